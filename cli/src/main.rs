@@ -1,0 +1,2 @@
+//! The `picofarm` binary.
+fn main() {}

@@ -1,0 +1,134 @@
+//! Pinhole cameras in the measurement contract's convention.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Vec3;
+
+/// Pinhole intrinsics in pixels; pixel (u, v) has its centre at (u+0.5, v+0.5).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Intrinsics {
+    /// Focal length along columns, pixels.
+    pub fx: f32,
+    /// Focal length along rows, pixels.
+    pub fy: f32,
+    /// Principal point, columns.
+    pub cx: f32,
+    /// Principal point, rows.
+    pub cy: f32,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+}
+
+impl Intrinsics {
+    /// Square pixels, centred principal point, horizontal field of view in degrees.
+    /// 90° at 256×256 gives fx = fy = cx = cy = 128.
+    pub fn from_fov(fov_x_deg: f32, width: u32, height: u32) -> Self {
+        let fx = if fov_x_deg == 90.0 {
+            width as f32 * 0.5
+        } else {
+            (f64::from(width) * 0.5 / libm::tan(f64::from(fov_x_deg).to_radians() * 0.5)) as f32
+        };
+        Self {
+            fx,
+            fy: fx,
+            cx: width as f32 * 0.5,
+            cy: height as f32 * 0.5,
+            width,
+            height,
+        }
+    }
+
+    /// The same field of view at another resolution.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let (sx, sy) = (
+            width as f32 / self.width as f32,
+            height as f32 / self.height as f32,
+        );
+        Self {
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+            width,
+            height,
+        }
+    }
+}
+
+/// A pinhole camera: intrinsics and pose. The axes are orthonormal world-space directions.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Intrinsics.
+    pub intrinsics: Intrinsics,
+    /// Pinhole centre x_c in world space, metres.
+    pub origin: Vec3,
+    /// Image +x (to the right) in world space.
+    pub right: Vec3,
+    /// Image +y (downwards) in world space.
+    pub down: Vec3,
+    /// Viewing direction, camera +z, in world space.
+    pub forward: Vec3,
+}
+
+impl Camera {
+    /// A camera at `origin` looking at `target`, with world +y up in the image.
+    pub fn look_at(origin: Vec3, target: Vec3, intrinsics: Intrinsics) -> Self {
+        let forward = (target - origin).normalized();
+        let right = forward.cross(Vec3::new(0.0, 1.0, 0.0)).normalized();
+        let down = forward.cross(right);
+        Self {
+            intrinsics,
+            origin,
+            right,
+            down,
+            forward,
+        }
+    }
+
+    /// Unnormalised ray direction through film position (x, y) in pixels: z-component 1 in the camera
+    /// frame, so a hit at parameter t has z-depth t.
+    #[inline]
+    pub fn ray(&self, x: f32, y: f32) -> Vec3 {
+        let i = &self.intrinsics;
+        self.right * ((x - i.cx) / i.fx) + self.down * ((y - i.cy) / i.fy) + self.forward
+    }
+
+    /// World point → camera frame (x right, y down, z forward).
+    pub fn to_camera(&self, p: Vec3) -> Vec3 {
+        self.direction_to_camera(p - self.origin)
+    }
+
+    /// World direction → camera frame.
+    pub fn direction_to_camera(&self, d: Vec3) -> Vec3 {
+        Vec3::new(self.right.dot(d), self.down.dot(d), self.forward.dot(d))
+    }
+
+    /// Finite, orthonormal and with a positive size; otherwise (field, what is wrong).
+    pub(crate) fn check(&self) -> Result<(), (String, String)> {
+        let i = &self.intrinsics;
+        if i.width == 0 || i.height == 0 {
+            return Err(("camera.intrinsics".into(), "the image has no pixels".into()));
+        }
+        let focal = [i.fx, i.fy].iter().all(|f| f.is_finite() && *f > 0.0);
+        if !focal || !i.cx.is_finite() || !i.cy.is_finite() {
+            return Err((
+                "camera.intrinsics".into(),
+                "focal lengths must be positive and finite".into(),
+            ));
+        }
+        let (r, d, f) = (self.right, self.down, self.forward);
+        let ortho = [r.dot(d), r.dot(f), d.dot(f)]
+            .iter()
+            .all(|x| x.abs() < 1e-4);
+        let unit = [r, d, f].iter().all(|v| (v.length() - 1.0).abs() < 1e-4);
+        if !(self.origin.is_finite() && ortho && unit) {
+            return Err((
+                "camera pose".into(),
+                "right, down and forward must be orthonormal and finite".into(),
+            ));
+        }
+        Ok(())
+    }
+}

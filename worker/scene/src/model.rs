@@ -1,0 +1,176 @@
+//! A whole scene: placed objects, a camera and a laser, with where it came from; and its validation.
+
+use std::{collections::BTreeMap, path::PathBuf, sync::Arc};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Affine, Camera, Laser, Mesh};
+
+/// A mesh placed in the world. Its index in [`Scene::objects`] is its instance id.
+#[derive(Debug, Clone)]
+pub struct Object {
+    /// Shared geometry.
+    pub mesh: Arc<Mesh>,
+    /// Mesh frame → world.
+    pub to_world: Affine,
+    /// Category, an index into [`Scene::labels`].
+    pub label: u16,
+    /// Name, for people.
+    pub name: String,
+}
+
+/// Where a scene came from, stored beside every histogram.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Generator or importer with its version, e.g. `furnished-1`, `gltf`.
+    pub source: String,
+    /// Seed of a generator.
+    pub seed: Option<u64>,
+    /// Attribution lines of the assets used (creator, licence).
+    pub attribution: Vec<String>,
+    /// Free-form facts (room type, size, what was dropped on import, …).
+    pub notes: BTreeMap<String, String>,
+}
+
+/// Everything the renderer needs, in world space.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Name, for people.
+    pub name: String,
+    /// Placed objects; the index is the instance id.
+    pub objects: Vec<Object>,
+    /// Category names; [`Object::label`] indexes this. Fixed vocabulary for generated scenes.
+    pub labels: Vec<String>,
+    /// The camera.
+    pub camera: Camera,
+    /// The laser and its beams.
+    pub laser: Laser,
+    /// Where it came from.
+    pub provenance: Provenance,
+}
+
+/// Why a scene cannot be read, generated or used.
+#[derive(Debug, thiserror::Error)]
+pub enum SceneError {
+    /// A file cannot be read.
+    #[error("cannot read {path}: {source}; check that the file exists and is readable")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A file's content is not what its format demands.
+    #[error("{path}: {what}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// Field, what was expected, what was found, and how to mend it.
+        what: String,
+    },
+    /// A scene's content is unusable, whatever its source.
+    #[error("scene {scene:?}: {field}: {what}")]
+    Invalid {
+        /// Scene name.
+        scene: String,
+        /// Field, e.g. `objects[3].mesh.positions[17]`.
+        field: String,
+        /// What is wrong, what was expected, and how to mend it.
+        what: String,
+    },
+    /// A generator ran out of tries.
+    #[error(
+        "generator {generator} found no acceptable scene for seed {seed} in {attempts} attempts; use another seed"
+    )]
+    Exhausted {
+        /// Generator.
+        generator: String,
+        /// Seed.
+        seed: u64,
+        /// Tries made.
+        attempts: u32,
+    },
+    /// Furniture assets that the job names are not here.
+    #[error(
+        "assets {name:?} are not installed ({looked}); run `picofarm assets install`, or set assets = \"parametric\""
+    )]
+    Assets {
+        /// Which asset source.
+        name: String,
+        /// Where it was looked for.
+        looked: String,
+    },
+}
+
+impl Scene {
+    /// Number of triangles over all placed objects.
+    pub fn triangle_count(&self) -> usize {
+        self.objects.iter().map(|o| o.mesh.triangles.len()).sum()
+    }
+
+    /// Checks everything the renderer relies on: finite vertices, indices in range, materials within
+    /// their physical limits, orthonormal camera, unit beams.
+    ///
+    /// # Errors
+    /// [`SceneError::Invalid`] naming the first offending field.
+    pub fn validate(&self) -> Result<(), SceneError> {
+        let bad = |field: String, what: String| {
+            Err(SceneError::Invalid {
+                scene: self.name.clone(),
+                field,
+                what,
+            })
+        };
+        for (i, object) in self.objects.iter().enumerate() {
+            let (mesh, at) = (&object.mesh, format!("objects[{i}] ({})", object.name));
+            if usize::from(object.label) >= self.labels.len() {
+                return bad(at, format!("label {} has no name in labels", object.label));
+            }
+            for (k, p) in mesh.positions.iter().enumerate() {
+                if !object.to_world.point(*p).is_finite() {
+                    return bad(
+                        format!("{at}.positions[{k}]"),
+                        format!("vertex {p:?} is not finite; repair or remove the mesh"),
+                    );
+                }
+            }
+            if mesh.triangle_material.len() != mesh.triangles.len() {
+                return bad(at, "needs one material index per triangle".into());
+            }
+            for (k, t) in mesh.triangles.iter().enumerate() {
+                if t.iter().any(|&v| v as usize >= mesh.positions.len()) {
+                    return bad(
+                        format!("{at}.triangles[{k}]"),
+                        format!("{t:?} points past {} vertices", mesh.positions.len()),
+                    );
+                }
+                if mesh.triangle_material[k] as usize >= mesh.materials.len() {
+                    return bad(
+                        format!("{at}.triangle_material[{k}]"),
+                        format!("no such material among {}", mesh.materials.len()),
+                    );
+                }
+            }
+            for m in &mesh.materials {
+                if let Err(what) = m.check() {
+                    return bad(format!("{at}.materials[{}]", m.name), what);
+                }
+            }
+        }
+        if let Err((field, what)) = self.camera.check() {
+            return bad(field, what);
+        }
+        for (i, b) in self.laser.beams.iter().enumerate() {
+            if !b.direction.is_finite() || (b.direction.length() - 1.0).abs() > 1e-4 {
+                return bad(
+                    format!("laser.beams[{i}].direction"),
+                    format!("{:?} is not a unit vector", b.direction),
+                );
+            }
+        }
+        if !self.laser.origin.is_finite() {
+            return bad("laser.origin".into(), "is not finite".into());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,165 @@
+//! What goes into a render and what comes out of it. Images are row-major `[row][column]`; histograms
+//! are `[row][column][bin]`; per-spot images are `[spot][row][column]`.
+
+use picofarm_scene::Spot;
+use serde::{Deserialize, Serialize};
+
+/// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
+pub const RENDERER_VERSION: &str = "transient-1";
+
+/// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Gate {
+    /// ℓ_min, metres.
+    pub start_m: f64,
+    /// Δ, metres.
+    pub bin_width_m: f64,
+    /// B.
+    pub bins: u32,
+}
+
+/// How much multi-bounce work to do.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Budget {
+    /// Camera paths per pixel.
+    Samples(u32),
+    /// Until the median per-pixel relative standard error falls to this share (0.1 = 10 %).
+    Error(f32),
+}
+
+/// Settings of one render.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// The gate.
+    pub gate: Gate,
+    /// Multi-bounce budget.
+    pub budget: Budget,
+    /// Longest path in bounces; `None` = until the gate ends. 2 renders no random walk.
+    pub max_bounces: Option<u32>,
+    /// Add the analytic one-bounce peaks to the histogram.
+    pub one_bounce: bool,
+    /// Seed of all random numbers.
+    pub seed: u64,
+    /// Keep the two-bounce and 3+ parts with their standard errors.
+    pub split: bool,
+}
+
+/// Told how far a render is; may end it.
+pub trait Progress: Sync {
+    /// Share done in [0, 1], from any thread, not necessarily increasing. Return `false` to stop the render.
+    fn at(&self, done: f32) -> bool;
+}
+
+/// A finished render.
+#[derive(Debug, Clone)]
+pub struct Rendered {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// The gate.
+    pub gate: Gate,
+    /// h(p, b), multiplexed over the spots: `[row][col][bin]`, radiance per pulse energy (1/(m² sr)).
+    pub transient: Vec<f32>,
+    /// The parts, where asked for.
+    pub split: Option<Split>,
+    /// Ground truth from the same rays.
+    pub truth: GroundTruth,
+    /// The spots, world space, in the order of the scene's beams; `None` where a beam meets nothing.
+    pub spots: Vec<Option<Spot>>,
+    /// What fell outside the gate.
+    pub overflow: Overflow,
+    /// How noisy it is.
+    pub error: ErrorEstimate,
+    /// What was done and why.
+    pub plan: Plan,
+    /// Rays traced.
+    pub rays: u64,
+}
+
+/// The exactly-two-bounce part and the 3+ part with standard errors, each `[row][col][bin]`.
+#[derive(Debug, Clone)]
+pub struct Split {
+    /// Exactly two bounces.
+    pub two: Vec<f32>,
+    /// Its standard error.
+    pub two_se: Vec<f32>,
+    /// Three bounces and more.
+    pub multi: Vec<f32>,
+    /// Its standard error.
+    pub multi_se: Vec<f32>,
+}
+
+/// Ground truth. Depth and its kin are those of the ray through the pixel's centre.
+#[derive(Debug, Clone)]
+pub struct GroundTruth {
+    /// z-depth, metres; 0 where the ray leaves the scene.
+    pub depth: Vec<f32>,
+    /// Distance along the ray, metres; 0 likewise.
+    pub range: Vec<f32>,
+    /// Unit normals facing the camera, camera frame, `[row][col][3]`.
+    pub normal: Vec<f32>,
+    /// Object index + 1; 0 = nothing.
+    pub instance: Vec<u32>,
+    /// Label index + 1; 0 = nothing.
+    pub label: Vec<u16>,
+    /// 1 where the first surface is a mirror (see `Material::is_specular`).
+    pub specular: Vec<u8>,
+    /// `[spot][row][col]`: 1 = lit, the segment from spot to surface point is free and both face it.
+    pub visibility: Vec<u8>,
+    /// Companion image, linear RGB in [0, 1], `[row][col][3]`.
+    pub rgb: Vec<f32>,
+}
+
+/// Energy outside the gate, same units as the histogram summed over pixels and bins.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Overflow {
+    /// Contributions dropped.
+    pub count: u64,
+    /// Their energy.
+    pub energy: f64,
+    /// Share of all energy found.
+    pub share: f64,
+}
+
+/// How noisy a render is, estimated from the variance between passes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct ErrorEstimate {
+    /// Median over pixels of ‖standard error‖₂ / ‖h‖₂ over the bins (one bounce left out).
+    pub median_relative: f32,
+    /// The same, 95th percentile.
+    pub p95_relative: f32,
+    /// Standard error of the total energy / total energy.
+    pub total_relative: f32,
+    /// Camera paths per pixel used.
+    pub samples: u32,
+}
+
+/// What the renderer decided for this scene.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Plan {
+    /// Strategies used, e.g. `two-bounce deterministic 4x4`, `image lobes: 2 planar mirrors`.
+    pub strategies: Vec<String>,
+    /// What is approximated or noisy here, in words; empty if nothing.
+    pub approximations: Vec<String>,
+}
+
+/// Why a render stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum RenderError {
+    /// The scene or a setting is unusable.
+    #[error("{field}: {what}")]
+    Invalid {
+        /// Field, e.g. `gate.bin_width_m`.
+        field: String,
+        /// What was expected and how to mend it.
+        what: String,
+    },
+    /// The scene is unusable.
+    #[error(transparent)]
+    Scene(#[from] picofarm_scene::SceneError),
+    /// [`Progress::at`] asked to stop.
+    #[error("render stopped on request")]
+    Stopped,
+}
