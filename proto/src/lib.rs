@@ -1,1 +1,17 @@
-//! Placeholder while the workspace is laid out.
+//! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
+//! protobuf types with their conversions. No I/O.
+
+pub mod convert;
+pub mod ids;
+pub mod key;
+pub mod model;
+
+/// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
+#[expect(missing_docs, reason = "generated from the schema, which documents it")]
+#[expect(clippy::large_enum_variant, reason = "generated")]
+pub mod wire {
+    tonic::include_proto!("picofarm.v1");
+}
+
+/// Version of the worker protocol; coordinator and worker must agree exactly.
+pub const PROTOCOL: u32 = 1;

@@ -1,0 +1,56 @@
+//! Wire → model and back. Every error names the field that cannot be used.
+
+mod job;
+mod session;
+mod status;
+
+use std::str::FromStr;
+
+use crate::model::SpecError;
+
+/// A wire message that cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ConvertError {
+    /// A field that must be there is not.
+    #[error("{field} is missing")]
+    Missing {
+        /// The field.
+        field: &'static str,
+    },
+    /// A field's value cannot be read.
+    #[error("{field}: {what}")]
+    Invalid {
+        /// The field.
+        field: &'static str,
+        /// What was expected.
+        what: String,
+    },
+    /// A job's field lies outside its limits.
+    #[error(transparent)]
+    Spec(#[from] SpecError),
+}
+
+fn required<T>(value: Option<T>, field: &'static str) -> Result<T, ConvertError> {
+    value.ok_or(ConvertError::Missing { field })
+}
+
+fn parse<T: FromStr>(text: &str, field: &'static str) -> Result<T, ConvertError>
+where
+    T::Err: std::fmt::Display,
+{
+    text.parse().map_err(|e: T::Err| ConvertError::Invalid {
+        field,
+        what: e.to_string(),
+    })
+}
+
+fn finite(value: f64, field: &'static str) -> Result<f64, ConvertError> {
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(ConvertError::Invalid {
+            field,
+            what: format!("{value} is not a finite number"),
+        })
+    }
+}

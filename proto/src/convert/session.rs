@@ -1,0 +1,201 @@
+//! The worker session on the wire.
+
+use super::{ConvertError, finite, parse, required};
+use crate::{
+    ids::{Epoch, LeaseRef},
+    key::TaskKey,
+    model::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello},
+    wire,
+};
+
+impl TryFrom<wire::LeaseRef> for LeaseRef {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::LeaseRef) -> Result<Self, ConvertError> {
+        Ok(LeaseRef {
+            range: parse(&w.range_id, "lease.range_id")?,
+            epoch: Epoch(w.epoch),
+        })
+    }
+}
+
+impl From<LeaseRef> for wire::LeaseRef {
+    fn from(m: LeaseRef) -> Self {
+        wire::LeaseRef {
+            range_id: m.range.to_string(),
+            epoch: m.epoch.0,
+        }
+    }
+}
+
+fn lease_ref(w: Option<wire::LeaseRef>) -> Result<LeaseRef, ConvertError> {
+    required(w, "lease")?.try_into()
+}
+
+impl TryFrom<wire::Hello> for WorkerHello {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::Hello) -> Result<Self, ConvertError> {
+        Ok(WorkerHello {
+            id: parse(&w.worker_id, "hello.worker_id")?,
+            incarnation: parse(&w.incarnation, "hello.incarnation")?,
+            name: w.name,
+            version: w.version,
+            protocol: w.protocol,
+            cores: w.cores,
+            held: w
+                .held
+                .into_iter()
+                .map(LeaseRef::try_from)
+                .collect::<Result<_, _>>()?,
+            renderer: w.renderer,
+            assets: w.assets,
+        })
+    }
+}
+
+impl From<WorkerHello> for wire::Hello {
+    fn from(m: WorkerHello) -> Self {
+        wire::Hello {
+            worker_id: m.id.to_string(),
+            incarnation: m.incarnation.to_string(),
+            name: m.name,
+            version: m.version,
+            protocol: m.protocol,
+            cores: m.cores,
+            held: m.held.into_iter().map(Into::into).collect(),
+            renderer: m.renderer,
+            assets: m.assets,
+        }
+    }
+}
+
+impl TryFrom<wire::Lease> for Lease {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::Lease) -> Result<Self, ConvertError> {
+        if w.lo >= w.hi {
+            return Err(ConvertError::Invalid {
+                field: "lease.hi",
+                what: format!("{}..{} holds no task", w.lo, w.hi),
+            });
+        }
+        Ok(Lease {
+            lease: lease_ref(w.lease)?,
+            job: parse(&w.job_id, "lease.job_id")?,
+            lo: w.lo,
+            hi: w.hi,
+            skip: w.skip,
+            ttl_ms: w.ttl_ms,
+            spec: required(w.spec, "lease.spec")?.try_into()?,
+        })
+    }
+}
+
+impl From<Lease> for wire::Lease {
+    fn from(m: Lease) -> Self {
+        wire::Lease {
+            lease: Some(m.lease.into()),
+            job_id: m.job.to_string(),
+            lo: m.lo,
+            hi: m.hi,
+            skip: m.skip,
+            ttl_ms: m.ttl_ms,
+            spec: Some(m.spec.into()),
+        }
+    }
+}
+
+impl TryFrom<wire::TaskDone> for Finished {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::TaskDone) -> Result<Self, ConvertError> {
+        Ok(Finished {
+            lease: lease_ref(w.lease)?,
+            index: w.index,
+            key: TaskKey::parse(&w.task_key).ok_or(ConvertError::Invalid {
+                field: "done.task_key",
+                what: "expected 64 hexadecimal digits".into(),
+            })?,
+            manifest_sha256: w.manifest_sha256,
+            bytes: w.bytes,
+            seconds: finite(w.seconds, "done.seconds")?,
+            adopted: w.adopted,
+        })
+    }
+}
+
+impl From<Finished> for wire::TaskDone {
+    fn from(m: Finished) -> Self {
+        wire::TaskDone {
+            lease: Some(m.lease.into()),
+            index: m.index,
+            task_key: m.key.to_string(),
+            manifest_sha256: m.manifest_sha256,
+            bytes: m.bytes,
+            seconds: m.seconds,
+            adopted: m.adopted,
+        }
+    }
+}
+
+impl TryFrom<wire::TaskFailed> for Failure {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::TaskFailed) -> Result<Self, ConvertError> {
+        let kind = match w.kind() {
+            wire::FailureKind::User => FailureKind::User,
+            wire::FailureKind::Crash => FailureKind::Crash,
+            wire::FailureKind::Interrupted => FailureKind::Interrupted,
+            wire::FailureKind::Unspecified => {
+                return Err(ConvertError::Missing {
+                    field: "failed.kind",
+                });
+            }
+        };
+        Ok(Failure {
+            lease: lease_ref(w.lease)?,
+            index: w.index,
+            kind,
+            message: w.message,
+        })
+    }
+}
+
+impl From<Failure> for wire::TaskFailed {
+    fn from(m: Failure) -> Self {
+        let kind = match m.kind {
+            FailureKind::User => wire::FailureKind::User,
+            FailureKind::Crash => wire::FailureKind::Crash,
+            FailureKind::Interrupted => wire::FailureKind::Interrupted,
+        };
+        wire::TaskFailed {
+            lease: Some(m.lease.into()),
+            index: m.index,
+            kind: kind.into(),
+            message: m.message,
+        }
+    }
+}
+
+impl TryFrom<wire::TaskProgress> for TaskProgress {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::TaskProgress) -> Result<Self, ConvertError> {
+        Ok(TaskProgress {
+            lease: lease_ref(w.lease)?,
+            index: w.index,
+            fraction: w.fraction.clamp(0.0, 1.0),
+        })
+    }
+}
+
+impl From<TaskProgress> for wire::TaskProgress {
+    fn from(m: TaskProgress) -> Self {
+        wire::TaskProgress {
+            lease: Some(m.lease.into()),
+            index: m.index,
+            fraction: m.fraction,
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! Typed identifiers: a job id cannot be passed for a range id.
+
+use std::{fmt, str::FromStr};
+
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+/// A text that is not an id of the wanted kind.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text:?} is not a {kind} id; expected a UUID such as {}", Uuid::nil())]
+pub struct IdError {
+    kind: &'static str,
+    text: String,
+}
+
+macro_rules! id {
+    ($(#[$doc:meta])* $name:ident, $kind:literal) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+        #[serde(transparent)]
+        pub struct $name(Uuid);
+
+        impl $name {
+            /// Wraps a UUID made elsewhere (ids are made at the edge, never in pure code).
+            pub const fn from_uuid(uuid: Uuid) -> Self {
+                Self(uuid)
+            }
+
+            /// The UUID.
+            pub const fn uuid(self) -> Uuid {
+                self.0
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                self.0.fmt(f)
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = IdError;
+            fn from_str(text: &str) -> Result<Self, IdError> {
+                Uuid::parse_str(text).map(Self).map_err(|_| IdError {
+                    kind: $kind,
+                    text: text.to_owned(),
+                })
+            }
+        }
+    };
+}
+
+id!(
+    /// One submission.
+    JobId,
+    "job"
+);
+id!(
+    /// A shard of a stage: consecutive tasks leased together.
+    RangeId,
+    "range"
+);
+id!(
+    /// A worker, across its restarts.
+    WorkerId,
+    "worker"
+);
+id!(
+    /// One process of a worker: new at every start.
+    Incarnation,
+    "incarnation"
+);
+
+/// Fences a lease: grows at each grant of a range, so that a former holder's words no longer count.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, Default,
+)]
+#[serde(transparent)]
+pub struct Epoch(pub u64);
+
+impl fmt::Display for Epoch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// A lease as both sides name it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct LeaseRef {
+    /// The range.
+    pub range: RangeId,
+    /// The epoch under which it was granted.
+    pub epoch: Epoch,
+}

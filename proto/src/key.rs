@@ -1,0 +1,97 @@
+//! Names of results. A stage key hashes everything that shapes the outputs of a job's tasks; a task key
+//! adds the task's index. Equal key, equal bytes: resume, reuse and reprocessing all rest on this.
+
+use std::fmt;
+
+use sha2::{Digest, Sha256};
+
+use crate::model::{JobSpec, SceneKind};
+
+/// Hash of the canonical description of a stage's tasks, without their number, name or budgets.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct StageKey(pub [u8; 32]);
+
+/// Names one task's result.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct TaskKey(pub [u8; 32]);
+
+macro_rules! hex_text {
+    ($name:ident) => {
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&hex::encode(self.0))
+            }
+        }
+        impl fmt::Debug for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                write!(f, concat!(stringify!($name), "({})"), self)
+            }
+        }
+        impl $name {
+            /// Parses 64 hexadecimal digits.
+            pub fn parse(text: &str) -> Option<Self> {
+                let mut bytes = [0; 32];
+                hex::decode_to_slice(text, &mut bytes).ok()?;
+                Some(Self(bytes))
+            }
+        }
+    };
+}
+hex_text!(StageKey);
+hex_text!(TaskKey);
+
+/// The stage key of a job's render stage: scene source (without `count`), render settings and codec profile.
+/// File scenes count by content and position, not by path; the place where results go does not count.
+pub fn stage_key(spec: &JobSpec) -> StageKey {
+    let scenes = match &spec.scenes.kind {
+        SceneKind::Furnished {
+            assets,
+            min_specular,
+        } => {
+            serde_json::json!({"kind": "furnished", "assets": assets, "min_specular": min_specular})
+        }
+        SceneKind::Primitive => serde_json::json!({"kind": "primitive"}),
+        SceneKind::Files { files } => serde_json::json!({
+            "kind": "files",
+            "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
+        }),
+    };
+    // serde_json's maps are sorted by key, so this text is canonical.
+    let text = serde_json::json!({
+        "task": "render",
+        "scenes": scenes,
+        "seed": spec.scenes.seed,
+        "fov_deg": spec.scenes.fov_deg,
+        "spots": spec.scenes.spots,
+        "render": serde_json::to_value(&spec.render).expect("settings are plain data"),
+        "profile": spec.output.profile,
+    })
+    .to_string();
+    StageKey(Sha256::digest(text.as_bytes()).into())
+}
+
+/// The key of task `index` of a stage.
+pub fn task_key(stage: &StageKey, index: u64) -> TaskKey {
+    let mut hash = Sha256::new();
+    hash.update(stage.0);
+    hash.update(index.to_le_bytes());
+    TaskKey(hash.finalize().into())
+}
+
+/// The seed of scene `index`: the first eight bytes of SHA-256("scene", seed, index).
+pub fn scene_seed(seed: u64, index: u64) -> u64 {
+    let mut hash = Sha256::new();
+    hash.update(b"scene");
+    hash.update(seed.to_le_bytes());
+    hash.update(index.to_le_bytes());
+    let digest = hash.finalize();
+    u64::from_le_bytes(digest[..8].try_into().expect("a digest has 32 bytes"))
+}
+
+/// SHA-256 over the whole spec: two submissions with equal hash are the same job.
+pub fn spec_hash(spec: &JobSpec) -> String {
+    let text = serde_json::to_value(spec)
+        .expect("a spec is plain data")
+        .to_string();
+    hex::encode(Sha256::digest(text.as_bytes()))
+}

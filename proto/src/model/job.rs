@@ -1,0 +1,306 @@
+//! A job: which scenes, rendered how, stored where. The TOML job file has exactly these fields; see
+//! [`JobSpec::check`] for their limits and the `Default` impls for what may be left out.
+
+use serde::{Deserialize, Serialize};
+
+use super::text::{RenderSettingsText, SceneSourceText};
+
+/// A field of a job that cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {what}")]
+pub struct SpecError {
+    /// The field, as in the job file, e.g. `render.bin_width_m`.
+    pub field: String,
+    /// What was expected and how to mend it.
+    pub what: String,
+}
+
+impl SpecError {
+    /// An error at `field`.
+    pub fn new(field: impl Into<String>, what: impl Into<String>) -> Self {
+        Self {
+            field: field.into(),
+            what: what.into(),
+        }
+    }
+}
+
+/// A whole job.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JobSpec {
+    /// Name, for people.
+    pub name: String,
+    /// Which scenes.
+    pub scenes: SceneSource,
+    /// How they are rendered.
+    #[serde(default)]
+    pub render: RenderSettings,
+    /// Where results go.
+    pub output: OutputSettings,
+    /// When a task is given up.
+    #[serde(default)]
+    pub limits: Limits,
+}
+
+/// The scenes of a job: one task each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "SceneSourceText")]
+pub struct SceneSource {
+    /// Where scenes come from.
+    #[serde(flatten)]
+    pub kind: SceneKind,
+    /// Number of scenes; with `kind = "files"`, the number of files (may be left out).
+    pub count: u64,
+    /// Seed (default 0); scene i derives its own from (seed, i).
+    pub seed: u64,
+    /// Horizontal field of view in degrees (generated scenes; default 90).
+    pub fov_deg: f64,
+    /// Laser spots: 1, 4, 16, 25 (default) or 100 (generated scenes, and files without a laser).
+    pub spots: u32,
+}
+
+/// Where scenes come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum SceneKind {
+    /// Furnished rooms.
+    Furnished {
+        /// `parametric`, `sweethome3d`, `auto` (default: whichever is installed; resolved before
+        /// submission), or a resolved fingerprint.
+        assets: String,
+        /// At least this many mirrors a room (default 1).
+        min_specular: u32,
+    },
+    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale.
+    Primitive,
+    /// Scene files (.glb, .gltf, .json), one scene each.
+    Files {
+        /// The files; in a job file, plain paths.
+        files: Vec<SceneFile>,
+    },
+}
+
+/// A scene file, pinned by its content.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "SceneFileText")]
+pub struct SceneFile {
+    /// Path as the workers see it.
+    pub path: String,
+    /// SHA-256 of the content in hexadecimal; empty until submission fills it in.
+    pub sha256: String,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum SceneFileText {
+    Path(String),
+    Pinned { path: String, sha256: String },
+}
+
+impl From<SceneFileText> for SceneFile {
+    fn from(text: SceneFileText) -> Self {
+        match text {
+            SceneFileText::Path(path) => Self {
+                path,
+                sha256: String::new(),
+            },
+            SceneFileText::Pinned { path, sha256 } => Self { path, sha256 },
+        }
+    }
+}
+
+/// How scenes are rendered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "RenderSettingsText")]
+pub struct RenderSettings {
+    /// Image width and height in pixels.
+    pub resolution: u32,
+    /// ℓ_min, metres of optical path.
+    pub gate_start_m: f64,
+    /// Δ, metres.
+    pub bin_width_m: f64,
+    /// Number of bins.
+    pub bins: u32,
+    /// Multi-bounce work: `samples = N` (paths per pixel) or `error = 0.1` (target).
+    #[serde(flatten)]
+    pub budget: Budget,
+    /// Longest path in bounces; 0 = until the gate ends.
+    pub max_bounces: u32,
+    /// Version of the renderer, part of every task key; filled in at submission where left out.
+    pub renderer: String,
+}
+
+/// How much multi-bounce work to do.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Budget {
+    /// Camera paths per pixel.
+    Samples(u32),
+    /// Until the median per-pixel relative error falls to this share.
+    Error(f64),
+}
+
+impl Default for RenderSettings {
+    /// The measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m, 256×256 px.
+    fn default() -> Self {
+        Self {
+            resolution: 256,
+            gate_start_m: 1.0,
+            bin_width_m: 0.0384,
+            bins: 637,
+            budget: Budget::Samples(32),
+            max_bounces: 0,
+            renderer: String::new(),
+        }
+    }
+}
+
+/// Where results go.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OutputSettings {
+    /// The store: a path or URL that every worker can reach.
+    pub store: String,
+    /// Folder of the data set in the store.
+    pub dataset: String,
+    /// Codec profile.
+    #[serde(default = "default_profile")]
+    pub profile: String,
+}
+
+fn default_profile() -> String {
+    "sqrt-u16".into()
+}
+
+/// When a task is given up. Interruptions are free and have no limit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Failures of the task itself before it is dead.
+    pub max_failures: u32,
+    /// Losses of the worker while it ran the task before it is dead.
+    pub max_crashes: u32,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            max_failures: 3,
+            max_crashes: 3,
+        }
+    }
+}
+
+impl JobSpec {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(field, what));
+        if self.name.trim().is_empty() {
+            return fail("name", "is empty; give the job a name".into());
+        }
+        self.scenes.check()?;
+        self.render.check()?;
+        if self.output.store.is_empty() {
+            return fail("output.store", "is empty; give a path or URL".into());
+        }
+        let dataset = &self.output.dataset;
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+        if dataset.is_empty() || dataset.starts_with('.') || !dataset.chars().all(plain) {
+            return fail(
+                "output.dataset",
+                format!(
+                    "{dataset:?} must be a plain folder name of letters, digits, '-', '_' and '.'"
+                ),
+            );
+        }
+        if self.limits.max_failures == 0 || self.limits.max_crashes == 0 {
+            return fail("limits", "budgets must be at least 1".into());
+        }
+        Ok(())
+    }
+}
+
+impl SceneSource {
+    /// Most tasks in one job.
+    pub const MAX_COUNT: u64 = 100_000_000;
+
+    fn check(&self) -> Result<(), SpecError> {
+        if self.count == 0 || self.count > Self::MAX_COUNT {
+            return Err(SpecError::new(
+                "scenes.count",
+                format!("{} lies outside 1..={}", self.count, Self::MAX_COUNT),
+            ));
+        }
+        if let SceneKind::Files { files } = &self.kind
+            && files.len() as u64 != self.count
+        {
+            return Err(SpecError::new(
+                "scenes.count",
+                format!(
+                    "{} differs from the {} files listed; leave count out",
+                    self.count,
+                    files.len()
+                ),
+            ));
+        }
+        if !(10.0..=150.0).contains(&self.fov_deg) {
+            return Err(SpecError::new(
+                "scenes.fov_deg",
+                format!("{} lies outside 10..=150 degrees", self.fov_deg),
+            ));
+        }
+        if ![1, 4, 16, 25, 100].contains(&self.spots) {
+            return Err(SpecError::new(
+                "scenes.spots",
+                format!("{} is not one of 1, 4, 16, 25, 100", self.spots),
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl RenderSettings {
+    fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
+        if !(1..=4096).contains(&self.resolution) {
+            return fail(
+                "resolution",
+                format!("{} lies outside 1..=4096 pixels", self.resolution),
+            );
+        }
+        if !(self.gate_start_m >= 0.0 && self.gate_start_m.is_finite()) {
+            return fail(
+                "gate_start_m",
+                format!("{} must be a finite length ≥ 0 m", self.gate_start_m),
+            );
+        }
+        if !(self.bin_width_m > 0.0 && self.bin_width_m.is_finite()) {
+            return fail(
+                "bin_width_m",
+                format!("{} must be a positive length in metres", self.bin_width_m),
+            );
+        }
+        if !(1..=65_536).contains(&self.bins) {
+            return fail("bins", format!("{} lies outside 1..=65536", self.bins));
+        }
+        match self.budget {
+            Budget::Samples(n) if !(2..=1_048_576).contains(&n) => fail(
+                "samples",
+                format!("{n} lies outside 2..=1048576 paths per pixel"),
+            ),
+            Budget::Error(e) if !(e > 0.0 && e < 1.0) => fail(
+                "error",
+                format!("{e} must lie between 0 and 1, e.g. 0.1 for 10 %"),
+            ),
+            _ if self.max_bounces == 1 => fail(
+                "max_bounces",
+                "1 keeps nothing but the spots; use 0 (all) or at least 2".into(),
+            ),
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,103 @@
+//! What passes between coordinator and worker, checked.
+
+use crate::{
+    ids::{Incarnation, JobId, LeaseRef, WorkerId},
+    key::TaskKey,
+    model::JobSpec,
+};
+
+/// Who a worker says it is at the start of a session.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WorkerHello {
+    /// The worker, across restarts.
+    pub id: WorkerId,
+    /// This process.
+    pub incarnation: Incarnation,
+    /// Name, for people (host and process).
+    pub name: String,
+    /// Program version.
+    pub version: String,
+    /// Protocol version; see [`crate::PROTOCOL`].
+    pub protocol: u32,
+    /// CPU cores it uses.
+    pub cores: u32,
+    /// Leases it still holds from before a reconnect.
+    pub held: Vec<LeaseRef>,
+    /// Its renderer's version.
+    pub renderer: String,
+    /// Fingerprints of the furniture it has.
+    pub assets: Vec<String>,
+}
+
+/// A granted lease: tasks `lo ≤ i < hi` less `skip`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lease {
+    /// Its name.
+    pub lease: LeaseRef,
+    /// The job.
+    pub job: JobId,
+    /// First task.
+    pub lo: u64,
+    /// One past the last task.
+    pub hi: u64,
+    /// Tasks of the interval that are not to be run.
+    pub skip: Vec<u64>,
+    /// Time to live from receipt, milliseconds.
+    pub ttl_ms: u32,
+    /// The job's spec.
+    pub spec: JobSpec,
+}
+
+/// A finished task as the worker reports it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finished {
+    /// The lease it ran under.
+    pub lease: LeaseRef,
+    /// Task index.
+    pub index: u64,
+    /// Names the result.
+    pub key: TaskKey,
+    /// SHA-256 of the manifest, hexadecimal.
+    pub manifest_sha256: String,
+    /// Bytes published.
+    pub bytes: u64,
+    /// Seconds it took.
+    pub seconds: f64,
+    /// Found in the store, not computed.
+    pub adopted: bool,
+}
+
+/// Who is to blame for a failure; budgets are separate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FailureKind {
+    /// The task's own input or settings.
+    User,
+    /// The executor panicked, or the worker was lost.
+    Crash,
+    /// Shutdown, preemption, store unreachable: free.
+    Interrupted,
+}
+
+/// A failed task as the worker reports it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Failure {
+    /// The lease it ran under.
+    pub lease: LeaseRef,
+    /// Task index.
+    pub index: u64,
+    /// Whose fault.
+    pub kind: FailureKind,
+    /// Why, for people.
+    pub message: String,
+}
+
+/// How far a running task is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TaskProgress {
+    /// Its lease.
+    pub lease: LeaseRef,
+    /// Task index.
+    pub index: u64,
+    /// Share done in [0, 1].
+    pub fraction: f32,
+}

@@ -1,0 +1,14 @@
+//! The checked model: what the coordinator and the agent reason about. Wire types convert into these.
+
+pub mod job;
+pub mod lease;
+pub mod status;
+mod text;
+
+pub use job::{
+    Budget, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind, SceneSource,
+    SpecError,
+};
+pub use lease::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
+pub use status::{Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, TaskCounts};
+pub use text::parse_share;

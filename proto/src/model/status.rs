@@ -1,0 +1,140 @@
+//! What people are told about jobs. Every count is derived from ranges and outputs.
+
+use serde::Serialize;
+
+use crate::{ids::JobId, model::JobSpec};
+
+/// Where a job stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JobState {
+    /// Tasks are pending or running.
+    Active,
+    /// Every task is done.
+    Done,
+    /// Every task is done or dead, and at least one is dead.
+    Failed,
+    /// Stopped by a person; finished tasks stay.
+    Cancelled,
+}
+
+/// Tasks of a job by state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct TaskCounts {
+    /// All.
+    pub total: u64,
+    /// Output committed.
+    pub done: u64,
+    /// Part of `done` that was there before this job ran it.
+    pub reused: u64,
+    /// In a live lease and not done.
+    pub leased: u64,
+    /// Waiting.
+    pub pending: u64,
+    /// Given up.
+    pub dead: u64,
+}
+
+/// A task that runs now.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RunningTask {
+    /// Task index.
+    pub index: u64,
+    /// Worker's name.
+    pub worker: String,
+    /// Share done in [0, 1].
+    pub fraction: f32,
+    /// Seconds since the worker began it.
+    pub seconds: f64,
+}
+
+/// A job as people see it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct JobStatus {
+    /// Id.
+    pub id: JobId,
+    /// Name.
+    pub name: String,
+    /// State.
+    pub state: JobState,
+    /// Counts.
+    pub tasks: TaskCounts,
+    /// Unix time of submission, milliseconds.
+    pub submitted_at_ms: i64,
+    /// Unix time of the end, milliseconds.
+    pub ended_at_ms: Option<i64>,
+    /// The job.
+    pub spec: JobSpec,
+    /// Mean seconds of a computed task on one worker; `None` before the first.
+    pub mean_task_seconds: Option<f64>,
+    /// Tasks that run now.
+    pub running: Vec<RunningTask>,
+    /// Workers connected to the coordinator.
+    pub workers: u32,
+}
+
+/// What a submission would do.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct JobPlan {
+    /// SHA-256 of the canonical spec, hexadecimal.
+    pub spec_hash: String,
+    /// Tasks.
+    pub total: u64,
+    /// Tasks whose output exists.
+    pub reuse: u64,
+    /// Tasks that will run.
+    pub run: u64,
+    /// The job that has this exact spec already.
+    pub existing_job: Option<JobId>,
+    /// Why tasks run, in words.
+    pub reasons: Vec<String>,
+}
+
+/// What happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventKind {
+    /// Job accepted.
+    Submitted,
+    /// Range granted to a worker.
+    Leased,
+    /// Task's output committed.
+    Committed,
+    /// Task's output was there already.
+    Reused,
+    /// Task failed and will be tried again.
+    Failed,
+    /// Task given up.
+    Dead,
+    /// A lease ran out.
+    Expired,
+    /// A worker gave a lease back.
+    Released,
+    /// Job cancelled.
+    Cancelled,
+    /// Dead tasks made pending again.
+    Retried,
+    /// Job ended.
+    Ended,
+}
+
+/// One line of a job's history.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Event {
+    /// Position in the history, growing.
+    pub sequence: u64,
+    /// Unix time, milliseconds.
+    pub at_ms: i64,
+    /// The job.
+    pub job: JobId,
+    /// What.
+    pub kind: EventKind,
+    /// Task, where it concerns one.
+    pub task: Option<u64>,
+    /// Worker's name, where one is concerned.
+    pub worker: String,
+    /// In words.
+    pub message: String,
+    /// Seconds the task took, where it ended.
+    pub seconds: f64,
+}

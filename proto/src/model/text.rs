@@ -1,0 +1,139 @@
+//! The shapes a job is written in (TOML file, stored JSON): every field known, every other one refused.
+//! They become the model types by `TryFrom`, whose errors name the field.
+
+use serde::Deserialize;
+
+use super::job::{Budget, RenderSettings, SceneFile, SceneKind, SceneSource, SpecError};
+
+/// `[scenes]`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SceneSourceText {
+    kind: String,
+    assets: Option<String>,
+    min_specular: Option<u32>,
+    files: Option<Vec<SceneFile>>,
+    count: Option<u64>,
+    #[serde(default)]
+    seed: u64,
+    fov_deg: Option<f64>,
+    spots: Option<u32>,
+}
+
+impl TryFrom<SceneSourceText> for SceneSource {
+    type Error = SpecError;
+
+    fn try_from(text: SceneSourceText) -> Result<Self, SpecError> {
+        let only = |field: &str, kind: &str, given: bool| {
+            if given && text.kind != kind {
+                Err(SpecError::new(
+                    format!("scenes.{field}"),
+                    format!(
+                        "belongs to kind = \"{kind}\"; remove it from kind = {:?}",
+                        text.kind
+                    ),
+                ))
+            } else {
+                Ok(())
+            }
+        };
+        only("assets", "furnished", text.assets.is_some())?;
+        only("min_specular", "furnished", text.min_specular.is_some())?;
+        only("files", "files", text.files.is_some())?;
+        let mut count = text.count;
+        let kind = match text.kind.as_str() {
+            "furnished" => SceneKind::Furnished {
+                assets: text.assets.unwrap_or_else(|| "auto".into()),
+                min_specular: text.min_specular.unwrap_or(1),
+            },
+            "primitive" => SceneKind::Primitive,
+            "files" => {
+                let files = text.files.unwrap_or_default();
+                count = count.or(Some(files.len() as u64));
+                SceneKind::Files { files }
+            }
+            other => {
+                return Err(SpecError::new(
+                    "scenes.kind",
+                    format!("{other:?} is not one of \"furnished\", \"primitive\", \"files\""),
+                ));
+            }
+        };
+        Ok(SceneSource {
+            kind,
+            count: count
+                .ok_or_else(|| SpecError::new("scenes.count", "is missing; say how many scenes"))?,
+            seed: text.seed,
+            fov_deg: text.fov_deg.unwrap_or(90.0),
+            spots: text.spots.unwrap_or(25),
+        })
+    }
+}
+
+/// `[render]`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RenderSettingsText {
+    resolution: Option<u32>,
+    gate_start_m: Option<f64>,
+    bin_width_m: Option<f64>,
+    bins: Option<u32>,
+    samples: Option<u32>,
+    error: Option<Share>,
+    max_bounces: Option<u32>,
+    renderer: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Share {
+    Number(f64),
+    Text(String),
+}
+
+/// Reads "10%" or "0.1" as 0.1.
+///
+/// # Errors
+/// A message that says what was expected.
+pub fn parse_share(text: &str) -> Result<f64, String> {
+    let (number, scale) = match text.trim().strip_suffix('%') {
+        Some(percent) => (percent, 0.01),
+        None => (text.trim(), 1.0),
+    };
+    number
+        .trim()
+        .parse::<f64>()
+        .map(|v| v * scale)
+        .map_err(|_| format!("{text:?} is not a share; write \"10%\" or 0.1"))
+}
+
+impl TryFrom<RenderSettingsText> for RenderSettings {
+    type Error = SpecError;
+
+    fn try_from(text: RenderSettingsText) -> Result<Self, SpecError> {
+        let default = RenderSettings::default();
+        let budget = match (text.samples, text.error) {
+            (Some(_), Some(_)) => {
+                return Err(SpecError::new(
+                    "render.error",
+                    "samples and error exclude each other; keep one",
+                ));
+            }
+            (Some(n), None) => Budget::Samples(n),
+            (None, Some(Share::Number(e))) => Budget::Error(e),
+            (None, Some(Share::Text(e))) => {
+                Budget::Error(parse_share(&e).map_err(|m| SpecError::new("render.error", m))?)
+            }
+            (None, None) => default.budget,
+        };
+        Ok(RenderSettings {
+            resolution: text.resolution.unwrap_or(default.resolution),
+            gate_start_m: text.gate_start_m.unwrap_or(default.gate_start_m),
+            bin_width_m: text.bin_width_m.unwrap_or(default.bin_width_m),
+            bins: text.bins.unwrap_or(default.bins),
+            budget,
+            max_bounces: text.max_bounces.unwrap_or(default.max_bounces),
+            renderer: text.renderer.unwrap_or_default(),
+        })
+    }
+}
