@@ -1,1 +1,33 @@
-//! Placeholder while the workspace is laid out.
+//! Histograms and ground truth at rest: one Zarr v3 group a data set, one object a scene and quantity, published
+//! create-only into an object store and readable by zarr-python and xarray without our code.
+//!
+//! A scene counts as published once `manifests/<scene>.json` exists. Objects and manifests are pure functions of the
+//! task, so whoever runs a task again writes the same bytes.
+
+mod codec;
+mod dataset;
+mod encode;
+mod error;
+mod layout;
+mod manifest;
+mod objects;
+mod publish;
+mod read;
+mod record;
+mod render_group;
+mod shard;
+mod spec;
+mod squareroot;
+mod store;
+
+pub use dataset::Dataset;
+pub use encode::EncodedScene;
+pub use error::DatasetError;
+pub use layout::{INNER_SIDE, Quantity};
+pub use manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry};
+pub use read::Stored;
+pub use record::{Intrinsics, Provenance, SceneRecord, Spot};
+pub use render_group::{RenderArray, write_render_group};
+pub use spec::{DatasetSpec, Gate, Profile};
+pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
+pub use store::{local_leftovers, open_store, probe};

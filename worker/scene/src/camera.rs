@@ -132,3 +132,21 @@ impl Camera {
         Ok(())
     }
 }
+
+/// Limits of a generated view: (field, what was expected).
+pub(crate) fn check_view(
+    width: u32,
+    height: u32,
+    fov_deg: f32,
+) -> Result<(), (&'static str, String)> {
+    if !(1..=4096).contains(&width) || !(1..=4096).contains(&height) {
+        return Err((
+            "width and height",
+            format!("{width}x{height}: choose 1 to 4096 pixels each"),
+        ));
+    }
+    if !(20.0..=120.0).contains(&fov_deg) {
+        return Err(("fov_deg", format!("{fov_deg}: choose 20 to 120 degrees")));
+    }
+    Ok(())
+}

@@ -93,3 +93,46 @@ impl LaserGrid {
         }
     }
 }
+
+/// The grid of a generator's `spots` setting, or (field, what was expected).
+pub(crate) fn check_spots(spots: u32) -> Result<LaserGrid, (&'static str, String)> {
+    LaserGrid::new(spots).ok_or_else(|| {
+        (
+            "spots",
+            format!("{spots}: there are grids of 1, 4, 16, 25 and 100 spots"),
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::LaserGrid;
+
+    fn film(spots: u32) -> Vec<[f32; 2]> {
+        LaserGrid::new(spots).expect("a standard grid").film()
+    }
+
+    #[test]
+    fn the_grids_of_4_and_25_are_cut_out_of_the_100() {
+        let hundred = film(100);
+        let index = |p: &[f32; 2]| hundred.iter().position(|q| q == p);
+        let four: Vec<_> = film(4).iter().map(index).collect();
+        assert_eq!(four, [22, 27, 72, 77].map(Some));
+        let of_25: Vec<_> = film(25).iter().map(index).collect();
+        let expected: Vec<_> = [0, 2, 4, 6, 8]
+            .iter()
+            .flat_map(|r| [1, 3, 5, 7, 9].map(|c| Some(r * 10 + c)))
+            .collect();
+        assert_eq!(of_25, expected);
+    }
+
+    #[test]
+    fn every_grid_lies_on_the_film_and_has_its_number_of_spots() {
+        for n in [1, 4, 16, 25, 100] {
+            let points = film(n);
+            assert_eq!(points.len(), n as usize);
+            assert!(points.iter().flatten().all(|x| (0.0..1.0).contains(x)));
+        }
+        assert_eq!(LaserGrid::new(9), None);
+    }
+}

@@ -5,15 +5,27 @@
 //! frame has x right, y **down** (image rows grow with y) and z forward.
 
 mod camera;
+pub mod export;
+mod extras;
+pub mod import;
+mod label;
 mod laser;
+mod layout;
 mod material;
 mod mesh;
 mod model;
+pub mod primitive;
+mod rng;
+mod shape;
+mod trace;
 mod vec3;
+mod view;
 
 pub use camera::{Camera, Intrinsics};
+pub use label::LABELS;
 pub use laser::{Beam, Laser, LaserGrid, Spot};
 pub use material::{Bsdf, Distribution, Material};
 pub use mesh::Mesh;
 pub use model::{Object, Provenance, Scene, SceneError};
 pub use vec3::{Affine, Vec3};
+pub use view::{MAX_DEPTH_M, MIN_DEPTH_M};

@@ -87,19 +87,17 @@ impl Material {
                 Err(format!("{name} = {v} lies outside [0, 1]"))
             }
         };
-        for v in self.rgb {
-            unit("rgb", v)?;
-        }
         match self.bsdf {
-            Bsdf::Diffuse { reflectance } => unit("reflectance", reflectance),
+            Bsdf::Diffuse { reflectance } => unit("reflectance", reflectance)?,
             Bsdf::RoughConductor {
                 alpha, reflectance, ..
             } => {
                 if !(alpha >= 1e-3 && alpha <= 1.0) {
                     return Err(format!("alpha = {alpha} lies outside [0.001, 1]"));
                 }
-                unit("reflectance", reflectance)
+                unit("reflectance", reflectance)?;
             }
         }
+        self.rgb.iter().try_for_each(|&v| unit("rgb", v))
     }
 }

@@ -16,3 +16,26 @@ pub struct Mesh {
     /// The materials of this mesh.
     pub materials: Vec<Material>,
 }
+
+impl Mesh {
+    /// Orders triangles by material, keeping their order within each: the canonical order on disk.
+    pub(crate) fn group_by_material(&mut self) {
+        if self.triangle_material.is_sorted() {
+            return;
+        }
+        let mut order: Vec<usize> = (0..self.triangles.len()).collect();
+        order.sort_by_key(|&k| self.triangle_material[k]);
+        self.triangles = order.iter().map(|&k| self.triangles[k]).collect();
+        self.triangle_material = order.iter().map(|&k| self.triangle_material[k]).collect();
+    }
+
+    /// Smallest and largest coordinates over the vertices; `None` without vertices.
+    pub fn bounds(&self) -> Option<(Vec3, Vec3)> {
+        let first = *self.positions.first()?;
+        Some(
+            self.positions
+                .iter()
+                .fold((first, first), |(lo, hi), &p| (lo.min(p), hi.max(p))),
+        )
+    }
+}

@@ -60,6 +60,14 @@ pub enum SceneError {
         /// Why.
         source: std::io::Error,
     },
+    /// A file cannot be written.
+    #[error("cannot write {path}: {source}; check the folder, its permissions and the free space")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
     /// A file's content is not what its format demands.
     #[error("{path}: {what}")]
     Format {

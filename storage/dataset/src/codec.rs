@@ -1,0 +1,137 @@
+//! Chunks to bytes and back, through zarrs' codec chains built from the very metadata that is stored.
+
+use std::borrow::Cow;
+use std::num::NonZeroU64;
+
+use serde_json::Value;
+use zarrs::array::codec::CodecChain;
+use zarrs::array::codec::api::{ArrayToBytesCodecTraits, CodecOptions};
+use zarrs::array::{ArrayBytes, DataType, FillValue, data_type};
+
+use crate::error::DatasetError;
+use crate::layout::{Element, Layout, index_codecs};
+
+/// The codecs of one kind of chunk. Deterministic: one thread a chunk, no state.
+#[derive(Debug, Clone)]
+pub(crate) struct ChunkCodec {
+    chain: CodecChain,
+    shape: Vec<NonZeroU64>,
+    data_type: DataType,
+    fill: FillValue,
+    len_bytes: usize,
+    name: &'static str,
+}
+
+impl ChunkCodec {
+    /// Codec of an array's objects, or of the inner chunks of its shards.
+    pub fn new(layout: &Layout) -> Self {
+        let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
+        let data_type = match layout.element {
+            Element::F32 => data_type::float32(),
+            Element::U8 => data_type::uint8(),
+            Element::U16 => data_type::uint16(),
+            Element::I16 => data_type::int16(),
+            Element::U32 => data_type::uint32(),
+        };
+        // The fill value plays no part in these codecs; only its size must fit.
+        let fill = FillValue::from(vec![0u8; layout.element.size() as usize]);
+        Self::from_parts(
+            &layout.chunk_codecs(),
+            std::iter::once(1).chain(shape.iter().copied()),
+            data_type,
+            fill,
+            layout.element.size() as usize,
+            layout.quantity.name(),
+        )
+    }
+
+    /// Codec of the index of a shard with `chunks` inner chunks.
+    pub fn index(chunks: usize) -> Self {
+        Self::from_parts(
+            &index_codecs(),
+            [chunks as u64, 2],
+            data_type::uint64(),
+            FillValue::from(u64::MAX),
+            8,
+            "shard index",
+        )
+    }
+
+    /// A codec of other f32 chunks (see `render_group`).
+    pub fn plain_f32(codecs: &Value, shape: &[u64]) -> Self {
+        Self::from_parts(
+            codecs,
+            shape.iter().copied(),
+            data_type::float32(),
+            FillValue::from(0.0f32),
+            4,
+            "array",
+        )
+    }
+
+    fn from_parts(
+        codecs: &Value,
+        shape: impl IntoIterator<Item = u64>,
+        data_type: DataType,
+        fill: FillValue,
+        element_size: usize,
+        name: &'static str,
+    ) -> Self {
+        let metadata: Vec<zarrs::metadata::v3::MetadataV3> =
+            serde_json::from_value(codecs.clone()).expect("our own codec metadata is well formed");
+        let chain =
+            CodecChain::from_metadata(&metadata).expect("our own codecs are compiled into zarrs");
+        let shape: Vec<NonZeroU64> = shape
+            .into_iter()
+            .map(|n| NonZeroU64::new(n).expect("sizes are checked to be positive"))
+            .collect();
+        let len_bytes = shape.iter().map(|n| n.get() as usize).product::<usize>() * element_size;
+        Self {
+            chain,
+            shape,
+            data_type,
+            fill,
+            len_bytes,
+            name,
+        }
+    }
+
+    /// Encodes a chunk of native-endian values.
+    pub fn encode(&self, values: &[u8]) -> Result<Vec<u8>, DatasetError> {
+        self.chain
+            .encode(
+                ArrayBytes::from(Cow::Borrowed(values)),
+                &self.shape,
+                &self.data_type,
+                &self.fill,
+                &CodecOptions::default(),
+            )
+            .map(Cow::into_owned)
+            .map_err(|e| DatasetError::codec(format!("cannot encode a chunk of {}", self.name), e))
+    }
+
+    /// Decodes a chunk to native-endian values, checking its crc32c and size.
+    pub fn decode(&self, bytes: &[u8]) -> Result<Vec<u8>, DatasetError> {
+        let fail =
+            |e: String| DatasetError::codec(format!("cannot decode a chunk of {}", self.name), e);
+        let decoded = self
+            .chain
+            .decode(
+                Cow::Borrowed(bytes),
+                &self.shape,
+                &self.data_type,
+                &self.fill,
+                &CodecOptions::default(),
+            )
+            .and_then(|bytes| Ok(bytes.into_fixed()?))
+            .map_err(|e| fail(e.to_string()))?;
+        if decoded.len() != self.len_bytes {
+            return Err(fail(format!(
+                "expected {} bytes, found {}",
+                self.len_bytes,
+                decoded.len()
+            )));
+        }
+        Ok(decoded.into_owned())
+    }
+}

@@ -1,0 +1,257 @@
+//! Creating, opening and growing a data set.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use object_store::ObjectStore;
+use object_store::path::Path;
+use serde_json::{Map, Value, json};
+
+use crate::codec::ChunkCodec;
+use crate::error::DatasetError;
+use crate::layout::{Layout, Quantity};
+use crate::manifest::{ENCODER_VERSION, FORMAT_VERSION};
+use crate::objects;
+use crate::spec::{DatasetSpec, Profile};
+
+/// An open data set: one Zarr v3 group in an object store. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    pub(crate) store: Arc<dyn ObjectStore>,
+    pub(crate) prefix: Path,
+    pub(crate) spec: DatasetSpec,
+    pub(crate) arrays: Arc<[ArrayCodec]>,
+}
+
+/// An array and the codec of its chunks.
+#[derive(Debug)]
+pub(crate) struct ArrayCodec {
+    pub layout: Layout,
+    pub codec: ChunkCodec,
+}
+
+/// Name of the metadata objects.
+pub(crate) const METADATA: &str = "zarr.json";
+
+impl Dataset {
+    /// Creates the data set at `prefix`, or opens it if it is there.
+    ///
+    /// The metadata are written create-only, the root last: a data set exists once its root `zarr.json` does.
+    /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
+    /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Let one
+    /// process at a time grow a data set: metadata are replaced without comparison (published scenes are never
+    /// touched, so the worst case is a number of scenes too small, which growing again mends).
+    ///
+    /// # Errors
+    /// [`DatasetError::SpecMismatch`] names the first differing field and both values; [`DatasetError::Invalid`];
+    /// [`DatasetError::Store`].
+    pub async fn create_or_open(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+        spec: &DatasetSpec,
+    ) -> Result<Self, DatasetError> {
+        spec.check()?;
+        let root = objects::path_of(&prefix, METADATA);
+        let stored = match objects::get(&*store, &root).await? {
+            Some(bytes) => parse_root(&bytes, &root)?,
+            None => {
+                let new = Self::assume(store.clone(), prefix.clone(), *spec);
+                for array in new.arrays.iter() {
+                    new.create_array_metadata(&array.layout).await?;
+                }
+                if objects::create(&*store, &root, pretty(&root_metadata(spec))).await? {
+                    return Ok(new);
+                }
+                // Another process was faster.
+                parse_root(&objects::require(&*store, &root).await?, &root)?
+            }
+        };
+        if let Some((field, stored, asked)) = stored.difference(spec) {
+            return Err(DatasetError::SpecMismatch {
+                prefix: prefix.to_string(),
+                field: field.into(),
+                stored,
+                asked,
+            });
+        }
+        if spec.scenes <= stored.scenes {
+            return Ok(Self::assume(store, prefix, stored));
+        }
+        let grown = Self::assume(store, prefix, *spec);
+        for array in grown.arrays.iter() {
+            let path = grown.metadata_path(&array.layout);
+            let bytes = pretty(&array.layout.metadata(spec.scenes));
+            objects::overwrite(&*grown.store, &path, bytes).await?;
+        }
+        objects::overwrite(&*grown.store, &root, pretty(&root_metadata(spec))).await?;
+        Ok(grown)
+    }
+
+    /// Opens the data set at `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] where the root is not a data set of ours,
+    /// [`DatasetError::Store`].
+    pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+        let root = objects::path_of(&prefix, METADATA);
+        let Some(bytes) = objects::get(&*store, &root).await? else {
+            return Err(DatasetError::NoDataset {
+                prefix: prefix.to_string(),
+            });
+        };
+        let spec = parse_root(&bytes, &root)?;
+        Ok(Self::assume(store, prefix, spec))
+    }
+
+    /// The data set's properties as stored.
+    pub fn spec(&self) -> &DatasetSpec {
+        &self.spec
+    }
+
+    /// Where it lies in its store.
+    pub fn prefix(&self) -> &Path {
+        &self.prefix
+    }
+
+    fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
+        let arrays = Quantity::ALL.map(|quantity| {
+            let layout = quantity.layout(&spec);
+            let codec = ChunkCodec::new(&layout);
+            ArrayCodec { layout, codec }
+        });
+        Self {
+            store,
+            prefix,
+            spec,
+            arrays: arrays.into(),
+        }
+    }
+
+    pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
+        let found = self.arrays.iter().find(|a| a.layout.quantity == quantity);
+        found.expect("every data set has all quantities")
+    }
+
+    pub(crate) fn path(&self, key: &str) -> Path {
+        objects::path_of(&self.prefix, key)
+    }
+
+    pub(crate) fn metadata_path(&self, layout: &Layout) -> Path {
+        self.path(&format!("{}/{METADATA}", layout.quantity.name()))
+    }
+
+    pub(crate) fn check_scene(&self, scene: u64) -> Result<(), DatasetError> {
+        if scene < self.spec.scenes {
+            return Ok(());
+        }
+        Err(DatasetError::SceneOutOfRange {
+            scene,
+            scenes: self.spec.scenes,
+        })
+    }
+
+    /// Writes an array's metadata while there is no root. What an interrupted creation left is adopted if it
+    /// differs at most in the number of scenes.
+    async fn create_array_metadata(&self, layout: &Layout) -> Result<(), DatasetError> {
+        let path = self.metadata_path(layout);
+        let ours = layout.metadata(self.spec.scenes);
+        if objects::create(&*self.store, &path, pretty(&ours)).await? {
+            return Ok(());
+        }
+        let stored = objects::require(&*self.store, &path).await?;
+        let mut stored: Value = serde_json::from_slice(&stored).unwrap_or(Value::Null);
+        let scenes = stored["shape"][0].as_u64().unwrap_or(0);
+        if scenes > 0 {
+            stored["shape"][0] = json!(self.spec.scenes);
+        }
+        if stored != ours {
+            return Err(DatasetError::Damaged {
+                object: path.to_string(),
+                what: "left by the interrupted creation of another data set; remove it, or use an empty location"
+                    .into(),
+            });
+        }
+        if scenes < self.spec.scenes {
+            objects::overwrite(&*self.store, &path, pretty(&ours)).await?;
+        }
+        Ok(())
+    }
+}
+
+pub(crate) fn pretty(value: &Value) -> Bytes {
+    let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
+    text.push(b'\n');
+    text.into()
+}
+
+/// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.
+pub(crate) fn root_metadata(spec: &DatasetSpec) -> Value {
+    let arrays: Map<String, Value> = Quantity::ALL
+        .iter()
+        .map(|q| (q.name().to_string(), q.layout(spec).metadata(spec.scenes)))
+        .collect();
+    let decode = match spec.profile {
+        Profile::SqrtU16 { delta } => json!([
+            "ds = xarray.open_zarr(location)  # i is the scene's index",
+            format!(
+                "q = ds['transient'][i].values.astype('float32') * numpy.float32({})",
+                delta / 2.0
+            ),
+            "h = q * q / ds['scale'][i].values  # radiance; q * q are photons; NaN where the scene is missing",
+            "# bins with code 65535 are saturated: their exact values stand in manifests/<i>.json, 'overflow'",
+            format!(
+                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
+                spec.spots
+            ),
+        ]),
+        Profile::PlainF32 => json!([
+            "ds = xarray.open_zarr(location)  # i is the scene's index",
+            "h = ds['transient'][i].values  # radiance",
+            "photons = h * ds['scale'][i].values  # NaN where the scene is missing",
+            "depth = ds['depth'][i].values  # z-depth in metres, not distance along the ray",
+            format!(
+                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
+                spec.spots
+            ),
+        ]),
+    };
+    json!({
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": {
+            "picofarm": {"format": FORMAT_VERSION, "encoder": ENCODER_VERSION, "spec": spec},
+            "gate": spec.gate,
+            "bin": "bin b holds optical path lengths [start_m + b*bin_width_m, start_m + (b+1)*bin_width_m)",
+            "speed_of_light_m_s": 299_792_458,
+            "units": "lengths in metres, times as optical path in metres, images [row][column]",
+            "visibility_polarity": "1 = lit",
+            "decode": decode,
+        },
+        "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": arrays},
+    })
+}
+
+fn parse_root(bytes: &[u8], root: &Path) -> Result<DatasetSpec, DatasetError> {
+    let damaged = |what: String| DatasetError::Damaged {
+        object: root.to_string(),
+        what,
+    };
+    let root: Value = serde_json::from_slice(bytes)
+        .map_err(|e| damaged(format!("not JSON ({e}), so no Zarr group")))?;
+    let ours = &root["attributes"]["picofarm"];
+    let Some(format) = ours["format"].as_u64() else {
+        return Err(damaged(
+            "a Zarr group, but not a picofarm data set (attributes.picofarm.format is missing)"
+                .into(),
+        ));
+    };
+    if format > u64::from(FORMAT_VERSION) {
+        return Err(damaged(format!(
+            "written in format {format}, this program knows formats up to {FORMAT_VERSION}: use a newer one"
+        )));
+    }
+    let spec: DatasetSpec = serde_json::from_value(ours["spec"].clone())
+        .map_err(|e| damaged(format!("attributes.picofarm.spec: {e}")))?;
+    spec.check()?;
+    Ok(spec)
+}

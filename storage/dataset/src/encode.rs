@@ -1,0 +1,315 @@
+//! A scene's record to the bytes of its objects. Deterministic: the same record gives the same bytes, whatever
+//! the number of threads.
+
+use bytes::Bytes;
+use rayon::prelude::*;
+
+use crate::codec::ChunkCodec;
+use crate::dataset::ArrayCodec;
+use crate::error::DatasetError;
+use crate::layout::{Layout, Quantity};
+use crate::manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, sha256_hex};
+use crate::record::{Provenance, SceneRecord};
+use crate::shard;
+use crate::spec::{DatasetSpec, Profile};
+use crate::squareroot::{ErrorSums, SATURATED, SquareRoot};
+
+/// Saturated bins allowed in a scene: the few pixels that see a spot have them, more mean a wrong scale.
+const MAX_OVERFLOW: usize = 1 << 16;
+
+/// A scene ready to be published.
+#[derive(Debug, Clone)]
+pub struct EncodedScene {
+    /// Its manifest.
+    pub manifest: Manifest,
+    /// Bytes of each of the manifest's objects, in the same order.
+    pub(crate) bytes: Vec<Bytes>,
+}
+
+pub(crate) fn encode_scene(
+    spec: &DatasetSpec,
+    arrays: &[ArrayCodec],
+    scene: u64,
+    record: &SceneRecord<'_>,
+    provenance: &Provenance,
+) -> Result<EncodedScene, DatasetError> {
+    record.check(spec)?;
+    let mut coded = None;
+    let mut objects = Vec::with_capacity(arrays.len());
+    let mut bytes = Vec::with_capacity(arrays.len());
+    for array in arrays {
+        let object = match array.layout.quantity {
+            Quantity::Transient => {
+                let transient = encode_transient(spec, array, record)?;
+                coded = Some((transient.error, transient.overflow));
+                transient.shard
+            }
+            quantity => array.codec.encode(&small_array(spec, quantity, record))?,
+        };
+        objects.push(ObjectEntry {
+            key: array.layout.key(scene),
+            size: object.len() as u64,
+            sha256: sha256_hex(&object),
+        });
+        bytes.push(Bytes::from(object));
+    }
+    let (error, overflow) = coded.expect("every data set has a transient");
+    let manifest = Manifest {
+        format: FORMAT_VERSION,
+        scene,
+        profile: spec.profile,
+        encoder: ENCODER_VERSION.into(),
+        scale: record.scale,
+        error: error.finish(),
+        provenance: provenance.clone(),
+        overflow,
+        objects,
+    };
+    Ok(EncodedScene { manifest, bytes })
+}
+
+struct CodedTransient {
+    shard: Vec<u8>,
+    error: ErrorSums,
+    overflow: Vec<(u64, f32)>,
+}
+
+struct CodedTile {
+    bytes: Vec<u8>,
+    error: ErrorSums,
+    overflow: Vec<(u64, f32)>,
+}
+
+fn encode_transient(
+    spec: &DatasetSpec,
+    array: &ArrayCodec,
+    record: &SceneRecord<'_>,
+) -> Result<CodedTransient, DatasetError> {
+    let tiles = Tiles::new(spec, &array.layout);
+    let coded = (0..tiles.count())
+        .into_par_iter()
+        .map(|tile| encode_tile(spec, &tiles, &array.codec, tile, record))
+        .collect::<Result<Vec<_>, _>>()?;
+    let mut error = ErrorSums::default();
+    let mut overflow = Vec::new();
+    let mut chunks = Vec::with_capacity(coded.len());
+    for tile in coded {
+        error.add(&tile.error);
+        overflow.extend(tile.overflow);
+        chunks.push(tile.bytes);
+    }
+    if overflow.len() > MAX_OVERFLOW {
+        let what = format!(
+            "{} bins exceed what 16 bits hold at {} photons per unit (at most {MAX_OVERFLOW} may); \
+             choose a smaller scale, a larger delta or the plain-f32 profile",
+            overflow.len(),
+            record.scale
+        );
+        return Err(DatasetError::invalid("record.scale", what));
+    }
+    overflow.sort_unstable_by_key(|(index, _)| *index);
+    Ok(CodedTransient {
+        shard: shard::assemble(&chunks)?,
+        error,
+        overflow,
+    })
+}
+
+fn encode_tile(
+    spec: &DatasetSpec,
+    tiles: &Tiles,
+    codec: &ChunkCodec,
+    tile: usize,
+    record: &SceneRecord<'_>,
+) -> Result<CodedTile, DatasetError> {
+    let mut error = ErrorSums::default();
+    let mut overflow = Vec::new();
+    let bytes = match spec.profile {
+        Profile::SqrtU16 { delta } => {
+            let code = SquareRoot::new(delta, record.scale);
+            let mut q = vec![0u16; tiles.tile_len()];
+            for run in tiles.runs(tile) {
+                let h = &record.transient[run.image..run.image + run.len];
+                let q = &mut q[run.tile..run.tile + run.len];
+                let facts = code.encode_run(h, q, &mut error);
+                if facts.invalid {
+                    return Err(invalid_value(h, run.image));
+                }
+                if facts.saturated {
+                    let saturated = q.iter().enumerate().filter(|(_, q)| **q == SATURATED);
+                    overflow.extend(saturated.map(|(i, _)| ((run.image + i) as u64, h[i])));
+                }
+            }
+            codec.encode(bytemuck::cast_slice(&q))?
+        }
+        Profile::PlainF32 => {
+            let mut values = vec![0f32; tiles.tile_len()];
+            for run in tiles.runs(tile) {
+                let h = &record.transient[run.image..run.image + run.len];
+                if !h.iter().all(|h| (0.0..=f32::MAX).contains(h)) {
+                    return Err(invalid_value(h, run.image));
+                }
+                values[run.tile..run.tile + run.len].copy_from_slice(h);
+            }
+            codec.encode(bytemuck::cast_slice(&values))?
+        }
+    };
+    Ok(CodedTile {
+        bytes,
+        error,
+        overflow,
+    })
+}
+
+fn invalid_value(h: &[f32], start: usize) -> DatasetError {
+    let at = h
+        .iter()
+        .position(|h| !(0.0..=f32::MAX).contains(h))
+        .unwrap_or(0);
+    DatasetError::invalid(
+        format!("record.transient[{}]", start + at),
+        format!("expected a finite value of at least 0, found {}", h[at]),
+    )
+}
+
+/// The inner chunks of a transient, row by row.
+pub(crate) struct Tiles {
+    /// Image size in pixels (rows, columns).
+    image: [usize; 2],
+    /// Tile size in pixels.
+    side: [usize; 2],
+    /// Number of tiles down and across.
+    grid: [usize; 2],
+    bins: usize,
+}
+
+/// A run of contiguous values: one row of a tile's pixels inside the image.
+pub(crate) struct Run {
+    /// Where it starts in the image's values.
+    pub image: usize,
+    /// Where it starts in the tile's values.
+    pub tile: usize,
+    pub len: usize,
+    /// Image row, first column and number of columns.
+    pub row: usize,
+    pub column: usize,
+    pub columns: usize,
+}
+
+impl Tiles {
+    pub fn new(spec: &DatasetSpec, layout: &Layout) -> Self {
+        let inner = layout.inner.as_ref().expect("transients are sharded");
+        let image = [spec.height as usize, spec.width as usize];
+        let side = [inner[0] as usize, inner[1] as usize];
+        Self {
+            image,
+            side,
+            grid: [image[0].div_ceil(side[0]), image[1].div_ceil(side[1])],
+            bins: spec.gate.bins as usize,
+        }
+    }
+
+    pub fn count(&self) -> usize {
+        self.grid[0] * self.grid[1]
+    }
+
+    pub fn tile_len(&self) -> usize {
+        self.side[0] * self.side[1] * self.bins
+    }
+
+    /// Whether the tile has pixels in the window.
+    pub fn touches(
+        &self,
+        tile: usize,
+        rows: &std::ops::Range<usize>,
+        columns: &std::ops::Range<usize>,
+    ) -> bool {
+        let (top, left) = self.corner(tile);
+        top < rows.end
+            && top + self.side[0] > rows.start
+            && left < columns.end
+            && left + self.side[1] > columns.start
+    }
+
+    fn corner(&self, tile: usize) -> (usize, usize) {
+        (
+            tile / self.grid[1] * self.side[0],
+            tile % self.grid[1] * self.side[1],
+        )
+    }
+
+    pub fn runs(&self, tile: usize) -> impl Iterator<Item = Run> + '_ {
+        let (top, left) = self.corner(tile);
+        let columns = self.side[1].min(self.image[1] - left);
+        let rows = self.side[0].min(self.image[0] - top);
+        (0..rows).map(move |r| Run {
+            image: ((top + r) * self.image[1] + left) * self.bins,
+            tile: r * self.side[1] * self.bins,
+            len: columns * self.bins,
+            row: top + r,
+            column: left,
+            columns,
+        })
+    }
+}
+
+/// Native-endian bytes of a quantity other than the transient.
+fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>) -> Vec<u8> {
+    match quantity {
+        Quantity::Transient => unreachable!("transients are coded by tiles"),
+        Quantity::Intensity => {
+            let bins = spec.gate.bins as usize;
+            let sums: Vec<f32> = record
+                .transient
+                .par_chunks(bins)
+                .map(|h| h.iter().map(|h| f64::from(*h)).sum::<f64>() as f32)
+                .collect();
+            bytemuck::cast_slice(&sums).to_vec()
+        }
+        Quantity::Depth => bytemuck::cast_slice(record.depth).to_vec(),
+        Quantity::Range => bytemuck::cast_slice(record.range).to_vec(),
+        Quantity::Normal => {
+            let code = |x: &f32| (libm::rintf(x.clamp(-1.0, 1.0) * 32767.0)) as i16;
+            let codes: Vec<i16> = record.normal.iter().map(code).collect();
+            bytemuck::cast_slice(&codes).to_vec()
+        }
+        Quantity::Instance => bytemuck::cast_slice(record.instance).to_vec(),
+        Quantity::Label => bytemuck::cast_slice(record.label).to_vec(),
+        Quantity::Specular => record.specular.to_vec(),
+        Quantity::Visibility => {
+            let pixels = spec.pixels();
+            let mut packed = vec![0u8; (spec.spots as usize).div_ceil(8) * pixels];
+            for (spot, lit) in record.visibility.chunks_exact(pixels).enumerate() {
+                let plane = &mut packed[spot / 8 * pixels..][..pixels];
+                for (byte, lit) in plane.iter_mut().zip(lit) {
+                    *byte |= lit << (spot % 8);
+                }
+            }
+            packed
+        }
+        Quantity::Rgb => record.rgb.iter().map(|x| srgb_u8(*x)).collect(),
+        Quantity::Spots => {
+            let row = |spot: &Option<crate::record::Spot>| spot.map_or([f32::NAN; 7], |s| s.row());
+            let rows: Vec<f32> = record.spots.iter().flat_map(row).collect();
+            bytemuck::cast_slice(&rows).to_vec()
+        }
+        Quantity::Intrinsics => {
+            let i = record.intrinsics;
+            bytemuck::cast_slice(&[i.fx, i.fy, i.cx, i.cy]).to_vec()
+        }
+        Quantity::Camera => bytemuck::cast_slice(record.camera.as_flattened()).to_vec(),
+        Quantity::Laser => bytemuck::cast_slice(&record.laser).to_vec(),
+        Quantity::Scale => record.scale.to_ne_bytes().to_vec(),
+    }
+}
+
+/// Linear value, clamped to [0, 1], to 8-bit sRGB (IEC 61966-2-1).
+fn srgb_u8(linear: f32) -> u8 {
+    let c = f64::from(linear.clamp(0.0, 1.0));
+    let s = if c <= 0.003_130_8 {
+        12.92 * c
+    } else {
+        1.055 * libm::pow(c, 1.0 / 2.4) - 0.055
+    };
+    libm::floor(s * 255.0 + 0.5) as u8
+}

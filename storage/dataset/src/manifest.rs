@@ -1,0 +1,101 @@
+//! A scene's manifest: the durable record that it is complete, what it consists of and where it came from.
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::error::DatasetError;
+use crate::record::Provenance;
+use crate::spec::Profile;
+use crate::squareroot::EncodeError;
+
+/// Version of the layout on disk.
+pub const FORMAT_VERSION: u32 = 1;
+
+/// Version of the bytes the encoder makes. Changes whenever the same record could give other bytes.
+pub const ENCODER_VERSION: &str = "encoder-1";
+
+/// One object of a scene.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ObjectEntry {
+    /// Key relative to the data set.
+    pub key: String,
+    /// Bytes.
+    pub size: u64,
+    /// SHA-256 of the bytes, hexadecimal.
+    pub sha256: String,
+}
+
+/// What a published scene consists of. A pure function of the task: its bytes come out the same in every run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// [`FORMAT_VERSION`] at the time of writing.
+    pub format: u32,
+    /// Scene index.
+    pub scene: u64,
+    /// Codec of the transient.
+    pub profile: Profile,
+    /// [`ENCODER_VERSION`] at the time of writing.
+    pub encoder: String,
+    /// Photons per unit of h.
+    pub scale: f32,
+    /// Error of the coded transient.
+    pub error: EncodeError,
+    /// Where the scene came from.
+    pub provenance: Provenance,
+    /// Saturated bins: (flat index in `[row][column][bin]`, exact value of h), by index.
+    pub overflow: Vec<(u64, f32)>,
+    /// The scene's objects.
+    pub objects: Vec<ObjectEntry>,
+}
+
+impl Manifest {
+    /// Key of a scene's manifest, relative to the data set.
+    pub fn key(scene: u64) -> String {
+        format!("manifests/{scene}.json")
+    }
+
+    /// Size of all objects together.
+    pub fn total_bytes(&self) -> u64 {
+        self.objects.iter().map(|o| o.size).sum()
+    }
+
+    /// The entry of an object.
+    pub fn object(&self, key: &str) -> Option<&ObjectEntry> {
+        self.objects.iter().find(|o| o.key == key)
+    }
+
+    pub(crate) fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = serde_json::to_vec_pretty(self)
+            .expect("a manifest has only string keys and finite numbers");
+        bytes.push(b'\n');
+        bytes
+    }
+
+    /// Parses the manifest of `scene` stored at `object`.
+    pub(crate) fn parse(bytes: &[u8], scene: u64, object: &str) -> Result<Self, DatasetError> {
+        let damaged = |what: String| DatasetError::Damaged {
+            object: object.to_string(),
+            what,
+        };
+        let manifest: Self =
+            serde_json::from_slice(bytes).map_err(|e| damaged(format!("not a manifest: {e}")))?;
+        if manifest.format > FORMAT_VERSION {
+            return Err(damaged(format!(
+                "written in format {}, this program knows formats up to {FORMAT_VERSION}: use a newer one",
+                manifest.format
+            )));
+        }
+        if manifest.scene != scene {
+            return Err(damaged(format!(
+                "holds scene {}, not {scene}",
+                manifest.scene
+            )));
+        }
+        Ok(manifest)
+    }
+}
+
+/// SHA-256 in hexadecimal.
+pub(crate) fn sha256_hex(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}

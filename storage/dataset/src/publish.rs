@@ -1,0 +1,98 @@
+//! Publishing scenes: create-only objects, then the manifest, which is the durable record of completion.
+
+use futures::{StreamExt, TryStreamExt, stream};
+
+use crate::dataset::Dataset;
+use crate::encode::{EncodedScene, encode_scene};
+use crate::error::DatasetError;
+use crate::manifest::Manifest;
+use crate::objects;
+use crate::record::{Provenance, SceneRecord};
+
+/// Requests in flight for one scene.
+const CONCURRENCY: usize = 8;
+
+impl Dataset {
+    /// Codes a scene on rayon's threads. Pure and blocking: from async code, call it through `spawn_blocking` and
+    /// hand the result to [`Self::publish_encoded`].
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] names the field and index of an unusable value; [`DatasetError::SceneOutOfRange`].
+    pub fn encode(
+        &self,
+        scene: u64,
+        record: &SceneRecord<'_>,
+        provenance: &Provenance,
+    ) -> Result<EncodedScene, DatasetError> {
+        self.check_scene(scene)?;
+        encode_scene(&self.spec, &self.arrays, scene, record, provenance)
+    }
+
+    /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal
+    /// bytes counts as written, so that a scene half-written by a killed worker is completed and publishing twice
+    /// succeeds.
+    ///
+    /// # Errors
+    /// [`DatasetError::Conflict`] where an object exists with other bytes (nothing stored is changed);
+    /// [`DatasetError::Store`].
+    pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
+        let EncodedScene { manifest, bytes } = scene;
+        let puts = manifest.objects.iter().zip(bytes).map(|(object, bytes)| {
+            let path = self.path(&object.key);
+            async move { objects::create_or_match(&*self.store, &path, bytes).await }
+        });
+        stream::iter(puts)
+            .buffer_unordered(CONCURRENCY)
+            .try_collect::<Vec<()>>()
+            .await?;
+        let path = self.path(&Manifest::key(manifest.scene));
+        objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
+        Ok(manifest)
+    }
+
+    /// Codes and publishes a scene; blocks its thread while coding.
+    ///
+    /// # Errors
+    /// Those of [`Self::encode`] and [`Self::publish_encoded`].
+    pub async fn publish(
+        &self,
+        scene: u64,
+        record: &SceneRecord<'_>,
+        provenance: &Provenance,
+    ) -> Result<Manifest, DatasetError> {
+        let encoded = self.encode(scene, record, provenance)?;
+        self.publish_encoded(encoded).await
+    }
+
+    /// The manifest of a scene published before, by whomever, after checking that each of its objects exists with
+    /// the stated size; `None` where the scene is not published. Lets a worker adopt work finished before a crash.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`] where the manifest is there but an object is missing (publishing again restores it)
+    /// or has another size; [`DatasetError::Store`].
+    pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, DatasetError> {
+        self.check_scene(scene)?;
+        let path = self.path(&Manifest::key(scene));
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        let manifest = Manifest::parse(&bytes, scene, path.as_ref())?;
+        let checks = manifest.objects.iter().map(|object| async move {
+            let path = self.path(&object.key);
+            let what = match objects::size(&*self.store, &path).await? {
+                Some(size) if size == object.size => return Ok(()),
+                Some(size) => format!("expected {} bytes, found {size}", object.size),
+                None => "the object is missing".into(),
+            };
+            Err(DatasetError::Damaged {
+                object: path.to_string(),
+                what,
+            })
+        });
+        stream::iter(checks)
+            .buffer_unordered(CONCURRENCY)
+            .try_collect::<Vec<()>>()
+            .await?;
+        Ok(Some(manifest))
+    }
+}

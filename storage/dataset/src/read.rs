@@ -1,0 +1,352 @@
+//! Reading published scenes back.
+
+use std::ops::Range;
+
+use bytes::Bytes;
+use futures::TryStreamExt;
+use object_store::{ObjectStore, ObjectStoreExt};
+use rayon::prelude::*;
+
+use crate::dataset::Dataset;
+use crate::encode::Tiles;
+use crate::error::DatasetError;
+use crate::layout::{Element, Quantity};
+use crate::manifest::Manifest;
+use crate::objects;
+use crate::record::{Intrinsics, Spot};
+use crate::shard;
+use crate::spec::Profile;
+use crate::squareroot::SquareRoot;
+
+/// A type in which an array may be stored.
+pub trait Stored: bytemuck::Pod + sealed::Stored {}
+
+mod sealed {
+    pub trait Stored {
+        const ELEMENT: crate::layout::Element;
+    }
+}
+
+macro_rules! stored {
+    ($($type:ty => $element:ident),*) => {$(
+        impl sealed::Stored for $type {
+            const ELEMENT: Element = Element::$element;
+        }
+        impl Stored for $type {}
+    )*};
+}
+stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
+
+impl Dataset {
+    /// The manifest of a published scene (its objects are not looked at; see [`Self::published`]).
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn manifest(&self, scene: u64) -> Result<Manifest, DatasetError> {
+        self.check_scene(scene)?;
+        let path = self.path(&Manifest::key(scene));
+        match objects::get(&*self.store, &path).await? {
+            Some(bytes) => Manifest::parse(&bytes, scene, path.as_ref()),
+            None => Err(DatasetError::NotPublished {
+                scene,
+                object: path.to_string(),
+            }),
+        }
+    }
+
+    /// Indices of the published scenes, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn scenes_present(&self) -> Result<Vec<u64>, DatasetError> {
+        let folder = self.path("manifests");
+        let mut scenes: Vec<u64> = self
+            .store
+            .list(Some(&folder))
+            .try_filter_map(|object| async move {
+                let name = object
+                    .location
+                    .filename()
+                    .and_then(|n| n.strip_suffix(".json"));
+                Ok(name.and_then(|n| n.parse::<u64>().ok()))
+            })
+            .try_collect()
+            .await
+            .map_err(|e| DatasetError::store("list", &folder, e))?;
+        scenes.retain(|scene| *scene < self.spec.scenes);
+        scenes.sort_unstable();
+        Ok(scenes)
+    }
+
+    /// h of a scene, decoded, with the exact values of saturated bins: `[row][column][bin]`.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        self.read_transient_crop(scene, 0..self.spec.height, 0..self.spec.width)
+            .await
+    }
+
+    /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
+    /// chunks it touches.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the window is empty or leaves the image; those of [`Self::read_transient`].
+    pub async fn read_transient_crop(
+        &self,
+        scene: u64,
+        rows: Range<u32>,
+        columns: Range<u32>,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let limits = [
+            ("rows", &rows, self.spec.height),
+            ("columns", &columns, self.spec.width),
+        ];
+        for (field, range, limit) in limits {
+            if range.is_empty() || range.end > limit {
+                let what = format!(
+                    "expected a window within 0..{limit} that is not empty, found {range:?}"
+                );
+                return Err(DatasetError::invalid(field, what));
+            }
+        }
+        let window = [
+            rows.start as usize..rows.end as usize,
+            columns.start as usize..columns.end as usize,
+        ];
+        let manifest = self.manifest(scene).await?;
+        let tiles = Tiles::new(&self.spec, &self.array(Quantity::Transient).layout);
+        let wanted: Vec<usize> = (0..tiles.count())
+            .filter(|tile| tiles.touches(*tile, &window[0], &window[1]))
+            .collect();
+        let chunks = self.fetch_tiles(&manifest, &tiles, &wanted).await?;
+        self.decode_window(&manifest, &tiles, chunks, window)
+    }
+
+    /// The coded bytes of the wanted tiles; `None` = all fill value.
+    async fn fetch_tiles(
+        &self,
+        manifest: &Manifest,
+        tiles: &Tiles,
+        wanted: &[usize],
+    ) -> Result<Vec<(usize, Option<Bytes>)>, DatasetError> {
+        let key = self.array(Quantity::Transient).layout.key(manifest.scene);
+        let path = self.path(&key);
+        let damaged = |what: String| DatasetError::Damaged {
+            object: path.to_string(),
+            what,
+        };
+        let entry = manifest
+            .object(&key)
+            .ok_or_else(|| damaged("the manifest does not list it".into()))?;
+        let tail = shard::index_len(tiles.count()) as u64;
+        let Some(start) = entry.size.checked_sub(tail) else {
+            return Err(damaged(format!(
+                "{} bytes are too few for a shard",
+                entry.size
+            )));
+        };
+        // The whole object in one request where all of it is wanted; otherwise its index first.
+        let whole = if wanted.len() == tiles.count() {
+            let bytes = objects::require(&*self.store, &path).await?;
+            if bytes.len() as u64 != entry.size {
+                return Err(damaged(format!(
+                    "expected {} bytes, found {}",
+                    entry.size,
+                    bytes.len()
+                )));
+            }
+            Some(bytes)
+        } else {
+            None
+        };
+        let fetch_error = |e| match e {
+            object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
+            e => DatasetError::store("read", &path, e),
+        };
+        let index = match &whole {
+            Some(bytes) => bytes.slice(start as usize..),
+            None => self
+                .store
+                .get_range(&path, start..entry.size)
+                .await
+                .map_err(fetch_error)?,
+        };
+        let index = shard::parse_index(&index, tiles.count(), entry.size)?;
+        let ranges: Vec<(usize, Range<u64>)> = wanted
+            .iter()
+            .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
+            .collect();
+        let parts: Vec<Bytes> = match &whole {
+            Some(bytes) => ranges
+                .iter()
+                .map(|(_, r)| bytes.slice(r.start as usize..r.end as usize))
+                .collect(),
+            None => {
+                let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
+                self.store
+                    .get_ranges(&path, &only)
+                    .await
+                    .map_err(fetch_error)?
+            }
+        };
+        let mut found = ranges.iter().map(|(tile, _)| *tile).zip(parts).peekable();
+        Ok(wanted
+            .iter()
+            .map(|tile| {
+                (
+                    *tile,
+                    found.next_if(|(t, _)| t == tile).map(|(_, bytes)| bytes),
+                )
+            })
+            .collect())
+    }
+
+    /// Decodes tiles into a window and applies the overflow list.
+    fn decode_window(
+        &self,
+        manifest: &Manifest,
+        tiles: &Tiles,
+        chunks: Vec<(usize, Option<Bytes>)>,
+        [rows, columns]: [Range<usize>; 2],
+    ) -> Result<Vec<f32>, DatasetError> {
+        let bins = self.spec.gate.bins as usize;
+        let codec = &self.array(Quantity::Transient).codec;
+        let decode = |(tile, bytes): (usize, Option<Bytes>)| {
+            let mut h = vec![0f32; tiles.tile_len()];
+            if let Some(bytes) = bytes {
+                let raw = codec.decode(&bytes)?;
+                match self.spec.profile {
+                    Profile::SqrtU16 { delta } => {
+                        let q: Vec<u16> = bytemuck::pod_collect_to_vec(&raw);
+                        SquareRoot::new(delta, manifest.scale).decode_run(&q, &mut h);
+                    }
+                    Profile::PlainF32 => h = bytemuck::pod_collect_to_vec(&raw),
+                }
+            }
+            Ok((tile, h))
+        };
+        let mut window = vec![0f32; rows.len() * columns.len() * bins];
+        // A few tiles at a time, so that decoded tiles do not pile up beside the window.
+        let batch = rayon::current_num_threads().max(1) * 2;
+        let mut rest = chunks.into_iter();
+        loop {
+            let some: Vec<_> = rest.by_ref().take(batch).collect();
+            if some.is_empty() {
+                break;
+            }
+            let decoded = some
+                .into_par_iter()
+                .map(decode)
+                .collect::<Result<Vec<_>, DatasetError>>()?;
+            for (tile, h) in decoded {
+                for run in tiles.runs(tile).filter(|run| rows.contains(&run.row)) {
+                    let from = run.column.max(columns.start);
+                    let to = (run.column + run.columns).min(columns.end);
+                    let len = (to - from) * bins;
+                    let source = run.tile + (from - run.column) * bins;
+                    let target =
+                        ((run.row - rows.start) * columns.len() + from - columns.start) * bins;
+                    window[target..target + len].copy_from_slice(&h[source..source + len]);
+                }
+            }
+        }
+        for (index, value) in &manifest.overflow {
+            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
+            let (row, column) = (
+                pixel / self.spec.width as usize,
+                pixel % self.spec.width as usize,
+            );
+            if rows.contains(&row) && columns.contains(&column) {
+                let at = (row - rows.start) * columns.len() + column - columns.start;
+                window[at * bins + bin] = *value;
+            }
+        }
+        Ok(window)
+    }
+
+    /// The stored values of a quantity other than the transient, in the shape [`Quantity`] states.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where `T` is not the stored type or the transient is asked for;
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    pub async fn read<T: Stored>(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+    ) -> Result<Vec<T>, DatasetError> {
+        let array = self.array(quantity);
+        if quantity == Quantity::Transient {
+            return Err(DatasetError::invalid(
+                "quantity",
+                "transients are read by read_transient",
+            ));
+        }
+        if array.layout.element != T::ELEMENT {
+            let what = format!(
+                "{} is stored as {}, not {}",
+                quantity.name(),
+                array.layout.element.name(),
+                T::ELEMENT.name()
+            );
+            return Err(DatasetError::invalid("quantity", what));
+        }
+        let path = self.path(&array.layout.key(scene));
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            // Tells a scene that is not there from one that lost an object.
+            self.manifest(scene).await?;
+            return Err(DatasetError::Damaged {
+                object: path.to_string(),
+                what: "the object is missing".into(),
+            });
+        };
+        Ok(bytemuck::pod_collect_to_vec(&array.codec.decode(&bytes)?))
+    }
+
+    /// Unit normals, camera frame: `[row][column][3]`.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_normal(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let codes = self.read::<i16>(scene, Quantity::Normal).await?;
+        Ok(codes.into_iter().map(|n| f32::from(n) / 32767.0).collect())
+    }
+
+    /// Visibility, 1 = lit: `[spot][row][column]`.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_visibility(&self, scene: u64) -> Result<Vec<u8>, DatasetError> {
+        let packed = self.read::<u8>(scene, Quantity::Visibility).await?;
+        let pixels = self.spec.pixels();
+        let spot = |s: usize| {
+            packed[s / 8 * pixels..][..pixels]
+                .iter()
+                .map(move |b| b >> (s % 8) & 1)
+        };
+        Ok((0..self.spec.spots as usize).flat_map(spot).collect())
+    }
+
+    /// The spots in the camera frame; `None` where a beam meets nothing.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_spots(&self, scene: u64) -> Result<Vec<Option<Spot>>, DatasetError> {
+        let rows = self.read::<f32>(scene, Quantity::Spots).await?;
+        Ok(rows.chunks_exact(7).map(Spot::from_row).collect())
+    }
+
+    /// Intrinsics.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_intrinsics(&self, scene: u64) -> Result<Intrinsics, DatasetError> {
+        let v = self.read::<f32>(scene, Quantity::Intrinsics).await?;
+        Ok(Intrinsics {
+            fx: v[0],
+            fy: v[1],
+            cx: v[2],
+            cy: v[3],
+        })
+    }
+}

@@ -1,0 +1,145 @@
+//! What a data set is: its size, gate and codec profile. Fixed at creation, except that scenes may be added.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::DatasetError;
+
+/// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Gate {
+    /// ℓ_min, metres.
+    pub start_m: f64,
+    /// Bin width, metres of path.
+    pub bin_width_m: f64,
+    /// B, number of bins.
+    pub bins: u32,
+}
+
+/// How transients are coded.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "name", rename_all = "kebab-case")]
+pub enum Profile {
+    /// Square-root code in u16: N = h·scale photons, q = round((2/Δ)·√N), decoded as N = (q·Δ/2)². The error
+    /// stays below (Δ/2 + Δ²/16) standard deviations of the photon noise, σ = √max(N, 1).
+    SqrtU16 {
+        /// Δ: a power of two from 1/16 to 2, so that decoding is exact in 32-bit floats.
+        delta: f32,
+    },
+    /// 32-bit floats, lossless.
+    PlainF32,
+}
+
+impl Default for Profile {
+    fn default() -> Self {
+        Self::SqrtU16 { delta: 0.25 }
+    }
+}
+
+/// The properties of a data set.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DatasetSpec {
+    /// Number of scenes there is room for. May grow later, never shrinks.
+    pub scenes: u64,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Illumination spots of each scene.
+    pub spots: u32,
+    /// The gate.
+    pub gate: Gate,
+    /// Codec of the transients.
+    pub profile: Profile,
+}
+
+impl DatasetSpec {
+    /// Numbers in range, so that every array's shape and key exist.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] names the field.
+    pub fn check(&self) -> Result<(), DatasetError> {
+        let sizes = [
+            ("spec.scenes", self.scenes, 1 << 32),
+            ("spec.height", u64::from(self.height), 1 << 14),
+            ("spec.width", u64::from(self.width), 1 << 14),
+            ("spec.spots", u64::from(self.spots), 1 << 14),
+            ("spec.gate.bins", u64::from(self.gate.bins), 1 << 18),
+        ];
+        for (field, value, max) in sizes {
+            if value == 0 || value > max {
+                return Err(DatasetError::invalid(
+                    field,
+                    format!("expected 1 to {max}, found {value}"),
+                ));
+            }
+        }
+        if !self.gate.start_m.is_finite() {
+            return Err(DatasetError::invalid(
+                "spec.gate.start_m",
+                format!(
+                    "expected a finite length in metres, found {}",
+                    self.gate.start_m
+                ),
+            ));
+        }
+        if !(self.gate.bin_width_m.is_finite() && self.gate.bin_width_m > 0.0) {
+            return Err(DatasetError::invalid(
+                "spec.gate.bin_width_m",
+                format!(
+                    "expected a positive length in metres, found {}",
+                    self.gate.bin_width_m
+                ),
+            ));
+        }
+        if let Profile::SqrtU16 { delta } = self.profile {
+            let known = [0.0625, 0.125, 0.25, 0.5, 1.0, 2.0];
+            if !known.contains(&delta) {
+                return Err(DatasetError::invalid(
+                    "spec.profile.delta",
+                    format!("expected one of {known:?}, found {delta}"),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Pixels of one image.
+    pub fn pixels(&self) -> usize {
+        self.height as usize * self.width as usize
+    }
+
+    /// Values in one scene's transient.
+    pub fn transient_len(&self) -> usize {
+        self.pixels() * self.gate.bins as usize
+    }
+
+    /// The first field, other than the number of scenes, in which `asked` differs: (field, stored, asked).
+    pub(crate) fn difference(&self, asked: &Self) -> Option<(&'static str, String, String)> {
+        let profile = |p: &Profile| match p {
+            Profile::SqrtU16 { delta } => format!("sqrt-u16 with delta {delta}"),
+            Profile::PlainF32 => "plain-f32".to_string(),
+        };
+        let pairs = [
+            ("height", self.height.to_string(), asked.height.to_string()),
+            ("width", self.width.to_string(), asked.width.to_string()),
+            ("spots", self.spots.to_string(), asked.spots.to_string()),
+            (
+                "gate.start_m",
+                self.gate.start_m.to_string(),
+                asked.gate.start_m.to_string(),
+            ),
+            (
+                "gate.bin_width_m",
+                self.gate.bin_width_m.to_string(),
+                asked.gate.bin_width_m.to_string(),
+            ),
+            (
+                "gate.bins",
+                self.gate.bins.to_string(),
+                asked.gate.bins.to_string(),
+            ),
+            ("profile", profile(&self.profile), profile(&asked.profile)),
+        ];
+        pairs.into_iter().find(|(_, stored, asked)| stored != asked)
+    }
+}

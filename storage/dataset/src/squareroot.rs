@@ -1,0 +1,161 @@
+//! The square-root code: photon counts to 16 bits with an error that is a fixed share of the photon noise,
+//! its error statistics, and the choice of a scene's photon scale.
+//!
+//! All arithmetic is IEEE single precision in a fixed order, so that the same histogram gives the same codes
+//! on every machine and numpy's float32 decodes to the same bits.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// The code that marks a saturated bin, whose exact value stands in the manifest's overflow list.
+pub const SATURATED: u16 = u16::MAX;
+
+/// The square-root code with step Δ.
+#[derive(Debug, Clone, Copy)]
+pub struct SquareRoot {
+    delta: f32,
+    scale: f32,
+}
+
+impl SquareRoot {
+    /// Step Δ (see [`crate::Profile`]) and photons per unit of h.
+    pub fn new(delta: f32, scale: f32) -> Self {
+        Self { delta, scale }
+    }
+
+    /// The code of h. `h` must be finite and not negative; [`SATURATED`] where 16 bits do not suffice
+    /// (above 6.7·10⁷ photons at Δ = 0.25).
+    #[inline]
+    pub fn encode(self, h: f32) -> u16 {
+        let q = (h * self.scale).sqrt() * (2.0 / self.delta) + 0.5;
+        // The cast floors and saturates: everything from 65535.0 upwards becomes SATURATED.
+        q as u16
+    }
+
+    /// Photons of a code.
+    #[inline]
+    pub fn photons(self, q: u16) -> f32 {
+        let root = f32::from(q) * (self.delta * 0.5);
+        root * root
+    }
+
+    /// h of a code that is not [`SATURATED`].
+    #[inline]
+    pub fn decode(self, q: u16) -> f32 {
+        self.photons(q) / self.scale
+    }
+
+    /// Codes `h` into `q`, adds to `error`, and says whether a bin saturated and whether all values were valid
+    /// (finite and not negative).
+    pub(crate) fn encode_run(self, h: &[f32], q: &mut [u16], error: &mut ErrorSums) -> RunFacts {
+        const LANES: usize = 8;
+        let mut invalid = [false; LANES];
+        let mut saturated = [false; LANES];
+        let mut squares = [0.0f32; LANES];
+        let mut worst = [0.0f32; LANES];
+        let mut one = |lane: usize, h: f32, q: &mut u16| {
+            *q = self.encode(h);
+            let n = h * self.scale;
+            let sat = *q == SATURATED;
+            let difference = if sat { 0.0 } else { self.photons(*q) - n };
+            // In units of σ² = max(N, 1).
+            let square = difference * difference / n.max(1.0);
+            invalid[lane] |= !(0.0..=f32::MAX).contains(&h);
+            saturated[lane] |= sat;
+            squares[lane] += square;
+            worst[lane] = worst[lane].max(square);
+        };
+        let whole = h.len() / LANES * LANES;
+        for (h, q) in h[..whole]
+            .chunks_exact(LANES)
+            .zip(q[..whole].chunks_exact_mut(LANES))
+        {
+            for lane in 0..LANES {
+                one(lane, h[lane], &mut q[lane]);
+            }
+        }
+        for (h, q) in h[whole..].iter().zip(&mut q[whole..]) {
+            one(0, *h, q);
+        }
+        for lane in 0..LANES {
+            error.squares += f64::from(squares[lane]);
+            error.worst = error.worst.max(worst[lane]);
+        }
+        error.count += h.len() as u64;
+        RunFacts {
+            invalid: invalid.contains(&true),
+            saturated: saturated.contains(&true),
+        }
+    }
+
+    /// Decodes `q` into `h`; saturated codes become +∞ until the overflow list is applied.
+    pub(crate) fn decode_run(self, q: &[u16], h: &mut [f32]) {
+        for (q, h) in q.iter().zip(h) {
+            *h = if *q == SATURATED {
+                f32::INFINITY
+            } else {
+                self.decode(*q)
+            };
+        }
+    }
+}
+
+/// What a run of values contained.
+pub(crate) struct RunFacts {
+    pub invalid: bool,
+    pub saturated: bool,
+}
+
+/// Sums of squared coding errors in units of σ².
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct ErrorSums {
+    squares: f64,
+    worst: f32,
+    count: u64,
+}
+
+impl ErrorSums {
+    pub fn add(&mut self, other: &Self) {
+        self.squares += other.squares;
+        self.worst = self.worst.max(other.worst);
+        self.count += other.count;
+    }
+
+    pub fn finish(&self) -> EncodeError {
+        EncodeError {
+            max_sigma: f64::from(self.worst).sqrt(),
+            rms_sigma: (self.squares / self.count.max(1) as f64).sqrt(),
+        }
+    }
+}
+
+/// Error of a scene's coded transient, in standard deviations of the photon noise, σ = √max(N, 1).
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct EncodeError {
+    /// The largest over all bins.
+    pub max_sigma: f64,
+    /// Root mean square over all bins.
+    pub rms_sigma: f64,
+}
+
+/// The scale (photons per unit of h) at which the median over the lit pixels of the brightest bin is `photons`
+/// (400 is the convention). `transient` is `[pixel][bin]`. The few pixels that see a spot directly are far brighter,
+/// which a median does not notice. 1 where no pixel has any light.
+pub fn photon_scale(transient: &[f32], bins: usize, photons: f32) -> f32 {
+    let mut peaks: Vec<f32> = transient
+        .par_chunks(bins.max(1))
+        .map(|h| h.iter().copied().fold(0.0, f32::max))
+        .filter(|peak| *peak > 0.0 && peak.is_finite())
+        .collect();
+    if peaks.is_empty() {
+        return 1.0;
+    }
+    let middle = (peaks.len() - 1) / 2;
+    let (_, median, _) = peaks.select_nth_unstable_by(middle, f32::total_cmp);
+    let scale = photons / *median;
+    if scale.is_finite() && scale > 0.0 {
+        scale
+    } else {
+        1.0
+    }
+}

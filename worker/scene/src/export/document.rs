@@ -1,0 +1,352 @@
+//! The glTF document of a scene: a flat list of nodes over shared meshes, in a fixed order.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use crate::{
+    Affine, Camera, Material, Mesh, Scene, Vec3,
+    extras::{FORMAT, Keyed, MaterialExtras, NodeExtras, SceneExtras, metallic_roughness},
+};
+
+const COMPONENT_F32: u32 = 5126;
+const COMPONENT_U32: u32 = 5125;
+const TARGET_VERTICES: u32 = 34962;
+const TARGET_INDICES: u32 = 34963;
+
+/// glTF 2.0's top level, as far as we write it. Field order is the order on disk.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Document {
+    asset: Asset,
+    scene: u32,
+    scenes: [SceneEntry; 1],
+    nodes: Vec<Node>,
+    cameras: [CameraEntry; 1],
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    meshes: Vec<MeshEntry>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    materials: Vec<MaterialEntry>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    accessors: Vec<Accessor>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    buffer_views: Vec<BufferView>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    buffers: Vec<Buffer>,
+}
+
+#[derive(Debug, Serialize)]
+struct Asset {
+    version: &'static str,
+    generator: &'static str,
+    #[serde(skip_serializing_if = "String::is_empty")]
+    copyright: String,
+}
+
+#[derive(Debug, Serialize)]
+struct SceneEntry {
+    name: String,
+    nodes: Vec<usize>,
+    extras: Keyed<SceneExtras>,
+}
+
+#[derive(Debug, Serialize)]
+struct Node {
+    name: String,
+    matrix: [f32; 16],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mesh: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    camera: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    extras: Option<NodeExtras>,
+}
+
+#[derive(Debug, Serialize)]
+struct CameraEntry {
+    r#type: &'static str,
+    perspective: Perspective,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Perspective {
+    aspect_ratio: f32,
+    yfov: f32,
+    znear: f32,
+}
+
+#[derive(Debug, Serialize)]
+struct MeshEntry {
+    name: String,
+    primitives: Vec<Primitive>,
+}
+
+#[derive(Debug, Serialize)]
+struct Primitive {
+    attributes: Attributes,
+    indices: usize,
+    material: usize,
+}
+
+#[derive(Debug, Serialize)]
+struct Attributes {
+    #[serde(rename = "POSITION")]
+    position: usize,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct MaterialEntry {
+    name: String,
+    double_sided: bool,
+    pbr_metallic_roughness: Pbr,
+    extras: Keyed<MaterialExtras>,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Pbr {
+    base_color_factor: [f32; 4],
+    metallic_factor: f32,
+    roughness_factor: f32,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Accessor {
+    buffer_view: usize,
+    component_type: u32,
+    count: usize,
+    r#type: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    min: Option<Vec3>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    max: Option<Vec3>,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct BufferView {
+    buffer: u32,
+    byte_offset: usize,
+    byte_length: usize,
+    target: u32,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Buffer {
+    byte_length: usize,
+}
+
+/// Accessors and the binary chunk while they grow.
+#[derive(Debug, Default)]
+struct Binary {
+    bytes: Vec<u8>,
+    views: Vec<BufferView>,
+    accessors: Vec<Accessor>,
+}
+
+impl Binary {
+    fn push(
+        &mut self,
+        words: impl Iterator<Item = [u8; 4]>,
+        target: u32,
+        accessor: Accessor,
+    ) -> usize {
+        let start = self.bytes.len();
+        self.bytes.extend(words.flatten());
+        self.views.push(BufferView {
+            buffer: 0,
+            byte_offset: start,
+            byte_length: self.bytes.len() - start,
+            target,
+        });
+        self.accessors.push(accessor);
+        self.accessors.len() - 1
+    }
+
+    fn positions(&mut self, mesh: &Mesh) -> usize {
+        let (min, max) = mesh.bounds().unzip();
+        let accessor = Accessor {
+            buffer_view: self.views.len(),
+            component_type: COMPONENT_F32,
+            count: mesh.positions.len(),
+            r#type: "VEC3",
+            min,
+            max,
+        };
+        let words = mesh.positions.iter().flat_map(|p| [p.x, p.y, p.z]);
+        self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
+    }
+
+    fn indices(&mut self, triangles: &[[u32; 3]]) -> usize {
+        let accessor = Accessor {
+            buffer_view: self.views.len(),
+            component_type: COMPONENT_U32,
+            count: triangles.len() * 3,
+            r#type: "SCALAR",
+            min: None,
+            max: None,
+        };
+        let words = triangles.iter().flatten().map(|v| v.to_le_bytes());
+        self.push(words, TARGET_INDICES, accessor)
+    }
+}
+
+impl Document {
+    /// The document and its binary chunk; `mesh_of[i]` is the mesh of object i.
+    pub(super) fn new(scene: &Scene, meshes: &[Arc<Mesh>], mesh_of: &[usize]) -> (Self, Vec<u8>) {
+        let mut binary = Binary::default();
+        let mut materials: Vec<MaterialEntry> = Vec::new();
+        let mesh_entries = meshes
+            .iter()
+            .map(|mesh| {
+                let mut grouped = Mesh::clone(mesh);
+                grouped.group_by_material();
+                let base = materials.len();
+                materials.extend(grouped.materials.iter().map(material_entry));
+                MeshEntry {
+                    name: grouped.name.clone(),
+                    primitives: primitives(&grouped, base, &mut binary),
+                }
+            })
+            .collect();
+
+        let mut nodes: Vec<Node> = scene
+            .objects
+            .iter()
+            .enumerate()
+            .map(|(i, object)| Node {
+                name: object.name.clone(),
+                matrix: columns(&object.to_world),
+                mesh: Some(mesh_of[i]),
+                camera: None,
+                extras: Some(NodeExtras {
+                    label: Some(scene.labels[usize::from(object.label)].clone()),
+                    instance: Some(i as u32),
+                    ..NodeExtras::default()
+                }),
+            })
+            .collect();
+        nodes.push(camera_node(&scene.camera));
+
+        let document = Self {
+            asset: Asset {
+                version: "2.0",
+                generator: concat!("picofarm-scene ", env!("CARGO_PKG_VERSION")),
+                copyright: scene.provenance.attribution.join("; "),
+            },
+            scene: 0,
+            scenes: [SceneEntry {
+                name: scene.name.clone(),
+                nodes: (0..nodes.len()).collect(),
+                extras: Keyed {
+                    picofarm: scene_extras(scene),
+                },
+            }],
+            nodes,
+            cameras: [camera_entry(&scene.camera)],
+            meshes: mesh_entries,
+            materials,
+            accessors: binary.accessors,
+            buffer_views: binary.views,
+            buffers: if binary.bytes.is_empty() {
+                Vec::new()
+            } else {
+                vec![Buffer {
+                    byte_length: binary.bytes.len(),
+                }]
+            },
+        };
+        (document, binary.bytes)
+    }
+}
+
+/// One primitive a material that is used; all share the mesh's vertices.
+fn primitives(mesh: &Mesh, base: usize, binary: &mut Binary) -> Vec<Primitive> {
+    let position = binary.positions(mesh);
+    let mut out = Vec::new();
+    let mut start = 0;
+    for run in mesh.triangle_material.chunk_by(|a, b| a == b) {
+        out.push(Primitive {
+            attributes: Attributes { position },
+            indices: binary.indices(&mesh.triangles[start..start + run.len()]),
+            material: base + run[0] as usize,
+        });
+        start += run.len();
+    }
+    out
+}
+
+fn scene_extras(scene: &Scene) -> SceneExtras {
+    SceneExtras {
+        format: FORMAT,
+        name: scene.name.clone(),
+        labels: scene.labels.clone(),
+        camera: scene.camera,
+        laser: scene.laser.clone(),
+        provenance: scene.provenance.clone(),
+    }
+}
+
+fn material_entry(material: &Material) -> MaterialEntry {
+    let (metallic_factor, roughness_factor) = metallic_roughness(material);
+    let [r, g, b] = material.rgb;
+    MaterialEntry {
+        name: material.name.clone(),
+        double_sided: material.two_sided,
+        pbr_metallic_roughness: Pbr {
+            base_color_factor: [r, g, b, 1.0],
+            metallic_factor,
+            roughness_factor,
+        },
+        extras: Keyed {
+            picofarm: MaterialExtras {
+                bsdf: material.bsdf,
+                two_sided: material.two_sided,
+            },
+        },
+    }
+}
+
+/// Column-major 4×4 matrix of an affine map.
+fn columns(a: &Affine) -> [f32; 16] {
+    let mut m = [0.0; 16];
+    for (row, r) in a.linear.iter().enumerate() {
+        (m[row], m[4 + row], m[8 + row]) = (r.x, r.y, r.z);
+        m[12 + row] = a.translation[row];
+    }
+    m[15] = 1.0;
+    m
+}
+
+/// glTF cameras look along −z with y up.
+fn camera_node(camera: &Camera) -> Node {
+    let (x, y, z) = (camera.right, -camera.down, -camera.forward);
+    let row = |k: usize| Vec3::new(x[k], y[k], z[k]);
+    let pose = Affine {
+        linear: [row(0), row(1), row(2)],
+        translation: camera.origin,
+    };
+    Node {
+        name: "camera".into(),
+        matrix: columns(&pose),
+        mesh: None,
+        camera: Some(0),
+        extras: None,
+    }
+}
+
+fn camera_entry(camera: &Camera) -> CameraEntry {
+    let i = &camera.intrinsics;
+    CameraEntry {
+        r#type: "perspective",
+        perspective: Perspective {
+            aspect_ratio: (i.width as f32 / i.fx) / (i.height as f32 / i.fy),
+            yfov: 2.0 * libm::atanf(i.height as f32 * 0.5 / i.fy),
+            znear: 0.01,
+        },
+    }
+}

@@ -1,0 +1,102 @@
+//! Writing scenes as canonical `.glb` files: one binary glTF 2.0 file that any viewer opens and that
+//! [`crate::import`] reads back exactly. The same scene gives the same bytes.
+
+mod document;
+
+use std::{
+    io::Write,
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use crate::{Mesh, Scene, SceneError};
+use document::Document;
+
+const GLB_MAGIC: u32 = 0x4654_6c67;
+const GLB_VERSION: u32 = 2;
+const CHUNK_JSON: u32 = 0x4e4f_534a;
+const CHUNK_BIN: u32 = 0x004e_4942;
+
+/// The canonical `.glb` bytes of a scene. Meshes shared by several objects are stored once; triangles
+/// are grouped by material, in their order otherwise.
+///
+/// # Errors
+/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`] or would pass glTF's 4 GiB.
+pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
+    scene.validate()?;
+    if let Some(i) = scene
+        .objects
+        .iter()
+        .position(|o| o.mesh.triangles.is_empty())
+    {
+        return Err(SceneError::Invalid {
+            scene: scene.name.clone(),
+            field: format!("objects[{i}] ({})", scene.objects[i].name),
+            what: "has no triangles, which glTF cannot hold; remove the object".into(),
+        });
+    }
+    let mut meshes: Vec<Arc<Mesh>> = Vec::new();
+    let mesh_of: Vec<usize> = scene
+        .objects
+        .iter()
+        .map(|object| {
+            let known = meshes.iter().position(|m| Arc::ptr_eq(m, &object.mesh));
+            known.unwrap_or_else(|| {
+                meshes.push(object.mesh.clone());
+                meshes.len() - 1
+            })
+        })
+        .collect();
+    let (document, binary) = Document::new(scene, &meshes, &mesh_of);
+    let invalid = |what: String| SceneError::Invalid {
+        scene: scene.name.clone(),
+        field: "glb".into(),
+        what,
+    };
+    let mut json = serde_json::to_vec(&document)
+        .map_err(|e| invalid(format!("cannot be written as JSON: {e}")))?;
+    json.resize(json.len().next_multiple_of(4), b' ');
+
+    let length = 12 + 8 + json.len() + 8 + binary.len();
+    let word = |n: usize| {
+        u32::try_from(n).map(u32::to_le_bytes).map_err(|_| {
+            invalid(format!(
+                "{n} bytes exceed the 4 GiB of a .glb; use fewer triangles"
+            ))
+        })
+    };
+    let mut out = Vec::with_capacity(length);
+    out.extend(GLB_MAGIC.to_le_bytes());
+    out.extend(GLB_VERSION.to_le_bytes());
+    out.extend(word(length)?);
+    for (kind, chunk) in [(CHUNK_JSON, &json), (CHUNK_BIN, &binary)] {
+        out.extend(word(chunk.len())?);
+        out.extend(kind.to_le_bytes());
+        out.extend(chunk);
+    }
+    Ok(out)
+}
+
+/// Writes the canonical `.glb` to `path`: a temporary file beside it first, then a rename, so that a
+/// reader never sees half a scene.
+///
+/// # Errors
+/// As [`glb_bytes`], and [`SceneError::Write`] naming the file.
+pub fn write_glb(scene: &Scene, path: &Path) -> Result<(), SceneError> {
+    let bytes = glb_bytes(scene)?;
+    let failed = |source| SceneError::Write {
+        path: path.to_path_buf(),
+        source,
+    };
+    let mut name = path.file_name().unwrap_or_default().to_os_string();
+    name.push(format!(".{}.partial", std::process::id()));
+    let partial: PathBuf = path.with_file_name(name);
+    let written = std::fs::File::create(&partial)
+        .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
+        .and_then(|()| std::fs::rename(&partial, path));
+    written.map_err(|source| {
+        // The partial file is ours alone; the error that matters is the first.
+        let _ = std::fs::remove_file(&partial);
+        failed(source)
+    })
+}

@@ -1,0 +1,62 @@
+//! What the canonical glTF keeps in `extras`, where glTF itself has no words for it.
+//!
+//! - scene: [`SceneExtras`] under the key `picofarm`: name, label vocabulary, camera pose and
+//!   intrinsics, laser beams and spots, provenance.
+//! - node with a mesh: `label` (category name) and `instance` (instance id).
+//! - material: [`MaterialExtras`] under the key `picofarm`: the exact BSDF, beside the standard
+//!   parameters that other programs read.
+//!
+//! Files of other makers may state a laser in the extras of any node: `"laser_spots": 25` (a grid over the
+//! camera's view) or `"laser_directions": [[x, y, z], …]` in that node's frame.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Bsdf, Camera, Laser, Material, Provenance, Vec3};
+
+/// Version of the extras, raised when their meaning changes.
+pub(crate) const FORMAT: u32 = 1;
+
+/// Everything about a scene that is not a mesh.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SceneExtras {
+    pub(crate) format: u32,
+    pub(crate) name: String,
+    pub(crate) labels: Vec<String>,
+    pub(crate) camera: Camera,
+    pub(crate) laser: Laser,
+    pub(crate) provenance: Provenance,
+}
+
+/// A material as this program knows it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct MaterialExtras {
+    pub(crate) bsdf: Bsdf,
+    pub(crate) two_sided: bool,
+}
+
+/// The key under which scene and material extras lie.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Keyed<T> {
+    pub(crate) picofarm: T,
+}
+
+/// Extras of a node.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct NodeExtras {
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) label: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) instance: Option<u32>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) laser_spots: Option<u32>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) laser_directions: Option<Vec<Vec3>>,
+}
+
+/// Metalness and roughness by which other programs know a BSDF: roughness = √α.
+pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
+    match material.bsdf {
+        Bsdf::Diffuse { .. } => (0.0, 1.0),
+        Bsdf::RoughConductor { alpha, .. } => (1.0, alpha.sqrt()),
+    }
+}

@@ -1,0 +1,132 @@
+//! The binary buffers of a glTF file, checked against what the document claims before anyone reads them.
+
+use std::path::Path;
+
+use gltf::{
+    Accessor, Document,
+    accessor::{DataType, Dimensions},
+    buffer::Source,
+};
+
+use crate::SceneError;
+
+use super::format_error;
+
+/// Bytes of every buffer, by index.
+#[derive(Debug)]
+pub(super) struct Buffers(Vec<Vec<u8>>);
+
+impl Buffers {
+    /// Reads or decodes every buffer.
+    pub(super) fn read(
+        path: &Path,
+        document: &Document,
+        mut blob: Option<Vec<u8>>,
+    ) -> Result<Self, SceneError> {
+        let base = path.parent();
+        let read = |buffer: gltf::Buffer<'_>| {
+            let at = format!("buffers[{}]", buffer.index());
+            let source = buffer.source();
+            if let Source::Uri(uri) = source
+                && !uri.starts_with("data:")
+            {
+                let file = base.unwrap_or(Path::new("")).join(percent_decoded(uri));
+                return std::fs::read(&file)
+                    .map_err(|source| SceneError::Read { path: file, source })
+                    .and_then(|data| checked(path, &at, data, buffer.length()));
+            }
+            let data =
+                gltf::buffer::Data::from_source_and_blob(source, base, &mut blob).map_err(|e| {
+                    format_error(
+                        path,
+                        format!("{at}: cannot be read ({e}); export the file again"),
+                    )
+                })?;
+            checked(path, &at, data.0, buffer.length())
+        };
+        document
+            .buffers()
+            .map(read)
+            .collect::<Result<_, _>>()
+            .map(Self)
+    }
+
+    /// A buffer's bytes, for the readers of the `gltf` crate.
+    pub(super) fn get(&self, buffer: &gltf::Buffer<'_>) -> Option<&[u8]> {
+        self.0.get(buffer.index()).map(Vec::as_slice)
+    }
+
+    /// Checks an accessor's type and that it lies inside its view and buffer; the readers of the `gltf`
+    /// crate rely on both.
+    pub(super) fn check(
+        &self,
+        accessor: &Accessor<'_>,
+        dimensions: Dimensions,
+        types: &[DataType],
+    ) -> Result<(), String> {
+        let at = format!("accessors[{}]", accessor.index());
+        if accessor.dimensions() != dimensions || !types.contains(&accessor.data_type()) {
+            return Err(format!(
+                "{at}: expected {dimensions:?} of {types:?}, found {:?} of {:?}",
+                accessor.dimensions(),
+                accessor.data_type()
+            ));
+        }
+        let Some(view) = accessor.view() else {
+            return Err(format!(
+                "{at}: has no bufferView (sparse only); export it as plain data"
+            ));
+        };
+        if accessor.sparse().is_some() {
+            return Err(format!("{at}: is sparse; export it as plain data"));
+        }
+        let size = accessor.size();
+        let stride = view.stride().unwrap_or(size);
+        let need = accessor.count().checked_sub(1).and_then(|n| {
+            n.checked_mul(stride)?
+                .checked_add(size)?
+                .checked_add(accessor.offset())
+        });
+        let end = view.offset().checked_add(view.length());
+        let buffer = self.0.get(view.buffer().index()).map_or(0, Vec::len);
+        match (need, end) {
+            (Some(need), Some(end)) if stride >= size && need <= view.length() && end <= buffer => {
+                Ok(())
+            }
+            _ => Err(format!(
+                "{at}: {} elements do not fit its bufferView of {} bytes; the file is damaged, export it again",
+                accessor.count(),
+                view.length()
+            )),
+        }
+    }
+}
+
+fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8>, SceneError> {
+    if data.len() < length {
+        return Err(format_error(
+            path,
+            format!(
+                "{at}: has {} of {length} bytes; the file is cut short, copy or export it again",
+                data.len()
+            ),
+        ));
+    }
+    Ok(data)
+}
+
+/// File names in glTF are URIs: `%20` stands for a space.
+fn percent_decoded(uri: &str) -> String {
+    let bytes = uri.as_bytes();
+    let mut out = Vec::with_capacity(bytes.len());
+    let mut i = 0;
+    while i < bytes.len() {
+        let hex = (bytes[i] == b'%')
+            .then(|| uri.get(i + 1..i + 3))
+            .flatten()
+            .and_then(|h| u8::from_str_radix(h, 16).ok());
+        out.push(hex.unwrap_or(bytes[i]));
+        i += if hex.is_some() { 3 } else { 1 };
+    }
+    String::from_utf8_lossy(&out).into_owned()
+}

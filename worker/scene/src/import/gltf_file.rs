@@ -1,0 +1,495 @@
+//! glTF 2.0 to scene: node transforms, labels and ids from extras, materials, camera and laser.
+
+use std::{collections::BTreeMap, path::Path, sync::Arc};
+
+use gltf::{
+    Gltf, Node,
+    accessor::{DataType, Dimensions},
+    camera::Projection,
+    mesh::Mode,
+};
+use serde::de::DeserializeOwned;
+
+use crate::{
+    Affine, Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, LaserGrid, Material, Mesh, Object,
+    Provenance, Scene, SceneError, Vec3,
+    extras::{FORMAT, Keyed, MaterialExtras, NodeExtras, SceneExtras, metallic_roughness},
+};
+
+use super::{ImportOptions, buffers::Buffers, compose, format_error};
+
+/// Rows given to a camera whose file states no resolution; callers resize.
+const DEFAULT_ROWS: u32 = 64;
+/// Category of nodes without a `label`.
+const UNLABELLED: &str = "unlabelled";
+/// Smallest roughness α of an imported conductor.
+const MIN_ALPHA: f32 = 1e-3;
+/// Standard parameters closer than this to those we would write leave our extras in force.
+const SAME_FACTOR: f32 = 1e-3;
+
+/// Reads `.glb` or `.gltf` bytes; the caller validates the result.
+pub(super) fn read(
+    path: &Path,
+    bytes: &[u8],
+    options: &ImportOptions,
+) -> Result<Scene, SceneError> {
+    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
+        format_error(
+            path,
+            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
+        )
+    })?;
+    let buffers = Buffers::read(path, &document, blob)?;
+    let root = document
+        .default_scene()
+        .or_else(|| document.scenes().next())
+        .ok_or_else(|| {
+            format_error(path, "scenes: the file has none; export at least one scene")
+        })?;
+    let ours: Option<SceneExtras> = keyed(
+        path,
+        "scene.extras.picofarm",
+        root.extras().as_deref().map(|r| r.get()),
+    )?;
+    if let Some(e) = &ours
+        && e.format != FORMAT
+    {
+        return Err(format_error(
+            path,
+            format!(
+                "scene.extras.picofarm.format: {} is not {FORMAT}; this program is too old or too new for it",
+                e.format
+            ),
+        ));
+    }
+    let mut walk = Walk {
+        path,
+        buffers: &buffers,
+        meshes: BTreeMap::new(),
+        objects: Vec::new(),
+        labels: ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone()),
+        camera: None,
+        laser: None,
+        notes: BTreeMap::new(),
+    };
+    for node in root.nodes() {
+        walk.node(&node, &Affine::IDENTITY, None)?;
+    }
+    walk.finish(&root, ours, options)
+}
+
+/// Parses `extras` that hold our key; `None` where they are absent or someone else's.
+fn keyed<T: DeserializeOwned>(
+    path: &Path,
+    field: &str,
+    raw: Option<&str>,
+) -> Result<Option<T>, SceneError> {
+    let Some(raw) = raw else { return Ok(None) };
+    let value: serde_json::Value = match serde_json::from_str(raw) {
+        Ok(value) => value,
+        Err(e) => return Err(format_error(path, format!("{field}: {e}"))),
+    };
+    if value.get("picofarm").is_none() {
+        return Ok(None);
+    }
+    // From the text again: a generic JSON value would round f32 numbers twice.
+    serde_json::from_str::<Keyed<T>>(raw)
+        .map(|k| Some(k.picofarm))
+        .map_err(|e| format_error(path, format!("{field}: {e}")))
+}
+
+struct Walk<'a> {
+    path: &'a Path,
+    buffers: &'a Buffers,
+    meshes: BTreeMap<usize, Option<Arc<Mesh>>>,
+    objects: Vec<(Option<u32>, Object)>,
+    labels: Vec<String>,
+    camera: Option<Camera>,
+    laser: Option<(Affine, NodeExtras)>,
+    notes: BTreeMap<String, String>,
+}
+
+impl Walk<'_> {
+    fn node(
+        &mut self,
+        node: &Node<'_>,
+        parent: &Affine,
+        label: Option<&str>,
+    ) -> Result<(), SceneError> {
+        let to_world = compose(parent, &affine(node.transform().matrix()));
+        let at = format!("nodes[{}].extras", node.index());
+        let extras: NodeExtras = match node.extras() {
+            Some(raw) => serde_json::from_str(raw.get()).map_err(|e| {
+                format_error(
+                    self.path,
+                    format!("{at}: {e}; expected label (text) and instance (number)"),
+                )
+            })?,
+            None => NodeExtras::default(),
+        };
+        let label = extras.label.as_deref().or(label);
+        if let Some(mesh) = node.mesh() {
+            self.object(node, &mesh, to_world, label, extras.instance)?;
+        }
+        if let (None, Some(camera)) = (&self.camera, node.camera()) {
+            self.camera = Some(self.camera_of(&to_world, &camera)?);
+        }
+        if self.laser.is_none()
+            && (extras.laser_spots.is_some() || extras.laser_directions.is_some())
+        {
+            self.laser = Some((to_world, extras.clone()));
+        }
+        for child in node.children() {
+            self.node(&child, &to_world, label)?;
+        }
+        Ok(())
+    }
+
+    fn object(
+        &mut self,
+        node: &Node<'_>,
+        mesh: &gltf::Mesh<'_>,
+        to_world: Affine,
+        label: Option<&str>,
+        instance: Option<u32>,
+    ) -> Result<(), SceneError> {
+        let shared = match self.meshes.get(&mesh.index()) {
+            Some(known) => known.clone(),
+            None => {
+                let read = self.mesh(mesh)?.map(Arc::new);
+                self.meshes.insert(mesh.index(), read.clone());
+                read
+            }
+        };
+        let Some(shared) = shared else { return Ok(()) };
+        let label = label.unwrap_or_else(|| {
+            self.notes.insert(
+                "labels".into(),
+                format!("some nodes have no label in their extras; they are {UNLABELLED:?}"),
+            );
+            UNLABELLED
+        });
+        let known = self.labels.iter().position(|l| l == label);
+        let label = known.unwrap_or_else(|| {
+            self.labels.push(label.to_owned());
+            self.labels.len() - 1
+        });
+        let label = u16::try_from(label).map_err(|_| {
+            format_error(
+                self.path,
+                "nodes[].extras.label: more than 65535 categories",
+            )
+        })?;
+        self.objects.push((
+            instance,
+            Object {
+                mesh: shared,
+                to_world,
+                label,
+                name: node.name().or(mesh.name()).unwrap_or("object").to_owned(),
+            },
+        ));
+        Ok(())
+    }
+
+    /// A mesh's triangles over one vertex list; `None` (with a note) if it has only lines or points.
+    fn mesh(&mut self, file: &gltf::Mesh<'_>) -> Result<Option<Mesh>, SceneError> {
+        let path = self.path;
+        let mut mesh = Mesh {
+            name: file.name().unwrap_or("mesh").to_owned(),
+            ..Mesh::default()
+        };
+        // Primitives often share their vertices: first vertex of each POSITION accessor, and material.
+        let mut vertex_base: BTreeMap<usize, u32> = BTreeMap::new();
+        let mut material_index: BTreeMap<Option<usize>, u32> = BTreeMap::new();
+        for primitive in file.primitives() {
+            let at = format!("meshes[{}].primitives[{}]", file.index(), primitive.index());
+            let fail = |what: String| format_error(path, format!("{at}: {what}"));
+            if matches!(
+                primitive.mode(),
+                Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip
+            ) {
+                self.notes
+                    .insert("dropped".into(), "points and lines".into());
+                continue;
+            }
+            let Some(accessor) = primitive.get(&gltf::Semantic::Positions) else {
+                return Err(fail(
+                    "has no POSITION; export the mesh with its vertices".into(),
+                ));
+            };
+            self.buffers
+                .check(&accessor, Dimensions::Vec3, &[DataType::F32])
+                .map_err(fail)?;
+            if let Some(indices) = primitive.indices() {
+                self.buffers
+                    .check(
+                        &indices,
+                        Dimensions::Scalar,
+                        &[DataType::U8, DataType::U16, DataType::U32],
+                    )
+                    .map_err(fail)?;
+            }
+            let reader = primitive.reader(|b| self.buffers.get(&b));
+            let base = match vertex_base.get(&accessor.index()) {
+                Some(&base) => base,
+                None => {
+                    let base = mesh.positions.len() as u32;
+                    mesh.positions.extend(
+                        reader
+                            .read_positions()
+                            .into_iter()
+                            .flatten()
+                            .map(Vec3::from),
+                    );
+                    vertex_base.insert(accessor.index(), base);
+                    base
+                }
+            };
+            let corners: Vec<u32> = match reader.read_indices() {
+                Some(indices) => indices.into_u32().collect(),
+                None => (0..accessor.count() as u32).collect(),
+            };
+            if let Some(&v) = corners.iter().find(|&&v| v as usize >= accessor.count()) {
+                return Err(fail(format!(
+                    "index {v} points past {} vertices",
+                    accessor.count()
+                )));
+            }
+            let triangles = triangles(&corners, primitive.mode());
+            let material = primitive.material();
+            let slot = match material_index.get(&material.index()) {
+                Some(&slot) => slot,
+                None => {
+                    mesh.materials.push(self.material(&material)?);
+                    let slot = mesh.materials.len() as u32 - 1;
+                    material_index.insert(material.index(), slot);
+                    slot
+                }
+            };
+            mesh.triangle_material
+                .extend(triangles.iter().map(|_| slot));
+            mesh.triangles
+                .extend(triangles.iter().map(|t| t.map(|v| v + base)));
+        }
+        Ok((!mesh.triangles.is_empty()).then_some(mesh))
+    }
+
+    fn material(&mut self, file: &gltf::Material<'_>) -> Result<Material, SceneError> {
+        let pbr = file.pbr_metallic_roughness();
+        let [r, g, b, alpha] = pbr.base_color_factor();
+        let name = file.name().unwrap_or("material").to_owned();
+        if pbr.base_color_texture().is_some() || pbr.metallic_roughness_texture().is_some() {
+            self.notes.insert(
+                "textures".into(),
+                "ignored; base colour and roughness factors used".into(),
+            );
+        }
+        if alpha < 1.0 || file.alpha_mode() == gltf::material::AlphaMode::Blend {
+            self.notes.insert(
+                "transparency".into(),
+                "ignored; such materials are opaque".into(),
+            );
+        }
+        let mut material = Material::diffuse(name, [r, g, b]);
+        if pbr.metallic_factor() >= 0.5 {
+            let alpha = pbr.roughness_factor() * pbr.roughness_factor();
+            material.bsdf = Bsdf::RoughConductor {
+                alpha: alpha.max(MIN_ALPHA),
+                distribution: Distribution::Beckmann,
+                reflectance: (r + g + b) / 3.0,
+            };
+        }
+        let at = format!("materials[{}].extras.picofarm", file.index().unwrap_or(0));
+        let ours: Option<MaterialExtras> =
+            keyed(self.path, &at, file.extras().as_deref().map(|r| r.get()))?;
+        if let Some(ours) = ours {
+            let exact = Material {
+                bsdf: ours.bsdf,
+                two_sided: ours.two_sided,
+                ..material.clone()
+            };
+            // Someone who edits the file in another program changes the standard factors: they win then.
+            let (metallic, roughness) = metallic_roughness(&exact);
+            let same = (metallic - pbr.metallic_factor()).abs() < SAME_FACTOR
+                && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
+            if same {
+                return Ok(exact);
+            }
+            self.notes.insert(
+                "materials".into(),
+                "edited since export; standard factors used".into(),
+            );
+        }
+        Ok(material)
+    }
+
+    fn camera_of(&self, to_world: &Affine, file: &gltf::Camera<'_>) -> Result<Camera, SceneError> {
+        let at = format!("cameras[{}]", file.index());
+        let Projection::Perspective(lens) = file.projection() else {
+            return Err(format_error(
+                self.path,
+                format!("{at}: is orthographic; use a perspective camera"),
+            ));
+        };
+        let aspect = lens.aspect_ratio().unwrap_or(1.0);
+        let half = libm::tan(f64::from(lens.yfov()) * 0.5) as f32;
+        let width = (DEFAULT_ROWS as f32 * aspect).round();
+        if !(half > 0.0 && half.is_finite() && (1.0..=65536.0).contains(&width)) {
+            return Err(format_error(
+                self.path,
+                format!("{at}: yfov and aspectRatio must be positive"),
+            ));
+        }
+        let column = |k: usize| {
+            Vec3::new(
+                to_world.linear[0][k],
+                to_world.linear[1][k],
+                to_world.linear[2][k],
+            )
+            .normalized()
+        };
+        let (height, width) = (DEFAULT_ROWS as f32, width as u32);
+        let fx = width as f32 * 0.5 / (half * aspect);
+        Ok(Camera {
+            intrinsics: Intrinsics {
+                fx,
+                fy: height * 0.5 / half,
+                cx: width as f32 * 0.5,
+                cy: height * 0.5,
+                width,
+                height: DEFAULT_ROWS,
+            },
+            origin: to_world.translation,
+            right: column(0),
+            down: -column(1),
+            forward: -column(2),
+        })
+    }
+
+    fn finish(
+        mut self,
+        root: &gltf::Scene<'_>,
+        ours: Option<SceneExtras>,
+        options: &ImportOptions,
+    ) -> Result<Scene, SceneError> {
+        let path = self.path;
+        let count = self.objects.len();
+        let mut ids: Vec<Option<u32>> = self.objects.iter().map(|(id, _)| *id).collect();
+        ids.sort_unstable();
+        if ids.iter().enumerate().all(|(k, id)| *id == Some(k as u32)) {
+            self.objects.sort_by_key(|(id, _)| *id);
+        } else if ids.iter().any(Option::is_some) {
+            self.notes.insert(
+                "instances".into(),
+                format!("ids in extras are not 0..{count}; objects are numbered in file order"),
+            );
+        }
+        let (camera, laser, mut provenance, name) = match ours {
+            Some(e) => (e.camera, e.laser, e.provenance, e.name),
+            None => {
+                let camera = options.camera.or(self.camera).ok_or_else(|| {
+                    format_error(
+                        path,
+                        "camera: no node has one; add a perspective camera, or state one on import",
+                    )
+                })?;
+                let laser = match (options.laser, &self.laser) {
+                    (Some(grid), _) => grid.laser(&camera),
+                    (None, Some((to_world, extras))) => laser_of(path, to_world, extras, &camera)?,
+                    (None, None) => {
+                        return Err(format_error(
+                            path,
+                            "laser: no node's extras hold \"laser_spots\" (1, 4, 16, 25 or 100) or \
+                             \"laser_directions\" ([[x, y, z], …]); add one, or state a grid on import",
+                        ));
+                    }
+                };
+                let provenance = Provenance {
+                    source: "gltf".into(),
+                    ..Provenance::default()
+                };
+                let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned());
+                let name = root.name().map(str::to_owned).or(stem).unwrap_or_default();
+                (camera, laser, provenance, name)
+            }
+        };
+        for (key, note) in self.notes {
+            provenance.notes.insert(format!("import.{key}"), note);
+        }
+        Ok(Scene {
+            name,
+            objects: self.objects.into_iter().map(|(_, object)| object).collect(),
+            labels: self.labels,
+            camera,
+            laser,
+            provenance,
+        })
+    }
+}
+
+fn laser_of(
+    path: &Path,
+    to_world: &Affine,
+    extras: &NodeExtras,
+    camera: &Camera,
+) -> Result<Laser, SceneError> {
+    if let Some(directions) = &extras.laser_directions {
+        let beams = directions
+            .iter()
+            .map(|&d| Beam {
+                direction: to_world.direction(d).normalized(),
+                spot: None,
+            })
+            .collect();
+        return Ok(Laser {
+            origin: to_world.translation,
+            beams,
+        });
+    }
+    let spots = extras.laser_spots.unwrap_or_default();
+    LaserGrid::new(spots)
+        .map(|grid| grid.laser(camera))
+        .ok_or_else(|| {
+            format_error(
+                path,
+                format!("laser_spots: {spots} is no grid; use 1, 4, 16, 25 or 100"),
+            )
+        })
+}
+
+/// glTF's column-major matrix as an affine map.
+fn affine(m: [[f32; 4]; 4]) -> Affine {
+    let row = |k: usize| Vec3::new(m[0][k], m[1][k], m[2][k]);
+    Affine {
+        linear: [row(0), row(1), row(2)],
+        translation: Vec3::new(m[3][0], m[3][1], m[3][2]),
+    }
+}
+
+/// Corners as triangles: lists, strips (every second one turned) and fans.
+fn triangles(corners: &[u32], mode: Mode) -> Vec<[u32; 3]> {
+    match mode {
+        Mode::TriangleStrip => corners
+            .windows(3)
+            .enumerate()
+            .map(|(k, w)| {
+                if k % 2 == 0 {
+                    [w[0], w[1], w[2]]
+                } else {
+                    [w[1], w[0], w[2]]
+                }
+            })
+            .collect(),
+        Mode::TriangleFan => corners
+            .get(1..)
+            .unwrap_or_default()
+            .windows(2)
+            .map(|w| [corners[0], w[0], w[1]])
+            .collect(),
+        _ => corners
+            .chunks_exact(3)
+            .map(|t| [t[0], t[1], t[2]])
+            .collect(),
+    }
+}

@@ -1,0 +1,131 @@
+//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`) and the reference scenes' JSON.
+
+mod buffers;
+mod gltf_file;
+mod reference;
+
+use std::path::Path;
+
+use crate::{Affine, Camera, LaserGrid, Scene, SceneError, Vec3};
+
+pub use reference::read_reference_json;
+
+/// What the caller states where a file does not, or wants otherwise.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ImportOptions {
+    /// Use this camera in place of the file's.
+    pub camera: Option<Camera>,
+    /// Use this grid over the camera's view in place of the file's laser.
+    pub laser: Option<LaserGrid>,
+}
+
+/// Reads a scene with its own camera and laser; see [`read_scene_with`].
+///
+/// # Errors
+/// As [`read_scene_with`].
+pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
+    read_scene_with(path, &ImportOptions::default())
+}
+
+/// Reads a scene by its content: `glTF` magic or a JSON object with `asset` is glTF, a JSON object with
+/// `meshes` and `spots` is a reference scene.
+///
+/// A glTF file written by [`crate::export`] comes back exactly. Of other files, metallic materials
+/// (factor ≥ 0.5) become Beckmann conductors with α = roughness², everything else Lambertian with the
+/// base colour; textures, lines and points are left out, with a note in the provenance. Materials
+/// without our extras scatter on both sides. The camera is the first camera node; its image gets
+/// 64 rows (see [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or
+/// `laser_directions` in a node's extras, or from `options`.
+///
+/// # Errors
+/// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Format`]
+/// naming file and field otherwise.
+pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, SceneError> {
+    let bytes = read_file(path)?;
+    let mut scene = if bytes.starts_with(b"glTF") {
+        gltf_file::read(path, &bytes, options)?
+    } else {
+        match sniff(path, &bytes)? {
+            Kind::Gltf => gltf_file::read(path, &bytes, options)?,
+            Kind::Reference => reference::parse(path, &bytes)?,
+        }
+    };
+    if let Some(camera) = options.camera {
+        scene.camera = camera;
+    }
+    if let Some(grid) = options.laser {
+        scene.laser = grid.laser(&scene.camera);
+    }
+    validated(path, scene)
+}
+
+enum Kind {
+    Gltf,
+    Reference,
+}
+
+fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
+    #[derive(serde::Deserialize)]
+    struct Keys {
+        asset: Option<serde::de::IgnoredAny>,
+        meshes: Option<serde::de::IgnoredAny>,
+        spots: Option<serde::de::IgnoredAny>,
+    }
+    let expected = "expected binary glTF (.glb), glTF JSON (.gltf) or a reference scene (.json)";
+    let keys: Keys = serde_json::from_slice(bytes).map_err(|e| {
+        format_error(
+            path,
+            format!("{expected}, found neither glTF nor JSON: {e}"),
+        )
+    })?;
+    match (keys.asset, keys.meshes, keys.spots) {
+        (Some(_), _, _) => Ok(Kind::Gltf),
+        (None, Some(_), Some(_)) => Ok(Kind::Reference),
+        _ => Err(format_error(
+            path,
+            format!("{expected}; this JSON has neither `asset` (glTF) nor `meshes` and `spots`"),
+        )),
+    }
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>, SceneError> {
+    std::fs::read(path).map_err(|source| SceneError::Read {
+        path: path.to_path_buf(),
+        source,
+    })
+}
+
+fn format_error(path: &Path, what: impl Into<String>) -> SceneError {
+    SceneError::Format {
+        path: path.to_path_buf(),
+        what: what.into(),
+    }
+}
+
+/// The scene if the renderer can use it; otherwise an error that names the file too.
+fn validated(path: &Path, scene: Scene) -> Result<Scene, SceneError> {
+    match scene.validate() {
+        Ok(()) => Ok(scene),
+        Err(SceneError::Invalid { field, what, .. }) => {
+            Err(format_error(path, format!("{field}: {what}")))
+        }
+        Err(other) => Err(other),
+    }
+}
+
+/// `outer` after `inner`.
+fn compose(outer: &Affine, inner: &Affine) -> Affine {
+    if *outer == Affine::IDENTITY {
+        return *inner;
+    }
+    let column = |k: usize| {
+        let c = Vec3::new(inner.linear[0][k], inner.linear[1][k], inner.linear[2][k]);
+        outer.direction(c)
+    };
+    let (x, y, z) = (column(0), column(1), column(2));
+    let row = |k: usize| Vec3::new(x[k], y[k], z[k]);
+    Affine {
+        linear: [row(0), row(1), row(2)],
+        translation: outer.point(inner.translation),
+    }
+}

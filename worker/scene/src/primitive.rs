@@ -1,0 +1,227 @@
+//! The paper's primitive rooms: a cube, a cylinder and a mirror in a bare room of varying scale, seen by
+//! a camera whose place and field of view jitter.
+
+use std::{collections::BTreeMap, f32::consts::TAU, sync::Arc};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    Affine, Camera, Intrinsics, LaserGrid, Material, Mesh, Object, Provenance, Scene, SceneError,
+    Vec3,
+    label::{label_id, vocabulary},
+    layout::{Footprint, Room},
+    rng::Rng,
+    shape::Shape,
+    trace::{Model, World},
+    view::{beams_land, coarse_view, full_view},
+};
+
+/// Changes whenever the same seed would give another scene.
+pub const GENERATOR_VERSION: &str = "primitive-1";
+
+/// Rooms tried for one seed before giving up.
+const ATTEMPTS: u32 = 64;
+/// Cameras tried for one room.
+const CAMERAS: u32 = 24;
+
+/// What a primitive room is made for.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PrimitiveSettings {
+    /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
+    pub spots: u32,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Middle of the horizontal field of view, degrees.
+    pub fov_deg: f32,
+    /// The field of view is uniform within ± this, degrees.
+    pub fov_jitter_deg: f32,
+    /// Hang or stand a mirror in the room.
+    pub mirror: bool,
+}
+
+impl Default for PrimitiveSettings {
+    fn default() -> Self {
+        Self {
+            spots: 25,
+            width: 256,
+            height: 256,
+            fov_deg: 90.0,
+            fov_jitter_deg: 5.0,
+            mirror: true,
+        }
+    }
+}
+
+/// The primitive room of `seed`: the same scene, bit for bit, on every machine.
+///
+/// # Errors
+/// [`SceneError::Invalid`] for settings out of range, [`SceneError::Exhausted`] if no camera of any
+/// sub-seed keeps the depth within [`crate::MIN_DEPTH_M`]..[`crate::MAX_DEPTH_M`].
+pub fn generate(seed: u64, settings: &PrimitiveSettings) -> Result<Scene, SceneError> {
+    let grid = settings.check()?;
+    for attempt in 0..ATTEMPTS {
+        let mut rng = Rng::new(seed, u64::from(attempt));
+        if let Some(scene) = attempt_room(seed, attempt, settings, grid, &mut rng) {
+            return Ok(scene);
+        }
+    }
+    Err(SceneError::Exhausted {
+        generator: GENERATOR_VERSION.into(),
+        seed,
+        attempts: ATTEMPTS,
+    })
+}
+
+impl PrimitiveSettings {
+    fn check(&self) -> Result<LaserGrid, SceneError> {
+        let invalid = |field: &str, what: String| SceneError::Invalid {
+            scene: GENERATOR_VERSION.into(),
+            field: field.into(),
+            what,
+        };
+        crate::camera::check_view(self.width, self.height, self.fov_deg)
+            .and_then(|()| {
+                let jitter = self.fov_jitter_deg;
+                crate::camera::check_view(self.width, self.height, self.fov_deg + jitter)?;
+                crate::camera::check_view(self.width, self.height, self.fov_deg - jitter)
+            })
+            .and_then(|()| crate::laser::check_spots(self.spots))
+            .map_err(|(field, what)| invalid(field, what))
+    }
+}
+
+fn grey(rng: &mut Rng, name: &str) -> Material {
+    let level = rng.range(0.3, 0.85);
+    let tint = |rng: &mut Rng| level * rng.range(0.85, 1.0);
+    let rgb = [tint(rng), tint(rng), tint(rng)];
+    Material::diffuse(name, rgb)
+}
+
+fn cube(rng: &mut Rng) -> Mesh {
+    let (half, height) = (rng.range(0.15, 0.4), rng.range(0.3, 0.9));
+    let mut shape = Shape::new("cube");
+    let m = shape.material(grey(rng, "cube"));
+    shape.cuboid([-half, 0.0, -half], [half, height, half], m);
+    shape.finish()
+}
+
+fn cylinder(rng: &mut Rng) -> Mesh {
+    let (radius, height) = (rng.range(0.12, 0.35), rng.range(0.3, 1.1));
+    let mut shape = Shape::new("cylinder");
+    let m = shape.material(grey(rng, "cylinder"));
+    shape.cylinder([0.0; 2], [0.0, height], [radius, radius], 48, m);
+    shape.finish()
+}
+
+/// A thin planar near-mirror (α = 0.01) with its back at z = 0 and its front towards +z.
+fn mirror(rng: &mut Rng) -> Mesh {
+    let (half, height) = (rng.range(0.25, 0.6), rng.range(0.5, 1.2));
+    let mut shape = Shape::new("mirror");
+    let m = shape.material(Material::mirror("mirror", 0.01));
+    shape.cuboid([-half, 0.0, -0.01], [half, height, 0.01], m);
+    shape.finish()
+}
+
+fn attempt_room(
+    seed: u64,
+    attempt: u32,
+    settings: &PrimitiveSettings,
+    grid: LaserGrid,
+    rng: &mut Rng,
+) -> Option<Scene> {
+    let scale = rng.range(0.8, 1.15);
+    let room = Room {
+        width: 3.6 * scale * rng.range(0.9, 1.1),
+        depth: 3.6 * scale * rng.range(0.9, 1.1),
+        height: 2.6 * scale,
+    };
+    let mut objects: Vec<Object> = Vec::new();
+    let mut world = World::default();
+    let mut put = |mesh: Mesh, label: &str, to_world: Affine| {
+        let model = Arc::new(Model::new(mesh).expect("primitives have triangles"));
+        objects.push(Object {
+            mesh: model.mesh.clone(),
+            to_world,
+            label: label_id(label),
+            name: format!("{label}-{}", objects.len()),
+        });
+        world.add(model, to_world);
+    };
+    let wall = grey(rng, "wall");
+    for (label, mesh) in room.shell(grey(rng, "floor"), grey(rng, "ceiling"), wall) {
+        put(mesh, label, Affine::IDENTITY);
+    }
+    let mut taken: Vec<Footprint> = Vec::new();
+    let mut kinds: Vec<(&str, fn(&mut Rng) -> Mesh)> = vec![("cube", cube), ("cylinder", cylinder)];
+    if settings.mirror {
+        kinds.push(("mirror", mirror));
+    }
+    for (label, make) in kinds {
+        let mesh = make(rng);
+        let (lo, hi) = mesh.bounds()?;
+        let half = [(hi.x - lo.x) * 0.5, (hi.z - lo.z) * 0.5];
+        let spot = (0..64).find_map(|_| {
+            let (at, yaw) = if label == "mirror" {
+                let (at, yaw) = room.against_wall(rng.below(4), rng.range(-1.0, 1.0), half, 0.002);
+                ([at[0], rng.range(0.3, 0.8), at[1]], yaw)
+            } else {
+                let x = rng.range(-0.5, 0.5) * room.width;
+                let z = rng.range(-0.5, 0.5) * room.depth;
+                ([x, 0.0005, z], rng.range(0.0, TAU))
+            };
+            let foot = Footprint::new(at, yaw, half, hi.y);
+            let free = room.holds(&foot) && !taken.iter().any(|t| t.overlaps(&foot));
+            free.then_some((foot, at, yaw))
+        });
+        let (foot, at, yaw) = spot?;
+        taken.push(foot);
+        put(mesh, label, Affine::yaw_then_move(yaw, at.into()));
+    }
+    for _ in 0..CAMERAS {
+        let fov = settings.fov_deg + rng.range(-1.0, 1.0) * settings.fov_jitter_deg;
+        let eye = Vec3::new(
+            rng.range(-0.45, 0.45) * room.width,
+            rng.range(0.35, 0.7) * room.height,
+            rng.range(0.38, 0.47) * room.depth,
+        );
+        let target = Vec3::new(
+            rng.range(-0.15, 0.15) * room.width,
+            rng.range(0.2, 0.5) * room.height,
+            rng.range(-0.3, 0.0) * room.depth,
+        );
+        let intrinsics = Intrinsics::from_fov(fov, settings.width, settings.height);
+        let camera = Camera::look_at(eye, target, intrinsics);
+        let laser = grid.laser(&camera);
+        let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
+            continue;
+        };
+        // Everything that is not the room itself must be in view.
+        if seen[6..].contains(&0) || !beams_land(&world, &laser, &objects) {
+            continue;
+        }
+        if let Some([near, far]) = full_view(&world, &camera) {
+            let notes = BTreeMap::from([
+                ("attempt".to_owned(), attempt.to_string()),
+                ("depth_m".to_owned(), format!("{near:.3}..{far:.3}")),
+                ("fov_deg".to_owned(), format!("{fov:.3}")),
+                ("room_m".to_owned(), room.describe()),
+            ]);
+            return Some(Scene {
+                name: format!("primitive-{seed}"),
+                objects,
+                labels: vocabulary(),
+                camera,
+                laser,
+                provenance: Provenance {
+                    source: GENERATOR_VERSION.into(),
+                    seed: Some(seed),
+                    attribution: Vec::new(),
+                    notes,
+                },
+            });
+        }
+    }
+    None
+}

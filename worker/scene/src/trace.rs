@@ -1,0 +1,238 @@
+//! Closest-hit rays against placed meshes, for the generators' own checks (support, view, beams).
+//!
+//! Acceleration is `obvhs`; the triangle test is our own scalar arithmetic, so that the depths on which
+//! a scene is accepted are the same on every machine. Each mesh keeps its tree, whatever scene it is in.
+
+use std::{sync::Arc, time::Duration};
+
+use obvhs::{
+    BvhBuildParams,
+    cwbvh::{CwBvh, builder::build_cwbvh_from_tris},
+    ray::{Ray, RayHit},
+    triangle::Triangle,
+};
+
+use crate::{Affine, Mesh, Vec3};
+
+/// A mesh with its ray tree and the box round it.
+#[derive(Debug)]
+pub(crate) struct Model {
+    /// The geometry.
+    pub(crate) mesh: Arc<Mesh>,
+    /// Smallest coordinates.
+    pub(crate) lo: Vec3,
+    /// Largest coordinates.
+    pub(crate) hi: Vec3,
+    tree: CwBvh,
+}
+
+/// Where a ray meets a scene.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Hit {
+    /// Ray parameter in units of the direction's length.
+    pub(crate) t: f32,
+    /// Index of the placed object.
+    pub(crate) object: usize,
+    /// Index of the triangle in its mesh.
+    pub(crate) triangle: u32,
+}
+
+/// Slack in barycentric coordinates: closes the seams between neighbouring triangles.
+const SEAM: f32 = 1e-6;
+
+/// Möller–Trumbore (1997), both sides; `None` for a miss or a degenerate triangle.
+fn intersect([a, b, c]: [Vec3; 3], origin: Vec3, direction: Vec3) -> Option<f32> {
+    let (e1, e2) = (b - a, c - a);
+    let p = direction.cross(e2);
+    let det = e1.dot(p);
+    if det == 0.0 {
+        return None;
+    }
+    let s = origin - a;
+    let u = s.dot(p) / det;
+    let q = s.cross(e1);
+    let v = direction.dot(q) / det;
+    let inside = u >= -SEAM && v >= -SEAM && u + v <= 1.0 + SEAM;
+    let t = e2.dot(q) / det;
+    (inside && t.is_finite()).then_some(t)
+}
+
+impl Model {
+    /// Builds the tree; `None` for a mesh without triangles or with a vertex that is not finite.
+    pub(crate) fn new(mesh: Mesh) -> Option<Self> {
+        if mesh.triangles.is_empty() || !mesh.positions.iter().all(|p| p.is_finite()) {
+            return None;
+        }
+        let (lo, hi) = mesh.bounds()?;
+        let corner = |v: u32| <[f32; 3]>::from(mesh.positions[v as usize]).into();
+        let triangles: Vec<Triangle> = mesh
+            .triangles
+            .iter()
+            .map(|&[a, b, c]| Triangle {
+                v0: corner(a),
+                v1: corner(b),
+                v2: corner(c),
+            })
+            .collect();
+        let tree = build_cwbvh_from_tris(
+            &triangles,
+            BvhBuildParams::fast_build(),
+            &mut Duration::default(),
+        );
+        Some(Self {
+            mesh: Arc::new(mesh),
+            lo,
+            hi,
+            tree,
+        })
+    }
+
+    /// Closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
+    pub(crate) fn closest(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<(f32, u32)> {
+        let (o, d): ([f32; 3], [f32; 3]) = (origin.into(), direction.into());
+        let mut hit = RayHit::none();
+        let found = self.tree.ray_traverse(
+            Ray::new(o.into(), d.into(), 0.0, limit),
+            &mut hit,
+            |_, id| {
+                let k = self.tree.primitive_indices[id] as usize;
+                let corners = self.mesh.triangles[k].map(|v| self.mesh.positions[v as usize]);
+                match intersect(corners, origin, direction) {
+                    Some(t) if t > 0.0 => t,
+                    _ => f32::INFINITY,
+                }
+            },
+        );
+        found.then(|| {
+            (
+                hit.t,
+                self.tree.primitive_indices[hit.primitive_id as usize],
+            )
+        })
+    }
+}
+
+/// Placed models, ready for rays. Every placement must be rigid.
+#[derive(Debug, Default)]
+pub(crate) struct World {
+    placed: Vec<Placed>,
+}
+
+#[derive(Debug)]
+struct Placed {
+    model: Arc<Model>,
+    to_world: Affine,
+    lo: Vec3,
+    hi: Vec3,
+}
+
+/// Boxes are widened by this, so that flat meshes have a volume (metres).
+const PAD: f32 = 1e-4;
+
+impl World {
+    /// Adds a model; its index is the number added before.
+    pub(crate) fn add(&mut self, model: Arc<Model>, to_world: Affine) {
+        let (mut lo, mut hi) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
+        for i in 0..8 {
+            let side = |k: usize| {
+                if i >> k & 1 == 1 {
+                    model.hi[k]
+                } else {
+                    model.lo[k]
+                }
+            };
+            let p = to_world.point(Vec3::new(side(0), side(1), side(2)));
+            (lo, hi) = (lo.min(p), hi.max(p));
+        }
+        self.placed.push(Placed {
+            model,
+            to_world,
+            lo: lo - Vec3::splat(PAD),
+            hi: hi + Vec3::splat(PAD),
+        });
+    }
+
+    /// Closest hit with t > 0 over all placed models; the first added wins ties.
+    pub(crate) fn closest(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
+        let inverse = Vec3::new(1.0 / direction.x, 1.0 / direction.y, 1.0 / direction.z);
+        let mut best: Option<Hit> = None;
+        for (object, placed) in self.placed.iter().enumerate() {
+            let limit = best.map_or(f32::MAX, |h| h.t);
+            if !placed.box_before(origin, inverse, limit) {
+                continue;
+            }
+            // The inverse of a rigid placement is its transpose.
+            let [r0, r1, r2] = placed.to_world.linear;
+            let back = |d: Vec3| r0 * d.x + r1 * d.y + r2 * d.z;
+            let local = back(origin - placed.to_world.translation);
+            if let Some((t, triangle)) = placed.model.closest(local, back(direction), limit)
+                && t < limit
+            {
+                best = Some(Hit {
+                    t,
+                    object,
+                    triangle,
+                });
+            }
+        }
+        best
+    }
+
+    /// World-space unit normal of the facet hit, turned against `direction`.
+    pub(crate) fn normal(&self, hit: Hit, direction: Vec3) -> Vec3 {
+        let placed = &self.placed[hit.object];
+        let mesh = &placed.model.mesh;
+        let [a, b, c] = mesh.triangles[hit.triangle as usize].map(|v| mesh.positions[v as usize]);
+        let n = placed.to_world.direction((b - a).cross(c - a)).normalized();
+        if n.dot(direction) > 0.0 { -n } else { n }
+    }
+}
+
+impl Placed {
+    fn box_before(&self, origin: Vec3, inverse: Vec3, limit: f32) -> bool {
+        let (mut near, mut far) = (0.0f32, limit);
+        for k in 0..3 {
+            let a = (self.lo[k] - origin[k]) * inverse[k];
+            let b = (self.hi[k] - origin[k]) * inverse[k];
+            // min and max drop the NaN of 0·∞ (a ray inside a slab and parallel to it).
+            near = near.max(a.min(b));
+            far = far.min(a.max(b));
+        }
+        near <= far
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Material, shape::Shape};
+
+    #[test]
+    fn rays_find_the_nearest_of_placed_and_turned_boxes() {
+        let mut shape = Shape::new("box");
+        let m = shape.material(Material::diffuse("grey", [0.5; 3]));
+        shape.cuboid([-0.5, 0.0, -0.5], [0.5, 1.0, 0.5], m);
+        let model = Arc::new(Model::new(shape.finish()).expect("a box has triangles"));
+        let mut world = World::default();
+        world.add(
+            model.clone(),
+            Affine::yaw_then_move(0.0, Vec3::new(0.0, 0.0, 5.0)),
+        );
+        let quarter = std::f32::consts::FRAC_PI_4;
+        world.add(
+            model,
+            Affine::yaw_then_move(quarter, Vec3::new(0.0, 0.0, 3.0)),
+        );
+        let ahead = Vec3::new(0.0, 0.0, 2.0);
+        let hit = world
+            .closest(Vec3::new(0.01, 0.5, 0.0), ahead)
+            .expect("two boxes stand in the way");
+        assert_eq!(hit.object, 1);
+        assert!(
+            (hit.t * 2.0 - (3.0 - 0.5f32.sqrt())).abs() < 0.02,
+            "{hit:?}"
+        );
+        assert!(world.normal(hit, ahead).z < 0.0);
+        assert!(world.closest(Vec3::new(0.0, 1.5, 0.0), ahead).is_none());
+    }
+}

@@ -1,0 +1,85 @@
+//! Canonical `.glb` files come back exactly, and appear whole or not at all.
+
+use picofarm_scene::{
+    Bsdf, Scene, export,
+    import::read_scene,
+    primitive::{self, PrimitiveSettings},
+};
+
+fn scene() -> Scene {
+    let settings = PrimitiveSettings {
+        width: 96,
+        height: 64,
+        ..PrimitiveSettings::default()
+    };
+    primitive::generate(3, &settings).expect("ordinary seeds succeed")
+}
+
+#[test]
+fn a_written_scene_reads_back_exactly() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("room.glb");
+    let scene = scene();
+    export::write_glb(&scene, &path).expect("writes");
+    let back = read_scene(&path).expect("reads");
+    assert_eq!(back.name, scene.name);
+    assert_eq!(back.labels, scene.labels);
+    assert_eq!(back.camera, scene.camera);
+    assert_eq!(back.laser, scene.laser);
+    assert_eq!(back.provenance, scene.provenance);
+    assert_eq!(back.objects.len(), scene.objects.len());
+    for (a, b) in back.objects.iter().zip(&scene.objects) {
+        assert_eq!(
+            (a.label, &a.name, a.to_world),
+            (b.label, &b.name, b.to_world)
+        );
+        assert_eq!(a.mesh, b.mesh);
+    }
+    assert_eq!(
+        export::glb_bytes(&back).expect("valid"),
+        std::fs::read(&path).expect("the file"),
+        "writing again gives the same bytes"
+    );
+    let left: Vec<_> = std::fs::read_dir(folder.path()).expect("lists").collect();
+    assert_eq!(left.len(), 1, "no temporary file stays behind");
+}
+
+#[test]
+fn other_programs_see_metal_with_the_square_root_of_alpha() {
+    let bytes = export::glb_bytes(&scene()).expect("valid");
+    let document = gltf::Gltf::from_slice(&bytes).expect("standard glTF");
+    let mirror = document
+        .materials()
+        .find(|m| m.name() == Some("mirror"))
+        .expect("a mirror");
+    let pbr = mirror.pbr_metallic_roughness();
+    assert_eq!(pbr.metallic_factor(), 1.0);
+    assert!((pbr.roughness_factor() - 0.1).abs() < 1e-6);
+    assert_eq!(document.cameras().count(), 1);
+}
+
+#[test]
+fn a_roughness_edited_elsewhere_takes_effect() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("edited.glb");
+    let bytes = export::glb_bytes(&scene()).expect("valid");
+    let text = String::from_utf8_lossy(&bytes);
+    let at = text
+        .find("\"roughnessFactor\":0.1}")
+        .expect("the mirror's roughness");
+    assert!(text.is_char_boundary(at) && bytes[at..].starts_with(b"\"roughnessFactor\":0.1}"));
+    let mut edited = bytes.clone();
+    edited[at + 18..at + 21].copy_from_slice(b"0.5");
+    std::fs::write(&path, edited).expect("writes");
+    let back = read_scene(&path).expect("reads");
+    let alpha = back
+        .objects
+        .iter()
+        .flat_map(|o| &o.mesh.materials)
+        .find_map(|m| match m.bsdf {
+            Bsdf::RoughConductor { alpha, .. } => Some(alpha),
+            Bsdf::Diffuse { .. } => None,
+        });
+    assert_eq!(alpha, Some(0.25));
+    assert!(back.provenance.notes.contains_key("import.materials"));
+}
