@@ -12,6 +12,7 @@ use picofarm_proto::{
     ids::{Incarnation, WorkerId},
     model::WorkerHello,
 };
+use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Endpoint;
 use tracing::{error, info, warn};
@@ -45,7 +46,7 @@ const SHUTDOWN: &str = "the worker is shutting down";
 /// coordinator is no error: the worker tries again for ever.
 pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
     config.check()?;
-    let executor = crate::execute::RenderExecutor::new(&config.asset_dirs);
+    let executor = crate::execute::RenderExecutor::new(&config.asset_dirs, Handle::current());
     run_with(config, Arc::new(executor), shutdown).await
 }
 

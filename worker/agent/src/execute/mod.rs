@@ -1,7 +1,9 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
+mod output;
 mod render;
 mod runner;
+mod scenes;
 
 use std::{
     fmt,
