@@ -38,7 +38,7 @@ enum_pairs!(
     "event.kind",
     [
         Submitted, Leased, Committed, Reused, Failed, Dead, Expired, Released, Cancelled, Retried,
-        Ended,
+        Ended, Waiting, Alarm,
     ]
 );
 

@@ -116,6 +116,10 @@ pub enum EventKind {
     Retried,
     /// Job ended.
     Ended,
+    /// Tasks are pending, but no connected worker may run them.
+    Waiting,
+    /// Something that must not happen did, e.g. two different results of one task.
+    Alarm,
 }
 
 /// One line of a job's history.

@@ -19,6 +19,7 @@ mod shard;
 mod spec;
 mod squareroot;
 mod store;
+mod verify;
 
 pub use dataset::Dataset;
 pub use encode::EncodedScene;
@@ -31,3 +32,4 @@ pub use render_group::{RenderArray, write_render_group};
 pub use spec::{DatasetSpec, Gate, Profile};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use store::{local_leftovers, open_store, probe};
+pub use verify::{Fault, Problem, Summary, Verification, VerifyMode};

@@ -1,6 +1,9 @@
 //! Publishing scenes: create-only objects, then the manifest, which is the durable record of completion.
 
+use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
+use object_store::path::Path;
 
 use crate::dataset::Dataset;
 use crate::encode::{EncodedScene, encode_scene};
@@ -37,10 +40,11 @@ impl Dataset {
     /// [`DatasetError::Store`].
     pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
         let EncodedScene { manifest, bytes } = scene;
-        let puts = manifest.objects.iter().zip(bytes).map(|(object, bytes)| {
-            let path = self.path(&object.key);
-            async move { objects::create_or_match(&*self.store, &path, bytes).await }
-        });
+        let paths = manifest.objects.iter().map(|object| self.path(&object.key));
+        let puts: Vec<_> = paths
+            .zip(bytes)
+            .map(|(path, bytes)| put(&*self.store, path, bytes))
+            .collect();
         stream::iter(puts)
             .buffer_unordered(CONCURRENCY)
             .try_collect::<Vec<()>>()
@@ -77,22 +81,34 @@ impl Dataset {
             return Ok(None);
         };
         let manifest = Manifest::parse(&bytes, scene, path.as_ref())?;
-        let checks = manifest.objects.iter().map(|object| async move {
-            let path = self.path(&object.key);
-            let what = match objects::size(&*self.store, &path).await? {
-                Some(size) if size == object.size => return Ok(()),
-                Some(size) => format!("expected {} bytes, found {size}", object.size),
-                None => "the object is missing".into(),
-            };
-            Err(DatasetError::Damaged {
-                object: path.to_string(),
-                what,
-            })
-        });
+        let objects = manifest.objects.iter();
+        let checks: Vec<_> = objects
+            .map(|object| check_size(&*self.store, self.path(&object.key), object.size))
+            .collect();
         stream::iter(checks)
             .buffer_unordered(CONCURRENCY)
             .try_collect::<Vec<()>>()
             .await?;
         Ok(Some(manifest))
     }
+}
+
+async fn put(store: &dyn ObjectStore, path: Path, bytes: Bytes) -> Result<(), DatasetError> {
+    objects::create_or_match(store, &path, bytes).await
+}
+
+async fn check_size(
+    store: &dyn ObjectStore,
+    path: Path,
+    expected: u64,
+) -> Result<(), DatasetError> {
+    let what = match objects::size(store, &path).await? {
+        Some(size) if size == expected => return Ok(()),
+        Some(size) => format!("expected {expected} bytes, found {size}"),
+        None => "the object is missing".into(),
+    };
+    Err(DatasetError::Damaged {
+        object: path.to_string(),
+        what,
+    })
 }

@@ -78,13 +78,16 @@ impl Dataset {
         Ok(scenes)
     }
 
-    /// h of a scene, decoded, with the exact values of saturated bins: `[row][column][bin]`.
+    /// h of a scene, decoded, with the exact values of saturated bins: `[row][column][bin]`. Blocks its thread
+    /// while decoding on rayon's threads.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
     pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
-        self.read_transient_crop(scene, 0..self.spec.height, 0..self.spec.width)
-            .await
+        let manifest = self.manifest(scene).await?;
+        let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
+        let bytes = objects::require(&*self.store, &path).await?;
+        self.decode_shard(&manifest, &bytes)
     }
 
     /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
@@ -146,50 +149,20 @@ impl Dataset {
                 entry.size
             )));
         };
-        // The whole object in one request where all of it is wanted; otherwise its index first.
-        let whole = if wanted.len() == tiles.count() {
-            let bytes = objects::require(&*self.store, &path).await?;
-            if bytes.len() as u64 != entry.size {
-                return Err(damaged(format!(
-                    "expected {} bytes, found {}",
-                    entry.size,
-                    bytes.len()
-                )));
-            }
-            Some(bytes)
-        } else {
-            None
-        };
         let fetch_error = |e| match e {
             object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
             e => DatasetError::store("read", &path, e),
         };
-        let index = match &whole {
-            Some(bytes) => bytes.slice(start as usize..),
-            None => self
-                .store
-                .get_range(&path, start..entry.size)
-                .await
-                .map_err(fetch_error)?,
-        };
+        let index = self.store.get_range(&path, start..entry.size);
+        let index = index.await.map_err(fetch_error)?;
         let index = shard::parse_index(&index, tiles.count(), entry.size)?;
         let ranges: Vec<(usize, Range<u64>)> = wanted
             .iter()
             .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
             .collect();
-        let parts: Vec<Bytes> = match &whole {
-            Some(bytes) => ranges
-                .iter()
-                .map(|(_, r)| bytes.slice(r.start as usize..r.end as usize))
-                .collect(),
-            None => {
-                let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
-                self.store
-                    .get_ranges(&path, &only)
-                    .await
-                    .map_err(fetch_error)?
-            }
-        };
+        let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
+        let parts = self.store.get_ranges(&path, &only);
+        let parts = parts.await.map_err(fetch_error)?;
         let mut found = ranges.iter().map(|(tile, _)| *tile).zip(parts).peekable();
         Ok(wanted
             .iter()
@@ -200,6 +173,27 @@ impl Dataset {
                 )
             })
             .collect())
+    }
+
+    /// h of a whole scene from the bytes of its shard.
+    pub(crate) fn decode_shard(
+        &self,
+        manifest: &Manifest,
+        bytes: &Bytes,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let tiles = Tiles::new(&self.spec, &self.array(Quantity::Transient).layout);
+        let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
+            let what = format!("{} bytes are too few", bytes.len());
+            return Err(DatasetError::codec("cannot read a shard's index", what));
+        };
+        let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
+        let chunks = index
+            .into_iter()
+            .map(|entry| entry.map(|r| bytes.slice(r.start as usize..r.end as usize)))
+            .enumerate()
+            .collect();
+        let image = [0..self.spec.height as usize, 0..self.spec.width as usize];
+        self.decode_window(manifest, &tiles, chunks, image)
     }
 
     /// Decodes tiles into a window and applies the overflow list.
@@ -261,6 +255,12 @@ impl Dataset {
                 let at = (row - rows.start) * columns.len() + column - columns.start;
                 window[at * bins + bin] = *value;
             }
+        }
+        if window.iter().any(|h| h.is_infinite()) {
+            return Err(DatasetError::Damaged {
+                object: self.path(&Manifest::key(manifest.scene)).to_string(),
+                what: "a saturated bin has no exact value in the overflow list".into(),
+            });
         }
         Ok(window)
     }

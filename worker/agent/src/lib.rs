@@ -1,1 +1,14 @@
-//! Placeholder while the workspace is laid out.
+//! The worker: a session with the coordinator, the leases it holds, and the executors that turn a task
+//! into a published scene. Knows the wire, the data set, scenes and the renderer; never the catalog.
+//!
+//! [`run`] is the whole worker; [`run_with`] takes another [`Executor`], which is how tests look at the
+//! session without rendering.
+
+mod agent;
+mod config;
+pub mod execute;
+mod session;
+
+pub use agent::{run, run_with};
+pub use config::{AgentConfig, AgentError, Summary};
+pub use execute::{Control, Executor, Output, Task, TaskError};

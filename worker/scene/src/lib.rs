@@ -4,9 +4,11 @@
 //! World space is right-handed, metres, +y up. Cameras follow the measurement contract: the camera
 //! frame has x right, y **down** (image rows grow with y) and z forward.
 
+mod assets;
 mod camera;
 pub mod export;
 mod extras;
+pub mod furnished;
 pub mod import;
 mod label;
 mod laser;
@@ -21,6 +23,7 @@ mod trace;
 mod vec3;
 mod view;
 
+pub use assets::AssetLibrary;
 pub use camera::{Camera, Intrinsics};
 pub use label::LABELS;
 pub use laser::{Beam, Laser, LaserGrid, Spot};

@@ -87,6 +87,11 @@ impl Model {
         })
     }
 
+    /// Extents along x, y and z.
+    pub(crate) fn size(&self) -> [f32; 3] {
+        (self.hi - self.lo).into()
+    }
+
     /// Closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<(f32, u32)> {
         let (o, d): ([f32; 3], [f32; 3]) = (origin.into(), direction.into());

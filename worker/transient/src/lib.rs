@@ -2,5 +2,22 @@
 //! jobs, stores or files.
 
 mod api;
+mod bsdf;
+mod bvh;
+mod emitter;
+mod film;
+mod lobe;
+mod multi;
+mod one;
+mod photo;
+mod plan;
+mod render;
+mod rng;
+mod truth;
+mod two;
+mod world;
 
 pub use api::*;
+pub use bvh::{Bvh, Kernel, Stack};
+pub use emitter::trace_spots;
+pub use render::render;

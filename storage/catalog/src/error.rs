@@ -1,0 +1,76 @@
+//! What can go wrong with a catalog, and what to do about it.
+
+use std::path::PathBuf;
+
+/// A catalog that cannot be opened, read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum CatalogError {
+    /// Another coordinator has it.
+    #[error(
+        "catalog {} is held by another coordinator ({holder}); stop that one first, or give this one a catalog of its own",
+        path.display()
+    )]
+    Held {
+        /// The database file.
+        path: PathBuf,
+        /// Who has it, as it said itself.
+        holder: String,
+    },
+    /// A later program wrote it.
+    #[error(
+        "catalog {} has schema version {found}, but this program knows versions up to {known}; use a newer picofarm, or another catalog file",
+        path.display()
+    )]
+    Newer {
+        /// The database file.
+        path: PathBuf,
+        /// Its schema version.
+        found: i64,
+        /// The latest schema version of this program.
+        known: i64,
+    },
+    /// The folder or file cannot be used.
+    #[error("catalog {}: {what}: {source}", path.display())]
+    File {
+        /// The database file.
+        path: PathBuf,
+        /// What was tried.
+        what: &'static str,
+        /// The system's answer.
+        source: std::io::Error,
+    },
+    /// No room.
+    #[error("catalog {}: the disk is full; free some space, then start the coordinator again: no finished work is lost", path.display())]
+    Full {
+        /// The database file.
+        path: PathBuf,
+    },
+    /// No right to write.
+    #[error("catalog {}: cannot be written (read-only file or folder); make it writable for this user or choose another path", path.display())]
+    ReadOnly {
+        /// The database file.
+        path: PathBuf,
+    },
+    /// Not a database of ours.
+    #[error("catalog {}: {what}; choose another path or restore the file from a backup", path.display())]
+    Unusable {
+        /// The database file.
+        path: PathBuf,
+        /// What was found.
+        what: String,
+    },
+    /// Something changed behind the caller's back.
+    #[error("catalog conflict: {0}")]
+    Conflict(String),
+    /// Any other answer of the database.
+    #[error("catalog {}: {source}", path.display())]
+    Database {
+        /// The database file.
+        path: PathBuf,
+        /// The database's answer.
+        source: sqlx::Error,
+    },
+    /// The writer has stopped.
+    #[error("the catalog is closed")]
+    Closed,
+}

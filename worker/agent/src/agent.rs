@@ -1,0 +1,439 @@
+//! The worker's one loop: connection, executor, clock and shutdown meet here, around the [`Desk`].
+
+use std::{
+    future::Future,
+    pin::Pin,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use picofarm_proto::{
+    PROTOCOL,
+    ids::{Incarnation, WorkerId},
+    model::WorkerHello,
+};
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Endpoint;
+use tracing::{error, info, warn};
+use uuid::Uuid;
+
+use crate::{
+    AgentConfig, AgentError, Control, Executor, Output, Summary, TaskError,
+    execute::Runner,
+    session::{
+        self, LinkError, Session, Welcome,
+        backoff::{Backoff, random},
+        desk::Desk,
+        message::Incoming,
+    },
+};
+
+/// A running task this close to its end may finish after the shutdown signal.
+const FINISH_WITHIN: Duration = Duration::from_millis(1500);
+/// How long a task may take to stop before the worker leaves without it.
+const STOP_WITHIN: Duration = Duration::from_secs(10);
+/// How long the last words may wait for their acknowledgement.
+const GOODBYE_WITHIN: Duration = Duration::from_secs(3);
+/// A session that lasted this long was a good one: the next reconnect begins with a short wait.
+const GOOD_SESSION: Duration = Duration::from_secs(10);
+const SHUTDOWN: &str = "the worker is shutting down";
+
+/// Runs a worker that renders, until `shutdown` or a refusal.
+///
+/// # Errors
+/// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
+/// coordinator is no error: the worker tries again for ever.
+pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
+    config.check()?;
+    let executor = crate::execute::RenderExecutor::new(&config.asset_dirs, Handle::current());
+    run_with(config, Arc::new(executor), shutdown).await
+}
+
+/// Runs a worker with an executor of the caller's; otherwise as [`run`].
+///
+/// # Errors
+/// As [`run`].
+pub async fn run_with(
+    config: AgentConfig,
+    executor: Arc<dyn Executor>,
+    shutdown: CancellationToken,
+) -> Result<Summary, AgentError> {
+    config.check()?;
+    let endpoint = session::endpoint(&config.coordinator)?;
+    let hello = WorkerHello {
+        id: config
+            .worker_id
+            .unwrap_or_else(|| WorkerId::from_uuid(Uuid::new_v4())),
+        incarnation: Incarnation::from_uuid(Uuid::new_v4()),
+        name: config.name.clone(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        protocol: PROTOCOL,
+        cores: u32::try_from(config.threads).unwrap_or(u32::MAX),
+        held: Vec::new(),
+        renderer: executor.renderer(),
+        assets: executor.assets(),
+    };
+    info!(worker = %hello.id, name = hello.name, threads = config.threads,
+        coordinator = config.coordinator, "worker starts");
+    let mut agent = Agent {
+        desk: Desk::new(config.slots),
+        runner: Runner::start(executor, config.threads)?,
+        control: None,
+        endpoint,
+        hello,
+        link: Link::Down(Instant::now()),
+        away_since: None,
+        retry: Backoff::new(Duration::from_millis(200), Duration::from_secs(10)),
+        relief: Backoff::new(Duration::from_secs(1), Duration::from_secs(60)),
+        leaving: None,
+        summary: Summary::default(),
+        coordinator: config.coordinator,
+    };
+    let outcome = agent.live(shutdown).await;
+    agent.summary.unacknowledged = agent.desk.unacknowledged() as u64;
+    outcome.map(|()| {
+        info!(summary = ?agent.summary, "worker ends");
+        agent.summary
+    })
+}
+
+type Opening = Pin<Box<dyn Future<Output = Result<(Welcome, Box<Session>), LinkError>> + Send>>;
+
+enum Link {
+    /// Not connected; try at this time.
+    Down(Instant),
+    Opening(Opening),
+    Up {
+        session: Box<Session>,
+        welcome: Welcome,
+        since: Instant,
+        next_beat: Instant,
+    },
+}
+
+enum Event {
+    Retry,
+    Opened(Result<(Welcome, Box<Session>), LinkError>),
+    Received(Result<Incoming, LinkError>),
+    Beat,
+}
+
+impl Link {
+    /// What the connection brings next. Safe to cancel.
+    async fn event(&mut self) -> Event {
+        match self {
+            Link::Down(until) => {
+                tokio::time::sleep_until((*until).into()).await;
+                Event::Retry
+            }
+            Link::Opening(opening) => Event::Opened(opening.await),
+            Link::Up {
+                session, next_beat, ..
+            } => tokio::select! {
+                received = session.receive() => Event::Received(received),
+                () = tokio::time::sleep_until((*next_beat).into()) => Event::Beat,
+            },
+        }
+    }
+}
+
+/// The way out.
+struct Leaving {
+    /// The running task is told to stop at this time.
+    stop_at: Instant,
+    /// Leave whatever still runs or waits.
+    give_up: Instant,
+    released: bool,
+}
+
+struct Agent {
+    desk: Desk,
+    runner: Runner,
+    /// Of the task in hand.
+    control: Option<Arc<Control>>,
+    endpoint: Endpoint,
+    hello: WorkerHello,
+    link: Link,
+    away_since: Option<Instant>,
+    retry: Backoff,
+    /// Waits after interruptions that come from this machine or the store.
+    relief: Backoff,
+    leaving: Option<Leaving>,
+    summary: Summary,
+    coordinator: String,
+}
+
+impl Agent {
+    async fn live(&mut self, shutdown: CancellationToken) -> Result<(), AgentError> {
+        loop {
+            let now = Instant::now();
+            if self.leave(now) {
+                return Ok(());
+            }
+            self.work(now);
+            let wake = self.wake(now);
+            tokio::select! {
+                event = self.link.event() => self.link_event(event)?,
+                result = self.runner.finished() => self.task_ended(result),
+                () = tokio::time::sleep_until(wake.into()) => {}
+                () = shutdown.cancelled(), if self.leaving.is_none() => self.begin_leaving(),
+            }
+        }
+    }
+
+    /// Starts the next task if the hand is free, and sends what is to be said.
+    fn work(&mut self, now: Instant) {
+        if let Some(task) = self.desk.begin(now) {
+            info!(job = %task.job, task = task.index, "task starts");
+            let control = Arc::new(Control::default());
+            self.control = Some(control.clone());
+            self.runner.begin(task, control);
+        }
+        if let Link::Up { session, .. } = &self.link {
+            for message in self.desk.outgoing(now) {
+                session.send(message);
+            }
+        }
+    }
+
+    /// When the loop must look again although nothing came.
+    fn wake(&self, now: Instant) -> Instant {
+        let leaving = self.leaving.iter().flat_map(|l| [l.stop_at, l.give_up]);
+        leaving
+            .chain(self.desk.paused_until())
+            .filter(|at| *at > now)
+            .min()
+            .unwrap_or(now + Duration::from_secs(60))
+    }
+
+    fn link_event(&mut self, event: Event) -> Result<(), AgentError> {
+        let now = Instant::now();
+        match event {
+            Event::Retry => {
+                let mut hello = self.hello.clone();
+                hello.held = self.desk.held();
+                self.link = Link::Opening(Box::pin(session::open(self.endpoint.clone(), hello)));
+            }
+            Event::Opened(Ok((welcome, session))) => {
+                match self.away_since.take() {
+                    Some(since) => {
+                        self.summary.reconnects += 1;
+                        info!(
+                            away_s = (now - since).as_secs_f64(),
+                            held = self.desk.held().len(),
+                            unacknowledged = self.desk.unacknowledged(),
+                            "reconnected"
+                        );
+                    }
+                    None => info!(coordinator = self.coordinator, "connected"),
+                }
+                self.link = Link::Up {
+                    session,
+                    welcome,
+                    since: now,
+                    next_beat: now,
+                };
+            }
+            Event::Opened(Err(error)) | Event::Received(Err(error)) => self.lost(now, error)?,
+            Event::Received(Ok(message)) => self.received(now, message),
+            Event::Beat => self.beat(now)?,
+        }
+        Ok(())
+    }
+
+    fn beat(&mut self, now: Instant) -> Result<(), AgentError> {
+        let Link::Up {
+            session,
+            welcome,
+            next_beat,
+            ..
+        } = &mut self.link
+        else {
+            return Ok(());
+        };
+        let silent = self.desk.silent_since().map(|since| now - since);
+        if let Some(silent) = silent.filter(|s| *s > welcome.lease / 2) {
+            let text = format!("no answer to heartbeats for {:.1} s", silent.as_secs_f64());
+            return self.lost(now, LinkError::Down(text));
+        }
+        let fraction = self.control.as_ref().map_or(0.0, |c| c.fraction());
+        session.send(self.desk.heartbeat(now, fraction));
+        *next_beat = now + welcome.heartbeat;
+        Ok(())
+    }
+
+    /// The connection is gone, or did not come about.
+    fn lost(&mut self, now: Instant, error: LinkError) -> Result<(), AgentError> {
+        let reason = match error {
+            LinkError::Refused(reason) => {
+                if let Some(control) = &self.control {
+                    control.stop();
+                }
+                return Err(AgentError::Refused {
+                    coordinator: self.coordinator.clone(),
+                    reason,
+                });
+            }
+            LinkError::Down(reason) => reason,
+        };
+        if matches!(self.link, Link::Up { since, .. } if now - since > GOOD_SESSION) {
+            self.retry.reset();
+        }
+        let wait = self.retry.next(random());
+        if self.away_since.is_none() {
+            warn!(
+                reason,
+                coordinator = self.coordinator,
+                unacknowledged = self.desk.unacknowledged(),
+                "no coordinator; the worker goes on with what it holds and tries again until one answers"
+            );
+        } else {
+            info!(
+                reason,
+                retry_in_s = wait.as_secs_f64(),
+                "still no coordinator"
+            );
+        }
+        self.away_since.get_or_insert(now);
+        self.desk.disconnected();
+        self.link = Link::Down(now + wait);
+        Ok(())
+    }
+
+    fn received(&mut self, now: Instant, message: Incoming) {
+        match message {
+            Incoming::Lease(lease) => {
+                info!(job = %lease.job, range = %lease.lease.range, epoch = %lease.lease.epoch,
+                    lo = lease.lo, hi = lease.hi, skip = lease.skip.len(), "lease granted");
+                self.desk.granted(now, *lease);
+            }
+            Incoming::UnusableLease(lease, why) => {
+                error!(
+                    why,
+                    "the coordinator granted a lease that cannot be used; it goes back"
+                );
+                self.desk.unusable(lease, &why);
+                self.desk.pause(now + self.relief.next(random()), &why);
+            }
+            Incoming::Acknowledge {
+                lease,
+                index,
+                accepted,
+                reason,
+            } => {
+                let known = self.desk.acknowledged(lease, index).is_some();
+                if known && !accepted {
+                    info!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
+                        "report not accepted; nothing to do, any output stands");
+                }
+            }
+            Incoming::Renewed { leases, ttl_ms } => {
+                let ttl = Duration::from_millis(ttl_ms.into());
+                for lost in self.desk.renewed(now, &leases, ttl) {
+                    warn!(range = %lost.range, epoch = %lost.epoch, "lease lost: not renewed");
+                }
+            }
+            Incoming::Revoke { lease, reason } => {
+                info!(range = %lease.range, epoch = %lease.epoch, reason, "lease revoked");
+                if self.desk.revoked(lease)
+                    && let Some(control) = &self.control
+                {
+                    control.stop();
+                }
+            }
+            Incoming::Unknown(what) => warn!(what, "the coordinator sent a message of no use"),
+        }
+    }
+
+    fn task_ended(&mut self, result: Result<Output, TaskError>) {
+        let now = Instant::now();
+        self.control = None;
+        let hand = self.desk.ended(now, &result);
+        let (job, task, seconds) = (
+            hand.task.job,
+            hand.task.index,
+            (now - hand.since).as_secs_f64(),
+        );
+        match &result {
+            Ok(output) => {
+                self.relief.reset();
+                if output.adopted {
+                    self.summary.adopted += 1;
+                    info!(%job, task, seconds, "task adopted: its output was in the store");
+                } else {
+                    self.summary.computed += 1;
+                    info!(%job, task, seconds, bytes = output.bytes, "task done");
+                }
+            }
+            Err(TaskError::Stopped) => info!(%job, task, seconds, "task stopped"),
+            Err(TaskError::Interrupted(why)) => {
+                self.summary.failed += 1;
+                let wait = self.relief.next(random());
+                warn!(%job, task, why, wait_s = wait.as_secs_f64(),
+                    "task interrupted; the worker hands its leases back and waits before taking more");
+                self.desk.pause(now + wait, why);
+            }
+            Err(error) => {
+                self.summary.failed += 1;
+                error!(%job, task, seconds, %error, "task failed");
+            }
+        }
+    }
+
+    /// The shutdown signal came.
+    fn begin_leaving(&mut self) {
+        let now = Instant::now();
+        self.desk.drain();
+        let nearly_done = self
+            .remaining(now)
+            .is_some_and(|left| left <= FINISH_WITHIN);
+        let stop_at = if nearly_done {
+            now + FINISH_WITHIN
+        } else {
+            now
+        };
+        info!(
+            running = self.desk.in_hand().is_some(),
+            nearly_done, "shutting down"
+        );
+        self.leaving = Some(Leaving {
+            stop_at,
+            give_up: stop_at + STOP_WITHIN,
+            released: false,
+        });
+    }
+
+    /// How long the task in hand still needs, if it goes on as it went so far.
+    fn remaining(&self, now: Instant) -> Option<Duration> {
+        let since = self.desk.in_hand()?.since;
+        let fraction = self.control.as_ref()?.fraction();
+        let left = (now - since).as_secs_f64() * f64::from((1.0 - fraction) / fraction);
+        Duration::try_from_secs_f64(left).ok()
+    }
+
+    /// Takes the next step of the way out; `true` when the worker may go.
+    fn leave(&mut self, now: Instant) -> bool {
+        let Some(leaving) = &mut self.leaving else {
+            return false;
+        };
+        let running = self.desk.in_hand().is_some();
+        if running && now < leaving.give_up {
+            if let Some(control) = &self.control
+                && now >= leaving.stop_at
+            {
+                control.stop();
+            }
+            return false;
+        }
+        if !leaving.released {
+            if running {
+                warn!("the running task did not stop; the worker leaves without it");
+            }
+            leaving.released = true;
+            leaving.give_up = now + GOODBYE_WITHIN;
+            self.desk.release_all(SHUTDOWN);
+        }
+        self.desk.unacknowledged() == 0 || now >= leaving.give_up
+    }
+}

@@ -1,0 +1,93 @@
+//! What a worker is told at its start, what it says at its end, and why it may end early.
+
+use std::path::PathBuf;
+
+use picofarm_proto::ids::WorkerId;
+
+/// Settings of one worker process.
+#[derive(Debug, Clone)]
+pub struct AgentConfig {
+    /// URL of the coordinator, e.g. `http://127.0.0.1:7717`.
+    pub coordinator: String,
+    /// Name, for people: host and process.
+    pub name: String,
+    /// Identity across restarts; `None` makes one for this process.
+    pub worker_id: Option<WorkerId>,
+    /// Threads of the render pool, at least 1.
+    pub threads: usize,
+    /// Folders to look in for furniture, besides the usual ones.
+    pub asset_dirs: Vec<PathBuf>,
+    /// Leases held at once, at least 1. With 2 the next lease waits here while one is worked off.
+    pub slots: u32,
+}
+
+impl AgentConfig {
+    /// Every limit of the fields above.
+    pub(crate) fn check(&self) -> Result<(), AgentError> {
+        let fail = |field, what: &str| {
+            Err(AgentError::Config {
+                field,
+                what: what.to_owned(),
+            })
+        };
+        if self.threads == 0 {
+            return fail("threads", "is 0; give the worker at least 1 thread");
+        }
+        if self.slots == 0 {
+            return fail("slots", "is 0; the worker must hold at least 1 lease");
+        }
+        if self.name.trim().is_empty() {
+            return fail("name", "is empty; give the worker a name");
+        }
+        Ok(())
+    }
+}
+
+/// What a worker did in its life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Summary {
+    /// Tasks computed and published.
+    pub computed: u64,
+    /// Tasks whose output was already in the store.
+    pub adopted: u64,
+    /// Tasks that failed.
+    pub failed: u64,
+    /// Times the session was lost and opened again.
+    pub reconnects: u64,
+    /// Reports that no coordinator acknowledged before the end. Their outputs are in the store, so
+    /// whoever gets those tasks next adopts them.
+    pub unacknowledged: u64,
+}
+
+/// Why a worker ended.
+#[derive(Debug, thiserror::Error)]
+pub enum AgentError {
+    /// A setting that cannot be used.
+    #[error("{field}: {what}")]
+    Config {
+        /// The setting.
+        field: &'static str,
+        /// What was expected.
+        what: String,
+    },
+    /// The coordinator will not have this worker, and asking again would not help.
+    #[error(
+        "the coordinator at {coordinator} refused this worker: {reason}; run the same picofarm version on both sides"
+    )]
+    Refused {
+        /// Its URL.
+        coordinator: String,
+        /// Its words.
+        reason: String,
+    },
+    /// The render threads could not be started.
+    #[error(
+        "cannot start {threads} render threads: {reason}; lower `threads` or raise the process limit"
+    )]
+    Threads {
+        /// How many were asked for.
+        threads: usize,
+        /// Why.
+        reason: String,
+    },
+}

@@ -1,0 +1,195 @@
+//! The executor that renders: adopt, or make the scene, render it, code it and publish it.
+
+use std::{path::PathBuf, time::Duration};
+
+use picofarm_dataset::{Intrinsics, Provenance, SceneRecord, Spot, photon_scale};
+use picofarm_proto::{
+    key::TaskKey,
+    model::{Budget, JobSpec},
+};
+use picofarm_scene::{AssetLibrary, Camera, Scene};
+use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
+use serde_json::json;
+use tokio::runtime::Handle;
+use tracing::debug;
+
+use super::{
+    Control, Executor, Output, Task, TaskError,
+    output::{Stores, manifest_sha256, of_dataset},
+    scenes,
+};
+
+/// Photons in the median pixel's brightest bin: the measurement's convention for the stored scale.
+const PEAK_PHOTONS: f32 = 400.0;
+/// Share of a task's progress that is rendering; the rest is coding and storing.
+const RENDER_SHARE: f32 = 0.95;
+/// How long a rendered scene waits for a store that is full or away before its task is handed back.
+const STORE_PATIENCE: Duration = Duration::from_secs(120);
+
+/// Renders scenes into data sets.
+pub struct RenderExecutor {
+    libraries: Vec<AssetLibrary>,
+    stores: Stores,
+}
+
+impl RenderExecutor {
+    /// An executor with the furniture found in `asset_dirs` and the usual places. Stores are reached through
+    /// `runtime`, which must not be a thread of the executor's own.
+    pub fn new(asset_dirs: &[PathBuf], runtime: Handle) -> Self {
+        Self {
+            libraries: scenes::find_libraries(asset_dirs),
+            stores: Stores::new(runtime, STORE_PATIENCE),
+        }
+    }
+}
+
+impl Executor for RenderExecutor {
+    fn renderer(&self) -> String {
+        RENDERER_VERSION.into()
+    }
+
+    fn assets(&self) -> Vec<String> {
+        let fingerprints = self.libraries.iter().map(|l| l.fingerprint().to_owned());
+        fingerprints.collect()
+    }
+
+    fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (spec, key) = (&*task.spec, task.key());
+        if spec.render.renderer != RENDERER_VERSION {
+            return Err(TaskError::User(format!(
+                "render.renderer: the job asks for {:?}, this worker renders {RENDERER_VERSION:?}; submit the job \
+                 again with this version, or run workers of the other one",
+                spec.render.renderer
+            )));
+        }
+        let dataset = self.stores.open(spec)?;
+        if let Some(manifest) = self.stores.finished(&dataset, task.index, &key)? {
+            return Ok(Output {
+                manifest_sha256: manifest_sha256(&manifest),
+                bytes: manifest.total_bytes(),
+                adopted: true,
+            });
+        }
+        let scene = scenes::scene(spec, task.index, &self.libraries)?;
+        debug!(task = task.index, scene = scene.name, triangles = scene.triangle_count(), "scene made");
+        let settings = settings(spec, &key);
+        let rendered = picofarm_transient::render(&scene, &settings, &Watched(control))
+            .map_err(of_render)?;
+        let camera = &scene.camera;
+        let spots: Vec<_> = rendered
+            .spots
+            .iter()
+            .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
+            .collect();
+        let record = record(&scene, &rendered, &spots);
+        let provenance = Provenance {
+            task_key: key.to_string(),
+            renderer: RENDERER_VERSION.into(),
+            seed: settings.seed,
+            plan: account(&scene, &rendered),
+        };
+        let encoded = dataset
+            .encode(task.index, &record, &provenance)
+            .map_err(of_dataset)?;
+        control.at((1.0 + RENDER_SHARE) / 2.0);
+        let manifest = self.stores.publish(&dataset, encoded, control)?;
+        control.at(1.0);
+        Ok(Output {
+            manifest_sha256: manifest_sha256(&manifest),
+            bytes: manifest.total_bytes(),
+            adopted: false,
+        })
+    }
+}
+
+/// Carries the renderer's progress to the task's control.
+struct Watched<'a>(&'a Control);
+
+impl Progress for Watched<'_> {
+    fn at(&self, done: f32) -> bool {
+        self.0.at(done * RENDER_SHARE)
+    }
+}
+
+/// The renderer's settings for a task. The seed is the head of the task's key, so that nothing but the task
+/// decides the numbers.
+fn settings(spec: &JobSpec, key: &TaskKey) -> Settings {
+    let render = &spec.render;
+    let head = key.0[..8].try_into().expect("a key has 32 bytes");
+    Settings {
+        gate: Gate {
+            start_m: render.gate_start_m,
+            bin_width_m: render.bin_width_m,
+            bins: render.bins,
+        },
+        budget: match render.budget {
+            Budget::Samples(n) => picofarm_transient::Budget::Samples(n),
+            Budget::Error(share) => picofarm_transient::Budget::Error(share as f32),
+        },
+        max_bounces: (render.max_bounces != 0).then_some(render.max_bounces),
+        one_bounce: true,
+        seed: u64::from_le_bytes(head),
+        split: false,
+    }
+}
+
+/// The render as the data set takes it.
+fn record<'a>(scene: &Scene, rendered: &'a Rendered, spots: &'a [Option<Spot>]) -> SceneRecord<'a> {
+    let (camera, truth) = (&scene.camera, &rendered.truth);
+    let i = camera.intrinsics;
+    let (r, d, f, o) = (camera.right, camera.down, camera.forward, camera.origin);
+    SceneRecord {
+        transient: &rendered.transient,
+        depth: &truth.depth,
+        range: &truth.range,
+        normal: &truth.normal,
+        instance: &truth.instance,
+        label: &truth.label,
+        specular: &truth.specular,
+        visibility: &truth.visibility,
+        rgb: &truth.rgb,
+        spots,
+        intrinsics: Intrinsics {
+            fx: i.fx,
+            fy: i.fy,
+            cx: i.cx,
+            cy: i.cy,
+        },
+        camera: [
+            [r.x, d.x, f.x, o.x],
+            [r.y, d.y, f.y, o.y],
+            [r.z, d.z, f.z, o.z],
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        laser: camera.to_camera(scene.laser.origin).into(),
+        scale: photon_scale(&rendered.transient, rendered.gate.bins as usize, PEAK_PHOTONS),
+    }
+}
+
+fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera) -> Spot {
+    Spot {
+        position: camera.to_camera(spot.point).into(),
+        normal: camera.direction_to_camera(spot.normal).into(),
+        path_m: spot.path_m,
+    }
+}
+
+/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine.
+fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
+    json!({
+        "scene": {"name": scene.name, "provenance": scene.provenance, "labels": scene.labels},
+        "strategies": rendered.plan.strategies,
+        "approximations": rendered.plan.approximations,
+        "overflow": rendered.overflow,
+        "error": rendered.error,
+        "rays": rendered.rays,
+    })
+}
+
+fn of_render(error: RenderError) -> TaskError {
+    match error {
+        RenderError::Stopped => TaskError::Stopped,
+        RenderError::Scene(error) => scenes::of_scene(error),
+        RenderError::Invalid { .. } => TaskError::User(format!("render.{error}")),
+    }
+}

@@ -1,0 +1,176 @@
+//! From a task to its scene: generated from the task's own seed, or read from a file pinned by its hash.
+
+use std::path::{Path, PathBuf};
+
+use picofarm_proto::{
+    key::scene_seed,
+    model::{JobSpec, SceneFile, SceneKind},
+};
+use picofarm_scene::{
+    AssetLibrary, LaserGrid, Scene, SceneError,
+    furnished::{self, FurnishedSettings},
+    import::{self, ImportOptions},
+    primitive::{self, PrimitiveSettings},
+};
+use sha2::{Digest, Sha256};
+use tracing::{info, warn};
+
+use super::TaskError;
+
+/// Names of the furniture libraries that this program knows.
+const LIBRARIES: [&str; 2] = ["parametric", "sweethome3d"];
+
+/// Finds the furniture on this machine. A library that is not installed is no error: jobs that need it go
+/// to other workers.
+pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
+    LIBRARIES
+        .iter()
+        .filter_map(|name| match AssetLibrary::find(name, dirs) {
+            Ok(library) => {
+                info!(library = name, fingerprint = library.fingerprint(), models = library.len(),
+                    "furniture at hand");
+                Some(library)
+            }
+            Err(why) => {
+                info!(library = name, %why, "furniture not at hand");
+                None
+            }
+        })
+        .collect()
+}
+
+/// The scene of task `index`, with the job's resolution and spots.
+pub(super) fn scene(
+    spec: &JobSpec,
+    index: u64,
+    libraries: &[AssetLibrary],
+) -> Result<Scene, TaskError> {
+    let (source, side) = (&spec.scenes, spec.render.resolution);
+    let seed = scene_seed(source.seed, index);
+    match &source.kind {
+        SceneKind::Furnished {
+            assets,
+            min_specular,
+        } => {
+            let library = library(assets, libraries)?;
+            let settings = FurnishedSettings {
+                spots: source.spots,
+                width: side,
+                height: side,
+                fov_deg: source.fov_deg as f32,
+                assets: library.name().to_owned(),
+                specular_at_least: *min_specular,
+            };
+            furnished::generate(seed, &settings, library).map_err(of_scene)
+        }
+        SceneKind::Primitive => {
+            let settings = PrimitiveSettings {
+                spots: source.spots,
+                width: side,
+                height: side,
+                fov_deg: source.fov_deg as f32,
+                ..PrimitiveSettings::default()
+            };
+            primitive::generate(seed, &settings).map_err(of_scene)
+        }
+        SceneKind::Files { files } => {
+            let at = format!("scenes.files[{index}]");
+            let file = usize::try_from(index).ok().and_then(|i| files.get(i));
+            let file = file.ok_or_else(|| {
+                TaskError::User(format!(
+                    "{at}: the job lists only {} files; submit it again",
+                    files.len()
+                ))
+            })?;
+            read(file, &at, spec)
+        }
+    }
+}
+
+fn library<'a>(
+    fingerprint: &str,
+    libraries: &'a [AssetLibrary],
+) -> Result<&'a AssetLibrary, TaskError> {
+    let found = libraries.iter().find(|l| l.fingerprint() == fingerprint);
+    found.ok_or_else(|| {
+        let here: Vec<_> = libraries.iter().map(AssetLibrary::fingerprint).collect();
+        TaskError::User(format!(
+            "scenes.assets: furniture {fingerprint:?} is not on this worker's machine (it has {}); run \
+             `picofarm assets install` there, or set assets = \"parametric\" in the job",
+            here.join(", ")
+        ))
+    })
+}
+
+/// Reads a scene file after checking its hash, and gives it the job's resolution.
+fn read(file: &SceneFile, at: &str, spec: &JobSpec) -> Result<Scene, TaskError> {
+    let path = Path::new(&file.path);
+    let bytes = std::fs::read(path).map_err(|source| {
+        let error = SceneError::Read {
+            path: path.to_path_buf(),
+            source,
+        };
+        named(at, error)
+    })?;
+    let found = hex::encode(Sha256::digest(&bytes));
+    if found != file.sha256 {
+        return Err(TaskError::User(format!(
+            "{at}: {} has SHA-256 {found}, but the job was submitted with {}; put the old file back, or submit \
+             the job again to use the new one",
+            file.path, file.sha256
+        )));
+    }
+    let mut scene = with_laser(path, spec.scenes.spots).map_err(|e| named(at, e))?;
+    let side = spec.render.resolution;
+    scene.camera.intrinsics = scene.camera.intrinsics.resized(side, side);
+    let beams = scene.laser.beams.len();
+    if beams != spec.scenes.spots as usize {
+        return Err(TaskError::User(format!(
+            "{at}: {} has a laser of {beams} beams, but the job says scenes.spots = {}; set scenes.spots to {beams}, \
+             or remove the laser from the file to use the job's grid",
+            file.path, spec.scenes.spots
+        )));
+    }
+    Ok(scene)
+}
+
+/// Reads a scene with its own laser, or the grid of `spots` where it has none.
+fn with_laser(path: &Path, spots: u32) -> Result<Scene, SceneError> {
+    match import::read_scene(path) {
+        // The importer's word for a file without a laser; one with an unusable laser is not mended here.
+        Err(SceneError::Format { what, .. }) if what.starts_with("laser: ") => {
+            warn!(path = %path.display(), spots, "the file has no laser; the job's grid is used");
+            let options = ImportOptions {
+                laser: LaserGrid::new(spots),
+                ..ImportOptions::default()
+            };
+            import::read_scene_with(path, &options)
+        }
+        read => read,
+    }
+}
+
+/// A scene's error with its place in the job.
+fn named(at: &str, error: SceneError) -> TaskError {
+    match of_scene(error) {
+        TaskError::User(text) => TaskError::User(format!("{at}: {text}")),
+        TaskError::Interrupted(text) => TaskError::Interrupted(format!("{at}: {text}")),
+        other => other,
+    }
+}
+
+/// Who is to blame for a scene's error: a disk that fails is nobody's fault, everything else is the job's.
+pub(super) fn of_scene(error: SceneError) -> TaskError {
+    use std::io::ErrorKind::{InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied};
+    match &error {
+        SceneError::Read { source, .. } => match source.kind() {
+            NotFound | NotADirectory | IsADirectory | PermissionDenied | InvalidInput => {
+                TaskError::User(format!(
+                    "{error}; every worker must see it under this path"
+                ))
+            }
+            _ => TaskError::Interrupted(error.to_string()),
+        },
+        _ => TaskError::User(error.to_string()),
+    }
+}

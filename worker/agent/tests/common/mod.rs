@@ -1,0 +1,399 @@
+//! A coordinator that says exactly what a test tells it to say, over real gRPC on a loopback port; and an
+//! executor that does what a test tells it to do.
+#![allow(dead_code, reason = "each test binary uses its own part")]
+
+use std::{net::SocketAddr, sync::Arc, time::Duration};
+
+use picofarm_agent::{
+    AgentConfig, AgentError, Control, Executor, Output, Summary, Task, TaskError,
+};
+use picofarm_proto::{
+    ids::{Epoch, JobId, LeaseRef, RangeId},
+    model::{
+        Budget, JobSpec, Lease, Limits, OutputSettings, RenderSettings, SceneKind, SceneSource,
+    },
+    wire::{
+        self, SessionRequest, SessionResponse,
+        farm_server::{Farm, FarmServer},
+        session_request::Message as Said,
+        session_response::Message as Answer,
+    },
+};
+use tokio::{net::TcpListener, sync::mpsc, task::JoinHandle};
+use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status, Streaming, transport::Server};
+use uuid::Uuid;
+
+/// No wait in these tests comes near this; it only keeps a broken test from hanging.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Waits for `what`, but not for ever.
+pub async fn soon<T>(what: &str, future: impl Future<Output = T>) -> T {
+    match tokio::time::timeout(PATIENCE, future).await {
+        Ok(value) => value,
+        Err(_) => panic!("{what}: nothing came within {PATIENCE:?}"),
+    }
+}
+
+/// Waits until `holds` is true.
+pub async fn until(what: &str, holds: impl Fn() -> bool) {
+    soon(what, async {
+        while !holds() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+}
+
+struct Door(mpsc::UnboundedSender<Conversation>);
+
+#[tonic::async_trait]
+impl Farm for Door {
+    type SessionStream = ReceiverStream<Result<SessionResponse, Status>>;
+
+    async fn session(
+        &self,
+        request: Request<Streaming<SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let (to, from) = mpsc::channel(64);
+        let conversation = Conversation {
+            from_worker: request.into_inner(),
+            to_worker: to,
+            credit: 0,
+            fractions: Vec::new(),
+            released: Vec::new(),
+            held: Vec::new(),
+            renew: true,
+        };
+        let _ = self.0.send(conversation);
+        Ok(Response::new(ReceiverStream::new(from)))
+    }
+}
+
+/// The scripted coordinator.
+pub struct FakeFarm {
+    pub address: SocketAddr,
+    server: JoinHandle<()>,
+    sessions: mpsc::UnboundedReceiver<Conversation>,
+}
+
+impl FakeFarm {
+    pub async fn start() -> Self {
+        Self::start_at("127.0.0.1:0".parse().unwrap()).await
+    }
+
+    pub async fn start_at(address: SocketAddr) -> Self {
+        let listener = TcpListener::bind(address).await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let (sender, sessions) = mpsc::unbounded_channel();
+        let server = tokio::spawn(async move {
+            Server::builder()
+                .add_service(FarmServer::new(Door(sender)))
+                .serve_with_incoming(TcpListenerStream::new(listener))
+                .await
+                .unwrap();
+        });
+        Self {
+            address,
+            server,
+            sessions,
+        }
+    }
+
+    /// Stops listening. Open conversations end when they are dropped.
+    pub async fn stop(self) -> SocketAddr {
+        self.server.abort();
+        let _ = self.server.await;
+        self.address
+    }
+
+    /// The next session, its hello read and not answered.
+    pub async fn meet(&mut self) -> (Conversation, wire::Hello) {
+        let mut c = soon("a session", self.sessions.recv()).await.unwrap();
+        let hello = match soon("hello", c.from_worker.message()).await {
+            Ok(Some(SessionRequest {
+                message: Some(Said::Hello(hello)),
+            })) => hello,
+            other => panic!("expected a hello first, got {other:?}"),
+        };
+        (c, hello)
+    }
+
+    /// The next session, welcomed with heartbeats each 50 ms and leases of `lease_ms`.
+    pub async fn welcome(&mut self, lease_ms: u32) -> (Conversation, wire::Hello) {
+        let (c, hello) = self.meet().await;
+        c.say(Answer::Welcome(wire::Welcome {
+            coordinator_version: "fake".into(),
+            heartbeat_ms: 50,
+            lease_ms,
+        }))
+        .await;
+        (c, hello)
+    }
+}
+
+/// One session as the coordinator sees it.
+pub struct Conversation {
+    from_worker: Streaming<SessionRequest>,
+    to_worker: mpsc::Sender<Result<SessionResponse, Status>>,
+    /// Leases the worker asked for.
+    pub credit: u32,
+    /// Progress reported, in order.
+    pub fractions: Vec<f32>,
+    /// Leases that heartbeats are answered without.
+    pub released: Vec<wire::LeaseRef>,
+    /// Leases that the latest heartbeat named.
+    pub held: Vec<wire::LeaseRef>,
+    /// Whether heartbeats are answered at all.
+    pub renew: bool,
+}
+
+impl Conversation {
+    pub async fn say(&self, message: Answer) {
+        let _ = self
+            .to_worker
+            .send(Ok(SessionResponse {
+                message: Some(message),
+            }))
+            .await;
+    }
+
+    pub async fn refuse(&self, status: Status) {
+        let _ = self.to_worker.send(Err(status)).await;
+    }
+
+    /// The next message that is neither credit nor heartbeat; heartbeats are answered on the way. `None`
+    /// when the worker has closed the session.
+    pub async fn next(&mut self) -> Option<Said> {
+        soon("a message from the worker", async {
+            loop {
+                let message = self.from_worker.message().await.ok()??;
+                match message.message.expect("workers send no empty messages") {
+                    Said::Credit(c) => self.credit += c.leases,
+                    Said::Heartbeat(h) => self.answer(h).await,
+                    other => return Some(other),
+                }
+            }
+        })
+        .await
+    }
+
+    async fn answer(&mut self, heartbeat: wire::Heartbeat) {
+        self.fractions
+            .extend(heartbeat.progress.iter().map(|p| p.fraction));
+        self.held = heartbeat.leases.clone();
+        if self.renew {
+            let leases = heartbeat.leases.into_iter();
+            self.say(Answer::Renewed(wire::Renewed {
+                leases: leases.filter(|l| !self.released.contains(l)).collect(),
+                ttl_ms: 60_000,
+            }))
+            .await;
+        }
+    }
+
+    /// Reads on until `enough` holds, answering heartbeats; anything else is an error of the test.
+    pub async fn listen_until(&mut self, what: &str, enough: impl Fn(&Self) -> bool) {
+        soon(what, async {
+            while !enough(self) {
+                let message = self.from_worker.message().await.unwrap().expect(what);
+                match message.message.unwrap() {
+                    Said::Credit(c) => self.credit += c.leases,
+                    Said::Heartbeat(h) => self.answer(h).await,
+                    other => panic!("{what}: did not expect {other:?}"),
+                }
+            }
+        })
+        .await;
+    }
+
+    pub async fn grant(&self, lease: Lease) {
+        self.say(Answer::Lease(lease.into())).await;
+    }
+
+    pub async fn done(&mut self) -> wire::TaskDone {
+        match self.next().await {
+            Some(Said::Done(done)) => done,
+            other => panic!("expected a finished task, got {other:?}"),
+        }
+    }
+
+    pub async fn failed(&mut self) -> wire::TaskFailed {
+        match self.next().await {
+            Some(Said::Failed(failed)) => failed,
+            other => panic!("expected a failed task, got {other:?}"),
+        }
+    }
+
+    pub async fn release(&mut self) -> wire::Release {
+        match self.next().await {
+            Some(Said::Release(release)) => release,
+            other => panic!("expected a release, got {other:?}"),
+        }
+    }
+
+    pub async fn acknowledge(&self, lease: Option<wire::LeaseRef>, index: u64) {
+        self.say(Answer::Acknowledge(wire::Acknowledge {
+            lease,
+            index,
+            accepted: true,
+            reason: String::new(),
+        }))
+        .await;
+    }
+}
+
+/// A small job of primitive scenes with results in `store`.
+pub fn spec(store: &str) -> JobSpec {
+    JobSpec {
+        name: "test".into(),
+        scenes: SceneSource {
+            kind: SceneKind::Primitive,
+            count: 100,
+            seed: 7,
+            fov_deg: 90.0,
+            spots: 1,
+        },
+        render: RenderSettings {
+            resolution: 16,
+            gate_start_m: 0.0,
+            bin_width_m: 0.5,
+            bins: 40,
+            budget: Budget::Samples(2),
+            max_bounces: 2,
+            renderer: picofarm_transient::RENDERER_VERSION.into(),
+        },
+        output: OutputSettings {
+            store: store.into(),
+            dataset: "tiny".into(),
+            profile: "sqrt-u16".into(),
+        },
+        limits: Limits::default(),
+    }
+}
+
+/// Tasks `lo..hi` of a job under `epoch`.
+pub fn lease(epoch: u64, lo: u64, hi: u64) -> Lease {
+    Lease {
+        lease: LeaseRef {
+            range: RangeId::from_uuid(Uuid::from_u128(0xA0 + u128::from(epoch))),
+            epoch: Epoch(epoch),
+        },
+        job: JobId::from_uuid(Uuid::from_u128(0x10B)),
+        lo,
+        hi,
+        skip: Vec::new(),
+        ttl_ms: 60_000,
+        spec: spec("/nowhere"),
+    }
+}
+
+type Work = dyn Fn(&Task, &Control) -> Result<Output, TaskError> + Send + Sync;
+
+/// Does what a test says and tells which tasks were started.
+pub struct FakeExecutor {
+    work: Box<Work>,
+    started: mpsc::UnboundedSender<u64>,
+}
+
+impl Executor for FakeExecutor {
+    fn renderer(&self) -> String {
+        "fake-1".into()
+    }
+
+    fn assets(&self) -> Vec<String> {
+        vec!["parametric-1".into()]
+    }
+
+    fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let _ = self.started.send(task.index);
+        (self.work)(task, control)
+    }
+}
+
+/// What an honest executor would say.
+pub fn output(task: &Task) -> Output {
+    Output {
+        manifest_sha256: task.key().to_string(),
+        bytes: 1000 + task.index,
+        adopted: false,
+    }
+}
+
+/// A worker under test.
+pub struct Worker {
+    pub started: mpsc::UnboundedReceiver<u64>,
+    pub shutdown: CancellationToken,
+    life: JoinHandle<Result<Summary, AgentError>>,
+}
+
+impl Worker {
+    pub fn start(
+        address: SocketAddr,
+        work: impl Fn(&Task, &Control) -> Result<Output, TaskError> + Send + Sync + 'static,
+    ) -> Self {
+        let (sender, started) = mpsc::unbounded_channel();
+        let executor = FakeExecutor {
+            work: Box::new(work),
+            started: sender,
+        };
+        let shutdown = CancellationToken::new();
+        let life = tokio::spawn(picofarm_agent::run_with(
+            config(address),
+            Arc::new(executor),
+            shutdown.clone(),
+        ));
+        Self {
+            started,
+            shutdown,
+            life,
+        }
+    }
+
+    /// Waits for its end.
+    pub async fn end(self) -> Result<Summary, AgentError> {
+        soon("the worker's end", self.life).await.unwrap()
+    }
+
+    pub async fn starts(&mut self) -> u64 {
+        soon("a task to start", self.started.recv()).await.unwrap()
+    }
+}
+
+/// One thread, one lease.
+pub fn config(address: SocketAddr) -> AgentConfig {
+    AgentConfig {
+        coordinator: format!("http://{address}"),
+        name: "tester".into(),
+        worker_id: None,
+        threads: 1,
+        asset_dirs: Vec::new(),
+        slots: 1,
+    }
+}
+
+/// Blocks an executor's task until the test opens the gate or the task is told to stop.
+#[derive(Clone)]
+pub struct Gate(pub CancellationToken);
+
+impl Gate {
+    pub fn new() -> Self {
+        Self(CancellationToken::new())
+    }
+
+    /// `Err` if told to stop first.
+    pub fn pass(&self, control: &Control) -> Result<(), TaskError> {
+        while !self.0.is_cancelled() {
+            if control.stopped() {
+                return Err(TaskError::Stopped);
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        Ok(())
+    }
+
+    pub fn open(&self) {
+        self.0.cancel();
+    }
+}

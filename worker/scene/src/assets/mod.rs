@@ -1,0 +1,202 @@
+//! Furniture: where models come from, what they are, and a cache that all threads share.
+
+mod parametric;
+mod small;
+mod storage;
+mod upholstery;
+
+use std::{
+    collections::BTreeMap,
+    path::PathBuf,
+    sync::{Arc, OnceLock},
+};
+
+use crate::{Mesh, SceneError, rng::Rng, trace::Model};
+
+/// Changes whenever a parametric model changes shape.
+const PARAMETRIC_VERSION: &str = "parametric-1";
+
+/// Where a model comes from.
+#[derive(Debug, Clone)]
+enum Recipe {
+    /// Our own builder and the variant's seed.
+    Built(fn(&mut Rng) -> Mesh, u64),
+}
+
+/// One piece of furniture of the library.
+#[derive(Debug)]
+pub(crate) struct Asset {
+    /// Name, for people.
+    pub(crate) name: String,
+    /// Category, a name of [`crate::LABELS`].
+    pub(crate) label: &'static str,
+    /// Height of its bottom over the floor where it hangs on a wall or from the ceiling, metres.
+    pub(crate) elevation: f32,
+    /// Creator and licence, where they must be named.
+    pub(crate) attribution: Option<String>,
+    /// Width (x), height (y) and depth (z) in metres, where the catalogue states them.
+    pub(crate) size: Option<[f32; 3]>,
+    recipe: Recipe,
+    model: OnceLock<Option<Arc<Model>>>,
+}
+
+/// A named set of furniture. Models are loaded when first used and then shared.
+#[derive(Debug)]
+pub struct AssetLibrary {
+    name: &'static str,
+    fingerprint: String,
+    assets: Vec<Asset>,
+    by_label: BTreeMap<&'static str, Vec<usize>>,
+}
+
+impl AssetLibrary {
+    /// Our own furniture of boxes, cylinders and lathes: needs no files.
+    pub fn parametric() -> Self {
+        let mut assets = Vec::new();
+        for (label, variants, build) in parametric::catalogue() {
+            for k in 0..variants {
+                let seed = (assets.len() as u64) << 8;
+                assets.push(Asset {
+                    name: format!("{label} {k}"),
+                    label,
+                    elevation: 0.0,
+                    attribution: None,
+                    size: None,
+                    recipe: Recipe::Built(build, seed),
+                    model: OnceLock::new(),
+                });
+            }
+        }
+        Self::new("parametric", PARAMETRIC_VERSION.to_owned(), assets)
+    }
+
+    /// The library called `name` (`parametric` or `sweethome3d`); files are looked for in `dirs`.
+    ///
+    /// # Errors
+    /// [`SceneError::Assets`] if its files are in none of the folders, [`SceneError::Invalid`] for a
+    /// name that no library has.
+    pub fn find(name: &str, dirs: &[PathBuf]) -> Result<Self, SceneError> {
+        let _ = dirs;
+        match name {
+            "parametric" => Ok(Self::parametric()),
+            other => Err(SceneError::Invalid {
+                scene: "assets".into(),
+                field: "assets".into(),
+                what: format!("{other:?} is not known; use \"parametric\" or \"sweethome3d\""),
+            }),
+        }
+    }
+
+    fn new(name: &'static str, fingerprint: String, assets: Vec<Asset>) -> Self {
+        let mut by_label: BTreeMap<_, Vec<usize>> = BTreeMap::new();
+        for (k, asset) in assets.iter().enumerate() {
+            by_label.entry(asset.label).or_default().push(k);
+        }
+        Self {
+            name,
+            fingerprint,
+            assets,
+            by_label,
+        }
+    }
+
+    /// Name by which jobs ask for this library.
+    pub fn name(&self) -> &str {
+        self.name
+    }
+
+    /// Names the exact set of assets; part of what decides a generated scene.
+    pub fn fingerprint(&self) -> &str {
+        &self.fingerprint
+    }
+
+    /// Number of models.
+    pub fn len(&self) -> usize {
+        self.assets.len()
+    }
+
+    /// True without any model.
+    pub fn is_empty(&self) -> bool {
+        self.assets.is_empty()
+    }
+
+    /// A random asset of a category that `fits` by its (width, height, depth) and elevation, with its
+    /// model; `None` if the category has none or a few draws do not fit.
+    pub(crate) fn draw(
+        &self,
+        rng: &mut Rng,
+        label: &str,
+        fits: impl Fn([f32; 3], f32) -> bool,
+    ) -> Option<(&Asset, Arc<Model>)> {
+        let candidates = self.by_label.get(label)?;
+        for _ in 0..12 {
+            let asset = &self.assets[*rng.pick(candidates)];
+            // The catalogue's size saves loading models that do not fit anyway.
+            if asset.size.is_some_and(|size| !fits(size, asset.elevation)) {
+                continue;
+            }
+            if let Some(model) = asset.model()
+                && fits(model.size(), asset.elevation)
+            {
+                return Some((asset, model));
+            }
+        }
+        None
+    }
+}
+
+impl Asset {
+    /// The model, loaded once; `None` if it cannot be used (unreadable, empty or too many triangles).
+    fn model(&self) -> Option<Arc<Model>> {
+        self.model
+            .get_or_init(|| {
+                let mesh = match &self.recipe {
+                    Recipe::Built(build, seed) => build(&mut Rng::new(*seed, 0)),
+                };
+                Model::new(standing(mesh)).map(Arc::new)
+            })
+            .clone()
+    }
+}
+
+/// The mesh moved so that its box stands on y = 0, centred on the vertical axis.
+fn standing(mut mesh: Mesh) -> Mesh {
+    if let Some((lo, hi)) = mesh.bounds() {
+        let mut offset = (lo + hi) * 0.5;
+        offset.y = lo.y;
+        for p in &mut mesh.positions {
+            *p = *p - offset;
+        }
+    }
+    mesh
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::LABELS;
+
+    #[test]
+    fn every_parametric_model_stands_on_the_floor_and_has_a_plausible_size() {
+        let library = AssetLibrary::parametric();
+        for asset in &library.assets {
+            let model = asset
+                .model()
+                .unwrap_or_else(|| panic!("{} is empty", asset.name));
+            let [w, h, d] = model.size();
+            assert!(LABELS.contains(&asset.label), "{}", asset.label);
+            assert!(
+                w.min(d) > 0.004 && w.max(d) < 2.6 && h > 0.004 && h < 2.3,
+                "{}: {w} {h} {d}",
+                asset.name
+            );
+            assert!(
+                model.lo.y.abs() < 1e-6 && (model.lo.x + model.hi.x).abs() < 1e-5,
+                "{}",
+                asset.name
+            );
+            assert!(model.mesh.triangles.len() < 6000, "{}", asset.name);
+            assert!(model.mesh.triangle_material.is_sorted());
+        }
+    }
+}

@@ -1,0 +1,91 @@
+//! Choosing the camera: random places near the walls, rejected until the view is acceptable.
+
+use crate::{
+    Camera, Intrinsics, Laser, LaserGrid, Vec3,
+    rng::Rng,
+    view::{beams_land, coarse_view, full_view, is_specular},
+};
+
+use super::{FurnishedSettings, plan::Plan};
+
+/// Cameras tried for one room.
+const CAMERAS: u32 = 160;
+/// Pieces of furniture that the camera must see.
+const MIN_SEEN: usize = 5;
+/// Coarse pixels (of 576) that count as seeing something.
+const SEEN_PIXELS: u32 = 2;
+/// Coarse pixels that count as seeing a near-mirror.
+const MIRROR_PIXELS: u32 = 5;
+/// The camera keeps this distance from every box, metres.
+const CLEARANCE: f32 = 0.12;
+
+/// An accepted camera with its laser.
+#[derive(Debug)]
+pub(super) struct View {
+    pub(super) camera: Camera,
+    pub(super) laser: Laser,
+    /// Smallest and largest z-depth, metres.
+    pub(super) depth: [f32; 2],
+}
+
+/// The first acceptable camera, if there is one among the first [`CAMERAS`].
+pub(super) fn choose(
+    rng: &mut Rng,
+    settings: &FurnishedSettings,
+    grid: LaserGrid,
+    plan: &Plan<'_>,
+) -> Option<View> {
+    let (world, objects) = (plan.world(), plan.objects());
+    let intrinsics = Intrinsics::from_fov(settings.fov_deg, settings.width, settings.height);
+    for _ in 0..CAMERAS {
+        let gap = rng.range(0.0, 0.35);
+        let (at, _) = plan
+            .room
+            .against_wall(rng.below(4), rng.range(-1.0, 1.0), [0.15; 2], gap);
+        let eye = Vec3::new(at[0], rng.range(1.0, 1.8), at[1]);
+        let target = Vec3::new(
+            rng.range(-0.25, 0.25) * plan.room.width,
+            rng.range(0.5, 1.1),
+            rng.range(-0.25, 0.25) * plan.room.depth,
+        );
+        let blocked = |foot: &crate::layout::Footprint| foot.contains(eye, CLEARANCE);
+        if plan
+            .placed
+            .iter()
+            .filter_map(|p| p.foot.as_ref())
+            .any(blocked)
+        {
+            continue;
+        }
+        let camera = Camera::look_at(eye, target, intrinsics);
+        let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
+            continue;
+        };
+        let furniture = plan
+            .placed
+            .iter()
+            .zip(&seen)
+            .filter(|(p, pixels)| p.foot.is_some() && **pixels >= SEEN_PIXELS)
+            .count();
+        let specular = objects
+            .iter()
+            .zip(&seen)
+            .filter(|(o, pixels)| **pixels >= MIRROR_PIXELS && is_specular(o))
+            .count();
+        if furniture < MIN_SEEN || specular < settings.specular_at_least as usize {
+            continue;
+        }
+        let laser = grid.laser(&camera);
+        if !beams_land(&world, &laser, &objects) {
+            continue;
+        }
+        if let Some(depth) = full_view(&world, &camera) {
+            return Some(View {
+                camera,
+                laser,
+                depth,
+            });
+        }
+    }
+    None
+}

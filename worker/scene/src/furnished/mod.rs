@@ -1,0 +1,212 @@
+//! Furnished rooms: a room type, furniture that stands as people place it, small things on tops, pictures
+//! and mirrors on the walls, and a camera that sees enough of it at bounded depth.
+
+mod camera;
+mod decor;
+mod furniture;
+mod plan;
+mod tops;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    AssetLibrary, LaserGrid, Material, Object, Provenance, Scene, SceneError, label::vocabulary,
+    layout::Room, rng::Rng,
+};
+use plan::Plan;
+
+/// Changes whenever the same seed and assets would give another scene.
+pub const GENERATOR_VERSION: &str = "furnished-1";
+
+/// Rooms tried for one seed before giving up.
+const ATTEMPTS: u32 = 64;
+
+/// What a furnished room is made for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FurnishedSettings {
+    /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
+    pub spots: u32,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Horizontal field of view, degrees.
+    pub fov_deg: f32,
+    /// Name of the furniture library ([`AssetLibrary::find`]).
+    pub assets: String,
+    /// Specular objects that the camera must see, 0 to 4.
+    pub specular_at_least: u32,
+}
+
+impl Default for FurnishedSettings {
+    fn default() -> Self {
+        Self {
+            spots: 25,
+            width: 256,
+            height: 256,
+            fov_deg: 90.0,
+            assets: "parametric".into(),
+            specular_at_least: 0,
+        }
+    }
+}
+
+/// What kind of room it is: decides the furniture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum RoomType {
+    Living,
+    Bedroom,
+    Office,
+    Kitchen,
+}
+
+impl RoomType {
+    const ALL: [Self; 4] = [Self::Living, Self::Bedroom, Self::Office, Self::Kitchen];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Living => "living room",
+            Self::Bedroom => "bedroom",
+            Self::Office => "office",
+            Self::Kitchen => "kitchen",
+        }
+    }
+}
+
+/// The furnished room of `seed`: the same scene, bit for bit, on every machine with the same assets.
+///
+/// # Errors
+/// [`SceneError::Invalid`] for settings out of range, [`SceneError::Assets`] if `assets` is not the
+/// library that the settings name, [`SceneError::Exhausted`] if no sub-seed gives an acceptable view.
+pub fn generate(
+    seed: u64,
+    settings: &FurnishedSettings,
+    assets: &AssetLibrary,
+) -> Result<Scene, SceneError> {
+    let grid = settings.check(assets)?;
+    for attempt in 0..ATTEMPTS {
+        let mut rng = Rng::new(seed, u64::from(attempt));
+        let (plan, kind) = furnish(&mut rng, settings, assets);
+        if let Some(view) = camera::choose(&mut rng, settings, grid, &plan) {
+            let scene = finish(seed, attempt, kind, plan, view, assets);
+            tracing::debug!(
+                seed,
+                attempt,
+                objects = scene.objects.len(),
+                "furnished room accepted"
+            );
+            return Ok(scene);
+        }
+    }
+    Err(SceneError::Exhausted {
+        generator: GENERATOR_VERSION.into(),
+        seed,
+        attempts: ATTEMPTS,
+    })
+}
+
+impl FurnishedSettings {
+    fn check(&self, assets: &AssetLibrary) -> Result<LaserGrid, SceneError> {
+        if self.assets != assets.name() {
+            return Err(SceneError::Assets {
+                name: self.assets.clone(),
+                looked: format!("the library at hand is {:?}", assets.name()),
+            });
+        }
+        let specular = if self.specular_at_least > 4 {
+            Err((
+                "specular_at_least",
+                format!("{}: choose 0 to 4", self.specular_at_least),
+            ))
+        } else {
+            Ok(())
+        };
+        specular
+            .and_then(|()| crate::camera::check_view(self.width, self.height, self.fov_deg))
+            .and_then(|()| crate::laser::check_spots(self.spots))
+            .map_err(|(field, what)| SceneError::Invalid {
+                scene: GENERATOR_VERSION.into(),
+                field: field.into(),
+                what,
+            })
+    }
+}
+
+fn furnish<'a>(
+    rng: &mut Rng,
+    settings: &FurnishedSettings,
+    assets: &'a AssetLibrary,
+) -> (Plan<'a>, RoomType) {
+    let kind = *rng.pick(&RoomType::ALL);
+    let room = Room {
+        width: rng.range(2.9, 4.2),
+        depth: rng.range(2.9, 4.2),
+        height: rng.range(2.3, 2.8),
+    };
+    let mut plan = Plan::new(room, assets);
+    let (floor, ceiling, wall) = (
+        surface(rng, "floor", 0.3, 0.75),
+        surface(rng, "ceiling", 0.75, 0.9),
+        surface(rng, "wall", 0.45, 0.9),
+    );
+    for (label, mesh) in room.shell(floor, ceiling, wall) {
+        plan.fix(mesh, label);
+    }
+    decor::openings(rng, &mut plan);
+    furniture::anchors(rng, &mut plan, kind);
+    furniture::groups(rng, &mut plan, kind);
+    furniture::clutter(rng, &mut plan);
+    decor::pictures_and_mirrors(rng, &mut plan, settings.specular_at_least);
+    tops::drop_things(rng, &mut plan, kind);
+    (plan, kind)
+}
+
+/// Paint or boards of a random tone.
+fn surface(rng: &mut Rng, name: &str, lo: f32, hi: f32) -> Material {
+    let level = rng.range(lo, hi);
+    let rgb = [
+        rng.range(0.92, 1.0),
+        rng.range(0.88, 1.0),
+        rng.range(0.8, 1.0),
+    ];
+    Material::diffuse(name, rgb.map(|c| c * level))
+}
+
+fn finish(
+    seed: u64,
+    attempt: u32,
+    kind: RoomType,
+    plan: Plan<'_>,
+    view: camera::View,
+    assets: &AssetLibrary,
+) -> Scene {
+    let attribution: BTreeSet<String> = plan
+        .placed
+        .iter()
+        .filter_map(|p| p.attribution.clone())
+        .collect();
+    let [near, far] = view.depth;
+    let notes = BTreeMap::from([
+        ("assets".to_owned(), assets.fingerprint().to_owned()),
+        ("attempt".to_owned(), attempt.to_string()),
+        ("depth_m".to_owned(), format!("{near:.3}..{far:.3}")),
+        ("room_m".to_owned(), plan.room.describe()),
+        ("room_type".to_owned(), kind.name().to_owned()),
+    ]);
+    let objects: Vec<Object> = plan.objects();
+    Scene {
+        name: format!("furnished-{seed}"),
+        objects,
+        labels: vocabulary(),
+        camera: view.camera,
+        laser: view.laser,
+        provenance: Provenance {
+            source: GENERATOR_VERSION.into(),
+            seed: Some(seed),
+            attribution: attribution.into_iter().collect(),
+            notes,
+        },
+    }
+}

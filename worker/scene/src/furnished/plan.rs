@@ -1,0 +1,170 @@
+//! A room being furnished: what stands where, and whether there is space for more.
+
+use std::sync::Arc;
+
+use crate::{
+    Affine, AssetLibrary, Mesh, Object,
+    assets::Asset,
+    label::label_id,
+    layout::{Footprint, Room},
+    trace::{Model, World},
+};
+
+/// Furniture stands this far above the floor or its support, so that no two surfaces coincide (metres).
+pub(super) const CONTACT_GAP: f32 = 5e-4;
+
+/// Something in the room.
+#[derive(Debug, Clone)]
+pub(super) struct Placed {
+    pub(super) model: Arc<Model>,
+    pub(super) label: &'static str,
+    pub(super) name: String,
+    /// Bottom centre of the model's box.
+    pub(super) at: [f32; 3],
+    pub(super) yaw: f32,
+    /// The box that nothing else may enter; `None` for the room itself and for rugs.
+    pub(super) foot: Option<Footprint>,
+    /// What it stands on, if not the floor.
+    pub(super) support: Option<usize>,
+    pub(super) attribution: Option<String>,
+}
+
+/// A room and everything in it so far.
+#[derive(Debug)]
+pub(super) struct Plan<'a> {
+    pub(super) room: Room,
+    pub(super) assets: &'a AssetLibrary,
+    pub(super) placed: Vec<Placed>,
+    /// Space kept free: in front of the door.
+    pub(super) reserved: Vec<Footprint>,
+}
+
+/// Half of a model's extents on the plan.
+pub(super) fn half_of(model: &Model) -> [f32; 2] {
+    let [w, _, d] = model.size();
+    [w * 0.5, d * 0.5]
+}
+
+impl<'a> Plan<'a> {
+    pub(super) fn new(room: Room, assets: &'a AssetLibrary) -> Self {
+        Self {
+            room,
+            assets,
+            placed: Vec::new(),
+            reserved: Vec::new(),
+        }
+    }
+
+    /// Adds a part of the room itself, in world coordinates.
+    pub(super) fn fix(&mut self, mesh: Mesh, label: &'static str) {
+        let model = Model::new(mesh).expect("parts of the room have triangles");
+        self.push(Placed {
+            model: Arc::new(model),
+            label,
+            name: label.to_owned(),
+            at: [0.0; 3],
+            yaw: 0.0,
+            foot: None,
+            support: None,
+            attribution: None,
+        });
+    }
+
+    /// Adds `model` if its box is inside the room and free; `support` is what it stands on.
+    pub(super) fn try_place(
+        &mut self,
+        (name, model): (&str, &Arc<Model>),
+        label: &'static str,
+        at: [f32; 3],
+        yaw: f32,
+        support: Option<usize>,
+    ) -> bool {
+        let foot = Footprint::new(at, yaw, half_of(model), model.size()[1]);
+        if !self.is_free(&foot, support) {
+            return false;
+        }
+        self.push(Placed {
+            model: model.clone(),
+            label,
+            name: name.to_owned(),
+            at,
+            yaw,
+            foot: Some(foot),
+            support,
+            attribution: None,
+        });
+        true
+    }
+
+    /// As [`Plan::try_place`], for an asset whose creator must be named.
+    pub(super) fn try_place_asset(
+        &mut self,
+        (asset, model): (&Asset, &Arc<Model>),
+        at: [f32; 3],
+        yaw: f32,
+        support: Option<usize>,
+    ) -> bool {
+        let placed = self.try_place((&asset.name, model), asset.label, at, yaw, support);
+        if let (true, Some(last)) = (placed, self.placed.last_mut()) {
+            last.attribution.clone_from(&asset.attribution);
+        }
+        placed
+    }
+
+    /// Adds something flat that furniture may stand on.
+    pub(super) fn lay(&mut self, (asset, model): (&Asset, &Arc<Model>), at: [f32; 3], yaw: f32) {
+        self.push(Placed {
+            model: model.clone(),
+            label: asset.label,
+            name: asset.name.clone(),
+            at,
+            yaw,
+            foot: None,
+            support: None,
+            attribution: asset.attribution.clone(),
+        });
+    }
+
+    fn push(&mut self, placed: Placed) {
+        self.placed.push(placed);
+    }
+
+    /// True if the box is inside the room and meets nothing but what it stands on.
+    pub(super) fn is_free(&self, foot: &Footprint, support: Option<usize>) -> bool {
+        let taken = self.placed.iter().enumerate().any(|(k, p)| {
+            Some(k) != support && p.foot.as_ref().is_some_and(|other| other.overlaps(foot))
+        });
+        self.room.holds(foot) && !taken && !self.reserved.iter().any(|r| r.overlaps(foot))
+    }
+
+    /// Everything placed, ready for rays; indices are those of `placed`.
+    pub(super) fn world(&self) -> World {
+        let mut world = World::default();
+        for p in &self.placed {
+            world.add(p.model.clone(), p.to_world());
+        }
+        world
+    }
+
+    /// Everything placed, as a scene holds it.
+    pub(super) fn objects(&self) -> Vec<Object> {
+        self.placed
+            .iter()
+            .map(|p| Object {
+                mesh: p.model.mesh.clone(),
+                to_world: p.to_world(),
+                label: label_id(p.label),
+                name: p.name.clone(),
+            })
+            .collect()
+    }
+}
+
+impl Placed {
+    pub(super) fn to_world(&self) -> Affine {
+        if self.yaw == 0.0 && self.at == [0.0; 3] {
+            return Affine::IDENTITY;
+        }
+        Affine::yaw_then_move(self.yaw, self.at.into())
+    }
+}

@@ -1,0 +1,80 @@
+//! Eight floats side by side: what the traversal needs of them, and the portable version.
+
+/// Eight f32 lanes. Comparisons give a bit mask, lane 0 lowest. `min` and `max` follow the machine's
+/// rule: the second operand where either is NaN.
+pub(super) trait Lanes: Copy {
+    fn splat(x: f32) -> Self;
+    fn load(a: &[f32; 8]) -> Self;
+    fn store(self) -> [f32; 8];
+    fn add(self, o: Self) -> Self;
+    fn sub(self, o: Self) -> Self;
+    fn mul(self, o: Self) -> Self;
+    fn div(self, o: Self) -> Self;
+    fn min(self, o: Self) -> Self;
+    fn max(self, o: Self) -> Self;
+    fn le(self, o: Self) -> u32;
+    fn gt(self, o: Self) -> u32;
+    /// Not equal and neither NaN.
+    fn differs(self, o: Self) -> u32;
+}
+
+#[inline(always)]
+fn zip(a: [f32; 8], b: [f32; 8], f: impl Fn(f32, f32) -> f32) -> [f32; 8] {
+    std::array::from_fn(|i| f(a[i], b[i]))
+}
+
+#[inline(always)]
+fn mask(a: [f32; 8], b: [f32; 8], f: impl Fn(f32, f32) -> bool) -> u32 {
+    (0..8).fold(0, |m, i| m | (u32::from(f(a[i], b[i])) << i))
+}
+
+impl Lanes for [f32; 8] {
+    #[inline(always)]
+    fn splat(x: f32) -> Self {
+        [x; 8]
+    }
+    #[inline(always)]
+    fn load(a: &[f32; 8]) -> Self {
+        *a
+    }
+    #[inline(always)]
+    fn store(self) -> [f32; 8] {
+        self
+    }
+    #[inline(always)]
+    fn add(self, o: Self) -> Self {
+        zip(self, o, |a, b| a + b)
+    }
+    #[inline(always)]
+    fn sub(self, o: Self) -> Self {
+        zip(self, o, |a, b| a - b)
+    }
+    #[inline(always)]
+    fn mul(self, o: Self) -> Self {
+        zip(self, o, |a, b| a * b)
+    }
+    #[inline(always)]
+    fn div(self, o: Self) -> Self {
+        zip(self, o, |a, b| a / b)
+    }
+    #[inline(always)]
+    fn min(self, o: Self) -> Self {
+        zip(self, o, |a, b| if a < b { a } else { b })
+    }
+    #[inline(always)]
+    fn max(self, o: Self) -> Self {
+        zip(self, o, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    fn le(self, o: Self) -> u32 {
+        mask(self, o, |a, b| a <= b)
+    }
+    #[inline(always)]
+    fn gt(self, o: Self) -> u32 {
+        mask(self, o, |a, b| a > b)
+    }
+    #[inline(always)]
+    fn differs(self, o: Self) -> u32 {
+        mask(self, o, |a, b| a < b || a > b)
+    }
+}

@@ -1,0 +1,174 @@
+//! The traversal, written once over [`Lanes`].
+
+use picofarm_scene::Vec3;
+
+use super::{Bvh, EMPTY, LEAF, lanes::Lanes};
+
+/// Nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit`: (t, triangle), triangle
+/// [`EMPTY`] for a miss. The caller has checked that ray and tree are usable and `stack` deep enough.
+#[inline(always)]
+pub(super) fn traverse<L: Lanes, const ANY: bool>(
+    bvh: &Bvh,
+    stack: &mut [(u32, f32)],
+    o: Vec3,
+    d: Vec3,
+    limit: f32,
+) -> (f32, u32) {
+    // 1/0 would make 0·∞ = NaN in the slab test; a huge finite slope does the same work.
+    let inverse = |x: f32| {
+        1.0 / if x.abs() < 1e-18 {
+            1e-18f32.copysign(x)
+        } else {
+            x
+        }
+    };
+    let iv = [
+        L::splat(inverse(d.x)),
+        L::splat(inverse(d.y)),
+        L::splat(inverse(d.z)),
+    ];
+    let ov = [L::splat(o.x), L::splat(o.y), L::splat(o.z)];
+    let sign = |x: f32| usize::from(x.is_sign_negative()) * 3;
+    let near = [sign(d.x), 1 + sign(d.y), 2 + sign(d.z)];
+    let far = [3 - sign(d.x), 4 - sign(d.y), 5 - sign(d.z)];
+    let zero = L::splat(0.0);
+    // A few ulp of slack on the far plane make the slab test watertight (Ize, JCGT 2013).
+    let slack = L::splat(1.0 + 4.0 * f32::EPSILON);
+
+    // Shear of Woop et al.: the ray's largest axis becomes z.
+    let (ax, ay, az) = (d.x.abs(), d.y.abs(), d.z.abs());
+    let kz = if az >= ax && az >= ay {
+        2
+    } else if ay >= ax {
+        1
+    } else {
+        0
+    };
+    let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
+    if d[kz] < 0.0 {
+        std::mem::swap(&mut kx, &mut ky);
+    }
+    let (sx, sy, sz) = (
+        L::splat(d[kx] / d[kz]),
+        L::splat(d[ky] / d[kz]),
+        L::splat(1.0 / d[kz]),
+    );
+
+    let (mut best, mut id) = (limit, EMPTY);
+    let mut depth = 0;
+    let mut current = 0u32;
+    'walk: loop {
+        while current & LEAF == 0 {
+            let node = &bvh.nodes[current as usize];
+            let plane = |k: usize, a: usize| L::load(&node.bounds[k]).sub(ov[a]).mul(iv[a]);
+            let t0 = plane(near[0], 0)
+                .max(plane(near[1], 1))
+                .max(plane(near[2], 2).max(zero));
+            let t1 = plane(far[0], 0)
+                .min(plane(far[1], 1))
+                .min(plane(far[2], 2))
+                .mul(slack)
+                .min(L::splat(best));
+            let mut mask = t0.le(t1);
+            if mask == 0 {
+                break;
+            }
+            let mut next = || {
+                let i = mask.trailing_zeros() as usize & 7;
+                mask &= mask - 1;
+                (i, mask)
+            };
+            let (i, rest) = next();
+            if rest == 0 {
+                current = node.child[i];
+                continue;
+            }
+            let t = t0.store();
+            let (j, mut rest) = next();
+            let (first, second) = ((node.child[i], t[i]), (node.child[j], t[j]));
+            if rest == 0 {
+                let (go, keep) = if first.1 <= second.1 {
+                    (first, second)
+                } else {
+                    (second, first)
+                };
+                stack[depth] = keep;
+                depth += 1;
+                current = go.0;
+                continue;
+            }
+            let base = depth;
+            stack[depth] = first;
+            stack[depth + 1] = second;
+            depth += 2;
+            while rest != 0 {
+                let k;
+                (k, rest) = next();
+                stack[depth] = (node.child[k], t[k]);
+                depth += 1;
+            }
+            if !ANY {
+                // Insertion sort, farthest first.
+                for a in base + 1..depth {
+                    let x = stack[a];
+                    let mut q = a;
+                    while q > base && stack[q - 1].1 < x.1 {
+                        stack[q] = stack[q - 1];
+                        q -= 1;
+                    }
+                    stack[q] = x;
+                }
+            }
+            depth -= 1;
+            current = stack[depth].0;
+        }
+        if current & LEAF != 0 {
+            let first = (current & 0x07ff_ffff) as usize;
+            let count = ((current >> 27) & 15) as usize;
+            for pack in &bvh.packs[first..first + count] {
+                let at = |v: usize, k: usize| L::load(&pack.vertex[3 * v + k]).sub(ov[k]);
+                let (az, bz, cz) = (at(0, kz), at(1, kz), at(2, kz));
+                let (ax, ay) = (at(0, kx).sub(sx.mul(az)), at(0, ky).sub(sy.mul(az)));
+                let (bx, by) = (at(1, kx).sub(sx.mul(bz)), at(1, ky).sub(sy.mul(bz)));
+                let (cx, cy) = (at(2, kx).sub(sx.mul(cz)), at(2, ky).sub(sy.mul(cz)));
+                let u = cx.mul(by).sub(cy.mul(bx));
+                let v = ax.mul(cy).sub(ay.mul(cx));
+                let w = bx.mul(ay).sub(by.mul(ax));
+                let (low, high) = (u.min(v).min(w), u.max(v).max(w));
+                let inside = zero.le(low) | high.le(zero);
+                if inside == 0 {
+                    continue;
+                }
+                let det = u.add(v).add(w);
+                let t = sz.mul(u.mul(az).add(v.mul(bz)).add(w.mul(cz))).div(det);
+                let mut hits = inside & det.differs(zero) & t.gt(zero) & t.le(L::splat(best));
+                if hits == 0 {
+                    continue;
+                }
+                if ANY {
+                    return (0.0, 0);
+                }
+                let t = t.store();
+                while hits != 0 {
+                    let k = hits.trailing_zeros() as usize & 7;
+                    hits &= hits - 1;
+                    if t[k] < best || (t[k] == best && pack.id[k] < id) {
+                        best = t[k];
+                        id = pack.id[k];
+                    }
+                }
+            }
+        }
+        loop {
+            if depth == 0 {
+                break 'walk;
+            }
+            depth -= 1;
+            if stack[depth].1 <= best {
+                current = stack[depth].0;
+                break;
+            }
+        }
+    }
+    (best, id)
+}

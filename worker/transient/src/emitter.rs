@@ -1,0 +1,249 @@
+//! Illumination spots: tracing beams to them, and how they scatter light into the scene.
+
+use picofarm_scene::{Beam, Scene, Spot, Vec3};
+
+use crate::{
+    api::RenderError,
+    bsdf::Surface,
+    bvh::Stack,
+    world::{Hit, World, lift},
+};
+
+/// Mirrors a beam may meet before it is given up.
+const MAX_REFLECTIONS: u32 = 64;
+
+/// The spots of a scene's beams in their order; `None` where a beam meets nothing. A spot stated by the
+/// beam is taken as it is; otherwise the beam is followed, through mirrors (`Material::is_specular`) by
+/// exact reflection, to the first other surface.
+///
+/// # Errors
+/// [`RenderError::Scene`] where the scene is invalid.
+pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
+    scene.validate()?;
+    let world = World::new(scene);
+    Ok(find_spots(&world, &scene.laser.beams))
+}
+
+pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
+    let mut stack = world.bvh.stack();
+    beams
+        .iter()
+        .map(|b| b.spot.or_else(|| follow(world, &mut stack, b.direction)))
+        .collect()
+}
+
+fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
+    let (mut from, mut direction) = (world.laser, direction);
+    let mut path = 0.0;
+    for _ in 0..MAX_REFLECTIONS {
+        let hit = world.closest(stack, from, direction)?;
+        path += world.metres((hit.p - from).length());
+        if hit.surface.specular && hit.surface.strength > 0.0 {
+            let n = hit.n;
+            direction = (direction - n * (2.0 * n.dot(direction))).normalized();
+            from = lift(hit.p, n);
+            continue;
+        }
+        let t = hit.triangle as usize;
+        return Some(Spot {
+            point: world.outward(hit.p),
+            normal: hit.n,
+            arriving: direction,
+            path_m: path as f32,
+            object: world.object[t],
+            material: world.material[world.surface[t] as usize],
+        });
+    }
+    None
+}
+
+/// A spot as a point source: unit power arrives along the beam and leaves by the BRDF.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Emitter {
+    /// Index of the beam.
+    pub beam: usize,
+    /// Position, render units.
+    pub p: Vec3,
+    /// Normal on the lit side.
+    pub n: Vec3,
+    /// Unit direction back along the beam.
+    pub back: Vec3,
+    /// Optical path from the laser, metres.
+    pub path_m: f64,
+    /// Scattering on the lit side (black behind a one-sided surface).
+    pub surface: Surface,
+}
+
+impl Emitter {
+    fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, surface: Surface) -> Self {
+        let p = world.inward(spot.point);
+        // The spot does not say whether its side is the facet's front: look at the facet beneath it.
+        let beneath = world.closest(stack, lift(p, spot.normal), -spot.normal);
+        let dark = |h: &Hit| (h.p - p).length() < 1e-3 && h.surface.strength == 0.0;
+        let surface = match beneath {
+            Some(h) if !surface.two_sided && dark(&h) => surface.black(),
+            _ => surface,
+        };
+        Self {
+            beam,
+            p,
+            n: spot.normal,
+            back: -spot.arriving,
+            path_m: f64::from(spot.path_m),
+            surface,
+        }
+    }
+
+    /// Radiant intensity per unit power towards the unit direction `w`: f·cos.
+    #[inline]
+    pub fn intensity(&self, w: Vec3) -> f32 {
+        self.surface.scatter(self.n, self.back, w)
+    }
+}
+
+/// Point sources side by side, for loops over all of them.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Columns {
+    pub px: Vec<f32>,
+    pub py: Vec<f32>,
+    pub pz: Vec<f32>,
+    pub nx: Vec<f32>,
+    pub ny: Vec<f32>,
+    pub nz: Vec<f32>,
+    /// Lambertian strength ρ/π; 0 where the source is not Lambertian.
+    pub strength: Vec<f32>,
+}
+
+impl Columns {
+    pub fn push(&mut self, p: Vec3, n: Vec3, strength: f32) {
+        self.px.push(p.x);
+        self.py.push(p.y);
+        self.pz.push(p.z);
+        self.nx.push(n.x);
+        self.ny.push(n.y);
+        self.nz.push(n.z);
+        self.strength.push(strength);
+    }
+
+    /// Writes strength · cos_s · cos_x / d² for a receiver at `x` with normal `n`: irradiance per unit
+    /// power of each Lambertian source, unshadowed.
+    #[inline]
+    pub fn irradiance(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
+        let count = out.len();
+        let (px, py, pz) = (&self.px[..count], &self.py[..count], &self.pz[..count]);
+        let (nx, ny, nz) = (&self.nx[..count], &self.ny[..count], &self.nz[..count]);
+        let strength = &self.strength[..count];
+        for i in 0..count {
+            let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
+            let d2 = dx * dx + dy * dy + dz * dz;
+            let cx = n.x * dx + n.y * dy + n.z * dz;
+            let cs = -(nx[i] * dx + ny[i] * dy + nz[i] * dz);
+            let lit = cx > 0.0 && cs > 0.0;
+            let value = strength[i] * cx * cs / (d2 * d2);
+            out[i] = if lit { value } else { 0.0 };
+        }
+    }
+}
+
+/// All spots that exist, as sources.
+#[derive(Debug)]
+pub(crate) struct Emitters {
+    /// The sources.
+    pub list: Vec<Emitter>,
+    /// The Lambertian ones in columns.
+    pub columns: Columns,
+    /// Indices of the others.
+    pub glossy: Vec<usize>,
+    /// Indices of those on mirrors.
+    pub on_mirror: Vec<usize>,
+}
+
+impl Emitters {
+    pub fn new(scene: &Scene, world: &World, spots: &[Option<Spot>]) -> Result<Self, RenderError> {
+        let mut stack = world.bvh.stack();
+        let mut all = Self {
+            list: vec![],
+            columns: Columns::default(),
+            glossy: vec![],
+            on_mirror: vec![],
+        };
+        for (beam, spot) in spots.iter().enumerate() {
+            let Some(spot) = spot else { continue };
+            let material = scene
+                .objects
+                .get(spot.object as usize)
+                .and_then(|o| o.mesh.materials.get(spot.material as usize));
+            let Some(material) = material else {
+                return Err(RenderError::Invalid {
+                    field: format!("laser.beams[{beam}].spot"),
+                    what: format!(
+                        "names object {} and material {}, which the scene does not have; drop the spot to have the beam traced",
+                        spot.object, spot.material
+                    ),
+                });
+            };
+            let unit = |v: Vec3| v.is_finite() && (v.length() - 1.0).abs() < 1e-3;
+            if !(spot.point.is_finite() && unit(spot.normal) && unit(spot.arriving)) {
+                return Err(RenderError::Invalid {
+                    field: format!("laser.beams[{beam}].spot"),
+                    what: "needs a finite point and unit normal and arriving directions".into(),
+                });
+            }
+            let e = Emitter::new(world, &mut stack, beam, spot, Surface::new(material));
+            let index = all.list.len();
+            let strength = if e.surface.diffuse() {
+                e.surface.strength
+            } else {
+                0.0
+            };
+            // A beam that arrives from behind its own normal lights nothing.
+            let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
+            all.columns.push(e.p, e.n, strength);
+            if !e.surface.diffuse() {
+                all.glossy.push(index);
+                if e.surface.specular {
+                    all.on_mirror.push(index);
+                }
+            }
+            all.list.push(e);
+        }
+        Ok(all)
+    }
+
+    /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s cos_s
+    /// f_x cos_x / d². `wo` is the unit direction in which the point is seen.
+    #[inline]
+    pub fn weights(&self, x: Vec3, n: Vec3, wo: Vec3, surface: &Surface, out: &mut [f32]) {
+        if surface.diffuse() {
+            self.columns.irradiance(x, n, out);
+            for w in out.iter_mut() {
+                *w *= surface.strength;
+            }
+            for &i in &self.glossy {
+                out[i] = self.weight(i, x, n, wo, surface);
+            }
+        } else {
+            for (i, w) in out.iter_mut().enumerate() {
+                *w = self.weight(i, x, n, wo, surface);
+            }
+        }
+    }
+
+    /// The same for one source.
+    #[inline]
+    pub fn weight(&self, i: usize, x: Vec3, n: Vec3, wo: Vec3, surface: &Surface) -> f32 {
+        let e = &self.list[i];
+        let to = e.p - x;
+        let (cx, cs) = (n.dot(to), -e.n.dot(to));
+        if !(cx > 0.0 && cs > 0.0) {
+            return 0.0;
+        }
+        let d2 = to.dot(to);
+        let w = to / d2.sqrt();
+        let f = surface.scatter(n, wo, w);
+        if f == 0.0 {
+            return 0.0;
+        }
+        f * e.intensity(-w) / d2
+    }
+}

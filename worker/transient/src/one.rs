@@ -1,0 +1,55 @@
+//! Exactly one bounce: laser → spot → camera, a point of light in one pixel and one bin.
+
+use crate::{api::Gate, bvh::Stack, emitter::Emitters, film::Sparse, world::World};
+
+/// One spot seen directly.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Peak {
+    /// Row-major pixel.
+    pub pixel: usize,
+    /// Optical path, metres.
+    pub path_m: f64,
+    /// Radiance averaged over the pixel, 1/(m² sr).
+    pub value: f32,
+}
+
+/// The peaks of all spots that the camera sees. A spot of intensity I at distance d and angle θ from the
+/// optical axis gives I/(d² cos³θ) over the pixel's area on the film at unit distance.
+pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Vec<Peak> {
+    let c = &world.camera;
+    let i = &c.intrinsics;
+    let mut peaks = vec![];
+    for e in &emitters.list {
+        let q = c.direction_to_camera(e.p);
+        let d = e.p.length();
+        if !(q.z > 0.0 && d > 0.0) {
+            continue;
+        }
+        let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
+        let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
+        let intensity = e.intensity(-e.p / d);
+        if !inside || intensity == 0.0 || !world.seen(stack, e.p, e.n) {
+            continue;
+        }
+        let cos = f64::from(q.z) / f64::from(d);
+        let metres = world.metres(d);
+        let area = 1.0 / (f64::from(i.fx) * f64::from(i.fy));
+        let value = f64::from(intensity) / (metres * metres * cos * cos * cos * area);
+        peaks.push(Peak {
+            pixel: y as usize * i.width as usize + x as usize,
+            path_m: e.path_m + metres,
+            value: value as f32,
+        });
+    }
+    peaks
+}
+
+/// Adds the peaks to a histogram; what lies outside the gate goes to `outside`.
+pub(crate) fn add(peaks: &[Peak], gate: &Gate, transient: &mut [f32], outside: &mut Sparse) {
+    for p in peaks {
+        match gate.bin(p.path_m) {
+            Some(b) => transient[p.pixel * gate.bins as usize + b as usize] += p.value,
+            None => outside.add(gate, p.path_m, p.value),
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! The companion image: what a colour camera would see under a soft ceiling light. Not radiometry, but
+//! the right shapes, colours, shadows and reflections, from few rays.
+
+use picofarm_scene::Vec3;
+use rayon::prelude::*;
+
+use crate::{
+    bsdf::frame,
+    bvh::Stack,
+    rng::{Rng, Stream},
+    world::{World, lift},
+};
+
+/// Sub-pixel samples a side.
+const SIDE: u32 = 2;
+/// Mirrors followed.
+const REFLECTIONS: u32 = 2;
+
+/// A disc of light beneath the ceiling.
+struct Lamp {
+    centre: Vec3,
+    radius: f32,
+    /// Distance at which a surface facing the lamp gets full light.
+    reach: f32,
+}
+
+/// Linear RGB in [0, 1], `[row][col][3]`, and the rays traced.
+pub(crate) fn photo(world: &World, seed: u64) -> (Vec<f32>, u64) {
+    let i = world.camera.intrinsics;
+    let (width, height) = (i.width as usize, i.height as usize);
+    let mut rgb = vec![0.0f32; 3 * width * height];
+    let lamp = lamp(world);
+    let rays = rgb
+        .par_chunks_mut(3 * width)
+        .enumerate()
+        .map(|(row, out)| {
+            let mut stack = world.bvh.stack();
+            for (col, pixel) in out.chunks_mut(3).enumerate() {
+                let mut rng = Rng::new(seed, Stream::Photo, (row * width + col) as u64, 0);
+                let mut sum = [0.0f32; 3];
+                for s in 0..SIDE * SIDE {
+                    let (a, b) = ((s % SIDE) as f32 + 0.5, (s / SIDE) as f32 + 0.5);
+                    let (x, y) = (col as f32 + a / SIDE as f32, row as f32 + b / SIDE as f32);
+                    let d = world.camera.ray(x, y).normalized();
+                    let c = shade(world, &lamp, &mut stack, &mut rng, d);
+                    for k in 0..3 {
+                        sum[k] += c[k];
+                    }
+                }
+                for k in 0..3 {
+                    pixel[k] = (sum[k] / (SIDE * SIDE) as f32).clamp(0.0, 1.0);
+                }
+            }
+            stack.rays
+        })
+        .sum();
+    (rgb, rays)
+}
+
+/// Places the lamp over the space in front of the camera, below whatever is above it.
+fn lamp(world: &World) -> Lamp {
+    let mut stack = world.bvh.stack();
+    let up = -world.camera.down;
+    let ahead = world
+        .closest(&mut stack, Vec3::ZERO, world.camera.forward)
+        .map_or(2.0, |h| h.p.length());
+    let under = world.camera.forward * (0.4 * ahead);
+    let above = world
+        .closest(&mut stack, under, up)
+        .map_or(ahead, |h| (h.p - under).length());
+    let rise = (0.85 * above).min(ahead);
+    Lamp {
+        centre: under + up * rise,
+        radius: 0.08 * ahead,
+        reach: 0.45 * ahead + rise,
+    }
+}
+
+fn shade(world: &World, lamp: &Lamp, stack: &mut Stack, rng: &mut Rng, d: Vec3) -> [f32; 3] {
+    let (mut from, mut d, mut tint) = (Vec3::ZERO, d, [1.0f32; 3]);
+    for reflection in 0..=REFLECTIONS {
+        let Some(h) = world.closest(stack, from, d) else {
+            return tint.map(|t| 0.6 * t);
+        };
+        let albedo = world.rgb[world.surface[h.triangle as usize] as usize];
+        for k in 0..3 {
+            tint[k] *= albedo[k];
+        }
+        if h.surface.specular && reflection < REFLECTIONS {
+            d = (d - h.n * (2.0 * h.n.dot(d))).normalized();
+            from = lift(h.p, h.n);
+            continue;
+        }
+        let axis = (lamp.centre - h.p).normalized();
+        let (t, b) = frame(axis);
+        let (x, y, _) = rng.disc();
+        let light = lamp.centre + t * (x * lamp.radius) + b * (y * lamp.radius);
+        let to = light - h.p;
+        let cos = h.n.dot(to) / to.length();
+        let direct = if cos > 0.0 && world.free(stack, h.p, h.n, light, Vec3::ZERO) {
+            let near = lamp.reach * lamp.reach / (to.dot(to) + 0.25 * lamp.reach * lamp.reach);
+            0.8 * cos * near
+        } else {
+            0.0
+        };
+        // A sky-like fill light keeps shadows readable.
+        let fill = 0.22 + 0.08 * h.n.dot(-world.camera.down);
+        return tint.map(|t| t * (direct + fill));
+    }
+    [0.0; 3]
+}

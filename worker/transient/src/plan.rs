@@ -1,0 +1,62 @@
+//! What the renderer decides to do in a scene, in words, for the scene's metadata.
+
+use crate::{
+    api::{Plan, Settings},
+    emitter::Emitters,
+    lobe::Mirrors,
+    two::Sampling,
+};
+
+/// The plan that `render` follows.
+pub(crate) fn plan(
+    settings: &Settings,
+    emitters: &Emitters,
+    mirrors: &Mirrors,
+    sampling: &Sampling,
+    paths: u32,
+) -> Plan {
+    let (mut strategies, mut approximations) = (vec![], vec![]);
+    let longest = settings.max_bounces.unwrap_or(u32::MAX);
+    if settings.one_bounce {
+        strategies.push("one bounce: analytic".into());
+    }
+    if longest >= 2 {
+        let (side, fine) = sampling.sides(paths);
+        let refined = sampling.refined.iter().filter(|&&r| r).count();
+        strategies.push(format!(
+            "two bounces: {side}x{side} strata a pixel, every spot"
+        ));
+        if refined > 0 {
+            strategies.push(format!(
+                "two bounces: {fine}x{fine} strata in {refined} pixels with narrow lobes"
+            ));
+        }
+    }
+    if longest >= 3 {
+        strategies.push("three and more: camera paths, one spot a vertex by contribution".into());
+        let planes = mirrors.list.len();
+        if planes > 0 {
+            strategies.push(format!("image lobes: {planes} planar mirrors"));
+        }
+        let on_mirror = emitters.on_mirror.len();
+        if on_mirror > 0 {
+            strategies.push(format!("light vertices: {on_mirror} spots on mirrors"));
+        }
+        if mirrors.curved_share > 0.01 {
+            approximations.push(format!(
+                "light reflected by curved near-mirrors ({:.0} % of the mirror area) is unbiased but noisy",
+                100.0 * mirrors.curved_share
+            ));
+        }
+        if planes > 1 {
+            approximations.push(
+                "light that meets two near-mirrors in a row on its way from a spot is unbiased but noisy"
+                    .into(),
+            );
+        }
+    }
+    Plan {
+        strategies,
+        approximations,
+    }
+}

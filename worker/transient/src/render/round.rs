@@ -1,0 +1,404 @@
+//! One round over the image: every pixel gets its two-bounce samples and a number of camera paths, and
+//! is blended into what earlier rounds found. Work is handed out in runs of pixels of one row, which are
+//! contiguous in memory; a pixel's random numbers depend on the pixel and the round alone.
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+
+use crate::{
+    api::{Overflow, Progress, RenderError},
+    film::Pixel,
+    multi::Walk,
+    rng::{Rng, Stream},
+    two::{self, Sampling, Scratch},
+};
+
+/// Pixels handed out at a time.
+const RUN: usize = 32;
+/// Pixels and paths of the pilot that sizes [`crate::Budget::Error`].
+const PILOT_PIXELS: usize = 256;
+pub(super) const PILOT_PATHS: u32 = 32;
+
+/// Everything a round needs to know.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Frame<'a> {
+    pub walk: Walk<'a>,
+    pub sampling: &'a Sampling,
+    pub seed: u64,
+    pub width: u32,
+    pub height: u32,
+}
+
+/// A pixel's sums for the error estimate.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Stat {
+    /// Σ over bins of h².
+    pub norm2: f64,
+    /// Σ over bins of the two-bounce part's variance.
+    pub two_variance: f64,
+    /// Σ over bins of the 3+ part's variance.
+    pub multi_variance: f64,
+    /// Σ over bins of h.
+    pub total: f64,
+    /// Variance of that sum.
+    pub total_variance: f64,
+}
+
+/// The parts with their standard errors.
+#[derive(Debug)]
+pub(super) struct Parts {
+    pub two: Vec<f32>,
+    pub two_se: Vec<f32>,
+    pub multi: Vec<f32>,
+    pub multi_se: Vec<f32>,
+}
+
+/// What rounds fill.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    pub transient: Vec<f32>,
+    pub split: Option<Parts>,
+    pub stats: Vec<Stat>,
+    bins: usize,
+}
+
+impl Buffers {
+    pub fn new(pixels: usize, bins: usize, split: bool) -> Self {
+        let empty = || vec![0.0f32; pixels * bins];
+        Self {
+            transient: empty(),
+            split: split.then(|| Parts {
+                two: empty(),
+                two_se: empty(),
+                multi: empty(),
+                multi_se: empty(),
+            }),
+            stats: vec![Stat::default(); pixels],
+            bins,
+        }
+    }
+}
+
+/// The part of the buffers that one run writes.
+struct Run<'a> {
+    first: usize,
+    transient: &'a mut [f32],
+    split: Option<[&'a mut [f32]; 4]>,
+    stats: &'a mut [Stat],
+}
+
+/// What a round found besides the histograms.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Found {
+    outside: Overflow,
+    pub rays: u64,
+}
+
+impl Found {
+    /// Joins this round's overflow (of weight `wave`) to that of earlier ones (of weight `spent`).
+    pub fn blend(&self, earlier: &Overflow, spent: u32, wave: u32) -> Overflow {
+        let new = share(spent, wave);
+        Overflow {
+            count: earlier.count + self.outside.count,
+            energy: earlier.energy * (1.0 - new) + self.outside.energy * new,
+            share: 0.0,
+        }
+    }
+}
+
+/// Weight of a round of `wave` paths after `spent` earlier ones.
+fn share(spent: u32, wave: u32) -> f64 {
+    if spent == 0 {
+        1.0
+    } else {
+        f64::from(wave) / (f64::from(spent) + f64::from(wave))
+    }
+}
+
+/// Tells the caller how far the render is and hears whether to stop.
+pub(super) struct Watch<'a> {
+    progress: &'a dyn Progress,
+    stopped: AtomicBool,
+    runs: AtomicUsize,
+    before: f32,
+    total: f32,
+}
+
+impl<'a> Watch<'a> {
+    /// A watch over the round that takes the render from `spent` to `total` paths.
+    pub fn new(progress: &'a dyn Progress, spent: u32, total: u32) -> Self {
+        Self {
+            progress,
+            stopped: AtomicBool::new(false),
+            runs: AtomicUsize::new(0),
+            before: spent as f32,
+            total: total.max(1) as f32,
+        }
+    }
+
+    /// Notes one finished run of `count`; false to stop.
+    fn tick(&self, count: usize) -> bool {
+        let done = self.runs.fetch_add(1, Ordering::Relaxed) + 1;
+        let before = self.before / self.total;
+        let at = before + (1.0 - before) * done as f32 / count as f32;
+        if !self.progress.at(at.min(1.0)) {
+            self.stopped.store(true, Ordering::Relaxed);
+        }
+        !self.stopped.load(Ordering::Relaxed)
+    }
+}
+
+/// Buffers of one worker.
+struct Bench {
+    scratch: Scratch,
+    images: Vec<f32>,
+    two: Pixel,
+    multi: Pixel,
+}
+
+impl Bench {
+    fn new(frame: &Frame) -> Self {
+        let bins = frame.walk.gate.bins as usize;
+        Self {
+            scratch: Scratch::new(frame.walk.world, frame.walk.emitters),
+            images: vec![0.0; frame.walk.mirrors.choices()],
+            two: Pixel::new(bins),
+            multi: Pixel::new(bins),
+        }
+    }
+
+    /// Fills `two` and `multi`; returns the number of strata.
+    fn pixel(&mut self, frame: &Frame, k: usize, pass: (u32, u32), out: &mut Overflow) -> u32 {
+        let walk = &frame.walk;
+        let (row, col) = (k as u32 / frame.width, k as u32 % frame.width);
+        let (before, paths) = pass;
+        self.two.clear();
+        self.multi.clear();
+        let mut strata = 1;
+        if walk.max_bounces >= 2 && !walk.emitters.list.is_empty() {
+            let (coarse, fine) = frame.sampling.sides(paths);
+            let side = if frame.sampling.refined[k] {
+                fine
+            } else {
+                coarse
+            };
+            let mut rng = Rng::new(frame.seed, Stream::Two, k as u64, u64::from(before));
+            strata = two::sample_pixel(
+                walk.world,
+                walk.emitters,
+                walk.gate,
+                (row, col, side),
+                &mut rng,
+                &mut self.scratch,
+                (&mut self.two, &mut *out),
+            );
+        }
+        for path in 0..paths {
+            let pass = u64::from(before) + u64::from(path);
+            let mut rng = Rng::new(frame.seed, Stream::Paths, k as u64, pass);
+            let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
+            walk.path(&mut rng, x, y, &mut self.scratch, &mut self.images);
+            self.multi.add(&mut self.scratch.first);
+            out.take(&mut self.scratch.first, paths);
+        }
+        strata
+    }
+}
+
+/// Renders every pixel once more with `pass` = (paths spent before, paths now).
+pub(super) fn round(
+    frame: &Frame,
+    buffers: &mut Buffers,
+    pass: (u32, u32),
+    watch: &Watch,
+) -> Result<Found, RenderError> {
+    let bins = buffers.bins;
+    let stride = RUN * bins;
+    // Runs end with their row.
+    let width = frame.width as usize;
+    let mut parts = buffers.split.as_mut().map(|s| {
+        [&mut s.two, &mut s.two_se, &mut s.multi, &mut s.multi_se]
+            .map(|v| cut(v, width * bins, stride))
+    });
+    let transient = cut(&mut buffers.transient, width * bins, stride);
+    let stats = cut(&mut buffers.stats, width, RUN);
+    let mut runs = vec![];
+    let mut first = 0;
+    for (transient, stats) in transient.into_iter().zip(stats) {
+        let split = parts.as_mut().map(|p| {
+            p.each_mut()
+                .map(|v| v.next().expect("all buffers are cut alike"))
+        });
+        let count = stats.len();
+        runs.push(Run {
+            first,
+            transient,
+            split,
+            stats,
+        });
+        first += count;
+    }
+    let count = runs.len();
+    let found: Vec<Option<Found>> = runs
+        .into_par_iter()
+        .map_init(
+            || Bench::new(frame),
+            |bench, run| {
+                if watch.stopped.load(Ordering::Relaxed) {
+                    return None;
+                }
+                let found = render_run(frame, bench, run, pass, bins);
+                watch.tick(count).then_some(found)
+            },
+        )
+        .collect();
+    let mut sum = Found::default();
+    for f in found {
+        let f = f.ok_or(RenderError::Stopped)?;
+        sum.rays += f.rays;
+        sum.outside.count += f.outside.count;
+        sum.outside.energy += f.outside.energy;
+    }
+    Ok(sum)
+}
+
+/// Cuts a buffer into rows and those into runs.
+fn cut<T>(buffer: &mut [T], row: usize, run: usize) -> std::vec::IntoIter<&mut [T]> {
+    let runs: Vec<&mut [T]> = buffer
+        .chunks_mut(row)
+        .flat_map(|r| r.chunks_mut(run))
+        .collect();
+    runs.into_iter()
+}
+
+fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins: usize) -> Found {
+    let mut found = Found::default();
+    let rays = bench.scratch.stack.rays;
+    let new = share(pass.0, pass.1);
+    let (a, b) = (1.0 - new, new);
+    // Render units → metres: every path has one 1/d² left over.
+    let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
+    let mut split = run.split;
+    for (i, stat) in run.stats.iter_mut().enumerate() {
+        let strata = bench.pixel(frame, run.first + i, pass, &mut found.outside);
+        let moments = Moments::new(bench, strata, pass.1, unit);
+        let range = i * bins..(i + 1) * bins;
+        let transient = &mut run.transient[range.clone()];
+        let mut sums = Stat::default();
+        for (k, h) in transient.iter_mut().enumerate() {
+            let [two, two_variance, multi, multi_variance] = moments.bin(bench, k);
+            *h = (f64::from(*h) * a + (two + multi) * b) as f32;
+            sums.norm2 += f64::from(*h) * f64::from(*h);
+            sums.total += f64::from(*h);
+            sums.two_variance += two_variance;
+            sums.multi_variance += multi_variance;
+            if let Some(s) = &mut split {
+                let at = range.start + k;
+                let mean = |old: f32, x: f64| (f64::from(old) * a + x * b) as f32;
+                let error = |old: f32, x: f64| {
+                    let old = f64::from(old) * a;
+                    (old * old + x * b * b).sqrt() as f32
+                };
+                s[0][at] = mean(s[0][at], two);
+                s[1][at] = error(s[1][at], two_variance);
+                s[2][at] = mean(s[2][at], multi);
+                s[3][at] = error(s[3][at], multi_variance);
+            }
+        }
+        stat.norm2 = sums.norm2;
+        stat.total = sums.total;
+        let blend = |old: f64, x: f64| old * a * a + x * b * b;
+        stat.two_variance = blend(stat.two_variance, sums.two_variance);
+        stat.multi_variance = blend(stat.multi_variance, sums.multi_variance);
+        stat.total_variance = blend(stat.total_variance, moments.total_variance);
+    }
+    found.outside.energy *= unit;
+    found.rays = bench.scratch.stack.rays - rays;
+    found
+}
+
+/// From a pixel's sums to means and variances in physical units.
+struct Moments {
+    strata: f64,
+    paths: f64,
+    unit: f64,
+    total_variance: f64,
+}
+
+impl Moments {
+    fn new(bench: &Bench, strata: u32, paths: u32, unit: f64) -> Self {
+        let mut m = Self {
+            strata: f64::from(strata),
+            paths: f64::from(paths),
+            unit,
+            total_variance: 0.0,
+        };
+        let total: f64 = bench.multi.sum.iter().map(|&v| f64::from(v)).sum();
+        m.total_variance = bench.two.total_square / (m.strata * m.strata) * unit * unit
+            + m.of_paths(total, bench.multi.total_square).1;
+        m
+    }
+
+    /// Mean and its variance from Σx and Σx² over the paths.
+    fn of_paths(&self, sum: f64, square: f64) -> (f64, f64) {
+        let n = self.paths;
+        if n == 0.0 {
+            return (0.0, 0.0);
+        }
+        let spread = if n > 1.0 {
+            (square - sum * sum / n).max(0.0) / (n * (n - 1.0))
+        } else {
+            square
+        };
+        (sum / n * self.unit, spread * self.unit * self.unit)
+    }
+
+    /// Two-bounce mean and variance, 3+ mean and variance.
+    fn bin(&self, bench: &Bench, k: usize) -> [f64; 4] {
+        let n = self.strata;
+        let two = f64::from(bench.two.sum[k]) / n * self.unit;
+        let two_variance = f64::from(bench.two.square[k]) / (n * n) * self.unit * self.unit;
+        let (sum, square) = (bench.multi.sum[k], bench.multi.square[k]);
+        let (multi, variance) = self.of_paths(f64::from(sum), f64::from(square));
+        [two, two_variance, multi, variance]
+    }
+}
+
+/// Renders a lattice of pixels with few paths, to see how many the image needs.
+pub(super) fn pilot(frame: &Frame) -> Vec<Stat> {
+    let (width, height) = (frame.width as usize, frame.height as usize);
+    let mut stride = 1;
+    while (width / (stride + 1)).max(1) * (height / (stride + 1)).max(1) >= PILOT_PIXELS {
+        stride += 1;
+    }
+    let half = stride / 2;
+    let pixels: Vec<usize> = (half..height)
+        .step_by(stride)
+        .flat_map(|row| {
+            (half..width)
+                .step_by(stride)
+                .map(move |col| row * width + col)
+        })
+        .collect();
+    // Passes from the far end of the range, so that no render repeats the pilot's random numbers.
+    let pass = (u32::MAX - PILOT_PATHS, PILOT_PATHS);
+    pixels
+        .into_par_iter()
+        .map_init(
+            || Bench::new(frame),
+            |bench, k| {
+                let strata = bench.pixel(frame, k, pass, &mut Overflow::default());
+                let moments = Moments::new(bench, strata, PILOT_PATHS, 1.0);
+                let mut stat = Stat::default();
+                for b in 0..frame.walk.gate.bins as usize {
+                    let [two, two_variance, multi, multi_variance] = moments.bin(bench, b);
+                    stat.norm2 += (two + multi) * (two + multi);
+                    stat.two_variance += two_variance;
+                    stat.multi_variance += multi_variance;
+                }
+                stat
+            },
+        )
+        .collect()
+}

@@ -1,0 +1,121 @@
+//! Random numbers: PCG-XSH-RR 64/32 (O'Neill 2014), seeded by SplitMix64 from (seed, stream, index), so
+//! that a number depends on what it is drawn for and never on who draws it.
+
+/// A small, fast generator of one stream.
+#[derive(Debug, Clone)]
+pub(crate) struct Rng {
+    state: u64,
+    increment: u64,
+}
+
+/// What a stream is for; keeps the parts of a render independent of each other.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Stream {
+    /// Sub-pixel samples of the two-bounce part.
+    Two = 1,
+    /// Camera paths.
+    Paths = 2,
+    /// The companion image.
+    Photo = 3,
+}
+
+fn splitmix(mut z: u64) -> u64 {
+    z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+impl Rng {
+    /// The generator of pixel `pixel` in pass `pass` of `stream`.
+    pub fn new(seed: u64, stream: Stream, pixel: u64, pass: u64) -> Self {
+        let key = [stream as u64, pixel, pass]
+            .into_iter()
+            .fold(splitmix(seed), |key, part| splitmix(key ^ splitmix(part)));
+        let mut rng = Self {
+            state: key,
+            increment: splitmix(key) | 1,
+        };
+        rng.next_u32();
+        rng
+    }
+
+    #[inline(always)]
+    fn next_u32(&mut self) -> u32 {
+        let s = self.state;
+        self.state = s
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(self.increment);
+        let x = (((s >> 18) ^ s) >> 27) as u32;
+        x.rotate_right((s >> 59) as u32)
+    }
+
+    /// Uniform in [0, 1), 24 bits.
+    #[inline(always)]
+    pub fn uniform(&mut self) -> f32 {
+        (self.next_u32() >> 8) as f32 * (1.0 / 16_777_216.0)
+    }
+
+    /// Uniform in the unit disc, by rejection: no trigonometry, so the same bits everywhere. Returns the
+    /// point and its squared radius.
+    #[inline(always)]
+    pub fn disc(&mut self) -> (f32, f32, f32) {
+        loop {
+            let (x, y) = (2.0 * self.uniform() - 1.0, 2.0 * self.uniform() - 1.0);
+            let r2 = x * x + y * y;
+            if r2 < 1.0 {
+                return (x, y, r2);
+            }
+        }
+    }
+
+    /// A direction on the unit circle.
+    #[inline(always)]
+    pub fn circle(&mut self) -> (f32, f32) {
+        loop {
+            let (x, y, r2) = self.disc();
+            if r2 > 1e-6 {
+                let k = 1.0 / r2.sqrt();
+                return (x * k, y * k);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn streams_pixels_and_passes_differ_and_repeat() {
+        let draw = |a, b, c, d| Rng::new(a, b, c, d).next_u32();
+        let all = [
+            draw(1, Stream::Two, 0, 0),
+            draw(2, Stream::Two, 0, 0),
+            draw(1, Stream::Paths, 0, 0),
+            draw(1, Stream::Two, 1, 0),
+            draw(1, Stream::Two, 0, 1),
+        ];
+        for i in 0..all.len() {
+            for j in 0..i {
+                assert_ne!(all[i], all[j]);
+            }
+        }
+        assert_eq!(all[0], draw(1, Stream::Two, 0, 0));
+    }
+
+    #[test]
+    fn uniform_numbers_have_the_right_moments() {
+        let mut rng = Rng::new(7, Stream::Paths, 3, 5);
+        let n = 100_000;
+        let (mut m, mut v) = (0.0f64, 0.0f64);
+        for _ in 0..n {
+            let x = f64::from(rng.uniform());
+            assert!((0.0..1.0).contains(&x));
+            m += x;
+            v += x * x;
+        }
+        let (m, v) = (m / f64::from(n), v / f64::from(n));
+        assert!((m - 0.5).abs() < 0.004 && (v - 1.0 / 3.0).abs() < 0.004);
+    }
+}

@@ -1,0 +1,99 @@
+//! Ground truth from the rays through the pixels' centres.
+
+use picofarm_scene::{Scene, Vec3};
+use rayon::prelude::*;
+
+use crate::{
+    api::GroundTruth,
+    emitter::Emitters,
+    world::{Hit, World},
+};
+
+/// What a pixel's centre sees.
+#[derive(Debug)]
+pub(crate) struct Centres {
+    /// First surfaces, row-major.
+    pub hits: Vec<Option<Hit>>,
+    /// Rays traced.
+    pub rays: u64,
+}
+
+/// Traces the centres.
+pub(crate) fn centres(world: &World) -> Centres {
+    let i = world.camera.intrinsics;
+    let rows: Vec<(Vec<Option<Hit>>, u64)> = (0..i.height)
+        .into_par_iter()
+        .map(|row| {
+            let mut stack = world.bvh.stack();
+            let hits = (0..i.width)
+                .map(|col| {
+                    let d = world.camera.ray(col as f32 + 0.5, row as f32 + 0.5);
+                    world.closest(&mut stack, Vec3::ZERO, d)
+                })
+                .collect();
+            (hits, stack.rays)
+        })
+        .collect();
+    let rays = rows.iter().map(|r| r.1).sum();
+    Centres {
+        hits: rows.into_iter().flat_map(|r| r.0).collect(),
+        rays,
+    }
+}
+
+/// Everything but the companion image. Visibility is per beam; a beam without a spot lights nothing.
+pub(crate) fn ground_truth(
+    scene: &Scene,
+    world: &World,
+    emitters: &Emitters,
+    centres: &mut Centres,
+    beams: usize,
+) -> GroundTruth {
+    let i = world.camera.intrinsics;
+    let count = i.width as usize * i.height as usize;
+    let mut truth = GroundTruth {
+        depth: vec![0.0; count],
+        range: vec![0.0; count],
+        normal: vec![0.0; 3 * count],
+        instance: vec![0; count],
+        label: vec![0; count],
+        specular: vec![0; count],
+        visibility: vec![0; beams * count],
+        rgb: vec![],
+    };
+    for (k, hit) in centres.hits.iter().enumerate() {
+        let Some(h) = hit else { continue };
+        let q = world.camera.direction_to_camera(h.p);
+        truth.depth[k] = world.metres(q.z) as f32;
+        truth.range[k] = world.metres(h.p.length()) as f32;
+        let n = world.camera.direction_to_camera(h.n);
+        truth.normal[3 * k..3 * k + 3].copy_from_slice(&<[f32; 3]>::from(n));
+        let object = world.object[h.triangle as usize];
+        truth.instance[k] = object + 1;
+        truth.label[k] = scene.objects[object as usize].label + 1;
+        truth.specular[k] = u8::from(h.surface.specular);
+    }
+    let hits = &centres.hits;
+    let mut rays = 0;
+    for e in &emitters.list {
+        let plane = &mut truth.visibility[e.beam * count..(e.beam + 1) * count];
+        rays += plane
+            .par_chunks_mut(i.width as usize)
+            .enumerate()
+            .map(|(row, out)| {
+                let mut stack = world.bvh.stack();
+                for (col, lit) in out.iter_mut().enumerate() {
+                    let Some(h) = &hits[row * i.width as usize + col] else {
+                        continue;
+                    };
+                    let to = e.p - h.p;
+                    let facing = h.n.dot(to) > 0.0 && e.n.dot(to) < 0.0;
+                    *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n));
+                }
+                stack.rays
+            })
+            .sum::<u64>();
+    }
+    centres.rays += rays;
+    truth
+}

@@ -1,0 +1,216 @@
+//! The scene as the renderer sees it: one soup of triangles in *render units*, with the camera at the
+//! origin and lengths scaled by a power of two so that the scene is a few units wide. That makes every
+//! offset scale-aware and results follow the physical law whatever the scene's size and place.
+
+use picofarm_scene::{Camera, Scene, Vec3};
+
+use crate::{
+    bsdf::Surface,
+    bvh::{Bvh, Stack, normal},
+};
+
+/// Geometry, materials and camera in render units.
+#[derive(Debug)]
+pub(crate) struct World {
+    /// The hierarchy over `triangles`.
+    pub bvh: Bvh,
+    /// Vertices, render units.
+    pub triangles: Vec<[Vec3; 3]>,
+    /// Unit geometric normals; zero for triangles without area, which are never hit.
+    pub normals: Vec<Vec3>,
+    /// Index into `surfaces`, one a triangle.
+    pub surface: Vec<u32>,
+    /// Object index, one a triangle.
+    pub object: Vec<u32>,
+    /// Scattering by surface index.
+    pub surfaces: Vec<Surface>,
+    /// Material index in its mesh, by surface index.
+    pub material: Vec<u32>,
+    /// Linear RGB albedo by surface index.
+    pub rgb: Vec<[f32; 3]>,
+    /// Laser position, render units.
+    pub laser: Vec3,
+    /// Render units per metre: a power of two.
+    pub scale: f32,
+    /// The camera (its origin is the origin of render units).
+    pub camera: Camera,
+}
+
+/// A point on a surface, seen from somewhere.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Hit {
+    /// Position, render units.
+    pub p: Vec3,
+    /// Unit geometric normal on the side the ray came from.
+    pub n: Vec3,
+    /// Triangle.
+    pub triangle: u32,
+    /// Scattering; black where the ray came from behind a one-sided surface.
+    pub surface: Surface,
+}
+
+impl World {
+    pub fn new(scene: &Scene) -> Self {
+        let origin = scene.camera.origin;
+        let wide = |v: Vec3| [f64::from(v.x), f64::from(v.y), f64::from(v.z)];
+        let centre = wide(origin);
+        let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
+        let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
+        for (index, o) in scene.objects.iter().enumerate() {
+            let first = surfaces.len() as u32;
+            for (k, m) in o.mesh.materials.iter().enumerate() {
+                surfaces.push(Surface::new(m));
+                material.push(k as u32);
+                rgb.push(m.rgb);
+            }
+            let rows = o.to_world.linear.map(wide);
+            let shift = wide(o.to_world.translation);
+            // f64 until the camera's place is taken off: keeps digits in scenes far from the origin.
+            let place = |p: Vec3| {
+                let p = wide(p);
+                std::array::from_fn(|r| {
+                    rows[r][0] * p[0] + rows[r][1] * p[1] + rows[r][2] * p[2] + shift[r] - centre[r]
+                })
+            };
+            let placed: Vec<[f64; 3]> = o.mesh.positions.iter().map(|&p| place(p)).collect();
+            for (t, &m) in o.mesh.triangles.iter().zip(&o.mesh.triangle_material) {
+                points.push(t.map(|v| placed[v as usize]));
+                surface.push(first + m);
+                object.push(index as u32);
+            }
+        }
+        let widest = points
+            .iter()
+            .flatten()
+            .flatten()
+            .fold(0.0f64, |a, x| a.max(x.abs()));
+        let scale = scale_for(widest);
+        let triangles: Vec<[Vec3; 3]> = points
+            .iter()
+            .map(|t| t.map(|p| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32))))
+            .collect();
+        let normals = triangles
+            .iter()
+            .map(|t| normal(t).unwrap_or_default())
+            .collect();
+        Self {
+            bvh: Bvh::build(&triangles),
+            triangles,
+            normals,
+            surface,
+            object,
+            surfaces,
+            material,
+            rgb,
+            laser: (scene.laser.origin - origin) * scale,
+            scale,
+            camera: scene.camera,
+        }
+    }
+
+    /// World metres → render units.
+    pub fn inward(&self, p: Vec3) -> Vec3 {
+        (p - self.camera.origin) * self.scale
+    }
+
+    /// Render units → world metres.
+    pub fn outward(&self, p: Vec3) -> Vec3 {
+        p / self.scale + self.camera.origin
+    }
+
+    /// A length in render units, in metres.
+    #[inline(always)]
+    pub fn metres(&self, length: f32) -> f64 {
+        f64::from(length / self.scale)
+    }
+
+    /// The first surface from `origin` along `direction` (any length).
+    #[inline]
+    pub fn closest(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<Hit> {
+        let (_, id) = self.bvh.closest(stack, origin, direction, f32::INFINITY)?;
+        let i = id as usize;
+        let geometric = self.normals[i];
+        let front = geometric.dot(direction) <= 0.0;
+        let surface = self.surfaces[self.surface[i] as usize];
+        Some(Hit {
+            p: point(&self.triangles[i], origin, direction),
+            n: if front { geometric } else { -geometric },
+            triangle: id,
+            surface: if front || surface.two_sided {
+                surface
+            } else {
+                surface.black()
+            },
+        })
+    }
+
+    /// True where the straight way between two surface points is free. Each end is lifted off its
+    /// surface, along the normal given, towards the side of the other end.
+    #[inline]
+    pub fn free(&self, stack: &mut Stack, a: Vec3, na: Vec3, b: Vec3, nb: Vec3) -> bool {
+        let (a, b) = (lift(a, na), lift(b, nb));
+        !self.bvh.occluded(stack, a, b - a, 1.0)
+    }
+
+    /// True where the straight way from the camera to a surface point is free.
+    pub fn seen(&self, stack: &mut Stack, p: Vec3, n: Vec3) -> bool {
+        !self.bvh.occluded(stack, Vec3::ZERO, lift(p, n), 1.0)
+    }
+}
+
+/// The power of two that brings `widest` into [4, 8).
+fn scale_for(widest: f64) -> f32 {
+    if !(widest.is_finite() && widest > 1e-30 && widest < 1e30) {
+        return 1.0;
+    }
+    let mut scale = 1.0f64;
+    while widest * scale >= 8.0 {
+        scale *= 0.5;
+    }
+    while widest * scale < 4.0 {
+        scale *= 2.0;
+    }
+    scale as f32
+}
+
+/// The hit point from barycentric coordinates (the same shear as the traversal's): on the triangle to
+/// the last bits, however far the ray's origin is.
+#[inline]
+fn point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
+    let n = Vec3::new(d.x.abs(), d.y.abs(), d.z.abs());
+    let kz = if n.z >= n.x && n.z >= n.y {
+        2
+    } else if n.y >= n.x {
+        1
+    } else {
+        0
+    };
+    let (kx, ky) = ((kz + 1) % 3, (kz + 2) % 3);
+    let (sx, sy) = (d[kx] / d[kz], d[ky] / d[kz]);
+    let [a, b, c] = t.map(|v| {
+        let v = v - o;
+        (v[kx] - sx * v[kz], v[ky] - sy * v[kz])
+    });
+    let u = c.0 * b.1 - c.1 * b.0;
+    let v = a.0 * c.1 - a.1 * c.0;
+    let w = b.0 * a.1 - b.1 * a.0;
+    let k = 1.0 / (u + v + w);
+    let (u, v) = (u * k, v * k);
+    t[0] * u + t[1] * v + t[2] * (1.0 - u - v)
+}
+
+/// A point moved off its surface by a few units in the last place, along `n` (Wächter and Binder, Ray
+/// Tracing Gems, chapter 6): enough that a ray does not meet the surface it starts from, too little to
+/// pass through anything.
+#[inline]
+pub(crate) fn lift(p: Vec3, n: Vec3) -> Vec3 {
+    let axis = |p: f32, n: f32| {
+        if p.abs() < 1.0 / 32.0 {
+            return p + n * (1.0 / 65536.0);
+        }
+        let steps = (256.0 * n) as i32;
+        let bits = p.to_bits() as i32;
+        f32::from_bits(bits.wrapping_add(if p < 0.0 { -steps } else { steps }) as u32)
+    };
+    Vec3::new(axis(p.x, n.x), axis(p.y, n.y), axis(p.z, n.z))
+}

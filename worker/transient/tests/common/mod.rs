@@ -1,0 +1,158 @@
+//! Helpers of the integration tests: small scenes, settings, and the reference transients.
+#![allow(dead_code, reason = "each test binary uses its own part")]
+
+pub mod npz;
+pub mod reference;
+
+use std::sync::Arc;
+
+use picofarm_scene::{
+    Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Vec3,
+};
+use picofarm_transient::{Budget, Gate, Progress, Settings};
+
+/// Lets every render run to its end.
+pub struct Quiet;
+
+impl Progress for Quiet {
+    fn at(&self, _done: f32) -> bool {
+        true
+    }
+}
+
+pub fn v(x: f32, y: f32, z: f32) -> Vec3 {
+    Vec3::new(x, y, z)
+}
+
+/// The data sets' gate.
+pub fn gate() -> Gate {
+    Gate {
+        start_m: 1.0,
+        bin_width_m: 0.0384,
+        bins: 637,
+    }
+}
+
+pub fn settings(budget: Budget) -> Settings {
+    Settings {
+        gate: gate(),
+        budget,
+        max_bounces: None,
+        one_bounce: false,
+        seed: 1,
+        split: true,
+    }
+}
+
+/// A grey two-sided Lambertian.
+pub fn grey(reflectance: f32) -> Material {
+    Material {
+        name: "grey".into(),
+        bsdf: Bsdf::Diffuse { reflectance },
+        rgb: [reflectance; 3],
+        two_sided: true,
+    }
+}
+
+pub fn object(name: &str, positions: Vec<Vec3>, triangles: Vec<[u32; 3]>, m: Material) -> Object {
+    Object {
+        mesh: Arc::new(Mesh {
+            name: name.into(),
+            triangle_material: vec![0; triangles.len()],
+            positions,
+            triangles,
+            materials: vec![m],
+        }),
+        to_world: Affine::IDENTITY,
+        label: 0,
+        name: name.into(),
+    }
+}
+
+/// A parallelogram: corner and two edges; its front is on the side of a × b.
+pub fn quad(corner: Vec3, a: Vec3, b: Vec3, m: Material) -> Object {
+    let positions = vec![corner, corner + a, corner + a + b, corner + b];
+    object("quad", positions, vec![[0, 1, 2], [0, 2, 3]], m)
+}
+
+/// A sphere from a subdivided octahedron.
+pub fn sphere(centre: Vec3, radius: f32, levels: u32, m: Material) -> Object {
+    let axis = [
+        v(1.0, 0.0, 0.0),
+        v(-1.0, 0.0, 0.0),
+        v(0.0, 1.0, 0.0),
+        v(0.0, -1.0, 0.0),
+        v(0.0, 0.0, 1.0),
+        v(0.0, 0.0, -1.0),
+    ];
+    let mut faces: Vec<[Vec3; 3]> = vec![];
+    for x in [0, 1] {
+        for y in [2, 3] {
+            for z in [4, 5] {
+                let flip = (x + y + z) % 2 == 1;
+                let (a, b, c) = (axis[x], axis[y], axis[z]);
+                faces.push(if flip { [a, c, b] } else { [a, b, c] });
+            }
+        }
+    }
+    for _ in 0..levels {
+        faces = faces
+            .into_iter()
+            .flat_map(|[a, b, c]| {
+                let m = |p: Vec3, q: Vec3| (p + q).normalized();
+                let (ab, bc, ca) = (m(a, b), m(b, c), m(c, a));
+                [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+            })
+            .collect();
+    }
+    let positions = faces
+        .iter()
+        .flatten()
+        .map(|&p| centre + p * radius)
+        .collect();
+    let triangles = (0..faces.len() as u32)
+        .map(|i| [3 * i, 3 * i + 1, 3 * i + 2])
+        .collect();
+    object("sphere", positions, triangles, m)
+}
+
+/// The six walls of a box, seen from inside, all of one material.
+pub fn room(low: Vec3, high: Vec3, m: &Material) -> Vec<Object> {
+    let s = high - low;
+    let (x, y, z) = (v(s.x, 0.0, 0.0), v(0.0, s.y, 0.0), v(0.0, 0.0, s.z));
+    vec![
+        quad(low, z, x, m.clone()),
+        quad(low, x, y, m.clone()),
+        quad(low, y, z, m.clone()),
+        quad(high, -x, -z, m.clone()),
+        quad(high, -y, -x, m.clone()),
+        quad(high, -z, -y, m.clone()),
+    ]
+}
+
+/// A scene with a camera at the origin that looks along −z and a laser in the same place.
+pub fn scene(objects: Vec<Object>, size: u32, directions: &[Vec3]) -> Scene {
+    let intrinsics = Intrinsics::from_fov(90.0, size, size);
+    let camera = Camera::look_at(Vec3::ZERO, v(0.0, 0.0, -1.0), intrinsics);
+    Scene {
+        name: "test".into(),
+        objects,
+        labels: vec!["thing".into()],
+        camera,
+        laser: Laser {
+            origin: Vec3::ZERO,
+            beams: directions
+                .iter()
+                .map(|d| Beam {
+                    direction: d.normalized(),
+                    spot: None,
+                })
+                .collect(),
+        },
+        provenance: Provenance::default(),
+    }
+}
+
+pub fn energy(h: &[f32]) -> f64 {
+    h.iter().map(|&x| f64::from(x)).sum()
+}
