@@ -80,6 +80,19 @@ impl Process {
             .is_none()
     }
 
+    /// Waits until its stderr says `words`.
+    ///
+    /// # Panics
+    /// When it ends without.
+    pub fn until_says(&mut self, words: &str) {
+        until(&format!("{} to say {words:?}", self.name), || {
+            let runs = self.runs();
+            let says = self.stderr().contains(words);
+            assert!(says || runs, "{} ended: {}", self.name, self.stderr());
+            says.then_some(())
+        });
+    }
+
     /// Sends a signal.
     ///
     /// # Panics

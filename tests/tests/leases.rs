@@ -14,14 +14,13 @@ fn a_worker_told_to_end_hands_its_scene_to_another_at_once() {
     };
     let id = farm.submit(&job);
     let mut leaver = farm.worker("leaver");
-    farm.until_running(&id, "leaver", 0.01);
+    leaver.until_says("task starts");
     let _heir = farm.worker("heir");
     until("both workers", || {
         (farm.status(&id)["workers"] == 2).then_some(())
     });
     leaver.signal(Signal::Terminate);
     leaver.end().ok();
-    farm.until_running(&id, "heir", 0.0);
     farm.until_done_once(&job, &id);
     let kinds: Vec<Value> = farm
         .events(&id)

@@ -2,7 +2,7 @@
 
 use std::time::SystemTime;
 
-use picofarm_tests::{Farm, Job, Process, mount::Tmpfs, store, wait::until};
+use picofarm_tests::{Farm, Job, Process, mount::Tmpfs, store};
 
 /// A farm with a worker and a finished job of two scenes in a small file system.
 struct Half {
@@ -32,7 +32,7 @@ impl Half {
         })
     }
 
-    /// Asks for five scenes, waits until the history says `words`, mends the disk with `options`, and checks that
+    /// Asks for five scenes, waits until the worker says `words`, mends the disk with `options`, and checks that
     /// the job completes with the first two scenes untouched and no failure counted.
     fn grow_through(mut self, words: &str, options: &str) {
         let (farm, job) = (
@@ -43,15 +43,10 @@ impl Half {
             },
         );
         let id = farm.submit(&job);
-        until(&format!("the history to say {words:?}"), || {
-            let said =
-                |m: &serde_json::Value| m["message"].as_str().is_some_and(|m| m.contains(words));
-            farm.events(&id).iter().any(said).then_some(())
-        });
+        self.worker.until_says(words);
         let status = farm.status(&id);
         assert_eq!(status["state"], "active", "{status}");
         assert_eq!(status["tasks"]["dead"], 0, "{status}");
-        assert!(self.worker.runs(), "{}", self.worker.stderr());
 
         self.disk.remount(options);
         farm.until_done_once(&job, &id);

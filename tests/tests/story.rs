@@ -130,7 +130,7 @@ fn a_cancelled_job_stops_keeps_what_it_has_and_can_be_submitted_again() {
     let job = Job::slow(&farm.store(), 30);
     let id = farm.submit(&job);
     let mut worker = farm.worker("worker");
-    farm.until_running(&id, "worker", 0.01);
+    worker.until_says("task starts");
     let cancelled = farm.json(&["job", "cancel", &id]);
     assert_eq!(cancelled["state"], "cancelled");
     farm.run(&["job", "wait", &id])

@@ -9,9 +9,10 @@ use picofarm_proto::{
         farm_client::FarmClient,
         farm_server::{Farm as FarmService, FarmServer},
         session_request::Message as Said,
+        session_response::Message as Answer,
     },
 };
-use picofarm_tests::{Cli, Farm, Scratch};
+use picofarm_tests::{Cli, Farm, Job, Scratch, wait::until};
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tonic::{Code, Request, Response, Status, Streaming, transport::Server};
@@ -79,6 +80,52 @@ async fn a_coordinator_refuses_a_worker_of_another_version_and_names_both() {
     tokio::task::spawn_blocking(move || farm.json(&["job", "list"]))
         .await
         .unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_with_another_renderer_gets_nothing_and_the_job_says_why() {
+    let (farm, id) = tokio::task::spawn_blocking(|| {
+        let farm = Farm::start("other-renderer");
+        let id = farm.submit(&Job::quick(&farm.store(), 1));
+        (farm, id)
+    })
+    .await
+    .unwrap();
+    let mut client = FarmClient::connect(farm.url().to_owned()).await.unwrap();
+    let (to, requests) = tokio::sync::mpsc::channel(2);
+    let say = async |message| {
+        to.send(SessionRequest {
+            message: Some(message),
+        })
+        .await
+        .unwrap()
+    };
+    say(Said::Hello(hello(env!("CARGO_PKG_VERSION"), PROTOCOL))).await;
+    let mut answers = client
+        .session(ReceiverStream::new(requests))
+        .await
+        .unwrap()
+        .into_inner();
+    let welcome = answers.message().await.unwrap().unwrap();
+    assert!(
+        matches!(welcome.message, Some(Answer::Welcome(_))),
+        "{welcome:?}"
+    );
+    say(Said::Credit(wire::Credit { leases: 1 })).await;
+    tokio::task::spawn_blocking(move || {
+        let waiting = until("the job to say why it waits", || {
+            farm.events_of(&id, "waiting").pop()
+        });
+        let message = waiting["message"].as_str().unwrap();
+        assert!(
+            message.contains("renderer") && message.contains("transient-0"),
+            "{message}"
+        );
+        assert_eq!(waiting["worker"], "stranger");
+        assert_eq!(farm.count(&id, "pending"), 1);
+    })
+    .await
+    .unwrap();
 }
 
 struct Refusing;
