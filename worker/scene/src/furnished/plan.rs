@@ -27,6 +27,8 @@ pub(super) struct Placed {
     /// What it stands on, if not the floor.
     pub(super) support: Option<usize>,
     pub(super) attribution: Option<String>,
+    /// What was changed in the model to use it.
+    pub(super) changes: Vec<&'static str>,
 }
 
 /// A room and everything in it so far.
@@ -67,6 +69,7 @@ impl<'a> Plan<'a> {
             foot: None,
             support: None,
             attribution: None,
+            changes: Vec::new(),
         });
     }
 
@@ -92,6 +95,7 @@ impl<'a> Plan<'a> {
             foot: Some(foot),
             support,
             attribution: None,
+            changes: Vec::new(),
         });
         true
     }
@@ -107,6 +111,7 @@ impl<'a> Plan<'a> {
         let placed = self.try_place((&asset.name, model), asset.label, at, yaw, support);
         if let (true, Some(last)) = (placed, self.placed.last_mut()) {
             last.attribution.clone_from(&asset.attribution);
+            last.changes = asset.changes().collect();
         }
         placed
     }
@@ -122,6 +127,7 @@ impl<'a> Plan<'a> {
             foot: None,
             support: None,
             attribution: asset.attribution.clone(),
+            changes: asset.changes().collect(),
         });
     }
 
