@@ -94,8 +94,7 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     }
     stretch(mesh, item.size)?;
     drop_degenerate(mesh);
-    mesh.group_by_material();
-    drop_unused_materials(mesh);
+    mesh.make_canonical();
     Ok(loaded)
 }
 
@@ -146,28 +145,6 @@ fn drop_degenerate(mesh: &mut Mesh) {
         .retain(|_| *k.next().expect("one flag a triangle"));
 }
 
-/// Keeps the materials that triangles name, in their order.
-fn drop_unused_materials(mesh: &mut Mesh) {
-    let mut used = vec![false; mesh.materials.len()];
-    for &m in &mesh.triangle_material {
-        used[m as usize] = true;
-    }
-    let mut next = 0;
-    let renumbered: Vec<u32> = used
-        .iter()
-        .map(|&u| {
-            next += u32::from(u);
-            next.saturating_sub(1)
-        })
-        .collect();
-    for m in &mut mesh.triangle_material {
-        *m = renumbered[*m as usize];
-    }
-    let mut flags = used.iter();
-    mesh.materials
-        .retain(|_| *flags.next().expect("one flag a material"));
-}
-
 /// Kd is a display colour: linear albedo by a 2.2 power, kept within what real surfaces have.
 fn material(file: &tobj::Material) -> Material {
     let linear = |v: f32| libm::powf(v.clamp(0.0, 1.0), 2.2).clamp(0.04, 0.9);
@@ -178,4 +155,98 @@ fn material(file: &tobj::Material) -> Material {
         None => [GREY; 3],
     };
     Material::diffuse(file.name.clone(), rgb)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{io::Write, path::Path};
+
+    use zip::{ZipWriter, write::SimpleFileOptions};
+
+    use crate::AssetLibrary;
+
+    const PROPERTIES: &str = "version=1.8\nlicense=Public domain\n\
+        name#1=Armchair\ncategory#1=Office\nwidth#1=60\ndepth#1=80\nheight#1=100\nmodel#1=/a/chair.obj\n\
+        creator#1=Someone\nmodelRotation#1=1 0 0 0 0 1 0 -1 0\n\
+        name#2=Sofa\ncategory#2=Office\nwidth#2=60\ndepth#2=80\nheight#2=100\nmodel#2=/a/broken.obj\n\
+        name#3=Bed\ncategory#3=Bedroom\nwidth#3=60\ndepth#3=80\nheight#3=100\nmodel#3=/a/absent.obj\n";
+
+    // A tetrahedron (z up) with a degenerate facet.
+    const OBJ: &str = "mtllib chair.mtl\nv 0 0 0\nv 2 0 0\nv 0 4 0\nv 0 0 8\nusemtl glass\n\
+        f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\nf 1 1 2\n";
+
+    fn library(dir: &Path) -> AssetLibrary {
+        let file = std::fs::File::create(dir.join("test.sh3f")).expect("creates");
+        let mut zip = ZipWriter::new(file);
+        for (name, text) in [
+            ("PluginFurnitureCatalog.properties", PROPERTIES),
+            ("a/chair.obj", OBJ),
+            (
+                "a/chair.mtl",
+                "newmtl wood\nKd 1 0 0\nnewmtl glass\nKd 0.5 0.5 0.5\nd 0.3\n",
+            ),
+            ("a/broken.obj", "v NaN 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ] {
+            zip.start_file(name, SimpleFileOptions::default())
+                .expect("starts");
+            zip.write_all(text.as_bytes()).expect("writes");
+        }
+        zip.finish().expect("finishes");
+        AssetLibrary::sweethome3d(dir).expect("opens")
+    }
+
+    #[test]
+    fn models_are_upright_of_catalogue_size_clean_and_opaque() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let library = library(folder.path());
+        assert_eq!(library.len(), 2, "an item without its model is left out");
+        let asset = &library.assets[0];
+        let model = asset.model().expect("loads");
+        for (got, want) in model.size().into_iter().zip([0.6, 1.0, 0.8]) {
+            assert!((got - want).abs() < 1e-5, "{:?}", model.size());
+        }
+        assert_eq!(
+            model.mesh.triangles.len(),
+            4,
+            "the degenerate facet is gone"
+        );
+        assert_eq!(
+            model.mesh.materials.len(),
+            1,
+            "only the used material stays"
+        );
+        // The apex pointed along z; turned upright it is the highest vertex.
+        assert!(
+            model
+                .mesh
+                .positions
+                .iter()
+                .any(|p| (p.y - 1.0).abs() < 1e-6)
+        );
+        let changes: Vec<_> = asset.changes().collect();
+        assert_eq!(changes, ["transparent materials made opaque"]);
+    }
+
+    #[test]
+    fn a_model_that_is_not_finite_is_left_out() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert!(library(folder.path()).assets[1].model().is_none());
+    }
+
+    #[test]
+    fn the_fingerprint_follows_the_content() {
+        let (a, b) = (
+            tempfile::tempdir().expect("a folder"),
+            tempfile::tempdir().expect("a folder"),
+        );
+        assert_eq!(
+            library(a.path()).fingerprint(),
+            library(b.path()).fingerprint()
+        );
+        assert!(
+            library(a.path())
+                .fingerprint()
+                .starts_with("sweethome3d-1.8:")
+        );
+    }
 }

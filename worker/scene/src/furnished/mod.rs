@@ -5,6 +5,8 @@ mod camera;
 mod decor;
 mod furniture;
 mod plan;
+#[cfg(test)]
+mod tests;
 mod tops;
 
 use std::collections::{BTreeMap, BTreeSet};

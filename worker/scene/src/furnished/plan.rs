@@ -24,8 +24,6 @@ pub(super) struct Placed {
     pub(super) yaw: f32,
     /// The box that nothing else may enter; `None` for the room itself and for rugs.
     pub(super) foot: Option<Footprint>,
-    /// What it stands on, if not the floor.
-    pub(super) support: Option<usize>,
     pub(super) attribution: Option<String>,
     /// What was changed in the model to use it.
     pub(super) changes: Vec<&'static str>,
@@ -67,7 +65,6 @@ impl<'a> Plan<'a> {
             at: [0.0; 3],
             yaw: 0.0,
             foot: None,
-            support: None,
             attribution: None,
             changes: Vec::new(),
         });
@@ -93,7 +90,6 @@ impl<'a> Plan<'a> {
             at,
             yaw,
             foot: Some(foot),
-            support,
             attribution: None,
             changes: Vec::new(),
         });
@@ -125,7 +121,6 @@ impl<'a> Plan<'a> {
             at,
             yaw,
             foot: None,
-            support: None,
             attribution: asset.attribution.clone(),
             changes: asset.changes().collect(),
         });

@@ -15,6 +15,22 @@ const FLATNESS_M: f32 = 0.01;
 /// Taller things stand on the floor, metres.
 const TALLEST_M: f32 = 0.75;
 
+/// What carries things.
+pub(super) const TOPS: [&str; 12] = [
+    "table",
+    "coffee_table",
+    "desk",
+    "nightstand",
+    "dresser",
+    "cabinet",
+    "tv_stand",
+    "shelf",
+    "piano",
+    "bookcase",
+    "fireplace",
+    "kitchen_appliance",
+];
+
 /// What people leave on the tops of a room.
 fn things(kind: RoomType) -> &'static [&'static str] {
     match kind {
@@ -49,20 +65,6 @@ fn things(kind: RoomType) -> &'static [&'static str] {
 
 /// Puts things on tables and cases.
 pub(super) fn drop_things(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
-    const TOPS: [&str; 12] = [
-        "table",
-        "coffee_table",
-        "desk",
-        "nightstand",
-        "dresser",
-        "cabinet",
-        "tv_stand",
-        "shelf",
-        "piano",
-        "bookcase",
-        "fireplace",
-        "kitchen_appliance",
-    ];
     for support in 0..plan.placed.len() {
         let label = plan.placed[support].label;
         if !TOPS.contains(&label) {
