@@ -115,6 +115,20 @@ pub(crate) struct Columns {
 }
 
 impl Columns {
+    pub fn clear(&mut self) {
+        for column in [
+            &mut self.px,
+            &mut self.py,
+            &mut self.pz,
+            &mut self.nx,
+            &mut self.ny,
+            &mut self.nz,
+            &mut self.strength,
+        ] {
+            column.clear();
+        }
+    }
+
     pub fn push(&mut self, p: Vec3, n: Vec3, strength: f32) {
         self.px.push(p.x);
         self.py.push(p.y);
