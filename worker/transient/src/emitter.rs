@@ -33,15 +33,18 @@ pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
 }
 
 fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
-    let (mut from, mut direction) = (world.laser, direction);
+    let (mut from, mut start, mut direction) = (world.laser, world.laser, direction);
     let mut path = 0.0;
     for _ in 0..MAX_REFLECTIONS {
-        let hit = world.closest(stack, from, direction)?;
+        let mut hit = world.closest(stack, start, direction)?;
+        // Where the beam meets that facet without the lift off the mirror before it.
+        hit.p = world.point(hit.triangle, from, direction);
         path += world.metres((hit.p - from).length());
         if hit.surface.specular && hit.surface.strength > 0.0 {
             let n = hit.n;
             direction = (direction - n * (2.0 * n.dot(direction))).normalized();
-            from = lift(hit.p, n);
+            from = hit.p;
+            start = lift(from, n);
             continue;
         }
         let t = hit.triangle as usize;
