@@ -1,2 +1,124 @@
-//! The `picofarm` binary.
-fn main() {}
+//! The `picofarm` binary: every role and command of the farm.
+
+mod args;
+mod assets;
+mod client;
+mod dataset;
+mod demo;
+mod doctor;
+mod error;
+mod follow;
+mod jobfile;
+mod jobs;
+mod local;
+mod output;
+mod picture;
+mod roles;
+mod scene;
+mod settings;
+mod signals;
+
+use std::process::ExitCode;
+
+use clap::{CommandFactory, Parser};
+
+use crate::{
+    args::{Cli, Command},
+    error::Result,
+    output::{Output, table},
+    settings::{Resolved, resolve},
+};
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let json = cli.global.json;
+    match start(cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => ExitCode::from(e.report(json)),
+    }
+}
+
+fn start(cli: Cli) -> Result<()> {
+    let resolved = resolve(&cli.global)?;
+    log_to_stderr(&resolved.settings.log)?;
+    let output = Output {
+        json: cli.global.json,
+    };
+    tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|e| error::io("cannot start the runtime", &e))?
+        .block_on(run(cli.command, &resolved, output))
+}
+
+async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
+    let settings = &resolved.settings;
+    match command {
+        Command::Demo(args) => demo::demo(args, settings, output).await,
+        Command::Up(args) => demo::up(args, settings, output).await,
+        Command::Coordinator(args) => roles::coordinator(args, output).await,
+        Command::Worker(args) => roles::worker(args, settings, output).await,
+        Command::Job(command) => jobs::run(command, settings, output).await,
+        Command::Dataset(command) => dataset::run(command, output).await,
+        Command::Scene(command) => scene::run(command, settings, output).await,
+        Command::Assets(command) => assets::run(command, settings, output).await,
+        Command::Config => {
+            show_settings(resolved, output);
+            Ok(())
+        }
+        Command::Doctor(args) => doctor::run(args, settings, output).await,
+        Command::Completions { shell } => {
+            clap_complete::generate(
+                shell,
+                &mut Cli::command(),
+                "picofarm",
+                &mut std::io::stdout(),
+            );
+            Ok(())
+        }
+    }
+}
+
+fn show_settings(resolved: &Resolved, output: Output) {
+    let values = serde_json::to_value(&resolved.settings).expect("settings are plain data");
+    let rows: Vec<_> = resolved
+        .sources
+        .iter()
+        .map(|(name, source)| {
+            let value = values[name].as_str().unwrap_or_default().to_owned();
+            vec![(*name).to_owned(), value, source.clone()]
+        })
+        .collect();
+    let document: serde_json::Map<_, _> = rows
+        .iter()
+        .map(|r| {
+            (
+                r[0].clone(),
+                serde_json::json!({"value": r[1], "source": r[2]}),
+            )
+        })
+        .collect();
+    output.result(&document, || table(&rows));
+}
+
+fn log_to_stderr(filter: &str) -> Result<()> {
+    let filter = tracing_subscriber::EnvFilter::try_new(filter).map_err(|e| {
+        error::CliError::input(format!("log filter {filter:?}: {e}"))
+            .hint("e.g. --log info, or --log picofarm_agent=debug")
+    })?;
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .init();
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        super::Cli::command().debug_assert();
+    }
+}

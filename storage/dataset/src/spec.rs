@@ -52,6 +52,22 @@ pub struct DatasetSpec {
     pub profile: Profile,
 }
 
+impl Profile {
+    /// The profile that jobs call `name`.
+    ///
+    /// # Errors
+    /// A message that lists the names there are.
+    pub fn parse(name: &str) -> Result<Self, String> {
+        match name {
+            "sqrt-u16" => Ok(Self::default()),
+            "plain-f32" => Ok(Self::PlainF32),
+            other => Err(format!(
+                "{other:?} is not one of \"sqrt-u16\", \"plain-f32\""
+            )),
+        }
+    }
+}
+
 impl DatasetSpec {
     /// Numbers in range, so that every array's shape and key exist.
     ///

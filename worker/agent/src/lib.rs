@@ -11,4 +11,5 @@ mod session;
 
 pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
+pub use execute::renderer_version;
 pub use execute::{Control, Executor, Output, Task, TaskError};

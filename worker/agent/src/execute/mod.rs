@@ -19,7 +19,7 @@ use picofarm_proto::{
     model::JobSpec,
 };
 
-pub use render::RenderExecutor;
+pub use render::{RenderExecutor, renderer_version};
 pub(crate) use runner::Runner;
 
 /// One task to run.

@@ -26,6 +26,17 @@ const RENDER_SHARE: f32 = 0.95;
 /// How long a rendered scene waits for a store that is full or away before its task is handed back.
 const STORE_PATIENCE: Duration = Duration::from_secs(120);
 
+/// Everything of this program that decides a task's bytes: renderer, generators and encoder. Part of every task
+/// key, so that a change of any of them renames the results.
+pub fn renderer_version() -> String {
+    format!(
+        "{RENDERER_VERSION}/{}/{}/{}",
+        picofarm_scene::furnished::GENERATOR_VERSION,
+        picofarm_scene::primitive::GENERATOR_VERSION,
+        picofarm_dataset::ENCODER_VERSION
+    )
+}
+
 /// Renders scenes into data sets.
 pub struct RenderExecutor {
     libraries: Vec<AssetLibrary>,
@@ -45,7 +56,7 @@ impl RenderExecutor {
 
 impl Executor for RenderExecutor {
     fn renderer(&self) -> String {
-        RENDERER_VERSION.into()
+        renderer_version()
     }
 
     fn assets(&self) -> Vec<String> {
@@ -55,10 +66,11 @@ impl Executor for RenderExecutor {
 
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (spec, key) = (&*task.spec, task.key());
-        if spec.render.renderer != RENDERER_VERSION {
+        let ours = renderer_version();
+        if spec.render.renderer != ours {
             return Err(TaskError::User(format!(
-                "render.renderer: the job asks for {:?}, this worker renders {RENDERER_VERSION:?}; submit the job \
-                 again with this version, or run workers of the other one",
+                "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
+                 version, or run workers of the other one",
                 spec.render.renderer
             )));
         }
@@ -71,10 +83,15 @@ impl Executor for RenderExecutor {
             });
         }
         let scene = scenes::scene(spec, task.index, &self.libraries)?;
-        debug!(task = task.index, scene = scene.name, triangles = scene.triangle_count(), "scene made");
+        debug!(
+            task = task.index,
+            scene = scene.name,
+            triangles = scene.triangle_count(),
+            "scene made"
+        );
         let settings = settings(spec, &key);
-        let rendered = picofarm_transient::render(&scene, &settings, &Watched(control))
-            .map_err(of_render)?;
+        let rendered =
+            picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
         let camera = &scene.camera;
         let spots: Vec<_> = rendered
             .spots
@@ -84,7 +101,7 @@ impl Executor for RenderExecutor {
         let record = record(&scene, &rendered, &spots);
         let provenance = Provenance {
             task_key: key.to_string(),
-            renderer: RENDERER_VERSION.into(),
+            renderer: spec.render.renderer.clone(),
             seed: settings.seed,
             plan: account(&scene, &rendered),
         };
@@ -162,7 +179,11 @@ fn record<'a>(scene: &Scene, rendered: &'a Rendered, spots: &'a [Option<Spot>]) 
             [0.0, 0.0, 0.0, 1.0],
         ],
         laser: camera.to_camera(scene.laser.origin).into(),
-        scale: photon_scale(&rendered.transient, rendered.gate.bins as usize, PEAK_PHOTONS),
+        scale: photon_scale(
+            &rendered.transient,
+            rendered.gate.bins as usize,
+            PEAK_PHOTONS,
+        ),
     }
 }
 

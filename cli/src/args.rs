@@ -1,0 +1,353 @@
+//! The command line: one definition feeds the parser, the help, and the completions.
+
+use std::{net::SocketAddr, path::PathBuf};
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Render farm for time-resolved lidar histograms.
+#[derive(Parser)]
+#[command(name = "picofarm", version, propagate_version = true, after_help = EXIT_CODES)]
+pub struct Cli {
+    #[command(flatten)]
+    pub global: Global,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0    done
+  1    something failed that is not listed here
+  2    wrong arguments
+  3    bad input: a job file, scene file, setting or scene that cannot be used
+  4    the coordinator cannot be reached, or refused (another version)
+  5    the job ended with dead tasks, or was cancelled
+  6    a data set is damaged or incomplete
+  7    a resource is taken or missing: port in use, disk full, store read-only
+  130  interrupted";
+
+#[derive(Args, Clone)]
+pub struct Global {
+    /// Print machine-readable JSON (one document; one a line where a command streams)
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Settings file [default: picofarm.toml here, else in the user's configuration folder]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// URL of the coordinator [env: PICOFARM_COORDINATOR]
+    #[arg(long, global = true, value_name = "URL")]
+    pub coordinator: Option<String>,
+    /// Folder with furniture assets [env: PICOFARM_ASSETS]
+    #[arg(long, global = true, value_name = "DIR")]
+    pub assets_dir: Option<PathBuf>,
+    /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
+    #[arg(long, global = true, value_name = "FILTER")]
+    pub log: Option<String>,
+}
+
+#[derive(Subcommand)]
+pub enum Command {
+    /// Render a small furnished-room data set end to end on this machine, and show it
+    Demo(Demo),
+    /// Run a coordinator and workers on this machine until stopped
+    Up(Up),
+    /// Run a coordinator
+    Coordinator(Coordinator),
+    /// Run a worker
+    Worker(Worker),
+    /// Write, plan, submit and follow jobs
+    #[command(subcommand)]
+    Job(Job),
+    /// Look at data sets and check them
+    #[command(subcommand)]
+    Dataset(Dataset),
+    /// Make, inspect and render single scenes
+    #[command(subcommand)]
+    Scene(Scene),
+    /// Furniture for generated rooms
+    #[command(subcommand)]
+    Assets(Assets),
+    /// Show the settings in force and where each comes from
+    Config,
+    /// Check this machine: store, disk, coordinator, furniture
+    Doctor(Doctor),
+    /// Print completions for a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
+}
+
+#[derive(Args)]
+pub struct Demo {
+    /// Folder for the catalog, the store and the pictures
+    #[arg(long, default_value = "picofarm-demo", value_name = "DIR")]
+    pub dir: PathBuf,
+    /// Number of scenes
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..))]
+    pub scenes: u64,
+    /// Image width and height in pixels
+    #[arg(long, default_value_t = 256, value_name = "PX")]
+    pub resolution: u32,
+    /// Laser spots: 1, 4, 16, 25 or 100
+    #[arg(long, default_value_t = 25)]
+    pub spots: u32,
+    /// Seed of the data set
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Workers to start; they share the cores [default: 2, or 1 on a single core]
+    #[arg(long)]
+    pub workers: Option<usize>,
+    /// Camera paths per pixel for three bounces and more
+    #[arg(long, default_value_t = 32)]
+    pub samples: u32,
+    /// Furniture: auto, parametric or sweethome3d
+    #[arg(long, default_value = "auto")]
+    pub assets: String,
+}
+
+#[derive(Args)]
+pub struct Up {
+    /// Folder for the catalog
+    #[arg(long, default_value = "picofarm-data", value_name = "DIR")]
+    pub dir: PathBuf,
+    /// Address to listen on
+    #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
+    pub listen: SocketAddr,
+    /// Workers to start; they share the cores [default: 1]
+    #[arg(long, default_value_t = 1)]
+    pub workers: usize,
+}
+
+#[derive(Args)]
+pub struct Coordinator {
+    /// The catalog, a SQLite file
+    #[arg(
+        long,
+        default_value = "picofarm-data/catalog.sqlite",
+        value_name = "FILE"
+    )]
+    pub catalog: PathBuf,
+    /// Address to listen on (port 0 = any free port; the address is printed)
+    #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
+    pub listen: SocketAddr,
+    /// Lease time to live in seconds
+    #[arg(long, default_value_t = 60.0, value_name = "S")]
+    pub lease_s: f64,
+    /// Listen beyond loopback although there is no authentication yet
+    #[arg(long)]
+    pub allow_insecure: bool,
+}
+
+#[derive(Args)]
+pub struct Worker {
+    /// Name, for people [default: host name and process id]
+    #[arg(long)]
+    pub name: Option<String>,
+    /// Threads to render with [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+}
+
+#[derive(Subcommand)]
+pub enum Job {
+    /// Write a commented job file to start from
+    Init {
+        /// Where to write it
+        #[arg(default_value = "job.toml")]
+        file: PathBuf,
+        /// Kind of scenes
+        #[arg(long, value_enum, default_value_t = SceneKindArg::Furnished)]
+        kind: SceneKindArg,
+    },
+    /// Say what a submission would run and what it would reuse; changes nothing
+    Plan {
+        /// The job file
+        file: PathBuf,
+    },
+    /// Submit a job file; the same file again answers with the same job
+    Submit {
+        /// The job file
+        file: PathBuf,
+        /// Follow the job until it ends
+        #[arg(long)]
+        watch: bool,
+        /// Submit again although the same job failed or was cancelled
+        #[arg(long)]
+        again: bool,
+    },
+    /// List all jobs
+    List,
+    /// Show one job
+    Status {
+        /// Job id, or the first letters of one
+        job: String,
+    },
+    /// Follow a job with progress until it ends
+    Watch {
+        /// Job id, or the first letters of one
+        job: String,
+    },
+    /// Wait silently until a job ends
+    Wait {
+        /// Job id, or the first letters of one
+        job: String,
+        /// Give up after this many seconds (exit code 1)
+        #[arg(long, value_name = "S")]
+        timeout_s: Option<f64>,
+    },
+    /// Stop a job; what it finished stays
+    Cancel {
+        /// Job id, or the first letters of one
+        job: String,
+    },
+    /// Make a job's dead tasks pending again
+    Retry {
+        /// Job id, or the first letters of one
+        job: String,
+    },
+    /// Show what happened to a job
+    Logs {
+        /// Job id, or the first letters of one
+        job: String,
+        /// Only this task
+        #[arg(long)]
+        task: Option<u64>,
+        /// Only the last N lines
+        #[arg(long, default_value_t = 100, value_name = "N")]
+        last: u32,
+    },
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum SceneKindArg {
+    Furnished,
+    Primitive,
+    Files,
+}
+
+#[derive(Subcommand)]
+pub enum Dataset {
+    /// Summarise a data set
+    Info {
+        /// Folder or URL of the data set
+        dataset: String,
+    },
+    /// Check a data set against its manifests; exit code 6 if anything is wrong
+    Verify {
+        /// Folder or URL of the data set
+        dataset: String,
+        /// Manifests and sizes only; otherwise every object is hashed and decoded
+        #[arg(long)]
+        fast: bool,
+    },
+    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
+    Picture {
+        /// Folder or URL of the data set
+        dataset: String,
+        /// Folder for the pictures
+        #[arg(long, default_value = ".", value_name = "DIR")]
+        out: PathBuf,
+        /// Rows of the contact sheet at most
+        #[arg(long, default_value_t = 8)]
+        rows: usize,
+    },
+}
+
+#[derive(Subcommand)]
+pub enum Scene {
+    /// Generate a scene from a seed and write it as .glb
+    Generate {
+        /// Kind of scene
+        #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
+        kind: GeneratorArg,
+        /// Seed
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+        /// Where to write it
+        #[arg(long, default_value = "scene.glb", value_name = "FILE")]
+        out: PathBuf,
+        /// Laser spots: 1, 4, 16, 25 or 100
+        #[arg(long, default_value_t = 25)]
+        spots: u32,
+        /// Image width and height in pixels
+        #[arg(long, default_value_t = 256, value_name = "PX")]
+        resolution: u32,
+        /// Furniture: auto, parametric or sweethome3d
+        #[arg(long, default_value = "auto")]
+        assets: String,
+    },
+    /// Say what a scene file holds
+    Show {
+        /// A .glb, .gltf or .json scene
+        file: PathBuf,
+    },
+    /// Render one scene file without a farm into a small Zarr group
+    Render(SceneRender),
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum GeneratorArg {
+    Furnished,
+    Primitive,
+}
+
+#[derive(Args)]
+pub struct SceneRender {
+    /// A .glb, .gltf or .json scene
+    pub file: PathBuf,
+    /// Folder for the Zarr group (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Image width and height in pixels [default: the scene's own]
+    #[arg(long, value_name = "PX")]
+    pub resolution: Option<u32>,
+    /// Render until the median per-pixel error falls to this share, e.g. 10%
+    #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
+    pub error: Option<f64>,
+    /// Camera paths per pixel [default: 64]
+    #[arg(long)]
+    pub samples: Option<u32>,
+    /// Seed of the random numbers
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Longest path in bounces [default: until the gate ends]
+    #[arg(long)]
+    pub max_bounces: Option<u32>,
+    /// Keep two-bounce and 3+ parts and their standard errors: arrays two, multi, two_se, multi_se
+    #[arg(long)]
+    pub split: bool,
+    /// Threads [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[command(flatten)]
+    pub gate: GateArgs,
+}
+
+#[derive(Args)]
+pub struct GateArgs {
+    /// Start of the time gate, metres of optical path
+    #[arg(long, default_value_t = 1.0, value_name = "M")]
+    pub gate_start_m: f64,
+    /// Bin width, metres of optical path
+    #[arg(long, default_value_t = 0.0384, value_name = "M")]
+    pub bin_width_m: f64,
+    /// Number of bins
+    #[arg(long, default_value_t = 637)]
+    pub bins: u32,
+}
+
+#[derive(Subcommand)]
+pub enum Assets {
+    /// Fetch Sweet Home 3D's furniture (Debian package, 120 MB) into the assets folder
+    Install,
+    /// Say which furniture is installed
+    List,
+}
+
+#[derive(Args)]
+pub struct Doctor {
+    /// Store to check [default: the current folder]
+    #[arg(long, default_value = ".", value_name = "PATH_OR_URL")]
+    pub store: String,
+}

@@ -1,0 +1,251 @@
+//! The coordinator as the commands see it: model types in, model types out, errors with a hint.
+
+use std::time::Duration;
+
+use picofarm_proto::{
+    convert::ConvertError,
+    ids::JobId,
+    model::{Event, JobPlan, JobSpec, JobStatus},
+    wire::{self, jobs_client::JobsClient},
+};
+use tonic::{
+    Code as Grpc, Status,
+    transport::{Channel, Endpoint},
+};
+
+use crate::error::{CliError, Code, Result};
+
+/// A connection to a coordinator's job service.
+#[derive(Clone)]
+pub struct Client {
+    jobs: JobsClient<Channel>,
+    url: String,
+}
+
+/// What a submission answered.
+pub struct Submitted {
+    pub job: JobId,
+    pub existed: bool,
+    pub plan: JobPlan,
+}
+
+fn refused(status: &Status) -> CliError {
+    let code = match status.code() {
+        Grpc::InvalidArgument | Grpc::NotFound | Grpc::OutOfRange => Code::Input,
+        Grpc::ResourceExhausted => Code::Resource,
+        Grpc::Unavailable | Grpc::FailedPrecondition | Grpc::Unimplemented => Code::Coordinator,
+        _ => Code::Failed,
+    };
+    CliError::new(code, status.message())
+}
+
+fn unreadable(e: ConvertError) -> CliError {
+    CliError::new(
+        Code::Coordinator,
+        format!("the coordinator's answer cannot be read: {e}"),
+    )
+    .hint("is it of another version? compare `picofarm --version` on both sides")
+}
+
+fn required<T>(value: Option<T>, field: &'static str) -> Result<T> {
+    value.ok_or_else(|| unreadable(ConvertError::Missing { field }))
+}
+
+impl Client {
+    /// Connects, within five seconds.
+    pub async fn connect(url: &str) -> Result<Self> {
+        let bad = |e: tonic::transport::Error| {
+            CliError::input(format!("coordinator {url:?}: {e}"))
+                .hint("give a URL such as http://127.0.0.1:7420")
+        };
+        let channel = Endpoint::from_shared(url.to_owned())
+            .map_err(bad)?
+            .connect_timeout(Duration::from_secs(5))
+            .connect()
+            .await
+            .map_err(|_| {
+                CliError::new(Code::Coordinator, format!("no coordinator answers at {url}")).hint(
+                    "start one with `picofarm up`, or name another with --coordinator or PICOFARM_COORDINATOR",
+                )
+            })?;
+        Ok(Self {
+            jobs: JobsClient::new(channel).max_decoding_message_size(64 << 20),
+            url: url.to_owned(),
+        })
+    }
+
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// (version, protocol, workers connected).
+    pub async fn server(&mut self) -> Result<(String, u32, u32)> {
+        let info = self
+            .jobs
+            .get_server_info(wire::GetServerInfoRequest {})
+            .await
+            .map_err(|s| refused(&s))?
+            .into_inner();
+        Ok((info.version, info.protocol, info.workers))
+    }
+
+    pub async fn plan(&mut self, spec: JobSpec) -> Result<JobPlan> {
+        let request = wire::PlanJobRequest {
+            spec: Some(spec.into()),
+        };
+        let reply = self.jobs.plan_job(request).await.map_err(|s| refused(&s))?;
+        required(reply.into_inner().plan, "plan")?
+            .try_into()
+            .map_err(unreadable)
+    }
+
+    pub async fn submit(&mut self, spec: JobSpec, again: bool) -> Result<Submitted> {
+        let request = wire::SubmitJobRequest {
+            spec: Some(spec.into()),
+            again,
+        };
+        let reply = self
+            .jobs
+            .submit_job(request)
+            .await
+            .map_err(|s| refused(&s))?
+            .into_inner();
+        Ok(Submitted {
+            job: reply.job_id.parse().map_err(|e| {
+                unreadable(ConvertError::Invalid {
+                    field: "job_id",
+                    what: format!("{e}"),
+                })
+            })?,
+            existed: reply.existed,
+            plan: required(reply.plan, "plan")?
+                .try_into()
+                .map_err(unreadable)?,
+        })
+    }
+
+    pub async fn list(&mut self) -> Result<Vec<JobStatus>> {
+        let reply = self
+            .jobs
+            .list_jobs(wire::ListJobsRequest {})
+            .await
+            .map_err(|s| refused(&s))?;
+        reply
+            .into_inner()
+            .jobs
+            .into_iter()
+            .map(|j| j.try_into().map_err(unreadable))
+            .collect()
+    }
+
+    pub async fn status(&mut self, job: JobId) -> Result<JobStatus> {
+        let request = wire::GetJobRequest {
+            job_id: job.to_string(),
+        };
+        let reply = self.jobs.get_job(request).await.map_err(|s| refused(&s))?;
+        required(reply.into_inner().job, "job")?
+            .try_into()
+            .map_err(unreadable)
+    }
+
+    /// Finds the one job whose id begins with `text`.
+    pub async fn find(&mut self, text: &str) -> Result<JobId> {
+        if let Ok(id) = text.parse() {
+            return Ok(id);
+        }
+        let jobs = self.list().await?;
+        let mut matching = jobs
+            .iter()
+            .filter(|j| !text.is_empty() && (j.id.to_string().starts_with(text) || j.name == text));
+        match (matching.next(), matching.next()) {
+            (Some(job), None) => Ok(job.id),
+            (Some(a), Some(b)) => Err(CliError::input(format!(
+                "{text:?} fits several jobs, e.g. {} and {}",
+                a.id, b.id
+            ))
+            .hint("give more letters of the id")),
+            _ => Err(CliError::input(format!("no job {text:?}")).hint("see `picofarm job list`")),
+        }
+    }
+
+    /// Streams statuses until the job ends.
+    pub async fn watch(&mut self, job: JobId) -> Result<Watch> {
+        let request = wire::WatchJobRequest {
+            job_id: job.to_string(),
+        };
+        let stream = self
+            .jobs
+            .watch_job(request)
+            .await
+            .map_err(|s| refused(&s))?;
+        Ok(Watch(stream.into_inner()))
+    }
+
+    pub async fn cancel(&mut self, job: JobId) -> Result<JobStatus> {
+        let request = wire::CancelJobRequest {
+            job_id: job.to_string(),
+        };
+        let reply = self
+            .jobs
+            .cancel_job(request)
+            .await
+            .map_err(|s| refused(&s))?;
+        required(reply.into_inner().job, "job")?
+            .try_into()
+            .map_err(unreadable)
+    }
+
+    pub async fn retry(&mut self, job: JobId) -> Result<u64> {
+        let request = wire::RetryJobRequest {
+            job_id: job.to_string(),
+        };
+        let reply = self
+            .jobs
+            .retry_job(request)
+            .await
+            .map_err(|s| refused(&s))?;
+        Ok(reply.into_inner().retried)
+    }
+
+    pub async fn events(
+        &mut self,
+        job: JobId,
+        after: u64,
+        task: Option<u64>,
+    ) -> Result<Vec<Event>> {
+        let request = wire::ListEventsRequest {
+            job_id: job.to_string(),
+            after,
+            limit: 1000,
+            task,
+        };
+        let reply = self
+            .jobs
+            .list_events(request)
+            .await
+            .map_err(|s| refused(&s))?;
+        reply
+            .into_inner()
+            .events
+            .into_iter()
+            .map(|e| e.try_into().map_err(unreadable))
+            .collect()
+    }
+}
+
+/// A stream of statuses.
+pub struct Watch(tonic::Streaming<wire::WatchJobResponse>);
+
+impl Watch {
+    /// The next status; `None` when the job has ended.
+    pub async fn next(&mut self) -> Result<Option<JobStatus>> {
+        match self.0.message().await {
+            Ok(None) => Ok(None),
+            Ok(Some(reply)) => required(reply.job, "job")?
+                .try_into()
+                .map(Some)
+                .map_err(unreadable),
+            Err(status) => Err(refused(&status)),
+        }
+    }
+}

@@ -1,0 +1,206 @@
+//! `picofarm dataset …`: what a data set holds, whether it is whole, and what it looks like.
+
+use std::path::{Path, PathBuf};
+
+use picofarm_dataset::{Dataset, DatasetError, Summary, Verification, VerifyMode, open_store};
+use serde_json::json;
+
+use crate::{
+    args::Dataset as Command,
+    error::{CliError, Code, Result, io},
+    output::{Output, bytes},
+    picture::{View, flight, sheet},
+};
+
+pub async fn run(command: Command, output: Output) -> Result<()> {
+    match command {
+        Command::Info { dataset } => {
+            let info = open(&dataset).await?.info().await.map_err(failed)?;
+            output.result(&info_json(&dataset, &info), || describe(&dataset, &info));
+            Ok(())
+        }
+        Command::Verify { dataset, fast } => {
+            let report = check(&dataset, fast).await?;
+            let facts = json!({
+                "scenes": report.scenes, "objects": report.objects, "bytes": report.bytes,
+                "problems": [], "unpublished": report.unpublished,
+            });
+            output.result(&facts, || {
+                format!(
+                    "{} scenes, {} objects, {}: whole",
+                    report.scenes,
+                    report.objects,
+                    bytes(report.bytes)
+                )
+            });
+            Ok(())
+        }
+        Command::Picture { dataset, out, rows } => {
+            std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
+            let present = open(&dataset)
+                .await?
+                .scenes_present()
+                .await
+                .map_err(failed)?;
+            let scenes = &present[..present.len().min(rows.max(1))];
+            let drawn = draw(&dataset, scenes, &out).await?;
+            output.result(
+                &json!({"contact_sheet": drawn.sheet, "light_in_flight": drawn.flight}),
+                || format!("{}\n{}", drawn.sheet.display(), drawn.flight.display()),
+            );
+            Ok(())
+        }
+    }
+}
+
+fn info_json(place: &str, info: &Summary) -> serde_json::Value {
+    json!({
+        "dataset": place, "spec": info.spec, "scenes": info.scenes, "bytes": info.bytes,
+        "max_sigma": info.max_sigma, "rms_sigma": info.rms_sigma, "overflow": info.overflow,
+    })
+}
+
+fn describe(place: &str, info: &Summary) -> String {
+    let s = &info.spec;
+    let end = s.gate.start_m + f64::from(s.gate.bins) * s.gate.bin_width_m;
+    let coding = match info.rms_sigma {
+        Some((lo, hi)) => format!(
+            ", coding error {lo:.3} to {hi:.3} sigma rms, {:.3} at most",
+            info.max_sigma
+        ),
+        None => String::new(),
+    };
+    let each = info
+        .bytes
+        .checked_div(info.scenes)
+        .map(|b| format!(", {} a scene", bytes(b)));
+    format!(
+        "{place}: {} of {} scenes, {}{}\n\
+         {}x{} pixels x {} bins of {} m from {} to {end:.5} m of path, {} spots\n\
+         {:?}{coding}, {} saturated bins kept exactly\n",
+        info.scenes,
+        s.scenes,
+        bytes(info.bytes),
+        each.unwrap_or_default(),
+        s.width,
+        s.height,
+        s.gate.bins,
+        s.gate.bin_width_m,
+        s.gate.start_m,
+        s.spots,
+        s.profile,
+        info.overflow,
+    )
+}
+
+async fn open(place: &str) -> Result<Dataset> {
+    let (store, prefix) = open_store(place).map_err(failed)?;
+    Dataset::open(store, prefix).await.map_err(failed)
+}
+
+fn failed(error: DatasetError) -> CliError {
+    let code = match &error {
+        DatasetError::Damaged { .. } | DatasetError::Conflict { .. } => Code::Damaged,
+        DatasetError::Store { .. } | DatasetError::UnsafeStore { .. } => Code::Resource,
+        _ => Code::Input,
+    };
+    CliError::new(code, error)
+}
+
+/// Verifies a data set.
+///
+/// # Errors
+/// Exit code 6 naming what is broken.
+pub async fn check(place: &str, fast: bool) -> Result<Verification> {
+    let mode = if fast {
+        VerifyMode::Fast
+    } else {
+        VerifyMode::Full
+    };
+    let report = open(place).await?.verify(mode).await.map_err(failed)?;
+    if report.is_sound() {
+        return Ok(report);
+    }
+    let shown: Vec<String> = report
+        .problems
+        .iter()
+        .take(20)
+        .map(ToString::to_string)
+        .collect();
+    let more = match report.problems.len().saturating_sub(shown.len()) {
+        0 => String::new(),
+        n => format!("\n  … and {n} more"),
+    };
+    Err(CliError::new(
+        Code::Damaged,
+        format!("{place}: {} problem(s)\n  {}{more}", report.problems.len(), shown.join("\n  ")),
+    )
+    .hint("remove the objects named and the scene's manifest, then submit the job again: only those scenes are rendered"))
+}
+
+/// Where the pictures are.
+pub struct Drawn {
+    pub sheet: PathBuf,
+    pub flight: PathBuf,
+}
+
+/// Draws the contact sheet of `scenes` and the first one's light in flight into `dir`.
+///
+/// # Errors
+/// No scenes, an unreadable scene, or a folder that cannot be written.
+pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
+    let Some(&first) = scenes.first() else {
+        return Err(CliError::input(format!(
+            "{place}: no finished scene to draw"
+        )));
+    };
+    let dataset = open(place).await?;
+    let drawn = Drawn {
+        sheet: dir.join("contact-sheet.png"),
+        flight: dir.join("light-in-flight.gif"),
+    };
+    let handle = tokio::runtime::Handle::current();
+    let (scenes, sheet_path, flight_path) =
+        (scenes.to_vec(), drawn.sheet.clone(), drawn.flight.clone());
+    tokio::task::spawn_blocking(move || {
+        let read = |scene| handle.block_on(view(&dataset, scene));
+        sheet::sheet(&scenes, read)?.save(&sheet_path)?;
+        flight::animate(&read(first)?, &flight_path)
+    })
+    .await
+    .map_err(|e| CliError::new(Code::Failed, format!("drawing broke: {e}")))??;
+    Ok(drawn)
+}
+
+async fn view(dataset: &Dataset, scene: u64) -> Result<View> {
+    use picofarm_dataset::Quantity as Q;
+    let spec = *dataset.spec();
+    let intrinsics = dataset.read_intrinsics(scene).await.map_err(failed)?;
+    let spots = dataset.read_spots(scene).await.map_err(failed)?;
+    let film = |s: picofarm_dataset::Spot| {
+        let [x, y, z] = s.position;
+        (z > 0.0).then(|| {
+            [
+                intrinsics.fx * x / z + intrinsics.cx,
+                intrinsics.fy * y / z + intrinsics.cy,
+            ]
+        })
+    };
+    Ok(View {
+        scene,
+        width: spec.width as usize,
+        height: spec.height as usize,
+        bins: spec.gate.bins as usize,
+        gate_start_m: spec.gate.start_m,
+        bin_width_m: spec.gate.bin_width_m,
+        transient: dataset.read_transient(scene).await.map_err(failed)?,
+        depth: dataset.read::<f32>(scene, Q::Depth).await.map_err(failed)?,
+        rgb: dataset.read::<u8>(scene, Q::Rgb).await.map_err(failed)?,
+        specular: dataset
+            .read::<u8>(scene, Q::Specular)
+            .await
+            .map_err(failed)?,
+        visibility: dataset.read_visibility(scene).await.map_err(failed)?,
+        spots: spots.into_iter().map(|s| s.and_then(film)).collect(),
+    })
+}

@@ -1,0 +1,194 @@
+//! `picofarm demo` and `picofarm up`: the whole farm on one machine.
+
+use std::{net::SocketAddr, path::Path};
+
+use picofarm_proto::{
+    ids::JobId,
+    model::{
+        Budget, JobSpec, JobState, JobStatus, Limits, OutputSettings, RenderSettings, SceneKind,
+        SceneSource,
+    },
+};
+use serde_json::json;
+
+use crate::{
+    args::{Demo, Up},
+    client::Client,
+    dataset,
+    error::{Result, io},
+    follow::{Show, follow, verdict},
+    jobfile,
+    local::Local,
+    output::{Output, bytes},
+    roles,
+    settings::Settings,
+    signals,
+};
+
+fn spec(args: &Demo) -> JobSpec {
+    JobSpec {
+        name: "demo".into(),
+        scenes: SceneSource {
+            kind: SceneKind::Furnished {
+                assets: args.assets.clone(),
+                min_specular: 1,
+            },
+            count: args.scenes,
+            seed: args.seed,
+            fov_deg: 90.0,
+            spots: args.spots,
+        },
+        render: RenderSettings {
+            resolution: args.resolution,
+            budget: Budget::Samples(args.samples),
+            ..RenderSettings::default()
+        },
+        output: OutputSettings {
+            store: "store".into(),
+            dataset: "rooms".into(),
+            profile: "sqrt-u16".into(),
+        },
+        limits: Limits::default(),
+    }
+}
+
+/// Renders, verifies and shows a data set.
+///
+/// # Errors
+/// Bad arguments, a folder that holds another demo, an interruption, or a failure on the way.
+pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()> {
+    let dir = std::path::absolute(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
+    let spec = jobfile::resolve(spec(&args), &dir, &settings.assets)?;
+    std::fs::create_dir_all(&dir).map_err(|e| io(dir.display(), &e))?;
+    let workers = args.workers.unwrap_or_else(|| roles::cores().min(2)).max(1);
+    let r = &spec.render;
+    output.say(format!(
+        "{} furnished rooms, {1}x{1} pixels x {2} bins, {3} spots, {4}; {workers} worker{5} in {6}",
+        spec.scenes.count,
+        r.resolution,
+        r.bins,
+        spec.scenes.spots,
+        furniture(&spec),
+        if workers == 1 { "" } else { "s" },
+        dir.display(),
+    ));
+
+    let stop = signals::stop_on_signal()?;
+    let any = SocketAddr::from(([127, 0, 0, 1], 0));
+    let mut farm =
+        Local::start(&dir.join("catalog.sqlite"), any, workers, &settings.assets).await?;
+    let mut client = Client::connect(&farm.url).await?;
+    let place = format!("{}/{}", spec.output.store, spec.output.dataset);
+    let rendered = tokio::select! {
+        status = render(&mut client, spec, output) => Some(status),
+        lost = farm.worker_lost() => Some(Err(lost)),
+        () = stop.cancelled() => None,
+    };
+    farm.stop().await?;
+    let Some(status) = rendered else {
+        return Err(signals::interrupted(
+            "run the same command again: it continues where it stopped",
+        ));
+    };
+    let (job, status) = status?;
+    verdict(&status)?;
+    show(&args, &dir, &place, job, &status, output).await
+}
+
+async fn render(client: &mut Client, spec: JobSpec, output: Output) -> Result<(JobId, JobStatus)> {
+    let mut submitted = client.submit(spec.clone(), false).await?;
+    let earlier = client.status(submitted.job).await?;
+    match earlier.state {
+        JobState::Failed => {
+            client.retry(submitted.job).await?;
+        }
+        JobState::Cancelled => submitted = client.submit(spec, true).await?,
+        JobState::Active | JobState::Done => {}
+    }
+    if submitted.existed && earlier.tasks.done > 0 {
+        output.say(format!(
+            "{} scenes are finished already and stay as they are",
+            earlier.tasks.done
+        ));
+    }
+    let progress = if output.json {
+        Show::Nothing
+    } else {
+        Show::Progress
+    };
+    let status = follow(client, submitted.job, output, progress).await?;
+    Ok((submitted.job, status))
+}
+
+async fn show(
+    args: &Demo,
+    dir: &Path,
+    place: &str,
+    job: JobId,
+    status: &JobStatus,
+    output: Output,
+) -> Result<()> {
+    output.say("verifying what was written …");
+    let report = dataset::check(place, false).await?;
+    let scenes: Vec<u64> = (0..args.scenes).collect();
+    output.say("drawing …");
+    let pictures = dataset::draw(place, &scenes[..scenes.len().min(16)], dir).await?;
+    let took = status.ended_at_ms.map_or(0, |e| e - status.submitted_at_ms) as f64 / 1000.0;
+    let summary = json!({
+        "job": job, "dataset": place, "scenes": args.scenes, "reused": status.tasks.reused,
+        "bytes": report.bytes, "objects": report.objects, "seconds": took,
+        "contact_sheet": pictures.sheet, "light_in_flight": pictures.flight,
+    });
+    output.result(&summary, || {
+        format!(
+            "{} scenes, {} in {} objects, all verified\n\
+             data set         {place}\n\
+             contact sheet    {}\n\
+             light in flight  {}\n\
+             next:\n  \
+             picofarm dataset info {place}\n  \
+             python3 -c 'import xarray; print(xarray.open_zarr(\"{place}\"))'\n  \
+             picofarm job init && picofarm up\n",
+            args.scenes,
+            bytes(report.bytes),
+            report.objects,
+            pictures.sheet.display(),
+            pictures.flight.display(),
+        )
+    });
+    Ok(())
+}
+
+/// Runs a coordinator and workers until a signal.
+///
+/// # Errors
+/// A taken address or catalog, or a worker that ends.
+pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
+    roles::refuse_beyond_loopback(args.listen, false)?;
+    std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
+    let stop = signals::stop_on_signal()?;
+    let catalog = args.dir.join("catalog.sqlite");
+    let mut farm = Local::start(&catalog, args.listen, args.workers, &settings.assets).await?;
+    output.result(&json!({"coordinator": farm.url, "workers": args.workers}), || {
+        format!(
+            "coordinator at {} with {} worker(s); submit with `picofarm --coordinator {} job submit FILE`",
+            farm.url, args.workers, farm.url
+        )
+    });
+    let lost = tokio::select! {
+        lost = farm.worker_lost() => Some(lost),
+        () = stop.cancelled() => None,
+    };
+    farm.stop().await?;
+    lost.map_or(Ok(()), Err)
+}
+
+fn furniture(spec: &JobSpec) -> String {
+    match &spec.scenes.kind {
+        SceneKind::Furnished { assets, .. } if assets.starts_with("parametric") => {
+            "parametric furniture (`picofarm assets install` fetches real models)".into()
+        }
+        SceneKind::Furnished { assets, .. } => format!("furniture {assets}"),
+        _ => String::new(),
+    }
+}

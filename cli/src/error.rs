@@ -1,0 +1,92 @@
+//! How a command fails: a message, a hint that can be typed, and a documented exit code.
+
+use std::fmt;
+
+/// Exit codes, as listed in `picofarm --help`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Code {
+    Failed = 1,
+    Input = 3,
+    Coordinator = 4,
+    JobFailed = 5,
+    Damaged = 6,
+    Resource = 7,
+    Interrupted = 130,
+}
+
+/// Why a command failed.
+#[derive(Debug)]
+pub struct CliError {
+    pub code: Code,
+    pub message: String,
+    pub hint: Option<String>,
+}
+
+pub type Result<T, E = CliError> = std::result::Result<T, E>;
+
+impl CliError {
+    pub fn new(code: Code, message: impl fmt::Display) -> Self {
+        Self {
+            code,
+            message: message.to_string(),
+            hint: None,
+        }
+    }
+
+    pub fn input(message: impl fmt::Display) -> Self {
+        Self::new(Code::Input, message)
+    }
+
+    pub fn hint(mut self, hint: impl fmt::Display) -> Self {
+        self.hint = Some(hint.to_string());
+        self
+    }
+
+    /// Prints to stderr and gives the exit code.
+    pub fn report(&self, json: bool) -> u8 {
+        if json {
+            let error = serde_json::json!({"error": {
+                "code": self.code as u8, "message": self.message, "hint": self.hint}});
+            eprintln!("{error}");
+        } else {
+            eprintln!("error: {}", self.message);
+            if let Some(hint) = &self.hint {
+                eprintln!("hint: {hint}");
+            }
+        }
+        self.code as u8
+    }
+}
+
+/// An I/O failure on a path the user knows.
+pub fn io(what: impl fmt::Display, error: &std::io::Error) -> CliError {
+    use std::io::ErrorKind as K;
+    let failed = CliError::new(Code::Resource, format!("{what}: {error}"));
+    match error.kind() {
+        K::StorageFull => {
+            failed.hint("free some space and run the same command again; finished work is kept")
+        }
+        K::PermissionDenied | K::ReadOnlyFilesystem => {
+            failed.hint("choose a folder that you may write to")
+        }
+        K::NotFound => CliError {
+            code: Code::Input,
+            ..failed
+        }
+        .hint("check the path"),
+        _ => failed,
+    }
+}
+
+impl From<picofarm_scene::SceneError> for CliError {
+    fn from(e: picofarm_scene::SceneError) -> Self {
+        CliError::input(e)
+    }
+}
+
+impl From<picofarm_proto::model::SpecError> for CliError {
+    fn from(e: picofarm_proto::model::SpecError) -> Self {
+        CliError::input(e)
+    }
+}

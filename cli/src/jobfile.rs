@@ -1,0 +1,212 @@
+//! Job files: the commented template, reading, and resolving what a submission must pin (furniture,
+//! scene files' content, renderer version, absolute store).
+
+use std::{
+    io::Read,
+    path::{Path, PathBuf},
+};
+
+use picofarm_proto::model::{JobSpec, SceneKind};
+use sha2::{Digest, Sha256};
+
+use crate::{
+    args::SceneKindArg,
+    assets,
+    error::{CliError, Code, Result, io},
+};
+
+/// A job file to start from.
+pub fn template(kind: SceneKindArg) -> String {
+    let scenes = match kind {
+        SceneKindArg::Furnished => {
+            "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
+             count = 8\n\
+             seed = 1                  # scene i derives its own seed from (seed, i)\n\
+             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             fov_deg = 90.0            # horizontal field of view\n\
+             assets = \"auto\"           # sweethome3d where installed, else parametric\n\
+             min_specular = 1          # mirrors a room at least\n"
+        }
+        SceneKindArg::Primitive => {
+            "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
+             count = 8\n\
+             seed = 1                  # scene i derives its own seed from (seed, i)\n\
+             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             fov_deg = 90.0            # horizontal field of view; jittered by scene\n"
+        }
+        SceneKindArg::Files => {
+            "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\
+             files = [\"scene.glb\"]     # relative to this file\n\
+             spots = 25                # for files that bring no laser\n"
+        }
+    };
+    format!(
+        "# A picofarm job. `picofarm job plan FILE` says what it would run; `picofarm job submit FILE` runs it.\n\
+         name = \"rooms\"\n\n\
+         [scenes]\n{scenes}\n\
+         [render]\n\
+         resolution = 256          # pixels, square\n\
+         gate_start_m = 1.0        # start of the time gate, metres of optical path\n\
+         bin_width_m = 0.0384      # metres of optical path (128 ps)\n\
+         bins = 637\n\
+         samples = 32              # camera paths per pixel; or: error = \"10%\"\n\
+         max_bounces = 0           # 0 = until the gate ends\n\n\
+         [output]\n\
+         store = \"picofarm-data/store\"   # a folder that every worker can reach\n\
+         dataset = \"rooms\"\n\
+         profile = \"sqrt-u16\"            # or: plain-f32\n\n\
+         [limits]\n\
+         max_failures = 3          # a task's own failures before it is given up\n\
+         max_crashes = 3           # losses of the worker under it before it is given up\n"
+    )
+}
+
+/// Reads a job file and pins everything a submission needs.
+///
+/// # Errors
+/// Input errors that name the file, the field and what was expected.
+pub fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
+    let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
+    let spec: JobSpec = toml::from_str(&text).map_err(|e| {
+        CliError::input(format!("{}: {}", path.display(), e.to_string().trim_end()))
+            .hint("`picofarm job init` writes a job file with every field explained")
+    })?;
+    let base = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    resolve(spec, base, asset_dir).map_err(|e| CliError {
+        message: format!("{}: {}", path.display(), e.message),
+        ..e
+    })
+}
+
+/// Pins furniture, file contents, the renderer's version and the store's absolute place.
+///
+/// # Errors
+/// A field out of its limits, a missing file, or furniture that is not installed.
+pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
+    let renderer = picofarm_agent::renderer_version();
+    if spec.render.renderer.is_empty() {
+        spec.render.renderer = renderer;
+    } else if spec.render.renderer != renderer {
+        return Err(CliError::input(format!(
+            "render.renderer: this program renders {renderer:?}, the job asks for {:?}",
+            spec.render.renderer
+        ))
+        .hint("leave the field out, or use the picofarm version that made the data set"));
+    }
+    spec.check()?;
+    picofarm_dataset::Profile::parse(&spec.output.profile)
+        .map_err(|e| CliError::input(format!("output.profile: {e}")))?;
+    if !spec.output.store.contains("://") {
+        spec.output.store = absolute(base, &spec.output.store)?.display().to_string();
+    }
+    match &mut spec.scenes.kind {
+        SceneKind::Furnished { assets: name, .. } => *name = assets::resolve(name, asset_dir)?,
+        SceneKind::Primitive => {}
+        SceneKind::Files { files } => {
+            for (i, file) in files.iter_mut().enumerate() {
+                let path = absolute(base, &file.path)?;
+                let hash = hash_file(&path)
+                    .map_err(|e| io(format!("scenes.files[{i}]: {}", path.display()), &e))?;
+                if !file.sha256.is_empty() && file.sha256 != hash {
+                    return Err(CliError::input(format!(
+                        "scenes.files[{i}]: {} has SHA-256 {hash}, the job says {}",
+                        path.display(),
+                        file.sha256
+                    )));
+                }
+                file.sha256 = hash;
+                file.path = path.display().to_string();
+            }
+        }
+    }
+    Ok(spec)
+}
+
+fn absolute(base: &Path, path: &str) -> Result<PathBuf> {
+    std::path::absolute(base.join(path))
+        .map_err(|e| CliError::new(Code::Input, format!("{path}: {e}")))
+}
+
+/// SHA-256 of a file's content in hexadecimal.
+fn hash_file(path: &Path) -> std::io::Result<String> {
+    let mut file = std::fs::File::open(path)?;
+    let mut hash = Sha256::new();
+    let mut buffer = vec![0; 1 << 16];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(hex::encode(hash.finalize())),
+            n => hash.update(&buffer[..n]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn written(dir: &Path, text: &str) -> PathBuf {
+        let path = dir.join("job.toml");
+        std::fs::write(&path, text).unwrap();
+        path
+    }
+
+    #[test]
+    fn every_template_reads_back() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("scene.glb"), b"x").unwrap();
+        for kind in [
+            SceneKindArg::Furnished,
+            SceneKindArg::Primitive,
+            SceneKindArg::Files,
+        ] {
+            let path = written(dir.path(), &template(kind));
+            let spec = read(&path, dir.path()).unwrap();
+            assert!(Path::new(&spec.output.store).is_absolute());
+        }
+    }
+
+    #[test]
+    fn an_unknown_field_is_named_with_its_line() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = template(SceneKindArg::Primitive).replace("bins = 637", "binns = 637");
+        let error = read(&written(dir.path(), &text), dir.path()).unwrap_err();
+        assert_eq!(error.code, Code::Input);
+        assert!(
+            error.message.contains("binns") && error.message.contains("job.toml"),
+            "{}",
+            error.message
+        );
+    }
+
+    #[test]
+    fn a_negative_gate_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let text =
+            template(SceneKindArg::Primitive).replace("gate_start_m = 1.0", "gate_start_m = -1.0");
+        let error = read(&written(dir.path(), &text), dir.path()).unwrap_err();
+        assert!(
+            error.message.contains("render.gate_start_m"),
+            "{}",
+            error.message
+        );
+    }
+
+    #[test]
+    fn a_missing_scene_file_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = read(
+            &written(dir.path(), &template(SceneKindArg::Files)),
+            dir.path(),
+        )
+        .unwrap_err();
+        assert!(
+            error.message.contains("scenes.files[0]"),
+            "{}",
+            error.message
+        );
+        assert_eq!(error.code, Code::Input);
+    }
+}

@@ -1,0 +1,280 @@
+//! `picofarm job …`.
+
+use std::{path::Path, time::Duration};
+
+use picofarm_proto::model::{Event, JobPlan, JobStatus};
+use serde_json::json;
+
+use crate::{
+    args::{Job, SceneKindArg},
+    client::Client,
+    error::{CliError, Code, Result, io},
+    follow::{Show, follow, verdict},
+    jobfile,
+    output::{Output, duration, table},
+    settings::Settings,
+};
+
+pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()> {
+    if let Job::Init { file, kind } = &command {
+        return init(file, *kind, output);
+    }
+    let spec = match &command {
+        Job::Plan { file } | Job::Submit { file, .. } => {
+            Some(jobfile::read(file, &settings.assets)?)
+        }
+        _ => None,
+    };
+    let mut client = Client::connect(&settings.coordinator).await?;
+    match command {
+        Job::Init { .. } => Ok(()),
+        Job::Plan { .. } => {
+            let plan = client.plan(spec.expect("read above")).await?;
+            output.result(&plan, || describe_plan(&plan));
+            Ok(())
+        }
+        Job::Submit { watch, again, .. } => {
+            let submitted = client.submit(spec.expect("read above"), again).await?;
+            let (job, existed) = (submitted.job, submitted.existed);
+            output.result(
+                &json!({"job": job, "existed": existed, "plan": submitted.plan}),
+                || {
+                    let was = if existed { " (was there already)" } else { "" };
+                    format!("job {job}{was}\n{}", describe_plan(&submitted.plan))
+                },
+            );
+            if watch {
+                finish(
+                    &follow(&mut client, job, output, Show::Progress).await?,
+                    output,
+                )
+            } else {
+                output.say(format!("follow it with `picofarm job watch {job}`"));
+                Ok(())
+            }
+        }
+        Job::List => {
+            let jobs = client.list().await?;
+            output.result(&jobs, || describe_list(&jobs));
+            Ok(())
+        }
+        Job::Status { job } => {
+            let job = client.find(&job).await?;
+            let status = client.status(job).await?;
+            output.result(&status, || describe(&status));
+            Ok(())
+        }
+        Job::Watch { job } => {
+            let job = client.find(&job).await?;
+            finish(
+                &follow(&mut client, job, output, Show::Progress).await?,
+                output,
+            )
+        }
+        Job::Wait { job, timeout_s } => {
+            let job = client.find(&job).await?;
+            let ended = follow(&mut client, job, output, Show::Nothing);
+            let status = match timeout_s {
+                None => ended.await?,
+                Some(s) => tokio::time::timeout(Duration::from_secs_f64(s.clamp(0.0, 1e9)), ended)
+                    .await
+                    .map_err(|_| {
+                        CliError::new(Code::Failed, format!("job {job} has not ended in {s} s"))
+                            .hint(format!("see `picofarm job status {job}`"))
+                    })??,
+            };
+            finish(&status, output)
+        }
+        Job::Cancel { job } => {
+            let job = client.find(&job).await?;
+            let status = client.cancel(job).await?;
+            output.result(&status, || describe(&status));
+            Ok(())
+        }
+        Job::Retry { job } => {
+            let job = client.find(&job).await?;
+            let retried = client.retry(job).await?;
+            output.result(&json!({"job": job, "retried": retried}), || {
+                format!("{retried} dead tasks of job {job} are pending again")
+            });
+            Ok(())
+        }
+        Job::Logs { job, task, last } => {
+            let job = client.find(&job).await?;
+            let events = history(&mut client, job, task, last).await?;
+            output.result(&events, || events.iter().map(describe_event).collect());
+            Ok(())
+        }
+    }
+}
+
+fn init(file: &Path, kind: SceneKindArg, output: Output) -> Result<()> {
+    use std::io::Write;
+    std::fs::File::create_new(file)
+        .and_then(|mut f| f.write_all(jobfile::template(kind).as_bytes()))
+        .map_err(|e| match e.kind() {
+            std::io::ErrorKind::AlreadyExists => {
+                CliError::input(format!("{} exists and is left as it is", file.display()))
+                    .hint("name another file")
+            }
+            _ => io(file.display(), &e),
+        })?;
+    output.result(&json!({"file": file}), || {
+        format!("wrote {0}; next: picofarm job plan {0}", file.display())
+    });
+    Ok(())
+}
+
+/// The last `last` events, in order.
+async fn history(
+    client: &mut Client,
+    job: picofarm_proto::ids::JobId,
+    task: Option<u64>,
+    last: u32,
+) -> Result<Vec<Event>> {
+    let (mut events, mut after) = (Vec::new(), 0);
+    loop {
+        let page = client.events(job, after, task).await?;
+        let Some(end) = page.last() else { break };
+        after = end.sequence;
+        events.extend(page);
+        let surplus = events.len().saturating_sub(last as usize);
+        events.drain(..surplus);
+    }
+    Ok(events)
+}
+
+fn finish(status: &JobStatus, output: Output) -> Result<()> {
+    output.result(status, || describe(status));
+    verdict(status)
+}
+
+pub fn describe_plan(plan: &JobPlan) -> String {
+    let mut text = format!(
+        "{} tasks: {} reuse, {} run\n",
+        plan.total, plan.reuse, plan.run
+    );
+    for reason in &plan.reasons {
+        text += &format!("  {reason}\n");
+    }
+    if let Some(job) = plan.existing_job {
+        text += &format!("  job {job} has this spec already\n");
+    }
+    text
+}
+
+fn state(status: &JobStatus) -> String {
+    format!("{:?}", status.state).to_lowercase()
+}
+
+fn describe_list(jobs: &[JobStatus]) -> String {
+    if jobs.is_empty() {
+        return "no jobs; submit one with `picofarm job submit FILE`".into();
+    }
+    let header = ["job", "name", "state", "done", "dead", "total"]
+        .map(String::from)
+        .to_vec();
+    let rows = jobs.iter().map(|j| {
+        vec![
+            j.id.to_string(),
+            j.name.clone(),
+            state(j),
+            j.tasks.done.to_string(),
+            j.tasks.dead.to_string(),
+            j.tasks.total.to_string(),
+        ]
+    });
+    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
+}
+
+pub fn describe(s: &JobStatus) -> String {
+    let t = &s.tasks;
+    let mut text = format!(
+        "job {} \"{}\": {}\n  {} tasks: {} done ({} reused), {} running, {} pending, {} dead\n",
+        s.id,
+        s.name,
+        state(s),
+        t.total,
+        t.done,
+        t.reused,
+        t.leased,
+        t.pending,
+        t.dead
+    );
+    if let Some(mean) = s.mean_task_seconds {
+        text += &format!("  {} a task on average\n", duration(mean));
+    }
+    if let Some(end) = s.ended_at_ms {
+        text += &format!(
+            "  took {}\n",
+            duration((end - s.submitted_at_ms) as f64 / 1000.0)
+        );
+    }
+    for r in &s.running {
+        text += &format!(
+            "  task {} on {}: {:.0} % after {}\n",
+            r.index,
+            r.worker,
+            r.fraction * 100.0,
+            duration(r.seconds)
+        );
+    }
+    text + &format!(
+        "  data set {}/{}\n",
+        s.spec.output.store, s.spec.output.dataset
+    )
+}
+
+fn describe_event(e: &Event) -> String {
+    let task = e.task.map(|t| format!("task {t} ")).unwrap_or_default();
+    let worker = if e.worker.is_empty() {
+        String::new()
+    } else {
+        format!("on {} ", e.worker)
+    };
+    let took = if e.seconds > 0.0 {
+        format!("in {} ", duration(e.seconds))
+    } else {
+        String::new()
+    };
+    let kind = format!("{:?}", e.kind).to_lowercase();
+    format!(
+        "{} {task}{kind} {worker}{took}{}",
+        clock(e.at_ms),
+        e.message
+    )
+    .trim_end()
+    .to_owned()
+        + "\n"
+}
+
+/// Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
+fn clock(ms: i64) -> String {
+    let (days, second) = (ms.div_euclid(86_400_000), ms.rem_euclid(86_400_000) / 1000);
+    // Civil date from days since 1970-01-01 (Hinnant's algorithm).
+    let z = days + 719_468;
+    let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
+    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
+    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
+    let mp = (5 * doy + 2) / 153;
+    let (day, month) = (
+        doy - (153 * mp + 2) / 5 + 1,
+        if mp < 10 { mp + 3 } else { mp - 9 },
+    );
+    let year = yoe + era * 400 + i64::from(month <= 2);
+    format!(
+        "{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z",
+        second / 3600,
+        second / 60 % 60,
+        second % 60
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn clock_is_utc() {
+        assert_eq!(super::clock(0), "1970-01-01T00:00:00Z");
+        assert_eq!(super::clock(1_795_255_530_000), "2026-11-21T10:05:30Z");
+    }
+}

@@ -1,0 +1,83 @@
+//! A coordinator and workers in this process, for `demo` and `up`.
+
+use std::{net::SocketAddr, path::Path, time::Duration};
+
+use picofarm_agent::{AgentConfig, AgentError, Summary};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    error::{CliError, Code, Result},
+    roles,
+};
+
+/// A farm on this machine.
+pub struct Local {
+    pub url: String,
+    coordinator: roles::Coordinator,
+    workers: JoinSet<Result<Summary, AgentError>>,
+    stop_workers: CancellationToken,
+}
+
+impl Local {
+    /// Starts a coordinator on `catalog` and `workers` workers that share the cores.
+    ///
+    /// # Errors
+    /// The catalog is in use or unreadable, or the address is taken.
+    pub async fn start(
+        catalog: &Path,
+        listen: SocketAddr,
+        workers: usize,
+        assets: &Path,
+    ) -> Result<Self> {
+        let coordinator =
+            roles::Coordinator::start(catalog, listen, Duration::from_secs(60)).await?;
+        let url = format!("http://{}", coordinator.address());
+        let mut local = Self {
+            url: url.clone(),
+            coordinator,
+            workers: JoinSet::new(),
+            stop_workers: CancellationToken::new(),
+        };
+        let cores = roles::cores();
+        for i in 0..workers {
+            let threads = (cores / workers + usize::from(i < cores % workers)).max(1);
+            let config = AgentConfig {
+                coordinator: url.clone(),
+                name: format!("local-{}", i + 1),
+                worker_id: None,
+                threads,
+                asset_dirs: vec![assets.to_owned()],
+                slots: 1,
+            };
+            local
+                .workers
+                .spawn(picofarm_agent::run(config, local.stop_workers.clone()));
+        }
+        Ok(local)
+    }
+
+    /// Resolves when a worker ends, which none should while the farm runs.
+    pub async fn worker_lost(&mut self) -> CliError {
+        match self.workers.join_next().await {
+            Some(Ok(Ok(_))) => CliError::new(Code::Failed, "a worker ended early"),
+            Some(Ok(Err(e))) => roles::agent_error(&e),
+            Some(Err(e)) => CliError::new(Code::Failed, format!("a worker broke: {e}")),
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Stops the workers, which hand back or finish their work, then the coordinator.
+    ///
+    /// # Errors
+    /// The coordinator ended with an error.
+    pub async fn stop(mut self) -> Result<()> {
+        self.stop_workers.cancel();
+        while let Some(ended) = self.workers.join_next().await {
+            if let Ok(Err(e)) = ended {
+                tracing::warn!("worker: {e}");
+            }
+        }
+        self.coordinator.stop().await
+    }
+}

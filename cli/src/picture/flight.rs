@@ -1,0 +1,98 @@
+//! Light in flight: one scene's transient as an animated GIF, a few bins a frame.
+
+use std::path::Path;
+
+use super::{View, cannot_write, colour::inferno, quantile, write_atomically};
+use crate::error::Result;
+
+/// Frames at most; bins are summed to stay below it.
+const FRAMES: usize = 160;
+/// Hundredths of a second a frame.
+const DELAY: u16 = 6;
+
+/// Writes the animation. Exposure is common to all frames (square root of the signal), so brightness can
+/// be compared over time; the palette is the colour map itself, so no colour is approximated.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn animate(view: &View, path: &Path) -> Result<()> {
+    let step = view.bins.div_ceil(FRAMES);
+    let energy = view.energy_by_bin();
+    let peak = energy.iter().copied().fold(0.0, f64::max);
+    // Leave out the dark ends of the gate.
+    let bright = |e: &f64| *e > 1e-4 * peak;
+    let first = energy
+        .iter()
+        .position(bright)
+        .unwrap_or(0)
+        .saturating_sub(2 * step);
+    let last = energy
+        .iter()
+        .rposition(bright)
+        .map_or(view.bins, |b| (b + step).min(view.bins));
+    let white = exposure(view, step, first, last);
+
+    let palette: Vec<u8> = (0..=255u8)
+        .flat_map(|i| inferno(f32::from(i) / 255.0))
+        .collect();
+    let mut bytes = Vec::new();
+    let failed = |e: gif::EncodingError| cannot_write(path, e);
+    {
+        let (w, h) = (view.width as u16, view.height as u16);
+        let mut encoder = gif::Encoder::new(&mut bytes, w, h, &palette).map_err(failed)?;
+        encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
+        for lo in (first..last).step_by(step) {
+            let slice = view.slice(lo, (lo + step).min(view.bins));
+            let indices: Vec<u8> = slice
+                .iter()
+                .map(|v| ((v / white).clamp(0.0, 1.0).sqrt() * 255.0).round() as u8)
+                .collect();
+            let frame = gif::Frame {
+                width: w,
+                height: h,
+                delay: DELAY,
+                buffer: indices.into(),
+                ..gif::Frame::default()
+            };
+            encoder.write_frame(&frame).map_err(failed)?;
+        }
+    }
+    write_atomically(path, &bytes)
+}
+
+/// The value shown as white: a high quantile of the bright part of a few frames.
+fn exposure(view: &View, step: usize, first: usize, last: usize) -> f32 {
+    let probes: Vec<f32> = (1..8)
+        .map(|k| first + (last - first) * k / 16)
+        .flat_map(|lo| view.slice(lo, (lo + step).min(view.bins)))
+        .filter(|v| *v > 0.0)
+        .collect();
+    quantile(&probes, 0.99).max(f32::MIN_POSITIVE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dark_scene_still_makes_a_picture() {
+        let view = View {
+            scene: 0,
+            width: 4,
+            height: 3,
+            bins: 10,
+            gate_start_m: 1.0,
+            bin_width_m: 0.1,
+            transient: vec![0.0; 120],
+            depth: vec![0.0; 12],
+            rgb: vec![0; 36],
+            specular: vec![0; 12],
+            visibility: vec![0; 12],
+            spots: vec![None],
+        };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("dark.gif");
+        animate(&view, &path).unwrap();
+        assert!(std::fs::read(&path).unwrap().starts_with(b"GIF89a"));
+    }
+}
