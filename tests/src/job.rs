@@ -50,7 +50,7 @@ impl Job {
         }
     }
 
-    /// The same with so many paths that each scene takes about two seconds on one thread: long enough to be struck
+    /// The same with so many paths that each scene takes one to two seconds on one thread: long enough to be struck
     /// in the middle. Lost workers never use up a task.
     pub fn slow(store: &Path, count: u64) -> Self {
         Self {
@@ -112,5 +112,5 @@ impl Job {
     }
 }
 
-/// Paths a pixel for about two seconds a scene.
-const SLOW: u32 = 4096;
+/// Paths a pixel for one to two seconds a scene.
+const SLOW: u32 = 2048;
