@@ -26,6 +26,7 @@ const CAMERAS: u32 = 24;
 
 /// What a primitive room is made for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct PrimitiveSettings {
     /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
     pub spots: u32,

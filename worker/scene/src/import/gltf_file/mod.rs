@@ -42,6 +42,7 @@ pub(super) fn read(
         .ok_or_else(|| {
             format_error(path, "scenes: the file has none; export at least one scene")
         })?;
+    is_a_forest(path, &document, &root)?;
     let ours: Option<SceneExtras> = keyed(
         path,
         "scene.extras.picofarm",
@@ -72,6 +73,31 @@ pub(super) fn read(
         walk.node(&node, &Affine::IDENTITY, None)?;
     }
     walk.finish(&root, ours, options)
+}
+
+/// Every node has one parent at most, and the scene's own nodes have none; otherwise a walk might not end.
+fn is_a_forest(
+    path: &Path,
+    document: &gltf::Document,
+    root: &gltf::Scene<'_>,
+) -> Result<(), SceneError> {
+    let mut parents = vec![0u32; document.nodes().len()];
+    let children = document.nodes().flat_map(|n| {
+        let inner: Vec<usize> = n.children().map(|c| c.index()).collect();
+        inner
+    });
+    for node in root.nodes().map(|n| n.index()).chain(children) {
+        parents[node] += 1;
+    }
+    match parents.iter().position(|&n| n > 1) {
+        Some(node) => Err(format_error(
+            path,
+            format!(
+                "nodes[{node}]: has more than one parent; glTF nodes must form trees, export again"
+            ),
+        )),
+        None => Ok(()),
+    }
 }
 
 /// Parses `extras` that hold our key; `None` where they are absent or someone else's.
