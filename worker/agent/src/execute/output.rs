@@ -47,7 +47,12 @@ impl Stores {
             ..
         } = &spec.output;
         let (store, prefix) = open_store(location).map_err(of_dataset)?;
-        let probed = |s: &Self| s.probed.lock().expect("no panic while locked").contains(location);
+        let probed = |s: &Self| {
+            s.probed
+                .lock()
+                .expect("no panic while locked")
+                .contains(location)
+        };
         if !probed(self) {
             self.runtime
                 .block_on(probe(&*store, &prefix))
@@ -57,7 +62,11 @@ impl Stores {
         }
         let spec = dataset_spec(spec)?;
         self.runtime
-            .block_on(Dataset::create_or_open(store, prefix.join(dataset.as_str()), &spec))
+            .block_on(Dataset::create_or_open(
+                store,
+                prefix.join(dataset.as_str()),
+                &spec,
+            ))
             .map_err(of_dataset)
     }
 
@@ -99,7 +108,10 @@ impl Stores {
         let until = Instant::now() + self.patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {
-            let error = match self.runtime.block_on(dataset.publish_encoded(scene.clone())) {
+            let error = match self
+                .runtime
+                .block_on(dataset.publish_encoded(scene.clone()))
+            {
                 Ok(manifest) => return Ok(manifest),
                 Err(error) => of_dataset(error),
             };

@@ -71,10 +71,15 @@ impl Executor for RenderExecutor {
             });
         }
         let scene = scenes::scene(spec, task.index, &self.libraries)?;
-        debug!(task = task.index, scene = scene.name, triangles = scene.triangle_count(), "scene made");
+        debug!(
+            task = task.index,
+            scene = scene.name,
+            triangles = scene.triangle_count(),
+            "scene made"
+        );
         let settings = settings(spec, &key);
-        let rendered = picofarm_transient::render(&scene, &settings, &Watched(control))
-            .map_err(of_render)?;
+        let rendered =
+            picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
         let camera = &scene.camera;
         let spots: Vec<_> = rendered
             .spots
@@ -162,7 +167,11 @@ fn record<'a>(scene: &Scene, rendered: &'a Rendered, spots: &'a [Option<Spot>]) 
             [0.0, 0.0, 0.0, 1.0],
         ],
         laser: camera.to_camera(scene.laser.origin).into(),
-        scale: photon_scale(&rendered.transient, rendered.gate.bins as usize, PEAK_PHOTONS),
+        scale: photon_scale(
+            &rendered.transient,
+            rendered.gate.bins as usize,
+            PEAK_PHOTONS,
+        ),
     }
 }
 
@@ -174,10 +183,12 @@ fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera) -> Spot {
     }
 }
 
-/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine.
+/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine, and
+/// not the scene's name, which may be that of a file, while the task's key holds only the file's content.
 fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
     json!({
-        "scene": {"name": scene.name, "provenance": scene.provenance, "labels": scene.labels},
+        "scene": scene.provenance,
+        "labels": scene.labels,
         "strategies": rendered.plan.strategies,
         "approximations": rendered.plan.approximations,
         "overflow": rendered.overflow,

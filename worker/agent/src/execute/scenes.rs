@@ -27,8 +27,12 @@ pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
         .iter()
         .filter_map(|name| match AssetLibrary::find(name, dirs) {
             Ok(library) => {
-                info!(library = name, fingerprint = library.fingerprint(), models = library.len(),
-                    "furniture at hand");
+                info!(
+                    library = name,
+                    fingerprint = library.fingerprint(),
+                    models = library.len(),
+                    "furniture at hand"
+                );
                 Some(library)
             }
             Err(why) => {
@@ -161,13 +165,13 @@ fn named(at: &str, error: SceneError) -> TaskError {
 
 /// Who is to blame for a scene's error: a disk that fails is nobody's fault, everything else is the job's.
 pub(super) fn of_scene(error: SceneError) -> TaskError {
-    use std::io::ErrorKind::{InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied};
+    use std::io::ErrorKind::{
+        InvalidInput, IsADirectory, NotADirectory, NotFound, PermissionDenied,
+    };
     match &error {
         SceneError::Read { source, .. } => match source.kind() {
             NotFound | NotADirectory | IsADirectory | PermissionDenied | InvalidInput => {
-                TaskError::User(format!(
-                    "{error}; every worker must see it under this path"
-                ))
+                TaskError::User(format!("{error}; every worker must see it under this path"))
             }
             _ => TaskError::Interrupted(error.to_string()),
         },
