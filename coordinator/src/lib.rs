@@ -1,1 +1,20 @@
-//! Placeholder while the workspace is laid out.
+//! The coordinator: plans jobs, places their tasks on workers, leases ranges of them, and commits what workers
+//! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`]).
+
+mod actor;
+pub mod budget;
+mod clock;
+mod core;
+pub mod place;
+pub mod plan;
+mod rpc;
+mod server;
+pub mod stage;
+pub mod transition;
+
+pub use budget::Backoff;
+pub use clock::Clock;
+pub use server::{CoordinatorConfig, CoordinatorError, Running, serve};
+
+/// Version of this program; workers must have the same.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -197,3 +197,30 @@ fn io_hint(error: &io::Error) -> Option<&'static str> {
         _ => None,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_told_with_the_object_and_a_hint() {
+        let nested = |kind| object_store::Error::Generic {
+            store: "LocalFileSystem",
+            source: Box::new(object_store::Error::Generic {
+                store: "inner",
+                source: Box::new(io::Error::from(kind)),
+            }),
+        };
+        let text =
+            |kind| DatasetError::store("write", "sets/a/depth/c/0/0/0", nested(kind)).to_string();
+        let full = text(io::ErrorKind::StorageFull);
+        assert!(
+            full.starts_with(
+                "cannot write sets/a/depth/c/0/0/0 (the disk is full: free some space"
+            ),
+            "{full}"
+        );
+        let read_only = text(io::ErrorKind::ReadOnlyFilesystem);
+        assert!(read_only.contains("mounted read-only"), "{read_only}");
+    }
+}

@@ -23,7 +23,7 @@ mod trace;
 mod vec3;
 mod view;
 
-pub use assets::AssetLibrary;
+pub use assets::{AssetLibrary, install};
 pub use camera::{Camera, Intrinsics};
 pub use label::LABELS;
 pub use laser::{Beam, Laser, LaserGrid, Spot};

@@ -18,15 +18,27 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Orders triangles by material, keeping their order within each: the canonical order on disk.
-    pub(crate) fn group_by_material(&mut self) {
-        if self.triangle_material.is_sorted() {
-            return;
-        }
+    /// The canonical order on disk: triangles by material, in their order otherwise; unused materials
+    /// dropped.
+    pub(crate) fn make_canonical(&mut self) {
         let mut order: Vec<usize> = (0..self.triangles.len()).collect();
         order.sort_by_key(|&k| self.triangle_material[k]);
         self.triangles = order.iter().map(|&k| self.triangles[k]).collect();
-        self.triangle_material = order.iter().map(|&k| self.triangle_material[k]).collect();
+
+        let mut used: Vec<u32> = self.triangle_material.clone();
+        used.sort_unstable();
+        used.dedup();
+        self.triangle_material = order
+            .iter()
+            .map(|&k| {
+                let slot = used.binary_search(&self.triangle_material[k]);
+                slot.expect("every triangle's material is used") as u32
+            })
+            .collect();
+        self.materials = used
+            .iter()
+            .map(|&m| self.materials[m as usize].clone())
+            .collect();
     }
 
     /// Smallest and largest coordinates over the vertices; `None` without vertices.

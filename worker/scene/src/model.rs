@@ -108,6 +108,12 @@ pub enum SceneError {
         /// Where it was looked for.
         looked: String,
     },
+    /// Furniture assets cannot be fetched.
+    #[error("assets cannot be installed: {what}")]
+    Install {
+        /// What failed and what to do instead.
+        what: String,
+    },
 }
 
 impl Scene {

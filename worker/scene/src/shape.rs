@@ -153,7 +153,7 @@ impl Shape {
     /// The finished mesh, its triangles grouped by material as the canonical format stores them.
     pub(crate) fn finish(self) -> Mesh {
         let mut mesh = self.mesh;
-        mesh.group_by_material();
+        mesh.make_canonical();
         mesh
     }
 }

@@ -94,6 +94,8 @@ impl Model {
 
     /// Closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<(f32, u32)> {
+        // obvhs's 8-wide nodes lose rays with a component of −0.0; adding 0.0 makes it +0.0.
+        let direction = direction + Vec3::ZERO;
         let (o, d): ([f32; 3], [f32; 3]) = (origin.into(), direction.into());
         let mut hit = RayHit::none();
         let found = self.tree.ray_traverse(
@@ -239,5 +241,21 @@ mod tests {
         );
         assert!(world.normal(hit, ahead).z < 0.0);
         assert!(world.closest(Vec3::new(0.0, 1.5, 0.0), ahead).is_none());
+    }
+
+    #[test]
+    fn a_direction_with_negative_zeros_hits_like_any_other() {
+        let mut shape = Shape::new("table");
+        let m = shape.material(Material::diffuse("grey", [0.5; 3]));
+        for k in 0..8 {
+            let x = k as f32 * 0.2;
+            shape.cuboid([x, 0.0, 0.0], [x + 0.1, 1.0, 0.1], m);
+        }
+        let model = Model::new(shape.finish()).expect("boxes have triangles");
+        for zero in [0.0, -0.0] {
+            let down = Vec3::new(zero, -1.0, zero);
+            let hit = model.closest(Vec3::new(0.63, 1.5, 0.04), down, f32::MAX);
+            assert_eq!(hit.map(|(t, _)| t), Some(0.5));
+        }
     }
 }

@@ -33,15 +33,18 @@ pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
 }
 
 fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
-    let (mut from, mut direction) = (world.laser, direction);
+    let (mut from, mut start, mut direction) = (world.laser, world.laser, direction);
     let mut path = 0.0;
     for _ in 0..MAX_REFLECTIONS {
-        let hit = world.closest(stack, from, direction)?;
+        let mut hit = world.closest(stack, start, direction)?;
+        // Where the beam meets that facet without the lift off the mirror before it.
+        hit.p = world.point(hit.triangle, from, direction);
         path += world.metres((hit.p - from).length());
         if hit.surface.specular && hit.surface.strength > 0.0 {
             let n = hit.n;
             direction = (direction - n * (2.0 * n.dot(direction))).normalized();
-            from = lift(hit.p, n);
+            from = hit.p;
+            start = lift(from, n);
             continue;
         }
         let t = hit.triangle as usize;
@@ -115,6 +118,20 @@ pub(crate) struct Columns {
 }
 
 impl Columns {
+    pub fn clear(&mut self) {
+        for column in [
+            &mut self.px,
+            &mut self.py,
+            &mut self.pz,
+            &mut self.nx,
+            &mut self.ny,
+            &mut self.nz,
+            &mut self.strength,
+        ] {
+            column.clear();
+        }
+    }
+
     pub fn push(&mut self, p: Vec3, n: Vec3, strength: f32) {
         self.px.push(p.x);
         self.py.push(p.y);

@@ -2,11 +2,11 @@
 
 use crate::api::{Gate, Overflow};
 
-/// A sparse histogram of one path or sample: contributions by bin, and what fell outside the gate.
-#[derive(Debug, Default)]
-pub(crate) struct Sparse {
-    /// (bin, value); a bin may occur more than once.
-    pub entries: Vec<(u32, f32)>,
+/// Contributions of one independent unit (a batch of paths, or a pair of strata) to one pixel, by bin.
+#[derive(Debug)]
+pub(crate) struct Unit {
+    value: Vec<f32>,
+    touched: Vec<u32>,
     /// Contributions outside the gate.
     pub outside: u64,
     /// Their sum.
@@ -28,12 +28,29 @@ impl Gate {
     }
 }
 
-impl Sparse {
-    /// Adds `value` at path length `path_m`.
+impl Unit {
+    pub fn new(bins: u32) -> Self {
+        Self {
+            value: vec![0.0; bins as usize],
+            touched: vec![],
+            outside: 0,
+            outside_energy: 0.0,
+        }
+    }
+
+    /// Adds `value` at path length `path_m`. `sign` is −1 for the second stratum of a pair: then the
+    /// unit holds the pair's difference, from which the variance follows.
     #[inline]
-    pub fn add(&mut self, gate: &Gate, path_m: f64, value: f32) {
+    pub fn add(&mut self, gate: &Gate, path_m: f64, value: f32, sign: f32, pixel: &mut Pixel) {
         match gate.bin(path_m) {
-            Some(b) => self.entries.push((b, value)),
+            Some(b) => {
+                let b = b as usize;
+                pixel.sum[b] += value;
+                if self.value[b] == 0.0 {
+                    self.touched.push(b as u32);
+                }
+                self.value[b] += sign * value;
+            }
             None => {
                 self.outside += 1;
                 self.outside_energy += f64::from(value);
@@ -41,21 +58,15 @@ impl Sparse {
         }
     }
 
-    /// Sums entries of equal bin, so that each bin occurs once.
-    pub fn merge(&mut self) {
-        let e = &mut self.entries;
-        let mut kept = 0;
-        for i in 0..e.len() {
-            let (bin, value) = e[i];
-            match e[..kept].iter_mut().find(|x| x.0 == bin) {
-                Some(x) => x.1 += value,
-                None => {
-                    e[kept] = (bin, value);
-                    kept += 1;
-                }
-            }
+    /// Ends the unit: its squares go to `pixel`.
+    pub fn finish(&mut self, pixel: &mut Pixel) {
+        let mut total = 0.0f64;
+        for b in self.touched.drain(..) {
+            let v = std::mem::take(&mut self.value[b as usize]);
+            pixel.square[b as usize] += v * v;
+            total += f64::from(v);
         }
-        e.truncate(kept);
+        pixel.total_square += total * total;
     }
 }
 
@@ -64,17 +75,17 @@ impl Sparse {
 pub(crate) struct Pixel {
     /// Σ of contributions by bin.
     pub sum: Vec<f32>,
-    /// Σ of squares of one path's (or one pair of strata's) contribution by bin.
+    /// Σ over units of (contribution by bin)².
     pub square: Vec<f32>,
-    /// Σ over paths of (whole path's energy)².
+    /// Σ over units of (all contributions)².
     pub total_square: f64,
 }
 
 impl Pixel {
-    pub fn new(bins: usize) -> Self {
+    pub fn new(bins: u32) -> Self {
         Self {
-            sum: vec![0.0; bins],
-            square: vec![0.0; bins],
+            sum: vec![0.0; bins as usize],
+            square: vec![0.0; bins as usize],
             total_square: 0.0,
         }
     }
@@ -84,48 +95,15 @@ impl Pixel {
         self.square.fill(0.0);
         self.total_square = 0.0;
     }
-
-    /// Adds one path.
-    pub fn add(&mut self, path: &mut Sparse) {
-        path.merge();
-        let mut total = 0.0f64;
-        for &(b, v) in &path.entries {
-            self.sum[b as usize] += v;
-            self.square[b as usize] += v * v;
-            total += f64::from(v);
-        }
-        self.total_square += total * total;
-        path.entries.clear();
-    }
-
-    /// Adds two neighbouring strata: their difference estimates the variance within strata (collapsed
-    /// strata; never too small on average).
-    pub fn add_pair(&mut self, a: &mut Sparse, b: &mut Sparse) {
-        let mut total = 0.0f64;
-        for &(bin, v) in a.entries.iter().chain(&b.entries) {
-            self.sum[bin as usize] += v;
-        }
-        for &(bin, v) in &b.entries {
-            a.entries.push((bin, -v));
-        }
-        a.merge();
-        for &(bin, v) in &a.entries {
-            self.square[bin as usize] += v * v;
-            total += f64::from(v);
-        }
-        self.total_square += total * total;
-        a.entries.clear();
-        b.entries.clear();
-    }
 }
 
 impl Overflow {
-    /// Adds what a sparse histogram left outside, divided by `samples`, and forgets it there.
-    pub(crate) fn take(&mut self, s: &mut Sparse, samples: u32) {
-        self.count += s.outside;
-        self.energy += s.outside_energy / f64::from(samples);
-        s.outside = 0;
-        s.outside_energy = 0.0;
+    /// Adds what a unit left outside, divided by `samples`, and forgets it there.
+    pub(crate) fn take(&mut self, unit: &mut Unit, samples: u32) {
+        self.count += unit.outside;
+        self.energy += unit.outside_energy / f64::from(samples);
+        unit.outside = 0;
+        unit.outside_energy = 0.0;
     }
 }
 

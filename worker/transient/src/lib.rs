@@ -11,6 +11,7 @@ mod multi;
 mod one;
 mod photo;
 mod plan;
+mod pool;
 mod render;
 mod rng;
 mod truth;

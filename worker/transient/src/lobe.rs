@@ -208,7 +208,7 @@ impl Mirrors {
 
 /// The entry in which the running sum passes `at`, and its weight; never one of weight 0.
 #[inline]
-pub(crate) fn pick(weights: &[f32], at: f32) -> Option<(usize, f32)> {
+fn pick(weights: &[f32], at: f32) -> Option<(usize, f32)> {
     let mut sum = 0.0;
     let mut last = None;
     for (i, &w) in weights.iter().enumerate() {

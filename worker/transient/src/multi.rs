@@ -1,15 +1,15 @@
-//! Three bounces and more: camera paths whose vertices connect to the spots, with two helpers where the
-//! scene needs them, both weighed against plain paths by multiple importance sampling (balance
-//! heuristic, Veach and Guibas 1995):
-//! - *image lobes*: spot → planar mirror → surface, aimed at the spots' mirror images;
-//! - *light vertices*: spots that lie on a mirror send their narrow lobe to a surface, which is connected.
+//! Three bounces and more: camera paths whose vertices connect to the spots and to light vertices, and,
+//! where the scene has planar near-mirrors, aim at the spots' images in them. All are weighed by
+//! multiple importance sampling (balance heuristic, Veach and Guibas 1995).
 
 use picofarm_scene::Vec3;
 
 use crate::{
     api::Gate,
     emitter::Emitters,
-    lobe::{Mirrors, pick},
+    film::Pixel,
+    lobe::Mirrors,
+    pool::{self, Pool},
     rng::Rng,
     two::Scratch,
     world::{Hit, World, lift},
@@ -51,9 +51,36 @@ struct Step {
     aimed: f32,
 }
 
+/// Buffers of the camera paths of one pixel.
+#[derive(Debug)]
+pub(crate) struct Paths {
+    pub pool: Pool,
+    /// Weights of spots in mirrors.
+    images: Vec<f32>,
+    /// Weights of light vertices.
+    lights: Vec<f32>,
+    /// What the pixel collects.
+    pub pixel: Pixel,
+}
+
+impl Paths {
+    pub fn new(mirrors: &Mirrors, gate: &Gate) -> Self {
+        Self {
+            pool: Pool::default(),
+            images: vec![0.0; mirrors.choices()],
+            lights: vec![],
+            pixel: Pixel::new(gate.bins),
+        }
+    }
+}
+
+/// Spots, and light vertices, that a camera vertex is connected to at most.
+const SPOTS: u32 = 4;
+const LIGHTS: u32 = 4;
+
 impl Walk<'_> {
-    /// Traces one path through film position (x, y); contributions go to `scratch.first`.
-    pub fn path(&self, rng: &mut Rng, x: f32, y: f32, scratch: &mut Scratch, images: &mut [f32]) {
+    /// Traces one path through film position (x, y); contributions go to `scratch.unit`.
+    pub fn path(&self, rng: &mut Rng, x: f32, y: f32, scratch: &mut Scratch, paths: &mut Paths) {
         let world = self.world;
         let d = world.camera.ray(x, y);
         let Some(hit) = world.closest(&mut scratch.stack, Vec3::ZERO, d) else {
@@ -73,18 +100,18 @@ impl Walk<'_> {
                 return;
             }
             if k >= 2 {
-                self.connect(rng, &vertex, step.as_ref(), scratch);
+                self.connect(rng, &vertex, step.as_ref(), scratch, &mut paths.pixel);
             }
             if k + 2 > self.max_bounces || vertex.length_m + self.shortest_m >= self.gate.end_m() {
                 return;
             }
             let helped = !vertex.hit.surface.specular;
             let mut aimed = 0.0;
-            if helped && !self.mirrors.list.is_empty() {
-                aimed = self.aim(rng, &vertex, scratch, images);
-            }
-            if helped && !self.emitters.on_mirror.is_empty() {
-                self.light_vertex(rng, &vertex, scratch);
+            if helped {
+                if !self.mirrors.list.is_empty() {
+                    aimed = self.aim(rng, &vertex, scratch, paths);
+                }
+                self.light(rng, &vertex, scratch, paths);
             }
             let h = vertex.hit;
             let Some((w, weight, pdf)) = h.surface.sample(h.n, vertex.wo, rng) else {
@@ -118,57 +145,71 @@ impl Walk<'_> {
         }
     }
 
-    /// Connects a vertex to one spot, chosen by unshadowed contribution.
-    fn connect(&self, rng: &mut Rng, v: &Vertex, step: Option<&Step>, scratch: &mut Scratch) {
+    /// Connects a vertex to a few spots, drawn by unshadowed contribution.
+    fn connect(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        step: Option<&Step>,
+        scratch: &mut Scratch,
+        pixel: &mut Pixel,
+    ) {
         let h = &v.hit;
-        let weights = &mut scratch.weights;
+        let Scratch {
+            stack,
+            weights,
+            unit,
+        } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
-        let total: f32 = weights.iter().sum();
-        let u = rng.uniform();
-        if !(total > 0.0) {
-            return;
+        if let Some(step) = step {
+            self.plain_shares(step, h, weights);
         }
-        let Some((spot, _)) = pick(weights, total * u) else {
-            return;
-        };
-        let e = &self.emitters.list[spot];
-        if !self.world.free(&mut scratch.stack, h.p, h.n, e.p, e.n) {
-            return;
-        }
-        let share = step.map_or(1.0, |s| self.plain_share(s, h, spot));
-        let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-        scratch.first.add(self.gate, path, v.beta * total * share);
+        draw(weights, SPOTS, rng.uniform(), |spot, value| {
+            let e = &self.emitters.list[spot];
+            if self.world.free(stack, h.p, h.n, e.p, e.n) {
+                let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
+                unit.add(self.gate, path, v.beta * value, 1.0, pixel);
+            }
+        });
     }
 
-    /// MIS weight of reaching `h` by BSDF sampling from `step` and connecting it to `spot`.
-    fn plain_share(&self, step: &Step, h: &Hit, spot: usize) -> f32 {
-        let e = &self.emitters.list[spot];
-        if let Some(mirror) = self.mirrors.of(h.triangle) {
+    /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
+    /// sampling, against aiming (mirrors) or light vertices (other surfaces).
+    fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32]) {
+        if h.surface.specular {
+            let Some(mirror) = self.mirrors.of(h.triangle) else {
+                return;
+            };
             if step.aimed > 0.0 {
-                let w = self.mirrors.weight(mirror, spot, step.p, step.n);
-                if w > 0.0 {
-                    let aimed = w / step.aimed * self.mirrors.pdf(mirror, spot, step.p, h.p);
-                    return step.pdf / (step.pdf + aimed);
+                for (spot, w) in weights.iter_mut().enumerate().filter(|(_, w)| **w > 0.0) {
+                    let image = self.mirrors.weight(mirror, spot, step.p, step.n);
+                    if image > 0.0 {
+                        let aimed = self.mirrors.pdf(mirror, spot, step.p, h.p);
+                        *w *= step.pdf / (step.pdf + image / step.aimed * aimed);
+                    }
                 }
             }
-        } else if e.surface.specular && !h.surface.specular {
-            let to = h.p - e.p;
-            let d2 = to.dot(to);
-            let w = to / d2.sqrt();
-            let chance = 1.0 / self.emitters.on_mirror.len() as f32;
-            let light = chance * e.surface.pdf(e.n, e.back, w) * h.n.dot(w).abs() / d2;
-            let back = step.p - h.p;
-            let b2 = back.dot(back);
-            let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
-            return plain / (plain + light);
+            return;
         }
-        1.0
+        let back = step.p - h.p;
+        let b2 = back.dot(back);
+        let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
+        for (e, w) in self.emitters.list.iter().zip(weights) {
+            if *w > 0.0 {
+                let to = h.p - e.p;
+                let d2 = to.dot(to);
+                let dir = to / d2.sqrt();
+                let pdf = e.surface.pdf(e.n, e.back, dir);
+                let light = pool::share(self.emitters, pdf) * h.n.dot(dir).abs() / d2;
+                *w *= plain / (plain + light);
+            }
+        }
     }
 
     /// Looks for a spot's image in a planar mirror. Returns the sum of weights for later MIS.
-    fn aim(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, images: &mut [f32]) -> f32 {
+    fn aim(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, paths: &mut Paths) -> f32 {
         let h = &v.hit;
-        let (total, aim) = self.mirrors.aim(h.p, h.n, rng, images);
+        let (total, aim) = self.mirrors.aim(h.p, h.n, rng, &mut paths.images);
         let Some(aim) = aim else { return total };
         let to = aim.target - h.p;
         if h.n.dot(to) <= 0.0 {
@@ -193,47 +234,58 @@ impl Walk<'_> {
         let plain = h.surface.pdf(h.n, v.wo, w);
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
         let path = v.length_m + lengths + e.path_m;
+        let value = v.beta * value / (aimed + plain);
         scratch
-            .first
-            .add(self.gate, path, v.beta * value / (aimed + plain));
+            .unit
+            .add(self.gate, path, value, 1.0, &mut paths.pixel);
         total
     }
 
-    /// Connects to a surface that a mirror spot's lobe lights.
-    fn light_vertex(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch) {
+    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
+    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, paths: &mut Paths) {
         let h = &v.hit;
-        let spots = &self.emitters.on_mirror;
-        let choice = (rng.uniform() * spots.len() as f32) as usize;
-        let e = &self.emitters.list[spots[choice.min(spots.len() - 1)]];
-        let Some((w, weight, pdf)) = e.surface.sample(e.n, e.back, rng) else {
-            return;
-        };
-        let Some(y) = self.world.closest(&mut scratch.stack, lift(e.p, e.n), w) else {
-            return;
-        };
-        if y.surface.specular || y.surface.strength == 0.0 {
-            return;
+        let Paths {
+            pool,
+            lights,
+            pixel,
+            ..
+        } = paths;
+        pool.weights(h, v.wo, lights);
+        draw(lights, LIGHTS, rng.uniform(), |i, value| {
+            let y = &pool.list[i];
+            let there = &y.hit;
+            if self
+                .world
+                .free(&mut scratch.stack, h.p, h.n, there.p, there.n)
+            {
+                let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
+                scratch
+                    .unit
+                    .add(self.gate, path, v.beta * value, 1.0, pixel);
+            }
+        });
+    }
+}
+
+/// Systematic sampling: draws `count` times in proportion to `weights`, from one random number, and
+/// calls `each` once for every entry drawn with its share of the sum. Unbiased for the sum.
+#[inline]
+fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
+    let total: f32 = weights.iter().sum();
+    if !(total > 0.0 && total.is_finite()) {
+        return;
+    }
+    let step = total / count as f32;
+    let (mut sum, mut next) = (0.0, u * step);
+    for (i, &w) in weights.iter().enumerate() {
+        sum += w;
+        let mut times = 0;
+        while next < sum {
+            times += 1;
+            next += step;
         }
-        let to = y.p - h.p;
-        let d2 = to.dot(to);
-        let d = d2.sqrt();
-        let dir = to / d;
-        let cos = -y.n.dot(dir);
-        if !(cos > 0.0 && h.n.dot(dir) > 0.0) {
-            return;
+        if times > 0 {
+            each(i, times as f32 * step);
         }
-        let value = h.surface.scatter(h.n, v.wo, dir) * y.surface.scatter(y.n, -w, -dir) / d2;
-        if value == 0.0 || !self.world.free(&mut scratch.stack, h.p, h.n, y.p, y.n) {
-            return;
-        }
-        let leg = y.p - e.p;
-        let chance = 1.0 / spots.len() as f32;
-        let light = chance * pdf * y.n.dot(w).abs() / leg.dot(leg);
-        let plain = h.surface.pdf(h.n, v.wo, dir) * cos / d2;
-        let share = light / (light + plain);
-        let lengths = self.world.metres(d) + self.world.metres(leg.length());
-        let path = v.length_m + lengths + e.path_m;
-        let value = v.beta * value * weight / chance * share;
-        scratch.first.add(self.gate, path, value);
     }
 }

@@ -1,6 +1,11 @@
 //! Exactly one bounce: laser → spot → camera, a point of light in one pixel and one bin.
 
-use crate::{api::Gate, bvh::Stack, emitter::Emitters, film::Sparse, world::World};
+use crate::{
+    api::{Gate, Overflow},
+    bvh::Stack,
+    emitter::Emitters,
+    world::World,
+};
 
 /// One spot seen directly.
 #[derive(Debug, Clone, Copy)]
@@ -45,11 +50,14 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
 }
 
 /// Adds the peaks to a histogram; what lies outside the gate goes to `outside`.
-pub(crate) fn add(peaks: &[Peak], gate: &Gate, transient: &mut [f32], outside: &mut Sparse) {
+pub(crate) fn add(peaks: &[Peak], gate: &Gate, transient: &mut [f32], outside: &mut Overflow) {
     for p in peaks {
         match gate.bin(p.path_m) {
             Some(b) => transient[p.pixel * gate.bins as usize + b as usize] += p.value,
-            None => outside.add(gate, p.path_m, p.value),
+            None => {
+                outside.count += 1;
+                outside.energy += f64::from(p.value);
+            }
         }
     }
 }

@@ -2,7 +2,6 @@
 
 use crate::{
     api::{Plan, Settings},
-    emitter::Emitters,
     lobe::Mirrors,
     two::Sampling,
 };
@@ -10,7 +9,6 @@ use crate::{
 /// The plan that `render` follows.
 pub(crate) fn plan(
     settings: &Settings,
-    emitters: &Emitters,
     mirrors: &Mirrors,
     sampling: &Sampling,
     paths: u32,
@@ -33,14 +31,13 @@ pub(crate) fn plan(
         }
     }
     if longest >= 3 {
-        strategies.push("three and more: camera paths, one spot a vertex by contribution".into());
+        strategies.push(
+            "three and more: camera paths, connected to spots and to light vertices by contribution"
+                .into(),
+        );
         let planes = mirrors.list.len();
         if planes > 0 {
             strategies.push(format!("image lobes: {planes} planar mirrors"));
-        }
-        let on_mirror = emitters.on_mirror.len();
-        if on_mirror > 0 {
-            strategies.push(format!("light vertices: {on_mirror} spots on mirrors"));
         }
         if mirrors.curved_share > 0.01 {
             approximations.push(format!(

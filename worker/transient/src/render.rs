@@ -12,7 +12,6 @@ use self::{
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
     emitter::{Emitters, find_spots},
-    film::Sparse,
     lobe::Mirrors,
     multi::Walk,
     one, photo,
@@ -81,7 +80,7 @@ pub fn render(
             (paths_for(&pilot, target, MAX_PATHS), Some(target))
         }
     };
-    let plan = plan(settings, &emitters, &mirrors, &sampling, paths);
+    let plan = plan(settings, &mirrors, &sampling, paths);
     let mut overflow = Overflow::default();
     let mut rays = 0;
     let mut spent = 0;
@@ -100,14 +99,17 @@ pub fn render(
         wave = (spent / 2).clamp(4, MAX_PATHS - spent.min(MAX_PATHS - 4));
     };
 
-    let mut outside = Sparse::default();
     if settings.one_bounce && frame.walk.max_bounces >= 1 {
         let mut stack = world.bvh.stack();
         let peaks = one::peaks(&world, &mut stack, &emitters);
-        one::add(&peaks, &settings.gate, &mut buffers.transient, &mut outside);
+        one::add(
+            &peaks,
+            &settings.gate,
+            &mut buffers.transient,
+            &mut overflow,
+        );
         rays += stack.rays;
     }
-    overflow.take(&mut outside, 1);
     let inside: f64 = buffers.transient.iter().map(|&v| f64::from(v)).sum();
     overflow.share = if overflow.energy > 0.0 {
         overflow.energy / (overflow.energy + inside)

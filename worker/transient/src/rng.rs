@@ -31,7 +31,9 @@ impl Rng {
     pub fn new(seed: u64, stream: Stream, pixel: u64, pass: u64) -> Self {
         let key = [stream as u64, pixel, pass]
             .into_iter()
-            .fold(splitmix(seed), |key, part| splitmix(key ^ splitmix(part)));
+            .fold(splitmix(seed), |key, part| {
+                splitmix(key.rotate_left(17) ^ splitmix(part))
+            });
         let mut rng = Self {
             state: key,
             increment: splitmix(key) | 1,

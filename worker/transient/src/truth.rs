@@ -87,7 +87,9 @@ pub(crate) fn ground_truth(
                         continue;
                     };
                     let to = e.p - h.p;
-                    let facing = h.n.dot(to) > 0.0 && e.n.dot(to) < 0.0;
+                    // Points on the spot's own wall see it at a right angle, give or take rounding.
+                    let slack = 1e-3 * to.length();
+                    let facing = h.n.dot(to) > -slack && e.n.dot(to) < slack;
                     *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n));
                 }
                 stack.rays

@@ -6,7 +6,7 @@ use crate::{
     api::{Gate, Overflow},
     bvh::Stack,
     emitter::Emitters,
-    film::{Pixel, Sparse},
+    film::{Pixel, Unit},
     rng::Rng,
     truth::Centres,
     world::World,
@@ -27,17 +27,15 @@ pub(crate) struct Sampling {
 pub(crate) struct Scratch {
     pub stack: Stack,
     pub weights: Vec<f32>,
-    pub first: Sparse,
-    pub second: Sparse,
+    pub unit: Unit,
 }
 
 impl Scratch {
-    pub fn new(world: &World, emitters: &Emitters) -> Self {
+    pub fn new(world: &World, emitters: &Emitters, gate: &Gate) -> Self {
         Self {
             stack: world.bvh.stack(),
             weights: vec![0.0; emitters.list.len()],
-            first: Sparse::default(),
-            second: Sparse::default(),
+            unit: Unit::new(gate.bins),
         }
     }
 }
@@ -102,13 +100,13 @@ pub(crate) fn sample_pixel(
             .camera
             .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
         let odd = stratum % 2 == 1;
-        connect(world, emitters, gate, d, scratch, odd);
+        let sign = if odd { -1.0 } else { 1.0 };
+        connect(world, emitters, gate, (d, sign), scratch, pixel);
         if odd {
-            pixel.add_pair(&mut scratch.first, &mut scratch.second);
-            overflow.take(&mut scratch.first, count);
-            overflow.take(&mut scratch.second, count);
+            scratch.unit.finish(pixel);
         }
     }
+    overflow.take(&mut scratch.unit, count);
     count
 }
 
@@ -116,17 +114,15 @@ fn connect(
     world: &World,
     emitters: &Emitters,
     gate: &Gate,
-    d: Vec3,
+    (d, sign): (Vec3, f32),
     scratch: &mut Scratch,
-    odd: bool,
+    pixel: &mut Pixel,
 ) {
     let Scratch {
         stack,
         weights,
-        first,
-        second,
+        unit,
     } = scratch;
-    let out = if odd { second } else { first };
     let Some(h) = world.closest(stack, Vec3::ZERO, d) else {
         return;
     };
@@ -139,7 +135,7 @@ fn connect(
     for (e, &w) in emitters.list.iter().zip(weights.iter()) {
         if w > 0.0 && world.free(stack, h.p, h.n, e.p, e.n) {
             let path = e.path_m + world.metres((e.p - h.p).length()) + to_camera;
-            out.add(gate, path, w);
+            unit.add(gate, path, w, sign, pixel);
         }
     }
 }

@@ -144,6 +144,11 @@ impl World {
         })
     }
 
+    /// Where the line from `origin` along `direction` meets the plane of a triangle.
+    pub fn point(&self, triangle: u32, origin: Vec3, direction: Vec3) -> Vec3 {
+        point(&self.triangles[triangle as usize], origin, direction)
+    }
+
     /// True where the straight way between two surface points is free. Each end is lifted off its
     /// surface, along the normal given, towards the side of the other end.
     #[inline]

@@ -1,5 +1,9 @@
 //! Furniture: where models come from, what they are, and a cache that all threads share.
 
+mod catalogue;
+mod category;
+mod install;
+mod obj;
 mod parametric;
 mod small;
 mod storage;
@@ -7,20 +11,37 @@ mod upholstery;
 
 use std::{
     collections::BTreeMap,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{Arc, OnceLock},
 };
 
+use sha2::{Digest, Sha256};
+
 use crate::{Mesh, SceneError, rng::Rng, trace::Model};
+use catalogue::{Archive, Item};
+
+pub use install::install;
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";
+/// Name of the library of Sweet Home 3D's furniture.
+const SWEETHOME3D: &str = "sweethome3d";
 
 /// Where a model comes from.
 #[derive(Debug, Clone)]
 enum Recipe {
     /// Our own builder and the variant's seed.
-    Built(fn(&mut Rng) -> Mesh, u64),
+    Built(parametric::Build, u64),
+    /// An entry of a furniture library.
+    Stored(Arc<Archive>, Item),
+}
+
+/// A model ready for use, and what was changed to make it so.
+#[derive(Debug)]
+struct Loaded {
+    model: Arc<Model>,
+    made_opaque: bool,
+    untextured: bool,
 }
 
 /// One piece of furniture of the library.
@@ -37,7 +58,7 @@ pub(crate) struct Asset {
     /// Width (x), height (y) and depth (z) in metres, where the catalogue states them.
     pub(crate) size: Option<[f32; 3]>,
     recipe: Recipe,
-    model: OnceLock<Option<Arc<Model>>>,
+    loaded: OnceLock<Option<Loaded>>,
 }
 
 /// A named set of furniture. Models are loaded when first used and then shared.
@@ -63,26 +84,85 @@ impl AssetLibrary {
                     attribution: None,
                     size: None,
                     recipe: Recipe::Built(build, seed),
-                    model: OnceLock::new(),
+                    loaded: OnceLock::new(),
                 });
             }
         }
         Self::new("parametric", PARAMETRIC_VERSION.to_owned(), assets)
     }
 
-    /// The library called `name` (`parametric` or `sweethome3d`); files are looked for in `dirs`.
+    /// Sweet Home 3D's furniture: every `.sh3f` file of `dir`, of which the CC0 and CC BY items that fit
+    /// into rooms are used. Each model is read when first needed and then kept.
+    ///
+    /// # Errors
+    /// [`SceneError::Assets`] if the folder has none, [`SceneError::Read`] or [`SceneError::Format`] for a
+    /// file that cannot be read.
+    pub fn sweethome3d(dir: &Path) -> Result<Self, SceneError> {
+        let files = install::libraries_in(dir);
+        if files.is_empty() {
+            return Err(SceneError::Assets {
+                name: SWEETHOME3D.into(),
+                looked: format!("no .sh3f file in {}", dir.display()),
+            });
+        }
+        let (mut assets, mut hash, mut newest) = (Vec::new(), Sha256::new(), String::new());
+        for file in files {
+            let archive = Arc::new(Archive::open(&file)?);
+            archive.fingerprint(&mut hash)?;
+            let catalogue = archive.catalogue(obj::MAX_BYTES)?;
+            newest = newest.max(catalogue.version);
+            assets.extend(catalogue.items.into_iter().map(|item| Asset {
+                name: item.name.clone(),
+                label: item.label,
+                elevation: item.elevation,
+                attribution: Some(item.attribution.clone()),
+                size: Some(item.size),
+                recipe: Recipe::Stored(archive.clone(), item),
+                loaded: OnceLock::new(),
+            }));
+        }
+        let digest = hex::encode(hash.finalize());
+        let fingerprint = format!("{SWEETHOME3D}-{newest}:{}", &digest[..16]);
+        Ok(Self::new(SWEETHOME3D, fingerprint, assets))
+    }
+
+    /// The library called `name` (`parametric` or `sweethome3d`). Files are looked for in each of `dirs`
+    /// and its subfolder `sweethome3d`, then where Debian installs them.
     ///
     /// # Errors
     /// [`SceneError::Assets`] if its files are in none of the folders, [`SceneError::Invalid`] for a
-    /// name that no library has.
+    /// name that no library has; otherwise as [`AssetLibrary::sweethome3d`].
     pub fn find(name: &str, dirs: &[PathBuf]) -> Result<Self, SceneError> {
-        let _ = dirs;
         match name {
             "parametric" => Ok(Self::parametric()),
+            SWEETHOME3D => {
+                let system = Path::new("/").join(install::INSIDE_PACKAGE);
+                let mut folders: Vec<PathBuf> = dirs
+                    .iter()
+                    .flat_map(|d| {
+                        [
+                            d.clone(),
+                            d.join(install::FOLDER),
+                            d.join(install::INSIDE_PACKAGE),
+                        ]
+                    })
+                    .collect();
+                folders.push(system);
+                match folders
+                    .iter()
+                    .find(|f| !install::libraries_in(f).is_empty())
+                {
+                    Some(folder) => Self::sweethome3d(folder),
+                    None => Err(SceneError::Assets {
+                        name: name.into(),
+                        looked: format!("no .sh3f file in {folders:?}"),
+                    }),
+                }
+            }
             other => Err(SceneError::Invalid {
                 scene: "assets".into(),
                 field: "assets".into(),
-                what: format!("{other:?} is not known; use \"parametric\" or \"sweethome3d\""),
+                what: format!("{other:?} is not known; use \"parametric\" or \"{SWEETHOME3D}\""),
             }),
         }
     }
@@ -148,14 +228,36 @@ impl AssetLibrary {
 impl Asset {
     /// The model, loaded once; `None` if it cannot be used (unreadable, empty or too many triangles).
     fn model(&self) -> Option<Arc<Model>> {
-        self.model
-            .get_or_init(|| {
-                let mesh = match &self.recipe {
-                    Recipe::Built(build, seed) => build(&mut Rng::new(*seed, 0)),
-                };
-                Model::new(standing(mesh)).map(Arc::new)
+        self.loaded().map(|l| l.model.clone())
+    }
+
+    /// What was changed to make the model usable, for the scene's notes.
+    pub(crate) fn changes(&self) -> impl Iterator<Item = &'static str> {
+        let (opaque, plain) = self
+            .loaded()
+            .map_or((false, false), |l| (l.made_opaque, l.untextured));
+        let opaque = opaque.then_some("transparent materials made opaque");
+        opaque
+            .into_iter()
+            .chain(plain.then_some("textures left out"))
+    }
+
+    fn loaded(&self) -> Option<&Loaded> {
+        let load = || {
+            let (mesh, made_opaque, untextured) = match &self.recipe {
+                Recipe::Built(build, seed) => (build(&mut Rng::new(*seed, 0)), false, false),
+                Recipe::Stored(archive, item) => {
+                    let l = obj::load(archive, item)?;
+                    (l.mesh, l.made_opaque, l.untextured)
+                }
+            };
+            Some(Loaded {
+                model: Arc::new(Model::new(standing(mesh))?),
+                made_opaque,
+                untextured,
             })
-            .clone()
+        };
+        self.loaded.get_or_init(load).as_ref()
     }
 }
 

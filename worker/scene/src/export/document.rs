@@ -204,7 +204,7 @@ impl Document {
             .iter()
             .map(|mesh| {
                 let mut grouped = Mesh::clone(mesh);
-                grouped.group_by_material();
+                grouped.make_canonical();
                 let base = materials.len();
                 materials.extend(grouped.materials.iter().map(material_entry));
                 MeshEntry {

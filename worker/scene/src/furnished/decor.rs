@@ -20,7 +20,8 @@ const HANG_GAP: f32 = 0.001;
 const DOOR_CLEARANCE: f32 = 0.55;
 
 fn tone(rng: &mut Rng, name: &str, lo: f32, hi: f32) -> Material {
-    let rgb = [rng.range(lo, hi), rng.range(lo, hi), rng.range(lo, hi)];
+    let level = rng.range(lo, hi);
+    let rgb = [(); 3].map(|()| (level * rng.range(0.75, 1.15)).min(0.92));
     Material::diffuse(name, rgb)
 }
 

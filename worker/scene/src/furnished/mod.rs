@@ -5,6 +5,8 @@ mod camera;
 mod decor;
 mod furniture;
 mod plan;
+#[cfg(test)]
+mod tests;
 mod tops;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,7 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    AssetLibrary, LaserGrid, Material, Object, Provenance, Scene, SceneError, label::vocabulary,
+    AssetLibrary, LaserGrid, Material, Provenance, Scene, SceneError, label::vocabulary,
     layout::Room, rng::Rng,
 };
 use plan::Plan;
@@ -188,17 +190,29 @@ fn finish(
         .filter_map(|p| p.attribution.clone())
         .collect();
     let [near, far] = view.depth;
-    let notes = BTreeMap::from([
+    let mut notes = BTreeMap::from([
         ("assets".to_owned(), assets.fingerprint().to_owned()),
         ("attempt".to_owned(), attempt.to_string()),
         ("depth_m".to_owned(), format!("{near:.3}..{far:.3}")),
         ("room_m".to_owned(), plan.room.describe()),
         ("room_type".to_owned(), kind.name().to_owned()),
     ]);
-    let objects: Vec<Object> = plan.objects();
+    for change in ["transparent materials made opaque", "textures left out"] {
+        let models = plan
+            .placed
+            .iter()
+            .filter(|p| p.changes.contains(&change))
+            .count();
+        if models > 0 {
+            notes.insert(
+                change.to_owned(),
+                format!("in {models} of {} models", plan.placed.len()),
+            );
+        }
+    }
     Scene {
         name: format!("furnished-{seed}"),
-        objects,
+        objects: plan.objects(),
         labels: vocabulary(),
         camera: view.camera,
         laser: view.laser,

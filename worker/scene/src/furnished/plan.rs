@@ -24,9 +24,9 @@ pub(super) struct Placed {
     pub(super) yaw: f32,
     /// The box that nothing else may enter; `None` for the room itself and for rugs.
     pub(super) foot: Option<Footprint>,
-    /// What it stands on, if not the floor.
-    pub(super) support: Option<usize>,
     pub(super) attribution: Option<String>,
+    /// What was changed in the model to use it.
+    pub(super) changes: Vec<&'static str>,
 }
 
 /// A room and everything in it so far.
@@ -65,8 +65,8 @@ impl<'a> Plan<'a> {
             at: [0.0; 3],
             yaw: 0.0,
             foot: None,
-            support: None,
             attribution: None,
+            changes: Vec::new(),
         });
     }
 
@@ -90,8 +90,8 @@ impl<'a> Plan<'a> {
             at,
             yaw,
             foot: Some(foot),
-            support,
             attribution: None,
+            changes: Vec::new(),
         });
         true
     }
@@ -107,6 +107,7 @@ impl<'a> Plan<'a> {
         let placed = self.try_place((&asset.name, model), asset.label, at, yaw, support);
         if let (true, Some(last)) = (placed, self.placed.last_mut()) {
             last.attribution.clone_from(&asset.attribution);
+            last.changes = asset.changes().collect();
         }
         placed
     }
@@ -120,8 +121,8 @@ impl<'a> Plan<'a> {
             at,
             yaw,
             foot: None,
-            support: None,
             attribution: asset.attribution.clone(),
+            changes: asset.changes().collect(),
         });
     }
 

@@ -12,6 +12,25 @@ use super::{
 /// Support heights under one object may differ by this, metres.
 const FLATNESS_M: f32 = 0.01;
 
+/// Taller things stand on the floor, metres.
+const TALLEST_M: f32 = 0.75;
+
+/// What carries things.
+pub(super) const TOPS: [&str; 12] = [
+    "table",
+    "coffee_table",
+    "desk",
+    "nightstand",
+    "dresser",
+    "cabinet",
+    "tv_stand",
+    "shelf",
+    "piano",
+    "bookcase",
+    "fireplace",
+    "kitchen_appliance",
+];
+
 /// What people leave on the tops of a room.
 fn things(kind: RoomType) -> &'static [&'static str] {
     match kind {
@@ -46,20 +65,6 @@ fn things(kind: RoomType) -> &'static [&'static str] {
 
 /// Puts things on tables and cases.
 pub(super) fn drop_things(rng: &mut Rng, plan: &mut Plan<'_>, kind: RoomType) {
-    const TOPS: [&str; 12] = [
-        "table",
-        "coffee_table",
-        "desk",
-        "nightstand",
-        "dresser",
-        "cabinet",
-        "tv_stand",
-        "shelf",
-        "piano",
-        "bookcase",
-        "fireplace",
-        "kitchen_appliance",
-    ];
     for support in 0..plan.placed.len() {
         let label = plan.placed[support].label;
         if !TOPS.contains(&label) {
@@ -83,7 +88,7 @@ fn drop_one(rng: &mut Rng, plan: &mut Plan<'_>, support: usize, label: &str) {
     let room_above = plan.room.height - 0.1 - (base.at[1] + model.size()[1]);
     let widest = if label == "tv" { 1.4 } else { 0.5 };
     let fits = |[w, h, d]: [f32; 3], elevation: f32| {
-        w.max(d) < widest && w.max(d) > 0.03 && h < room_above && elevation < 0.01
+        w.max(d) < widest && w.max(d) > 0.03 && h < room_above.min(TALLEST_M) && elevation < 0.01
     };
     let Some((asset, thing)) = plan.assets.draw(rng, label, fits) else {
         return;

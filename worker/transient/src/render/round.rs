@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::{
     api::{Overflow, Progress, RenderError},
     film::Pixel,
-    multi::Walk,
+    multi::{Paths, Walk},
     rng::{Rng, Stream},
     two::{self, Sampling, Scratch},
 };
@@ -19,6 +19,10 @@ const RUN: usize = 32;
 /// Pixels and paths of the pilot that sizes [`crate::Budget::Error`].
 const PILOT_PIXELS: usize = 256;
 pub(super) const PILOT_PATHS: u32 = 32;
+
+/// Paths that share light vertices, and light vertices drawn for each.
+const BATCH: u32 = 8;
+const LIGHTS_A_PATH: u32 = 2;
 
 /// Everything a round needs to know.
 #[derive(Debug, Clone, Copy)]
@@ -152,30 +156,40 @@ impl<'a> Watch<'a> {
 /// Buffers of one worker.
 struct Bench {
     scratch: Scratch,
-    images: Vec<f32>,
     two: Pixel,
-    multi: Pixel,
+    paths: Paths,
+}
+
+/// How many of what a pixel got.
+#[derive(Debug, Clone, Copy)]
+struct Counts {
+    strata: u32,
+    paths: u32,
+    batches: u32,
 }
 
 impl Bench {
     fn new(frame: &Frame) -> Self {
-        let bins = frame.walk.gate.bins as usize;
+        let walk = &frame.walk;
         Self {
-            scratch: Scratch::new(frame.walk.world, frame.walk.emitters),
-            images: vec![0.0; frame.walk.mirrors.choices()],
-            two: Pixel::new(bins),
-            multi: Pixel::new(bins),
+            scratch: Scratch::new(walk.world, walk.emitters, walk.gate),
+            two: Pixel::new(walk.gate.bins),
+            paths: Paths::new(walk.mirrors, walk.gate),
         }
     }
 
-    /// Fills `two` and `multi`; returns the number of strata.
-    fn pixel(&mut self, frame: &Frame, k: usize, pass: (u32, u32), out: &mut Overflow) -> u32 {
+    /// Fills `two` and `paths.pixel`.
+    fn pixel(&mut self, frame: &Frame, k: usize, pass: (u32, u32), out: &mut Overflow) -> Counts {
         let walk = &frame.walk;
         let (row, col) = (k as u32 / frame.width, k as u32 % frame.width);
         let (before, paths) = pass;
         self.two.clear();
-        self.multi.clear();
-        let mut strata = 1;
+        self.paths.pixel.clear();
+        let mut counts = Counts {
+            strata: 1,
+            paths,
+            batches: 0,
+        };
         if walk.max_bounces >= 2 && !walk.emitters.list.is_empty() {
             let (coarse, fine) = frame.sampling.sides(paths);
             let side = if frame.sampling.refined[k] {
@@ -184,7 +198,7 @@ impl Bench {
                 coarse
             };
             let mut rng = Rng::new(frame.seed, Stream::Two, k as u64, u64::from(before));
-            strata = two::sample_pixel(
+            counts.strata = two::sample_pixel(
                 walk.world,
                 walk.emitters,
                 walk.gate,
@@ -194,15 +208,31 @@ impl Bench {
                 (&mut self.two, &mut *out),
             );
         }
-        for path in 0..paths {
-            let pass = u64::from(before) + u64::from(path);
+        // Paths of a batch share light vertices; batches are independent.
+        let batch = (paths / 8).clamp(1, BATCH);
+        let mut done = 0;
+        while done < paths {
+            let now = batch.min(paths - done);
+            let pass = u64::from(before) + u64::from(done);
             let mut rng = Rng::new(frame.seed, Stream::Paths, k as u64, pass);
-            let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
-            walk.path(&mut rng, x, y, &mut self.scratch, &mut self.images);
-            self.multi.add(&mut self.scratch.first);
-            out.take(&mut self.scratch.first, paths);
+            let lights = LIGHTS_A_PATH * now;
+            self.paths.pool.fill(
+                walk.world,
+                walk.emitters,
+                lights,
+                &mut rng,
+                &mut self.scratch.stack,
+            );
+            for _ in 0..now {
+                let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
+                walk.path(&mut rng, x, y, &mut self.scratch, &mut self.paths);
+            }
+            self.scratch.unit.finish(&mut self.paths.pixel);
+            done += now;
+            counts.batches += 1;
         }
-        strata
+        out.take(&mut self.scratch.unit, paths.max(1));
+        counts
     }
 }
 
@@ -281,8 +311,8 @@ fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins
     let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
     let mut split = run.split;
     for (i, stat) in run.stats.iter_mut().enumerate() {
-        let strata = bench.pixel(frame, run.first + i, pass, &mut found.outside);
-        let moments = Moments::new(bench, strata, pass.1, unit);
+        let counts = bench.pixel(frame, run.first + i, pass, &mut found.outside);
+        let moments = Moments::new(bench, counts, unit);
         let range = i * bins..(i + 1) * bins;
         let transient = &mut run.transient[range.clone()];
         let mut sums = Stat::default();
@@ -322,36 +352,40 @@ fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins
 struct Moments {
     strata: f64,
     paths: f64,
+    batches: f64,
     unit: f64,
     total_variance: f64,
 }
 
 impl Moments {
-    fn new(bench: &Bench, strata: u32, paths: u32, unit: f64) -> Self {
+    fn new(bench: &Bench, counts: Counts, unit: f64) -> Self {
         let mut m = Self {
-            strata: f64::from(strata),
-            paths: f64::from(paths),
+            strata: f64::from(counts.strata),
+            paths: f64::from(counts.paths),
+            batches: f64::from(counts.batches),
             unit,
             total_variance: 0.0,
         };
-        let total: f64 = bench.multi.sum.iter().map(|&v| f64::from(v)).sum();
+        let multi = &bench.paths.pixel;
+        let total: f64 = multi.sum.iter().map(|&v| f64::from(v)).sum();
         m.total_variance = bench.two.total_square / (m.strata * m.strata) * unit * unit
-            + m.of_paths(total, bench.multi.total_square).1;
+            + m.of_batches(total, multi.total_square).1;
         m
     }
 
-    /// Mean and its variance from Σx and Σx² over the paths.
-    fn of_paths(&self, sum: f64, square: f64) -> (f64, f64) {
-        let n = self.paths;
-        if n == 0.0 {
+    /// Mean over paths and its variance from Σx and Σx² over the batches.
+    fn of_batches(&self, sum: f64, square: f64) -> (f64, f64) {
+        if self.paths == 0.0 {
             return (0.0, 0.0);
         }
+        let n = self.batches;
         let spread = if n > 1.0 {
-            (square - sum * sum / n).max(0.0) / (n * (n - 1.0))
+            (square - sum * sum / n).max(0.0) * n / (n - 1.0)
         } else {
             square
         };
-        (sum / n * self.unit, spread * self.unit * self.unit)
+        let scale = self.unit / self.paths;
+        (sum * scale, spread * scale * scale)
     }
 
     /// Two-bounce mean and variance, 3+ mean and variance.
@@ -359,8 +393,8 @@ impl Moments {
         let n = self.strata;
         let two = f64::from(bench.two.sum[k]) / n * self.unit;
         let two_variance = f64::from(bench.two.square[k]) / (n * n) * self.unit * self.unit;
-        let (sum, square) = (bench.multi.sum[k], bench.multi.square[k]);
-        let (multi, variance) = self.of_paths(f64::from(sum), f64::from(square));
+        let (sum, square) = (bench.paths.pixel.sum[k], bench.paths.pixel.square[k]);
+        let (multi, variance) = self.of_batches(f64::from(sum), f64::from(square));
         [two, two_variance, multi, variance]
     }
 }
@@ -388,8 +422,8 @@ pub(super) fn pilot(frame: &Frame) -> Vec<Stat> {
         .map_init(
             || Bench::new(frame),
             |bench, k| {
-                let strata = bench.pixel(frame, k, pass, &mut Overflow::default());
-                let moments = Moments::new(bench, strata, PILOT_PATHS, 1.0);
+                let counts = bench.pixel(frame, k, pass, &mut Overflow::default());
+                let moments = Moments::new(bench, counts, 1.0);
                 let mut stat = Stat::default();
                 for b in 0..frame.walk.gate.bins as usize {
                     let [two, two_variance, multi, multi_variance] = moments.bin(bench, b);

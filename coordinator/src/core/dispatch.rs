@@ -1,0 +1,140 @@
+//! Grants: pending tasks to workers with credit, in memory and only when something has changed.
+
+use picofarm_catalog::RangeState;
+use picofarm_proto::{
+    ids::{JobId, WorkerId},
+    model::{EventKind, JobState, Lease},
+};
+
+use super::{About, Core, Say};
+use crate::{place, transition::RangeEvent};
+
+impl Core {
+    /// Grants whatever can be granted now.
+    pub(crate) fn dispatch(&mut self, now_ms: i64) {
+        let hungry: Vec<WorkerId> = self
+            .workers
+            .iter()
+            .filter(|(_, w)| w.credits > 0 && !w.quarantined)
+            .map(|(id, _)| *id)
+            .collect();
+        let waiting: Vec<JobId> = self
+            .order
+            .iter()
+            .filter(|id| {
+                let entry = &self.jobs[id];
+                entry.job.state == JobState::Active && entry.stage.counts().pending > 0
+            })
+            .copied()
+            .collect();
+        for job in &waiting {
+            self.explain_waiting(*job, now_ms);
+        }
+        // In rounds, so that the first worker does not take everything.
+        let mut granted = true;
+        while granted {
+            granted = false;
+            for worker in &hungry {
+                granted |= waiting.iter().any(|job| self.grant(*job, *worker, now_ms));
+            }
+        }
+    }
+
+    /// Grants one lease of a job to a worker, if both can.
+    fn grant(&mut self, id: JobId, worker: WorkerId, now_ms: i64) -> bool {
+        let able = self.able(id);
+        let entry = self.jobs.get_mut(&id).expect("the caller lists known jobs");
+        let who = self
+            .workers
+            .get_mut(&worker)
+            .expect("the caller lists connected workers");
+        if who.credits == 0
+            || who.quarantined
+            || place::may_run(&entry.job.spec, &who.abilities).is_err()
+        {
+            return false;
+        }
+        // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
+        let Some(range) = entry.stage.front(now_ms, who.leases.is_empty()).cloned() else {
+            return false;
+        };
+        let count = place::lease_size(
+            self.sets[entry.set].timing.mean(),
+            entry.stage.counts().pending,
+            range.len(),
+            able,
+        );
+        let granted = entry
+            .stage
+            .apply(
+                &range,
+                &RangeEvent::Grant {
+                    count,
+                    worker,
+                    incarnation: who.incarnation,
+                    until_ms: now_ms + i64::from(self.settings.lease_ms),
+                },
+                &mut Self::range_id(&mut self.make_id),
+                &mut self.changes,
+            )
+            .expect("a pending range can be granted")
+            .expect("a grant leaves a leased range");
+        debug_assert!(matches!(granted.state, RangeState::Leased(_)));
+        who.credits -= 1;
+        who.leases.insert(granted.id);
+        who.quarantined = granted.crashes > 0;
+        self.leases.insert(granted.id, id);
+        let lease = Lease {
+            lease: granted.lease(),
+            job: id,
+            lo: granted.lo,
+            hi: granted.hi,
+            skip: Vec::new(),
+            ttl_ms: self.settings.lease_ms,
+            spec: (*entry.job.spec).clone(),
+        };
+        self.say.push((who.session, Say::Lease(Box::new(lease))));
+        let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))
+            .tasks(granted.lo, granted.hi)
+            .worker(who.name.clone());
+        self.event(now_ms, id, EventKind::Leased, about);
+        true
+    }
+
+    /// Number of connected workers that may run a job's tasks.
+    fn able(&self, id: JobId) -> u64 {
+        let spec = &self.jobs[&id].job.spec;
+        self.workers
+            .values()
+            .filter(|w| place::may_run(spec, &w.abilities).is_ok())
+            .count() as u64
+    }
+
+    /// Where workers are connected but none may run a job, its history says why, once for each reason.
+    fn explain_waiting(&mut self, id: JobId, now_ms: i64) {
+        let entry = &self.jobs[&id];
+        let mut reasons = self
+            .workers
+            .values()
+            .map(|w| (&w.name, place::may_run(&entry.job.spec, &w.abilities)));
+        let Some((name, Err(reason))) = reasons.next() else {
+            return;
+        };
+        if reasons.any(|(_, verdict)| verdict.is_ok()) {
+            return;
+        }
+        if entry.waiting.as_deref() == Some(&*reason) {
+            return;
+        }
+        let name = name.clone();
+        tracing::warn!(job = %id, worker = name, "no connected worker may run this job: {reason}");
+        self.jobs.get_mut(&id).expect("looked up above").waiting = Some(reason.clone());
+        let message = format!("no connected worker may run this job: {reason}");
+        self.event(
+            now_ms,
+            id,
+            EventKind::Waiting,
+            About::message(message).worker(name),
+        );
+    }
+}

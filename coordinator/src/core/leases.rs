@@ -1,0 +1,508 @@
+//! The life of a lease after its grant: commit, failure, return, expiry.
+
+use picofarm_catalog::{Exception, Mark, Output, Range, RangeState};
+use picofarm_proto::{
+    ids::{JobId, LeaseRef, RangeId},
+    key::task_key,
+    model::{EventKind, Failure, FailureKind, Finished, JobState, TaskProgress},
+};
+
+use super::{About, Core, JobEntry, Progress, Say, SessionId};
+use crate::{budget, transition::RangeEvent};
+
+/// What the catalog already holds for a reported task: looked up before [`Core::finished`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct OutputHint(pub Option<[u8; 32]>);
+
+impl Core {
+    /// The job whose task a report is about: by its lease, or else by the task key.
+    pub(crate) fn job_of(&self, report: &Finished) -> Option<JobId> {
+        let fits = |entry: &JobEntry| {
+            report.index < entry.job.spec.scenes.count
+                && task_key(&self.sets[entry.set].key, report.index) == report.key
+        };
+        if let Some(id) = self.leases.get(&report.lease.range) {
+            return fits(&self.jobs[id]).then_some(*id);
+        }
+        self.order
+            .iter()
+            .rev()
+            .find(|id| fits(&self.jobs[id]))
+            .copied()
+    }
+
+    /// Commits a finished task, or says why not. `hint` is what the catalog holds for it.
+    pub(crate) fn finished(
+        &mut self,
+        session: SessionId,
+        report: &Finished,
+        hint: OutputHint,
+        now_ms: i64,
+    ) {
+        let Some(worker) = self.sessions.get(&session).copied() else {
+            return;
+        };
+        let verdict = self.commit(session, report, hint, now_ms);
+        if let Err(reason) = &verdict {
+            tracing::info!(%worker, range = %report.lease.range, task = report.index, reason, "report refused");
+        }
+        self.acknowledge(session, report.lease, report.index, verdict);
+    }
+
+    fn commit(
+        &mut self,
+        session: SessionId,
+        report: &Finished,
+        OutputHint(known): OutputHint,
+        now_ms: i64,
+    ) -> Result<(), String> {
+        let mut manifest = [0; 32];
+        hex_into(&report.manifest_sha256, &mut manifest)
+            .ok_or("manifest_sha256: expected 64 hexadecimal digits")?;
+        let id = self.job_of(report).ok_or(
+            "the task key names no task of this job; the worker's renderer or settings differ from the job's",
+        )?;
+        let set = self.jobs[&id].set;
+        let known = known.or_else(|| self.fresh.get(&(set, report.index)).copied());
+        let live = self
+            .held_to_do(session, report.lease, report.index, now_ms)
+            .cloned();
+        match (live, known) {
+            (Ok(range), None) => {
+                self.commit_new(session, id, &range, report, manifest, now_ms);
+                Ok(())
+            }
+            (live, Some(known)) => {
+                // The output stands, whoever made it: the task is done.
+                if let Ok(range) = live {
+                    self.mark(
+                        &range,
+                        &RangeEvent::Finish {
+                            task: report.index,
+                            reused: true,
+                        },
+                    );
+                    self.end_if_over(id, now_ms);
+                }
+                if known == manifest {
+                    return Ok(());
+                }
+                let name = self.session_name(session);
+                let message = format!(
+                    "task {} has two different results: committed manifest {}, reported {}; the committed one stands. Is the renderer deterministic on this worker?",
+                    report.index,
+                    hex_of(&known),
+                    report.manifest_sha256
+                );
+                tracing::error!(job = %id, worker = name, "{message}");
+                let about = About::message(message.clone())
+                    .task(report.index)
+                    .worker(name);
+                self.event(now_ms, id, EventKind::Alarm, about);
+                Err(message)
+            }
+            (Err(reason), None) => Err(reason),
+        }
+    }
+
+    fn commit_new(
+        &mut self,
+        session: SessionId,
+        id: JobId,
+        range: &Range,
+        report: &Finished,
+        manifest: [u8; 32],
+        now_ms: i64,
+    ) {
+        let task = report.index;
+        let set = self.jobs[&id].set;
+        self.fresh.insert((set, task), manifest);
+        self.changes.outputs.push(Output {
+            job: id,
+            task,
+            manifest,
+            bytes: report.bytes,
+            seconds: report.seconds,
+            epoch: report.lease.epoch,
+            adopted: report.adopted,
+        });
+        let kind = if report.adopted {
+            EventKind::Reused
+        } else {
+            let timing = &mut self.sets[set].timing;
+            timing.tasks += 1;
+            timing.seconds += report.seconds;
+            EventKind::Committed
+        };
+        let about = About::default()
+            .task(task)
+            .worker(self.session_name(session))
+            .seconds(report.seconds);
+        self.event(now_ms, id, kind, about);
+        self.mark(
+            range,
+            &RangeEvent::Finish {
+                task,
+                reused: report.adopted,
+            },
+        );
+        self.end_if_over(id, now_ms);
+        self.settle_elsewhere(set, id, task, now_ms);
+    }
+
+    /// Other jobs that wait for the same output have it now.
+    fn settle_elsewhere(&mut self, set: usize, but: JobId, task: u64, now_ms: i64) {
+        if self.sets[set].jobs.len() < 2 {
+            return;
+        }
+        for id in self.sets[set].jobs.clone() {
+            let entry = self.jobs.get_mut(&id).expect("a set names known jobs");
+            if id == but || entry.job.state != JobState::Active {
+                continue;
+            }
+            let Some(range) = entry.stage.pending_at(task).cloned() else {
+                continue;
+            };
+            entry
+                .stage
+                .apply(
+                    &range,
+                    &RangeEvent::Settle { task },
+                    &mut Self::range_id(&mut self.make_id),
+                    &mut self.changes,
+                )
+                .expect("a pending task can be settled");
+            let about = About::message(format!("committed by job {but}")).task(task);
+            self.event(now_ms, id, EventKind::Reused, about);
+            self.end_if_over(id, now_ms);
+        }
+    }
+
+    /// Charges a failed task to its budgets and takes it out of the lease.
+    pub(crate) fn failed(&mut self, session: SessionId, failure: &Failure, now_ms: i64) {
+        let held = self
+            .held_to_do(session, failure.lease, failure.index, now_ms)
+            .cloned();
+        let verdict = held.map(|range| {
+            let name = self.session_name(session);
+            self.leave(
+                &range,
+                failure.index,
+                failure.kind,
+                &failure.message,
+                &name,
+                now_ms,
+            );
+            self.end_if_over(range.job, now_ms);
+        });
+        self.acknowledge(session, failure.lease, failure.index, verdict);
+    }
+
+    /// Takes a lease back that the worker gives up of itself.
+    pub(crate) fn released(
+        &mut self,
+        session: SessionId,
+        lease: LeaseRef,
+        reason: &str,
+        now_ms: i64,
+    ) {
+        let held = self.held(session, lease, now_ms).cloned();
+        let verdict = held.map(|range| {
+            let about = About::message(reason)
+                .tasks(range.lo, range.hi)
+                .worker(self.session_name(session));
+            self.event(now_ms, range.job, EventKind::Released, about);
+            self.close(&range, false);
+        });
+        self.acknowledge(session, lease, 0, verdict);
+    }
+
+    /// Prolongs the leases a worker names and notes how far it is; says which live on.
+    pub(crate) fn heartbeat(
+        &mut self,
+        session: SessionId,
+        leases: &[LeaseRef],
+        progress: &[TaskProgress],
+        now_ms: i64,
+    ) {
+        let mut alive = Vec::with_capacity(leases.len());
+        for lease in leases {
+            if self.held(session, *lease, now_ms).is_ok() {
+                self.renew(lease.range, now_ms);
+                alive.push(*lease);
+            }
+        }
+        for report in progress {
+            let held = self.held_to_do(session, report.lease, report.index, now_ms);
+            if held.is_err() {
+                continue;
+            }
+            self.progress
+                .entry(report.lease.range)
+                .or_default()
+                .entry(report.index)
+                .or_insert(Progress {
+                    fraction: 0.0,
+                    since_ms: now_ms,
+                })
+                .fraction = report.fraction;
+        }
+        let ttl_ms = self.settings.lease_ms;
+        self.say.push((
+            session,
+            Say::Renewed {
+                leases: alive,
+                ttl_ms,
+            },
+        ));
+    }
+
+    /// Takes back every lease that has run out; to be called about once a second.
+    pub(crate) fn expire(&mut self, now_ms: i64) {
+        for range in std::mem::take(&mut self.renewed) {
+            if let Some(range) = self.range(range) {
+                let range = range.clone();
+                self.changes.put(range);
+            }
+        }
+        let over: Vec<Range> = self
+            .leases
+            .keys()
+            .filter_map(|id| self.range(*id))
+            .filter(|range| matches!(&range.state, RangeState::Leased(l) if l.until_ms <= now_ms))
+            .cloned()
+            .collect();
+        for range in over {
+            self.lost(
+                &range,
+                "the lease ran out: nothing was heard of the worker",
+                now_ms,
+            );
+        }
+    }
+
+    /// The worker was lost without a goodbye: the task in hand is charged with a crash, the rest is halved.
+    pub(crate) fn lost(&mut self, range: &Range, why: &str, now_ms: i64) {
+        let Some((_, lease)) = self.jobs[&range.job].stage.lease(range.lease()) else {
+            return;
+        };
+        let worker = lease.worker;
+        let name = self.name_of(worker);
+        if let Some(entry) = self.workers.get(&worker) {
+            let revoke = Say::Revoke {
+                lease: range.lease(),
+                reason: why.to_owned(),
+            };
+            self.say.push((entry.session, revoke));
+        }
+        let about = About::message(why).tasks(range.lo, range.hi).worker(&*name);
+        self.event(now_ms, range.job, EventKind::Expired, about);
+        let todo = |task: &u64| to_do(range, *task);
+        let mut in_hand: Vec<u64> = self
+            .progress
+            .get(&range.id)
+            .into_iter()
+            .flat_map(|tasks| tasks.keys().copied())
+            .filter(todo)
+            .collect();
+        if in_hand.is_empty() {
+            in_hand.extend((range.lo..range.hi).find(todo));
+        }
+        for task in in_hand {
+            if let Some(range) = self.range(range.id).cloned() {
+                self.leave(&range, task, FailureKind::Crash, why, &name, now_ms);
+            }
+        }
+        // The last task to leave has closed the lease.
+        if let Some(range) = self.range(range.id).cloned() {
+            self.close(&range, true);
+        }
+        self.end_if_over(range.job, now_ms);
+    }
+
+    /// One task fails and leaves its lease.
+    fn leave(
+        &mut self,
+        range: &Range,
+        task: u64,
+        kind: FailureKind,
+        message: &str,
+        worker: &str,
+        now_ms: i64,
+    ) {
+        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
+        let fresh = Exception {
+            job: range.job,
+            task,
+            failures: 0,
+            crashes: 0,
+            dead: false,
+            last_error: String::new(),
+        };
+        let verdict = budget::charge(
+            entry.exceptions.get(&task),
+            fresh,
+            kind,
+            message,
+            &entry.job.spec.limits,
+            &self.settings.backoff,
+            now_ms,
+        );
+        let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
+        if let Some(exception) = verdict.exception {
+            self.changes
+                .exceptions
+                .insert((range.job, task), exception.clone());
+            entry.exceptions.insert(task, exception);
+        }
+        self.mark(
+            range,
+            &RangeEvent::Leave {
+                task,
+                retry_at_ms: verdict.retry_at_ms,
+                crashes,
+            },
+        );
+        let kind = match verdict.retry_at_ms {
+            Some(_) => EventKind::Failed,
+            None => EventKind::Dead,
+        };
+        let about = About::message(message).task(task).worker(worker);
+        self.event(now_ms, range.job, kind, about);
+    }
+
+    /// Ends a lease; what is not done becomes pending.
+    pub(super) fn close(&mut self, range: &Range, halve: bool) {
+        self.mark(range, &RangeEvent::Close { halve });
+    }
+
+    /// Prolongs a lease in memory; written with the next tick.
+    pub(super) fn renew(&mut self, id: RangeId, now_ms: i64) {
+        let until_ms = now_ms + i64::from(self.settings.lease_ms);
+        let Some(range) = self.range(id).cloned() else {
+            return;
+        };
+        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
+        entry.stage.renew(range.id, until_ms);
+        self.renewed.insert(id);
+    }
+
+    /// Lets something happen to a leased range and forgets the lease when it has ended by that.
+    fn mark(&mut self, range: &Range, event: &RangeEvent) {
+        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
+        let left = entry
+            .stage
+            .apply(
+                range,
+                event,
+                &mut Self::range_id(&mut self.make_id),
+                &mut self.changes,
+            )
+            .expect("callers checked that the lease has the task to do");
+        if let RangeEvent::Finish { task, .. } | RangeEvent::Leave { task, .. } = event
+            && let Some(tasks) = self.progress.get_mut(&range.id)
+        {
+            tasks.remove(task);
+        }
+        if left.is_none() {
+            self.leases.remove(&range.id);
+            self.progress.remove(&range.id);
+            self.renewed.remove(&range.id);
+            for worker in self.workers.values_mut() {
+                if worker.leases.remove(&range.id) && worker.leases.is_empty() {
+                    worker.quarantined = false;
+                }
+            }
+        }
+    }
+
+    /// A leased range.
+    fn range(&self, id: RangeId) -> Option<&Range> {
+        let job = self.leases.get(&id)?;
+        self.jobs[job].stage.leased_range(id)
+    }
+
+    /// The range of a lease that this session's worker holds now.
+    fn held(&self, session: SessionId, lease: LeaseRef, now_ms: i64) -> Result<&Range, String> {
+        let worker = self
+            .sessions
+            .get(&session)
+            .ok_or("the session is no longer this worker's")?;
+        let incarnation = self.workers[worker].incarnation;
+        let (range, state) = self
+            .leases
+            .get(&lease.range)
+            .and_then(|job| self.jobs[job].stage.lease(lease))
+            .ok_or("the lease is no longer live: it ran out, was cancelled, or is finished")?;
+        if state.worker != *worker || state.incarnation != incarnation {
+            return Err("the lease is another worker's now".into());
+        }
+        if state.until_ms <= now_ms {
+            return Err("the lease has run out".into());
+        }
+        Ok(range)
+    }
+
+    /// As [`Core::held`], for a lease that has this task to do.
+    fn held_to_do(
+        &self,
+        session: SessionId,
+        lease: LeaseRef,
+        task: u64,
+        now_ms: i64,
+    ) -> Result<&Range, String> {
+        let range = self.held(session, lease, now_ms)?;
+        if to_do(range, task) {
+            Ok(range)
+        } else {
+            Err("this lease does not have that task to do".into())
+        }
+    }
+
+    fn session_name(&self, session: SessionId) -> String {
+        self.sessions
+            .get(&session)
+            .map(|worker| self.name_of(*worker))
+            .unwrap_or_default()
+    }
+
+    fn acknowledge(
+        &mut self,
+        session: SessionId,
+        lease: LeaseRef,
+        index: u64,
+        verdict: Result<(), String>,
+    ) {
+        let (accepted, reason) = match verdict {
+            Ok(()) => (true, String::new()),
+            Err(reason) => (false, reason),
+        };
+        self.say.push((
+            session,
+            Say::Acknowledge {
+                lease,
+                index,
+                accepted,
+                reason,
+            },
+        ));
+    }
+}
+
+/// Whether a leased range has this task to do.
+fn to_do(range: &Range, task: u64) -> bool {
+    let RangeState::Leased(lease) = &range.state else {
+        return false;
+    };
+    task.checked_sub(range.lo)
+        .and_then(|at| lease.marks.get(usize::try_from(at).ok()?))
+        == Some(&Mark::Todo)
+}
+
+fn hex_into(text: &str, bytes: &mut [u8; 32]) -> Option<()> {
+    hex::decode_to_slice(text, bytes).ok()
+}
+
+fn hex_of(bytes: &[u8; 32]) -> String {
+    hex::encode(bytes)
+}

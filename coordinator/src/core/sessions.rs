@@ -1,0 +1,120 @@
+//! Workers come and go. One session a worker: a newer one takes the older one's place.
+
+use picofarm_catalog::{Range, Worker};
+use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
+
+use super::{Core, Say, SessionId, WorkerEntry};
+use crate::place::Abilities;
+
+impl Core {
+    /// A worker connects. Leases it still holds live on; those it does not know of become pending again; those
+    /// of an earlier process of it are lost.
+    pub(crate) fn hello(&mut self, session: SessionId, hello: WorkerHello, now_ms: i64) {
+        let id = hello.id;
+        if let Some(old) = self.workers.remove(&id) {
+            self.sessions.remove(&old.session);
+            self.say.push((old.session, Say::Replaced));
+        }
+        self.names.insert(id, hello.name.clone());
+        self.changes.workers.insert(
+            id,
+            Worker {
+                id,
+                incarnation: hello.incarnation,
+                name: hello.name.clone(),
+                last_seen_ms: now_ms,
+            },
+        );
+        let mut mine = Vec::new();
+        let mut former = Vec::new();
+        for job in self.jobs.values() {
+            for (range, lease) in job.stage.leased().filter(|(_, l)| l.worker == id) {
+                if lease.incarnation == hello.incarnation {
+                    mine.push(range.clone());
+                } else {
+                    former.push(range.clone());
+                }
+            }
+        }
+        for range in &former {
+            self.lost(
+                range,
+                "the worker was restarted while it held this lease",
+                now_ms,
+            );
+        }
+        self.sessions.insert(session, id);
+        self.workers.insert(
+            id,
+            WorkerEntry {
+                session,
+                incarnation: hello.incarnation,
+                name: hello.name,
+                abilities: Abilities {
+                    renderer: hello.renderer,
+                    assets: hello.assets,
+                },
+                credits: 0,
+                leases: Default::default(),
+                quarantined: false,
+            },
+        );
+        self.keep_held(session, &hello.held, mine, now_ms);
+    }
+
+    fn keep_held(&mut self, session: SessionId, held: &[LeaseRef], mine: Vec<Range>, now_ms: i64) {
+        let worker = self.sessions[&session];
+        for lease in held {
+            if !mine.iter().any(|range| range.lease() == *lease) {
+                let revoke = Say::Revoke {
+                    lease: *lease,
+                    reason:
+                        "the lease is no longer live: it ran out, was cancelled, or is finished"
+                            .into(),
+                };
+                self.say.push((session, revoke));
+            }
+        }
+        for range in mine {
+            if held.contains(&range.lease()) {
+                self.renew(range.id, now_ms);
+                let entry = self
+                    .workers
+                    .get_mut(&worker)
+                    .expect("it has just connected");
+                entry.leases.insert(range.id);
+                entry.quarantined |= range.crashes > 0;
+            } else {
+                // The grant was lost on the way: nobody works on it and nobody is to blame.
+                self.close(&range, false);
+            }
+        }
+    }
+
+    /// A worker can take more leases.
+    pub(crate) fn credit(&mut self, session: SessionId, leases: u32) {
+        if let Some(worker) = self.sessions.get(&session)
+            && let Some(entry) = self.workers.get_mut(worker)
+        {
+            entry.credits = entry.credits.saturating_add(leases);
+        }
+    }
+
+    /// A session has ended. Leases that were not given back live on until they run out: the worker may come back.
+    pub(crate) fn closed(&mut self, session: SessionId, now_ms: i64) {
+        let Some(worker) = self.sessions.remove(&session) else {
+            return;
+        };
+        if let Some(entry) = self.workers.remove(&worker) {
+            self.changes.workers.insert(
+                worker,
+                Worker {
+                    id: worker,
+                    incarnation: entry.incarnation,
+                    name: entry.name,
+                    last_seen_ms: now_ms,
+                },
+            );
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Service `Farm`: the session of a worker.
+
+use std::{
+    pin::Pin,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use futures::Stream;
+use picofarm_proto::{
+    PROTOCOL,
+    convert::ConvertError,
+    ids::LeaseRef,
+    model::WorkerHello,
+    wire::{
+        self, farm_server::Farm, session_request::Message as From, session_response::Message as To,
+    },
+};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::{Link, invalid};
+use crate::{
+    VERSION,
+    actor::{Command, FromWorker},
+    core::{Say, SessionId},
+};
+
+/// How long a worker may take to say who it is.
+const HELLO: Duration = Duration::from_secs(20);
+/// Messages that may wait for a worker; one that reads none of them is let go.
+const OUTBOX: usize = 4096;
+
+pub(crate) struct FarmService {
+    link: Link,
+    sessions: Arc<AtomicU64>,
+}
+
+impl FarmService {
+    pub(crate) fn new(link: Link) -> Self {
+        Self {
+            link,
+            sessions: Arc::new(AtomicU64::new(1)),
+        }
+    }
+}
+
+type Out = mpsc::Sender<Result<wire::SessionResponse, Status>>;
+
+#[tonic::async_trait]
+impl Farm for FarmService {
+    type SessionStream = Pin<Box<dyn Stream<Item = Result<wire::SessionResponse, Status>> + Send>>;
+
+    async fn session(
+        &self,
+        request: Request<Streaming<wire::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let session = self.sessions.fetch_add(1, Ordering::Relaxed);
+        let (out, stream) = mpsc::channel(16);
+        tokio::spawn(run(self.link.clone(), session, request.into_inner(), out));
+        // At once: a client may wait for this before it says hello.
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+}
+
+async fn run(link: Link, session: SessionId, mut input: Streaming<wire::SessionRequest>, out: Out) {
+    let hello = match greeting(&mut input).await {
+        Ok(hello) => hello,
+        Err(status) => {
+            tracing::warn!("a worker was refused: {}", status.message());
+            let _ = out.send(Err(status)).await;
+            return;
+        }
+    };
+    let worker = hello.name.clone();
+    let welcome = To::Welcome(wire::Welcome {
+        coordinator_version: VERSION.into(),
+        heartbeat_ms: link.heartbeat_ms,
+        lease_ms: link.lease_ms,
+    });
+    if send(&out, welcome).await.is_err() {
+        return;
+    }
+    tracing::info!(worker, session, "worker connected");
+    let (say, mut said) = mpsc::channel(OUTBOX);
+    let open = Command::Open {
+        session,
+        hello,
+        say,
+    };
+    if link.commands.send(open).await.is_err() {
+        return;
+    }
+    let end = tokio::select! {
+        end = listen(&link, session, &mut input) => end,
+        end = speak(&mut said, &out) => end,
+        () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
+    };
+    tracing::info!(worker, session, "worker disconnected");
+    // The actor is gone when the coordinator stops.
+    let _ = link
+        .commands
+        .send(Command::Worker(session, FromWorker::Closed))
+        .await;
+    if let Err(status) = end {
+        let _ = out.send(Err(status)).await;
+    }
+}
+
+/// The first message, if this worker may work here.
+async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerHello, Status> {
+    let first = tokio::time::timeout(HELLO, input.message())
+        .await
+        .map_err(|_| Status::deadline_exceeded("no hello within 20 s"))??;
+    let Some(wire::SessionRequest {
+        message: Some(From::Hello(hello)),
+    }) = first
+    else {
+        return Err(Status::invalid_argument(
+            "the first message of a session must be hello",
+        ));
+    };
+    if hello.protocol != PROTOCOL || hello.version != VERSION {
+        return Err(Status::failed_precondition(format!(
+            "worker {:?} is picofarm {} (protocol {}), the coordinator is picofarm {VERSION} (protocol {PROTOCOL}); install the same version on both",
+            hello.name, hello.version, hello.protocol
+        )));
+    }
+    WorkerHello::try_from(hello).map_err(invalid)
+}
+
+/// Passes on what the worker says, until it ends its side.
+async fn listen(
+    link: &Link,
+    session: SessionId,
+    input: &mut Streaming<wire::SessionRequest>,
+) -> Result<(), Status> {
+    loop {
+        let Some(request) = input.message().await? else {
+            return Ok(());
+        };
+        let said = checked(request).map_err(invalid)?;
+        let command = Command::Worker(session, said);
+        if link.commands.send(command).await.is_err() {
+            return Err(Status::unavailable(
+                "the coordinator is stopping; reconnect",
+            ));
+        }
+    }
+}
+
+fn checked(request: wire::SessionRequest) -> Result<FromWorker, ConvertError> {
+    let lease = |lease: Option<wire::LeaseRef>| -> Result<LeaseRef, ConvertError> {
+        lease
+            .ok_or(ConvertError::Missing { field: "lease" })?
+            .try_into()
+    };
+    Ok(match request.message {
+        None => return Err(ConvertError::Missing { field: "message" }),
+        Some(From::Hello(_)) => {
+            return Err(ConvertError::Invalid {
+                field: "hello",
+                what: "is only the first message of a session".into(),
+            });
+        }
+        Some(From::Credit(credit)) => FromWorker::Credit(credit.leases),
+        Some(From::Heartbeat(beat)) => FromWorker::Heartbeat(
+            beat.leases
+                .into_iter()
+                .map(TryInto::try_into)
+                .collect::<Result<_, _>>()?,
+            beat.progress
+                .into_iter()
+                .map(TryInto::try_into)
+                .collect::<Result<_, _>>()?,
+        ),
+        Some(From::Done(done)) => FromWorker::Done(done.try_into()?),
+        Some(From::Failed(failed)) => FromWorker::Failed(failed.try_into()?),
+        Some(From::Release(release)) => FromWorker::Release(lease(release.lease)?, release.reason),
+    })
+}
+
+/// Tells the worker what the actor says, until the actor lets it go.
+async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out) -> Result<(), Status> {
+    while let Some(say) = said.recv().await {
+        let message = match say {
+            Say::Lease(lease) => To::Lease((*lease).into()),
+            Say::Acknowledge {
+                lease,
+                index,
+                accepted,
+                reason,
+            } => To::Acknowledge(wire::Acknowledge {
+                lease: Some(lease.into()),
+                index,
+                accepted,
+                reason,
+            }),
+            Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
+                leases: leases.into_iter().map(Into::into).collect(),
+                ttl_ms,
+            }),
+            Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
+                lease: Some(lease.into()),
+                reason,
+            }),
+            Say::Replaced => {
+                return Err(Status::aborted(
+                    "a newer session of this worker id took over; if that is another worker, give each its own id",
+                ));
+            }
+        };
+        send(out, message).await?;
+    }
+    Err(Status::unavailable(
+        "the coordinator let this session go; reconnect",
+    ))
+}
+
+async fn send(out: &Out, message: To) -> Result<(), Status> {
+    let response = wire::SessionResponse {
+        message: Some(message),
+    };
+    out.send(Ok(response))
+        .await
+        .map_err(|_| Status::cancelled("the worker is gone"))
+}

@@ -1,0 +1,210 @@
+//! Service `Jobs`: what clients ask.
+
+use std::{pin::Pin, time::Duration};
+
+use futures::Stream;
+use picofarm_catalog::EventQuery;
+use picofarm_proto::{
+    PROTOCOL,
+    convert::ConvertError,
+    ids::JobId,
+    model::{JobSpec, JobState},
+    wire::{self, jobs_server::Jobs},
+};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Request, Response, Status};
+
+use super::{Link, invalid};
+use crate::{VERSION, actor::Command, plan};
+
+/// Least time between two reports to a watcher.
+const DEBOUNCE: Duration = Duration::from_millis(250);
+/// Events in one answer where the client names no limit, and at most.
+const EVENTS: u32 = 1_000;
+const MOST_EVENTS: u32 = 10_000;
+
+pub(crate) struct JobsService(pub Link);
+
+fn spec(wire: Option<wire::JobSpec>) -> Result<Box<JobSpec>, Status> {
+    let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
+    let spec = JobSpec::try_from(wire).map_err(invalid)?;
+    plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
+    Ok(Box::new(spec))
+}
+
+fn job_id(text: &str) -> Result<JobId, Status> {
+    text.parse()
+        .map_err(|e| Status::invalid_argument(format!("job_id: {e}")))
+}
+
+#[tonic::async_trait]
+impl Jobs for JobsService {
+    async fn get_server_info(
+        &self,
+        _: Request<wire::GetServerInfoRequest>,
+    ) -> Result<Response<wire::GetServerInfoResponse>, Status> {
+        Ok(Response::new(wire::GetServerInfoResponse {
+            version: VERSION.into(),
+            protocol: PROTOCOL,
+            workers: self.0.ask(Command::Workers).await?,
+        }))
+    }
+
+    async fn plan_job(
+        &self,
+        request: Request<wire::PlanJobRequest>,
+    ) -> Result<Response<wire::PlanJobResponse>, Status> {
+        let spec = spec(request.into_inner().spec)?;
+        let plan = self.0.ask(|reply| Command::Plan(spec, reply)).await?;
+        Ok(Response::new(wire::PlanJobResponse {
+            plan: Some(plan.into()),
+        }))
+    }
+
+    async fn submit_job(
+        &self,
+        request: Request<wire::SubmitJobRequest>,
+    ) -> Result<Response<wire::SubmitJobResponse>, Status> {
+        let request = request.into_inner();
+        let spec = spec(request.spec)?;
+        let again = request.again;
+        let submitted = self
+            .0
+            .ask(|reply| Command::Submit { spec, again, reply })
+            .await?;
+        Ok(Response::new(wire::SubmitJobResponse {
+            job_id: submitted.job.to_string(),
+            existed: submitted.existed,
+            plan: Some(submitted.plan.into()),
+        }))
+    }
+
+    async fn list_jobs(
+        &self,
+        _: Request<wire::ListJobsRequest>,
+    ) -> Result<Response<wire::ListJobsResponse>, Status> {
+        let jobs = self.0.ask(Command::List).await?;
+        Ok(Response::new(wire::ListJobsResponse {
+            jobs: jobs.into_iter().map(Into::into).collect(),
+        }))
+    }
+
+    async fn get_job(
+        &self,
+        request: Request<wire::GetJobRequest>,
+    ) -> Result<Response<wire::GetJobResponse>, Status> {
+        let id = job_id(&request.into_inner().job_id)?;
+        let job = self.0.ask(|reply| Command::Get(id, reply)).await?;
+        Ok(Response::new(wire::GetJobResponse {
+            job: Some(job.into()),
+        }))
+    }
+
+    type WatchJobStream =
+        Pin<Box<dyn Stream<Item = Result<wire::WatchJobResponse, Status>> + Send>>;
+
+    async fn watch_job(
+        &self,
+        request: Request<wire::WatchJobRequest>,
+    ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let id = job_id(&request.into_inner().job_id)?;
+        // A job that does not exist is an error now, not in the stream.
+        self.0.ask(|reply| Command::Get(id, reply)).await?;
+        let (sender, stream) = mpsc::channel(4);
+        tokio::spawn(watch(self.0.clone(), id, sender));
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn cancel_job(
+        &self,
+        request: Request<wire::CancelJobRequest>,
+    ) -> Result<Response<wire::CancelJobResponse>, Status> {
+        let id = job_id(&request.into_inner().job_id)?;
+        let job = self.0.ask(|reply| Command::Cancel(id, reply)).await?;
+        Ok(Response::new(wire::CancelJobResponse {
+            job: Some(job.into()),
+        }))
+    }
+
+    async fn retry_job(
+        &self,
+        request: Request<wire::RetryJobRequest>,
+    ) -> Result<Response<wire::RetryJobResponse>, Status> {
+        let id = job_id(&request.into_inner().job_id)?;
+        let retried = self.0.ask(|reply| Command::Retry(id, reply)).await?;
+        Ok(Response::new(wire::RetryJobResponse { retried }))
+    }
+
+    async fn list_events(
+        &self,
+        request: Request<wire::ListEventsRequest>,
+    ) -> Result<Response<wire::ListEventsResponse>, Status> {
+        let request = request.into_inner();
+        let job = job_id(&request.job_id)?;
+        // A job that does not exist is an error, not an empty history.
+        self.0.ask(|reply| Command::Get(job, reply)).await?;
+        let query = EventQuery {
+            job,
+            after: request.after,
+            limit: match request.limit {
+                0 => EVENTS,
+                n => n.min(MOST_EVENTS),
+            },
+            task: request.task,
+        };
+        let events = self
+            .0
+            .catalog
+            .events(&query)
+            .await
+            .map_err(|e| Status::unavailable(e.to_string()))?;
+        Ok(Response::new(wire::ListEventsResponse {
+            events: events.into_iter().map(Into::into).collect(),
+        }))
+    }
+}
+
+/// Reports at once and after each change, until the job ends or nobody listens.
+async fn watch(
+    mut link: Link,
+    id: JobId,
+    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
+) {
+    let mut last = None;
+    loop {
+        link.revision.mark_unchanged();
+        let status = match link.ask(|reply| Command::Get(id, reply)).await {
+            Ok(status) => status,
+            Err(error) => {
+                let _ = sender.send(Err(error)).await;
+                return;
+            }
+        };
+        let over = status.state != JobState::Active;
+        if last.as_ref() != Some(&status) {
+            let job = Some(status.clone().into());
+            if sender
+                .send(Ok(wire::WatchJobResponse { job }))
+                .await
+                .is_err()
+            {
+                return;
+            }
+            last = Some(status);
+        }
+        if over {
+            return;
+        }
+        tokio::select! {
+            () = tokio::time::sleep(DEBOUNCE) => {}
+            () = sender.closed() => return,
+            () = link.stop.cancelled() => return,
+        }
+        tokio::select! {
+            changed = link.revision.changed() => if changed.is_err() { return },
+            () = sender.closed() => return,
+            () = link.stop.cancelled() => return,
+        }
+    }
+}

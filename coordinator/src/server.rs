@@ -1,0 +1,192 @@
+//! Starting and stopping a coordinator.
+
+use std::{io, net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
+
+use picofarm_catalog::{Catalog, CatalogError, SqliteCatalog};
+use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
+use tokio::{
+    net::TcpListener,
+    sync::{mpsc, watch},
+    task::JoinHandle,
+};
+use tokio_util::sync::CancellationToken;
+use tonic::transport::{Server, server::TcpIncoming};
+
+use crate::{
+    actor::Actor,
+    budget::Backoff,
+    clock::Clock,
+    core::Settings,
+    rpc::{FarmService, JobsService, Link},
+};
+
+/// Largest message either way: a job of 100,000 scene files is about 15 MB.
+pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Commands that may wait for the actor; more senders wait for room.
+const QUEUE: usize = 8192;
+/// How often an idle connection is probed, and how long an answer may take.
+const KEEPALIVE: Duration = Duration::from_secs(20);
+
+/// How a coordinator runs.
+#[derive(Debug, Clone)]
+pub struct CoordinatorConfig {
+    /// The SQLite file; its folder is created.
+    pub catalog: PathBuf,
+    /// Where to listen; port 0 = any free port.
+    pub listen: SocketAddr,
+    /// Life of a lease without a heartbeat, milliseconds (default 60,000).
+    pub lease_ms: u32,
+    /// How often workers report, milliseconds (default a sixth of a lease).
+    pub heartbeat_ms: u32,
+    /// How often leases are looked through for expiry (default 1 s).
+    pub tick: Duration,
+    /// Waiting times after failures.
+    pub backoff: Backoff,
+    /// The clock leases live by.
+    pub clock: Clock,
+}
+
+impl CoordinatorConfig {
+    /// The defaults, for this catalog and address.
+    pub fn new(catalog: PathBuf, listen: SocketAddr) -> Self {
+        Self {
+            catalog,
+            listen,
+            lease_ms: 60_000,
+            heartbeat_ms: 10_000,
+            tick: Duration::from_secs(1),
+            backoff: Backoff::default(),
+            clock: Clock::system(),
+        }
+    }
+}
+
+/// Why a coordinator does not run.
+#[derive(Debug, thiserror::Error)]
+pub enum CoordinatorError {
+    /// The address is taken.
+    #[error(
+        "cannot listen on {address}: the port is in use; is a coordinator running already? Choose another port, or 0 for any free one"
+    )]
+    AddressInUse {
+        /// The address.
+        address: SocketAddr,
+    },
+    /// The address cannot be used.
+    #[error("cannot listen on {address}: {source}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// The system's answer.
+        source: io::Error,
+    },
+    /// A time in the configuration makes no sense.
+    #[error("{0}")]
+    Config(String),
+    /// The catalog cannot be used.
+    #[error(transparent)]
+    Catalog(#[from] CatalogError),
+    /// The server broke.
+    #[error("the server stopped: {0}")]
+    Server(#[from] tonic::transport::Error),
+}
+
+/// A coordinator at work.
+#[derive(Debug)]
+pub struct Running {
+    /// Where it listens, with the port it got.
+    pub address: SocketAddr,
+    /// Ends after a shutdown, when the catalog is closed.
+    pub task: JoinHandle<Result<(), CoordinatorError>>,
+}
+
+impl Running {
+    /// Waits until it has stopped.
+    ///
+    /// # Errors
+    /// What stopped it, if not `shutdown`.
+    ///
+    /// # Panics
+    /// When its task panicked.
+    pub async fn wait(self) -> Result<(), CoordinatorError> {
+        self.task.await.expect("the server task does not panic")
+    }
+}
+
+/// Starts a coordinator; it runs until `shutdown` is cancelled. Clients may connect when this returns.
+///
+/// # Errors
+/// [`CoordinatorError`] when the address or the catalog cannot be used.
+pub async fn serve(
+    config: CoordinatorConfig,
+    shutdown: CancellationToken,
+) -> Result<Running, CoordinatorError> {
+    if config.heartbeat_ms == 0 || config.lease_ms < 2 * config.heartbeat_ms {
+        return Err(CoordinatorError::Config(format!(
+            "heartbeat_ms {} must be at least 1 and at most half of lease_ms {}",
+            config.heartbeat_ms, config.lease_ms
+        )));
+    }
+    let failed = |source: io::Error| match source.kind() {
+        io::ErrorKind::AddrInUse => CoordinatorError::AddressInUse {
+            address: config.listen,
+        },
+        _ => CoordinatorError::Listen {
+            address: config.listen,
+            source,
+        },
+    };
+    let listener = TcpListener::bind(config.listen).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    let holder = format!("process {}, listening on {address}", std::process::id());
+    let catalog: Arc<dyn Catalog> = Arc::new(SqliteCatalog::open(&config.catalog, &holder).await?);
+
+    let (commands, queue) = mpsc::channel(QUEUE);
+    let (revision, seen) = watch::channel(0);
+    let actor = Actor {
+        catalog: Arc::clone(&catalog),
+        settings: Settings {
+            lease_ms: config.lease_ms,
+            backoff: config.backoff,
+        },
+        tick: config.tick,
+        clock: config.clock,
+        revision,
+        stop: shutdown.clone(),
+    };
+    let link = Link {
+        commands,
+        revision: seen,
+        catalog,
+        stop: shutdown.clone(),
+        lease_ms: config.lease_ms,
+        heartbeat_ms: config.heartbeat_ms,
+    };
+    let actor = tokio::spawn(actor.run(queue));
+    let server = Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE))
+        .add_service(
+            JobsServer::new(JobsService(link.clone()))
+                .max_decoding_message_size(MAX_MESSAGE_BYTES)
+                .max_encoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            FarmServer::new(FarmService::new(link))
+                .max_decoding_message_size(MAX_MESSAGE_BYTES)
+                .max_encoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .serve_with_incoming_shutdown(
+            TcpIncoming::from(listener).with_nodelay(Some(true)),
+            shutdown.clone().cancelled_owned(),
+        );
+    let task = tokio::spawn(async move {
+        let served = server.await;
+        // Whatever ended the server ends the actor too, which closes the catalog.
+        shutdown.cancel();
+        actor.await.expect("the actor does not panic");
+        Ok(served?)
+    });
+    tracing::info!(%address, catalog = %config.catalog.display(), "coordinator listens");
+    Ok(Running { address, task })
+}

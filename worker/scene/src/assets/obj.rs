@@ -1,0 +1,252 @@
+//! One OBJ model of a furniture library as a mesh of ours: upright, front towards +z, of the catalogue's
+//! size.
+
+use std::io::Cursor;
+
+use crate::{Material, Mesh, Vec3};
+
+use super::catalogue::{Archive, Item};
+
+/// Larger models are left out: they cost more than they show.
+pub(super) const MAX_TRIANGLES: usize = 40_000;
+/// An OBJ file of [`MAX_TRIANGLES`] is never larger than this.
+pub(super) const MAX_BYTES: u64 = 8 << 20;
+/// Triangles of less than this (twice the area, m²) are degenerate.
+const MIN_DOUBLE_AREA: f32 = 1e-10;
+/// Albedo of surfaces without a stated colour.
+const GREY: f32 = 0.5;
+
+/// A loaded model.
+#[derive(Debug)]
+pub(super) struct Loaded {
+    pub(super) mesh: Mesh,
+    /// A transparent material was made opaque.
+    pub(super) made_opaque: bool,
+    /// A texture was left out.
+    pub(super) untextured: bool,
+}
+
+/// Reads, turns, stretches and cleans the model; `None` if it cannot be used.
+pub(super) fn load(archive: &Archive, item: &Item) -> Option<Loaded> {
+    let loaded = parse(archive, item);
+    match &loaded {
+        Err(why) => tracing::warn!(model = item.model, why, "furniture model left out"),
+        Ok(l) => tracing::trace!(
+            model = item.model,
+            triangles = l.mesh.triangles.len(),
+            "loaded"
+        ),
+    }
+    loaded.ok()
+}
+
+fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
+    let bytes = archive.read(&item.model).map_err(|e| e.to_string())?;
+    let folder = item.model.rsplit_once('/').map_or("", |(folder, _)| folder);
+    let options = tobj::LoadOptions {
+        triangulate: true,
+        ignore_points: true,
+        ignore_lines: true,
+        ..tobj::LoadOptions::default()
+    };
+    let (models, materials) = tobj::load_obj_buf(&mut Cursor::new(&bytes), &options, |mtl| {
+        let name = mtl.file_name().unwrap_or_default().to_string_lossy();
+        let text = archive
+            .read(&format!("{folder}/{name}"))
+            .map_err(|_| tobj::LoadError::OpenFileFailed)?;
+        tobj::load_mtl_buf(&mut Cursor::new(text))
+    })
+    .map_err(|e| e.to_string())?;
+    // Without a material file everything is grey.
+    let materials = materials.unwrap_or_default();
+    let mut loaded = Loaded {
+        mesh: Mesh {
+            name: item.name.clone(),
+            ..Mesh::default()
+        },
+        made_opaque: materials
+            .iter()
+            .any(|m| m.dissolve.is_some_and(|d| d < 1.0)),
+        untextured: materials.iter().any(|m| m.diffuse_texture.is_some()),
+    };
+    let mesh = &mut loaded.mesh;
+    mesh.materials = materials.iter().map(material).collect();
+    mesh.materials.push(Material::diffuse("unnamed", [GREY; 3]));
+    for model in &models {
+        let (base, part) = (mesh.positions.len() as u32, &model.mesh);
+        let vertices = part.positions.chunks_exact(3);
+        mesh.positions
+            .extend(vertices.map(|p| turned(item, Vec3::new(p[0], p[1], p[2]))));
+        let slot = part
+            .material_id
+            .unwrap_or(materials.len())
+            .min(materials.len()) as u32;
+        for t in part.indices.chunks_exact(3) {
+            mesh.triangles.push([t[0] + base, t[1] + base, t[2] + base]);
+            mesh.triangle_material.push(slot);
+        }
+    }
+    if mesh.triangles.len() > MAX_TRIANGLES {
+        return Err(format!(
+            "{} triangles, more than {MAX_TRIANGLES}",
+            mesh.triangles.len()
+        ));
+    }
+    stretch(mesh, item.size)?;
+    drop_degenerate(mesh);
+    mesh.make_canonical();
+    Ok(loaded)
+}
+
+/// Catalogue rotations are rows of a 3×3 matrix.
+fn turned(item: &Item, p: Vec3) -> Vec3 {
+    item.rotation.map_or(p, |r| {
+        let row = |k: usize| Vec3::new(r[k], r[k + 1], r[k + 2]).dot(p);
+        Vec3::new(row(0), row(3), row(6))
+    })
+}
+
+/// Scales the mesh's box to width × height × depth.
+fn stretch(mesh: &mut Mesh, size: [f32; 3]) -> Result<(), String> {
+    let (lo, hi) = mesh.bounds().ok_or("no vertices")?;
+    let extent = hi - lo;
+    if !extent.is_finite() {
+        return Err("a vertex is not finite".into());
+    }
+    let scale = |k: usize| {
+        if extent[k] > 0.0 {
+            size[k] / extent[k]
+        } else {
+            1.0
+        }
+    };
+    let (sx, sy, sz) = (scale(0), scale(1), scale(2));
+    for p in &mut mesh.positions {
+        let q = *p - lo;
+        *p = Vec3::new(q.x * sx, q.y * sy, q.z * sz);
+    }
+    Ok(())
+}
+
+fn drop_degenerate(mesh: &mut Mesh) {
+    let keep: Vec<bool> = mesh
+        .triangles
+        .iter()
+        .map(|t| {
+            let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
+            (b - a).cross(c - a).length() > MIN_DOUBLE_AREA
+        })
+        .collect();
+    let mut k = keep.iter();
+    mesh.triangles
+        .retain(|_| *k.next().expect("one flag a triangle"));
+    let mut k = keep.iter();
+    mesh.triangle_material
+        .retain(|_| *k.next().expect("one flag a triangle"));
+}
+
+/// Kd is a display colour: linear albedo by a 2.2 power, kept within what real surfaces have.
+fn material(file: &tobj::Material) -> Material {
+    let linear = |v: f32| libm::powf(v.clamp(0.0, 1.0), 2.2).clamp(0.04, 0.9);
+    let rgb = match file.diffuse {
+        // Black under a texture means that the texture has all the colour.
+        Some([0.0, 0.0, 0.0]) if file.diffuse_texture.is_some() => [GREY; 3],
+        Some(kd) => kd.map(linear),
+        None => [GREY; 3],
+    };
+    Material::diffuse(file.name.clone(), rgb)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{io::Write, path::Path};
+
+    use zip::{ZipWriter, write::SimpleFileOptions};
+
+    use crate::AssetLibrary;
+
+    const PROPERTIES: &str = "version=1.8\nlicense=Public domain\n\
+        name#1=Armchair\ncategory#1=Office\nwidth#1=60\ndepth#1=80\nheight#1=100\nmodel#1=/a/chair.obj\n\
+        creator#1=Someone\nmodelRotation#1=1 0 0 0 0 1 0 -1 0\n\
+        name#2=Sofa\ncategory#2=Office\nwidth#2=60\ndepth#2=80\nheight#2=100\nmodel#2=/a/broken.obj\n\
+        name#3=Bed\ncategory#3=Bedroom\nwidth#3=60\ndepth#3=80\nheight#3=100\nmodel#3=/a/absent.obj\n";
+
+    // A tetrahedron (z up) with a degenerate facet.
+    const OBJ: &str = "mtllib chair.mtl\nv 0 0 0\nv 2 0 0\nv 0 4 0\nv 0 0 8\nusemtl glass\n\
+        f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\nf 1 1 2\n";
+
+    fn library(dir: &Path) -> AssetLibrary {
+        let file = std::fs::File::create(dir.join("test.sh3f")).expect("creates");
+        let mut zip = ZipWriter::new(file);
+        for (name, text) in [
+            ("PluginFurnitureCatalog.properties", PROPERTIES),
+            ("a/chair.obj", OBJ),
+            (
+                "a/chair.mtl",
+                "newmtl wood\nKd 1 0 0\nnewmtl glass\nKd 0.5 0.5 0.5\nd 0.3\n",
+            ),
+            ("a/broken.obj", "v NaN 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ] {
+            zip.start_file(name, SimpleFileOptions::default())
+                .expect("starts");
+            zip.write_all(text.as_bytes()).expect("writes");
+        }
+        zip.finish().expect("finishes");
+        AssetLibrary::sweethome3d(dir).expect("opens")
+    }
+
+    #[test]
+    fn models_are_upright_of_catalogue_size_clean_and_opaque() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let library = library(folder.path());
+        assert_eq!(library.len(), 2, "an item without its model is left out");
+        let asset = &library.assets[0];
+        let model = asset.model().expect("loads");
+        for (got, want) in model.size().into_iter().zip([0.6, 1.0, 0.8]) {
+            assert!((got - want).abs() < 1e-5, "{:?}", model.size());
+        }
+        assert_eq!(
+            model.mesh.triangles.len(),
+            4,
+            "the degenerate facet is gone"
+        );
+        assert_eq!(
+            model.mesh.materials.len(),
+            1,
+            "only the used material stays"
+        );
+        // The apex pointed along z; turned upright it is the highest vertex.
+        assert!(
+            model
+                .mesh
+                .positions
+                .iter()
+                .any(|p| (p.y - 1.0).abs() < 1e-6)
+        );
+        let changes: Vec<_> = asset.changes().collect();
+        assert_eq!(changes, ["transparent materials made opaque"]);
+    }
+
+    #[test]
+    fn a_model_that_is_not_finite_is_left_out() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert!(library(folder.path()).assets[1].model().is_none());
+    }
+
+    #[test]
+    fn the_fingerprint_follows_the_content() {
+        let (a, b) = (
+            tempfile::tempdir().expect("a folder"),
+            tempfile::tempdir().expect("a folder"),
+        );
+        assert_eq!(
+            library(a.path()).fingerprint(),
+            library(b.path()).fingerprint()
+        );
+        assert!(
+            library(a.path())
+                .fingerprint()
+                .starts_with("sweethome3d-1.8:")
+        );
+    }
+}

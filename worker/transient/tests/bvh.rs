@@ -1,0 +1,195 @@
+//! The hierarchy against brute force, against obvhs' own CWBVH, and at shared edges and vertices.
+
+mod common;
+
+use common::{sphere, v};
+use obvhs::{
+    BvhBuildParams, cwbvh::builder::build_cwbvh_from_tris, ray::Ray, ray::RayHit,
+    triangle::Triangle,
+};
+use picofarm_scene::{Object, Vec3};
+use picofarm_transient::{Bvh, Kernel};
+use proptest::prelude::*;
+
+fn soup(o: &Object) -> Vec<[Vec3; 3]> {
+    let p = &o.mesh.positions;
+    let corner = |i: u32| p[i as usize];
+    o.mesh.triangles.iter().map(|t| t.map(corner)).collect()
+}
+
+/// Numbers in [-1, 1) without a generator crate.
+fn noise(seed: u32) -> impl FnMut() -> f32 {
+    let mut s = seed.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+    move || {
+        s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (s >> 8) as f32 / 8_388_608.0 - 1.0
+    }
+}
+
+fn random_soup(count: usize, size: f32, seed: u32) -> Vec<[Vec3; 3]> {
+    let mut r = noise(seed);
+    (0..count)
+        .map(|_| {
+            let c = v(r(), r(), r()) * 4.0;
+            [0; 3].map(|_| c + v(r(), r(), r()) * size)
+        })
+        .collect()
+}
+
+#[test]
+fn a_closed_mesh_lets_no_ray_through_at_edges_and_vertices() {
+    let triangles = soup(&sphere(v(0.3, -0.2, 0.1), 1.5, 4, common::grey(0.5)));
+    for kernel in [Kernel::Avx2, Kernel::Portable] {
+        let Some(bvh) = Bvh::build(&triangles).with_kernel(kernel) else {
+            println!("skipped: no {kernel:?} here");
+            continue;
+        };
+        let mut stack = bvh.stack();
+        let mut r = noise(5);
+        for t in &triangles {
+            for i in 0..3 {
+                let from = v(r(), r(), r()) * 0.5;
+                let (a, b) = (t[i], t[(i + 1) % 3]);
+                let s = 0.5 + 0.5 * r();
+                for target in [a, a + (b - a) * s, a + (b - a) * 0.5] {
+                    let d = target - from;
+                    assert!(bvh.closest(&mut stack, from, d, 10.0).is_some());
+                    assert!(bvh.occluded(&mut stack, from, d, 10.0));
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn both_kernels_give_the_same_bits() {
+    let triangles = random_soup(3000, 0.4, 3);
+    let portable = Bvh::build(&triangles)
+        .with_kernel(Kernel::Portable)
+        .unwrap();
+    let Some(wide) = Bvh::build(&triangles).with_kernel(Kernel::Avx2) else {
+        println!("skipped: no AVX2 here");
+        return;
+    };
+    let (mut a, mut b) = (portable.stack(), wide.stack());
+    let mut r = noise(8);
+    for i in 0..20_000 {
+        let mut d = v(r(), r(), r());
+        if i % 5 == 0 {
+            d.x = 0.0;
+        }
+        let o = v(r(), r(), r()) * 5.0;
+        let bits = |h: Option<(f32, u32)>| h.map(|(t, id)| (t.to_bits(), id));
+        let far = f32::INFINITY;
+        assert_eq!(
+            bits(portable.closest(&mut a, o, d, far)),
+            bits(wide.closest(&mut b, o, d, far))
+        );
+        let limit = 3.0 * r().abs();
+        assert_eq!(
+            portable.occluded(&mut a, o, d, limit),
+            wide.occluded(&mut b, o, d, limit)
+        );
+    }
+}
+
+#[test]
+fn the_nearest_hit_agrees_with_cwbvh() {
+    let triangles = random_soup(20_000, 0.2, 11);
+    let input: Vec<Triangle> = triangles
+        .iter()
+        .map(|t| {
+            let [a, b, c] = t.map(<[f32; 3]>::from);
+            let mut t = Triangle::default();
+            (t.v0, t.v1, t.v2) = (a.into(), b.into(), c.into());
+            t
+        })
+        .collect();
+    let oracle = build_cwbvh_from_tris(
+        &input,
+        BvhBuildParams::medium_build(),
+        &mut std::time::Duration::default(),
+    );
+    let bvh = Bvh::build(&triangles);
+    let mut stack = bvh.stack();
+    let mut r = noise(21);
+    let (mut hits, mut differ) = (0, 0);
+    for _ in 0..20_000 {
+        let (o, d) = (v(r(), r(), r()) * 5.0, v(r(), r(), r()));
+        let ray = Ray::new_inf(<[f32; 3]>::from(o).into(), <[f32; 3]>::from(d).into());
+        let mut hit = RayHit::none();
+        let found = oracle.ray_traverse(ray, &mut hit, |ray, id| {
+            input[oracle.primitive_indices[id] as usize].intersect(ray)
+        });
+        match bvh.closest(&mut stack, o, d, f32::INFINITY) {
+            Some((t, _)) if found => {
+                hits += 1;
+                differ += u32::from((t - hit.t).abs() > 1e-4 * t.max(1.0));
+            }
+            None if !found => {}
+            _ => differ += 1,
+        }
+    }
+    // Rays that graze an edge may be judged differently by the oracle's test.
+    assert!(hits > 5_000 && differ <= 2, "{hits} hits, {differ} differ");
+}
+
+#[test]
+fn rays_that_are_not_finite_are_refused() {
+    let bvh = Bvh::build(&random_soup(50, 1.0, 2));
+    let mut stack = bvh.stack();
+    let good = v(0.1, 0.2, 0.3);
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for wrong in [v(bad, 0.0, 1.0), v(0.0, bad, 1.0), v(0.0, 1.0, bad)] {
+            assert_eq!(bvh.closest(&mut stack, wrong, good, 1.0), None);
+            assert_eq!(bvh.closest(&mut stack, good, wrong, 1.0), None);
+            assert!(bvh.occluded(&mut stack, wrong, good, 1.0));
+        }
+    }
+    assert_eq!(bvh.closest(&mut stack, good, good, f32::NAN), None);
+    assert_eq!(bvh.closest(&mut stack, good, Vec3::ZERO, 1.0), None);
+}
+
+#[test]
+fn degenerate_duplicate_and_inverted_triangles_do_no_harm() {
+    let t = [v(-1.0, -1.0, -2.0), v(1.0, -1.0, -2.0), v(0.0, 1.0, -2.0)];
+    let point = [t[0]; 3];
+    let line = [t[0], t[1], t[0] + (t[1] - t[0]) * 0.5];
+    let nan = [v(f32::NAN, 0.0, 0.0), t[1], t[2]];
+    let mut triangles = vec![point, line, nan, [t[0], t[2], t[1]], t];
+    triangles.extend(vec![t; 100]);
+    let bvh = Bvh::build(&triangles);
+    let mut stack = bvh.stack();
+    let hit = bvh.closest(&mut stack, Vec3::ZERO, v(0.0, 0.0, -1.0), 10.0);
+    assert_eq!(hit, Some((2.0, 3)), "the lowest index wins a tie");
+    let empty = Bvh::build(&[point, line]);
+    let mut stack = empty.stack();
+    assert_eq!(empty.closest(&mut stack, Vec3::ZERO, t[0], 10.0), None);
+    assert!(!empty.occluded(&mut stack, Vec3::ZERO, t[0], 10.0));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn the_nearest_hit_is_that_of_a_tree_of_one_triangle_each(seed in any::<u32>(), count in 1usize..60) {
+        let triangles = random_soup(count, 1.0, seed);
+        let bvh = Bvh::build(&triangles);
+        let single: Vec<Bvh> = triangles.iter().map(|t| Bvh::build(&[*t])).collect();
+        let mut stack = bvh.stack();
+        let mut r = noise(seed ^ 77);
+        for _ in 0..200 {
+            let (o, d) = (v(r(), r(), r()) * 5.0, v(r(), r(), r()));
+            let mut best: Option<(f32, u32)> = None;
+            for (i, one) in single.iter().enumerate() {
+                let mut s = one.stack();
+                if let Some((t, _)) = one.closest(&mut s, o, d, f32::INFINITY)
+                    && best.is_none_or(|b| t < b.0)
+                {
+                    best = Some((t, i as u32));
+                }
+            }
+            prop_assert_eq!(bvh.closest(&mut stack, o, d, f32::INFINITY), best);
+        }
+    }
+}
