@@ -5,6 +5,8 @@ mod actor;
 pub mod budget;
 mod clock;
 mod core;
+#[cfg(test)]
+mod laws;
 pub mod place;
 pub mod plan;
 mod rpc;

@@ -158,6 +158,9 @@ impl Core {
             let timing = timing.get(&set).copied().unwrap_or_default();
             let mut changes = Changes::default();
             let stage = Stage::new(ranges.remove(&job.id).unwrap_or_default(), &mut changes);
+            if !changes.gone.is_empty() {
+                core.changes.append(changes);
+            }
             core.leases
                 .extend(stage.leased().map(|(range, _)| (range.id, job.id)));
             core.adopt(job, set, timing, stage);

@@ -34,7 +34,7 @@ pub const LEASE_MS: u32 = 60_000;
 const PATIENCE: Duration = Duration::from_secs(20);
 
 pub struct Farm {
-    pub folder: tempfile::TempDir,
+    _folder: tempfile::TempDir,
     pub clock: Arc<AtomicI64>,
     pub config: CoordinatorConfig,
     stop: CancellationToken,
@@ -62,7 +62,7 @@ impl Farm {
         };
         let (running, stop, jobs) = run(&config).await.unwrap();
         Self {
-            folder,
+            _folder: folder,
             clock,
             config,
             stop,

@@ -62,7 +62,7 @@ pub enum DatasetError {
          verify the data set"
     )]
     Conflict {
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// SHA-256 of the stored bytes.
         stored: String,
@@ -74,7 +74,7 @@ pub enum DatasetError {
         "{object}: {what}; publish the scene again to replace a missing object, or delete a broken one first"
     )]
     Damaged {
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// What is wrong with it.
         what: String,
@@ -102,7 +102,7 @@ pub enum DatasetError {
     Store {
         /// E.g. `write`.
         action: &'static str,
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// How to mend it, where known.
         hint: Option<&'static str>,

@@ -47,10 +47,10 @@ impl Dataset {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));
         match objects::get(&*self.store, &path).await? {
-            Some(bytes) => Manifest::parse(&bytes, scene, path.as_ref()),
+            Some(bytes) => Manifest::parse(&bytes, scene, &self.shown(&path)),
             None => Err(DatasetError::NotPublished {
                 scene,
-                object: path.to_string(),
+                object: self.shown(&path),
             }),
         }
     }
@@ -73,7 +73,7 @@ impl Dataset {
             })
             .try_collect()
             .await
-            .map_err(|e| DatasetError::store("list", &folder, e))?;
+            .map_err(|e| DatasetError::store("list", self.shown(&folder), e))?;
         scenes.retain(|scene| *scene < self.spec.scenes);
         scenes.sort_unstable();
         Ok(scenes)
@@ -137,7 +137,7 @@ impl Dataset {
         let key = self.array(Quantity::Transient).layout.key(manifest.scene);
         let path = self.path(&key);
         let damaged = |what: String| DatasetError::Damaged {
-            object: path.to_string(),
+            object: self.shown(&path),
             what,
         };
         let entry = manifest
@@ -152,7 +152,7 @@ impl Dataset {
         };
         let fetch_error = |e| match e {
             object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
-            e => DatasetError::store("read", &path, e),
+            e => DatasetError::store("read", self.shown(&path), e),
         };
         let index = self.store.get_range(&path, start..entry.size);
         let index = index.await.map_err(fetch_error)?;
@@ -242,7 +242,7 @@ impl Dataset {
         }
         if saturated.contains(&true) && window.iter().any(|h| h.is_infinite()) {
             return Err(DatasetError::Damaged {
-                object: self.path(&Manifest::key(manifest.scene)).to_string(),
+                object: self.shown(&self.path(&Manifest::key(manifest.scene))),
                 what: "a saturated bin has no exact value in the overflow list".into(),
             });
         }
@@ -320,7 +320,7 @@ impl Dataset {
             // Tells a scene that is not there from one that lost an object.
             self.manifest(scene).await?;
             return Err(DatasetError::Damaged {
-                object: path.to_string(),
+                object: self.shown(&path),
                 what: "the object is missing".into(),
             });
         };
