@@ -324,7 +324,7 @@ impl Agent {
             } => {
                 let known = self.desk.acknowledged(lease, index).is_some();
                 if known && !accepted {
-                    info!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
+                    warn!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
                         "report not accepted; nothing to do, any output stands");
                 }
             }

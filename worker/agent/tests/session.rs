@@ -264,11 +264,16 @@ async fn a_lease_revoked_after_it_ran_out_is_lost_but_its_running_task_is_still_
         reason: "the lease ran out".into(),
     }))
     .await;
-    c.listen_until("a heartbeat without it", |c| c.beats > 0 && c.held.is_empty())
-        .await;
+    c.listen_until("a heartbeat without it", |c| {
+        c.beats > 0 && c.held.is_empty()
+    })
+    .await;
     gate.open();
     take_done(&mut c, [0]).await;
-    assert!(worker.started.try_recv().is_err(), "lost: task 1 must not start");
+    assert!(
+        worker.started.try_recv().is_err(),
+        "lost: task 1 must not start"
+    );
     worker.shutdown.cancel();
     assert_eq!(worker.end().await.unwrap().computed, 1);
 }
@@ -278,9 +283,14 @@ async fn a_worker_whose_id_another_process_took_over_ends_instead_of_fighting_fo
     let mut farm = FakeFarm::start().await;
     let worker = Worker::start(farm.address, |task, _| Ok(output(task)));
     let (c, _) = farm.welcome(60_000).await;
-    c.refuse(Status::aborted("a newer session of this worker id took over")).await;
+    c.refuse(Status::aborted(
+        "a newer session of this worker id took over",
+    ))
+    .await;
     match worker.end().await {
-        Err(AgentError::Refused { reason, .. }) => assert!(reason.contains("took over"), "{reason}"),
+        Err(AgentError::Refused { reason, .. }) => {
+            assert!(reason.contains("took over"), "{reason}")
+        }
         other => panic!("{other:?}"),
     }
 }
@@ -444,7 +454,8 @@ async fn the_next_lease_is_asked_for_ahead_of_short_tasks_but_not_of_long_ones()
     c.grant(lease(1, 1, 3)).await;
     assert_eq!(worker.starts().await, 1);
     let beats = c.beats;
-    c.listen_until("some heartbeats", |c| c.beats > beats + 3).await;
+    c.listen_until("some heartbeats", |c| c.beats > beats + 3)
+        .await;
     assert_eq!(c.credit, 1, "nobody knows yet how long task 1 takes");
     gate.open();
     take_done(&mut c, [1, 2]).await;
