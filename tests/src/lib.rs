@@ -1,1 +1,23 @@
-//! Placeholder while the workspace is laid out.
+//! The harness of the end-to-end tests: real `picofarm` processes on loopback ports, started, stopped, frozen and
+//! killed; what they print, and what they leave in a store.
+//!
+//! Nothing here knows the insides of the program. A test waits for what can be seen from outside (status, events,
+//! files, logs), never for a time. Each test has a folder of its own, which stays when the test fails.
+
+pub mod binary;
+pub mod cli;
+pub mod farm;
+pub mod job;
+pub mod mount;
+pub mod process;
+pub mod rng;
+pub mod scratch;
+pub mod shapes;
+pub mod store;
+pub mod wait;
+
+pub use cli::{Cli, Ended};
+pub use farm::Farm;
+pub use job::Job;
+pub use process::{Process, Signal};
+pub use scratch::Scratch;

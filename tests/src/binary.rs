@@ -1,0 +1,75 @@
+//! Where the `picofarm` program under test is.
+//!
+//! Cargo tells only the tests of its own package where a binary is (`CARGO_BIN_EXE_…`), and builds it only for them.
+//! So it is asked for it: `cargo build --bin picofarm`, once a test process. That costs a third of a second when
+//! nothing changed, can never test a stale program, and is safe in parallel, because Cargo locks its target folder.
+//! Two arguments keep it from compiling the dependencies a second time with other features: `--workspace`, as the
+//! tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
+
+use std::{
+    env,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    sync::OnceLock,
+};
+
+use serde_json::Value;
+
+/// The program under test: `PICOFARM_TEST_BINARY` where set (an installed one, say), else built from this workspace
+/// with the profile and into the target folder of the running test.
+///
+/// # Panics
+/// When it cannot be built.
+pub fn picofarm() -> &'static Path {
+    static BINARY: OnceLock<PathBuf> = OnceLock::new();
+    BINARY.get_or_init(|| match env::var_os("PICOFARM_TEST_BINARY") {
+        Some(path) => PathBuf::from(path),
+        None => build(),
+    })
+}
+
+fn build() -> PathBuf {
+    let test = env::current_exe().expect("the running test has a path");
+    // <target>/<profile>/deps/<test>
+    let profile = test
+        .ancestors()
+        .nth(2)
+        .expect("tests lie in a target folder");
+    let target = profile.parent().expect("tests lie in a target folder");
+    let profile = match profile.file_name().and_then(|n| n.to_str()) {
+        Some("debug") => "dev",
+        Some(name) => name,
+        None => panic!(
+            "{}: expected <target>/<profile>/deps/<test>",
+            test.display()
+        ),
+    };
+    let output = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
+        .args([
+            "build",
+            "--workspace",
+            "--bin",
+            "picofarm",
+            "--test",
+            "story",
+        ])
+        .args([
+            "--message-format",
+            "json-render-diagnostics",
+            "--profile",
+            profile,
+        ])
+        .arg("--target-dir")
+        .arg(target)
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .stderr(Stdio::inherit())
+        .output()
+        .expect("cargo starts");
+    assert!(output.status.success(), "cargo build: {}", output.status);
+    String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .filter_map(|line| serde_json::from_str::<Value>(line).ok())
+        .filter(|m| m["target"]["name"] == "picofarm" && m["target"]["kind"][0] == "bin")
+        .find_map(|m| m["executable"].as_str().map(PathBuf::from))
+        .expect("cargo names the program it built")
+}

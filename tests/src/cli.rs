@@ -1,0 +1,146 @@
+//! Commands as a person types them, and what they answer.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use serde_json::Value;
+
+use crate::{binary, process::Process};
+
+/// Runs `picofarm` in a folder, untouched by the settings of whoever runs the tests.
+#[derive(Clone)]
+pub struct Cli {
+    dir: PathBuf,
+    variables: Vec<(String, String)>,
+}
+
+impl Cli {
+    /// Commands run in `dir`, which is their home too.
+    pub fn new(dir: &Path) -> Self {
+        Self {
+            dir: dir.to_owned(),
+            variables: Vec::new(),
+        }
+    }
+
+    /// With an environment variable.
+    pub fn with(mut self, name: &str, value: &str) -> Self {
+        self.variables.push((name.to_owned(), value.to_owned()));
+        self
+    }
+
+    /// The command, to be started by the caller.
+    pub fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(binary::picofarm());
+        for (name, _) in std::env::vars_os() {
+            if name.to_string_lossy().starts_with("PICOFARM_") {
+                command.env_remove(name);
+            }
+        }
+        command
+            .args(args)
+            .current_dir(&self.dir)
+            .env("HOME", &self.dir)
+            .env_remove("XDG_CONFIG_HOME")
+            .env_remove("XDG_DATA_HOME")
+            .envs(self.variables.iter().map(|(n, v)| (n, v)));
+        command
+    }
+
+    /// Starts it and lets it run.
+    pub fn start(&self, name: &str, args: &[&str]) -> Process {
+        Process::start(name, self.command(args), &self.dir)
+    }
+
+    /// Runs it to its end.
+    pub fn run(&self, args: &[&str]) -> Ended {
+        let mut ended = self.start("command", args).end();
+        ended.what = format!("picofarm {}", args.join(" "));
+        ended
+    }
+
+    /// Runs it to its successful end with `--json`: the document it prints.
+    pub fn json(&self, args: &[&str]) -> Value {
+        self.run(&[args, &["--json"]].concat()).ok().json()
+    }
+}
+
+/// How a process ended.
+#[derive(Debug, Clone)]
+pub struct Ended {
+    /// What ran.
+    pub what: String,
+    /// Exit code; `None` if a signal ended it.
+    pub code: Option<i32>,
+    /// All of stdout.
+    pub stdout: String,
+    /// All of stderr.
+    pub stderr: String,
+}
+
+impl Ended {
+    /// Itself, if the exit code is 0.
+    ///
+    /// # Panics
+    /// Otherwise.
+    pub fn ok(self) -> Self {
+        self.code(0)
+    }
+
+    /// Itself, if the exit code is `code`.
+    ///
+    /// # Panics
+    /// Otherwise.
+    pub fn code(self, code: i32) -> Self {
+        assert_eq!(
+            self.code,
+            Some(code),
+            "{}\nstdout: {}\nstderr: {}",
+            self.what,
+            self.stdout,
+            self.stderr
+        );
+        self
+    }
+
+    /// Checks that it failed with `code` and that stderr says each of `parts`.
+    ///
+    /// # Panics
+    /// Otherwise.
+    pub fn fails(self, code: i32, parts: &[&str]) -> Self {
+        let ended = self.code(code);
+        for part in parts {
+            assert!(
+                ended.stderr.contains(part),
+                "{}: expected {part:?} in stderr: {}",
+                ended.what,
+                ended.stderr
+            );
+        }
+        ended
+    }
+
+    /// The JSON document on stdout (the last, where there are several lines).
+    ///
+    /// # Panics
+    /// When there is none.
+    pub fn json(&self) -> Value {
+        let line = self.stdout.lines().last().unwrap_or_default();
+        serde_json::from_str(line)
+            .unwrap_or_else(|e| panic!("{}: {e} in {:?}", self.what, self.stdout))
+    }
+
+    /// The error that `--json` prints on stderr.
+    ///
+    /// # Panics
+    /// When there is none.
+    pub fn error(&self) -> Value {
+        self.stderr
+            .lines()
+            .filter_map(|line| serde_json::from_str::<Value>(line).ok())
+            .find_map(|document| document.get("error").cloned())
+            .unwrap_or_else(|| panic!("{}: no JSON error in {:?}", self.what, self.stderr))
+    }
+}

@@ -1,0 +1,259 @@
+//! A farm of real processes: one coordinator, any number of workers, and what people would ask them.
+
+use std::path::PathBuf;
+
+use serde_json::Value;
+
+use crate::{
+    cli::{Cli, Ended},
+    job::Job,
+    process::Process,
+    scratch::Scratch,
+    store,
+    wait::until,
+};
+
+/// A folder with a catalog and a store, and the coordinator on them.
+pub struct Farm {
+    // Processes end before the folder goes.
+    coordinator: Option<Process>,
+    url: Option<String>,
+    lease_s: f64,
+    cli: Cli,
+    /// Its folder.
+    pub scratch: Scratch,
+}
+
+impl Farm {
+    /// A farm with a running coordinator whose leases live so long that none expires in a test.
+    pub fn start(name: &str) -> Self {
+        Self::with_lease(name, 300.0)
+    }
+
+    /// A farm with a running coordinator whose leases live for `lease_s` seconds.
+    pub fn with_lease(name: &str, lease_s: f64) -> Self {
+        let scratch = Scratch::new(name);
+        let mut farm = Self {
+            coordinator: None,
+            url: None,
+            lease_s,
+            cli: Cli::new(scratch.path()),
+            scratch,
+        };
+        farm.start_coordinator();
+        farm
+    }
+
+    /// Starts the coordinator: the first time on any free port, then on the same one.
+    ///
+    /// # Panics
+    /// When it does not come up.
+    pub fn start_coordinator(&mut self) {
+        let listen = match &self.url {
+            Some(url) => url.trim_start_matches("http://").to_owned(),
+            None => "127.0.0.1:0".into(),
+        };
+        let lease = self.lease_s.to_string();
+        let args = [
+            "coordinator",
+            "--json",
+            "--log",
+            "info",
+            "--catalog",
+            "catalog.sqlite",
+        ];
+        let args = [&args[..], &["--listen", &listen, "--lease-s", &lease]].concat();
+        let mut process = self.cli.start("coordinator", &args);
+        let line = process.first_line();
+        let document: Value = serde_json::from_str(&line).expect("the first line is JSON");
+        let url = document["coordinator"]
+            .as_str()
+            .expect("it names its address");
+        if let Some(before) = &self.url {
+            assert_eq!(url, before, "a coordinator comes back where it was");
+        }
+        self.url = Some(url.to_owned());
+        self.coordinator = Some(process);
+    }
+
+    /// The coordinator's process.
+    ///
+    /// # Panics
+    /// When it was taken.
+    pub fn coordinator(&mut self) -> &mut Process {
+        self.coordinator.as_mut().expect("a coordinator runs")
+    }
+
+    /// Ends the coordinator as `kill -9` does.
+    ///
+    /// # Panics
+    /// When there is none, or it had ended by itself.
+    pub fn kill_coordinator(&mut self) {
+        self.coordinator.take().expect("a coordinator runs").kill();
+    }
+
+    /// Its URL.
+    ///
+    /// # Panics
+    /// Before its first start.
+    pub fn url(&self) -> &str {
+        self.url.as_deref().expect("it was started")
+    }
+
+    /// Starts a worker with one thread.
+    pub fn worker(&self, name: &str) -> Process {
+        let args = ["worker", "--log", "info", "--name", name, "--threads", "1"];
+        self.cli
+            .start(name, &[&args[..], &["--coordinator", self.url()]].concat())
+    }
+
+    /// Commands that know the coordinator.
+    pub fn cli(&self) -> Cli {
+        self.cli.clone().with("PICOFARM_COORDINATOR", self.url())
+    }
+
+    /// Runs a command to its end.
+    pub fn run(&self, args: &[&str]) -> Ended {
+        self.cli().run(args)
+    }
+
+    /// The JSON answer of a command that succeeds.
+    pub fn json(&self, args: &[&str]) -> Value {
+        self.cli().json(args)
+    }
+
+    /// The folder for results.
+    pub fn store(&self) -> PathBuf {
+        self.scratch.join("store")
+    }
+
+    /// Submits a job: its id.
+    ///
+    /// # Panics
+    /// When it is refused.
+    pub fn submit(&self, job: &Job) -> String {
+        let file = self.scratch.join(&format!("{}.toml", job.name));
+        job.write(&file);
+        let answer = self.json(&["job", "submit", &file.display().to_string()]);
+        answer["job"]
+            .as_str()
+            .expect("a submission answers with a job")
+            .to_owned()
+    }
+
+    /// `job status`.
+    pub fn status(&self, job: &str) -> Value {
+        self.json(&["job", "status", job])
+    }
+
+    /// Number of tasks in a state (`done`, `dead`, `pending`, …).
+    ///
+    /// # Panics
+    /// When the status does not tell.
+    pub fn count(&self, job: &str, state: &str) -> u64 {
+        self.status(job)["tasks"][state]
+            .as_u64()
+            .expect("a status counts tasks")
+    }
+
+    /// The whole history.
+    ///
+    /// # Panics
+    /// When it is no list.
+    pub fn events(&self, job: &str) -> Vec<Value> {
+        let answer = self.json(&["job", "logs", job, "--last", "1000000"]);
+        answer.as_array().expect("a history is a list").clone()
+    }
+
+    /// The events of a kind.
+    pub fn events_of(&self, job: &str, kind: &str) -> Vec<Value> {
+        let mut events = self.events(job);
+        events.retain(|e| e["kind"] == kind);
+        events
+    }
+
+    /// Waits until `worker` is so far in a scene: share done in [0, 1]. Gives the scene's index. Workers tell it six
+    /// times in the life of a lease, so this is for farms with short leases.
+    ///
+    /// # Panics
+    /// When the job ends before.
+    pub fn until_running(&self, job: &str, worker: &str, share: f64) -> u64 {
+        until(&format!("{worker} to be {share} through a scene"), || {
+            let status = self.status(job);
+            assert_eq!(
+                status["state"], "active",
+                "the job ended too early: {status}"
+            );
+            let running = status["running"]
+                .as_array()
+                .expect("a status lists what runs");
+            let task = running.iter().find(|r| {
+                r["worker"] == worker && r["fraction"].as_f64().is_some_and(|f| f >= share)
+            })?;
+            task["index"].as_u64()
+        })
+    }
+
+    /// Waits until the job ends: its last status.
+    ///
+    /// # Panics
+    /// When it does not end.
+    pub fn until_ended(&self, job: &str) -> Value {
+        until(&format!("the end of job {job}"), || {
+            let status = self.status(job);
+            (status["state"] != "active").then_some(status)
+        })
+    }
+
+    /// Waits until the job is done, and checks that each scene was committed exactly once, that the data set is
+    /// whole, and that the store's objects are those of `expected`.
+    ///
+    /// # Panics
+    /// When any of it fails.
+    pub fn until_done_once(&self, job: &Job, id: &str) {
+        let status = self.until_ended(id);
+        assert_eq!(status["state"], "done", "{status}");
+        let total = status["tasks"]["total"]
+            .as_u64()
+            .expect("a status counts tasks");
+        assert_eq!(status["tasks"]["done"], total, "{status}");
+        self.committed_once(id, total);
+        let place = job.place();
+        assert_eq!(store::finished(&place), (0..total).collect::<Vec<_>>());
+        let report = self.json(&["dataset", "verify", &place.display().to_string()]);
+        assert_eq!(report["scenes"], total, "{report}");
+    }
+
+    /// Checks in the history that each of `total` scenes was committed exactly once and nothing raised an alarm.
+    ///
+    /// # Panics
+    /// When one was not.
+    pub fn committed_once(&self, job: &str, total: u64) {
+        for task in 0..total {
+            let task = task.to_string();
+            let mut events = self.json(&["job", "logs", job, "--task", &task]);
+            let events = events.as_array_mut().expect("a history is a list");
+            events.retain(|e| e["kind"] == "committed" || e["kind"] == "reused");
+            assert_eq!(
+                events.len(),
+                1,
+                "scene {task} must be committed once: {events:?}"
+            );
+        }
+        let alarms = self.events_of(job, "alarm");
+        assert!(alarms.is_empty(), "{alarms:?}");
+    }
+}
+
+/// The objects that an undisturbed run of `job` leaves, from a farm of its own.
+pub fn undisturbed(name: &str, job: &Job) -> std::collections::BTreeMap<String, String> {
+    let farm = Farm::start(&format!("{name}-undisturbed"));
+    let job = Job {
+        store: farm.store(),
+        ..job.clone()
+    };
+    let id = farm.submit(&job);
+    let _worker = farm.worker("calm");
+    farm.until_done_once(&job, &id);
+    store::hashes(&job.place())
+}

@@ -1,0 +1,74 @@
+//! A file system of a given size, to fill up or to make read-only. Needs root.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+/// A tmpfs; unmounted with the value.
+pub struct Tmpfs(PathBuf);
+
+impl Tmpfs {
+    /// Mounts one of `kib` KiB at the new folder `path`; `None`, saying why, where the system does not let us.
+    ///
+    /// # Panics
+    /// When the folder cannot be made.
+    pub fn mount(path: &Path, kib: u64) -> Option<Self> {
+        std::fs::create_dir(path).expect("the test's folder is writable");
+        let size = format!("size={kib}k");
+        let tried = Command::new("mount")
+            .args(["-t", "tmpfs", "-o", &size, "picofarm-test"])
+            .arg(path)
+            .output();
+        match tried {
+            Ok(output) if output.status.success() => Some(Self(path.to_owned())),
+            Ok(output) => {
+                let why = String::from_utf8_lossy(&output.stderr);
+                eprintln!("skipped: a tmpfs cannot be mounted here ({})", why.trim());
+                None
+            }
+            Err(e) => {
+                eprintln!("skipped: there is no `mount` ({e})");
+                None
+            }
+        }
+    }
+
+    /// Changes its options, e.g. `ro` or `size=1000k`.
+    ///
+    /// # Panics
+    /// When the system refuses.
+    pub fn remount(&self, options: &str) {
+        let status = Command::new("mount")
+            .args(["-o", &format!("remount,{options}")])
+            .arg(&self.0)
+            .status();
+        assert!(
+            status.expect("there is `mount`").success(),
+            "remount,{options}"
+        );
+    }
+
+    /// KiB in use.
+    ///
+    /// # Panics
+    /// When `df` does not tell.
+    pub fn used_kib(&self) -> u64 {
+        let output = Command::new("df")
+            .args(["--output=used", "-k"])
+            .arg(&self.0)
+            .output();
+        let text = String::from_utf8(output.expect("there is `df`").stdout).expect("numbers");
+        text.lines()
+            .last()
+            .and_then(|l| l.trim().parse().ok())
+            .expect("df prints a number")
+    }
+}
+
+impl Drop for Tmpfs {
+    fn drop(&mut self) {
+        // Lazily: a process that still runs in it must not keep the mount alive. Nothing to be done where it fails.
+        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
+    }
+}

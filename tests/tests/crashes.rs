@@ -1,0 +1,93 @@
+//! `kill -9` of anything, at any instant, any number of times: every scene is committed once, and the store holds
+//! the objects of an undisturbed run, bit for bit.
+
+use std::{thread::sleep, time::Duration};
+
+use picofarm_tests::{Farm, Job, Process, farm::undisturbed, rng::Rng, store};
+
+/// Short enough that a killed worker's scene is soon given to another.
+const LEASE_S: f64 = 2.0;
+/// Kills in each test.
+const ROUNDS: u64 = 4;
+
+/// Strikes when `worker` is somewhere in a scene: the seed chooses how far, and how many milliseconds later, so that
+/// some kills also hit the encoding, the publishing and the report.
+fn instant(farm: &Farm, id: &str, worker: &str, rng: &mut Rng) {
+    farm.until_running(id, worker, 0.01 + 0.9 * rng.unit());
+    sleep(Duration::from_millis(rng.number() % 300));
+}
+
+fn round_name(round: u64) -> String {
+    format!("worker-{round}")
+}
+
+#[test]
+fn a_worker_killed_in_mid_scene_again_and_again_changes_nothing() {
+    let mut rng = Rng::new(1);
+    let farm = Farm::with_lease("worker-killed", LEASE_S);
+    let job = Job::slow(&farm.store(), 3);
+    let id = farm.submit(&job);
+    for round in 0..ROUNDS {
+        let name = round_name(round);
+        let worker = farm.worker(&name);
+        instant(&farm, &id, &name, &mut rng);
+        worker.kill();
+    }
+    let _last = farm.worker("last");
+    farm.until_done_once(&job, &id);
+    assert_eq!(farm.count(&id, "dead"), 0);
+    assert_eq!(
+        store::hashes(&job.place()),
+        undisturbed("worker-killed", &job)
+    );
+}
+
+#[test]
+fn a_coordinator_killed_in_mid_job_again_and_again_changes_nothing() {
+    let mut rng = Rng::new(2);
+    let mut farm = Farm::with_lease("coordinator-killed", LEASE_S);
+    let job = Job::slow(&farm.store(), 3);
+    let id = farm.submit(&job);
+    let mut worker = farm.worker("steady");
+    for _ in 0..ROUNDS {
+        instant(&farm, &id, "steady", &mut rng);
+        farm.kill_coordinator();
+        sleep(Duration::from_millis(rng.number() % 1500));
+        farm.start_coordinator();
+    }
+    farm.until_done_once(&job, &id);
+    assert!(
+        worker.runs(),
+        "a worker outlives its coordinator: {}",
+        worker.stderr()
+    );
+    assert_eq!(
+        store::hashes(&job.place()),
+        undisturbed("coordinator-killed", &job)
+    );
+}
+
+#[test]
+fn everything_killed_at_once_again_and_again_changes_nothing() {
+    let mut rng = Rng::new(3);
+    let mut farm = Farm::with_lease("all-killed", LEASE_S);
+    let job = Job::slow(&farm.store(), 4);
+    let id = farm.submit(&job);
+    for round in 0..ROUNDS {
+        let names = [format!("left-{round}"), format!("right-{round}")];
+        let workers = names.each_ref().map(|name| farm.worker(name));
+        let struck = &names[(rng.number() % 2) as usize];
+        instant(&farm, &id, struck, &mut rng);
+        if rng.unit() < 0.5 {
+            farm.kill_coordinator();
+            workers.into_iter().for_each(Process::kill);
+        } else {
+            workers.into_iter().for_each(Process::kill);
+            farm.kill_coordinator();
+        }
+        farm.start_coordinator();
+    }
+    let _last = farm.worker("last");
+    farm.until_done_once(&job, &id);
+    assert_eq!(store::hashes(&job.place()), undisturbed("all-killed", &job));
+}

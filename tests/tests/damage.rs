@@ -1,0 +1,106 @@
+//! `dataset verify` finds every kind of damage and names the object; mending costs only the damaged scene.
+
+use std::{fs, path::Path};
+
+use picofarm_tests::{Farm, Job, store};
+
+type Harm = fn(&Path);
+
+fn flip(path: &Path) {
+    let mut bytes = fs::read(path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    fs::write(path, bytes).unwrap();
+}
+
+fn truncate(path: &Path) {
+    let bytes = fs::read(path).unwrap();
+    fs::write(path, &bytes[..bytes.len() - 1]).unwrap();
+}
+
+fn delete(path: &Path) {
+    fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn a_flipped_bit_a_missing_byte_and_a_missing_object_are_each_found_and_named() {
+    let farm = Farm::start("damage");
+    let job = Job::quick(&farm.store(), 2);
+    let id = farm.submit(&job);
+    let _worker = farm.worker("worker");
+    farm.until_done_once(&job, &id);
+    let place = job.place();
+    let whole = store::hashes(&place);
+    let folder = place.display().to_string();
+    let verify = ["dataset", "verify", folder.as_str()];
+    let info = farm.json(&["dataset", "info", &folder]);
+    assert_eq!(info["scenes"], 2, "{info}");
+
+    let harms: [(&str, Harm); 3] = [
+        ("flipped", flip),
+        ("truncated", truncate),
+        ("deleted", delete),
+    ];
+    for key in store::objects(&place, 1) {
+        let path = place.join(&key);
+        let bytes = fs::read(&path).unwrap();
+        for (harm, damage) in &harms {
+            damage(&path);
+            let ended = farm.run(&verify);
+            if key == "manifests/1.json" && *harm == "deleted" {
+                // Then the scene is not part of the data set, which says so by its count.
+                assert!(
+                    ended.code != Some(0) || ended.stdout.contains("1 scenes"),
+                    "{ended:?}"
+                );
+            } else {
+                ended.fails(6, &[&key]);
+            }
+            if *harm != "flipped" {
+                let fast = farm.run(&[&verify[..], &["--fast"]].concat());
+                assert!(
+                    key.starts_with("manifests/") || fast.code == Some(6),
+                    "{harm} {key}: {fast:?}"
+                );
+            }
+            fs::write(&path, &bytes).unwrap();
+        }
+    }
+    farm.run(&verify).ok();
+    assert_eq!(store::hashes(&place), whole, "verifying changes nothing");
+
+    farm.run(&["dataset", "verify", "no-such-folder"])
+        .fails(3, &["no-such-folder", "no data set"]);
+}
+
+#[test]
+fn a_damaged_scene_is_mended_as_the_hint_says_and_only_that_scene_is_rendered() {
+    let farm = Farm::start("mend");
+    let job = Job::quick(&farm.store(), 2);
+    let id = farm.submit(&job);
+    let _worker = farm.worker("worker");
+    farm.until_done_once(&job, &id);
+    let place = job.place();
+    let (hashes, times) = (store::hashes(&place), store::times(&place));
+    let objects = store::objects(&place, 1);
+    flip(&place.join(&objects[0]));
+    let folder = place.display().to_string();
+    let hint = "remove the objects named and the scene's manifest, then submit the job again";
+    farm.run(&["dataset", "verify", &folder])
+        .fails(6, &[&objects[0], hint]);
+
+    delete(&place.join(&objects[0]));
+    delete(&place.join("manifests/1.json"));
+    farm.json(&["job", "submit", "quick.toml"]);
+    farm.until_ended(&id);
+    farm.run(&["dataset", "verify", &folder]).ok();
+    assert_eq!(
+        store::hashes(&place),
+        hashes,
+        "the same scene comes out bit for bit"
+    );
+    let new_times = store::times(&place);
+    for key in store::objects(&place, 0) {
+        assert_eq!(new_times[&key], times[&key], "{key} was written again");
+    }
+}

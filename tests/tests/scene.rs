@@ -1,0 +1,203 @@
+//! Single scenes without a farm: generate, show, render, and the arrays that come out.
+
+use std::{path::Path, sync::Arc};
+
+use picofarm_tests::{Cli, Scratch, store};
+use zarrs::{array::Array, filesystem::FilesystemStore};
+
+fn array(group: &Path, name: &str) -> (Vec<u64>, Vec<f32>) {
+    let store = Arc::new(FilesystemStore::new(group).unwrap());
+    let array = Array::open(store, &format!("/{name}")).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let data = array.retrieve_array_subset(&array.subset_all()).unwrap();
+    (array.shape().to_vec(), data)
+}
+
+const GATE: [&str; 4] = ["--bins", "64", "--bin-width-m", "0.384"];
+
+#[test]
+fn a_generated_scene_is_the_same_file_each_time_and_shows_what_it_holds() {
+    let scratch = Scratch::new("generate");
+    let cli = Cli::new(scratch.path());
+    for kind in ["primitive", "furnished"] {
+        let generate = [
+            "scene",
+            "generate",
+            "--kind",
+            kind,
+            "--seed",
+            "3",
+            "--assets",
+            "parametric",
+        ];
+        let small = ["--spots", "4", "--resolution", "16"];
+        for out in ["a.glb", "b.glb"] {
+            cli.run(&[&generate[..], &small, &["--out", out]].concat())
+                .ok();
+        }
+        let read = |name| std::fs::read(scratch.join(name)).unwrap();
+        assert!(
+            read("a.glb") == read("b.glb"),
+            "{kind}: the seed decides everything"
+        );
+        let facts = cli.json(&["scene", "show", "a.glb"]);
+        assert_eq!(facts["beams"], 4);
+        assert!(facts["objects"].as_u64().unwrap() > 2, "{facts}");
+        assert!(
+            facts["labels"].as_object().unwrap().contains_key("floor"),
+            "{facts}"
+        );
+        assert!(
+            cli.run(&["scene", "show", "a.glb"])
+                .ok()
+                .stdout
+                .contains("triangles")
+        );
+    }
+}
+
+#[test]
+fn the_parts_of_a_split_render_add_up_to_the_whole() {
+    let scratch = Scratch::new("split");
+    let cli = Cli::new(scratch.path());
+    let generate = [
+        "scene",
+        "generate",
+        "--kind",
+        "primitive",
+        "--seed",
+        "3",
+        "--spots",
+        "4",
+    ];
+    cli.run(&[&generate[..], &["--out", "room.glb"]].concat())
+        .ok();
+    let render = [
+        "scene",
+        "render",
+        "room.glb",
+        "--resolution",
+        "16",
+        "--samples",
+        "16",
+        "--split",
+    ];
+    let render = [&render[..], &GATE].concat();
+    let report = cli.json(&[&render[..], &["--out", "room.zarr"]].concat());
+    assert!(report["rays"].as_u64().unwrap() > 0, "{report}");
+    let group = scratch.join("room.zarr");
+    let get = |name: &str| array(&group, name);
+    let (shape, whole) = get("transient");
+    assert_eq!(shape, [16, 16, 64]);
+    let (two, multi) = (get("two").1, get("multi").1);
+    for name in ["two_se", "multi_se"] {
+        let (shape, error) = get(name);
+        assert_eq!(shape, [16, 16, 64]);
+        assert!(error.iter().all(|e| e.is_finite() && *e >= 0.0), "{name}");
+    }
+    assert_eq!(get("depth").0, [16, 16]);
+    assert_eq!(get("rgb").0, [16, 16, 3]);
+
+    // What is left is the one-bounce light: never negative, and only where a spot is seen.
+    let sum = |a: &[f32]| a.iter().map(|&v| f64::from(v)).sum::<f64>();
+    assert!(sum(&two) > 0.0 && sum(&multi) > 0.0);
+    let mut spots = 0;
+    for (pixel, whole) in whole.chunks_exact(64).enumerate() {
+        let range = pixel * 64..(pixel + 1) * 64;
+        let parts = two[range.clone()].iter().zip(&multi[range]);
+        let rest: Vec<f32> = whole
+            .iter()
+            .zip(parts)
+            .map(|(w, (t, m))| w - t - m)
+            .collect();
+        let slack = 1e-5 * whole.iter().fold(0.0f32, |a, &b| a.max(b));
+        assert!(
+            rest.iter().all(|r| *r >= -slack),
+            "pixel {pixel}: the parts exceed the whole"
+        );
+        spots += usize::from(rest.iter().any(|r| *r > slack));
+    }
+    assert!(
+        (1..=4).contains(&spots),
+        "{spots} pixels with one-bounce light from 4 spots"
+    );
+
+    // The same seed gives the same bits, also with another number of threads; a taken folder is refused.
+    cli.run(&[&render[..], &["--out", "again.zarr", "--threads", "1"]].concat())
+        .ok();
+    assert_eq!(
+        store::hashes(&scratch.join("again.zarr")),
+        store::hashes(&group)
+    );
+    cli.run(&[&render[..], &["--out", "room.zarr"]].concat())
+        .fails(3, &["room.zarr", "not empty"]);
+}
+
+#[test]
+fn an_interrupted_render_exits_130_and_leaves_nothing() {
+    let scratch = Scratch::new("render-interrupted");
+    let cli = Cli::new(scratch.path());
+    cli.run(&[
+        "scene",
+        "generate",
+        "--kind",
+        "primitive",
+        "--out",
+        "room.glb",
+    ])
+    .ok();
+    let render = [
+        "scene",
+        "render",
+        "room.glb",
+        "--samples",
+        "1048576",
+        "--out",
+        "room.zarr",
+    ];
+    let mut running = cli.start("render", &render);
+    picofarm_tests::wait::until("progress", || running.stderr().contains('%').then_some(()));
+    running.signal(picofarm_tests::Signal::Interrupt);
+    running
+        .end()
+        .fails(130, &["interrupted", "nothing was written"]);
+    assert!(!scratch.join("room.zarr").exists());
+}
+
+#[test]
+fn a_reference_scene_renders_with_the_same_depth_as_its_walls() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../../shared/reference/transients/room-diffuse-1.json");
+    if !file.is_file() {
+        eprintln!("skipped: there is no reference scene at {}", file.display());
+        return;
+    }
+    let scratch = Scratch::new("reference");
+    let cli = Cli::new(scratch.path());
+    let scene = file.display().to_string();
+    let facts = cli.json(&["scene", "show", &scene]);
+    assert_eq!(facts["name"], "room-diffuse-1");
+    let render = [
+        "scene",
+        "render",
+        &scene,
+        "--resolution",
+        "16",
+        "--samples",
+        "4",
+        "--out",
+        "room.zarr",
+    ];
+    cli.run(&[&render[..], &GATE].concat()).ok();
+    let (_, depth) = array(&scratch.join("room.zarr"), "depth");
+    assert!(
+        depth.iter().all(|d| (0.3..10.0).contains(d)),
+        "a closed room"
+    );
+    let (_, transient) = array(&scratch.join("room.zarr"), "transient");
+    assert!(transient.iter().all(|h| h.is_finite() && *h >= 0.0));
+    let lit = transient
+        .chunks_exact(64)
+        .filter(|h| h.iter().any(|v| *v > 0.0))
+        .count();
+    assert!(lit > 200, "light reaches nearly every pixel, {lit} of 256");
+}

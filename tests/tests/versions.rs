@@ -1,0 +1,172 @@
+//! Workers and coordinators of different versions refuse each other and say what to do.
+
+use std::time::Duration;
+
+use picofarm_proto::{
+    PROTOCOL,
+    wire::{
+        self, SessionRequest, SessionResponse,
+        farm_client::FarmClient,
+        farm_server::{Farm as FarmService, FarmServer},
+        session_request::Message as Said,
+        session_response::Message as Answer,
+    },
+};
+use picofarm_tests::{Cli, Farm, Job, Scratch, wait::until};
+use tokio::net::TcpListener;
+use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
+use tonic::{Code, Request, Response, Status, Streaming, transport::Server};
+
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn hello(version: &str, protocol: u32) -> wire::Hello {
+    wire::Hello {
+        worker_id: uuid::Uuid::new_v4().to_string(),
+        incarnation: uuid::Uuid::new_v4().to_string(),
+        name: "stranger".into(),
+        version: version.into(),
+        protocol,
+        cores: 1,
+        held: Vec::new(),
+        renderer: "transient-0".into(),
+        assets: Vec::new(),
+    }
+}
+
+/// Says hello and gives the first answer.
+async fn greet(url: &str, hello: wire::Hello) -> Result<Option<SessionResponse>, Status> {
+    let mut client = FarmClient::connect(url.to_owned())
+        .await
+        .expect("the coordinator listens");
+    let (to, requests) = tokio::sync::mpsc::channel(1);
+    to.send(SessionRequest {
+        message: Some(Said::Hello(hello)),
+    })
+    .await
+    .expect("just made");
+    let answer = async {
+        let mut answers = client
+            .session(ReceiverStream::new(requests))
+            .await?
+            .into_inner();
+        answers.message().await
+    };
+    let answer = tokio::time::timeout(PATIENCE, answer)
+        .await
+        .expect("an answer");
+    drop(to);
+    answer
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_coordinator_refuses_a_worker_of_another_version_and_names_both() {
+    let farm = tokio::task::spawn_blocking(|| Farm::start("other-worker"))
+        .await
+        .unwrap();
+    let refusal = greet(farm.url(), hello("9.9.9", PROTOCOL + 1))
+        .await
+        .unwrap_err();
+    assert_eq!(refusal.code(), Code::FailedPrecondition, "{refusal}");
+    let words = refusal.message();
+    for part in [PROTOCOL, PROTOCOL + 1] {
+        assert!(words.contains(&part.to_string()), "{words}");
+    }
+
+    let mut nameless = hello("9.9.9", PROTOCOL);
+    nameless.worker_id = "nobody".into();
+    let refusal = greet(farm.url(), nameless).await.unwrap_err();
+    assert_eq!(refusal.code(), Code::InvalidArgument, "{refusal}");
+    assert!(refusal.message().contains("worker_id"), "{refusal}");
+    tokio::task::spawn_blocking(move || farm.json(&["job", "list"]))
+        .await
+        .unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_with_another_renderer_gets_nothing_and_the_job_says_why() {
+    let (farm, id) = tokio::task::spawn_blocking(|| {
+        let farm = Farm::start("other-renderer");
+        let id = farm.submit(&Job::quick(&farm.store(), 1));
+        (farm, id)
+    })
+    .await
+    .unwrap();
+    let mut client = FarmClient::connect(farm.url().to_owned()).await.unwrap();
+    let (to, requests) = tokio::sync::mpsc::channel(2);
+    let say = async |message| {
+        to.send(SessionRequest {
+            message: Some(message),
+        })
+        .await
+        .unwrap()
+    };
+    say(Said::Hello(hello(env!("CARGO_PKG_VERSION"), PROTOCOL))).await;
+    let mut answers = client
+        .session(ReceiverStream::new(requests))
+        .await
+        .unwrap()
+        .into_inner();
+    let welcome = answers.message().await.unwrap().unwrap();
+    assert!(
+        matches!(welcome.message, Some(Answer::Welcome(_))),
+        "{welcome:?}"
+    );
+    say(Said::Credit(wire::Credit { leases: 1 })).await;
+    tokio::task::spawn_blocking(move || {
+        let waiting = until("the job to say why it waits", || {
+            farm.events_of(&id, "waiting").pop()
+        });
+        let message = waiting["message"].as_str().unwrap();
+        assert!(
+            message.contains("renderer") && message.contains("transient-0"),
+            "{message}"
+        );
+        assert_eq!(waiting["worker"], "stranger");
+        assert_eq!(farm.count(&id, "pending"), 1);
+    })
+    .await
+    .unwrap();
+}
+
+struct Refusing;
+
+#[tonic::async_trait]
+impl FarmService for Refusing {
+    type SessionStream = ReceiverStream<Result<SessionResponse, Status>>;
+
+    async fn session(
+        &self,
+        _: Request<Streaming<SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        Err(Status::failed_precondition(
+            "this coordinator speaks protocol 77",
+        ))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_refused_for_its_version_exits_with_4_and_says_what_to_do() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let server = tokio::spawn(
+        Server::builder()
+            .add_service(FarmServer::new(Refusing))
+            .serve_with_incoming(TcpListenerStream::new(listener)),
+    );
+    let asked = url.clone();
+    tokio::task::spawn_blocking(move || {
+        let scratch = Scratch::new("refused-worker");
+        let cli = Cli::new(scratch.path());
+        cli.run(&["worker", "--coordinator", &asked]).fails(
+            4,
+            &[
+                "this coordinator speaks protocol 77",
+                &asked,
+                "same picofarm version",
+            ],
+        );
+    })
+    .await
+    .unwrap();
+    server.abort();
+}
