@@ -196,6 +196,32 @@ async fn a_poison_task_is_cornered_and_everything_else_is_done() {
 }
 
 #[tokio::test]
+async fn a_lost_worker_is_charged_to_the_task_it_had_in_hand() {
+    let mut farm = Farm::start().await;
+    let job = farm.submit(&spec(20)).await.job_id;
+    let mut worker = farm.worker().await;
+    let first = worker.lease().await;
+    assert!(worker.done(&first, first.lo).await.accepted);
+    let lease = worker.lease().await;
+    let in_hand = lease.hi - 1;
+    assert!(in_hand > lease.lo);
+    worker.beat(&[&lease], Some(in_hand)).await;
+    let running = farm.status(&job).await.running;
+    assert_eq!((running.len(), running[0].index), (1, in_hand));
+    drop(worker);
+    farm.pass(i64::from(LEASE_MS) + 1);
+    farm.until(&job, |s| s.tasks.leased == 0).await;
+    let failed: Vec<_> = farm
+        .events(&job, None)
+        .await
+        .iter()
+        .filter(|e| e.kind() == wire::EventKind::Failed)
+        .map(|e| e.task)
+        .collect();
+    assert_eq!(failed, [Some(in_hand)]);
+}
+
+#[tokio::test]
 async fn a_worker_gets_at_most_as_many_leases_as_credits() {
     let mut farm = Farm::start().await;
     farm.submit(&spec(10)).await;
