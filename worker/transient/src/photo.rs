@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// Sub-pixel samples a side.
-const SIDE: u32 = 2;
+const SIDE: u32 = 3;
 /// Mirrors followed.
 const REFLECTIONS: u32 = 2;
 
@@ -68,10 +68,11 @@ fn lamp(world: &World) -> Lamp {
     let above = world
         .closest(&mut stack, under, up)
         .map_or(ahead, |h| (h.p - under).length());
-    let rise = (0.85 * above).min(ahead);
+    let rise = (0.75 * above).min(ahead);
     Lamp {
         centre: under + up * rise,
-        radius: 0.08 * ahead,
+        // Well below the ceiling, however the disc is turned.
+        radius: (0.06 * ahead).min(0.2 * above),
         reach: 0.45 * ahead + rise,
     }
 }
