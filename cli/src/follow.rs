@@ -100,7 +100,11 @@ async fn failures(client: &mut Client, job: JobId, meter: &Meter, seen: &mut u64
         *seen = event.sequence;
         if matches!(
             event.kind,
-            EventKind::Failed | EventKind::Dead | EventKind::Expired
+            EventKind::Failed
+                | EventKind::Dead
+                | EventKind::Expired
+                | EventKind::Alarm
+                | EventKind::Waiting
         ) {
             let task = event.task.map(|t| format!("task {t} ")).unwrap_or_default();
             meter.line(

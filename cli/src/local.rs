@@ -48,7 +48,6 @@ impl Local {
                 worker_id: None,
                 threads,
                 asset_dirs: vec![assets.to_owned()],
-                slots: 1,
             };
             local
                 .workers

@@ -126,7 +126,6 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         worker_id: None,
         threads: args.threads.unwrap_or_else(cores),
         asset_dirs: vec![settings.assets.clone()],
-        slots: 1,
     };
     output.say(format!("worker {} for {}", config.name, config.coordinator));
     let summary = picofarm_agent::run(config, stop)

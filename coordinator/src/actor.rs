@@ -3,10 +3,12 @@
 
 use std::{
     collections::{HashMap, hash_map::Entry},
+    panic::AssertUnwindSafe,
     sync::Arc,
     time::{Duration, Instant},
 };
 
+use futures::FutureExt;
 use picofarm_catalog::{Catalog, CatalogError, ResultSet};
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
@@ -98,17 +100,21 @@ impl Actor {
     /// state is loaded afresh.
     pub(crate) async fn run(self, mut commands: mpsc::Receiver<Command>) {
         while !self.stop.is_cancelled() {
-            let result = async { self.begin().await?.run(&mut commands).await }.await;
-            if let Err(error) = result {
-                tracing::error!(%error, "the catalog failed; trying again in {} s", MEND.as_secs());
-                tokio::select! {
-                    () = tokio::time::sleep(MEND) => {}
-                    () = self.stop.cancelled() => {}
-                }
-                // Those who asked meanwhile are told at once rather than kept waiting.
-                while let Ok(command) = commands.try_recv() {
-                    refuse(command, &error);
-                }
+            let life = async { self.begin().await?.run(&mut commands).await };
+            // A panic is a bug, but no reason to drop everyone: the state is loaded afresh.
+            let why = match AssertUnwindSafe(life).catch_unwind().await {
+                Ok(Ok(())) => break,
+                Ok(Err(error)) => error.to_string(),
+                Err(_) => "the coordinator panicked; please report this with its log".to_owned(),
+            };
+            tracing::error!("{why}; trying again in {} s", MEND.as_secs());
+            tokio::select! {
+                () = tokio::time::sleep(MEND) => {}
+                () = self.stop.cancelled() => {}
+            }
+            // Those who asked meanwhile are told at once rather than kept waiting.
+            while let Ok(command) = commands.try_recv() {
+                refuse(command, &why);
             }
         }
         self.catalog.close().await;
@@ -330,9 +336,9 @@ impl Life<'_> {
 }
 
 /// Tells whoever asks that the catalog is out of order.
-fn refuse(command: Command, error: &CatalogError) {
-    fn no<T>(reply: Reply<T>, error: &CatalogError) {
-        let _ = reply.send(Err(Refusal::Catalog(error.to_string())));
+fn refuse(command: Command, error: &str) {
+    fn no<T>(reply: Reply<T>, error: &str) {
+        let _ = reply.send(Err(Refusal::Catalog(error.to_owned())));
     }
     match command {
         // Dropping a session's sender ends it.

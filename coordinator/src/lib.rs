@@ -5,6 +5,8 @@ mod actor;
 pub mod budget;
 mod clock;
 mod core;
+#[cfg(test)]
+mod laws;
 pub mod place;
 pub mod plan;
 mod rpc;
@@ -14,7 +16,7 @@ pub mod transition;
 
 pub use budget::Backoff;
 pub use clock::Clock;
-pub use server::{CoordinatorConfig, CoordinatorError, Running, serve};
+pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 
 /// Version of this program; workers must have the same.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

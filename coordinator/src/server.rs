@@ -113,7 +113,8 @@ impl Running {
     }
 }
 
-/// Starts a coordinator; it runs until `shutdown` is cancelled. Clients may connect when this returns.
+/// Starts a coordinator; it runs until `shutdown` is cancelled
+/// (and cancels it when it ends by itself). Clients may connect when this returns.
 ///
 /// # Errors
 /// [`CoordinatorError`] when the address or the catalog cannot be used.
@@ -184,7 +185,7 @@ pub async fn serve(
         let served = server.await;
         // Whatever ended the server ends the actor too, which closes the catalog.
         shutdown.cancel();
-        actor.await.expect("the actor does not panic");
+        actor.await.expect("the actor catches panics");
         Ok(served?)
     });
     tracing::info!(%address, catalog = %config.catalog.display(), "coordinator listens");

@@ -10,26 +10,14 @@ const FRAMES: usize = 160;
 /// Hundredths of a second a frame.
 const DELAY: u16 = 6;
 
-/// Writes the animation. Exposure is common to all frames (square root of the signal), so brightness can
+/// Writes the animation. Exposure is common to all frames (the signal to the power 0.4), so brightness can
 /// be compared over time; the palette is the colour map itself, so no colour is approximated.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn animate(view: &View, path: &Path) -> Result<()> {
-    let step = view.bins.div_ceil(FRAMES);
-    let energy = view.energy_by_bin();
-    let peak = energy.iter().copied().fold(0.0, f64::max);
-    // Leave out the dark ends of the gate.
-    let bright = |e: &f64| *e > 1e-4 * peak;
-    let first = energy
-        .iter()
-        .position(bright)
-        .unwrap_or(0)
-        .saturating_sub(2 * step);
-    let last = energy
-        .iter()
-        .rposition(bright)
-        .map_or(view.bins, |b| (b + step).min(view.bins));
+    let (first, last) = lively(&view.energy_by_bin());
+    let step = (last - first).div_ceil(FRAMES).max(1);
     let white = exposure(view, step, first, last);
 
     let palette: Vec<u8> = (0..=255u8)
@@ -45,7 +33,7 @@ pub fn animate(view: &View, path: &Path) -> Result<()> {
             let slice = view.slice(lo, (lo + step).min(view.bins));
             let indices: Vec<u8> = slice
                 .iter()
-                .map(|v| ((v / white).clamp(0.0, 1.0).sqrt() * 255.0).round() as u8)
+                .map(|v| ((v / white).clamp(0.0, 1.0).powf(0.4) * 255.0).round() as u8)
                 .collect();
             let frame = gif::Frame {
                 width: w,
@@ -58,6 +46,24 @@ pub fn animate(view: &View, path: &Path) -> Result<()> {
         }
     }
     write_atomically(path, &bytes)
+}
+
+/// The bins between the first light and the arrival of 92 % of the energy: after that there is only a faint,
+/// even glow.
+fn lively(energy: &[f64]) -> (usize, usize) {
+    let total: f64 = energy.iter().sum();
+    let arrived = |share: f64| {
+        let mut sum = 0.0;
+        let reached = |e: &f64| {
+            sum += e;
+            sum > share * total
+        };
+        energy.iter().position(reached)
+    };
+    match (arrived(1e-6), arrived(0.92)) {
+        (Some(first), Some(last)) => (first.saturating_sub(2), last + 1),
+        _ => (0, energy.len()),
+    }
 }
 
 /// The value shown as white: a high quantile of the bright part of a few frames.

@@ -30,19 +30,25 @@ impl Core {
         for job in &waiting {
             self.explain_waiting(*job, now_ms);
         }
+        if hungry.is_empty() {
+            return;
+        }
+        let waiting: Vec<(JobId, u64)> =
+            waiting.iter().map(|job| (*job, self.able(*job))).collect();
         // In rounds, so that the first worker does not take everything.
         let mut granted = true;
         while granted {
             granted = false;
             for worker in &hungry {
-                granted |= waiting.iter().any(|job| self.grant(*job, *worker, now_ms));
+                granted |= waiting
+                    .iter()
+                    .any(|(job, able)| self.grant(*job, *worker, *able, now_ms));
             }
         }
     }
 
-    /// Grants one lease of a job to a worker, if both can.
-    fn grant(&mut self, id: JobId, worker: WorkerId, now_ms: i64) -> bool {
-        let able = self.able(id);
+    /// Grants one lease of a job to a worker, if both can; `able` workers may run the job.
+    fn grant(&mut self, id: JobId, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = self.jobs.get_mut(&id).expect("the caller lists known jobs");
         let who = self
             .workers

@@ -1,183 +1,15 @@
-//! The life of a lease after its grant: commit, failure, return, expiry.
+//! The life of a lease after its grant: heartbeat, failure, return, expiry.
 
-use picofarm_catalog::{Exception, Mark, Output, Range, RangeState};
+use picofarm_catalog::{Exception, Mark, Range, RangeState};
 use picofarm_proto::{
-    ids::{JobId, LeaseRef, RangeId},
-    key::task_key,
-    model::{EventKind, Failure, FailureKind, Finished, JobState, TaskProgress},
+    ids::{LeaseRef, RangeId},
+    model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
-use super::{About, Core, JobEntry, Progress, Say, SessionId};
+use super::{About, Core, Progress, Say, SessionId};
 use crate::{budget, transition::RangeEvent};
 
-/// What the catalog already holds for a reported task: looked up before [`Core::finished`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct OutputHint(pub Option<[u8; 32]>);
-
 impl Core {
-    /// The job whose task a report is about: by its lease, or else by the task key.
-    pub(crate) fn job_of(&self, report: &Finished) -> Option<JobId> {
-        let fits = |entry: &JobEntry| {
-            report.index < entry.job.spec.scenes.count
-                && task_key(&self.sets[entry.set].key, report.index) == report.key
-        };
-        if let Some(id) = self.leases.get(&report.lease.range) {
-            return fits(&self.jobs[id]).then_some(*id);
-        }
-        self.order
-            .iter()
-            .rev()
-            .find(|id| fits(&self.jobs[id]))
-            .copied()
-    }
-
-    /// Commits a finished task, or says why not. `hint` is what the catalog holds for it.
-    pub(crate) fn finished(
-        &mut self,
-        session: SessionId,
-        report: &Finished,
-        hint: OutputHint,
-        now_ms: i64,
-    ) {
-        let Some(worker) = self.sessions.get(&session).copied() else {
-            return;
-        };
-        let verdict = self.commit(session, report, hint, now_ms);
-        if let Err(reason) = &verdict {
-            tracing::info!(%worker, range = %report.lease.range, task = report.index, reason, "report refused");
-        }
-        self.acknowledge(session, report.lease, report.index, verdict);
-    }
-
-    fn commit(
-        &mut self,
-        session: SessionId,
-        report: &Finished,
-        OutputHint(known): OutputHint,
-        now_ms: i64,
-    ) -> Result<(), String> {
-        let mut manifest = [0; 32];
-        hex_into(&report.manifest_sha256, &mut manifest)
-            .ok_or("manifest_sha256: expected 64 hexadecimal digits")?;
-        let id = self.job_of(report).ok_or(
-            "the task key names no task of this job; the worker's renderer or settings differ from the job's",
-        )?;
-        let set = self.jobs[&id].set;
-        let known = known.or_else(|| self.fresh.get(&(set, report.index)).copied());
-        let live = self
-            .held_to_do(session, report.lease, report.index, now_ms)
-            .cloned();
-        match (live, known) {
-            (Ok(range), None) => {
-                self.commit_new(session, id, &range, report, manifest, now_ms);
-                Ok(())
-            }
-            (live, Some(known)) => {
-                // The output stands, whoever made it: the task is done.
-                if let Ok(range) = live {
-                    self.mark(
-                        &range,
-                        &RangeEvent::Finish {
-                            task: report.index,
-                            reused: true,
-                        },
-                    );
-                    self.end_if_over(id, now_ms);
-                }
-                if known == manifest {
-                    return Ok(());
-                }
-                let name = self.session_name(session);
-                let message = format!(
-                    "task {} has two different results: committed manifest {}, reported {}; the committed one stands. Is the renderer deterministic on this worker?",
-                    report.index,
-                    hex_of(&known),
-                    report.manifest_sha256
-                );
-                tracing::error!(job = %id, worker = name, "{message}");
-                let about = About::message(message.clone())
-                    .task(report.index)
-                    .worker(name);
-                self.event(now_ms, id, EventKind::Alarm, about);
-                Err(message)
-            }
-            (Err(reason), None) => Err(reason),
-        }
-    }
-
-    fn commit_new(
-        &mut self,
-        session: SessionId,
-        id: JobId,
-        range: &Range,
-        report: &Finished,
-        manifest: [u8; 32],
-        now_ms: i64,
-    ) {
-        let task = report.index;
-        let set = self.jobs[&id].set;
-        self.fresh.insert((set, task), manifest);
-        self.changes.outputs.push(Output {
-            job: id,
-            task,
-            manifest,
-            bytes: report.bytes,
-            seconds: report.seconds,
-            epoch: report.lease.epoch,
-            adopted: report.adopted,
-        });
-        let kind = if report.adopted {
-            EventKind::Reused
-        } else {
-            let timing = &mut self.sets[set].timing;
-            timing.tasks += 1;
-            timing.seconds += report.seconds;
-            EventKind::Committed
-        };
-        let about = About::default()
-            .task(task)
-            .worker(self.session_name(session))
-            .seconds(report.seconds);
-        self.event(now_ms, id, kind, about);
-        self.mark(
-            range,
-            &RangeEvent::Finish {
-                task,
-                reused: report.adopted,
-            },
-        );
-        self.end_if_over(id, now_ms);
-        self.settle_elsewhere(set, id, task, now_ms);
-    }
-
-    /// Other jobs that wait for the same output have it now.
-    fn settle_elsewhere(&mut self, set: usize, but: JobId, task: u64, now_ms: i64) {
-        if self.sets[set].jobs.len() < 2 {
-            return;
-        }
-        for id in self.sets[set].jobs.clone() {
-            let entry = self.jobs.get_mut(&id).expect("a set names known jobs");
-            if id == but || entry.job.state != JobState::Active {
-                continue;
-            }
-            let Some(range) = entry.stage.pending_at(task).cloned() else {
-                continue;
-            };
-            entry
-                .stage
-                .apply(
-                    &range,
-                    &RangeEvent::Settle { task },
-                    &mut Self::range_id(&mut self.make_id),
-                    &mut self.changes,
-                )
-                .expect("a pending task can be settled");
-            let about = About::message(format!("committed by job {but}")).task(task);
-            self.event(now_ms, id, EventKind::Reused, about);
-            self.end_if_over(id, now_ms);
-        }
-    }
-
     /// Charges a failed task to its budgets and takes it out of the lease.
     pub(crate) fn failed(&mut self, session: SessionId, failure: &Failure, now_ms: i64) {
         let held = self
@@ -388,7 +220,7 @@ impl Core {
     }
 
     /// Lets something happen to a leased range and forgets the lease when it has ended by that.
-    fn mark(&mut self, range: &Range, event: &RangeEvent) {
+    pub(super) fn mark(&mut self, range: &Range, event: &RangeEvent) {
         let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
         let left = entry
             .stage
@@ -444,7 +276,7 @@ impl Core {
     }
 
     /// As [`Core::held`], for a lease that has this task to do.
-    fn held_to_do(
+    pub(super) fn held_to_do(
         &self,
         session: SessionId,
         lease: LeaseRef,
@@ -459,14 +291,14 @@ impl Core {
         }
     }
 
-    fn session_name(&self, session: SessionId) -> String {
+    pub(super) fn session_name(&self, session: SessionId) -> String {
         self.sessions
             .get(&session)
             .map(|worker| self.name_of(*worker))
             .unwrap_or_default()
     }
 
-    fn acknowledge(
+    pub(super) fn acknowledge(
         &mut self,
         session: SessionId,
         lease: LeaseRef,
@@ -497,12 +329,4 @@ fn to_do(range: &Range, task: u64) -> bool {
     task.checked_sub(range.lo)
         .and_then(|at| lease.marks.get(usize::try_from(at).ok()?))
         == Some(&Mark::Todo)
-}
-
-fn hex_into(text: &str, bytes: &mut [u8; 32]) -> Option<()> {
-    hex::decode_to_slice(text, bytes).ok()
-}
-
-fn hex_of(bytes: &[u8; 32]) -> String {
-    hex::encode(bytes)
 }

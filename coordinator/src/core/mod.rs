@@ -1,6 +1,7 @@
 //! The coordinator's mind: all live state in memory, synchronous methods over it, no I/O. Time and ids are
 //! passed in. Each method notes what must become durable ([`Changes`]) and what to say afterwards ([`Say`]).
 
+mod commit;
 mod dispatch;
 mod jobs;
 mod leases;
@@ -20,8 +21,8 @@ use uuid::Uuid;
 
 use crate::{budget::Backoff, place::Abilities, stage::Stage};
 
+pub(crate) use commit::OutputHint;
 pub(crate) use jobs::Submitted;
-pub(crate) use leases::OutputHint;
 
 /// Makes UUIDs; passed in, so that the core is deterministic.
 pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send>;
@@ -158,6 +159,9 @@ impl Core {
             let timing = timing.get(&set).copied().unwrap_or_default();
             let mut changes = Changes::default();
             let stage = Stage::new(ranges.remove(&job.id).unwrap_or_default(), &mut changes);
+            if !changes.gone.is_empty() {
+                core.changes.append(changes);
+            }
             core.leases
                 .extend(stage.leased().map(|(range, _)| (range.id, job.id)));
             core.adopt(job, set, timing, stage);

@@ -1,6 +1,9 @@
 //! What can go wrong with a catalog, and what to do about it.
 
-use std::path::PathBuf;
+use std::{
+    io,
+    path::{Path, PathBuf},
+};
 
 /// A catalog that cannot be opened, read or written.
 #[derive(Debug, thiserror::Error)]
@@ -37,7 +40,7 @@ pub enum CatalogError {
         /// What was tried.
         what: &'static str,
         /// The system's answer.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// No room.
     #[error("catalog {}: the disk is full; free some space, then start the coordinator again: no finished work is lost", path.display())]
@@ -73,4 +76,18 @@ pub enum CatalogError {
     /// The writer has stopped.
     #[error("the catalog is closed")]
     Closed,
+}
+
+impl CatalogError {
+    /// The error a person can act on, for a failure of the file system while doing `what`.
+    pub(crate) fn file(path: &Path, what: &'static str, source: io::Error) -> Self {
+        let path = path.to_owned();
+        match source.kind() {
+            io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
+                Self::ReadOnly { path }
+            }
+            io::ErrorKind::StorageFull => Self::Full { path },
+            _ => Self::File { path, what, source },
+        }
+    }
 }

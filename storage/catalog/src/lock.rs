@@ -20,23 +20,7 @@ impl CatalogLock {
     pub(crate) fn take(path: &Path, holder: &str) -> Result<Self, CatalogError> {
         let mut lock_path = path.as_os_str().to_owned();
         lock_path.push(".lock");
-        let failed = |what| {
-            move |source: std::io::Error| match source.kind() {
-                std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem => {
-                    CatalogError::ReadOnly {
-                        path: path.to_owned(),
-                    }
-                }
-                std::io::ErrorKind::StorageFull => CatalogError::Full {
-                    path: path.to_owned(),
-                },
-                _ => CatalogError::File {
-                    path: path.to_owned(),
-                    what,
-                    source,
-                },
-            }
-        };
+        let failed = |what| move |source| CatalogError::file(path, what, source);
         let mut file = OpenOptions::new()
             .read(true)
             .write(true)

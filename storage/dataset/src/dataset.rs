@@ -53,7 +53,7 @@ impl Dataset {
         spec.check()?;
         let root = objects::path_of(&prefix, METADATA);
         let stored = match objects::get(&*store, &root).await? {
-            Some(bytes) => parse_root(&bytes, &root)?,
+            Some(bytes) => parse_root(&bytes, &objects::shown(&*store, &root))?,
             None => {
                 let new = Self::assume(store.clone(), prefix.clone(), *spec);
                 for array in new.arrays.iter() {
@@ -63,12 +63,15 @@ impl Dataset {
                     return Ok(new);
                 }
                 // Another process was faster.
-                parse_root(&objects::require(&*store, &root).await?, &root)?
+                parse_root(
+                    &objects::require(&*store, &root).await?,
+                    &objects::shown(&*store, &root),
+                )?
             }
         };
         if let Some((field, stored, asked)) = stored.difference(spec) {
             return Err(DatasetError::SpecMismatch {
-                prefix: prefix.to_string(),
+                prefix: objects::shown(&*store, &prefix),
                 field: field.into(),
                 stored,
                 asked,
@@ -96,10 +99,10 @@ impl Dataset {
         let root = objects::path_of(&prefix, METADATA);
         let Some(bytes) = objects::get(&*store, &root).await? else {
             return Err(DatasetError::NoDataset {
-                prefix: prefix.to_string(),
+                prefix: objects::shown(&*store, &prefix),
             });
         };
-        let spec = parse_root(&bytes, &root)?;
+        let spec = parse_root(&bytes, &objects::shown(&*store, &root))?;
         Ok(Self::assume(store, prefix, spec))
     }
 
@@ -136,6 +139,11 @@ impl Dataset {
         objects::path_of(&self.prefix, key)
     }
 
+    /// A path for a message.
+    pub(crate) fn shown(&self, path: &Path) -> String {
+        objects::shown(&*self.store, path)
+    }
+
     pub(crate) fn metadata_path(&self, layout: &Layout) -> Path {
         self.path(&format!("{}/{METADATA}", layout.quantity.name()))
     }
@@ -166,7 +174,7 @@ impl Dataset {
         }
         if stored != ours {
             return Err(DatasetError::Damaged {
-                object: path.to_string(),
+                object: self.shown(&path),
                 what: "left by the interrupted creation of another data set; remove it, or use an empty location"
                     .into(),
             });
@@ -231,7 +239,7 @@ pub(crate) fn root_metadata(spec: &DatasetSpec) -> Value {
     })
 }
 
-fn parse_root(bytes: &[u8], root: &Path) -> Result<DatasetSpec, DatasetError> {
+fn parse_root(bytes: &[u8], root: &str) -> Result<DatasetSpec, DatasetError> {
     let damaged = |what: String| DatasetError::Damaged {
         object: root.to_string(),
         what,

@@ -238,6 +238,17 @@ impl Tiles {
         )
     }
 
+    /// Which row of tiles a tile is in.
+    pub fn row_of(&self, tile: usize) -> usize {
+        tile / self.grid[1]
+    }
+
+    /// The image rows of a tile, cut at the image's edge.
+    pub fn rows_of(&self, tile: usize) -> std::ops::Range<usize> {
+        let top = self.corner(tile).0;
+        top..(top + self.side[0]).min(self.image[0])
+    }
+
     pub fn runs(&self, tile: usize) -> impl Iterator<Item = Run> + '_ {
         let (top, left) = self.corner(tile);
         let columns = self.side[1].min(self.image[1] - left);

@@ -62,7 +62,7 @@ pub enum DatasetError {
          verify the data set"
     )]
     Conflict {
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// SHA-256 of the stored bytes.
         stored: String,
@@ -74,7 +74,7 @@ pub enum DatasetError {
         "{object}: {what}; publish the scene again to replace a missing object, or delete a broken one first"
     )]
     Damaged {
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// What is wrong with it.
         what: String,
@@ -102,7 +102,7 @@ pub enum DatasetError {
     Store {
         /// E.g. `write`.
         action: &'static str,
-        /// The object's full key.
+        /// The object's full key (its path, in a local store).
         object: String,
         /// How to mend it, where known.
         hint: Option<&'static str>,
@@ -195,5 +195,32 @@ fn io_hint(error: &io::Error) -> Option<&'static str> {
             Some("the file system has no hard links, which create-only writes need")
         }
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_told_with_the_object_and_a_hint() {
+        let nested = |kind| object_store::Error::Generic {
+            store: "LocalFileSystem",
+            source: Box::new(object_store::Error::Generic {
+                store: "inner",
+                source: Box::new(io::Error::from(kind)),
+            }),
+        };
+        let text =
+            |kind| DatasetError::store("write", "sets/a/depth/c/0/0/0", nested(kind)).to_string();
+        let full = text(io::ErrorKind::StorageFull);
+        assert!(
+            full.starts_with(
+                "cannot write sets/a/depth/c/0/0/0 (the disk is full: free some space"
+            ),
+            "{full}"
+        );
+        let read_only = text(io::ErrorKind::ReadOnlyFilesystem);
+        assert!(read_only.contains("mounted read-only"), "{read_only}");
     }
 }

@@ -13,6 +13,18 @@ pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
         .fold(prefix.clone(), |path, part| path.join(part))
 }
 
+/// A path as a person would look for it: with the leading `/` for local stores, whose keys are paths from the root.
+pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
+    // The store's root is told only by how it displays itself.
+    match store.to_string().strip_prefix("LocalFileSystem(file://") {
+        Some(root) => format!(
+            "{}/{path}",
+            root.trim_end_matches(')').trim_end_matches('/')
+        ),
+        None => path.to_string(),
+    }
+}
+
 /// Puts create-only. `false`: it exists already.
 pub(crate) async fn create(
     store: &dyn ObjectStore,
@@ -23,7 +35,7 @@ pub(crate) async fn create(
     match store.put_opts(path, bytes.into(), options).await {
         Ok(_) => Ok(true),
         Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => Ok(false),
-        Err(e) => Err(DatasetError::store("write", path, e)),
+        Err(e) => Err(DatasetError::store("write", shown(store, path), e)),
     }
 }
 
@@ -44,7 +56,7 @@ pub(crate) async fn create_or_match(
     let (stored, ours) = (sha256_hex(&stored), sha256_hex(&bytes));
     tracing::error!(object = %path, %stored, %ours, "conflict: an object exists with other bytes");
     Err(DatasetError::Conflict {
-        object: path.to_string(),
+        object: shown(store, path),
         stored,
         ours,
     })
@@ -59,7 +71,7 @@ pub(crate) async fn overwrite(
     let put = store.put_opts(path, bytes.into(), PutOptions::default());
     put.await
         .map(drop)
-        .map_err(|e| DatasetError::store("replace", path, e))
+        .map_err(|e| DatasetError::store("replace", shown(store, path), e))
 }
 
 /// The bytes; `None` where there is no such object.
@@ -74,7 +86,7 @@ pub(crate) async fn get(
     match result {
         Ok(bytes) => Ok(Some(bytes)),
         Err(Error::NotFound { .. }) => Ok(None),
-        Err(e) => Err(DatasetError::store("read", path, e)),
+        Err(e) => Err(DatasetError::store("read", shown(store, path), e)),
     }
 }
 
@@ -83,7 +95,7 @@ pub(crate) async fn require(store: &dyn ObjectStore, path: &Path) -> Result<Byte
     get(store, path)
         .await?
         .ok_or_else(|| DatasetError::Damaged {
-            object: path.to_string(),
+            object: shown(store, path),
             what: "the object is missing".into(),
         })
 }
@@ -96,6 +108,6 @@ pub(crate) async fn size(
     match store.head(path).await {
         Ok(meta) => Ok(Some(meta.size)),
         Err(Error::NotFound { .. }) => Ok(None),
-        Err(e) => Err(DatasetError::store("look up", path, e)),
+        Err(e) => Err(DatasetError::store("look up", shown(store, path), e)),
     }
 }

@@ -80,7 +80,7 @@ impl Dataset {
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             return Ok(None);
         };
-        let manifest = Manifest::parse(&bytes, scene, path.as_ref())?;
+        let manifest = Manifest::parse(&bytes, scene, &self.shown(&path))?;
         let objects = manifest.objects.iter();
         let checks: Vec<_> = objects
             .map(|object| check_size(&*self.store, self.path(&object.key), object.size))
@@ -108,7 +108,7 @@ async fn check_size(
         None => "the object is missing".into(),
     };
     Err(DatasetError::Damaged {
-        object: path.to_string(),
+        object: objects::shown(store, &path),
         what,
     })
 }

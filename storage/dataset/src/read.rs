@@ -1,5 +1,6 @@
 //! Reading published scenes back.
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use bytes::Bytes;
@@ -46,10 +47,10 @@ impl Dataset {
         self.check_scene(scene)?;
         let path = self.path(&Manifest::key(scene));
         match objects::get(&*self.store, &path).await? {
-            Some(bytes) => Manifest::parse(&bytes, scene, path.as_ref()),
+            Some(bytes) => Manifest::parse(&bytes, scene, &self.shown(&path)),
             None => Err(DatasetError::NotPublished {
                 scene,
-                object: path.to_string(),
+                object: self.shown(&path),
             }),
         }
     }
@@ -72,7 +73,7 @@ impl Dataset {
             })
             .try_collect()
             .await
-            .map_err(|e| DatasetError::store("list", &folder, e))?;
+            .map_err(|e| DatasetError::store("list", self.shown(&folder), e))?;
         scenes.retain(|scene| *scene < self.spec.scenes);
         scenes.sort_unstable();
         Ok(scenes)
@@ -136,7 +137,7 @@ impl Dataset {
         let key = self.array(Quantity::Transient).layout.key(manifest.scene);
         let path = self.path(&key);
         let damaged = |what: String| DatasetError::Damaged {
-            object: path.to_string(),
+            object: self.shown(&path),
             what,
         };
         let entry = manifest
@@ -151,7 +152,7 @@ impl Dataset {
         };
         let fetch_error = |e| match e {
             object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
-            e => DatasetError::store("read", &path, e),
+            e => DatasetError::store("read", self.shown(&path), e),
         };
         let index = self.store.get_range(&path, start..entry.size);
         let index = index.await.map_err(fetch_error)?;
@@ -196,7 +197,8 @@ impl Dataset {
         self.decode_window(manifest, &tiles, chunks, image)
     }
 
-    /// Decodes tiles into a window and applies the overflow list.
+    /// Decodes tiles into a window and applies the overflow list. Bands of tiles are decoded at once, each straight
+    /// into its rows of the window.
     fn decode_window(
         &self,
         manifest: &Manifest,
@@ -205,64 +207,86 @@ impl Dataset {
         [rows, columns]: [Range<usize>; 2],
     ) -> Result<Vec<f32>, DatasetError> {
         let bins = self.spec.gate.bins as usize;
-        let codec = &self.array(Quantity::Transient).codec;
-        let decode = |(tile, bytes): (usize, Option<Bytes>)| {
-            let mut h = vec![0f32; tiles.tile_len()];
-            if let Some(bytes) = bytes {
-                let raw = codec.decode(&bytes)?;
-                match self.spec.profile {
-                    Profile::SqrtU16 { delta } => {
-                        let q: Vec<u16> = bytemuck::pod_collect_to_vec(&raw);
-                        SquareRoot::new(delta, manifest.scale).decode_run(&q, &mut h);
-                    }
-                    Profile::PlainF32 => h = bytemuck::pod_collect_to_vec(&raw),
-                }
-            }
-            Ok((tile, h))
-        };
-        let mut window = vec![0f32; rows.len() * columns.len() * bins];
-        // A few tiles at a time, so that decoded tiles do not pile up beside the window.
-        let batch = rayon::current_num_threads().max(1) * 2;
-        let mut rest = chunks.into_iter();
-        loop {
-            let some: Vec<_> = rest.by_ref().take(batch).collect();
-            if some.is_empty() {
-                break;
-            }
-            let decoded = some
-                .into_par_iter()
-                .map(decode)
-                .collect::<Result<Vec<_>, DatasetError>>()?;
-            for (tile, h) in decoded {
-                for run in tiles.runs(tile).filter(|run| rows.contains(&run.row)) {
-                    let from = run.column.max(columns.start);
-                    let to = (run.column + run.columns).min(columns.end);
-                    let len = (to - from) * bins;
-                    let source = run.tile + (from - run.column) * bins;
-                    let target =
-                        ((run.row - rows.start) * columns.len() + from - columns.start) * bins;
-                    window[target..target + len].copy_from_slice(&h[source..source + len]);
-                }
-            }
+        let row_len = columns.len() * bins;
+        let mut window = vec![0f32; rows.len() * row_len];
+        let mut bands = Vec::new();
+        let mut rest = &mut window[..];
+        let mut top = rows.start;
+        for chunks in chunks.chunk_by(|a, b| tiles.row_of(a.0) == tiles.row_of(b.0)) {
+            let band = tiles.rows_of(chunks[0].0);
+            let height = band.end.min(rows.end) - top;
+            let (target, below) = std::mem::take(&mut rest).split_at_mut(height * row_len);
+            bands.push((chunks, top..top + height, target));
+            rest = below;
+            top += height;
         }
+        let saturated = bands
+            .into_par_iter()
+            .map(|(chunks, rows, target)| {
+                let window = Window {
+                    rows,
+                    columns: columns.clone(),
+                    target,
+                };
+                self.decode_band(manifest.scale, tiles, chunks, window)
+            })
+            .collect::<Result<Vec<bool>, DatasetError>>()?;
         for (index, value) in &manifest.overflow {
             let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
-            let (row, column) = (
-                pixel / self.spec.width as usize,
-                pixel % self.spec.width as usize,
-            );
+            let width = self.spec.width as usize;
+            let (row, column) = (pixel / width, pixel % width);
             if rows.contains(&row) && columns.contains(&column) {
                 let at = (row - rows.start) * columns.len() + column - columns.start;
                 window[at * bins + bin] = *value;
             }
         }
-        if window.iter().any(|h| h.is_infinite()) {
+        if saturated.contains(&true) && window.iter().any(|h| h.is_infinite()) {
             return Err(DatasetError::Damaged {
-                object: self.path(&Manifest::key(manifest.scene)).to_string(),
+                object: self.shown(&self.path(&Manifest::key(manifest.scene))),
                 what: "a saturated bin has no exact value in the overflow list".into(),
             });
         }
         Ok(window)
+    }
+
+    /// Decodes a row of tiles into its part of a window; says whether a bin is saturated.
+    fn decode_band(
+        &self,
+        scale: f32,
+        tiles: &Tiles,
+        chunks: &[(usize, Option<Bytes>)],
+        window: Window<'_>,
+    ) -> Result<bool, DatasetError> {
+        let bins = self.spec.gate.bins as usize;
+        let codec = &self.array(Quantity::Transient).codec;
+        let mut saturated = false;
+        for (tile, bytes) in chunks {
+            // Without bytes the tile is all fill value, which the window holds already.
+            let Some(bytes) = bytes else { continue };
+            let raw = codec.decode(bytes)?;
+            for run in tiles
+                .runs(*tile)
+                .filter(|run| window.rows.contains(&run.row))
+            {
+                let from = run.column.max(window.columns.start);
+                let to = (run.column + run.columns).min(window.columns.end);
+                let len = (to - from) * bins;
+                let source = run.tile + (from - run.column) * bins;
+                let pixel = (run.row - window.rows.start) * window.columns.len() + from
+                    - window.columns.start;
+                let target = &mut window.target[pixel * bins..][..len];
+                match self.spec.profile {
+                    Profile::SqrtU16 { delta } => {
+                        let q = values::<u16>(&raw[source * 2..][..len * 2]);
+                        saturated |= SquareRoot::new(delta, scale).decode_run(&q, target);
+                    }
+                    Profile::PlainF32 => {
+                        target.copy_from_slice(&values::<f32>(&raw[source * 4..][..len * 4]));
+                    }
+                }
+            }
+        }
+        Ok(saturated)
     }
 
     /// The stored values of a quantity other than the transient, in the shape [`Quantity`] states.
@@ -296,7 +320,7 @@ impl Dataset {
             // Tells a scene that is not there from one that lost an object.
             self.manifest(scene).await?;
             return Err(DatasetError::Damaged {
-                object: path.to_string(),
+                object: self.shown(&path),
                 what: "the object is missing".into(),
             });
         };
@@ -348,5 +372,20 @@ impl Dataset {
             cx: v[2],
             cy: v[3],
         })
+    }
+}
+
+/// A part of the image being decoded into.
+struct Window<'a> {
+    rows: Range<usize>,
+    columns: Range<usize>,
+    target: &'a mut [f32],
+}
+
+/// Bytes as values, copied only where they are not aligned.
+fn values<T: bytemuck::Pod>(bytes: &[u8]) -> Cow<'_, [T]> {
+    match bytemuck::try_cast_slice(bytes) {
+        Ok(values) => Cow::Borrowed(values),
+        Err(_) => Cow::Owned(bytemuck::pod_collect_to_vec(bytes)),
     }
 }

@@ -88,15 +88,18 @@ impl SquareRoot {
         }
     }
 
-    /// Decodes `q` into `h`; saturated codes become +∞ until the overflow list is applied.
-    pub(crate) fn decode_run(self, q: &[u16], h: &mut [f32]) {
+    /// Decodes `q` into `h`; saturated codes become +∞ until the overflow list is applied. Says whether there are any.
+    pub(crate) fn decode_run(self, q: &[u16], h: &mut [f32]) -> bool {
+        let mut top = 0;
         for (q, h) in q.iter().zip(h) {
+            top = top.max(*q);
             *h = if *q == SATURATED {
                 f32::INFINITY
             } else {
                 self.decode(*q)
             };
         }
+        top == SATURATED
     }
 }
 

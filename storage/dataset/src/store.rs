@@ -84,7 +84,13 @@ pub async fn probe(store: &dyn ObjectStore, prefix: &Path) -> Result<(), Dataset
         match store.delete(path).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
             // The probe's own finding comes first.
-            Err(e) if result.is_ok() => return Err(DatasetError::store("delete", path, e)),
+            Err(e) if result.is_ok() => {
+                return Err(DatasetError::store(
+                    "delete",
+                    objects::shown(store, path),
+                    e,
+                ));
+            }
             Err(_) => {}
         }
     }
@@ -98,7 +104,7 @@ async fn probe_at(
     race: &Path,
 ) -> Result<(), DatasetError> {
     let broken = |what: String| DatasetError::UnsafeStore {
-        prefix: prefix.to_string(),
+        prefix: objects::shown(store, prefix),
         what,
     };
     if !objects::create(store, sequential, Bytes::from_static(b"first")).await? {

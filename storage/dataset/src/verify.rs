@@ -172,7 +172,7 @@ impl Dataset {
             }
         }
         for key in listed.into_keys() {
-            let object = self.path(&key).to_string();
+            let object = self.shown(&self.path(&key));
             match self.object_scene(&key) {
                 Some(_) => report.unpublished.push(object),
                 None => report.problems.push(Problem {
@@ -232,7 +232,7 @@ impl Dataset {
             })
             .try_collect()
             .await
-            .map_err(|e| DatasetError::store("list", &self.prefix, e))
+            .map_err(|e| DatasetError::store("list", self.shown(&self.prefix), e))
     }
 
     async fn verify_metadata(
@@ -253,7 +253,7 @@ impl Dataset {
             };
             listed.remove(&key);
             report.problems.extend(fault.map(|fault| Problem {
-                object: path.to_string(),
+                object: self.shown(&path),
                 scene: None,
                 fault,
             }));
@@ -278,12 +278,12 @@ impl Dataset {
             fault,
         };
         let bytes = objects::require(&*self.store, &path).await?;
-        let manifest = match self.usable_manifest(&bytes, scene, path.as_ref()) {
+        let manifest = match self.usable_manifest(&bytes, scene, &self.shown(&path)) {
             Ok(manifest) => manifest,
             Err(why) => {
                 checked
                     .problems
-                    .push(problem(path.to_string(), Fault::BadManifest(why)));
+                    .push(problem(self.shown(&path), Fault::BadManifest(why)));
                 return Ok(checked);
             }
         };
@@ -308,7 +308,7 @@ impl Dataset {
                     }
                 }
             };
-            let fault = fault.map(|fault| problem(path.to_string(), fault));
+            let fault = fault.map(|fault| problem(self.shown(&path), fault));
             checked.problems.extend(fault);
         }
         Ok(checked)

@@ -77,7 +77,7 @@ pub async fn run_with(
     info!(worker = %hello.id, name = hello.name, threads = config.threads,
         coordinator = config.coordinator, "worker starts");
     let mut agent = Agent {
-        desk: Desk::new(config.slots),
+        desk: Desk::new(),
         runner: Runner::start(executor, config.threads)?,
         control: None,
         endpoint,
@@ -91,7 +91,7 @@ pub async fn run_with(
         coordinator: config.coordinator,
     };
     let outcome = agent.live(shutdown).await;
-    agent.summary.unacknowledged = agent.desk.unacknowledged() as u64;
+    agent.summary.unacknowledged = agent.desk.unacknowledged_outputs() as u64;
     outcome.map(|()| {
         info!(summary = ?agent.summary, "worker ends");
         agent.summary
@@ -324,7 +324,7 @@ impl Agent {
             } => {
                 let known = self.desk.acknowledged(lease, index).is_some();
                 if known && !accepted {
-                    info!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
+                    warn!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
                         "report not accepted; nothing to do, any output stands");
                 }
             }
@@ -336,7 +336,7 @@ impl Agent {
             }
             Incoming::Revoke { lease, reason } => {
                 info!(range = %lease.range, epoch = %lease.epoch, reason, "lease revoked");
-                if self.desk.revoked(lease)
+                if self.desk.revoked(now, lease)
                     && let Some(control) = &self.control
                 {
                     control.stop();

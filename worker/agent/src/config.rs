@@ -17,8 +17,6 @@ pub struct AgentConfig {
     pub threads: usize,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,
-    /// Leases held at once, at least 1. With 2 the next lease waits here while one is worked off.
-    pub slots: u32,
 }
 
 impl AgentConfig {
@@ -32,9 +30,6 @@ impl AgentConfig {
         };
         if self.threads == 0 {
             return fail("threads", "is 0; give the worker at least 1 thread");
-        }
-        if self.slots == 0 {
-            return fail("slots", "is 0; the worker must hold at least 1 lease");
         }
         if self.name.trim().is_empty() {
             return fail("name", "is empty; give the worker a name");
@@ -54,7 +49,7 @@ pub struct Summary {
     pub failed: u64,
     /// Times the session was lost and opened again.
     pub reconnects: u64,
-    /// Reports that no coordinator acknowledged before the end. Their outputs are in the store, so
+    /// Finished tasks that no coordinator acknowledged before the end. Their outputs are in the store, so
     /// whoever gets those tasks next adopts them.
     pub unacknowledged: u64,
 }
@@ -71,9 +66,7 @@ pub enum AgentError {
         what: String,
     },
     /// The coordinator will not have this worker, and asking again would not help.
-    #[error(
-        "the coordinator at {coordinator} refused this worker: {reason}; run the same picofarm version on both sides"
-    )]
+    #[error("the coordinator at {coordinator} refused this worker: {reason}")]
     Refused {
         /// Its URL.
         coordinator: String,

@@ -242,6 +242,60 @@ async fn shutdown_lets_a_task_finish_that_is_nearly_done() {
 }
 
 #[tokio::test]
+async fn a_lease_revoked_after_it_ran_out_is_lost_but_its_running_task_is_still_handed_in() {
+    let mut farm = FakeFarm::start().await;
+    let gate = Gate::new();
+    let held = gate.clone();
+    let mut worker = Worker::start(farm.address, move |task, control| {
+        held.pass(control)?;
+        Ok(output(task))
+    });
+    let (c, _) = farm.welcome(60_000).await;
+    let mut short = lease(1, 0, 3);
+    short.ttl_ms = 100;
+    c.grant(short.clone()).await;
+    assert_eq!(worker.starts().await, 0);
+    drop(c);
+    let (mut c, hello) = farm.welcome(60_000).await;
+    assert_eq!(hello.held, [short.lease.into()]);
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    c.say(Answer::Revoke(wire::Revoke {
+        lease: Some(short.lease.into()),
+        reason: "the lease ran out".into(),
+    }))
+    .await;
+    c.listen_until("a heartbeat without it", |c| {
+        c.beats > 0 && c.held.is_empty()
+    })
+    .await;
+    gate.open();
+    take_done(&mut c, [0]).await;
+    assert!(
+        worker.started.try_recv().is_err(),
+        "lost: task 1 must not start"
+    );
+    worker.shutdown.cancel();
+    assert_eq!(worker.end().await.unwrap().computed, 1);
+}
+
+#[tokio::test]
+async fn a_worker_whose_id_another_process_took_over_ends_instead_of_fighting_for_it() {
+    let mut farm = FakeFarm::start().await;
+    let worker = Worker::start(farm.address, |task, _| Ok(output(task)));
+    let (c, _) = farm.welcome(60_000).await;
+    c.refuse(Status::aborted(
+        "a newer session of this worker id took over",
+    ))
+    .await;
+    match worker.end().await {
+        Err(AgentError::Refused { reason, .. }) => {
+            assert!(reason.contains("took over"), "{reason}")
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
 async fn a_refused_worker_ends_with_the_coordinators_words() {
     let mut farm = FakeFarm::start().await;
     let worker = Worker::start(farm.address, |task, _| Ok(output(task)));
@@ -378,6 +432,40 @@ async fn a_lease_that_the_renewal_leaves_out_is_lost_but_its_running_task_is_sti
         worker.started.try_recv().is_err(),
         "lost: task 1 must not start"
     );
+    worker.shutdown.cancel();
+    worker.end().await.unwrap();
+}
+
+#[tokio::test]
+async fn the_next_lease_is_asked_for_ahead_of_short_tasks_but_not_of_long_ones() {
+    let mut farm = FakeFarm::start().await;
+    let (gate, second) = (Gate::new(), Gate::new());
+    let gates = [(1, gate.clone()), (8, second.clone())];
+    let mut worker = Worker::start(farm.address, move |task, control| {
+        for (index, gate) in &gates {
+            if task.index == *index {
+                gate.pass(control)?;
+            }
+        }
+        Ok(output(task))
+    });
+    let (mut c, _) = farm.welcome(60_000).await;
+    c.listen_until("credit", |c| c.credit == 1).await;
+    c.grant(lease(1, 1, 3)).await;
+    assert_eq!(worker.starts().await, 1);
+    let beats = c.beats;
+    c.listen_until("some heartbeats", |c| c.beats > beats + 3)
+        .await;
+    assert_eq!(c.credit, 1, "nobody knows yet how long task 1 takes");
+    gate.open();
+    take_done(&mut c, [1, 2]).await;
+    c.listen_until("the next credit", |c| c.credit == 2).await;
+    c.grant(lease(2, 5, 9)).await;
+    take_done(&mut c, [5, 6, 7]).await;
+    c.listen_until("credit while task 8 runs", |c| c.credit == 3)
+        .await;
+    second.open();
+    take_done(&mut c, [8]).await;
     worker.shutdown.cancel();
     worker.end().await.unwrap();
 }

@@ -57,7 +57,7 @@ impl LaserGrid {
         self.0
     }
 
-    /// Film positions in [0,1]² (x right, y down), row by row. 4 and 25 are subsets of the 10×10 grid
+    /// Film positions in `[0, 1]²` (x right, y down), row by row. 4 and 25 are subsets of the 10×10 grid
     /// of cell centres: 25 = rows 0,2,4,6,8 × columns 1,3,5,7,9; 4 = indices 22, 27, 72, 77. 16 is a
     /// 4×4 grid of its own; 1 is the centre.
     pub fn film(self) -> Vec<[f32; 2]> {

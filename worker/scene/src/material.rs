@@ -92,7 +92,7 @@ impl Material {
             Bsdf::RoughConductor {
                 alpha, reflectance, ..
             } => {
-                if !(alpha >= 1e-3 && alpha <= 1.0) {
+                if !(1e-3..=1.0).contains(&alpha) {
                     return Err(format!("alpha = {alpha} lies outside [0.001, 1]"));
                 }
                 unit("reflectance", reflectance)?;

@@ -26,6 +26,7 @@ const CAMERAS: u32 = 24;
 
 /// What a primitive room is made for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct PrimitiveSettings {
     /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
     pub spots: u32,
@@ -154,12 +155,13 @@ fn attempt_room(
         put(mesh, label, Affine::IDENTITY);
     }
     let mut taken: Vec<Footprint> = Vec::new();
-    let mut kinds: Vec<(&str, fn(&mut Rng) -> Mesh)> = vec![("cube", cube), ("cylinder", cylinder)];
-    if settings.mirror {
-        kinds.push(("mirror", mirror));
-    }
-    for (label, make) in kinds {
-        let mesh = make(rng);
+    for label in ["cube", "cylinder", "mirror"] {
+        let mesh = match label {
+            "cube" => cube(rng),
+            "cylinder" => cylinder(rng),
+            _ if settings.mirror => mirror(rng),
+            _ => continue,
+        };
         let (lo, hi) = mesh.bounds()?;
         let half = [(hi.x - lo.x) * 0.5, (hi.z - lo.z) * 0.5];
         let spot = (0..64).find_map(|_| {

@@ -160,7 +160,7 @@ impl Shape {
 
 #[cfg(test)]
 mod tests {
-    use super::Shape;
+    use super::{Shape, TAU};
     use crate::{Material, Mesh, Vec3};
 
     /// Volume by the divergence theorem: positive only if the facets look outwards.
@@ -184,7 +184,7 @@ mod tests {
         let cuboid = solid(|s, m| s.cuboid([1.0, 2.0, 3.0], [2.0, 4.0, 6.0], m));
         assert!((volume(&cuboid) - 6.0).abs() < 1e-3);
         let cylinder = solid(|s, m| s.cylinder([0.3, 0.1], [0.0, 2.0], [1.0, 1.0], 64, m));
-        assert!((volume(&cylinder) - 6.283).abs() < 0.02);
+        assert!((volume(&cylinder) - TAU).abs() < 0.02);
         let ball = solid(|s, m| s.ellipsoid(Vec3::new(0.0, 1.0, 0.0), [1.0, 1.0], 32, m));
         assert!((volume(&ball) - 4.19).abs() < 0.05);
     }

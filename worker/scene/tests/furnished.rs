@@ -20,33 +20,43 @@ fn settings(assets: &str) -> FurnishedSettings {
     }
 }
 
-/// All triangles in world space with their object, for rays without any acceleration structure.
-struct Soup(Vec<([Vec3; 3], usize)>);
+/// World-space triangles of every object with the sphere round it, for rays without any tree.
+struct Soup(Vec<(Vec<[Vec3; 3]>, Vec3, f32)>);
 
 impl Soup {
     fn new(scene: &Scene) -> Self {
-        let mut soup = Vec::new();
-        for (k, o) in scene.objects.iter().enumerate() {
+        let objects = scene.objects.iter().map(|o| {
             let world = |v: u32| o.to_world.point(o.mesh.positions[v as usize]);
-            soup.extend(o.mesh.triangles.iter().map(|t| (t.map(world), k)));
-        }
-        Self(soup)
+            let triangles: Vec<_> = o.mesh.triangles.iter().map(|t| t.map(world)).collect();
+            let (lo, hi) = o.mesh.bounds().expect("objects have vertices");
+            let centre = o.to_world.point((lo + hi) * 0.5);
+            let far = triangles.iter().flatten().map(|p| (*p - centre).length());
+            let radius = far.fold(0.0, f32::max) + 1e-3;
+            (triangles, centre, radius)
+        });
+        Self(objects.collect())
     }
 
     /// (t, object) of the closest hit, by Möller and Trumbore with a little slack at the edges.
     fn closest(&self, origin: Vec3, direction: Vec3) -> Option<(f32, usize)> {
         let mut best: Option<(f32, usize)> = None;
-        for &([a, b, c], object) in &self.0 {
-            let (e1, e2) = (b - a, c - a);
-            let p = direction.cross(e2);
-            let inverse = 1.0 / e1.dot(p);
-            let s = origin - a;
-            let u = s.dot(p) * inverse;
-            let q = s.cross(e1);
-            let (v, t) = (direction.dot(q) * inverse, e2.dot(q) * inverse);
-            let inside = u >= -1e-5 && v >= -1e-5 && u + v <= 1.0 + 1e-5;
-            if inside && t > 0.0 && best.is_none_or(|(nearest, _)| t < nearest) {
-                best = Some((t, object));
+        for (object, (triangles, centre, radius)) in self.0.iter().enumerate() {
+            let beside = direction.cross(*centre - origin).length() / direction.length();
+            if beside > *radius {
+                continue;
+            }
+            for &[a, b, c] in triangles {
+                let (e1, e2) = (b - a, c - a);
+                let p = direction.cross(e2);
+                let inverse = 1.0 / e1.dot(p);
+                let s = origin - a;
+                let u = s.dot(p) * inverse;
+                let q = s.cross(e1);
+                let (v, t) = (direction.dot(q) * inverse, e2.dot(q) * inverse);
+                let inside = u >= -1e-5 && v >= -1e-5 && u + v <= 1.0 + 1e-5;
+                if inside && t > 0.0 && best.is_none_or(|(nearest, _)| t < nearest) {
+                    best = Some((t, object));
+                }
             }
         }
         best

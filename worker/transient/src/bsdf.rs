@@ -116,7 +116,7 @@ impl Surface {
         let a2 = self.alpha * self.alpha;
         let x = s2 / (c2 * a2);
         // e^-80 is beneath everything that f32 can add to anything.
-        if !(c > 0.0) || x > 80.0 {
+        if c <= 0.0 || x > 80.0 {
             return 0.0;
         }
         let cos2 = c2 / (c2 + s2);

@@ -160,7 +160,7 @@ impl Mirrors {
                 total += w;
             }
         }
-        if !(total > 0.0) {
+        if total <= 0.0 {
             return (0.0, None);
         }
         let Some((k, w)) = pick(weights, total * rng.uniform()) else {

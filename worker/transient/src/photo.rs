@@ -12,13 +12,15 @@ use crate::{
 };
 
 /// Sub-pixel samples a side.
-const SIDE: u32 = 2;
+const SIDE: u32 = 3;
 /// Mirrors followed.
 const REFLECTIONS: u32 = 2;
 
-/// A disc of light beneath the ceiling.
+/// A disc of light beneath the ceiling and parallel to it, so that no part of it sticks out above.
 struct Lamp {
     centre: Vec3,
+    /// Unit vectors that span the disc's plane.
+    plane: (Vec3, Vec3),
     radius: f32,
     /// Distance at which a surface facing the lamp gets full light.
     reach: f32,
@@ -42,7 +44,8 @@ pub(crate) fn photo(world: &World, seed: u64) -> (Vec<f32>, u64) {
                     let (a, b) = ((s % SIDE) as f32 + 0.5, (s / SIDE) as f32 + 0.5);
                     let (x, y) = (col as f32 + a / SIDE as f32, row as f32 + b / SIDE as f32);
                     let d = world.camera.ray(x, y).normalized();
-                    let c = shade(world, &lamp, &mut stack, &mut rng, d);
+                    let light = lamp.point(&mut rng, s);
+                    let c = shade(world, &lamp, light, &mut stack, d);
                     for k in 0..3 {
                         sum[k] += c[k];
                     }
@@ -65,18 +68,31 @@ fn lamp(world: &World) -> Lamp {
         .closest(&mut stack, Vec3::ZERO, world.camera.forward)
         .map_or(2.0, |h| h.p.length());
     let under = world.camera.forward * (0.4 * ahead);
-    let above = world
+    let (above, normal) = world
         .closest(&mut stack, under, up)
-        .map_or(ahead, |h| (h.p - under).length());
-    let rise = (0.85 * above).min(ahead);
+        .map_or((ahead, -up), |h| ((h.p - under).length(), h.n));
+    let rise = (0.75 * above).min(ahead);
     Lamp {
         centre: under + up * rise,
+        plane: frame(normal),
         radius: 0.08 * ahead,
         reach: 0.45 * ahead + rise,
     }
 }
 
-fn shade(world: &World, lamp: &Lamp, stack: &mut Stack, rng: &mut Rng, d: Vec3) -> [f32; 3] {
+impl Lamp {
+    /// A point of the disc for sub-pixel sample `s`: stratified in angle and radius over the samples of a pixel.
+    fn point(&self, rng: &mut Rng, s: u32) -> Vec3 {
+        let strata = (SIDE * SIDE) as f32;
+        // Golden-angle spiral, turned and shifted at random for each pixel's sample.
+        let turn = (s as f32 * 0.618_034 + rng.uniform() / strata) * std::f32::consts::TAU;
+        let r = self.radius * ((s as f32 + rng.uniform()) / strata).sqrt();
+        let (t, b) = self.plane;
+        self.centre + t * (r * libm::cosf(turn)) + b * (r * libm::sinf(turn))
+    }
+}
+
+fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) -> [f32; 3] {
     let (mut from, mut d, mut tint) = (Vec3::ZERO, d, [1.0f32; 3]);
     for reflection in 0..=REFLECTIONS {
         let Some(h) = world.closest(stack, from, d) else {
@@ -91,10 +107,6 @@ fn shade(world: &World, lamp: &Lamp, stack: &mut Stack, rng: &mut Rng, d: Vec3) 
             from = lift(h.p, h.n);
             continue;
         }
-        let axis = (lamp.centre - h.p).normalized();
-        let (t, b) = frame(axis);
-        let (x, y, _) = rng.disc();
-        let light = lamp.centre + t * (x * lamp.radius) + b * (y * lamp.radius);
         let to = light - h.p;
         let cos = h.n.dot(to) / to.length();
         let direct = if cos > 0.0 && world.free(stack, h.p, h.n, light, Vec3::ZERO) {

@@ -140,4 +140,4 @@ pub(crate) fn share(emitters: &Emitters, pdf: f32) -> f32 {
 }
 
 /// Light vertices count as this many samples against one BSDF sample.
-pub(crate) const LIGHT_WEIGHT: f32 = 4.0;
+pub(crate) const LIGHT_WEIGHT: f32 = 8.0;

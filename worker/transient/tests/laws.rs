@@ -83,7 +83,7 @@ fn two_bounces_on_a_lambertian_plane_match_the_integral() {
         assert!((a / b - 1.0).abs() < 2e-3, "pixel {k}: {a} {b}");
     }
     assert!((error / norm).sqrt() < 0.05, "{}", (error / norm).sqrt());
-    assert_eq!(energy(&got.multi) > 0.0, true);
+    assert!(energy(&got.multi) > 0.0);
 }
 
 /// In a sphere of radius R and albedo ρ one point of light spreads evenly at once (cos cos / d² is the

@@ -30,15 +30,15 @@ fn check(name: &str, paths: u32) {
 
 #[test]
 fn room_diffuse_with_one_spot_agrees_with_the_reference() {
-    check("room-diffuse-1", 256);
+    check("room-diffuse-1", 1024);
 }
 
 #[test]
 fn room_diffuse_agrees_with_the_reference() {
-    check("room-diffuse", 256);
+    check("room-diffuse", 512);
 }
 
 #[test]
 fn room_mirror_agrees_with_the_reference() {
-    check("room-mirror", 256);
+    check("room-mirror", 512);
 }

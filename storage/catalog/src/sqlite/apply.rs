@@ -66,18 +66,18 @@ pub(super) async fn transaction(
     changes: &Changes,
 ) -> Result<(), ApplyError> {
     let mut tx = connection.begin_with("BEGIN IMMEDIATE").await?;
-    let result = write(&mut tx, keys, changes).await;
-    match result {
-        Ok(()) => Ok(tx.commit().await?),
-        Err(error) => {
-            // Keys found in a transaction that is undone may not exist.
-            for job in &changes.jobs {
-                keys.0.remove(&job.id);
-            }
-            tx.rollback().await?;
-            Err(error)
+    let result = match write(&mut tx, keys, changes).await {
+        Ok(()) => tx.commit().await.map_err(ApplyError::Sql),
+        // Dropping the transaction undoes it.
+        Err(error) => Err(error),
+    };
+    if result.is_err() {
+        // Keys found in a transaction that is undone may not exist.
+        for job in &changes.jobs {
+            keys.0.remove(&job.id);
         }
     }
+    result
 }
 
 async fn write(

@@ -11,6 +11,8 @@ const FULL: i32 = 13;
 const CANTOPEN: i32 = 14;
 const CONSTRAINT: i32 = 19;
 const NOTADB: i32 = 26;
+/// The log's index could not grow; seen on a full disk where SQLITE_FULL might be expected.
+const IOERR_SHMSIZE: i32 = 4874;
 
 /// The error a person can act on.
 pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
@@ -19,6 +21,9 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
         .as_database_error()
         .and_then(|e| e.code())
         .and_then(|code| code.parse::<i32>().ok());
+    if code == Some(IOERR_SHMSIZE) {
+        return CatalogError::Full { path };
+    }
     // The low byte is the primary code.
     match code.map(|code| code & 0xff) {
         Some(FULL) => CatalogError::Full { path },

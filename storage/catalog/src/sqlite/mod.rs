@@ -48,11 +48,8 @@ impl SqliteCatalog {
     /// wrote it, others when the file cannot be used.
     pub async fn open(path: &Path, holder: &str) -> Result<Self, CatalogError> {
         if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder).map_err(|source| CatalogError::File {
-                path: path.to_owned(),
-                what: "creating its folder",
-                source,
-            })?;
+            std::fs::create_dir_all(folder)
+                .map_err(|e| CatalogError::file(path, "creating its folder", e))?;
         }
         let lock = CatalogLock::take(path, holder)?;
         let options = SqliteConnectOptions::new()

@@ -195,10 +195,12 @@ fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera) -> Spot {
     }
 }
 
-/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine.
+/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine, and
+/// not the scene's name, which may be that of a file, while the task's key holds only the file's content.
 fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
     json!({
-        "scene": {"name": scene.name, "provenance": scene.provenance, "labels": scene.labels},
+        "scene": scene.provenance,
+        "labels": scene.labels,
         "strategies": rendered.plan.strategies,
         "approximations": rendered.plan.approximations,
         "overflow": rendered.overflow,

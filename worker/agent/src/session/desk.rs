@@ -19,6 +19,10 @@ use super::{
 };
 use crate::execute::{Output, Task, TaskError};
 
+/// A further lease is asked for when the work at hand will last no longer than this, so that short tasks do not
+/// wait for the coordinator and long ones are not hoarded.
+const AHEAD: Duration = Duration::from_secs(2);
+
 /// A lease and what is left of it.
 #[derive(Debug)]
 struct Held {
@@ -38,6 +42,11 @@ impl Held {
     /// From here on no task of it may be started: two thirds of its life are over.
     fn fence(&self) -> Instant {
         self.renewed_at + self.ttl * 2 / 3
+    }
+
+    /// When it ends unless it is renewed.
+    fn end(&self) -> Instant {
+        self.renewed_at + self.ttl
     }
 
     /// Moves `next` to a task that is to be run, or to `hi`.
@@ -69,29 +78,30 @@ struct Beat {
 /// The worker's desk.
 #[derive(Debug)]
 pub(crate) struct Desk {
-    slots: u32,
     leases: Vec<Held>,
     in_hand: Option<InHand>,
     outbox: Outbox,
     /// Heartbeats of this connection without an answer, oldest first. Each answer belongs to the oldest.
     beats: VecDeque<Beat>,
-    /// Leases asked for on this connection and not received yet.
-    asked: u32,
+    /// A lease has been asked for on this connection and not received yet.
+    asked: bool,
+    /// How long the last finished task took.
+    pace: Option<Duration>,
     /// No new work before this time.
     paused_until: Option<Instant>,
     draining: bool,
 }
 
 impl Desk {
-    /// An empty desk for up to `slots` leases.
-    pub(crate) fn new(slots: u32) -> Self {
+    /// An empty desk.
+    pub(crate) fn new() -> Self {
         Self {
-            slots,
             leases: Vec::new(),
             in_hand: None,
             outbox: Outbox::default(),
             beats: VecDeque::new(),
-            asked: 0,
+            asked: false,
+            pace: None,
             paused_until: None,
             draining: false,
         }
@@ -112,11 +122,16 @@ impl Desk {
         self.outbox.len()
     }
 
+    /// Finished tasks without an acknowledgement.
+    pub(crate) fn unacknowledged_outputs(&self) -> usize {
+        self.outbox.finished()
+    }
+
     /// The connection is gone: what it was asked and told must be said again.
     pub(crate) fn disconnected(&mut self) {
         self.outbox.rewind();
         self.beats.clear();
-        self.asked = 0;
+        self.asked = false;
     }
 
     /// When the oldest unanswered heartbeat was sent.
@@ -126,7 +141,7 @@ impl Desk {
 
     /// A lease arrives. `false` if it is held already.
     pub(crate) fn granted(&mut self, now: Instant, lease: Lease) -> bool {
-        self.asked = self.asked.saturating_sub(1);
+        self.asked = false;
         if self.leases.iter().any(|h| h.lease == lease.lease) {
             return false;
         }
@@ -153,7 +168,7 @@ impl Desk {
 
     /// A lease arrived that cannot be used: it goes back.
     pub(crate) fn unusable(&mut self, lease: Option<LeaseRef>, why: &str) {
-        self.asked = self.asked.saturating_sub(1);
+        self.asked = false;
         if let Some(lease) = lease {
             self.outbox.push(Report::Release {
                 lease,
@@ -184,10 +199,15 @@ impl Desk {
         lost
     }
 
-    /// A lease is not wanted any more. `true` if the task in hand belongs to it and must stop.
-    pub(crate) fn revoked(&mut self, lease: LeaseRef) -> bool {
+    /// A lease is revoked. `true` if the task in hand belongs to it and must stop: only while the lease was
+    /// live, for then the work is not wanted. One that had run out is merely lost.
+    pub(crate) fn revoked(&mut self, now: Instant, lease: LeaseRef) -> bool {
+        let live = self
+            .leases
+            .iter()
+            .any(|h| h.lease == lease && now < h.end());
         self.leases.retain(|h| h.lease != lease);
-        self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
+        live && self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
     }
 
     /// An acknowledgement arrived. Returns the report it answers.
@@ -230,6 +250,9 @@ impl Desk {
             .take()
             .expect("only the task in hand can end: the runner runs one at a time");
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
+        if result.is_ok() {
+            self.pace = Some(now - hand.since);
+        }
         match result {
             Ok(output) => self.outbox.push(Report::Done(Finished {
                 lease: hand.lease,
@@ -302,7 +325,18 @@ impl Desk {
         });
     }
 
-    /// What is to be sent now: reports not yet sent on this connection, and how many more leases fit.
+    /// Whether to ask for a lease: none is on its way, and the work at hand is over or soon will be.
+    fn wants(&self) -> bool {
+        let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
+        let left = waiting + u64::from(self.in_hand.is_some());
+        let soon_over = self.pace.is_some_and(|pace| {
+            let left = u32::try_from(left).unwrap_or(u32::MAX);
+            pace.saturating_mul(left) <= AHEAD
+        });
+        !self.asked && !self.draining && (left == 0 || soon_over)
+    }
+
+    /// What is to be sent now: reports not yet sent on this connection, and the wish for a lease.
     pub(crate) fn outgoing(&mut self, now: Instant) -> Vec<Outgoing> {
         let mut messages: Vec<_> = self
             .outbox
@@ -310,17 +344,9 @@ impl Desk {
             .into_iter()
             .map(Outgoing::Report)
             .collect();
-        let busy = self.in_hand.as_ref().map(|t| t.lease);
-        let open = self
-            .leases
-            .iter()
-            .filter(|h| h.next < h.hi && Some(h.lease) != busy)
-            .count() as u32
-            + u32::from(busy.is_some());
-        let wanted = self.slots.saturating_sub(open + self.asked);
-        if wanted > 0 && !self.draining && !self.paused(now) {
-            self.asked += wanted;
-            messages.push(Outgoing::Credit(wanted));
+        if !self.paused(now) && self.wants() {
+            self.asked = true;
+            messages.push(Outgoing::Credit(1));
         }
         messages
     }

@@ -15,12 +15,15 @@
 //! and an honest rival would have written the same bytes. What fencing prevents is waste: a worker cut off
 //! from the farm working through a range that has long been given to another.
 //!
-//! A lease that a heartbeat's answer leaves out is lost: its waiting tasks are dropped and its running task
-//! goes on, since its result can still be adopted. A *revoked* lease is not wanted any more (a cancelled
-//! job), so its running task is stopped.
+//! A lease that a heartbeat's answer leaves out, or that is revoked after its time has run out here, is *lost*
+//! (a laptop that slept, a coordinator long away): its waiting tasks are dropped and its running task goes on,
+//! since its result can still be adopted. A lease revoked while its time still runs is not *wanted* any more
+//! (a cancelled job): its running task is stopped.
 
 pub(crate) mod backoff;
 pub(crate) mod desk;
+#[cfg(test)]
+mod desk_laws;
 pub(crate) mod message;
 pub(crate) mod outbox;
 
@@ -60,11 +63,15 @@ impl From<Status> for LinkError {
             message => message.to_owned(),
         };
         match status.code() {
-            Code::FailedPrecondition
+            // Aborted: another process took this worker's id. Coming back would only throw that one out.
+            Code::Aborted
+            | Code::FailedPrecondition
             | Code::InvalidArgument
             | Code::PermissionDenied
-            | Code::Unauthenticated
-            | Code::Unimplemented => LinkError::Refused(text),
+            | Code::Unauthenticated => LinkError::Refused(text),
+            Code::Unimplemented => LinkError::Refused(format!(
+                "what answers there is no picofarm coordinator ({text}); check the address"
+            )),
             _ => LinkError::Down(text),
         }
     }

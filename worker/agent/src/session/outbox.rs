@@ -75,6 +75,12 @@ impl Outbox {
     pub(crate) fn len(&self) -> usize {
         self.reports.len()
     }
+
+    /// Finished tasks among them.
+    pub(crate) fn finished(&self) -> usize {
+        let done = |r: &&Report| matches!(r, Report::Done(_));
+        self.reports.iter().filter(done).count()
+    }
 }
 
 #[cfg(test)]

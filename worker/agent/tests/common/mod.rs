@@ -64,6 +64,7 @@ impl Farm for Door {
             fractions: Vec::new(),
             released: Vec::new(),
             held: Vec::new(),
+            beats: 0,
             renew: true,
         };
         let _ = self.0.send(conversation);
@@ -145,6 +146,8 @@ pub struct Conversation {
     pub released: Vec<wire::LeaseRef>,
     /// Leases that the latest heartbeat named.
     pub held: Vec<wire::LeaseRef>,
+    /// Heartbeats heard.
+    pub beats: u32,
     /// Whether heartbeats are answered at all.
     pub renew: bool,
 }
@@ -182,6 +185,7 @@ impl Conversation {
     async fn answer(&mut self, heartbeat: wire::Heartbeat) {
         self.fractions
             .extend(heartbeat.progress.iter().map(|p| p.fraction));
+        self.beats += 1;
         self.held = heartbeat.leases.clone();
         if self.renew {
             let leases = heartbeat.leases.into_iter();
@@ -361,7 +365,7 @@ impl Worker {
     }
 }
 
-/// One thread, one lease.
+/// One thread.
 pub fn config(address: SocketAddr) -> AgentConfig {
     AgentConfig {
         coordinator: format!("http://{address}"),
@@ -369,7 +373,6 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         worker_id: None,
         threads: 1,
         asset_dirs: Vec::new(),
-        slots: 1,
     }
 }
 

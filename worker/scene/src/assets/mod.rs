@@ -2,6 +2,7 @@
 
 mod catalogue;
 mod category;
+mod devices;
 mod install;
 mod obj;
 mod parametric;
@@ -277,6 +278,12 @@ fn standing(mut mesh: Mesh) -> Mesh {
 mod tests {
     use super::*;
     use crate::LABELS;
+
+    #[test]
+    fn threads_share_a_library() {
+        fn shared<T: Send + Sync>() {}
+        shared::<AssetLibrary>();
+    }
 
     #[test]
     fn every_parametric_model_stands_on_the_floor_and_has_a_plausible_size() {

@@ -30,7 +30,7 @@ pub(super) struct Loaded {
 pub(super) fn load(archive: &Archive, item: &Item) -> Option<Loaded> {
     let loaded = parse(archive, item);
     match &loaded {
-        Err(why) => tracing::warn!(model = item.model, why, "furniture model left out"),
+        Err(why) => tracing::debug!(model = item.model, why, "furniture model left out"),
         Ok(l) => tracing::trace!(
             model = item.model,
             triangles = l.mesh.triangles.len(),

@@ -5,7 +5,7 @@
 
 use crate::{Material, Mesh, rng::Rng};
 
-use super::{small, storage, upholstery};
+use super::{devices, small, storage, upholstery};
 
 /// A builder of one variant.
 pub(super) type Build = fn(&mut Rng) -> Mesh;
@@ -38,13 +38,13 @@ pub(super) fn catalogue() -> Vec<(&'static str, u64, Build)> {
         ("plant", 8, small::plant),
         ("vase", 6, small::vase),
         ("rug", 6, small::rug),
-        ("tv", 4, small::tv),
-        ("computer", 4, small::computer),
-        ("laptop", 4, small::laptop),
-        ("keyboard", 3, small::keyboard),
-        ("phone", 2, small::phone),
-        ("speaker", 4, small::speaker),
-        ("clock", 3, small::clock),
+        ("tv", 4, devices::tv),
+        ("computer", 4, devices::computer),
+        ("laptop", 4, devices::laptop),
+        ("keyboard", 3, devices::keyboard),
+        ("phone", 2, devices::phone),
+        ("speaker", 4, devices::speaker),
+        ("clock", 3, devices::clock),
         ("book", 8, small::books),
         ("cup", 6, small::cup),
         ("bottle", 6, small::bottle),
@@ -57,7 +57,7 @@ pub(super) fn catalogue() -> Vec<(&'static str, u64, Build)> {
         ("box", 8, small::carton),
         ("bag", 4, small::bag),
         ("ball", 4, small::ball),
-        ("small_appliance", 5, small::kettle),
+        ("small_appliance", 5, devices::kettle),
         ("exercise", 3, small::dumbbell),
     ]
 }

@@ -16,6 +16,8 @@ const MIN_SEEN: usize = 5;
 const SEEN_PIXELS: u32 = 2;
 /// Coarse pixels that count as seeing a near-mirror.
 const MIRROR_PIXELS: u32 = 5;
+/// Coarse pixels that one piece of furniture may fill: no view of nothing but a wardrobe.
+const FILL_PIXELS: u32 = 200;
 /// The camera keeps this distance from every box, metres.
 const CLEARANCE: f32 = 0.12;
 
@@ -72,7 +74,12 @@ pub(super) fn choose(
             .zip(&seen)
             .filter(|(o, pixels)| **pixels >= MIRROR_PIXELS && is_specular(o))
             .count();
-        if furniture < MIN_SEEN || specular < settings.specular_at_least as usize {
+        let crowded = plan
+            .placed
+            .iter()
+            .zip(&seen)
+            .any(|(p, pixels)| p.foot.is_some() && *pixels > FILL_PIXELS);
+        if crowded || furniture < MIN_SEEN || specular < settings.specular_at_least as usize {
             continue;
         }
         let laser = grid.laser(&camera);

@@ -27,6 +27,7 @@ const ATTEMPTS: u32 = 64;
 
 /// What a furnished room is made for.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct FurnishedSettings {
     /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
     pub spots: u32,

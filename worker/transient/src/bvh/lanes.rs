@@ -75,6 +75,6 @@ impl Lanes for [f32; 8] {
     }
     #[inline(always)]
     fn differs(self, o: Self) -> u32 {
-        mask(self, o, |a, b| a < b || a > b)
+        mask(self, o, |a, b| a.partial_cmp(&b).is_some_and(|c| c.is_ne()))
     }
 }

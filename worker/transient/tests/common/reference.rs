@@ -130,10 +130,12 @@ pub fn compare(h: &[f32], se: &[f32], r: &Part) -> Report {
     let (mut errors, mut noises) = (vec![], vec![]);
     for k in 0..64 * 64 {
         let (mut e, mut n, mut s) = (0.0f64, 0.0f64, 0.0f64);
-        for i in k * bins..(k + 1) * bins {
-            e += f64::from(h[i] - r.mean[i]).powi(2);
-            n += f64::from(r.mean[i]).powi(2);
-            s += f64::from(r.se[i]).powi(2);
+        let range = k * bins..(k + 1) * bins;
+        let theirs = r.mean[range.clone()].iter().zip(&r.se[range.clone()]);
+        for (&h, (&mean, &se)) in h[range].iter().zip(theirs) {
+            e += f64::from(h - mean).powi(2);
+            n += f64::from(mean).powi(2);
+            s += f64::from(se).powi(2);
         }
         if n > 0.0 {
             errors.push((e / n).sqrt());

@@ -1,0 +1,239 @@
+//! Laws of the pure parts: no task is lost or doubled by any sequence of events, sizes stay in bounds.
+
+use picofarm_catalog::{Changes, Range, RangeState, Run};
+use picofarm_proto::{
+    ids::{Epoch, Incarnation, JobId, RangeId, WorkerId},
+    model::{FailureKind, Limits},
+};
+use proptest::prelude::*;
+use uuid::Uuid;
+
+use crate::{
+    budget::{Backoff, charge},
+    place::lease_size,
+    plan::expand,
+    stage::Stage,
+    transition::RangeEvent,
+};
+
+fn counter() -> impl FnMut() -> RangeId {
+    let mut n = 0u128;
+    move || {
+        n += 1;
+        RangeId::from_uuid(Uuid::from_u128(n))
+    }
+}
+
+fn job() -> JobId {
+    JobId::from_uuid(Uuid::nil())
+}
+
+/// What a person would write down for each task.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Task {
+    Pending,
+    Leased,
+    Done,
+    Dead,
+}
+
+fn choose(range: &Range, pick: u64) -> u64 {
+    range.lo + pick % range.len()
+}
+
+proptest! {
+    #[test]
+    fn ranges_follow_a_table_of_tasks(
+        total in 1..40u64,
+        cut in prop::collection::vec(any::<bool>(), 40),
+        ops in prop::collection::vec((0..6u8, any::<u64>(), any::<u64>(), any::<bool>()), 0..80),
+    ) {
+        let mut ids = counter();
+        let existing: Vec<Run> = (0..total)
+            .filter(|i| cut[*i as usize])
+            .map(|i| Run { lo: i, hi: i + 1 })
+            .collect();
+        let mut table: Vec<Task> = (0..total)
+            .map(|i| if cut[i as usize] { Task::Done } else { Task::Pending })
+            .collect();
+        let mut changes = Changes::default();
+        let mut stage = Stage::new(expand(job(), total, &existing, &mut ids), &mut changes);
+        for (op, a, b, flag) in ops {
+            let leased: Vec<Range> = stage.leased().map(|(r, _)| r.clone()).collect();
+            let lease = (!leased.is_empty()).then(|| leased[a as usize % leased.len()].clone());
+            let (range, event) = match (op, lease) {
+                (0, _) => {
+                    let Some(front) = stage.front(i64::MAX, flag).cloned() else { continue };
+                    let count = 1 + b % front.len();
+                    for t in front.lo..front.lo + count {
+                        table[t as usize] = Task::Leased;
+                    }
+                    let event = RangeEvent::Grant {
+                        count,
+                        worker: WorkerId::from_uuid(Uuid::nil()),
+                        incarnation: Incarnation::from_uuid(Uuid::nil()),
+                        until_ms: 1,
+                    };
+                    (front, event)
+                }
+                (1, Some(range)) => {
+                    let task = choose(&range, b);
+                    (range, RangeEvent::Finish { task, reused: flag })
+                }
+                (2, Some(range)) => {
+                    let task = choose(&range, b);
+                    let retry_at_ms = flag.then_some(b as i64 % 1_000);
+                    (range, RangeEvent::Leave { task, retry_at_ms, crashes: u32::from(flag) })
+                }
+                (3, Some(range)) => (range, RangeEvent::Close { halve: flag }),
+                (4, _) => {
+                    let task = a % total;
+                    let Some(range) = stage.pending_at(task).cloned() else {
+                        prop_assert_ne!(table[task as usize], Task::Pending);
+                        continue;
+                    };
+                    (range, RangeEvent::Settle { task })
+                }
+                (5, _) => {
+                    let dead = stage.dead();
+                    if dead.is_empty() { continue }
+                    (dead[a as usize % dead.len()].clone(), RangeEvent::Retry)
+                }
+                _ => continue,
+            };
+            let before = stage.lease(range.lease()).map(|(r, _)| r.clone());
+            match stage.apply(&range, &event, &mut ids, &mut changes) {
+                Ok(_) => match event {
+                    RangeEvent::Grant { .. } => {}
+                    RangeEvent::Finish { task, .. } | RangeEvent::Settle { task } => {
+                        table[task as usize] = Task::Done;
+                    }
+                    RangeEvent::Leave { task, retry_at_ms, .. } => {
+                        table[task as usize] = if retry_at_ms.is_some() { Task::Pending } else { Task::Dead };
+                    }
+                    RangeEvent::Close { .. } => {
+                        let RangeState::Leased(lease) = &range.state else { unreachable!() };
+                        for (i, mark) in lease.marks.iter().enumerate() {
+                            if *mark == picofarm_catalog::Mark::Todo {
+                                table[range.lo as usize + i] = Task::Pending;
+                            }
+                        }
+                    }
+                    RangeEvent::Retry => {
+                        for t in range.lo..range.hi {
+                            table[t as usize] = Task::Pending;
+                        }
+                    }
+                },
+                // A refused event changes nothing.
+                Err(_) => prop_assert_eq!(stage.lease(range.lease()).map(|(r, _)| r.clone()), before),
+            }
+            let counts = stage.counts();
+            let of = |t: Task| table.iter().filter(|x| **x == t).count() as u64;
+            prop_assert_eq!(counts.total, total);
+            prop_assert_eq!(counts.pending, of(Task::Pending));
+            prop_assert_eq!(counts.leased, of(Task::Leased));
+            prop_assert_eq!(counts.done, of(Task::Done));
+            prop_assert_eq!(counts.dead, of(Task::Dead));
+            for (i, task) in table.iter().enumerate() {
+                prop_assert_eq!(stage.pending_at(i as u64).is_some(), *task == Task::Pending);
+            }
+            // What was written is what there is.
+            prop_assert_eq!(changes.ranges.len(), stage.rows());
+        }
+    }
+
+    #[test]
+    fn epochs_never_fall(grants in prop::collection::vec(any::<bool>(), 1..20)) {
+        let mut ids = counter();
+        let mut changes = Changes::default();
+        let mut stage = Stage::new(expand(job(), 4, &[], &mut ids), &mut changes);
+        let mut last = Epoch(0);
+        for halve in grants {
+            let front = stage.front(i64::MAX, true).unwrap().clone();
+            prop_assume!(front.lo == 0);
+            let event = RangeEvent::Grant {
+                count: 1,
+                worker: WorkerId::from_uuid(Uuid::nil()),
+                incarnation: Incarnation::from_uuid(Uuid::nil()),
+                until_ms: 1,
+            };
+            let leased = stage.apply(&front, &event, &mut ids, &mut changes).unwrap().unwrap();
+            prop_assert!(leased.epoch > last);
+            last = leased.epoch;
+            stage.apply(&leased, &RangeEvent::Close { halve }, &mut ids, &mut changes).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_plan_covers_every_task_once(total in 1..200u64, mut cuts in prop::collection::vec(0..250u64, 0..12)) {
+        cuts.sort_unstable();
+        cuts.dedup();
+        let existing: Vec<Run> = cuts.chunks_exact(2).map(|c| Run { lo: c[0], hi: c[1] }).collect();
+        let ranges = expand(job(), total, &existing, &mut counter());
+        let mut at = 0;
+        for range in &ranges {
+            prop_assert_eq!(range.lo, at);
+            at = range.hi;
+            let exists = existing.iter().any(|r| r.lo <= range.lo && range.lo < r.hi);
+            prop_assert_eq!(range.state == RangeState::Done { reused: true }, exists);
+        }
+        prop_assert_eq!(at, total);
+    }
+
+    #[test]
+    fn a_lease_is_never_empty_and_leaves_work_for_others(
+        mean in prop::option::of(0.0..1e4f64), in_range in 1..100_000u64, more in 0..100_000u64, workers in 0..2_000u64,
+    ) {
+        let pending = in_range + more;
+        let n = lease_size(mean, pending, in_range, workers);
+        prop_assert!((1..=in_range).contains(&n));
+        if mean.is_none() {
+            prop_assert_eq!(n, 1);
+        }
+        prop_assert!(n <= pending.div_ceil(2 * workers.max(1)));
+    }
+
+    #[test]
+    fn budgets_are_separate_and_interruptions_free(kinds in prop::collection::vec(0..3u8, 0..30)) {
+        let limits = Limits { max_failures: 3, max_crashes: 2 };
+        let backoff = Backoff::default();
+        let fresh = || picofarm_catalog::Exception {
+            job: job(), task: 0, failures: 0, crashes: 0, dead: false, last_error: String::new(),
+        };
+        let (mut record, mut failures, mut crashes) = (None, 0, 0);
+        for kind in kinds {
+            let kind = [FailureKind::User, FailureKind::Crash, FailureKind::Interrupted][usize::from(kind)];
+            failures += u32::from(kind == FailureKind::User);
+            crashes += u32::from(kind == FailureKind::Crash);
+            let verdict = charge(record.as_ref(), fresh(), kind, "x", &limits, &backoff, 100);
+            let dead = kind != FailureKind::Interrupted && (failures >= 3 || crashes >= 2);
+            prop_assert_eq!(verdict.retry_at_ms.is_none(), dead);
+            prop_assert!(verdict.retry_at_ms.is_none_or(|at| at > 100));
+            record = verdict.exception;
+            if dead {
+                break;
+            }
+        }
+    }
+}
+
+#[test]
+fn known_task_times_give_about_a_minute_of_work() {
+    assert_eq!(lease_size(Some(9.0), 100_000, 100_000, 10), 5);
+    assert_eq!(lease_size(Some(400.0), 100_000, 100_000, 10), 1);
+    assert_eq!(lease_size(Some(0.01), 100_000, 100_000, 10), 4096);
+    assert_eq!(lease_size(Some(0.01), 40, 40, 10), 2);
+}
+
+#[test]
+fn backoff_doubles_up_to_its_limit() {
+    let backoff = Backoff {
+        first_ms: 1_000,
+        most_ms: 5_000,
+    };
+    assert_eq!(
+        [1, 2, 3, 4, 60].map(|n| backoff.after(n)),
+        [1_000, 2_000, 4_000, 5_000, 5_000]
+    );
+}

@@ -1,0 +1,350 @@
+//! A coordinator with a clock of its own, a client, and a worker that does what the test says.
+
+use std::{
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicI64, Ordering},
+    },
+    time::Duration,
+};
+
+use picofarm_coordinator::{
+    Backoff, Clock, CoordinatorConfig, CoordinatorError, Running, VERSION, serve,
+};
+use picofarm_proto::{
+    PROTOCOL,
+    ids::{Incarnation, WorkerId},
+    key::{stage_key, task_key},
+    model::{JobSpec, JobState, JobStatus, Lease, WorkerHello},
+    wire::{
+        self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
+        session_response::Message as Heard,
+    },
+};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::{Status, Streaming, transport::Channel};
+use uuid::Uuid;
+
+/// Life of a lease in these tests, in milliseconds of the test's clock.
+pub const LEASE_MS: u32 = 60_000;
+/// Nothing here takes long; a test that waits longer has failed.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+pub struct Farm {
+    _folder: tempfile::TempDir,
+    pub clock: Arc<AtomicI64>,
+    pub config: CoordinatorConfig,
+    stop: CancellationToken,
+    running: Option<Running>,
+    pub jobs: JobsClient<Channel>,
+}
+
+impl Farm {
+    pub async fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let clock = Arc::new(AtomicI64::new(1_000_000));
+        let told = Arc::clone(&clock);
+        let config = CoordinatorConfig {
+            lease_ms: LEASE_MS,
+            tick: Duration::from_millis(10),
+            backoff: Backoff {
+                first_ms: 1_000,
+                most_ms: 8_000,
+            },
+            clock: Clock::new(move || told.load(Ordering::SeqCst)),
+            ..CoordinatorConfig::new(
+                folder.path().join("state/catalog.db"),
+                "127.0.0.1:0".parse().unwrap(),
+            )
+        };
+        let (running, stop, jobs) = run(&config).await.unwrap();
+        Self {
+            _folder: folder,
+            clock,
+            config,
+            stop,
+            running: Some(running),
+            jobs,
+        }
+    }
+
+    pub fn address(&self) -> std::net::SocketAddr {
+        self.running.as_ref().unwrap().address
+    }
+
+    pub async fn stop(&mut self) {
+        self.stop.cancel();
+        if let Some(running) = self.running.take() {
+            tokio::time::timeout(PATIENCE, running.wait())
+                .await
+                .expect("stops in time")
+                .unwrap();
+        }
+    }
+
+    /// Stops the coordinator and starts another on the same catalog.
+    pub async fn restart(&mut self) {
+        self.stop().await;
+        let (running, stop, jobs) = run(&self.config).await.unwrap();
+        self.running = Some(running);
+        self.stop = stop;
+        self.jobs = jobs;
+    }
+
+    pub fn pass(&self, ms: i64) {
+        self.clock.fetch_add(ms, Ordering::SeqCst);
+    }
+
+    pub async fn submit(&mut self, spec: &JobSpec) -> wire::SubmitJobResponse {
+        self.submit_again(spec, false).await
+    }
+
+    pub async fn submit_again(&mut self, spec: &JobSpec, again: bool) -> wire::SubmitJobResponse {
+        let request = wire::SubmitJobRequest {
+            spec: Some(spec.clone().into()),
+            again,
+        };
+        self.jobs.submit_job(request).await.unwrap().into_inner()
+    }
+
+    pub async fn status(&mut self, job: &str) -> JobStatus {
+        let request = wire::GetJobRequest { job_id: job.into() };
+        let response = self.jobs.get_job(request).await.unwrap().into_inner();
+        response.job.unwrap().try_into().unwrap()
+    }
+
+    /// Waits until the job is as wanted.
+    pub async fn until(&mut self, job: &str, what: impl Fn(&JobStatus) -> bool) -> JobStatus {
+        let start = std::time::Instant::now();
+        loop {
+            let status = self.status(job).await;
+            if what(&status) {
+                return status;
+            }
+            assert!(start.elapsed() < PATIENCE, "the job stays {status:?}");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    pub async fn until_ended(&mut self, job: &str) -> JobStatus {
+        self.until(job, |s| s.state != JobState::Active).await
+    }
+
+    pub async fn events(&mut self, job: &str, task: Option<u64>) -> Vec<wire::Event> {
+        let request = wire::ListEventsRequest {
+            job_id: job.into(),
+            after: 0,
+            limit: 0,
+            task,
+        };
+        let response = self.jobs.list_events(request).await.unwrap();
+        response.into_inner().events
+    }
+
+    pub async fn worker(&self) -> Worker {
+        self.connect(hello("ada")).await.unwrap()
+    }
+
+    pub async fn connect(&self, hello: WorkerHello) -> Result<Worker, Status> {
+        Worker::connect(self.address(), hello).await
+    }
+}
+
+async fn run(
+    config: &CoordinatorConfig,
+) -> Result<(Running, CancellationToken, JobsClient<Channel>), CoordinatorError> {
+    let stop = CancellationToken::new();
+    let running = serve(config.clone(), stop.clone()).await?;
+    let url = format!("http://{}", running.address);
+    let jobs = JobsClient::connect(url).await.unwrap();
+    Ok((running, stop, jobs))
+}
+
+/// A worker that fits [`spec`].
+pub fn hello(name: &str) -> WorkerHello {
+    WorkerHello {
+        id: WorkerId::from_uuid(Uuid::new_v4()),
+        incarnation: Incarnation::from_uuid(Uuid::new_v4()),
+        name: name.into(),
+        version: VERSION.into(),
+        protocol: PROTOCOL,
+        cores: 1,
+        held: Vec::new(),
+        renderer: "r1".into(),
+        assets: vec!["parametric-1".into()],
+    }
+}
+
+pub fn spec(count: u64) -> JobSpec {
+    let text = format!(
+        r#"{{"name": "test", "scenes": {{"kind": "primitive", "count": {count}}},
+            "render": {{"renderer": "r1"}},
+            "output": {{"store": "file:///nowhere", "dataset": "d", "profile": "sqrt-u16"}}}}"#
+    );
+    serde_json::from_str(&text).unwrap()
+}
+
+/// The manifest hash that an honest worker reports for a task.
+pub fn manifest(index: u64) -> String {
+    format!("{index:064x}")
+}
+
+pub struct Worker {
+    pub hello: WorkerHello,
+    say: mpsc::Sender<wire::SessionRequest>,
+    heard: Streaming<wire::SessionResponse>,
+}
+
+impl Worker {
+    pub async fn connect(
+        address: std::net::SocketAddr,
+        hello: WorkerHello,
+    ) -> Result<Self, Status> {
+        let url = format!("http://{address}");
+        let mut client = FarmClient::connect(url).await.unwrap();
+        let (say, said) = mpsc::channel(64);
+        let first = wire::SessionRequest {
+            message: Some(Say::Hello(hello.clone().into())),
+        };
+        say.send(first).await.unwrap();
+        let heard = client
+            .session(ReceiverStream::new(said))
+            .await?
+            .into_inner();
+        let mut worker = Self { hello, say, heard };
+        match worker.hear().await? {
+            Heard::Welcome(welcome) => assert_eq!(welcome.lease_ms, LEASE_MS),
+            other => panic!("expected welcome, heard {other:?}"),
+        }
+        Ok(worker)
+    }
+
+    pub async fn say(&self, message: Say) {
+        let request = wire::SessionRequest {
+            message: Some(message),
+        };
+        self.say.send(request).await.unwrap();
+    }
+
+    /// The next message.
+    pub async fn hear(&mut self) -> Result<Heard, Status> {
+        let message = tokio::time::timeout(PATIENCE, self.heard.message())
+            .await
+            .expect("something is heard in time")?;
+        let message = message.ok_or_else(|| Status::ok("the session ended"))?;
+        Ok(message.message.unwrap())
+    }
+
+    pub async fn credit(&self, leases: u32) {
+        self.say(Say::Credit(wire::Credit { leases })).await;
+    }
+
+    /// Asks for one lease and waits for it.
+    pub async fn lease(&mut self) -> Lease {
+        self.credit(1).await;
+        match self.hear().await.unwrap() {
+            Heard::Lease(lease) => lease.try_into().unwrap(),
+            other => panic!("expected a lease, heard {other:?}"),
+        }
+    }
+
+    pub async fn report(&mut self, lease: &Lease, index: u64, manifest: &str) -> wire::Acknowledge {
+        let done = wire::TaskDone {
+            lease: Some(lease.lease.into()),
+            index,
+            task_key: task_key(&stage_key(&lease.spec), index).to_string(),
+            manifest_sha256: manifest.into(),
+            bytes: 100,
+            seconds: 2.0,
+            adopted: false,
+        };
+        self.say(Say::Done(done)).await;
+        self.acknowledged().await
+    }
+
+    pub async fn done(&mut self, lease: &Lease, index: u64) -> wire::Acknowledge {
+        self.report(lease, index, &manifest(index)).await
+    }
+
+    pub async fn fail(&mut self, lease: &Lease, index: u64, kind: wire::FailureKind) {
+        self.say(Say::Failed(wire::TaskFailed {
+            lease: Some(lease.lease.into()),
+            index,
+            kind: kind.into(),
+            message: "no such mesh".into(),
+        }))
+        .await;
+        assert!(self.acknowledged().await.accepted);
+    }
+
+    pub async fn release(&mut self, lease: &Lease) -> wire::Acknowledge {
+        self.say(Say::Release(wire::Release {
+            lease: Some(lease.lease.into()),
+            reason: "shutdown".into(),
+        }))
+        .await;
+        self.acknowledged().await
+    }
+
+    /// Names leases and the task in hand; returns those that live on.
+    pub async fn beat(&mut self, leases: &[&Lease], in_hand: Option<u64>) -> Vec<wire::LeaseRef> {
+        self.say(Say::Heartbeat(wire::Heartbeat {
+            leases: leases.iter().map(|l| l.lease.into()).collect(),
+            progress: in_hand
+                .map(|index| wire::TaskProgress {
+                    lease: Some(leases[0].lease.into()),
+                    index,
+                    fraction: 0.5,
+                })
+                .into_iter()
+                .collect(),
+        }))
+        .await;
+        match self.hear().await.unwrap() {
+            Heard::Renewed(renewed) => renewed.leases,
+            other => panic!("expected renewed, heard {other:?}"),
+        }
+    }
+
+    pub async fn acknowledged(&mut self) -> wire::Acknowledge {
+        loop {
+            match self.hear().await.unwrap() {
+                Heard::Acknowledge(ack) => return ack,
+                Heard::Revoke(_) => {}
+                other => panic!("expected an acknowledgement, heard {other:?}"),
+            }
+        }
+    }
+
+    pub async fn revoked(&mut self) -> wire::Revoke {
+        match self.hear().await.unwrap() {
+            Heard::Revoke(revoke) => revoke,
+            other => panic!("expected a revoke, heard {other:?}"),
+        }
+    }
+
+    /// Works honestly until the job has ended.
+    pub async fn work(&mut self, farm: &mut Farm, job: &str) -> JobStatus {
+        loop {
+            let status = farm.status(job).await;
+            if status.state != JobState::Active {
+                return status;
+            }
+            if status.tasks.pending == 0 {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+                continue;
+            }
+            let lease = self.lease().await;
+            for index in lease.lo..lease.hi {
+                assert!(self.done(&lease, index).await.accepted);
+            }
+        }
+    }
+}
+
+pub fn catalog_of(farm: &Farm) -> PathBuf {
+    farm.config.catalog.clone()
+}

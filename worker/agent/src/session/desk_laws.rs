@@ -1,0 +1,225 @@
+//! Laws of the [`Desk`] under any order of grants, renewals, losses, disconnects and results.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::{Duration, Instant},
+};
+
+use picofarm_proto::{
+    ids::{Epoch, JobId, LeaseRef, RangeId},
+    model::{JobSpec, Lease, Limits, OutputSettings, RenderSettings, SceneKind, SceneSource},
+};
+use proptest::prelude::*;
+use uuid::Uuid;
+
+use super::{
+    desk::Desk,
+    message::{Outgoing, Report},
+};
+use crate::execute::{Output, TaskError};
+
+const TTL: Duration = Duration::from_millis(900);
+
+#[derive(Debug, Clone)]
+enum Step {
+    Grant {
+        tasks: u64,
+        skip: Vec<u64>,
+    },
+    Begin,
+    End(u8),
+    Wait(u64),
+    Heartbeat,
+    /// Answer the oldest heartbeat; the bits choose which leases live on.
+    Renew(u8),
+    Revoke(usize),
+    Send,
+    Acknowledge,
+    Disconnect,
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        (1u64..5, prop::collection::vec(0u64..5, 0..3))
+            .prop_map(|(tasks, skip)| Step::Grant { tasks, skip }),
+        Just(Step::Begin),
+        Just(Step::Begin),
+        (0u8..5).prop_map(Step::End),
+        (0u64..400).prop_map(Step::Wait),
+        Just(Step::Heartbeat),
+        any::<u8>().prop_map(Step::Renew),
+        (0usize..4).prop_map(Step::Revoke),
+        Just(Step::Send),
+        Just(Step::Acknowledge),
+        Just(Step::Disconnect),
+    ]
+}
+
+fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
+    Lease {
+        lease: LeaseRef {
+            range: RangeId::from_uuid(Uuid::from_u128(1)),
+            epoch: Epoch(epoch),
+        },
+        job: JobId::from_uuid(Uuid::from_u128(2)),
+        lo: 0,
+        hi: tasks,
+        skip,
+        ttl_ms: TTL.as_millis() as u32,
+        spec: JobSpec {
+            name: "laws".into(),
+            scenes: SceneSource {
+                kind: SceneKind::Primitive,
+                count: 5,
+                seed: 0,
+                fov_deg: 90.0,
+                spots: 1,
+            },
+            render: RenderSettings::default(),
+            output: OutputSettings {
+                store: "/s".into(),
+                dataset: "d".into(),
+                profile: "plain-f32".into(),
+            },
+            limits: Limits::default(),
+        },
+    }
+}
+
+fn result(kind: u8) -> Result<Output, TaskError> {
+    match kind {
+        0 => Err(TaskError::User("u".into())),
+        1 => Err(TaskError::Stopped),
+        _ => Ok(Output {
+            manifest_sha256: String::new(),
+            bytes: 1,
+            adopted: false,
+        }),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn no_task_starts_twice_skipped_fenced_or_lost_and_every_finished_one_is_told_until_acknowledged(
+        steps in prop::collection::vec(step(), 1..60),
+    ) {
+        let mut desk = Desk::new();
+        let mut now = Instant::now();
+        let mut epoch = 0;
+        let mut renewed: BTreeMap<LeaseRef, Instant> = BTreeMap::new();
+        let mut skipped: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut started: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut finished: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut wire: Vec<Report> = Vec::new();
+        let mut beats: Vec<(Instant, Vec<LeaseRef>)> = Vec::new();
+
+        for step in steps {
+            match step {
+                Step::Grant { tasks, skip } => {
+                    epoch += 1;
+                    let lease = lease(epoch, tasks, skip);
+                    skipped.extend(lease.skip.iter().map(|i| (lease.lease, *i)));
+                    renewed.insert(lease.lease, now);
+                    prop_assert!(desk.granted(now, lease.clone()));
+                    if desk.held().contains(&lease.lease) {
+                        prop_assert!(!desk.granted(now, lease), "a repeated grant is no news");
+                    }
+                }
+                Step::Begin => {
+                    let free = desk.in_hand().is_none();
+                    if let Some(task) = desk.begin(now) {
+                        prop_assert!(free, "one at a time");
+                        let lease = desk.in_hand().unwrap().lease;
+                        prop_assert!(started.insert((lease, task.index)), "twice");
+                        prop_assert!(!skipped.contains(&(lease, task.index)), "skipped");
+                        let life = renewed.get(&lease).expect("not lost");
+                        prop_assert!(now - *life < TTL * 2 / 3, "fenced");
+                    }
+                }
+                Step::End(kind) => {
+                    if desk.in_hand().is_some() {
+                        let hand = desk.ended(now, &result(kind));
+                        if kind > 1 {
+                            finished.insert((hand.lease, hand.task.index));
+                        }
+                    }
+                }
+                Step::Wait(ms) => now += Duration::from_millis(ms),
+                Step::Heartbeat => {
+                    let Outgoing::Heartbeat { leases, progress } = desk.heartbeat(now, 0.5) else {
+                        unreachable!()
+                    };
+                    prop_assert!(progress.iter().all(|p| leases.contains(&p.lease)));
+                    beats.push((now, leases));
+                }
+                Step::Renew(bits) => {
+                    if beats.is_empty() {
+                        continue;
+                    }
+                    let (sent, named) = beats.remove(0);
+                    let (kept, gone): (Vec<_>, Vec<_>) =
+                        named.into_iter().partition(|l| bits >> (l.epoch.0 % 8) & 1 == 1);
+                    desk.renewed(now, &kept, TTL);
+                    for lease in kept {
+                        // A lease lost earlier does not come back.
+                        renewed.entry(lease).and_modify(|at| *at = (*at).max(sent));
+                    }
+                    for lease in gone {
+                        renewed.remove(&lease);
+                    }
+                }
+                Step::Revoke(k) => {
+                    if let Some(lease) = desk.held().get(k).copied() {
+                        let life = renewed.remove(&lease).expect("held leases are not lost");
+                        let mine = desk.in_hand().is_some_and(|t| t.lease == lease);
+                        prop_assert_eq!(desk.revoked(now, lease), mine && now - life < TTL);
+                    }
+                }
+                Step::Send => {
+                    for message in desk.outgoing(now) {
+                        match message {
+                            Outgoing::Report(report) => wire.push(report),
+                            Outgoing::Credit(n) => prop_assert_eq!(n, 1),
+                            Outgoing::Heartbeat { .. } => unreachable!(),
+                        }
+                    }
+                }
+                Step::Acknowledge => {
+                    if wire.is_empty() {
+                        continue;
+                    }
+                    let report = wire.remove(0);
+                    let index = match &report {
+                        Report::Done(d) => d.index,
+                        Report::Failed(f) => f.index,
+                        Report::Release { .. } => 0,
+                    };
+                    let answered = desk.acknowledged(report.lease(), index);
+                    prop_assert_eq!(answered.as_ref(), Some(&report));
+                    if let Report::Done(done) = report {
+                        prop_assert!(finished.remove(&(done.lease, done.index)));
+                    }
+                }
+                Step::Disconnect => {
+                    desk.disconnected();
+                    wire.clear();
+                    beats.clear();
+                }
+            }
+            prop_assert_eq!(desk.unacknowledged_outputs(), finished.len());
+        }
+        // Whatever was never acknowledged goes out once more after a reconnect.
+        desk.disconnected();
+        let told: BTreeSet<_> = desk
+            .outgoing(now)
+            .into_iter()
+            .filter_map(|m| match m {
+                Outgoing::Report(Report::Done(d)) => Some((d.lease, d.index)),
+                _ => None,
+            })
+            .collect();
+        prop_assert_eq!(told, finished);
+    }
+}
