@@ -91,12 +91,15 @@ impl Core {
         }
     }
 
-    /// A worker can take more leases.
+    /// A worker can take more leases; with 0 it takes back what it asked for.
     pub(crate) fn credit(&mut self, session: SessionId, leases: u32) {
         if let Some(worker) = self.sessions.get(&session)
             && let Some(entry) = self.workers.get_mut(worker)
         {
-            entry.credits = entry.credits.saturating_add(leases);
+            entry.credits = match leases {
+                0 => 0,
+                n => entry.credits.saturating_add(n),
+            };
         }
     }
 

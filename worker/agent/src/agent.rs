@@ -397,6 +397,12 @@ impl Agent {
             running = self.desk.in_hand().is_some(),
             nearly_done, "shutting down"
         );
+        let fraction = self.control.as_ref().map_or(0.0, |c| c.fraction());
+        if let Link::Up { session, .. } = &self.link {
+            for message in self.desk.withdraw(now, fraction) {
+                session.send(message);
+            }
+        }
         self.leaving = Some(Leaving {
             stop_at,
             give_up: stop_at + STOP_WITHIN,
@@ -434,6 +440,8 @@ impl Agent {
             leaving.give_up = now + GOODBYE_WITHIN;
             self.desk.release_all(SHUTDOWN);
         }
-        self.desk.unacknowledged() == 0 || now >= leaving.give_up
+        // A lease under way would be nobody's until it expires: it is awaited and handed back.
+        let all_said = self.desk.unacknowledged() == 0 && !self.desk.expects_lease();
+        all_said || now >= leaving.give_up
     }
 }

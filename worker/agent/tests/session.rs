@@ -217,6 +217,22 @@ async fn shutdown_stops_a_long_task_and_gives_its_lease_back() {
 }
 
 #[tokio::test]
+async fn shutdown_takes_the_credit_back_and_hands_back_a_lease_that_was_under_way() {
+    let mut farm = FakeFarm::start().await;
+    let worker = Worker::start(farm.address, |task, _| Ok(output(task)));
+    let (mut c, _) = farm.welcome(60_000).await;
+    c.listen_until("credit", |c| c.credit == 1).await;
+    c.renew = false;
+    worker.shutdown.cancel();
+    // Granted before the coordinator read of the withdrawal.
+    c.grant(lease(1, 0, 5)).await;
+    let release = c.release().await;
+    assert_eq!(release.lease, Some(lease(1, 0, 5).lease.into()));
+    c.acknowledge(release.lease, 0).await;
+    assert_eq!(worker.end().await.unwrap().computed, 0);
+}
+
+#[tokio::test]
 async fn shutdown_lets_a_task_finish_that_is_nearly_done() {
     let mut farm = FakeFarm::start().await;
     let gate = Gate::new();

@@ -73,6 +73,8 @@ pub(crate) struct InHand {
 struct Beat {
     sent: Instant,
     leases: Vec<LeaseRef>,
+    /// It went out right after the withdrawal of all credit.
+    withdrawal: bool,
 }
 
 /// The worker's desk.
@@ -186,6 +188,10 @@ impl Desk {
         ttl: Duration,
     ) -> Vec<LeaseRef> {
         let beat = self.beats.pop_front();
+        if beat.as_ref().is_some_and(|b| b.withdrawal) {
+            // Answers keep their order: whatever was granted before the withdrawal has arrived.
+            self.asked = false;
+        }
         let begun = beat.as_ref().map_or(now, |b| b.sent);
         for held in &mut self.leases {
             if named.contains(&held.lease) {
@@ -351,12 +357,31 @@ impl Desk {
         messages
     }
 
+    /// Takes back what was asked for: the credit, and a heartbeat whose answer shows that no lease is under way
+    /// any more.
+    pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32) -> Vec<Outgoing> {
+        if !self.asked {
+            return Vec::new();
+        }
+        let heartbeat = self.heartbeat(now, fraction);
+        if let Some(beat) = self.beats.back_mut() {
+            beat.withdrawal = true;
+        }
+        vec![Outgoing::Credit(0), heartbeat]
+    }
+
+    /// Whether a lease may be under way to this worker.
+    pub(crate) fn expects_lease(&self) -> bool {
+        self.asked
+    }
+
     /// The heartbeat to send now.
     pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32) -> Outgoing {
         let leases = self.held();
         self.beats.push_back(Beat {
             sent: now,
             leases: leases.clone(),
+            withdrawal: false,
         });
         let progress = self
             .in_hand
