@@ -41,7 +41,11 @@ impl Drop for Scratch {
             .into_iter()
             .flatten()
             .filter_map(|entry| Some(entry.ok()?.path()))
-            .filter(|path| path.extension().is_some_and(|e| e == "stderr"))
+            // Of commands, the failed assertion shows what they said.
+            .filter(|path| {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                name.ends_with(".stderr") && !name.ends_with("-command.stderr")
+            })
             .collect();
         logs.sort();
         for path in logs {

@@ -95,7 +95,6 @@ fn the_parts_of_a_split_render_add_up_to_the_whole() {
         assert!(error.iter().all(|e| e.is_finite() && *e >= 0.0), "{name}");
     }
     assert_eq!(get("depth").0, [16, 16]);
-    assert_eq!(get("rgb").0, [16, 16, 3]);
 
     // What is left is the one-bounce light: never negative, and only where a spot is seen.
     let sum = |a: &[f32]| a.iter().map(|&v| f64::from(v)).sum::<f64>();
@@ -150,7 +149,7 @@ fn an_interrupted_render_exits_130_and_leaves_nothing() {
         "render",
         "room.glb",
         "--samples",
-        "1048576",
+        "65536",
         "--out",
         "room.zarr",
     ];

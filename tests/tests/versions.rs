@@ -17,6 +17,7 @@ use tokio::net::TcpListener;
 use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tonic::{Code, Request, Response, Status, Streaming, transport::Server};
 
+const VERSION: &str = env!("CARGO_PKG_VERSION");
 const PATIENCE: Duration = Duration::from_secs(30);
 
 fn hello(version: &str, protocol: u32) -> wire::Hello {
@@ -72,7 +73,7 @@ async fn a_coordinator_refuses_a_worker_of_another_version_and_names_both() {
         assert!(words.contains(&part.to_string()), "{words}");
     }
 
-    let mut nameless = hello("9.9.9", PROTOCOL);
+    let mut nameless = hello(VERSION, PROTOCOL);
     nameless.worker_id = "nobody".into();
     let refusal = greet(farm.url(), nameless).await.unwrap_err();
     assert_eq!(refusal.code(), Code::InvalidArgument, "{refusal}");
@@ -100,7 +101,7 @@ async fn a_worker_with_another_renderer_gets_nothing_and_the_job_says_why() {
         .await
         .unwrap()
     };
-    say(Said::Hello(hello(env!("CARGO_PKG_VERSION"), PROTOCOL))).await;
+    say(Said::Hello(hello(VERSION, PROTOCOL))).await;
     let mut answers = client
         .session(ReceiverStream::new(requests))
         .await
