@@ -12,7 +12,7 @@ use futures::FutureExt;
 use picofarm_catalog::{Catalog, CatalogError, ResultSet};
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
-    model::{Failure, Finished, JobPlan, JobSpec, JobStatus, TaskProgress, WorkerHello},
+    model::{Failure, Finished, JobPlan, JobSpec, JobStatus, SpecError, TaskProgress, WorkerHello},
 };
 use tokio::{
     sync::{mpsc, oneshot, watch},
@@ -39,6 +39,7 @@ pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
 pub(crate) enum Refusal {
     NoSuchJob(JobId),
     NotNow(String),
+    Spec(SpecError),
     Catalog(String),
 }
 
@@ -215,7 +216,11 @@ impl Life<'_> {
                         .catalog
                         .output_runs(&set, spec.scenes.count)
                         .await?;
-                    let _ = reply.send(Ok(self.core.plan(&spec, &runs)));
+                    let plan = self
+                        .core
+                        .place_is_free(&spec)
+                        .map(|()| self.core.plan(&spec, &runs));
+                    let _ = reply.send(plan.map_err(Refusal::Spec));
                 }
                 Command::Submit { spec, again, reply } => {
                     // First what is under way, so that no output is missed.
@@ -229,7 +234,7 @@ impl Life<'_> {
                     let timing = self.actor.catalog.timing(&set).await?;
                     let now = self.now();
                     let submitted = self.core.submit(*spec, again, &runs, timing, now);
-                    self.defer(reply, Ok(submitted));
+                    self.defer(reply, submitted.map_err(Refusal::Spec));
                 }
                 Command::List(reply) => {
                     let list = self.core.list(self.now());

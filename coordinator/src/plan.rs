@@ -75,6 +75,32 @@ pub fn plan(spec: &JobSpec, existing: &[Run], existing_job: Option<JobId>) -> Jo
     }
 }
 
+/// The first setting that shapes results and differs between two jobs, in words: `: render.bins is 637 there and
+/// 300 here`. `None` where none differs.
+pub fn difference(there: &JobSpec, here: &JobSpec) -> Option<String> {
+    let shaping = |spec: &JobSpec| {
+        let mut scenes = serde_json::to_value(&spec.scenes).expect("settings are plain data");
+        scenes["count"] = serde_json::Value::Null;
+        serde_json::json!({
+            "scenes": scenes, "render": spec.render, "output": {"profile": spec.output.profile},
+        })
+    };
+    let (there, here) = (shaping(there), shaping(here));
+    ["scenes", "render", "output"]
+        .into_iter()
+        .find_map(|section| {
+            let (a, b) = (there[section].as_object()?, here[section].as_object()?);
+            let name = a.keys().chain(b.keys()).find(|k| a.get(*k) != b.get(*k))?;
+            let text =
+                |v: Option<&serde_json::Value>| v.map_or("unset".into(), ToString::to_string);
+            Some(format!(
+                ": {section}.{name} is {} there and {} here",
+                text(a.get(name)),
+                text(b.get(name))
+            ))
+        })
+}
+
 /// Checks what a client must have resolved before it submits.
 ///
 /// # Errors

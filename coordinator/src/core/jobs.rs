@@ -4,7 +4,7 @@ use picofarm_catalog::{Changes, Job, ResultSet, Run, Timing};
 use picofarm_proto::{
     ids::JobId,
     key::spec_hash,
-    model::{EventKind, JobPlan, JobSpec, JobState, JobStatus, RunningTask},
+    model::{EventKind, JobPlan, JobSpec, JobState, JobStatus, RunningTask, SpecError},
 };
 
 use super::{About, Core, Say};
@@ -34,8 +34,38 @@ impl Core {
         plan::plan(spec, existing, job)
     }
 
+    /// Checks that no job has put scenes of other settings into the data set this one names: their keys
+    /// would be the same, their bytes not.
+    ///
+    /// # Errors
+    /// [`SpecError`] at `output.dataset` that names the job and the first setting that differs.
+    pub(crate) fn place_is_free(&self, spec: &JobSpec) -> Result<(), SpecError> {
+        let set = ResultSet::of(spec);
+        for id in &self.order {
+            let entry = &self.jobs[id];
+            let other = &entry.job.spec;
+            let same_place = other.output.store == set.store && other.output.dataset == set.dataset;
+            let holds = entry.job.state == JobState::Active || entry.stage.counts().done > 0;
+            if same_place && holds && ResultSet::of(other).stage_key != set.stage_key {
+                let what = plan::difference(other, spec).unwrap_or_default();
+                return Err(SpecError::new(
+                    "output.dataset",
+                    format!(
+                        "{:?} in {} holds scenes of job {id} ({:?}) with other settings{what}; \
+                         name another data set, or use that job's settings",
+                        set.dataset, set.store, other.name
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
     /// Submits a job; one that is active or done already, or ended otherwise and is not to be submitted again,
     /// answers with itself.
+    ///
+    /// # Errors
+    /// As [`Core::place_is_free`].
     pub(crate) fn submit(
         &mut self,
         spec: JobSpec,
@@ -43,18 +73,19 @@ impl Core {
         existing: &[Run],
         timing: Timing,
         now_ms: i64,
-    ) -> Submitted {
+    ) -> Result<Submitted, SpecError> {
         let plan = self.plan(&spec, existing);
         if let Some(job) = self.job_with(&plan.spec_hash) {
             let ended_badly = matches!(job.state, JobState::Failed | JobState::Cancelled);
             if !(again && ended_badly) {
-                return Submitted {
+                return Ok(Submitted {
                     job: job.id,
                     existed: true,
                     plan,
-                };
+                });
             }
         }
+        self.place_is_free(&spec)?;
         let id = JobId::from_uuid((self.make_id)());
         let set = ResultSet::of(&spec);
         let job = Job {
@@ -88,11 +119,11 @@ impl Core {
             self.event(now_ms, id, EventKind::Reused, about.tasks(lo, hi));
         }
         self.end_if_over(id, now_ms);
-        Submitted {
+        Ok(Submitted {
             job: id,
             existed: false,
             plan,
-        }
+        })
     }
 
     /// Stops a job: its leases are revoked, finished tasks stay. One that has ended stays as it is.

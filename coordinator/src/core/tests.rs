@@ -126,7 +126,10 @@ impl World {
         let set = ResultSet::of(&spec);
         let runs = self.catalog.output_runs(&set, count).await.unwrap();
         let timing = self.catalog.timing(&set).await.unwrap();
-        let submitted = self.core.submit(spec, true, &runs, timing, self.now);
+        let submitted = self
+            .core
+            .submit(spec, true, &runs, timing, self.now)
+            .expect("all specs of this test share their settings");
         if !submitted.existed {
             self.jobs.push(submitted.job);
         }

@@ -43,6 +43,7 @@ impl Link {
             Err(Refusal::NoSuchJob(id)) => Err(Status::not_found(format!(
                 "there is no job {id}; list the jobs to see their ids"
             ))),
+            Err(Refusal::Spec(why)) => Err(Status::invalid_argument(why.to_string())),
             Err(Refusal::NotNow(why)) => Err(Status::failed_precondition(why)),
             Err(Refusal::Catalog(why)) => Err(Status::unavailable(why)),
         }

@@ -61,6 +61,26 @@ async fn a_larger_job_reuses_the_outputs_of_a_smaller_one() {
 }
 
 #[tokio::test]
+async fn a_job_that_would_mix_settings_in_one_data_set_is_refused() {
+    let mut farm = Farm::start().await;
+    let first = farm.submit(&spec(2)).await.job_id;
+    let mut other = spec(2);
+    other.render.bins += 1;
+    let request = wire::SubmitJobRequest {
+        spec: Some(other.clone().into()),
+        again: false,
+    };
+    let refused = farm.jobs.submit_job(request).await.unwrap_err();
+    assert_eq!(refused.code(), Code::InvalidArgument);
+    for part in ["output.dataset", &first, "render.bins"] {
+        assert!(refused.message().contains(part), "{}", refused.message());
+    }
+    // Another data set is another matter.
+    other.output.dataset = "elsewhere".into();
+    assert!(!farm.submit(&other).await.existed);
+}
+
+#[tokio::test]
 async fn an_output_settles_every_job_that_waits_for_it() {
     let mut farm = Farm::start().await;
     let small = farm.submit(&spec(3)).await.job_id;

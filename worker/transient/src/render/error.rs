@@ -39,25 +39,26 @@ pub(super) fn estimate(stats: &[Stat], samples: u32) -> ErrorEstimate {
 }
 
 /// The fewest paths per pixel, on a ladder of steps of about √2, with which the pilot's median error
-/// comes down to `target`; where the two-bounce part alone is above it, the paths that match that part.
+/// comes down to `target`. The two-bounce strata grow with the root of the paths, and their variance
+/// falls with the power 3/2 of their number (half of it lies on edges between bins).
 pub(super) fn paths_for(pilot: &[Stat], target: f32, most: u32) -> u32 {
-    let median = |n: Option<u32>| {
+    let median = |n: u32| {
+        let scale = f64::from(PILOT_PATHS) / f64::from(n);
+        let two_scale = scale.sqrt() * scale.sqrt().sqrt();
         let mut all: Vec<f64> = pilot
             .iter()
             .filter_map(|s| {
                 let v = s.two_variance + s.multi_variance;
                 let clean = (s.norm2 - v).max(0.1 * s.norm2);
-                let scale = n.map_or(0.0, |n| f64::from(PILOT_PATHS) / f64::from(n));
-                let then = s.two_variance + s.multi_variance * scale;
+                let then = s.two_variance * two_scale + s.multi_variance * scale;
                 (s.norm2 > 0.0).then(|| (then / clean).sqrt())
             })
             .collect();
         all.sort_by(f64::total_cmp);
         quantile(&all, 0.5)
     };
-    let goal = f64::from(target).max(1.1 * median(None));
     let mut n = 4;
-    while n < most && median(Some(n)) > goal {
+    while n < most && median(n) > f64::from(target) {
         // 4, 6, 8, 12, 16, 24, …
         n = if n.is_power_of_two() {
             n + n / 2
