@@ -135,7 +135,7 @@ pub async fn check(place: &str, fast: bool) -> Result<Verification> {
         Code::Damaged,
         format!("{place}: {} problem(s)\n  {}{more}", report.problems.len(), shown.join("\n  ")),
     )
-    .hint("remove the objects named and the scene's manifest, then submit the job again: only those scenes are rendered"))
+    .hint("remove the objects named, then submit the job to a coordinator with a new catalog: whole scenes are adopted, only the others are rendered"))
 }
 
 /// Where the pictures are.

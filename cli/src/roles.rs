@@ -41,7 +41,13 @@ pub fn agent_error(error: &AgentError) -> CliError {
         AgentError::Threads { .. } => Code::Resource,
         _ => Code::Input,
     };
-    CliError::new(code, error)
+    let ended = CliError::new(code, error);
+    match error {
+        AgentError::Refused { .. } => {
+            ended.hint("compare `picofarm --version` on both machines and install the same one")
+        }
+        _ => ended,
+    }
 }
 
 /// A running coordinator.
