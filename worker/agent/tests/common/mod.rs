@@ -266,7 +266,7 @@ pub fn spec(store: &str) -> JobSpec {
             bins: 40,
             budget: Budget::Samples(2),
             max_bounces: 2,
-            renderer: picofarm_transient::RENDERER_VERSION.into(),
+            renderer: picofarm_agent::renderer_version(),
         },
         output: OutputSettings {
             store: store.into(),
