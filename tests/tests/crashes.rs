@@ -3,7 +3,7 @@
 
 use std::{thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, Job, Process, farm::undisturbed, rng::Rng, store};
+use picofarm_tests::{Farm, Job, Process, farm::undisturbed, rng::Rng, store, wait::until};
 
 /// Short enough that a killed worker's scene is soon given to another.
 const LEASE_S: f64 = 2.0;
@@ -46,13 +46,16 @@ fn a_worker_killed_in_mid_scene_again_and_again_changes_nothing() {
 fn a_coordinator_killed_in_mid_job_again_and_again_changes_nothing() {
     let mut rng = Rng::new(2);
     let mut farm = Farm::with_lease("coordinator-killed", LEASE_S);
-    let job = Job::slow(&farm.store(), 3);
+    let job = Job::slow(&farm.store(), 8);
     let id = farm.submit(&job);
     let mut worker = farm.worker("steady");
-    for _ in 0..ROUNDS {
+    for round in 0..ROUNDS {
+        until("some scenes", || {
+            (farm.count(&id, "done") >= round).then_some(())
+        });
         instant(&farm, &id, "steady", &mut rng);
         farm.kill_coordinator();
-        sleep(Duration::from_millis(rng.number() % 1500));
+        sleep(Duration::from_millis(rng.number() % 1000));
         farm.start_coordinator();
     }
     farm.until_done_once(&job, &id);

@@ -79,17 +79,19 @@ fn a_damaged_scene_is_mended_as_the_hint_says_and_only_that_scene_is_rendered() 
     let place = job.place();
     let (hashes, times) = (store::hashes(&place), store::times(&place));
     let objects = store::objects(&place, 1);
-    flip(&place.join(&objects[0]));
+    let broken = place.join(&objects[0]);
+    flip(&broken);
     let folder = place.display().to_string();
-    let hint = "remove the objects named and the scene's manifest, then submit the job again";
+    let hint = "remove the objects named, then submit the job to a coordinator with a new catalog";
     farm.run(&["dataset", "verify", &folder])
         .fails(6, &[&objects[0], hint]);
 
-    delete(&place.join(&objects[0]));
-    delete(&place.join("manifests/1.json"));
-    farm.json(&["job", "submit", "quick.toml"]);
-    farm.until_ended(&id);
-    farm.run(&["dataset", "verify", &folder]).ok();
+    delete(&broken);
+    let fresh = Farm::start("mend-fresh");
+    let again = fresh.submit(&job);
+    let _other = fresh.worker("other");
+    fresh.until_done_once(&job, &again);
+    assert_eq!(fresh.count(&again, "reused"), 1, "a whole scene is adopted");
     assert_eq!(
         store::hashes(&place),
         hashes,

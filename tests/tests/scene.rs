@@ -149,7 +149,9 @@ fn an_interrupted_render_exits_130_and_leaves_nothing() {
         "render",
         "room.glb",
         "--samples",
-        "65536",
+        "4096",
+        "--resolution",
+        "64",
         "--out",
         "room.zarr",
     ];

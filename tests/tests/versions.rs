@@ -163,7 +163,7 @@ async fn a_worker_refused_for_its_version_exits_with_4_and_says_what_to_do() {
             &[
                 "this coordinator speaks protocol 77",
                 &asked,
-                "same picofarm version",
+                "hint: compare `picofarm --version`",
             ],
         );
     })
