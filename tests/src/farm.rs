@@ -205,8 +205,7 @@ impl Farm {
         })
     }
 
-    /// Waits until the job is done, and checks that each scene was committed exactly once, that the data set is
-    /// whole, and that the store's objects are those of `expected`.
+    /// Waits until the job is done, and checks that each scene was committed exactly once and the data set is whole.
     ///
     /// # Panics
     /// When any of it fails.
