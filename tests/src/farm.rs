@@ -112,6 +112,23 @@ impl Farm {
         self.cli.clone().with("PICOFARM_COORDINATOR", self.url())
     }
 
+    /// How often the logs of all processes of this farm say `words`.
+    ///
+    /// # Panics
+    /// When a log cannot be read.
+    pub fn logged(&self, words: &str) -> u64 {
+        let entries = std::fs::read_dir(self.scratch.path()).expect("the test's folder is there");
+        let count = |path: PathBuf| {
+            let log = std::fs::read_to_string(path).expect("a log is text");
+            log.lines().filter(|line| line.contains(words)).count() as u64
+        };
+        entries
+            .map(|entry| entry.expect("a folder can be listed").path())
+            .filter(|path| path.extension().is_some_and(|e| e == "stderr"))
+            .map(count)
+            .sum()
+    }
+
     /// Runs a command to its end.
     pub fn run(&self, args: &[&str]) -> Ended {
         self.cli().run(args)
