@@ -189,25 +189,22 @@ impl Farm {
         events
     }
 
-    /// Waits until `worker` is so far in a scene: share done in [0, 1]. Gives the scene's index. Workers tell it six
+    /// Waits until one of `workers` is in the middle of a scene; `false` if the job ended first. Workers tell it six
     /// times in the life of a lease, so this is for farms with short leases.
     ///
     /// # Panics
-    /// When the job ends before.
-    pub fn until_running(&self, job: &str, worker: &str, share: f64) -> u64 {
-        until(&format!("{worker} to be {share} through a scene"), || {
+    /// When neither happens.
+    pub fn until_busy(&self, job: &str, workers: &[&str]) -> bool {
+        until(&format!("{workers:?} to be in a scene"), || {
             let status = self.status(job);
-            assert_eq!(
-                status["state"], "active",
-                "the job ended too early: {status}"
-            );
             let running = status["running"]
                 .as_array()
                 .expect("a status lists what runs");
-            let task = running.iter().find(|r| {
-                r["worker"] == worker && r["fraction"].as_f64().is_some_and(|f| f >= share)
-            })?;
-            task["index"].as_u64()
+            let busy = running.iter().any(|task| {
+                workers.iter().any(|name| task["worker"] == *name)
+                    && task["fraction"].as_f64().is_some_and(|share| share > 0.0)
+            });
+            (busy || status["state"] != "active").then_some(busy)
         })
     }
 

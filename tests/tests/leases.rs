@@ -41,9 +41,13 @@ fn a_worker_told_to_end_hands_its_scene_to_another_at_once() {
 fn a_worker_that_wakes_up_after_its_lease_doubles_and_overwrites_nothing() {
     let farm = Farm::with_lease("zombie", 2.0);
     let job = Job::slow(&farm.store(), 1);
+    let job = Job {
+        samples: 3 * job.samples,
+        ..job
+    };
     let id = farm.submit(&job);
     let mut zombie = farm.worker("zombie");
-    farm.until_running(&id, "zombie", 0.01);
+    assert!(farm.until_busy(&id, &["zombie"]));
     zombie.signal(Signal::Stop);
     until("the lease to expire", || {
         (!farm.events_of(&id, "expired").is_empty()).then_some(())
