@@ -77,7 +77,7 @@ fn describe(place: &str, info: &Summary) -> String {
     format!(
         "{place}: {} of {} scenes, {}{}\n\
          {}x{} pixels x {} bins of {} m from {} to {end:.5} m of path, {} spots\n\
-         {:?}{coding}, {} saturated bins kept exactly\n",
+         {}{coding}, {} saturated bins kept exactly\n",
         info.scenes,
         s.scenes,
         bytes(info.bytes),

@@ -147,10 +147,9 @@ impl Pace {
             n => format!(" ({n} reused)"),
         };
         let message = format!(
-            "{}/{} scenes{reused}{dead}, {} on {} worker{}{eta}",
+            "{}/{} scenes{reused}{dead}, {} worker{}{eta}",
             s.tasks.done,
             s.tasks.total,
-            s.running.len(),
             s.workers,
             if s.workers == 1 { "" } else { "s" },
         );

@@ -157,9 +157,6 @@ pub fn describe_plan(plan: &JobPlan) -> String {
     for reason in &plan.reasons {
         text += &format!("  {reason}\n");
     }
-    if let Some(job) = plan.existing_job {
-        text += &format!("  job {job} has this spec already\n");
-    }
     text
 }
 

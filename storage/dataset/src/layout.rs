@@ -183,7 +183,10 @@ impl Quantity {
                     (U32, vec![h, w], IMAGE, a)
                 }
                 Self::Label => {
-                    let a = json!({"long_name": "semantic label index + 1; 0 = nothing"});
+                    let a = json!({
+                        "long_name": "semantic label index + 1; 0 = nothing",
+                        "names": "manifests/<scene>.json, provenance.plan.labels",
+                    });
                     (U16, vec![h, w], IMAGE, a)
                 }
                 Self::Specular => {

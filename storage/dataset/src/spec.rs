@@ -68,6 +68,15 @@ impl Profile {
     }
 }
 
+impl std::fmt::Display for Profile {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::SqrtU16 { delta } => write!(f, "sqrt-u16 with delta {delta}"),
+            Self::PlainF32 => write!(f, "plain-f32"),
+        }
+    }
+}
+
 impl DatasetSpec {
     /// Numbers in range, so that every array's shape and key exist.
     ///
@@ -131,10 +140,6 @@ impl DatasetSpec {
 
     /// The first field, other than the number of scenes, in which `asked` differs: (field, stored, asked).
     pub(crate) fn difference(&self, asked: &Self) -> Option<(&'static str, String, String)> {
-        let profile = |p: &Profile| match p {
-            Profile::SqrtU16 { delta } => format!("sqrt-u16 with delta {delta}"),
-            Profile::PlainF32 => "plain-f32".to_string(),
-        };
         let pairs = [
             ("height", self.height.to_string(), asked.height.to_string()),
             ("width", self.width.to_string(), asked.width.to_string()),
@@ -154,7 +159,11 @@ impl DatasetSpec {
                 self.gate.bins.to_string(),
                 asked.gate.bins.to_string(),
             ),
-            ("profile", profile(&self.profile), profile(&asked.profile)),
+            (
+                "profile",
+                self.profile.to_string(),
+                asked.profile.to_string(),
+            ),
         ];
         pairs.into_iter().find(|(_, stored, asked)| stored != asked)
     }
