@@ -71,7 +71,7 @@ impl Meter {
             None if self.quiet => {}
             None => {
                 let due = self.last.as_ref().is_none_or(|(at, text)| {
-                    *text != message && (at.elapsed() >= Self::BETWEEN_LINES || fraction >= 1.0)
+                    at.elapsed() >= Self::BETWEEN_LINES || (fraction >= 1.0 && *text != message)
                 });
                 if due {
                     eprintln!("[{:3.0}%] {message}", fraction * 100.0);
