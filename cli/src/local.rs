@@ -11,6 +11,10 @@ use crate::{
     roles,
 };
 
+/// Life of a lease: short, since after a `kill -9` of this one process the next run waits for it to end, and no network
+/// can delay a heartbeat.
+const LEASE: Duration = Duration::from_secs(20);
+
 /// A farm on this machine.
 pub struct Local {
     pub url: String,
@@ -30,8 +34,7 @@ impl Local {
         workers: usize,
         assets: &Path,
     ) -> Result<Self> {
-        let coordinator =
-            roles::Coordinator::start(catalog, listen, Duration::from_secs(60)).await?;
+        let coordinator = roles::Coordinator::start(catalog, listen, LEASE).await?;
         let url = format!("http://{}", coordinator.address());
         let mut local = Self {
             url: url.clone(),
