@@ -101,6 +101,7 @@ async fn failures(client: &mut Client, job: JobId, meter: &Meter, seen: &mut u64
         if matches!(
             event.kind,
             EventKind::Failed
+                | EventKind::Released
                 | EventKind::Dead
                 | EventKind::Expired
                 | EventKind::Alarm

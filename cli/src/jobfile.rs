@@ -1,13 +1,9 @@
 //! Job files: the commented template, reading, and resolving what a submission must pin (furniture,
 //! scene files' content, renderer version, absolute store).
 
-use std::{
-    io::Read,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use picofarm_proto::model::{JobSpec, SceneKind};
-use sha2::{Digest, Sha256};
 
 use crate::{
     args::SceneKindArg,
@@ -108,8 +104,8 @@ pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSp
         SceneKind::Files { files } => {
             for (i, file) in files.iter_mut().enumerate() {
                 let path = absolute(base, &file.path)?;
-                let hash = hash_file(&path)
-                    .map_err(|e| io(format!("scenes.files[{i}]: {}", path.display()), &e))?;
+                let hash = picofarm_scene::import::fingerprint(&path)
+                    .map_err(|e| CliError::input(format!("scenes.files[{i}]: {e}")))?;
                 if !file.sha256.is_empty() && file.sha256 != hash {
                     return Err(CliError::input(format!(
                         "scenes.files[{i}]: {} has SHA-256 {hash}, the job says {}",
@@ -130,19 +126,6 @@ fn absolute(base: &Path, path: &str) -> Result<PathBuf> {
         .map_err(|e| CliError::new(Code::Input, format!("{path}: {e}")))
 }
 
-/// SHA-256 of a file's content in hexadecimal.
-fn hash_file(path: &Path) -> std::io::Result<String> {
-    let mut file = std::fs::File::open(path)?;
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 16];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => return Ok(hex::encode(hash.finalize())),
-            n => hash.update(&buffer[..n]),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -156,7 +139,11 @@ mod tests {
     #[test]
     fn every_template_reads_back() {
         let dir = tempfile::tempdir().unwrap();
-        std::fs::write(dir.path().join("scene.glb"), b"x").unwrap();
+        std::fs::write(
+            dir.path().join("scene.glb"),
+            br#"{"asset":{"version":"2.0"}}"#,
+        )
+        .unwrap();
         for kind in [
             SceneKindArg::Furnished,
             SceneKindArg::Primitive,

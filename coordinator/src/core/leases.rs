@@ -196,6 +196,8 @@ impl Core {
             },
         );
         let kind = match verdict.retry_at_ms {
+            // Free: the task was given back, nothing is wrong with it.
+            Some(_) if kind == FailureKind::Interrupted => EventKind::Released,
             Some(_) => EventKind::Failed,
             None => EventKind::Dead,
         };

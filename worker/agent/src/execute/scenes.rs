@@ -12,7 +12,6 @@ use picofarm_scene::{
     import::{self, ImportOptions},
     primitive::{self, PrimitiveSettings},
 };
-use sha2::{Digest, Sha256};
 use tracing::{info, warn};
 
 use super::TaskError;
@@ -109,14 +108,7 @@ fn library<'a>(
 /// Reads a scene file after checking its hash, and gives it the job's resolution.
 fn read(file: &SceneFile, at: &str, spec: &JobSpec) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
-    let bytes = std::fs::read(path).map_err(|source| {
-        let error = SceneError::Read {
-            path: path.to_path_buf(),
-            source,
-        };
-        named(at, error)
-    })?;
-    let found = hex::encode(Sha256::digest(&bytes));
+    let found = import::fingerprint(path).map_err(|e| named(at, e))?;
     if found != file.sha256 {
         return Err(TaskError::User(format!(
             "{at}: {} has SHA-256 {found}, but the job was submitted with {}; put the old file back, or submit \

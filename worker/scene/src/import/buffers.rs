@@ -1,6 +1,6 @@
 //! The binary buffers of a glTF file, checked against what the document claims before anyone reads them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use gltf::{
     Accessor, Document,
@@ -28,9 +28,8 @@ impl Buffers {
             let at = format!("buffers[{}]", buffer.index());
             let source = buffer.source();
             if let Source::Uri(uri) = source
-                && !uri.starts_with("data:")
+                && let Some(file) = buffer_file(path, uri)
             {
-                let file = base.unwrap_or(Path::new("")).join(percent_decoded(uri));
                 return std::fs::read(&file)
                     .map_err(|source| SceneError::Read { path: file, source })
                     .and_then(|data| checked(path, &at, data, buffer.length()));
@@ -113,6 +112,12 @@ fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8
         ));
     }
     Ok(data)
+}
+
+/// The file that a buffer's URI names beside the glTF file `path`; `None` for data within the URI.
+pub(super) fn buffer_file(path: &Path, uri: &str) -> Option<PathBuf> {
+    let base = path.parent().unwrap_or(Path::new(""));
+    (!uri.starts_with("data:")).then(|| base.join(percent_decoded(uri)))
 }
 
 /// File names in glTF are URIs: `%20` stands for a space.

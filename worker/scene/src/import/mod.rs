@@ -1,6 +1,7 @@
 //! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`) and the reference scenes' JSON.
 
 mod buffers;
+mod fingerprint;
 mod gltf_file;
 mod reference;
 
@@ -8,6 +9,7 @@ use std::path::Path;
 
 use crate::{Affine, Camera, LaserGrid, Scene, SceneError, Vec3};
 
+pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
 
 /// What the caller states where a file does not, or wants otherwise.

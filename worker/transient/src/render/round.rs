@@ -143,7 +143,13 @@ impl<'a> Watch<'a> {
 
     /// Notes one finished run of `count`; false to stop.
     fn tick(&self, count: usize) -> bool {
-        let done = self.runs.fetch_add(1, Ordering::Relaxed) + 1;
+        self.runs.fetch_add(1, Ordering::Relaxed);
+        self.ask(count)
+    }
+
+    /// False to stop. Asked for each pixel, since a run of many paths takes long.
+    fn ask(&self, count: usize) -> bool {
+        let done = self.runs.load(Ordering::Relaxed);
         let before = self.before / self.total;
         let at = before + (1.0 - before) * done as f32 / count as f32;
         if !self.progress.at(at.min(1.0)) {
@@ -278,7 +284,7 @@ pub(super) fn round(
                 if watch.stopped.load(Ordering::Relaxed) {
                     return None;
                 }
-                let found = render_run(frame, bench, run, pass, bins);
+                let found = render_run(frame, bench, run, pass, bins, &|| watch.ask(count))?;
                 watch.tick(count).then_some(found)
             },
         )
@@ -302,7 +308,15 @@ fn cut<T>(buffer: &mut [T], row: usize, run: usize) -> std::vec::IntoIter<&mut [
     runs.into_iter()
 }
 
-fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins: usize) -> Found {
+/// Renders the pixels of one run; `None` when `go_on` says to stop.
+fn render_run(
+    frame: &Frame,
+    bench: &mut Bench,
+    run: Run,
+    pass: (u32, u32),
+    bins: usize,
+    go_on: &dyn Fn() -> bool,
+) -> Option<Found> {
     let mut found = Found::default();
     let rays = bench.scratch.stack.rays;
     let new = share(pass.0, pass.1);
@@ -311,6 +325,9 @@ fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins
     let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
     let mut split = run.split;
     for (i, stat) in run.stats.iter_mut().enumerate() {
+        if !go_on() {
+            return None;
+        }
         let counts = bench.pixel(frame, run.first + i, pass, &mut found.outside);
         let moments = Moments::new(bench, counts, unit);
         let range = i * bins..(i + 1) * bins;
@@ -345,7 +362,7 @@ fn render_run(frame: &Frame, bench: &mut Bench, run: Run, pass: (u32, u32), bins
     }
     found.outside.energy *= unit;
     found.rays = bench.scratch.stack.rays - rays;
-    found
+    Some(found)
 }
 
 /// From a pixel's sums to means and variances in physical units.

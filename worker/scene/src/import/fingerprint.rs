@@ -1,0 +1,67 @@
+//! What pins a scene file: its own bytes and those of the buffer files that it refers to.
+
+use std::path::Path;
+
+use gltf::buffer::Source;
+use sha2::{Digest, Sha256};
+
+use super::{Kind, buffers::buffer_file, format_error, read_file, sniff};
+use crate::SceneError;
+
+/// SHA-256 of a scene's content, hexadecimal. For a file that stands alone (every `.glb` and reference scene of ours)
+/// it is the file's own SHA-256; each external buffer of a glTF file adds its URI, its length and its bytes.
+///
+/// # Errors
+/// [`SceneError::Read`] for the file or a buffer that cannot be read, [`SceneError::Format`] for a file that is no
+/// scene.
+pub fn fingerprint(path: &Path) -> Result<String, SceneError> {
+    let bytes = read_file(path)?;
+    let mut hash = Sha256::new_with_prefix(&bytes);
+    if bytes.starts_with(b"glTF") || matches!(sniff(path, &bytes)?, Kind::Gltf) {
+        let file = gltf::Gltf::from_slice_without_validation(&bytes).map_err(|e| {
+            format_error(path, format!("is not readable glTF: {e}; export it again"))
+        })?;
+        for buffer in file.document.buffers() {
+            if let Source::Uri(uri) = buffer.source()
+                && let Some(external) = buffer_file(path, uri)
+            {
+                let data = read_file(&external)?;
+                hash.update(uri.as_bytes());
+                hash.update((data.len() as u64).to_le_bytes());
+                hash.update(&data);
+            }
+        }
+    }
+    Ok(hex::encode(hash.finalize()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_external_buffer_is_part_of_the_fingerprint() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = dir.path().join("a.gltf");
+        let document = r#"{"asset":{"version":"2.0"},"buffers":[{"uri":"a.bin","byteLength":3}]}"#;
+        std::fs::write(&scene, document).unwrap();
+        let missing = fingerprint(&scene).unwrap_err().to_string();
+        assert!(missing.contains("a.bin"), "{missing}");
+        std::fs::write(dir.path().join("a.bin"), b"abc").unwrap();
+        let before = fingerprint(&scene).unwrap();
+        std::fs::write(dir.path().join("a.bin"), b"abd").unwrap();
+        assert_ne!(before, fingerprint(&scene).unwrap());
+    }
+
+    #[test]
+    fn a_file_that_stands_alone_has_its_own_sha256() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = dir.path().join("a.gltf");
+        let document = br#"{"asset":{"version":"2.0"},"buffers":[]}"#;
+        std::fs::write(&scene, document).unwrap();
+        assert_eq!(
+            fingerprint(&scene).unwrap(),
+            hex::encode(Sha256::digest(document))
+        );
+    }
+}
