@@ -76,12 +76,13 @@ impl Paths {
     }
 }
 
-/// Spots that a camera vertex is connected to at most. Shadow rays are cheap beside new vertices; this
-/// and the numbers below were chosen by error² × CPU time on the reference rooms, where the optimum is
-/// flat.
-const SPOTS: u32 = 12;
+/// Spots that a camera vertex is connected to at most. This and the numbers below were chosen by
+/// error² × CPU time on the reference rooms, where the optimum is flat (2, 4 and 12 spots: 7.2, 5.7 and
+/// 6.0 on room-diffuse). More connections from one vertex also tie neighbouring bins of a pixel together,
+/// so that errors of sums over bins exceed what the bins' own errors say.
+const SPOTS: u32 = 4;
 /// Light vertices that a camera vertex is connected to at most.
-const LIGHTS: u32 = 4;
+const LIGHTS: u32 = 2;
 /// Russian roulette keeps a path with this multiple of its throughput as probability.
 const SURVIVAL: f32 = 1.5;
 
