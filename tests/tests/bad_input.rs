@@ -103,11 +103,8 @@ fn a_scene_with_a_vertex_that_is_not_a_number_is_named_and_renders_nothing() {
 fn a_scene_without_its_mesh_file_dies_alone_and_the_message_names_the_file() {
     let farm = Farm::start("missing-mesh");
     room(&farm.cli());
-    Parts::of(&farm.scratch.join("room.glb")).write(farm.scratch.path(), "torn");
-    fs::remove_file(farm.scratch.join("torn.bin")).unwrap();
-    farm.run(&["scene", "show", "torn.gltf"])
-        .fails(3, &["torn.bin"]);
-
+    let parts = Parts::of(&farm.scratch.join("room.glb"));
+    parts.write(farm.scratch.path(), "torn");
     let files = [
         farm.scratch.join("torn.gltf"),
         farm.scratch.join("room.glb"),
@@ -116,7 +113,19 @@ fn a_scene_without_its_mesh_file_dies_alone_and_the_message_names_the_file() {
         max_failures: 2,
         ..Job::files(&farm.store(), &[&files[0], &files[1]])
     };
+    let mesh = farm.scratch.join("torn.bin");
+    fs::remove_file(&mesh).unwrap();
+    farm.run(&["scene", "show", "torn.gltf"])
+        .fails(3, &["torn.bin"]);
+    let file = farm.scratch.join("early.toml");
+    job.write(&file);
+    farm.run(&["job", "submit", "early.toml"])
+        .fails(3, &["scenes.files[0]", "torn.bin"]);
+
+    // There at submission, gone when the worker wants it.
+    parts.write(farm.scratch.path(), "torn");
     let id = farm.submit(&job);
+    fs::remove_file(&mesh).unwrap();
     let _worker = farm.worker("worker");
     farm.run(&["job", "wait", &id])
         .fails(5, &["1 of 2 tasks are dead", "picofarm job logs", "retry"]);

@@ -5,22 +5,19 @@ use std::path::Path;
 use gltf::buffer::Source;
 use sha2::{Digest, Sha256};
 
-use super::{Kind, buffers::buffer_file, format_error, read_file, sniff};
+use super::{buffers::buffer_file, read_file};
 use crate::SceneError;
 
 /// SHA-256 of a scene's content, hexadecimal. For a file that stands alone (every `.glb` and reference scene of ours)
 /// it is the file's own SHA-256; each external buffer of a glTF file adds its URI, its length and its bytes.
 ///
 /// # Errors
-/// [`SceneError::Read`] for the file or a buffer that cannot be read, [`SceneError::Format`] for a file that is no
-/// scene.
+/// [`SceneError::Read`] for the file or a buffer that cannot be read.
 pub fn fingerprint(path: &Path) -> Result<String, SceneError> {
     let bytes = read_file(path)?;
     let mut hash = Sha256::new_with_prefix(&bytes);
-    if bytes.starts_with(b"glTF") || matches!(sniff(path, &bytes)?, Kind::Gltf) {
-        let file = gltf::Gltf::from_slice_without_validation(&bytes).map_err(|e| {
-            format_error(path, format!("is not readable glTF: {e}; export it again"))
-        })?;
+    // Other files, unreadable ones too, stand alone.
+    if let Ok(file) = gltf::Gltf::from_slice_without_validation(&bytes) {
         for buffer in file.document.buffers() {
             if let Source::Uri(uri) = buffer.source()
                 && let Some(external) = buffer_file(path, uri)
