@@ -18,7 +18,10 @@ mod scene;
 mod settings;
 mod signals;
 
-use std::{io::IsTerminal, process::ExitCode};
+use std::{
+    io::{IsTerminal, Write},
+    process::ExitCode,
+};
 
 use clap::{CommandFactory, Parser};
 
@@ -68,12 +71,10 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         }
         Command::Doctor(args) => doctor::run(args, settings, output).await,
         Command::Completions { shell } => {
-            clap_complete::generate(
-                shell,
-                &mut Cli::command(),
-                "picofarm",
-                &mut std::io::stdout(),
-            );
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut Cli::command(), "picofarm", &mut script);
+            // A closed pipe (`| head`) is not an error worth a message.
+            let _ = std::io::stdout().write_all(&script);
             Ok(())
         }
     }
