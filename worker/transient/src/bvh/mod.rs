@@ -133,6 +133,23 @@ impl Bvh {
         };
         id != EMPTY
     }
+
+    /// Which of the segments from ONE point to many are blocked: `blocked[i]` becomes
+    /// `occluded(stack, from, to[i] - from, 1.0)`, bit for bit, whatever else is in the bundle. The origin
+    /// of every ray is `from`: the same segments from their other ends may differ in grazing cases. Fast
+    /// where the targets lie close together, any number of them. Panics where the lengths differ.
+    pub fn occluded_bundle(
+        &self,
+        stack: &mut Stack,
+        from: Vec3,
+        to: &[Vec3],
+        blocked: &mut [bool],
+    ) {
+        assert_eq!(to.len(), blocked.len(), "one answer for each target");
+        for (b, &p) in blocked.iter_mut().zip(to) {
+            *b = self.occluded(stack, from, p - from, 1.0);
+        }
+    }
 }
 
 /// NaN and infinite rays would select every lane, empty ones included: they are refused up front.
