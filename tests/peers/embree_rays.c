@@ -13,7 +13,7 @@ typedef struct {
 typedef struct {
   Ray ray;
   float ng[3], u, v;
-  unsigned prim, geom, inst;
+  unsigned prim, geom, inst, inst_prim;
 } __attribute__((aligned(16))) RayHit;
 typedef struct {
   float org[3][16], tnear[16], dir[3][16], time[16], tfar[16];
@@ -22,7 +22,7 @@ typedef struct {
 typedef struct {
   Ray16 ray;
   float ng[3][16], u[16], v[16];
-  unsigned prim[16], geom[16], inst[16];
+  unsigned prim[16], geom[16], inst[16], inst_prim[16];
 } __attribute__((aligned(64))) RayHit16;
 
 Handle rtcNewDevice(const char *);
