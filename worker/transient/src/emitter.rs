@@ -167,6 +167,8 @@ impl Columns {
 pub(crate) struct Emitters {
     /// The sources.
     pub list: Vec<Emitter>,
+    /// Their places, lifted off the surface, for shadow rays.
+    pub lifted: Vec<Vec3>,
     /// The Lambertian ones in columns.
     pub columns: Columns,
     /// Indices of the others.
@@ -180,6 +182,7 @@ impl Emitters {
         let mut stack = world.bvh.stack();
         let mut all = Self {
             list: vec![],
+            lifted: vec![],
             columns: Columns::default(),
             glossy: vec![],
             on_mirror: vec![],
@@ -222,6 +225,7 @@ impl Emitters {
                     all.on_mirror.push(index);
                 }
             }
+            all.lifted.push(lift(e.p, e.n));
             all.list.push(e);
         }
         Ok(all)

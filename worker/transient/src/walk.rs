@@ -25,6 +25,8 @@ pub(crate) struct Walk<'a> {
     pub gate: &'a Gate,
     /// Longest path in bounces.
     pub max_bounces: u32,
+    /// Walks connect to light vertices.
+    pub lights: bool,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
 }
@@ -120,7 +122,8 @@ impl Walk<'_> {
                 aimed = self.aim(rng, &vertex, scratch, sink);
                 self.light(rng, &vertex, scratch, sink);
             }
-            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack) else {
+            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack)
+            else {
                 return;
             };
             vertex = next;
@@ -216,6 +219,9 @@ impl Walk<'_> {
             }
             return;
         }
+        if !self.lights {
+            return;
+        }
         let back = step.p - h.p;
         let b2 = back.dot(back);
         let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
@@ -286,6 +292,9 @@ impl Walk<'_> {
 
     /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
     fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
+        if !self.lights {
+            return;
+        }
         let h = &v.hit;
         let Scratch {
             stack,

@@ -168,7 +168,7 @@ fn the_histogram_of_many_spots_is_the_sum_of_their_own() {
                 &one,
                 &Settings {
                     budget: Budget::Samples(64),
-                    ..set
+                    ..set.clone()
                 },
             );
             let s = r.split.unwrap();
@@ -212,7 +212,7 @@ fn scenes_scaled_and_moved_obey_the_physical_law() {
             spot.point = spot.point * scale;
             spot.path_m *= scale;
         }
-        let mut scaled = set;
+        let mut scaled = set.clone();
         scaled.gate.start_m *= f64::from(scale);
         scaled.gate.bin_width_m *= f64::from(scale);
         let r = ok(&s, &scaled);

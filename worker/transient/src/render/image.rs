@@ -38,13 +38,12 @@ pub(super) struct Parts {
 pub(super) struct Image {
     pub transient: Vec<f32>,
     pub split: Option<Parts>,
+    pub groups: Vec<Vec<f32>>,
     pub stats: Vec<Stat>,
     /// Variance of the image's whole energy.
     pub total_variance: f64,
     /// Energy outside the gate.
     pub overflow: f64,
-    /// Contributions outside the gate.
-    pub outside: u64,
     /// Passes of every tile at least.
     pub passes: u32,
     tiles: Vec<Region>,
@@ -114,10 +113,10 @@ impl Image {
                 multi: empty(),
                 multi_se: empty(),
             }),
+            groups: (1..frame.film.channels).map(|_| empty()).collect(),
             stats: vec![Stat::default(); pixels],
             total_variance: 0.0,
             overflow: 0.0,
-            outside: 0,
             passes: 0,
             spent: vec![0; tiles.len()],
             tile_variance: vec![0.0; tiles.len()],
@@ -225,6 +224,13 @@ impl Image {
                     s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
                 }
             }
+            for (g, group) in self.groups.iter_mut().enumerate() {
+                for bin in 0..bins {
+                    let h = &mut group[pixel * bins + bin];
+                    let x = done.value(film, k, g + 1, bin + 1);
+                    *h = (f64::from(*h) * a + x * unit * b) as f32;
+                }
+            }
             let old = self.stats[pixel];
             self.stats[pixel] = Stat {
                 two_variance: blend(old.two_variance, stat.two_variance * unit2),
@@ -234,7 +240,6 @@ impl Image {
         }
         self.tile_variance[t] = blend(self.tile_variance[t], done.total_variance() * unit2);
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
-        self.outside += done.outside;
         self.spent[t] += done.passes;
     }
 }
@@ -246,7 +251,11 @@ pub(super) fn pilot(frame: &Frame) -> (Vec<Stat>, u64) {
         let side = PILOT_SIDE.min(length);
         let count = PILOT_TILES.min(length / side);
         (0..count)
-            .map(|i| (length * (2 * i + 1) / (2 * count)).saturating_sub(side / 2).min(length - side))
+            .map(|i| {
+                (length * (2 * i + 1) / (2 * count))
+                    .saturating_sub(side / 2)
+                    .min(length - side)
+            })
             .collect()
     };
     let columns = starts(frame.width);

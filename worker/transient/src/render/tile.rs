@@ -1,13 +1,13 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{Stat, relative_median};
+use super::error::{MULTI_REACH, Stat, TWO_REACH, pool, relative_median};
 use crate::{
     api::Overflow,
-    film::{Film, Pairs},
+    film::{Blocks, Film},
     rng::{Rng, Stream},
     share::{Effort, Sharing, Tile},
-    two::{self, Sampling},
+    two::{Sampling, Strata},
     walk::{Scratch, Walk},
 };
 
@@ -51,7 +51,8 @@ pub(super) struct Order {
 pub(super) struct Bench {
     scratch: Scratch,
     sharing: Sharing,
-    pairs: Pairs,
+    blocks: Blocks,
+    strata: Strata,
     /// One pass over the pixels that share vertices.
     pass: Vec<f32>,
     pub done: Done,
@@ -64,8 +65,8 @@ pub(super) struct Done {
     sum: Vec<f32>,
     /// Σ over passes of its square, channel 0.
     square: Vec<f32>,
-    /// Σ over passes of (a pixel's whole pass)².
-    total_square: Vec<f64>,
+    /// Variance of the mean of the 3+ part, channel 0, pooled.
+    multi_variance: Vec<f32>,
     /// Mean of the two-bounce part.
     two: Vec<f32>,
     /// Variance of that mean, channel 0.
@@ -75,7 +76,6 @@ pub(super) struct Done {
     /// Σ and Σ² over passes of the whole tile.
     all: (f64, f64),
     pub passes: u32,
-    pub outside: u64,
     pub rays: u64,
 }
 
@@ -111,13 +111,10 @@ impl Done {
         zero(&mut self.square, pixels * film.slots);
         zero(&mut self.two, pixels * film.pixel());
         zero(&mut self.two_variance, pixels * film.slots);
-        for v in [&mut self.total_square, &mut self.two_total_variance] {
-            v.clear();
-            v.resize(pixels, 0.0);
-        }
+        self.two_total_variance.clear();
+        self.two_total_variance.resize(pixels, 0.0);
         self.all = (0.0, 0.0);
         self.passes = 0;
-        self.outside = 0;
     }
 
     /// Two-bounce and 3+ means of any channel's slot of pixel `k`.
@@ -130,14 +127,30 @@ impl Done {
     /// Means and variances of a slot of pixel `k`, channel 0.
     pub fn moments(&self, film: &Film, k: usize, slot: usize) -> Moments {
         let (wide, narrow) = (k * film.pixel() + slot, k * film.slots + slot);
-        let (sum, square) = (f64::from(self.sum[wide]), f64::from(self.square[narrow]));
-        let (multi, multi_variance) = mean(sum, square, f64::from(self.passes));
+        let n = f64::from(self.passes.max(1));
         Moments {
             two: f64::from(self.two[wide]),
             two_variance: f64::from(self.two_variance[narrow]),
-            multi,
-            multi_variance,
+            multi: f64::from(self.sum[wide]) / n,
+            multi_variance: f64::from(self.multi_variance[narrow]),
         }
+    }
+
+    /// Brings the variances up to the passes done.
+    fn estimate(&mut self, film: &Film, region: &Region) {
+        let n = f64::from(self.passes);
+        self.multi_variance.clear();
+        for (sum, square) in self
+            .sum
+            .chunks(film.pixel())
+            .zip(self.square.chunks(film.slots))
+        {
+            let both = sum[..film.slots].iter().zip(square);
+            self.multi_variance.extend(
+                both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
+            );
+        }
+        pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
     }
 
     /// What pixel `k` adds to the error estimate.
@@ -165,7 +178,11 @@ impl Done {
     pub fn overflow(&self, film: &Film) -> f64 {
         let mut all = Overflow::default();
         let n = f64::from(self.passes.max(1));
-        for (sum, two) in self.sum.chunks(film.pixel()).zip(self.two.chunks(film.pixel())) {
+        for (sum, two) in self
+            .sum
+            .chunks(film.pixel())
+            .zip(self.two.chunks(film.pixel()))
+        {
             all.take(film, sum, 1.0 / n);
             all.take(film, two, 1.0);
         }
@@ -179,7 +196,8 @@ impl Bench {
         Self {
             scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
             sharing: Sharing::default(),
-            pairs: Pairs::new(frame.film),
+            blocks: Blocks::new(frame.film),
+            strata: Strata::default(),
             pass: vec![],
             done: Done::default(),
         }
@@ -208,6 +226,7 @@ impl Bench {
                 && end < most
             {
                 let film = frame.film;
+                self.done.estimate(film, region);
                 let stats = (0..region.pixels()).map(|k| self.done.stat(film, k));
                 let error = relative_median(stats);
                 if error > f64::from(target) {
@@ -217,6 +236,7 @@ impl Bench {
                 }
             }
         }
+        self.done.estimate(frame.film, region);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -252,26 +272,27 @@ impl Bench {
                 index as u64,
                 u64::from(order.first),
             );
-            self.pairs.clear();
-            let strata = two::sample_pixel(
+            self.blocks.clear();
+            let strata = self.strata.sample_pixel(
                 walk,
                 film,
                 (row, col, side),
                 &mut rng,
                 &mut self.scratch,
-                (&mut self.pairs, &mut self.done.outside),
+                &mut self.blocks,
             );
             let n = 1.0 / strata as f32;
             let wide = &mut self.done.two[k * film.pixel()..(k + 1) * film.pixel()];
-            for (out, v) in wide.iter_mut().zip(&self.pairs.sum) {
+            for (out, v) in wide.iter_mut().zip(&self.blocks.sum) {
                 *out = v * n;
             }
             let narrow = &mut self.done.two_variance[k * film.slots..(k + 1) * film.slots];
-            for (out, v) in narrow.iter_mut().zip(&self.pairs.square) {
+            for (out, v) in narrow.iter_mut().zip(&self.blocks.square) {
                 *out = v * n * n;
             }
-            self.done.two_total_variance[k] = self.pairs.total_square * f64::from(n * n);
+            self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
+        pool(&mut self.done.two_variance, region, film.slots, TWO_REACH);
         Some(())
     }
 
@@ -314,7 +335,6 @@ impl Bench {
                     &tile,
                     &mut self.scratch,
                     &mut self.pass,
-                    &mut self.done.outside,
                 );
                 for k in 0..count as u32 {
                     let (r, c) = (row + k / cols, col + k % cols);
@@ -349,7 +369,6 @@ impl Bench {
             }
         }
         let total: f64 = totals.iter().map(|&t| f64::from(t)).sum();
-        self.done.total_square[to] += total * total;
         total
     }
 }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use picofarm_scene::{
     Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Vec3,
 };
-use picofarm_transient::{Budget, Gate, Progress, Settings};
+use picofarm_transient::{Budget, Gate, Progress, Settings, Strategy};
 
 /// Lets every render run to its end.
 pub struct Quiet;
@@ -41,6 +41,8 @@ pub fn settings(budget: Budget) -> Settings {
         one_bounce: false,
         seed: 1,
         split: true,
+        groups: vec![],
+        strategy: Strategy::default(),
     }
 }
 
