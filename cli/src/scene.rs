@@ -108,7 +108,7 @@ fn facts(scene: &Scene) -> serde_json::Value {
     let materials = || scene.objects.iter().flat_map(|o| &o.mesh.materials);
     let mirrors = materials().filter(|m| m.is_specular()).count();
     let rough = materials()
-        .filter(|m| matches!(m.bsdf, Bsdf::RoughConductor { .. }))
+        .filter(|m| !matches!(m.bsdf, Bsdf::Diffuse { .. }))
         .count();
     json!({
         "name": scene.name,

@@ -78,7 +78,7 @@ fn a_roughness_edited_elsewhere_takes_effect() {
         .flat_map(|o| &o.mesh.materials)
         .find_map(|m| match m.bsdf {
             Bsdf::RoughConductor { alpha, .. } => Some(alpha),
-            Bsdf::Diffuse { .. } => None,
+            _ => None,
         });
     assert_eq!(alpha, Some(0.25));
     assert!(back.provenance.notes.contains_key("import.materials"));
