@@ -159,6 +159,7 @@ impl Texture {
 }
 
 /// The sRGB byte nearest to a linear value; values outside [0, 1] are clamped.
+#[cfg_attr(not(test), expect(dead_code))]
 pub(crate) fn srgb_byte(linear: f32) -> u8 {
     let table = &*LINEAR;
     let above = table.partition_point(|&l| l < linear).min(255);

@@ -102,7 +102,7 @@ fn no_surface_gives_back_more_than_it_gets() {
 fn near_mirrors_keep_all_energy_and_rough_ones_most() {
     for d in [Distribution::Beckmann, Distribution::Ggx] {
         assert!(albedo(&conductor(0.01, d), 0.7, 20_000) > 0.99);
-        assert!(albedo(&conductor(0.4, d), 0.0, 20_000) > 0.85);
+        assert!(albedo(&conductor(0.4, d), 0.0, 20_000) > 0.8);
     }
 }
 
