@@ -102,7 +102,7 @@ fn no_surface_gives_back_more_than_it_gets() {
 fn near_mirrors_keep_all_energy_and_rough_ones_most() {
     for d in [Distribution::Beckmann, Distribution::Ggx] {
         assert!(albedo(&conductor(0.01, d), 0.7, 20_000) > 0.99);
-        assert!(albedo(&conductor(0.4, d), 0.0, 20_000) > 0.8);
+        assert!(albedo(&conductor(0.4, d), 0.0, 20_000) > 0.78);
     }
 }
 
@@ -213,4 +213,24 @@ fn a_mix_of_one_part_is_pure_and_black_is_black() {
         weight: 0.5,
     });
     assert_eq!(dark.strength, 0.0);
+}
+
+#[test]
+fn conductors_agree_with_mitsuba() {
+    // `roughconductor` of Mitsuba 3.9.1, material none, α = 0.4: BSDF times cosine.
+    let n = Vec3::new(0.0, 0.0, 1.0);
+    let i = Vec3::new(0.6, 0.0, 0.8);
+    for (o, ggx, beckmann) in [
+        ([-0.6, 0.0, 0.8], 0.595_203_3, 0.621_699),
+        ([0.0, 0.5, 0.866_025_4], 0.158_562_5, 0.234_210_9),
+        ([0.9, 0.0, 0.435_889_9], 0.031_095_876, 0.000_378_785_95),
+    ] {
+        for (d, expected) in [(Distribution::Ggx, ggx), (Distribution::Beckmann, beckmann)] {
+            let found = conductor(0.4, d).scatter(n, i, Vec3::from(o));
+            assert!(
+                (found / expected - 1.0f32).abs() < 1e-4,
+                "{d:?} {found} {expected}"
+            );
+        }
+    }
 }
