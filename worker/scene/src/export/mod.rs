@@ -1,7 +1,9 @@
 //! Writing scenes as canonical `.glb` files: one binary glTF 2.0 file that any viewer opens and that
 //! [`crate::import`] reads back exactly. The same scene gives the same bytes.
 
+mod binary;
 mod document;
+mod textures;
 
 use std::{
     io::Write,
@@ -9,8 +11,9 @@ use std::{
     sync::Arc,
 };
 
-use crate::{Mesh, Scene, SceneError};
+use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
+use image::ImageEncoder;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;
@@ -83,20 +86,37 @@ pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
 /// # Errors
 /// As [`glb_bytes`], and [`SceneError::Write`] naming the file.
 pub fn write_glb(scene: &Scene, path: &Path) -> Result<(), SceneError> {
-    let bytes = glb_bytes(scene)?;
-    let failed = |source| SceneError::Write {
-        path: path.to_path_buf(),
-        source,
-    };
+    write_whole(path, &glb_bytes(scene)?)
+}
+
+/// Writes a file so that it appears whole or not at all.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(format!(".{}.partial", std::process::id()));
     let partial: PathBuf = path.with_file_name(name);
     let written = std::fs::File::create(&partial)
-        .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| std::fs::rename(&partial, path));
     written.map_err(|source| {
         // The partial file is ours alone; the error that matters is the first.
         let _ = std::fs::remove_file(&partial);
-        failed(source)
+        SceneError::Write {
+            path: path.to_path_buf(),
+            source,
+        }
     })
+}
+
+/// A texture as 8-bit RGB PNG.
+fn png(texture: &Texture) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut bytes)
+        .write_image(
+            texture.texels().as_flattened(),
+            texture.width(),
+            texture.height(),
+            image::ExtendedColorType::Rgb8,
+        )
+        .expect("memory takes every image whose size fits its texels");
+    bytes
 }

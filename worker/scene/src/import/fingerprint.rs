@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use gltf::buffer::Source;
+use gltf::{buffer::Source, image};
 use sha2::{Digest, Sha256};
 
 use super::{buffers::buffer_file, read_file};
@@ -18,10 +18,16 @@ pub fn fingerprint(path: &Path) -> Result<String, SceneError> {
     let mut hash = Sha256::new_with_prefix(&bytes);
     // Other files, unreadable ones too, stand alone.
     if let Ok(file) = gltf::Gltf::from_slice_without_validation(&bytes) {
-        for buffer in file.document.buffers() {
-            if let Source::Uri(uri) = buffer.source()
-                && let Some(external) = buffer_file(path, uri)
-            {
+        let buffers = file.document.buffers().filter_map(|b| match b.source() {
+            Source::Uri(uri) => Some(uri),
+            Source::Bin => None,
+        });
+        let images = file.document.images().filter_map(|i| match i.source() {
+            image::Source::Uri { uri, .. } => Some(uri),
+            image::Source::View { .. } => None,
+        });
+        for uri in buffers.chain(images) {
+            if let Some(external) = buffer_file(path, uri) {
                 let data = read_file(&external)?;
                 hash.update(uri.as_bytes());
                 hash.update((data.len() as u64).to_le_bytes());

@@ -3,6 +3,7 @@
 mod buffers;
 mod fingerprint;
 mod gltf_file;
+mod image;
 mod reference;
 
 use std::path::Path;
@@ -90,8 +91,19 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
     }
 }
 
+/// Largest file read, bytes.
+const MAX_FILE_BYTES: u64 = 8 << 30;
+
+/// A regular file's bytes: a path inside a scene file may name anything, devices too.
 fn read_file(path: &Path) -> Result<Vec<u8>, SceneError> {
-    std::fs::read(path).map_err(|source| SceneError::Read {
+    let read = || {
+        let about = std::fs::metadata(path)?;
+        if !about.is_file() || about.len() > MAX_FILE_BYTES {
+            return Err(std::io::Error::other("not a file of at most 8 GiB"));
+        }
+        std::fs::read(path)
+    };
+    read().map_err(|source| SceneError::Read {
         path: path.to_path_buf(),
         source,
     })
