@@ -158,8 +158,12 @@ impl Texture {
     }
 }
 
+/// Linear light of an sRGB byte.
+pub(crate) fn linear(byte: u8) -> f32 {
+    LINEAR[usize::from(byte)]
+}
+
 /// The sRGB byte nearest to a linear value; values outside [0, 1] are clamped.
-#[cfg_attr(not(test), expect(dead_code))]
 pub(crate) fn srgb_byte(linear: f32) -> u8 {
     let table = &*LINEAR;
     let above = table.partition_point(|&l| l < linear).min(255);

@@ -3,6 +3,7 @@
 
 mod binary;
 mod document;
+mod ply;
 mod textures;
 
 use std::{
@@ -87,6 +88,24 @@ pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
 /// As [`glb_bytes`], and [`SceneError::Write`] naming the file.
 pub fn write_glb(scene: &Scene, path: &Path) -> Result<(), SceneError> {
     write_whole(path, &glb_bytes(scene)?)
+}
+
+/// Writes the whole scene as one PLY mesh in world space, for programs that look at shapes only: faces carry
+/// their sRGB colour and the index of their object (`instance`). Camera, laser, BSDFs and textures are left out.
+///
+/// # Errors
+/// As [`write_glb`]; [`SceneError::Invalid`] also for more than 2³² vertices.
+pub fn write_ply(scene: &Scene, path: &Path) -> Result<(), SceneError> {
+    scene.validate()?;
+    let vertices: usize = scene.objects.iter().map(|o| o.mesh.positions.len()).sum();
+    if u32::try_from(vertices).is_err() {
+        return Err(SceneError::Invalid {
+            scene: scene.name.clone(),
+            field: "ply".into(),
+            what: format!("{vertices} vertices exceed the 2³² of a PLY; use fewer"),
+        });
+    }
+    write_whole(path, &ply::scene_bytes(scene))
 }
 
 /// Writes a file so that it appears whole or not at all.

@@ -4,6 +4,7 @@ mod buffers;
 mod fingerprint;
 mod gltf_file;
 mod image;
+mod ply;
 mod reference;
 
 use std::path::Path;
@@ -20,6 +21,8 @@ pub struct ImportOptions {
     pub camera: Option<Camera>,
     /// Use this grid over the camera's view in place of the file's laser.
     pub laser: Option<LaserGrid>,
+    /// Put a camera in front of a lone mesh (PLY) where no camera is stated: 60°, on its +z side, seeing all of it.
+    pub frame: bool,
 }
 
 /// Reads a scene with its own camera and laser; see [`read_scene_with`].
@@ -47,6 +50,8 @@ pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, Sc
     let bytes = read_file(path)?;
     let mut scene = if bytes.starts_with(b"glTF") {
         gltf_file::read(path, &bytes, options)?
+    } else if ply::is_ply(&bytes) {
+        ply::read(path, &bytes, options)?
     } else {
         match sniff(path, &bytes)? {
             Kind::Gltf => gltf_file::read(path, &bytes, options)?,
