@@ -3,6 +3,7 @@
 
 mod binary;
 mod document;
+pub(crate) mod mitsuba;
 mod ply;
 mod textures;
 
@@ -15,6 +16,7 @@ use std::{
 use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
 use image::ImageEncoder;
+pub use mitsuba::write_mitsuba;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;
