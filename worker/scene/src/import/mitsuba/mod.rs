@@ -72,18 +72,14 @@ pub(super) fn read_dictionary(
     options: &ImportOptions,
 ) -> Result<Scene, SceneError> {
     let fail = |what: String| format_error(path, what);
-    let json = serde_json::from_slice(bytes).map_err(|e| fail(e.to_string()))?;
-    let root = dictionary::parse(&json).map_err(fail)?;
+    let root = dictionary::parse(bytes).map_err(fail)?;
     Reader::new(path, root, None).scene(options).map_err(fail)
 }
 
 /// The files that a scene in XML or JSON refers to, in order of their names.
 pub(super) fn files(path: &Path, bytes: &[u8]) -> Vec<PathBuf> {
     let root = match std::str::from_utf8(bytes) {
-        Ok(text) if text.trim_start().starts_with('{') => {
-            let json = serde_json::from_str(text).ok();
-            json.and_then(|j| dictionary::parse(&j).ok())
-        }
+        Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes).ok(),
         Ok(text) => xml::parse(text.trim_start_matches('\u{feff}'))
             .ok()
             .map(|x| x.0),
