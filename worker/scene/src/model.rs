@@ -99,14 +99,14 @@ pub enum SceneError {
         attempts: u32,
     },
     /// Furniture assets that the job names are not here.
-    #[error(
-        "assets {name:?} are not installed ({looked}); run `picofarm assets install`, or set assets = \"parametric\""
-    )]
+    #[error("assets {name:?} are not installed ({looked}); {mend}, or set assets = \"parametric\"")]
     Assets {
         /// Which asset source.
         name: String,
         /// Where it was looked for.
         looked: String,
+        /// How to come by them.
+        mend: &'static str,
     },
     /// Furniture assets cannot be fetched.
     #[error("assets cannot be installed: {what}")]

@@ -72,6 +72,13 @@ pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, Sc
     validated(path, scene)
 }
 
+/// One glTF file as one mesh in its own frame, with the notes on what was dropped; its numbers are unchecked.
+pub(crate) fn read_model(
+    path: &Path,
+) -> Result<(crate::Mesh, std::collections::BTreeMap<String, String>), SceneError> {
+    gltf_file::read_model(path, &read_file(path)?)
+}
+
 enum Kind {
     Gltf,
     Reference,

@@ -18,6 +18,8 @@ use parts::laser_of;
 
 use super::{ImportOptions, buffers::Buffers, compose, format_error, image::Images};
 
+/// Deepest nesting of nodes.
+const MAX_DEPTH: usize = 1000;
 /// Category of nodes without a `label`.
 const UNLABELLED: &str = "unlabelled";
 
@@ -27,20 +29,8 @@ pub(super) fn read(
     bytes: &[u8],
     options: &ImportOptions,
 ) -> Result<Scene, SceneError> {
-    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
-        format_error(
-            path,
-            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
-        )
-    })?;
-    let buffers = Buffers::read(path, &document, blob)?;
-    let root = document
-        .default_scene()
-        .or_else(|| document.scenes().next())
-        .ok_or_else(|| {
-            format_error(path, "scenes: the file has none; export at least one scene")
-        })?;
-    is_a_forest(path, &document, &root)?;
+    let (document, buffers) = open(path, bytes)?;
+    let root = root(path, &document)?;
     let ours: Option<SceneExtras> = keyed(
         path,
         "scene.extras.picofarm",
@@ -57,22 +47,65 @@ pub(super) fn read(
             ),
         ));
     }
-    let mut walk = Walk {
-        path,
-        buffers: &buffers,
-        images: Images::default(),
-        meshes: BTreeMap::new(),
-        objects: Vec::new(),
-        labels: ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone()),
-        camera: None,
-        laser: None,
-        notes: BTreeMap::new(),
-    };
-    walk.dropped_parts(&document);
-    for node in root.nodes() {
-        walk.node(&node, &Affine::IDENTITY, None)?;
-    }
+    let labels = ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone());
+    let walk = Walk::over(path, &document, &buffers, labels)?;
     walk.finish(&root, ours, options)
+}
+
+/// Reads `.glb` or `.gltf` bytes as one mesh in the file's own frame, with the notes on what was dropped. Cameras
+/// and lasers are not looked for; the caller checks the numbers.
+pub(super) fn read_model(
+    path: &Path,
+    bytes: &[u8],
+) -> Result<(Mesh, BTreeMap<String, String>), SceneError> {
+    let (document, buffers) = open(path, bytes)?;
+    let walk = Walk::over(path, &document, &buffers, Vec::new())?;
+    let mut all = Mesh {
+        name: path
+            .file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into(),
+        ..Mesh::default()
+    };
+    for (_, object) in &walk.objects {
+        let (mesh, base) = (&object.mesh, all.positions.len());
+        let slot = all.materials.len() as u32;
+        let place = |p: &Vec3| object.to_world.point(*p);
+        all.positions.extend(mesh.positions.iter().map(place));
+        if !mesh.uv.is_empty() {
+            all.uv.resize(base, [0.0; 2]);
+            all.uv.extend(&mesh.uv);
+        }
+        if !all.uv.is_empty() {
+            all.uv.resize(all.positions.len(), [0.0; 2]);
+        }
+        let shift = |t: &[u32; 3]| t.map(|v| v + base as u32);
+        all.triangles.extend(mesh.triangles.iter().map(shift));
+        let shift = |m: &u32| m + slot;
+        all.triangle_material
+            .extend(mesh.triangle_material.iter().map(shift));
+        all.materials.extend(mesh.materials.iter().cloned());
+    }
+    Ok((all, walk.notes))
+}
+
+fn open(path: &Path, bytes: &[u8]) -> Result<(gltf::Document, Buffers), SceneError> {
+    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
+        format_error(
+            path,
+            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
+        )
+    })?;
+    let buffers = Buffers::read(path, &document, blob)?;
+    Ok((document, buffers))
+}
+
+fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>, SceneError> {
+    document
+        .default_scene()
+        .or_else(|| document.scenes().next())
+        .ok_or_else(|| format_error(path, "scenes: the file has none; export at least one scene"))
 }
 
 /// Every node has one parent at most, and the scene's own nodes have none; otherwise a walk might not end.
@@ -132,13 +165,45 @@ struct Walk<'a> {
     notes: BTreeMap<String, String>,
 }
 
-impl Walk<'_> {
+impl<'a> Walk<'a> {
+    /// Everything that the document's scene places.
+    fn over(
+        path: &'a Path,
+        document: &gltf::Document,
+        buffers: &'a Buffers,
+        labels: Vec<String>,
+    ) -> Result<Self, SceneError> {
+        let root = root(path, document)?;
+        is_a_forest(path, document, &root)?;
+        let mut walk = Walk {
+            path,
+            buffers,
+            images: Images::default(),
+            meshes: BTreeMap::new(),
+            objects: Vec::new(),
+            labels,
+            camera: None,
+            laser: None,
+            notes: BTreeMap::new(),
+        };
+        walk.dropped_parts(document);
+        for node in root.nodes() {
+            walk.node(&node, &Affine::IDENTITY, None, 0)?;
+        }
+        Ok(walk)
+    }
+
     fn node(
         &mut self,
         node: &Node<'_>,
         parent: &Affine,
         label: Option<&str>,
+        depth: usize,
     ) -> Result<(), SceneError> {
+        if depth > MAX_DEPTH {
+            let what = format!("nodes[{}]: nested deeper than {MAX_DEPTH}", node.index());
+            return Err(format_error(self.path, what));
+        }
         let to_world = compose(parent, &affine(node.transform().matrix()));
         let at = format!("nodes[{}].extras", node.index());
         let extras: NodeExtras = match node.extras() {
@@ -163,7 +228,7 @@ impl Walk<'_> {
             self.laser = Some((to_world, extras.clone()));
         }
         for child in node.children() {
-            self.node(&child, &to_world, label)?;
+            self.node(&child, &to_world, label, depth + 1)?;
         }
         Ok(())
     }
