@@ -279,11 +279,38 @@ pub enum Scene {
     },
     /// Say what a scene file holds
     Show {
-        /// A .glb, .gltf or .json scene
+        /// A .glb, .gltf, .xml (Mitsuba) or .json scene
         file: PathBuf,
     },
+    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or one .ply mesh
+    Export(SceneExport),
     /// Render one scene file without a farm into a small Zarr group
     Render(SceneRender),
+}
+
+#[derive(Args)]
+pub struct SceneExport {
+    /// A .glb, .gltf, .xml (Mitsuba), .json or .ply scene
+    pub file: PathBuf,
+    /// Where to write it: a file, or a folder for scene.glb, scene.xml or scene.ply
+    #[arg(long, value_name = "DIR_OR_FILE")]
+    pub out: PathBuf,
+    /// Format [default: by the extension of --out]
+    #[arg(long, value_enum)]
+    pub format: Option<FormatArg>,
+    /// Aim this many laser spots over the camera's view, in place of the file's laser: 1, 4, 16, 25 or 100
+    #[arg(long)]
+    pub spots: Option<u32>,
+    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say otherwise
+    #[arg(long)]
+    pub frame: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum FormatArg {
+    Glb,
+    Mitsuba,
+    Ply,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -294,7 +321,7 @@ pub enum GeneratorArg {
 
 #[derive(Args)]
 pub struct SceneRender {
-    /// A .glb, .gltf or .json scene
+    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
     pub file: PathBuf,
     /// Folder for the Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]

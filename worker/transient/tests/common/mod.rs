@@ -52,6 +52,7 @@ pub fn grey(reflectance: f32) -> Material {
         name: "grey".into(),
         bsdf: Bsdf::Diffuse { reflectance },
         rgb: [reflectance; 3],
+        texture: None,
         two_sided: true,
     }
 }
@@ -64,6 +65,7 @@ pub fn object(name: &str, positions: Vec<Vec3>, triangles: Vec<[u32; 3]>, m: Mat
             positions,
             triangles,
             materials: vec![m],
+            uv: vec![],
         }),
         to_world: Affine::IDENTITY,
         label: 0,

@@ -80,6 +80,7 @@ fn build(json: &Value) -> Scene {
             name: "reference".into(),
             bsdf: bsdf(&m["bsdf"]),
             rgb: [0.5; 3],
+            texture: None,
             two_sided: false,
         };
         objects.push(object(
