@@ -138,22 +138,7 @@ impl Rays {
             rays.shear[1][k] = d[ky][k] / d[kz][k];
             rays.shear[2][k] = 1.0 / d[kz][k];
         }
-        let range = |a: &[f32; MOST]| {
-            let (mut low, mut high) = (W::load(a), W::load(a));
-            for k in (W::N..padded).step_by(W::N) {
-                low = low.min(W::load(&a[k..]));
-                high = high.max(W::load(&a[k..]));
-            }
-            let (mut l, mut h) = ([0.0f32; 16], [0.0f32; 16]);
-            low.store(&mut l);
-            high.store(&mut h);
-            let low = l[..W::N].iter().fold(f32::INFINITY, |a, &b| a.min(b));
-            (
-                low,
-                h[..W::N].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)),
-            )
-        };
-        let (low, high) = range(&d[kz]);
+        let (low, high) = range::<W>(&d[kz], padded);
         let (near, far) = if negative { (-high, -low) } else { (low, high) };
         let widest = o.x.abs().max(o.y.abs()).max(o.z.abs()).max(far);
         if !(near > 1e-9 && widest < 1e9) {
@@ -163,7 +148,7 @@ impl Rays {
         // Components below 1e-18 count as that in the slab test.
         let least = 2e-18 / near;
         for a in 0..2 {
-            let (low, high) = range(&rays.shear[a]);
+            let (low, high) = range::<W>(&rays.shear[a], padded);
             let (low, high) = if negative { (-high, -low) } else { (low, high) };
             rays.slope[a] = (
                 low - (low.abs() * MARGIN + least),
@@ -191,15 +176,15 @@ impl Rays {
         let (mut current, mut depth) = (0u32, 0);
         loop {
             let node = &bvh.nodes[current as usize];
-            let from_o = |k: usize, a: usize| E::load(&node.bounds[k]).sub(o[a]);
-            let z0 = from_o(near, kz).mul(sign);
-            let z1 = from_o(far, kz).mul(sign);
+            let z0 = E::load(&node.bounds[near]).sub(o[kz]).mul(sign);
+            let z1 = E::load(&node.bounds[far]).sub(o[kz]).mul(sign);
             let mut mask = z0.le(deepest) & zero.sub(tiny).le(z1);
             let (z0, z1) = (z0.max(zero), z1.min(deepest));
             for (a, (low, high)) in [kx, ky].into_iter().zip(slope) {
                 let low = z0.mul(low).min(z1.mul(low)).sub(tiny);
                 let high = z0.mul(high).max(z1.mul(high)).add(tiny);
-                mask &= from_o(a, a).le(high) & low.le(from_o(3 + a, a));
+                mask &= E::load(&node.bounds[a]).sub(o[a]).le(high);
+                mask &= low.le(E::load(&node.bounds[3 + a]).sub(o[a]));
             }
             while mask != 0 {
                 let i = mask.trailing_zeros() as usize & 7;
@@ -229,8 +214,17 @@ impl Rays {
     /// Which of the rays `of` meet box `i` of a node: the single ray's slab test, a lane for each ray.
     #[inline(always)]
     fn meet<W: Lanes>(&self, bounds: &[[f32; 8]; 6], i: usize, of: u64) -> u64 {
-        let low: [W; 3] = std::array::from_fn(|a| W::splat(bounds[a][i] - self.o[a]));
-        let high: [W; 3] = std::array::from_fn(|a| W::splat(bounds[3 + a][i] - self.o[a]));
+        let (ox, oy, oz) = (self.o.x, self.o.y, self.o.z);
+        let low = [
+            W::splat(bounds[0][i] - ox),
+            W::splat(bounds[1][i] - oy),
+            W::splat(bounds[2][i] - oz),
+        ];
+        let high = [
+            W::splat(bounds[3][i] - ox),
+            W::splat(bounds[4][i] - oy),
+            W::splat(bounds[5][i] - oz),
+        ];
         let slack = W::splat(1.0 + 4.0 * f32::EPSILON);
         let mut met = 0;
         for k in (0..self.count).step_by(W::N) {
@@ -238,18 +232,23 @@ impl Rays {
             if lanes == 0 {
                 continue;
             }
-            // Which plane is nearer depends on the sign; as min and max they are the same numbers.
-            let plane = |a: usize| {
-                let inverse = W::load(&self.inverse[a][k..]);
-                let (p, q) = (low[a].mul(inverse), high[a].mul(inverse));
-                (p.min(q), p.max(q))
-            };
-            let ((nx, fx), (ny, fy), (nz, fz)) = (plane(0), plane(1), plane(2));
+            let (nx, fx) = self.planes::<W>(low[0], high[0], 0, k);
+            let (ny, fy) = self.planes::<W>(low[1], high[1], 1, k);
+            let (nz, fz) = self.planes::<W>(low[2], high[2], 2, k);
             let t0 = nx.max(ny).max(nz.max(W::splat(0.0)));
             let t1 = fx.min(fy).min(fz).mul(slack).min(W::splat(1.0));
             met |= (u64::from(t0.le(t1)) & lanes) << k;
         }
         met
+    }
+
+    /// Where rays `k..` enter and leave a slab. Which plane is nearer depends on the sign; as min and max
+    /// they are the same numbers.
+    #[inline(always)]
+    fn planes<W: Lanes>(&self, low: W, high: W, axis: usize, k: usize) -> (W, W) {
+        let inverse = W::load(&self.inverse[axis][k..]);
+        let (p, q) = (low.mul(inverse), high.mul(inverse));
+        (p.min(q), p.max(q))
     }
 
     /// Which of the rays `of` meet a triangle of a leaf.
@@ -275,13 +274,26 @@ impl Rays {
     #[inline(always)]
     fn by_ray<E: Lanes>(&self, pack: &Pack, mut of: u64) -> u64 {
         let [kx, ky, kz] = self.axes;
-        let at = |v: usize, k: usize| E::load(&pack.vertex[3 * v + k]).sub(E::splat(self.o[k]));
-        let vertices = std::array::from_fn(|v| [at(v, kx), at(v, ky), at(v, kz)]);
+        let o = [
+            E::splat(self.o[kx]),
+            E::splat(self.o[ky]),
+            E::splat(self.o[kz]),
+        ];
+        let mut vertices = [[E::splat(0.0); 3]; 3];
+        for v in 0..3 {
+            for (a, k) in [kx, ky, kz].into_iter().enumerate() {
+                vertices[v][a] = E::load(&pack.vertex[3 * v + k]).sub(o[a]);
+            }
+        }
         let mut hit = 0;
         while of != 0 {
             let k = of.trailing_zeros() as usize & (MOST - 1);
             of &= of - 1;
-            let shear = std::array::from_fn(|a| E::splat(self.shear[a][k]));
+            let shear = [
+                E::splat(self.shear[0][k]),
+                E::splat(self.shear[1][k]),
+                E::splat(self.shear[2][k]),
+            ];
             hit |= u64::from(meets(&vertices, &shear) != 0) << k;
         }
         hit
@@ -291,20 +303,22 @@ impl Rays {
     fn by_triangle<W: Lanes>(&self, pack: &Pack, fill: usize, of: u64) -> u64 {
         let mut hit = 0;
         for lane in 0..fill {
-            let at = |v: usize, k: usize| W::splat(pack.vertex[3 * v + k][lane] - self.o[k]);
-            let vertices = std::array::from_fn(|v| {
-                [
-                    at(v, self.axes[0]),
-                    at(v, self.axes[1]),
-                    at(v, self.axes[2]),
-                ]
-            });
+            let mut vertices = [[W::splat(0.0); 3]; 3];
+            for v in 0..3 {
+                for (a, k) in self.axes.into_iter().enumerate() {
+                    vertices[v][a] = W::splat(pack.vertex[3 * v + k][lane] - self.o[k]);
+                }
+            }
             for k in (0..self.count).step_by(W::N) {
                 let lanes = (of & !hit) >> k & (u64::MAX >> (64 - W::N));
                 if lanes == 0 {
                     continue;
                 }
-                let shear = std::array::from_fn(|a| W::load(&self.shear[a][k..]));
+                let shear = [
+                    W::load(&self.shear[0][k..]),
+                    W::load(&self.shear[1][k..]),
+                    W::load(&self.shear[2][k..]),
+                ];
                 hit |= (u64::from(meets(&vertices, &shear)) & lanes) << k;
             }
         }
@@ -312,13 +326,35 @@ impl Rays {
     }
 }
 
+/// Least and greatest of the first `padded` numbers, a multiple of the lanes.
+#[inline(always)]
+fn range<W: Lanes>(a: &[f32; MOST], padded: usize) -> (f32, f32) {
+    let (mut low, mut high) = (W::load(a), W::load(a));
+    let mut k = W::N;
+    while k < padded {
+        low = low.min(W::load(&a[k..]));
+        high = high.max(W::load(&a[k..]));
+        k += W::N;
+    }
+    let (mut l, mut h) = ([0.0f32; 16], [0.0f32; 16]);
+    low.store(&mut l);
+    high.store(&mut h);
+    let (mut low, mut high) = (l[0], h[0]);
+    for k in 1..W::N {
+        low = if l[k] < low { l[k] } else { low };
+        high = if h[k] > high { h[k] } else { high };
+    }
+    (low, high)
+}
+
 /// The triangle test of the single ray with limit 1: vertices relative to the origin, axes in the order
 /// of the shear.
 #[inline(always)]
 fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> u32 {
-    let shear = |p: &[L; 3]| (p[0].sub(sx.mul(p[2])), p[1].sub(sy.mul(p[2])));
-    let ((ax, ay), (bx, by), (cx, cy)) = (shear(&v[0]), shear(&v[1]), shear(&v[2]));
-    let (az, bz, cz) = (v[0][2], v[1][2], v[2][2]);
+    let [[ax, ay, az], [bx, by, bz], [cx, cy, cz]] = *v;
+    let (ax, ay) = (ax.sub(sx.mul(az)), ay.sub(sy.mul(az)));
+    let (bx, by) = (bx.sub(sx.mul(bz)), by.sub(sy.mul(bz)));
+    let (cx, cy) = (cx.sub(sx.mul(cz)), cy.sub(sy.mul(cz)));
     let zero = L::splat(0.0);
     let u = cx.mul(by).sub(cy.mul(bx));
     let v = ax.mul(cy).sub(ay.mul(cx));
