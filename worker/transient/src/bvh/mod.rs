@@ -7,7 +7,9 @@
 
 mod build;
 mod bundle;
+mod bundle_leaf;
 mod lanes;
+mod pyramid;
 mod simd;
 mod traverse;
 
@@ -74,6 +76,7 @@ pub struct Bvh {
 #[derive(Debug)]
 pub struct Stack {
     entries: Vec<(u32, f32)>,
+    bundle: Box<bundle::Scratch>,
     /// Rays traced with this stack.
     pub rays: u64,
 }
@@ -97,6 +100,7 @@ impl Bvh {
     pub fn stack(&self) -> Stack {
         Stack {
             entries: vec![(0, 0.0); 8 * (self.depth + 2)],
+            bundle: Box::new(bundle::Scratch::new()),
             rays: 0,
         }
     }
