@@ -240,6 +240,7 @@ fn trace<E: Lanes, W: Lanes>(
             mask &= mask - 1;
             let child = node.child[i];
             if child & LEAF == 0 {
+                bvh.prefetch::<E>(child);
                 stack[depth].0 = child;
                 depth += 1;
                 continue;

@@ -5,6 +5,9 @@
 pub(super) trait Lanes: Copy {
     /// How many lanes: 8 or 16.
     const N: usize;
+    /// Asks for `x` to be brought near; a hint.
+    #[inline(always)]
+    fn prefetch<T>(_x: &T) {}
     fn splat(x: f32) -> Self;
     /// The first `N` of `a`.
     fn load(a: &[f32]) -> Self;

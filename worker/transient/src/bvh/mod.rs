@@ -26,7 +26,7 @@ struct Node {
 }
 
 /// Eight triangles: vertex components a.xyz, b.xyz, c.xyz; NaN in unused lanes, which never hit.
-#[repr(C, align(32))]
+#[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 struct Pack {
     vertex: [[f32; 8]; 9],
@@ -163,6 +163,16 @@ impl Bvh {
             Kernel::Avx512 => simd::bundle_avx512(self, stack, from, to, blocked),
             Kernel::Avx2 => simd::bundle_avx2(self, stack, from, to, blocked),
             Kernel::Portable => simd::bundle_portable(self, stack, from, to, blocked),
+        }
+    }
+
+    /// Brings a child's node or first pack near.
+    #[inline(always)]
+    fn prefetch<L: lanes::Lanes>(&self, child: u32) {
+        if child & LEAF == 0 {
+            L::prefetch(&self.nodes[child as usize]);
+        } else {
+            L::prefetch(&self.packs[packs(child).start]);
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch no
 //! memory except unaligned loads and stores of one whole register, from and to slices that are checked
-//! to be that long. The functions `*_avx2` and `*_avx512` are reached only through a
+//! to be that long; a prefetch may name any address. The functions `*_avx2` and `*_avx512` are reached only through a
 //! [`Bvh`](super::Bvh) of that kernel, which `build` and `with_kernel` set only where [`available`] says
 //! so. Features are enabled for these functions alone; everything below is inlined into them.
 #![cfg_attr(
@@ -131,6 +131,13 @@ mod native {
             // proof), and the slices are as long as a register.
             impl Lanes for $t {
                 const N: usize = $n;
+                #[inline(always)]
+                fn prefetch<T>(x: &T) {
+                    let start = std::ptr::from_ref(x).cast::<i8>();
+                    for line in (0..size_of::<T>()).step_by(64) {
+                        unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(line)) };
+                    }
+                }
                 #[inline(always)]
                 fn splat(x: f32) -> Self {
                     Self(unsafe { $splat(x) })
