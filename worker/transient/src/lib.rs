@@ -14,6 +14,7 @@ mod plan;
 mod pool;
 mod render;
 mod rng;
+pub mod sensor;
 mod truth;
 mod two;
 mod world;
