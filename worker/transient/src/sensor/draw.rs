@@ -84,19 +84,23 @@ const LARGE: f64 = 10.0;
 /// A Poisson count, exact for rates up to 10¹²: inversion below a rate of 10, from there Hörmann's transformed rejection
 /// (PTRS; W. Hörmann, "The transformed rejection method for generating Poisson random variables", Insurance:
 /// Mathematics and Economics 12, 1993). A rate that is not above 0 gives 0.
+///
+/// # Panics
+/// Where the rate is above 10¹².
 #[inline]
 pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
-    if rate < LARGE {
-        if rate > 0.0 {
-            let u = draws.uniform();
-            // 1 − rate ≤ exp(−rate): most dark bins need no exponential.
-            if u < 1.0 - rate {
-                return 0;
-            }
-            return poisson_inverse(rate, u);
-        }
+    if rate.is_nan() || rate <= 0.0 {
         return 0;
     }
+    if rate < LARGE {
+        let u = draws.uniform();
+        // 1 − rate ≤ exp(−rate): most dark bins need no exponential.
+        if u < 1.0 - rate {
+            return 0;
+        }
+        return poisson_inverse(rate, u);
+    }
+    assert!(rate <= 1e12, "a rate of {rate} is beyond exact counting");
     poisson_ptrs(rate, draws)
 }
 
