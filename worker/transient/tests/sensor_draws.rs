@@ -23,7 +23,11 @@ fn deviation(
     // What lies outside is less likely than one in 10⁹.
     assert_eq!((below, above), (0, 0));
     let n = samples as f64;
-    let cell = if probabilities.len() < 60 { 20.0 } else { n / 60.0 };
+    let cell = if probabilities.len() < 60 {
+        20.0
+    } else {
+        n / 60.0
+    };
     let (mut expected, mut observed) = (0.0, 0.0);
     let mut cells = vec![];
     for (p, seen) in probabilities.iter().zip(&seen) {

@@ -84,15 +84,19 @@ pub enum Jitter {
     /// As the published code does it: the pulse is rolled by floor(N(0, σ)) bins of the histogram, once for all pixels.
     /// The pulse is shifted rather than rolled round its own array, so no tail appears before its rise.
     Sb3dCompat {
-        /// σ in bins of the histogram; 2.654 in the published code (50 ps FWHM in bins of 8 ps).
+        /// σ in bins of the histogram; absent = [`Jitter::SB3D_SIGMA_BINS`].
         #[serde(default = "sb3d_sigma")]
         sigma_bins: f64,
     },
 }
 
-/// σ of the published code, bins.
+impl Jitter {
+    /// σ of the published code: 50 ps FWHM in bins of 8 ps.
+    pub const SB3D_SIGMA_BINS: f64 = 2.654;
+}
+
 fn sb3d_sigma() -> f64 {
-    2.654
+    Jitter::SB3D_SIGMA_BINS
 }
 
 impl Default for Jitter {
