@@ -486,7 +486,7 @@ mod tests {
         assert!((sum - expected).abs() < 5.0 * expected.sqrt());
         // Bright counts need 32 bits.
         let bright = measure(&SceneSense {
-            photons_per_unit: Some(1e6),
+            photons_per_unit: Some(1e8),
             ..args(folder.path(), "bright")
         })
         .unwrap();
