@@ -28,7 +28,7 @@ use crate::{
     assets,
     error::{CliError, Code, Result, io},
     output::{Meter, Output, duration},
-    roles,
+    roles, sense,
     settings::Settings,
     signals,
 };
@@ -63,6 +63,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         }
         Command::Export(args) => export_scene(&args, output),
         Command::Render(args) => render(args, output).await,
+        Command::Sense(args) => sense::run(args, output).await,
     }
 }
 
@@ -323,7 +324,7 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
 }
 
 /// Refuses early what the writer would refuse after the render.
-fn free_folder(out: &Path) -> Result<()> {
+pub fn free_folder(out: &Path) -> Result<()> {
     let taken = match std::fs::read_dir(out) {
         Ok(mut entries) => entries.next().is_some(),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,

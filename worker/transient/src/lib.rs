@@ -14,6 +14,7 @@ mod pool;
 mod render;
 mod rng;
 mod share;
+pub mod sensor;
 mod truth;
 mod two;
 mod walk;
