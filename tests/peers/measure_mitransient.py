@@ -258,10 +258,10 @@ def measure(mode, d, args, truth):
     for spp in args.ladder or []:
         climb(spp)
     if not args.ladder:
-        # Up until the error is near the target; the last step aims just below it.
+        # Up until the error is near the target: what little is left is extrapolated with error ~ time^-1/2.
         spp, error = args.first, climb(args.first)
-        while error > args.target and sum(r["cpu_seconds"] for r in rungs) < args.limit:
-            spp = int(np.ceil(spp * min(max((error / args.target) ** 2 * 1.15, 1.5), 8)))
+        while error > 1.2 * args.target and sum(r["cpu_seconds"] for r in rungs) < args.limit:
+            spp = int(np.ceil(spp * min((error / args.target) ** 2 * 1.1, 8)))
             error = climb(spp)
     i = args.resolution
     return {"scene": d["name"], "mode": mode, "width": i, "height": i, "bins": d["histogram"]["bins"],
@@ -275,7 +275,7 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--mode", action="append", choices=list(SCENES))
     parser.add_argument("--ladder", type=lambda t: [int(n) for n in t.split(",")],
-                        help="samples a pixel and render; default: climb until --target is passed")
+                        help="samples a pixel and render; default: climb until close to --target")
     parser.add_argument("--first", type=int, default=64, help="first rung without --ladder")
     parser.add_argument("--target", type=float, default=0.1)
     parser.add_argument("--limit", type=float, default=600, help="CPU seconds after which climbing ends")
