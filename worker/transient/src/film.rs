@@ -1,17 +1,9 @@
-//! The gate, and what one pixel collects.
+//! The gate as an array of slots, and what pixels collect in it.
 
-use crate::api::{Gate, Overflow};
-
-/// Contributions of one independent unit (a batch of paths, or a pair of strata) to one pixel, by bin.
-#[derive(Debug)]
-pub(crate) struct Unit {
-    value: Vec<f32>,
-    touched: Vec<u32>,
-    /// Contributions outside the gate.
-    pub outside: u64,
-    /// Their sum.
-    pub outside_energy: f64,
-}
+use crate::{
+    api::{Gate, Overflow},
+    walk::Sink,
+};
 
 impl Gate {
     /// ℓ_max, metres.
@@ -28,65 +20,106 @@ impl Gate {
     }
 }
 
-impl Unit {
-    pub fn new(bins: u32) -> Self {
-        Self {
-            value: vec![0.0; bins as usize],
-            touched: vec![],
-            outside: 0,
-            outside_energy: 0.0,
-        }
-    }
-
-    /// Adds `value` at path length `path_m`. `sign` is −1 for the second stratum of a pair: then the
-    /// unit holds the pair's difference, from which the variance follows.
-    #[inline]
-    pub fn add(&mut self, gate: &Gate, path_m: f64, value: f32, sign: f32, pixel: &mut Pixel) {
-        match gate.bin(path_m) {
-            Some(b) => {
-                let b = b as usize;
-                pixel.sum[b] += value;
-                if self.value[b] == 0.0 {
-                    self.touched.push(b as u32);
-                }
-                self.value[b] += sign * value;
-            }
-            None => {
-                self.outside += 1;
-                self.outside_energy += f64::from(value);
-            }
-        }
-    }
-
-    /// Ends the unit: its squares go to `pixel`.
-    pub fn finish(&mut self, pixel: &mut Pixel) {
-        let mut total = 0.0f64;
-        for b in self.touched.drain(..) {
-            let v = std::mem::take(&mut self.value[b as usize]);
-            pixel.square[b as usize] += v * v;
-            total += f64::from(v);
-        }
-        pixel.total_square += total * total;
-    }
-}
-
-/// One pixel's histogram with the sum of squares that gives its standard error.
+/// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
+/// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
+/// what comes before the gate and one behind for what comes after.
 #[derive(Debug)]
-pub(crate) struct Pixel {
-    /// Σ of contributions by bin.
-    pub sum: Vec<f32>,
-    /// Σ over units of (contribution by bin)².
-    pub square: Vec<f32>,
-    /// Σ over units of (all contributions)².
-    pub total_square: f64,
+pub(crate) struct Film {
+    pub gate: Gate,
+    /// Slots of a channel.
+    pub slots: usize,
+    /// Channels of a pixel.
+    pub channels: usize,
+    /// Channels beyond 0 that a spot counts in, by emitter.
+    pub of_spot: Vec<Vec<u16>>,
 }
 
-impl Pixel {
-    pub fn new(bins: u32) -> Self {
+impl Film {
+    /// A film for a gate and the groups that each emitter belongs to.
+    pub fn new(gate: &Gate, groups: usize, of_spot: Vec<Vec<u16>>) -> Self {
         Self {
-            sum: vec![0.0; bins as usize],
-            square: vec![0.0; bins as usize],
+            gate: *gate,
+            slots: gate.bins as usize + 2,
+            channels: 1 + groups,
+            of_spot,
+        }
+    }
+
+    /// Slots of one pixel.
+    pub fn pixel(&self) -> usize {
+        self.slots * self.channels
+    }
+
+    /// The slot of a path of a length.
+    #[inline]
+    pub fn slot(&self, path_m: f64) -> usize {
+        let b = (path_m - self.gate.start_m) / self.gate.bin_width_m;
+        if b >= f64::from(self.gate.bins) {
+            self.slots - 1
+        } else if b >= 0.0 {
+            1 + b as usize
+        } else {
+            0
+        }
+    }
+
+    /// True for the slots before and behind the gate.
+    #[inline]
+    pub fn outside(&self, slot: usize) -> bool {
+        slot == 0 || slot + 1 == self.slots
+    }
+
+    /// Adds a value to a pixel's channels.
+    #[inline]
+    pub fn add(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
+        pixel[slot] += value;
+        if self.channels > 1 {
+            for &c in &self.of_spot[spot] {
+                pixel[usize::from(c) * self.slots + slot] += value;
+            }
+        }
+    }
+}
+
+/// A walk's contributions to one pixel.
+pub(crate) struct PixelSink<'a> {
+    pub film: &'a Film,
+    pub pixel: &'a mut [f32],
+    pub factor: f32,
+    /// Counts contributions outside the gate.
+    pub outside: &'a mut u64,
+}
+
+impl Sink for PixelSink<'_> {
+    #[inline]
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32) {
+        let slot = self.film.slot(path_m);
+        *self.outside += u64::from(self.film.outside(slot));
+        self.film.add(self.pixel, slot, self.factor * value, spot);
+    }
+}
+
+/// Two-bounce contributions of one pixel: sums, and squared differences of pairs of strata.
+#[derive(Debug)]
+pub(crate) struct Pairs {
+    /// Σ of contributions, as [`Film::pixel`] slots.
+    pub sum: Vec<f32>,
+    /// Σ over pairs of (difference by slot of channel 0)².
+    pub square: Vec<f32>,
+    /// Σ over pairs of (difference of the whole)².
+    pub total_square: f64,
+    difference: Vec<f32>,
+    touched: Vec<u32>,
+}
+
+impl Pairs {
+    pub fn new(film: &Film) -> Self {
+        Self {
+            sum: vec![0.0; film.pixel()],
+            square: vec![0.0; film.slots],
             total_square: 0.0,
+            difference: vec![0.0; film.slots],
+            touched: vec![],
         }
     }
 
@@ -95,15 +128,34 @@ impl Pixel {
         self.square.fill(0.0);
         self.total_square = 0.0;
     }
+
+    /// Adds one stratum's contribution; `sign` is −1 for the second of a pair.
+    #[inline]
+    pub fn add(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
+        film.add(&mut self.sum, slot, value, spot);
+        if self.difference[slot] == 0.0 {
+            self.touched.push(slot as u32);
+        }
+        self.difference[slot] += sign * value;
+    }
+
+    /// Ends a pair.
+    pub fn finish(&mut self) {
+        let mut total = 0.0f64;
+        for b in self.touched.drain(..) {
+            let v = std::mem::take(&mut self.difference[b as usize]);
+            self.square[b as usize] += v * v;
+            total += f64::from(v);
+        }
+        self.total_square += total * total;
+    }
 }
 
 impl Overflow {
-    /// Adds what a unit left outside, divided by `samples`, and forgets it there.
-    pub(crate) fn take(&mut self, unit: &mut Unit, samples: u32) {
-        self.count += unit.outside;
-        self.energy += unit.outside_energy / f64::from(samples);
-        unit.outside = 0;
-        unit.outside_energy = 0.0;
+    /// Adds what a pixel collected outside the gate.
+    pub(crate) fn take(&mut self, film: &Film, pixel: &[f32], factor: f64) {
+        let outside = f64::from(pixel[0]) + f64::from(pixel[film.slots - 1]);
+        self.energy += outside * factor;
     }
 }
 
@@ -125,5 +177,10 @@ mod tests {
         assert_eq!(g.bin(2.0), None);
         assert_eq!(g.bin(0.999), None);
         assert_eq!(g.bin(f64::NAN), None);
+        let film = Film::new(&g, 0, vec![]);
+        let slots: Vec<usize> = [0.999, 1.0, 1.25, 1.2499999, 1.9999999, 2.0]
+            .map(|l| film.slot(l))
+            .into();
+        assert_eq!(slots, [0, 1, 2, 1, 4, 5]);
     }
 }

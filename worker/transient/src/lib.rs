@@ -7,15 +7,16 @@ mod bvh;
 mod emitter;
 mod film;
 mod lobe;
-mod multi;
 mod one;
 mod photo;
 mod plan;
 mod pool;
 mod render;
 mod rng;
+mod share;
 mod truth;
 mod two;
+mod walk;
 mod world;
 
 pub use api::*;

@@ -26,6 +26,8 @@ pub(crate) struct LightVertex {
     pub density: f32,
     /// Optical path from the laser, metres.
     pub path_m: f64,
+    /// Emitter.
+    pub spot: usize,
 }
 
 /// The light vertices of one batch.
@@ -60,8 +62,8 @@ impl Pool {
         for l in 0..count {
             // Strata over the spots, rotated.
             let at = (l as f32 + rng.uniform()) / count as f32 + shift;
-            let spot = ((at - at.floor()) * spots as f32) as usize;
-            let e = &emitters.list[spot.min(spots - 1)];
+            let spot = (((at - at.floor()) * spots as f32) as usize).min(spots - 1);
+            let e = &emitters.list[spot];
             let Some((w, weight, pdf)) = e.surface.sample(e.n, e.back, rng) else {
                 continue;
             };
@@ -87,6 +89,7 @@ impl Pool {
                 flux,
                 density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
+                spot,
             });
         }
     }

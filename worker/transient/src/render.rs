@@ -1,28 +1,34 @@
-//! The driver: checks, preparation, rounds over the image, and the stopping rule.
+//! The driver: checks, preparation, tiles over the image, and the stopping rule.
 
 mod error;
-mod round;
+mod image;
+mod tile;
 
 use picofarm_scene::Scene;
 
 use self::{
-    error::{estimate, paths_for},
-    round::{Buffers, Frame, Watch, pilot},
+    error::{estimate, passes_for},
+    image::{Image, Watch},
+    tile::Frame,
 };
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
     emitter::{Emitters, find_spots},
+    film::Film,
     lobe::Mirrors,
-    multi::Walk,
     one, photo,
     plan::plan,
+    share::Effort,
     truth,
     two::Sampling,
+    walk::Walk,
     world::World,
 };
 
-/// Most paths per pixel that [`Budget::Error`] spends.
-const MAX_PATHS: u32 = 1 << 16;
+/// Most passes that [`Budget::Error`] spends.
+const MAX_PASSES: u32 = 1 << 16;
+/// Fewest that it spends, so that the error estimate means something.
+const MIN_PASSES: u32 = 8;
 
 /// Renders a scene. Runs on the caller's rayon pool; the result is bit-identical for any number of
 /// threads, and on any machine.
@@ -49,6 +55,7 @@ pub fn render(
 
     let intrinsics = scene.camera.intrinsics;
     let (width, height) = (intrinsics.width, intrinsics.height);
+    let film = Film::new(&settings.gate, 0, vec![vec![]; emitters.list.len()]);
     let frame = Frame {
         walk: Walk {
             world: &world,
@@ -61,56 +68,59 @@ pub fn render(
                 .iter()
                 .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
         },
+        film: &film,
         sampling: &sampling,
+        effort: Effort::from_env(),
         seed: settings.seed,
         width,
         height,
     };
-    let mut buffers = Buffers::new(
-        width as usize * height as usize,
-        settings.gate.bins as usize,
-        settings.split,
-    );
+    let mut image = Image::new(&frame, settings.split);
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
-    let (paths, target) = match settings.budget {
+    let mut rays = 0;
+    let (passes, target) = match settings.budget {
         _ if !walks => (0, None),
         Budget::Samples(n) => (n, None),
         Budget::Error(target) => {
-            let pilot = pilot(&frame);
-            (paths_for(&pilot, target, MAX_PATHS), Some(target))
+            let (pilot, traced) = image::pilot(&frame);
+            rays += traced;
+            let two = |n| sampling.variance(n);
+            let range = (MIN_PASSES, MAX_PASSES);
+            let n = passes_for(&pilot, image::PILOT_PASSES, target, range, two);
+            (n, Some(target))
         }
     };
-    let plan = plan(settings, &mirrors, &sampling, paths);
-    let mut overflow = Overflow::default();
-    let mut rays = 0;
-    let mut spent = 0;
-    let mut wave = paths;
+    let plan = plan(settings, &mirrors, &sampling, passes);
+    let mut wave = passes;
     let error = loop {
-        let watch = Watch::new(progress, spent, spent + wave);
-        let found = round::round(&frame, &mut buffers, (spent, wave), &watch)?;
-        overflow = found.blend(&overflow, spent, wave);
-        rays += found.rays;
-        spent += wave;
-        let error = estimate(&buffers.stats, spent);
-        let done = target.is_none_or(|t| error.median_relative <= t) || spent >= MAX_PATHS;
+        let watch = Watch::new(progress, image.passes, image.passes + wave);
+        rays += image.round(&frame, wave, target, &watch)?;
+        let error = estimate(&image.stats, image.total_variance, image.mean_passes());
+        let done = target.is_none_or(|t| error.median_relative <= t) || image.passes >= MAX_PASSES;
         if done {
             break error;
         }
-        wave = (spent / 2).clamp(4, MAX_PATHS - spent.min(MAX_PATHS - 4));
+        let spent = image.passes;
+        wave = (spent / 2).clamp(4, MAX_PASSES - spent.min(MAX_PASSES - 4));
     };
 
+    let mut overflow = Overflow {
+        count: image.outside,
+        energy: image.overflow,
+        share: 0.0,
+    };
     if settings.one_bounce && frame.walk.max_bounces >= 1 {
         let mut stack = world.bvh.stack();
         let peaks = one::peaks(&world, &mut stack, &emitters);
         one::add(
             &peaks,
             &settings.gate,
-            &mut buffers.transient,
+            &mut image.transient,
             &mut overflow,
         );
         rays += stack.rays;
     }
-    let inside: f64 = buffers.transient.iter().map(|&v| f64::from(v)).sum();
+    let inside: f64 = image.transient.iter().map(|&v| f64::from(v)).sum();
     overflow.share = if overflow.energy > 0.0 {
         overflow.energy / (overflow.energy + inside)
     } else {
@@ -120,8 +130,8 @@ pub fn render(
         width,
         height,
         gate: settings.gate,
-        transient: buffers.transient,
-        split: buffers.split.map(|s| Split {
+        transient: image.transient,
+        split: image.split.map(|s| Split {
             two: s.two,
             two_se: s.two_se,
             multi: s.multi,
@@ -160,11 +170,11 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
         return bad("gate.bins", format!("is {}, expected 1 to 1048576", g.bins));
     }
     match settings.budget {
-        Budget::Samples(n) if n > MAX_PATHS * 16 => bad(
+        Budget::Samples(n) if n > MAX_PASSES * 16 => bad(
             "budget.samples",
             format!(
                 "is {n}, expected at most {} paths per pixel",
-                MAX_PATHS * 16
+                MAX_PASSES * 16
             ),
         ),
         Budget::Error(e) if !(e > 0.0 && e.is_finite()) => bad(

@@ -13,10 +13,12 @@ pub(crate) struct Rng {
 pub(crate) enum Stream {
     /// Sub-pixel samples of the two-bounce part.
     Two = 1,
-    /// Camera paths.
+    /// Camera paths and what they share.
     Paths = 2,
     /// The companion image.
     Photo = 3,
+    /// Where tiles that share vertices begin.
+    Grid = 4,
 }
 
 fn splitmix(mut z: u64) -> u64 {

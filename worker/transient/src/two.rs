@@ -3,12 +3,11 @@
 use picofarm_scene::Vec3;
 
 use crate::{
-    api::{Gate, Overflow},
-    bvh::Stack,
     emitter::Emitters,
-    film::{Pixel, Unit},
+    film::{Film, Pairs},
     rng::Rng,
     truth::Centres,
+    walk::{Scratch, Walk},
     world::World,
 };
 
@@ -22,31 +21,13 @@ pub(crate) struct Sampling {
     pub refined: Vec<bool>,
 }
 
-/// Buffers reused between pixels.
-#[derive(Debug)]
-pub(crate) struct Scratch {
-    pub stack: Stack,
-    pub weights: Vec<f32>,
-    pub unit: Unit,
-}
-
-impl Scratch {
-    pub fn new(world: &World, emitters: &Emitters, gate: &Gate) -> Self {
-        Self {
-            stack: world.bvh.stack(),
-            weights: vec![0.0; emitters.list.len()],
-            unit: Unit::new(gate.bins),
-        }
-    }
-}
-
 impl Sampling {
     pub fn plan(world: &World, emitters: &Emitters, centres: &Centres) -> Self {
         let i = world.camera.intrinsics;
         // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
         // its width: wider pixels straddle more bins.
         let pixel = 1.0 / i.fx.min(i.fy);
-        let base = 4.0 * (pixel * 128.0).sqrt();
+        let base = std::env::var("E_TWO").ok().and_then(|v| v.parse().ok()).unwrap_or(4.0f32) * (pixel * 128.0).sqrt();
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
                 h.surface.specular
@@ -72,57 +53,59 @@ impl Sampling {
     }
 
     /// Strata a side (even) in ordinary pixels and where a narrow lobe may be seen. They grow with the
-    /// camera paths so that neither part of the histogram is much noisier than the other; `paths` = 0
+    /// passes so that neither part of the histogram is much noisier than the other; `passes` = 0
     /// is a render of two bounces only.
-    pub fn sides(&self, paths: u32) -> (u32, u32) {
-        let paths = if paths == 0 { 256 } else { paths };
-        let side = self.base * (paths as f32 / 64.0).sqrt().sqrt();
+    pub fn sides(&self, passes: u32) -> (u32, u32) {
+        let passes = if passes == 0 { 64 } else { passes };
+        let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
         let side = 2 * (0.5 * side).round().clamp(1.0, 16.0) as u32;
         (side, (4 * side).min(64))
     }
+
+    /// How the two-bounce variance falls with the passes: as n^(−3/2) for n strata, since half of it
+    /// lies on edges between bins.
+    pub fn variance(&self, passes: u32) -> f64 {
+        let side = f64::from(self.sides(passes).0);
+        1.0 / (side * side * side)
+    }
 }
 
-/// Adds one pixel's two-bounce samples to `pixel`; returns how many there were.
+/// Adds one pixel's two-bounce samples to `pairs`; returns how many there were.
 pub(crate) fn sample_pixel(
-    world: &World,
-    emitters: &Emitters,
-    gate: &Gate,
+    walk: &Walk,
+    film: &Film,
     (row, col, side): (u32, u32, u32),
     rng: &mut Rng,
     scratch: &mut Scratch,
-    (pixel, overflow): (&mut Pixel, &mut Overflow),
+    (pairs, outside): (&mut Pairs, &mut u64),
 ) -> u32 {
     let count = side * side;
     for stratum in 0..count {
         let (a, b) = ((stratum % side) as f32, (stratum / side) as f32);
         let (a, b) = (a + rng.uniform(), b + rng.uniform());
-        let d = world
+        let d = walk
+            .world
             .camera
             .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
         let odd = stratum % 2 == 1;
         let sign = if odd { -1.0 } else { 1.0 };
-        connect(world, emitters, gate, (d, sign), scratch, pixel);
+        connect(walk, film, (d, sign), scratch, (pairs, outside));
         if odd {
-            scratch.unit.finish(pixel);
+            pairs.finish();
         }
     }
-    overflow.take(&mut scratch.unit, count);
     count
 }
 
 fn connect(
-    world: &World,
-    emitters: &Emitters,
-    gate: &Gate,
+    walk: &Walk,
+    film: &Film,
     (d, sign): (Vec3, f32),
     scratch: &mut Scratch,
-    pixel: &mut Pixel,
+    (pairs, outside): (&mut Pairs, &mut u64),
 ) {
-    let Scratch {
-        stack,
-        weights,
-        unit,
-    } = scratch;
+    let (world, emitters) = (walk.world, walk.emitters);
+    let Scratch { stack, weights, .. } = scratch;
     let Some(h) = world.closest(stack, Vec3::ZERO, d) else {
         return;
     };
@@ -132,10 +115,12 @@ fn connect(
     let range = h.p.length();
     emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
     let to_camera = world.metres(range);
-    for (e, &w) in emitters.list.iter().zip(weights.iter()) {
+    for (spot, (e, &w)) in emitters.list.iter().zip(weights.iter()).enumerate() {
         if w > 0.0 && world.free(stack, h.p, h.n, e.p, e.n) {
             let path = e.path_m + world.metres((e.p - h.p).length()) + to_camera;
-            unit.add(gate, path, w, sign, pixel);
+            let slot = film.slot(path);
+            *outside += u64::from(film.outside(slot));
+            pairs.add(film, slot, w, sign, spot);
         }
     }
 }

@@ -9,7 +9,9 @@ use obvhs::{
 };
 use picofarm_scene::{Object, Vec3};
 use picofarm_transient::{Bvh, Kernel};
-use proptest::prelude::*;
+use proptest::{prelude::*, test_runner::TestCaseError};
+
+const KERNELS: [Kernel; 3] = [Kernel::Avx512, Kernel::Avx2, Kernel::Portable];
 
 fn soup(o: &Object) -> Vec<[Vec3; 3]> {
     let p = &o.mesh.positions;
@@ -39,7 +41,7 @@ fn random_soup(count: usize, size: f32, seed: u32) -> Vec<[Vec3; 3]> {
 #[test]
 fn a_closed_mesh_lets_no_ray_through_at_edges_and_vertices() {
     let triangles = soup(&sphere(v(0.3, -0.2, 0.1), 1.5, 4, common::grey(0.5)));
-    for kernel in [Kernel::Avx2, Kernel::Portable] {
+    for kernel in KERNELS {
         let Some(bvh) = Bvh::build(&triangles).with_kernel(kernel) else {
             println!("skipped: no {kernel:?} here");
             continue;
@@ -62,35 +64,135 @@ fn a_closed_mesh_lets_no_ray_through_at_edges_and_vertices() {
 }
 
 #[test]
-fn both_kernels_give_the_same_bits() {
+fn all_kernels_give_the_same_bits() {
     let triangles = random_soup(3000, 0.4, 3);
     let portable = Bvh::build(&triangles)
         .with_kernel(Kernel::Portable)
         .unwrap();
-    let Some(wide) = Bvh::build(&triangles).with_kernel(Kernel::Avx2) else {
-        println!("skipped: no AVX2 here");
-        return;
-    };
-    let (mut a, mut b) = (portable.stack(), wide.stack());
-    let mut r = noise(8);
-    for i in 0..20_000 {
-        let mut d = v(r(), r(), r());
-        if i % 5 == 0 {
-            d.x = 0.0;
+    for kernel in KERNELS {
+        let Some(wide) = Bvh::build(&triangles).with_kernel(kernel) else {
+            println!("skipped: no {kernel:?} here");
+            continue;
+        };
+        let (mut a, mut b) = (portable.stack(), wide.stack());
+        let mut r = noise(8);
+        for i in 0..20_000 {
+            let mut d = v(r(), r(), r());
+            if i % 5 == 0 {
+                d.x = 0.0;
+            }
+            let o = v(r(), r(), r()) * 5.0;
+            let bits = |h: Option<(f32, u32)>| h.map(|(t, id)| (t.to_bits(), id));
+            let far = f32::INFINITY;
+            assert_eq!(
+                bits(portable.closest(&mut a, o, d, far)),
+                bits(wide.closest(&mut b, o, d, far))
+            );
+            let limit = 3.0 * r().abs();
+            assert_eq!(
+                portable.occluded(&mut a, o, d, limit),
+                wide.occluded(&mut b, o, d, limit)
+            );
         }
-        let o = v(r(), r(), r()) * 5.0;
-        let bits = |h: Option<(f32, u32)>| h.map(|(t, id)| (t.to_bits(), id));
-        let far = f32::INFINITY;
-        assert_eq!(
-            bits(portable.closest(&mut a, o, d, far)),
-            bits(wide.closest(&mut b, o, d, far))
-        );
-        let limit = 3.0 * r().abs();
-        assert_eq!(
-            portable.occluded(&mut a, o, d, limit),
-            wide.occluded(&mut b, o, d, limit)
-        );
     }
+}
+
+/// Every kernel's answers for the bundle are those of portable single rays.
+fn bundles_agree(triangles: &[[Vec3; 3]], from: Vec3, to: &[Vec3]) -> Result<usize, TestCaseError> {
+    let single = Bvh::build(triangles).with_kernel(Kernel::Portable).unwrap();
+    let mut stack = single.stack();
+    let expected: Vec<bool> = to
+        .iter()
+        .map(|&p| single.occluded(&mut stack, from, p - from, 1.0))
+        .collect();
+    for kernel in KERNELS {
+        let Some(bvh) = Bvh::build(triangles).with_kernel(kernel) else {
+            println!("skipped: no {kernel:?} here");
+            continue;
+        };
+        let mut stack = bvh.stack();
+        let mut blocked = vec![false; to.len()];
+        bvh.occluded_bundle(&mut stack, from, to, &mut blocked);
+        prop_assert_eq!(&blocked, &expected, "{:?} from {:?}", kernel, from);
+        prop_assert_eq!(stack.rays, to.len() as u64);
+    }
+    Ok(expected.iter().filter(|&&b| b).count())
+}
+
+/// Points about `centre`; some repeat a coordinate of `from` or of each other, so that directions have
+/// zeros and ties, and some are `from` itself or not finite.
+fn targets(
+    from: Vec3,
+    centre: Vec3,
+    spread: f32,
+    count: usize,
+    r: &mut impl FnMut() -> f32,
+) -> Vec<Vec3> {
+    let mut to: Vec<Vec3> = vec![];
+    for _ in 0..count {
+        let mut p = centre + v(r(), r(), r()) * spread;
+        match (r() * 16.0) as i32 {
+            3 => p.x = from.x,
+            4 => p.y = from.y,
+            5 => (p.x, p.z) = (from.x, from.z),
+            6 => p = from + v(1.0, 1.0, 1.0) * (p.x - from.x),
+            7 => p.z = from.z - (p.y - from.y),
+            8 if r() > 0.5 => p = from,
+            9 if r() > 0.8 => p.x = f32::INFINITY,
+            10 if r() > 0.8 => p.y = f32::NAN,
+            11 => p.x = from.x - 1e-30,
+            12 if !to.is_empty() => p = to[to.len() / 2],
+            _ => {}
+        }
+        to.push(p);
+    }
+    to
+}
+
+#[test]
+fn bundles_in_a_room_of_axis_aligned_walls_agree_with_single_rays() {
+    let material = common::grey(0.5);
+    let mut objects = common::room(v(-2.0, -1.0, -3.0), v(2.0, 1.5, 1.0), &material);
+    objects.extend(common::room(
+        v(-0.5, -1.0, -1.5),
+        v(0.25, -0.25, -0.75),
+        &material,
+    ));
+    objects.push(sphere(v(1.0, 0.0, -2.0), 0.5, 3, material));
+    let triangles: Vec<_> = objects.iter().flat_map(soup).collect();
+    let mut r = noise(77);
+    let mut mixed = 0;
+    for i in 0..300 {
+        // On walls, on vertices and on edges too: segments that graze and end on surfaces.
+        let t = triangles[((r() * 0.5 + 0.5) * triangles.len() as f32) as usize % triangles.len()];
+        let from = match i % 3 {
+            0 => t[0],
+            1 => t[0] + (t[1] - t[0]) * 0.5,
+            _ => v(1.9 * r(), 1.2 * r(), 2.0 * r() - 1.0),
+        };
+        let t = triangles[((r() * 0.5 + 0.5) * triangles.len() as f32) as usize % triangles.len()];
+        let mut to = targets(from, t[0], 0.3, 20, &mut r);
+        for k in 0..50 {
+            let (a, b) = (0.02 * k as f32, 0.5 + 0.5 * r());
+            to.push(t[0] + (t[1] - t[0]) * a + (t[2] - t[0]) * (b * (1.0 - a)));
+        }
+        let blocked = bundles_agree(&triangles, from, &to).unwrap();
+        mixed += u32::from(blocked > 0 && blocked < to.len());
+    }
+    assert!(mixed > 50, "{mixed} bundles are partly blocked");
+}
+
+#[test]
+fn a_bundle_into_an_empty_tree_is_free() {
+    let empty = Bvh::build(&[]);
+    let mut blocked = [true; 3];
+    let to = [v(1.0, 0.0, 0.0), v(0.0, 0.0, 0.0), v(f32::NAN, 0.0, 0.0)];
+    empty.occluded_bundle(&mut empty.stack(), Vec3::ZERO, &to, &mut blocked);
+    assert_eq!(
+        blocked,
+        [false, true, true],
+        "useless segments count as blocked"
+    );
 }
 
 #[test]
@@ -170,6 +272,42 @@ fn degenerate_duplicate_and_inverted_triangles_do_no_harm() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn a_bundle_gives_what_its_segments_give_alone(
+        seed in any::<u32>(),
+        count in 1usize..1500,
+        size in prop::sample::select(vec![0.02f32, 0.2, 1.0, 6.0]),
+        spread in prop::sample::select(vec![0.001f32, 0.1, 0.5, 4.0]),
+        scale in prop::sample::select(vec![1.0f32, 1.0, 1e-3, 1e4, 1e-12, 1e12]),
+        shift in prop::sample::select(vec![0.0f32, 0.0, 300.0]),
+    ) {
+        let mut triangles = random_soup(count, size, seed);
+        for (i, t) in triangles.iter_mut().enumerate() {
+            // Some lie in planes of the axes; some are needles or double.
+            match i % 8 {
+                0 => t.iter_mut().for_each(|p| p.y = 0.5),
+                1 => t.iter_mut().for_each(|p| p.x = -0.25),
+                2 => t[2] = t[0] + (t[1] - t[0]) * 0.999,
+                _ => {}
+            }
+        }
+        let place = |p: Vec3| (p + v(shift, 0.0, -shift)) * scale;
+        let placed: Vec<_> = triangles.iter().map(|t| t.map(place)).collect();
+        let mut r = noise(seed ^ 1234);
+        for i in 0..12 {
+            let t = triangles[i % triangles.len()];
+            let from = if i % 3 == 0 { t[1] } else { v(r(), r(), r()) * 5.0 };
+            let centre = if i % 4 == 0 { t[0] } else { v(r(), r(), r()) * 5.0 };
+            let number = [1, 2, 7, 16, 33, 64, 65, 150][i % 8];
+            let mut to = targets(from, centre, spread, number, &mut r);
+            if i % 2 == 0 {
+                to.extend([t[0], t[1], t[2], (t[0] + t[1]) * 0.5]);
+            }
+            let to: Vec<Vec3> = to.into_iter().map(place).collect();
+            bundles_agree(&placed, place(from), &to)?;
+        }
+    }
 
     #[test]
     fn the_nearest_hit_is_that_of_a_tree_of_one_triangle_each(seed in any::<u32>(), count in 1usize..60) {

@@ -7,7 +7,7 @@ use obvhs::{
 };
 use picofarm_scene::Vec3;
 
-use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, avx2};
+use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, simd};
 
 /// Triangles in a leaf: one pack.
 const LEAF_SIZE: u32 = 8;
@@ -29,11 +29,10 @@ pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
         nodes: vec![],
         packs: vec![],
         depth: 0,
-        kernel: if avx2::available() {
-            Kernel::Avx2
-        } else {
-            Kernel::Portable
-        },
+        kernel: [Kernel::Avx512, Kernel::Avx2]
+            .into_iter()
+            .find(|&k| simd::available(k))
+            .unwrap_or(Kernel::Portable),
     };
     // A triangle without area cannot be hit; near-degenerate ones stay.
     let used: Vec<u32> = (0..triangles.len() as u32)
@@ -165,10 +164,11 @@ impl Bvh {
             self.packs.push(pack);
         }
         let count = self.packs.len() as u32 - start;
+        let last = (node.prim_count - 1) % 8;
         assert!(
-            start < (1 << 27) && count < 16,
-            "leaves hold at most {LEAF_SIZE} triangles and scenes fewer than 2^27 packs"
+            start < (1 << 24) && count < 16,
+            "leaves hold at most {LEAF_SIZE} triangles and scenes fewer than 2^24 packs"
         );
-        LEAF | (count << 27) | start
+        LEAF | (count << 27) | (last << 24) | start
     }
 }

@@ -1,11 +1,15 @@
-//! Eight floats side by side: what the traversal needs of them, and the portable version.
+//! Floats side by side: what the traversal needs of them, and the portable version.
 
-/// Eight f32 lanes. Comparisons give a bit mask, lane 0 lowest. `min` and `max` follow the machine's
+/// `N` f32 lanes. Comparisons give a bit mask, lane 0 lowest. `min` and `max` follow the machine's
 /// rule: the second operand where either is NaN.
 pub(super) trait Lanes: Copy {
+    /// How many lanes: 8 or 16.
+    const N: usize;
     fn splat(x: f32) -> Self;
-    fn load(a: &[f32; 8]) -> Self;
-    fn store(self) -> [f32; 8];
+    /// The first `N` of `a`.
+    fn load(a: &[f32]) -> Self;
+    /// Into the first `N` of `a`.
+    fn store(self, a: &mut [f32]);
     fn add(self, o: Self) -> Self;
     fn sub(self, o: Self) -> Self;
     fn mul(self, o: Self) -> Self;
@@ -29,17 +33,18 @@ fn mask(a: [f32; 8], b: [f32; 8], f: impl Fn(f32, f32) -> bool) -> u32 {
 }
 
 impl Lanes for [f32; 8] {
+    const N: usize = 8;
     #[inline(always)]
     fn splat(x: f32) -> Self {
         [x; 8]
     }
     #[inline(always)]
-    fn load(a: &[f32; 8]) -> Self {
-        *a
+    fn load(a: &[f32]) -> Self {
+        std::array::from_fn(|i| a[i])
     }
     #[inline(always)]
-    fn store(self) -> [f32; 8] {
-        self
+    fn store(self, a: &mut [f32]) {
+        a[..8].copy_from_slice(&self);
     }
     #[inline(always)]
     fn add(self, o: Self) -> Self {

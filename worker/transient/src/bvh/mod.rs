@@ -3,11 +3,12 @@
 //! `obvhs` builds a binary tree (PLOC with reinsertion), which is collapsed to eight children a node.
 //! Rays meet triangles by the test of Woop, Benthin and Wald (JCGT 2013), edges included and without
 //! fused multiply-add, so that no ray slips between two triangles that share an edge or a vertex.
-//! The AVX2 kernel and the portable one run the same operations in the same order: same bits.
+//! The kernels (AVX-512, AVX2, portable) run the same operations in the same order: same bits.
 
-mod avx2;
 mod build;
+mod bundle;
 mod lanes;
+mod simd;
 mod traverse;
 
 use picofarm_scene::Vec3;
@@ -30,14 +31,30 @@ struct Pack {
     id: [u32; 8],
 }
 
-/// A child that is a leaf: count of packs in bits 27..31, first pack below.
+/// A child that is a leaf: count of packs in bits 27..31, triangles in the last pack less one in bits
+/// 24..27, first pack below.
 const LEAF: u32 = 0x8000_0000;
 /// A child that does not exist; its bounds are never met.
 const EMPTY: u32 = u32::MAX;
 
+/// The packs of a leaf.
+#[inline(always)]
+fn packs(leaf: u32) -> std::ops::Range<usize> {
+    let first = (leaf & 0x00ff_ffff) as usize;
+    first..first + ((leaf >> 27) & 15) as usize
+}
+
+/// Triangles in the last pack of a leaf.
+#[inline(always)]
+fn last_fill(leaf: u32) -> usize {
+    ((leaf >> 24) & 7) as usize + 1
+}
+
 /// Which code traverses the tree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kernel {
+    /// Eight lanes in AVX2 registers, sixteen in AVX-512 registers for bundles.
+    Avx512,
     /// Eight lanes in AVX2 registers.
     Avx2,
     /// Plain scalar code, the same operations in the same order.
@@ -69,7 +86,7 @@ impl Bvh {
 
     /// The same tree traversed by another kernel; `None` where this machine lacks it.
     pub fn with_kernel(mut self, kernel: Kernel) -> Option<Self> {
-        if kernel == Kernel::Avx2 && !avx2::available() {
+        if !simd::available(kernel) {
             return None;
         }
         self.kernel = kernel;
@@ -99,14 +116,9 @@ impl Bvh {
             return None;
         }
         let (t, id) = match self.kernel {
-            Kernel::Avx2 => avx2::closest(self, stack, origin, direction, limit),
-            Kernel::Portable => traverse::traverse::<[f32; 8], false>(
-                self,
-                &mut stack.entries,
-                origin,
-                direction,
-                limit,
-            ),
+            Kernel::Avx512 => simd::closest_avx512(self, stack, origin, direction, limit),
+            Kernel::Avx2 => simd::closest_avx2(self, stack, origin, direction, limit),
+            Kernel::Portable => simd::closest_portable(self, stack, origin, direction, limit),
         };
         (id != EMPTY).then_some((t, id))
     }
@@ -121,17 +133,43 @@ impl Bvh {
         if self.nodes.is_empty() {
             return false;
         }
-        let (_, id) = match self.kernel {
-            Kernel::Avx2 => avx2::any(self, stack, origin, direction, limit),
-            Kernel::Portable => traverse::traverse::<[f32; 8], true>(
-                self,
-                &mut stack.entries,
-                origin,
-                direction,
-                limit,
-            ),
-        };
-        id != EMPTY
+        self.any(stack, origin, direction, limit)
+    }
+
+    /// Which of the segments from ONE point to many are blocked: `blocked[i]` becomes
+    /// `occluded(stack, from, to[i] - from, 1.0)`, bit for bit, whatever else is in the bundle. The origin
+    /// of every ray is `from`: the same segments from their other ends may differ in grazing cases. Fast
+    /// where the targets lie close together, any number of them. Panics where the lengths differ.
+    pub fn occluded_bundle(
+        &self,
+        stack: &mut Stack,
+        from: Vec3,
+        to: &[Vec3],
+        blocked: &mut [bool],
+    ) {
+        assert_eq!(to.len(), blocked.len(), "one answer for each target");
+        stack.rays += to.len() as u64;
+        if self.nodes.is_empty() {
+            for (b, &p) in blocked.iter_mut().zip(to) {
+                *b = !usable(from, p - from, 1.0);
+            }
+            return;
+        }
+        match self.kernel {
+            Kernel::Avx512 => simd::bundle_avx512(self, stack, from, to, blocked),
+            Kernel::Avx2 => simd::bundle_avx2(self, stack, from, to, blocked),
+            Kernel::Portable => simd::bundle_portable(self, stack, from, to, blocked),
+        }
+    }
+
+    /// Some hit in (0, `limit`] for a usable ray in a tree with nodes.
+    #[inline(always)]
+    fn any(&self, stack: &mut Stack, origin: Vec3, direction: Vec3, limit: f32) -> bool {
+        match self.kernel {
+            Kernel::Avx512 => simd::any_avx512(self, stack, origin, direction, limit),
+            Kernel::Avx2 => simd::any_avx2(self, stack, origin, direction, limit),
+            Kernel::Portable => simd::any_portable(self, stack, origin, direction, limit),
+        }
     }
 }
 

@@ -2,7 +2,30 @@
 
 use picofarm_scene::Vec3;
 
-use super::{Bvh, EMPTY, LEAF, lanes::Lanes};
+use super::{Bvh, EMPTY, LEAF, lanes::Lanes, packs};
+
+/// 1/x. 1/0 would make 0·∞ = NaN in the slab test; a huge finite slope does the same work.
+#[inline(always)]
+pub(super) fn inverse(x: f32) -> f32 {
+    1.0 / if x.abs() < 1e-18 {
+        1e-18f32.copysign(x)
+    } else {
+        x
+    }
+}
+
+/// The axis of the largest component.
+#[inline(always)]
+pub(super) fn largest(d: Vec3) -> usize {
+    let (ax, ay, az) = (d.x.abs(), d.y.abs(), d.z.abs());
+    if az >= ax && az >= ay {
+        2
+    } else if ay >= ax {
+        1
+    } else {
+        0
+    }
+}
 
 /// Nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit`: (t, triangle), triangle
 /// [`EMPTY`] for a miss. The caller has checked that ray and tree are usable and `stack` deep enough.
@@ -14,14 +37,6 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
     d: Vec3,
     limit: f32,
 ) -> (f32, u32) {
-    // 1/0 would make 0·∞ = NaN in the slab test; a huge finite slope does the same work.
-    let inverse = |x: f32| {
-        1.0 / if x.abs() < 1e-18 {
-            1e-18f32.copysign(x)
-        } else {
-            x
-        }
-    };
     let iv = [
         L::splat(inverse(d.x)),
         L::splat(inverse(d.y)),
@@ -36,14 +51,7 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
     let slack = L::splat(1.0 + 4.0 * f32::EPSILON);
 
     // Shear of Woop et al.: the ray's largest axis becomes z.
-    let (ax, ay, az) = (d.x.abs(), d.y.abs(), d.z.abs());
-    let kz = if az >= ax && az >= ay {
-        2
-    } else if ay >= ax {
-        1
-    } else {
-        0
-    };
+    let kz = largest(d);
     let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
     if d[kz] < 0.0 {
         std::mem::swap(&mut kx, &mut ky);
@@ -83,7 +91,8 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
                 current = node.child[i];
                 continue;
             }
-            let t = t0.store();
+            let mut t = [0.0; 8];
+            t0.store(&mut t);
             let (j, mut rest) = next();
             let (first, second) = ((node.child[i], t[i]), (node.child[j], t[j]));
             if rest == 0 {
@@ -123,9 +132,7 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
             current = stack[depth].0;
         }
         if current & LEAF != 0 {
-            let first = (current & 0x07ff_ffff) as usize;
-            let count = ((current >> 27) & 15) as usize;
-            for pack in &bvh.packs[first..first + count] {
+            for pack in &bvh.packs[packs(current)] {
                 let at = |v: usize, k: usize| L::load(&pack.vertex[3 * v + k]).sub(ov[k]);
                 let (az, bz, cz) = (at(0, kz), at(1, kz), at(2, kz));
                 let (ax, ay) = (at(0, kx).sub(sx.mul(az)), at(0, ky).sub(sy.mul(az)));
@@ -148,7 +155,9 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
                 if ANY {
                     return (0.0, 0);
                 }
-                let t = t.store();
+                let mut distances = [0.0; 8];
+                t.store(&mut distances);
+                let t = distances;
                 while hits != 0 {
                     let k = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;

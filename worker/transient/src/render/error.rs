@@ -1,7 +1,19 @@
-//! From variances to error estimates, and from a pilot to a number of paths.
+//! From variances to error estimates, and from a pilot to a number of passes.
 
-use super::round::{PILOT_PATHS, Stat};
 use crate::api::ErrorEstimate;
+
+/// A pixel's sums for the error estimate.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Stat {
+    /// Σ over bins of h².
+    pub norm2: f64,
+    /// Σ over bins of the two-bounce part's variance.
+    pub two_variance: f64,
+    /// Σ over bins of the 3+ part's variance.
+    pub multi_variance: f64,
+    /// Σ over bins of h.
+    pub total: f64,
+}
 
 /// ‖standard error‖ / ‖h‖ of a pixel; `None` for a pixel without light. The measured ‖h‖² contains the
 /// variance; it is taken off, down to a tenth.
@@ -17,15 +29,23 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
     }
 }
 
-/// The estimate for a whole image after `samples` paths a pixel.
-pub(super) fn estimate(stats: &[Stat], samples: u32) -> ErrorEstimate {
+fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
     let mut all: Vec<f64> = stats
-        .iter()
         .filter_map(|s| relative(s.norm2, s.two_variance + s.multi_variance))
         .collect();
     all.sort_by(f64::total_cmp);
+    all
+}
+
+/// Median of the pixels' relative errors.
+pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
+    quantile(&sorted(stats), 0.5)
+}
+
+/// The estimate for a whole image of `variance` in its whole energy, after `samples` passes on average.
+pub(super) fn estimate(stats: &[Stat], variance: f64, samples: u32) -> ErrorEstimate {
+    let all = sorted(stats.iter().copied());
     let total: f64 = stats.iter().map(|s| s.total).sum();
-    let variance: f64 = stats.iter().map(|s| s.total_variance).sum();
     ErrorEstimate {
         median_relative: quantile(&all, 0.5) as f32,
         p95_relative: quantile(&all, 0.95) as f32,
@@ -38,33 +58,35 @@ pub(super) fn estimate(stats: &[Stat], samples: u32) -> ErrorEstimate {
     }
 }
 
-/// The fewest paths per pixel, on a ladder of steps of about √2, with which the pilot's median error
-/// comes down to `target`. The two-bounce strata grow with the root of the paths, and their variance
-/// falls with the power 3/2 of their number (half of it lies on edges between bins).
-pub(super) fn paths_for(pilot: &[Stat], target: f32, most: u32) -> u32 {
+/// The fewest passes, on a ladder of steps of about √2 from `least`, with which the pilot's median error
+/// comes down to `target`. `two` says how the two-bounce variance falls with the passes.
+pub(super) fn passes_for(
+    pilot: &[Stat],
+    passes: u32,
+    target: f32,
+    (least, most): (u32, u32),
+    two: impl Fn(u32) -> f64,
+) -> u32 {
     let median = |n: u32| {
-        let scale = f64::from(PILOT_PATHS) / f64::from(n);
-        let two_scale = scale.sqrt() * scale.sqrt().sqrt();
-        let mut all: Vec<f64> = pilot
-            .iter()
-            .filter_map(|s| {
-                let v = s.two_variance + s.multi_variance;
-                let clean = (s.norm2 - v).max(0.1 * s.norm2);
-                let then = s.two_variance * two_scale + s.multi_variance * scale;
-                (s.norm2 > 0.0).then(|| (then / clean).sqrt())
-            })
-            .collect();
-        all.sort_by(f64::total_cmp);
-        quantile(&all, 0.5)
+        let scale = f64::from(passes) / f64::from(n);
+        let then = pilot.iter().map(|s| {
+            // As `sorted` would find it after n passes: the measured norm loses the variance of then.
+            let now = s.two_variance + s.multi_variance;
+            let clean = (s.norm2 - now).max(0.1 * s.norm2);
+            let two_variance = s.two_variance * two(n) / two(passes);
+            let multi_variance = s.multi_variance * scale;
+            Stat {
+                norm2: clean + two_variance + multi_variance,
+                two_variance,
+                multi_variance,
+                total: s.total,
+            }
+        });
+        relative_median(then)
     };
-    let mut n = 4;
+    let mut n = least;
     while n < most && median(n) > f64::from(target) {
-        // 4, 6, 8, 12, 16, 24, …
-        n = if n.is_power_of_two() {
-            n + n / 2
-        } else {
-            n / 3 * 4
-        };
+        n = (n + (n / 2).max(1)).min(most);
     }
-    n.min(most)
+    n
 }

@@ -1,5 +1,5 @@
-//! Three bounces and more: camera paths whose vertices connect to the spots and to light vertices, and,
-//! where the scene has planar near-mirrors, aim at the spots' images in them. All are weighed by
+//! Walks: random paths onward from a vertex, whose vertices connect to the spots and to light vertices
+//! and, where the scene has planar near-mirrors, aim at the spots' images in them. All are weighed by
 //! multiple importance sampling (balance heuristic, Veach and Guibas 1995).
 
 use std::f32::consts::PI;
@@ -8,16 +8,15 @@ use picofarm_scene::Vec3;
 
 use crate::{
     api::Gate,
+    bvh::Stack,
     emitter::Emitters,
-    film::Pixel,
     lobe::Mirrors,
     pool::{self, Pool},
     rng::Rng,
-    two::Scratch,
     world::{Hit, World, lift},
 };
 
-/// What camera paths are traced in.
+/// What paths are traced in.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Walk<'a> {
     pub world: &'a World,
@@ -30,21 +29,23 @@ pub(crate) struct Walk<'a> {
     pub shortest_m: f64,
 }
 
-/// A vertex of a camera path.
+/// A vertex of a path from the camera.
 #[derive(Debug, Clone, Copy)]
-struct Vertex {
-    hit: Hit,
+pub(crate) struct Vertex {
+    pub hit: Hit,
     /// Unit direction back along the path.
-    wo: Vec3,
+    pub wo: Vec3,
     /// Product of scattering and sampling weights up to here.
-    beta: f32,
-    /// Optical path from the camera, metres.
-    length_m: f64,
+    pub beta: f32,
+    /// Optical path from where the walk is counted, metres.
+    pub length_m: f64,
+    /// Bounces up to and with this vertex.
+    pub bounce: u32,
 }
 
 /// How a vertex was reached, for MIS.
 #[derive(Debug, Clone, Copy)]
-struct Step {
+pub(crate) struct Step {
     p: Vec3,
     n: Vec3,
     /// Density per steradian of the direction taken.
@@ -53,25 +54,33 @@ struct Step {
     aimed: f32,
 }
 
-/// Buffers of the camera paths of one pixel.
+/// Takes what a walk finds: optical path in metres, value, spot, bounces of the whole path.
+pub(crate) trait Sink {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32);
+}
+
+/// Buffers of one thread's walks.
 #[derive(Debug)]
-pub(crate) struct Paths {
-    pub pool: Pool,
+pub(crate) struct Scratch {
+    pub stack: Stack,
+    /// Weights of spots.
+    pub weights: Vec<f32>,
     /// Weights of spots in mirrors.
     images: Vec<f32>,
     /// Weights of light vertices.
     lights: Vec<f32>,
-    /// What the pixel collects.
-    pub pixel: Pixel,
+    /// Light vertices that walks connect to.
+    pub pool: Pool,
 }
 
-impl Paths {
-    pub fn new(mirrors: &Mirrors, gate: &Gate) -> Self {
+impl Scratch {
+    pub fn new(world: &World, emitters: &Emitters, mirrors: &Mirrors) -> Self {
         Self {
-            pool: Pool::default(),
+            stack: world.bvh.stack(),
+            weights: vec![0.0; emitters.list.len()],
             images: vec![0.0; mirrors.choices()],
             lights: vec![],
-            pixel: Pixel::new(gate.bins),
+            pool: Pool::default(),
         }
     }
 }
@@ -81,104 +90,112 @@ impl Paths {
 /// 6.0 on room-diffuse). More connections from one vertex also tie neighbouring bins of a pixel together,
 /// so that errors of sums over bins exceed what the bins' own errors say.
 const SPOTS: u32 = 4;
+/// Connect to every spot.
+pub(crate) const ALL: u32 = u32::MAX;
 /// Light vertices that a camera vertex is connected to at most.
 const LIGHTS: u32 = 2;
 /// Russian roulette keeps a path with this multiple of its throughput as probability.
 const SURVIVAL: f32 = 1.5;
 
 impl Walk<'_> {
-    /// Traces one path through film position (x, y); contributions go to `scratch.unit`.
-    pub fn path(&self, rng: &mut Rng, x: f32, y: f32, scratch: &mut Scratch, paths: &mut Paths) {
-        let world = self.world;
-        let d = world.camera.ray(x, y);
-        let Some(hit) = world.closest(&mut scratch.stack, Vec3::ZERO, d) else {
-            return;
-        };
-        let range = hit.p.length();
-        let mut vertex = Vertex {
-            hit,
-            wo: -hit.p / range,
-            beta: 1.0,
-            length_m: world.metres(range),
-        };
-        let mut step: Option<Step> = None;
-        let mut k = 1;
-        loop {
-            if vertex.hit.surface.strength == 0.0 {
-                return;
-            }
-            if k >= 2 {
-                self.connect(rng, &vertex, step.as_ref(), scratch, &mut paths.pixel);
-            }
-            if k + 2 > self.max_bounces || vertex.length_m + self.shortest_m >= self.gate.end_m() {
-                return;
-            }
+    /// True where a path with one more vertex and a spot can still count.
+    #[inline]
+    pub fn goes_on(&self, v: &Vertex) -> bool {
+        v.hit.surface.strength > 0.0
+            && v.bounce + 2 <= self.max_bounces
+            && v.length_m + self.shortest_m < self.gate.end_m()
+    }
+
+    /// Settles a surface of several lobes on one of them.
+    #[inline]
+    pub fn choose_lobe(&self, _rng: &mut Rng, _hit: &mut Hit) {}
+
+    /// Walks on from a vertex: everything beyond it except its own connection to the spots.
+    pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
+        let mut vertex = from;
+        while self.goes_on(&vertex) {
             let helped = !vertex.hit.surface.specular;
             let mut aimed = 0.0;
             if helped {
-                if !self.mirrors.list.is_empty() {
-                    aimed = self.aim(rng, &vertex, scratch, paths);
-                }
-                self.light(rng, &vertex, scratch, paths);
+                aimed = self.aim(rng, &vertex, scratch, sink);
+                self.light(rng, &vertex, scratch, sink);
             }
-            let h = vertex.hit;
-            let Some((w, weight, pdf)) = h.surface.sample(h.n, vertex.wo, rng) else {
+            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack) else {
                 return;
             };
-            let mut beta = vertex.beta * weight;
-            if k >= 2 {
-                // Russian roulette.
-                let survive = (SURVIVAL * beta).min(0.95);
-                if rng.uniform() >= survive {
-                    return;
-                }
-                beta /= survive;
-            }
-            let Some(hit) = world.closest(&mut scratch.stack, lift(h.p, h.n), w) else {
-                return;
-            };
-            step = helped.then_some(Step {
-                p: h.p,
-                n: h.n,
-                pdf,
-                aimed,
-            });
-            vertex = Vertex {
-                hit,
-                wo: -w,
-                beta,
-                length_m: vertex.length_m + world.metres((hit.p - h.p).length()),
-            };
-            k += 1;
+            vertex = next;
+            self.connect(rng, &vertex, helped.then_some(&step), SPOTS, scratch, sink);
         }
     }
 
-    /// Connects a vertex to a few spots, drawn by unshadowed contribution.
-    fn connect(
+    /// One step by the surface's own scattering, with Russian roulette where asked for.
+    pub fn step(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        aimed: f32,
+        roulette: bool,
+        stack: &mut Stack,
+    ) -> Option<(Step, Vertex)> {
+        let h = v.hit;
+        let (w, weight, pdf) = h.surface.sample(h.n, v.wo, rng)?;
+        let mut beta = v.beta * weight;
+        if roulette {
+            let survive = (SURVIVAL * beta).min(0.95);
+            if rng.uniform() >= survive {
+                return None;
+            }
+            beta /= survive;
+        }
+        let hit = self.world.closest(stack, lift(h.p, h.n), w)?;
+        let step = Step {
+            p: h.p,
+            n: h.n,
+            pdf,
+            aimed,
+        };
+        let next = Vertex {
+            hit,
+            wo: -w,
+            beta,
+            length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
+            bounce: v.bounce + 1,
+        };
+        Some((step, next))
+    }
+
+    /// Connects a vertex to `count` spots, drawn by unshadowed contribution.
+    pub fn connect(
         &self,
         rng: &mut Rng,
         v: &Vertex,
         step: Option<&Step>,
+        count: u32,
         scratch: &mut Scratch,
-        pixel: &mut Pixel,
+        sink: &mut impl Sink,
     ) {
         let h = &v.hit;
-        let Scratch {
-            stack,
-            weights,
-            unit,
-        } = scratch;
+        if h.surface.strength == 0.0 {
+            return;
+        }
+        let Scratch { stack, weights, .. } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
         if let Some(step) = step {
             self.plain_shares(step, h, weights);
         }
-        draw(weights, SPOTS, rng.uniform(), |spot, value| {
+        let mut each = |spot: usize, value: f32| {
             let e = &self.emitters.list[spot];
             if self.world.free(stack, h.p, h.n, e.p, e.n) {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-                unit.add(self.gate, path, v.beta * value, 1.0, pixel);
+                sink.add(path, v.beta * value, spot, v.bounce + 1);
             }
-        });
+        };
+        if count == ALL {
+            let lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
+            lit.for_each(|(spot, &w)| each(spot, w));
+        } else {
+            draw(weights, count, rng.uniform(), each);
+        }
     }
 
     /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
@@ -226,9 +243,18 @@ impl Walk<'_> {
     }
 
     /// Looks for a spot's image in a planar mirror. Returns the sum of weights for later MIS.
-    fn aim(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, paths: &mut Paths) -> f32 {
+    pub fn aim(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) -> f32 {
+        if self.mirrors.list.is_empty() {
+            return 0.0;
+        }
         let h = &v.hit;
-        let (total, aim) = self.mirrors.aim(h.p, h.n, rng, &mut paths.images);
+        let (total, aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images);
         let Some(aim) = aim else { return total };
         let to = aim.target - h.p;
         if h.n.dot(to) <= 0.0 {
@@ -254,33 +280,26 @@ impl Walk<'_> {
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
         let path = v.length_m + lengths + e.path_m;
         let value = v.beta * value / (aimed + plain);
-        scratch
-            .unit
-            .add(self.gate, path, value, 1.0, &mut paths.pixel);
+        sink.add(path, value, aim.spot, v.bounce + 2);
         total
     }
 
     /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
-    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, paths: &mut Paths) {
+    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
         let h = &v.hit;
-        let Paths {
-            pool,
+        let Scratch {
+            stack,
             lights,
-            pixel,
+            pool,
             ..
-        } = paths;
+        } = scratch;
         pool.weights(h, v.wo, lights);
         draw(lights, LIGHTS, rng.uniform(), |i, value| {
             let y = &pool.list[i];
             let there = &y.hit;
-            if self
-                .world
-                .free(&mut scratch.stack, h.p, h.n, there.p, there.n)
-            {
+            if self.world.free(stack, h.p, h.n, there.p, there.n) {
                 let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
-                scratch
-                    .unit
-                    .add(self.gate, path, v.beta * value, 1.0, pixel);
+                sink.add(path, v.beta * value, y.spot, v.bounce + 2);
             }
         });
     }

@@ -1,0 +1,283 @@
+//! The whole image: rounds over its tiles, joined to what earlier rounds found, and the pilot.
+
+use std::sync::{
+    Mutex,
+    atomic::{AtomicBool, AtomicUsize, Ordering},
+};
+
+use rayon::prelude::*;
+
+use super::{
+    error::Stat,
+    tile::{Bench, Done, Frame, Order, Region},
+};
+use crate::api::{Progress, RenderError};
+
+/// Side of a tile in pixels.
+const TILE: u32 = 16;
+/// Side and number of the pilot's tiles, and its passes.
+const PILOT_SIDE: u32 = 4;
+const PILOT_TILES: u32 = 5;
+pub(super) const PILOT_PASSES: u32 = 8;
+/// A tile goes on by itself while its error is above this multiple of the target, up to this multiple of
+/// the image's passes.
+const SLACK: f32 = 1.25;
+const FURTHER: u32 = 4;
+
+/// The parts with their standard errors.
+#[derive(Debug)]
+pub(super) struct Parts {
+    pub two: Vec<f32>,
+    pub two_se: Vec<f32>,
+    pub multi: Vec<f32>,
+    pub multi_se: Vec<f32>,
+}
+
+/// What rounds fill.
+#[derive(Debug)]
+pub(super) struct Image {
+    pub transient: Vec<f32>,
+    pub split: Option<Parts>,
+    pub stats: Vec<Stat>,
+    /// Variance of the image's whole energy.
+    pub total_variance: f64,
+    /// Energy outside the gate.
+    pub overflow: f64,
+    /// Contributions outside the gate.
+    pub outside: u64,
+    /// Passes of every tile at least.
+    pub passes: u32,
+    tiles: Vec<Region>,
+    /// Passes of each tile.
+    spent: Vec<u32>,
+    tile_variance: Vec<f64>,
+    tile_overflow: Vec<f64>,
+    width: usize,
+    bins: usize,
+}
+
+/// Tells the caller how far the render is and hears whether to stop.
+pub(super) struct Watch<'a> {
+    progress: &'a dyn Progress,
+    stopped: AtomicBool,
+    tiles: AtomicUsize,
+    before: f32,
+    total: f32,
+}
+
+impl<'a> Watch<'a> {
+    /// A watch over the round that takes the render from `spent` to `total` passes.
+    pub fn new(progress: &'a dyn Progress, spent: u32, total: u32) -> Self {
+        Self {
+            progress,
+            stopped: AtomicBool::new(false),
+            tiles: AtomicUsize::new(0),
+            before: spent as f32,
+            total: total.max(1) as f32,
+        }
+    }
+
+    /// False to stop. Asked often, since a tile of many passes takes long.
+    fn ask(&self, count: usize) -> bool {
+        let done = self.tiles.load(Ordering::Relaxed);
+        let before = self.before / self.total;
+        let at = before + (1.0 - before) * done as f32 / count as f32;
+        if !self.progress.at(at.min(1.0)) {
+            self.stopped.store(true, Ordering::Relaxed);
+        }
+        !self.stopped.load(Ordering::Relaxed)
+    }
+}
+
+impl Image {
+    pub fn new(frame: &Frame, split: bool) -> Self {
+        let (width, height) = (frame.width, frame.height);
+        let pixels = width as usize * height as usize;
+        let bins = frame.film.gate.bins as usize;
+        let empty = || vec![0.0f32; pixels * bins];
+        let tiles: Vec<Region> = (0..height)
+            .step_by(TILE as usize)
+            .flat_map(|row| {
+                (0..width).step_by(TILE as usize).map(move |col| Region {
+                    row,
+                    col,
+                    rows: TILE.min(height - row),
+                    cols: TILE.min(width - col),
+                })
+            })
+            .collect();
+        Self {
+            transient: empty(),
+            split: split.then(|| Parts {
+                two: empty(),
+                two_se: empty(),
+                multi: empty(),
+                multi_se: empty(),
+            }),
+            stats: vec![Stat::default(); pixels],
+            total_variance: 0.0,
+            overflow: 0.0,
+            outside: 0,
+            passes: 0,
+            spent: vec![0; tiles.len()],
+            tile_variance: vec![0.0; tiles.len()],
+            tile_overflow: vec![0.0; tiles.len()],
+            tiles,
+            width: width as usize,
+            bins,
+        }
+    }
+
+    /// Passes of a tile on average.
+    pub fn mean_passes(&self) -> u32 {
+        let pixels: u64 = self.tiles.iter().map(|t| t.pixels() as u64).sum();
+        let spent = self.tiles.iter().zip(&self.spent);
+        let all: u64 = spent.map(|(t, &n)| t.pixels() as u64 * u64::from(n)).sum();
+        all.div_ceil(pixels.max(1)) as u32
+    }
+
+    /// `wave` more passes over every tile; with a target, tiles that are far from it go on. Returns the
+    /// rays traced.
+    pub fn round(
+        &mut self,
+        frame: &Frame,
+        wave: u32,
+        target: Option<f32>,
+        watch: &Watch,
+    ) -> Result<u64, RenderError> {
+        let tiles = self.tiles.clone();
+        let spent = self.spent.clone();
+        let first = self.passes == 0;
+        let count = tiles.len();
+        let image = Mutex::new(&mut *self);
+        let rays: Vec<Option<u64>> = (0..count)
+            .into_par_iter()
+            .map_init(
+                || Bench::new(frame),
+                |bench, t| {
+                    if watch.stopped.load(Ordering::Relaxed) {
+                        return None;
+                    }
+                    let order = Order {
+                        first: spent[t],
+                        count: wave,
+                        further: target
+                            .filter(|_| first)
+                            .map(|e| (SLACK * e, FURTHER * wave)),
+                    };
+                    bench.render(frame, &tiles[t], &order, &|| watch.ask(count))?;
+                    let mut image = image.lock().unwrap_or_else(|e| e.into_inner());
+                    image.join(frame, t, &bench.done);
+                    drop(image);
+                    watch.tiles.fetch_add(1, Ordering::Relaxed);
+                    Some(bench.done.rays)
+                },
+            )
+            .collect();
+        let mut all = 0;
+        for r in rays {
+            all += r.ok_or(RenderError::Stopped)?;
+        }
+        self.passes += wave;
+        self.total_variance = self.tile_variance.iter().sum();
+        self.overflow = self.tile_overflow.iter().sum();
+        Ok(all)
+    }
+
+    /// Joins a tile's new passes to its earlier ones, each weighed by its passes.
+    fn join(&mut self, frame: &Frame, t: usize, done: &Done) {
+        let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
+        let spent = f64::from(self.spent[t]);
+        let new = if spent == 0.0 {
+            1.0
+        } else {
+            f64::from(done.passes) / (spent + f64::from(done.passes))
+        };
+        let (a, b) = (1.0 - new, new);
+        // Render units → metres: every path has one 1/d² left over.
+        let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
+        let unit2 = unit * unit;
+        let blend = |old: f64, x: f64| old * a * a + x * b * b;
+        for k in 0..region.pixels() {
+            let row = region.row as usize + k / region.cols as usize;
+            let col = region.col as usize + k % region.cols as usize;
+            let pixel = row * self.width + col;
+            let mut stat = Stat::default();
+            for bin in 0..bins {
+                let m = done.moments(film, k, bin + 1);
+                let at = pixel * bins + bin;
+                let old = f64::from(self.transient[at]) * a;
+                let h = (old + (m.two + m.multi) * unit * b) as f32;
+                self.transient[at] = h;
+                stat.norm2 += f64::from(h) * f64::from(h);
+                stat.total += f64::from(h);
+                stat.two_variance += m.two_variance;
+                stat.multi_variance += m.multi_variance;
+                if let Some(s) = &mut self.split {
+                    let mean = |old: f32, x: f64| (f64::from(old) * a + x * unit * b) as f32;
+                    let error = |old: f32, x: f64| {
+                        let old = f64::from(old);
+                        blend(old * old, x * unit2).sqrt() as f32
+                    };
+                    s.two[at] = mean(s.two[at], m.two);
+                    s.two_se[at] = error(s.two_se[at], m.two_variance);
+                    s.multi[at] = mean(s.multi[at], m.multi);
+                    s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
+                }
+            }
+            let old = self.stats[pixel];
+            self.stats[pixel] = Stat {
+                two_variance: blend(old.two_variance, stat.two_variance * unit2),
+                multi_variance: blend(old.multi_variance, stat.multi_variance * unit2),
+                ..stat
+            };
+        }
+        self.tile_variance[t] = blend(self.tile_variance[t], done.total_variance() * unit2);
+        self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
+        self.outside += done.outside;
+        self.spent[t] += done.passes;
+    }
+}
+
+/// Renders small tiles all over the image with few passes, to see how many the image needs. Returns the
+/// pixels' sums and the rays traced.
+pub(super) fn pilot(frame: &Frame) -> (Vec<Stat>, u64) {
+    let starts = |length: u32| -> Vec<u32> {
+        let side = PILOT_SIDE.min(length);
+        let count = PILOT_TILES.min(length / side);
+        (0..count)
+            .map(|i| (length * (2 * i + 1) / (2 * count)).saturating_sub(side / 2).min(length - side))
+            .collect()
+    };
+    let columns = starts(frame.width);
+    let regions: Vec<Region> = starts(frame.height)
+        .into_iter()
+        .flat_map(|row| {
+            columns.iter().map(move |&col| Region {
+                row,
+                col,
+                rows: PILOT_SIDE.min(frame.height),
+                cols: PILOT_SIDE.min(frame.width),
+            })
+        })
+        .collect();
+    // Passes from the far end of the range, so that no render repeats the pilot's random numbers.
+    let order = Order {
+        first: u32::MAX - PILOT_PASSES,
+        count: PILOT_PASSES,
+        further: None,
+    };
+    let found: Vec<(Vec<Stat>, u64)> = regions
+        .into_par_iter()
+        .map_init(
+            || Bench::new(frame),
+            |bench, region| {
+                bench.render(frame, &region, &order, &|| true);
+                let stats = (0..region.pixels()).map(|k| bench.done.stat(frame.film, k));
+                (stats.collect(), bench.done.rays)
+            },
+        )
+        .collect();
+    let rays = found.iter().map(|f| f.1).sum();
+    (found.into_iter().flat_map(|f| f.0).collect(), rays)
+}

@@ -1,0 +1,355 @@
+//! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
+//! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
+
+use super::error::{Stat, relative_median};
+use crate::{
+    api::Overflow,
+    film::{Film, Pairs},
+    rng::{Rng, Stream},
+    share::{Effort, Sharing, Tile},
+    two::{self, Sampling},
+    walk::{Scratch, Walk},
+};
+
+/// Everything a tile needs to know.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Frame<'a> {
+    pub walk: Walk<'a>,
+    pub film: &'a Film,
+    pub sampling: &'a Sampling,
+    pub effort: Effort,
+    pub seed: u64,
+    pub width: u32,
+    pub height: u32,
+}
+
+/// A rectangle of pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Region {
+    pub row: u32,
+    pub col: u32,
+    pub rows: u32,
+    pub cols: u32,
+}
+
+impl Region {
+    pub fn pixels(&self) -> usize {
+        self.rows as usize * self.cols as usize
+    }
+}
+
+/// Passes to do: the first one's number, how many, and, where the tile may go on by itself, the error to
+/// reach and the most passes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Order {
+    pub first: u32,
+    pub count: u32,
+    pub further: Option<(f32, u32)>,
+}
+
+/// Buffers of one thread.
+pub(super) struct Bench {
+    scratch: Scratch,
+    sharing: Sharing,
+    pairs: Pairs,
+    /// One pass over the pixels that share vertices.
+    pass: Vec<f32>,
+    pub done: Done,
+}
+
+/// A finished tile, in render units.
+#[derive(Debug, Default)]
+pub(super) struct Done {
+    /// Σ over passes of the 3+ part, slots by pixel.
+    sum: Vec<f32>,
+    /// Σ over passes of its square, channel 0.
+    square: Vec<f32>,
+    /// Σ over passes of (a pixel's whole pass)².
+    total_square: Vec<f64>,
+    /// Mean of the two-bounce part.
+    two: Vec<f32>,
+    /// Variance of that mean, channel 0.
+    two_variance: Vec<f32>,
+    /// Variance of the sum over slots of the two-bounce mean.
+    two_total_variance: Vec<f64>,
+    /// Σ and Σ² over passes of the whole tile.
+    all: (f64, f64),
+    pub passes: u32,
+    pub outside: u64,
+    pub rays: u64,
+}
+
+/// What a tile tells of one channel-0 slot of one pixel.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Moments {
+    pub two: f64,
+    pub two_variance: f64,
+    pub multi: f64,
+    pub multi_variance: f64,
+}
+
+/// Mean and its variance from Σx and Σx² over `n` passes.
+fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
+    if n == 0.0 {
+        return (0.0, 0.0);
+    }
+    let spread = if n > 1.0 {
+        (square - sum * sum / n).max(0.0) / (n - 1.0)
+    } else {
+        square
+    };
+    (sum / n, spread / n)
+}
+
+impl Done {
+    fn reset(&mut self, film: &Film, pixels: usize) {
+        let zero = |v: &mut Vec<f32>, n: usize| {
+            v.clear();
+            v.resize(n, 0.0);
+        };
+        zero(&mut self.sum, pixels * film.pixel());
+        zero(&mut self.square, pixels * film.slots);
+        zero(&mut self.two, pixels * film.pixel());
+        zero(&mut self.two_variance, pixels * film.slots);
+        for v in [&mut self.total_square, &mut self.two_total_variance] {
+            v.clear();
+            v.resize(pixels, 0.0);
+        }
+        self.all = (0.0, 0.0);
+        self.passes = 0;
+        self.outside = 0;
+    }
+
+    /// Two-bounce and 3+ means of any channel's slot of pixel `k`.
+    pub fn value(&self, film: &Film, k: usize, channel: usize, slot: usize) -> f64 {
+        let at = k * film.pixel() + channel * film.slots + slot;
+        let n = f64::from(self.passes.max(1));
+        f64::from(self.two[at]) + f64::from(self.sum[at]) / n
+    }
+
+    /// Means and variances of a slot of pixel `k`, channel 0.
+    pub fn moments(&self, film: &Film, k: usize, slot: usize) -> Moments {
+        let (wide, narrow) = (k * film.pixel() + slot, k * film.slots + slot);
+        let (sum, square) = (f64::from(self.sum[wide]), f64::from(self.square[narrow]));
+        let (multi, multi_variance) = mean(sum, square, f64::from(self.passes));
+        Moments {
+            two: f64::from(self.two[wide]),
+            two_variance: f64::from(self.two_variance[narrow]),
+            multi,
+            multi_variance,
+        }
+    }
+
+    /// What pixel `k` adds to the error estimate.
+    pub fn stat(&self, film: &Film, k: usize) -> Stat {
+        let mut stat = Stat::default();
+        for slot in 1..film.slots - 1 {
+            let m = self.moments(film, k, slot);
+            let h = m.two + m.multi;
+            stat.norm2 += h * h;
+            stat.total += h;
+            stat.two_variance += m.two_variance;
+            stat.multi_variance += m.multi_variance;
+        }
+        stat
+    }
+
+    /// Variance of the tile's whole energy. Pixels that share vertices err together, so this is not the
+    /// sum of theirs.
+    pub fn total_variance(&self) -> f64 {
+        let (_, multi) = mean(self.all.0, self.all.1, f64::from(self.passes));
+        multi + self.two_total_variance.iter().sum::<f64>()
+    }
+
+    /// Energy outside the gate.
+    pub fn overflow(&self, film: &Film) -> f64 {
+        let mut all = Overflow::default();
+        let n = f64::from(self.passes.max(1));
+        for (sum, two) in self.sum.chunks(film.pixel()).zip(self.two.chunks(film.pixel())) {
+            all.take(film, sum, 1.0 / n);
+            all.take(film, two, 1.0);
+        }
+        all.energy
+    }
+}
+
+impl Bench {
+    pub fn new(frame: &Frame) -> Self {
+        let walk = &frame.walk;
+        Self {
+            scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
+            sharing: Sharing::default(),
+            pairs: Pairs::new(frame.film),
+            pass: vec![],
+            done: Done::default(),
+        }
+    }
+
+    /// Renders a region into `done`; `None` when `go_on` says to stop.
+    pub fn render(
+        &mut self,
+        frame: &Frame,
+        region: &Region,
+        order: &Order,
+        go_on: &dyn Fn() -> bool,
+    ) -> Option<()> {
+        let rays = self.scratch.stack.rays;
+        self.done.reset(frame.film, region.pixels());
+        self.two(frame, region, order, go_on)?;
+        let mut end = order.count;
+        while self.done.passes < end {
+            if !go_on() {
+                return None;
+            }
+            self.pass(frame, region, order.first + self.done.passes);
+            let passes = self.done.passes;
+            if let Some((target, most)) = order.further
+                && passes == end
+                && end < most
+            {
+                let film = frame.film;
+                let stats = (0..region.pixels()).map(|k| self.done.stat(film, k));
+                let error = relative_median(stats);
+                if error > f64::from(target) {
+                    // Variance falls as 1/passes.
+                    let need = f64::from(passes) * (error / f64::from(target)).powi(2);
+                    end = (need.ceil().min(f64::from(most)) as u32).max(passes + 1);
+                }
+            }
+        }
+        self.done.rays = self.scratch.stack.rays - rays;
+        Some(())
+    }
+
+    /// The two-bounce part of every pixel.
+    fn two(
+        &mut self,
+        frame: &Frame,
+        region: &Region,
+        order: &Order,
+        go_on: &dyn Fn() -> bool,
+    ) -> Option<()> {
+        let (walk, film) = (&frame.walk, frame.film);
+        if walk.max_bounces < 2 || walk.emitters.list.is_empty() {
+            return Some(());
+        }
+        let (coarse, fine) = frame.sampling.sides(order.count);
+        for k in 0..region.pixels() {
+            if !go_on() {
+                return None;
+            }
+            let row = region.row + k as u32 / region.cols;
+            let col = region.col + k as u32 % region.cols;
+            let index = row as usize * frame.width as usize + col as usize;
+            let side = if frame.sampling.refined[index] {
+                fine
+            } else {
+                coarse
+            };
+            let mut rng = Rng::new(
+                frame.seed,
+                Stream::Two,
+                index as u64,
+                u64::from(order.first),
+            );
+            self.pairs.clear();
+            let strata = two::sample_pixel(
+                walk,
+                film,
+                (row, col, side),
+                &mut rng,
+                &mut self.scratch,
+                (&mut self.pairs, &mut self.done.outside),
+            );
+            let n = 1.0 / strata as f32;
+            let wide = &mut self.done.two[k * film.pixel()..(k + 1) * film.pixel()];
+            for (out, v) in wide.iter_mut().zip(&self.pairs.sum) {
+                *out = v * n;
+            }
+            let narrow = &mut self.done.two_variance[k * film.slots..(k + 1) * film.slots];
+            for (out, v) in narrow.iter_mut().zip(&self.pairs.square) {
+                *out = v * n * n;
+            }
+            self.done.two_total_variance[k] = self.pairs.total_square * f64::from(n * n);
+        }
+        Some(())
+    }
+
+    /// One pass over the region. The grid of tiles that share vertices is moved in each pass, so that no
+    /// edge between them stays.
+    fn pass(&mut self, frame: &Frame, region: &Region, pass: u32) {
+        let (film, side) = (frame.film, frame.effort.side);
+        let size = film.pixel();
+        let start = u64::from(region.row) * u64::from(frame.width) + u64::from(region.col);
+        let mut rng = Rng::new(frame.seed, Stream::Grid, start, u64::from(pass));
+        let mut shift = |length: u32| {
+            if length > side {
+                (rng.uniform() * side as f32) as u32
+            } else {
+                0
+            }
+        };
+        let (down, right) = (shift(region.rows), shift(region.cols));
+        let cuts = |shift: u32, length: u32| {
+            let starts = (0..length).filter(move |i| *i == 0 || (i + shift) % side == 0);
+            starts.map(move |i| (i, (side - (i + shift) % side).min(length - i)))
+        };
+        let mut all = 0.0f64;
+        for (row, rows) in cuts(down, region.rows) {
+            for (col, cols) in cuts(right, region.cols) {
+                let count = (rows * cols) as usize;
+                self.pass.clear();
+                self.pass.resize(count * size, 0.0);
+                let tile = Tile {
+                    row: region.row + row,
+                    col: region.col + col,
+                    rows,
+                    cols,
+                    width: frame.width,
+                    seed: frame.seed,
+                    pass: u64::from(pass),
+                };
+                self.sharing.pass(
+                    (&frame.walk, film, &frame.effort),
+                    &tile,
+                    &mut self.scratch,
+                    &mut self.pass,
+                    &mut self.done.outside,
+                );
+                for k in 0..count as u32 {
+                    let (r, c) = (row + k / cols, col + k % cols);
+                    let k = k as usize;
+                    all += self.fold((r * region.cols + c) as usize, k, film);
+                }
+            }
+        }
+        self.done.all.0 += all;
+        self.done.all.1 += all * all;
+        self.done.passes += 1;
+    }
+
+    /// Adds pixel `from` of the pass to pixel `to` of the region; returns its energy inside the gate.
+    fn fold(&mut self, to: usize, from: usize, film: &Film) -> f64 {
+        let size = film.pixel();
+        let pass = &self.pass[from * size..(from + 1) * size];
+        let sum = &mut self.done.sum[to * size..(to + 1) * size];
+        for (sum, v) in sum.iter_mut().zip(pass) {
+            *sum += v;
+        }
+        let pass = &pass[..film.slots];
+        let square = &mut self.done.square[to * film.slots..(to + 1) * film.slots];
+        // Eight sums side by side: exact enough, and the compiler can keep them in one register.
+        let mut totals = [0.0f32; 8];
+        for (square, v) in square.iter_mut().zip(pass) {
+            *square += v * v;
+        }
+        for chunk in pass[1..film.slots - 1].chunks(8) {
+            for (t, v) in totals.iter_mut().zip(chunk) {
+                *t += v;
+            }
+        }
+        let total: f64 = totals.iter().map(|&t| f64::from(t)).sum();
+        self.done.total_square[to] += total * total;
+        total
+    }
+}

@@ -1,0 +1,461 @@
+//! Path reuse: three bounces and more for a tile of neighbouring pixels at once.
+//!
+//! Every pixel of a tile brings one *gather point*: the first surface point along a camera path that is
+//! not a near-mirror. *Shared vertices* are drawn from the gather points' scattering and from the spots',
+//! and every gather point is connected to every shared vertex (Bekaert, Sbert and Halton, EGWR 2002;
+//! vertices from the light side as in Segovia et al., EGSR 2006). A shared vertex sends out its direct
+//! light from all spots, found exactly, and what a few random walks bring: one shadow ray carries a whole
+//! list of arrivals to a pixel. All ways of drawing a shared vertex are joined by the balance heuristic
+//! with visibility in the densities, so both 1/d² singularities, at the gather point and at the spot, stay
+//! bounded.
+//!
+//! What only one pixel can see, namely light by way of a near-mirror or a glossy surface, is walked for
+//! that pixel alone.
+
+use std::f32::consts::PI;
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    emitter::Columns,
+    film::{Film, PixelSink},
+    rng::{Rng, Stream},
+    walk::{ALL, Scratch, Sink, Vertex, Walk},
+    world::{Hit, lift},
+};
+
+/// How much a pass does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Effort {
+    /// Side of a tile in pixels.
+    pub side: u32,
+    /// Shared vertices drawn from gather points, for each of them.
+    pub camera: f32,
+    /// Shared vertices drawn from spots, for each gather point.
+    pub light: f32,
+    /// Walks from each shared vertex.
+    pub walks: u32,
+    /// Light vertices that walks of one pass connect to.
+    pub pool: u32,
+}
+
+impl Effort {
+    pub fn from_env() -> Self {
+        let get = |k: &str, d: f32| std::env::var(k).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
+        Self {
+            side: get("E_SIDE", 4.0) as u32,
+            camera: get("E_CAMERA", 1.0),
+            light: get("E_LIGHT", 0.5),
+            walks: get("E_WALKS", 1.0) as u32,
+            pool: get("E_POOL", 16.0) as u32,
+        }
+    }
+}
+
+/// A vertex that all gather points of a tile share.
+#[derive(Debug, Clone, Copy)]
+struct Shared {
+    hit: Hit,
+    /// Expected number of such vertices per area, from the spots' side.
+    light: f32,
+    /// Its arrivals.
+    first: usize,
+    end: usize,
+}
+
+/// What arrives at a shared vertex and goes on, per unit solid angle, to every side.
+#[derive(Debug, Default)]
+struct Arrivals {
+    /// Optical path from the laser, in bins.
+    bins: Vec<f32>,
+    value: Vec<f32>,
+    spot: Vec<u16>,
+    /// Bounces of the whole path where the gather point is the first.
+    bounces: Vec<u8>,
+}
+
+/// Adds arrivals; lengths counted from `base_m`.
+struct ArrivalSink<'a> {
+    list: &'a mut Arrivals,
+    base_m: f64,
+    per_metre: f64,
+    factor: f32,
+}
+
+impl Sink for ArrivalSink<'_> {
+    #[inline]
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32) {
+        let list = &mut *self.list;
+        list.bins
+            .push(((path_m - self.base_m) * self.per_metre) as f32);
+        list.value.push(self.factor * value);
+        list.spot.push(spot as u16);
+        list.bounces.push(bounces.min(255) as u8);
+    }
+}
+
+/// Where a pass stands: pixels of a tile (at least one) and its number.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Tile {
+    pub row: u32,
+    pub col: u32,
+    pub rows: u32,
+    pub cols: u32,
+    pub width: u32,
+    pub seed: u64,
+    pub pass: u64,
+}
+
+/// Buffers of one thread's passes.
+#[derive(Debug, Default)]
+pub(crate) struct Sharing {
+    gathers: Vec<(Vertex, usize)>,
+    columns: Columns,
+    /// Indices of gather points that are not Lambertian.
+    glossy: Vec<usize>,
+    shared: Vec<Shared>,
+    arrivals: Arrivals,
+    /// `[shared][gather]`: value of an arrival at the pixel, and path in bins to add.
+    weight: Vec<f32>,
+    offset: Vec<f32>,
+}
+
+impl Sharing {
+    /// One pass over a tile. `pixels` holds its pixels' slots row by row, as [`Film::pixel`] each, and is
+    /// added to. `outside` counts contributions outside the gate.
+    pub fn pass(
+        &mut self,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        tile: &Tile,
+        scratch: &mut Scratch,
+        pixels: &mut [f32],
+        outside: &mut u64,
+    ) {
+        let first = u64::from(tile.row) * u64::from(tile.width) + u64::from(tile.col);
+        let mut rng = Rng::new(tile.seed, Stream::Paths, first, tile.pass);
+        self.gathers.clear();
+        self.shared.clear();
+        let a = &mut self.arrivals;
+        a.bins.clear();
+        a.value.clear();
+        a.spot.clear();
+        a.bounces.clear();
+        let size = film.pixel();
+        for (k, pixel) in pixels.chunks_mut(size).enumerate() {
+            let (row, col) = (tile.row + k as u32 / tile.cols, tile.col + k as u32 % tile.cols);
+            let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
+            let mut sink = PixelSink {
+                film,
+                pixel,
+                factor: 1.0,
+                outside,
+            };
+            if let Some(v) = gather_point(walk, &mut rng, (x, y), scratch, &mut sink) {
+                self.gathers.push((v, k));
+            }
+        }
+        if self.gathers.is_empty() {
+            return;
+        }
+        self.index();
+        let count = self.gathers.len() as f32;
+        let pool = effort.pool.min((count * 4.0) as u32).max(2);
+        let mut lights = std::mem::take(&mut scratch.pool);
+        lights.fill(walk.world, walk.emitters, pool, &mut rng, &mut scratch.stack);
+        scratch.pool = lights;
+        let camera = (count * effort.camera).round().max(1.0) as u32;
+        let light = (count * effort.light).round().max(1.0) as u32;
+        self.draw_from_camera((walk, film), camera, &mut rng, scratch, pixels, outside);
+        self.draw_from_spots(walk, light, &mut rng, scratch);
+        self.light_up((walk, film, effort), light, &mut rng, scratch);
+        self.connect((walk, film), camera, scratch);
+        self.spread((walk, film), pixels, outside);
+    }
+
+    /// Lays the gather points out in columns.
+    fn index(&mut self) {
+        self.columns.clear();
+        self.glossy.clear();
+        for (i, (v, _)) in self.gathers.iter().enumerate() {
+            let diffuse = v.hit.surface.diffuse();
+            if !diffuse {
+                self.glossy.push(i);
+            }
+            self.columns
+                .push(v.hit.p, v.hit.n, if diffuse { 1.0 } else { 0.0 });
+        }
+    }
+
+    /// Draws shared vertices by the scattering of gather points in turn. A vertex that cannot be shared is
+    /// walked on for its own pixel.
+    fn draw_from_camera(
+        &mut self,
+        (walk, film): (&Walk, &Film),
+        count: u32,
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+        pixels: &mut [f32],
+        outside: &mut u64,
+    ) {
+        let size = film.pixel();
+        let points = self.gathers.len();
+        let shift = rng.uniform();
+        for j in 0..count {
+            let at = (j as f32 + rng.uniform()) / count as f32 + shift;
+            let at = (((at - at.floor()) * points as f32) as usize).min(points - 1);
+            let (vertex, k) = self.gathers[at];
+            if !walk.goes_on(&vertex) {
+                continue;
+            }
+            let mut sink = PixelSink {
+                film,
+                pixel: &mut pixels[k * size..(k + 1) * size],
+                factor: points as f32 / count as f32,
+                outside,
+            };
+            let aimed = walk.aim(rng, &vertex, scratch, &mut sink);
+            let Some((step, mut next)) = walk.step(rng, &vertex, aimed, false, &mut scratch.stack)
+            else {
+                continue;
+            };
+            walk.choose_lobe(rng, &mut next.hit);
+            if next.hit.surface.strength == 0.0 {
+                continue;
+            }
+            if next.hit.surface.diffuse() {
+                self.shared.push(Shared {
+                    hit: next.hit,
+                    light: 0.0,
+                    first: 0,
+                    end: 0,
+                });
+            } else {
+                walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
+                walk.run(rng, next, scratch, &mut sink);
+            }
+        }
+    }
+
+    /// Draws shared vertices by the scattering of the spots in turn.
+    fn draw_from_spots(&mut self, walk: &Walk, count: u32, rng: &mut Rng, scratch: &mut Scratch) {
+        let spots = &walk.emitters.list;
+        let shift = rng.uniform();
+        for j in 0..count {
+            let at = (j as f32 + rng.uniform()) / count as f32 + shift;
+            let at = (((at - at.floor()) * spots.len() as f32) as usize).min(spots.len() - 1);
+            let e = &spots[at];
+            let Some((w, weight, _)) = e.surface.sample(e.n, e.back, rng) else {
+                continue;
+            };
+            let hit = walk
+                .world
+                .closest(&mut scratch.stack, lift(e.p, e.n), w)
+                .filter(|_| weight > 0.0);
+            let Some(mut hit) = hit else { continue };
+            walk.choose_lobe(rng, &mut hit);
+            if hit.surface.strength > 0.0 && hit.surface.diffuse() {
+                self.shared.push(Shared {
+                    hit,
+                    light: 0.0,
+                    first: 0,
+                    end: 0,
+                });
+            }
+        }
+    }
+
+    /// Finds what arrives at every shared vertex: from all spots directly, from beyond by walks.
+    fn light_up(
+        &mut self,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        drawn: u32,
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+    ) {
+        let emitters = walk.emitters;
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        let nearest = self
+            .gathers
+            .iter()
+            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
+        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
+        let bounce = lowest.unwrap_or(1) + 1;
+        let share = drawn as f32 / emitters.list.len() as f32;
+        for y in &mut self.shared {
+            y.first = self.arrivals.bins.len();
+            let h = &y.hit;
+            let mut sink = ArrivalSink {
+                list: &mut self.arrivals,
+                base_m: nearest,
+                per_metre,
+                factor: 1.0,
+            };
+            let mut density = 0.0;
+            emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
+            for (spot, &w) in scratch.weights.iter().enumerate() {
+                let e = &emitters.list[spot];
+                if w > 0.0 && walk.world.free(&mut scratch.stack, h.p, h.n, e.p, e.n) {
+                    let to = h.p - e.p;
+                    let d2 = to.dot(to);
+                    let d = d2.sqrt();
+                    let strength = emitters.columns.strength[spot];
+                    density += if strength > 0.0 {
+                        w / (strength * h.surface.strength * PI)
+                    } else {
+                        let out = to / d;
+                        e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
+                    };
+                    let path = nearest + walk.world.metres(d) + e.path_m;
+                    sink.add(path, w, spot, bounce + 1);
+                }
+            }
+            y.light = density * share;
+            let vertex = Vertex {
+                hit: *h,
+                wo: h.n,
+                beta: 1.0,
+                length_m: nearest,
+                bounce,
+            };
+            sink.factor = 1.0 / effort.walks.max(1) as f32;
+            for _ in 0..effort.walks {
+                walk.run(rng, vertex, scratch, &mut sink);
+            }
+            y.end = sink.list.bins.len();
+        }
+    }
+
+    /// Weighs every pair of shared vertex and gather point.
+    fn connect(&mut self, (walk, film): (&Walk, &Film), drawn: u32, scratch: &mut Scratch) {
+        let count = self.gathers.len();
+        self.weight.clear();
+        self.offset.clear();
+        self.weight.resize(count * self.shared.len(), 0.0);
+        self.offset.resize(count * self.shared.len(), 0.0);
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        let nearest = self
+            .gathers
+            .iter()
+            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
+        let share = drawn as f32 / count as f32;
+        let rows = self
+            .weight
+            .chunks_mut(count)
+            .zip(self.offset.chunks_mut(count));
+        for (y, (weight, offset)) in self.shared.iter().zip(rows) {
+            let h = &y.hit;
+            self.columns.irradiance(h.p, h.n, weight);
+            for &i in &self.glossy {
+                let x = &self.gathers[i].0.hit;
+                let to = x.p - h.p;
+                let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
+                weight[i] = if seen { 1.0 } else { 0.0 };
+            }
+            let mut density = 0.0;
+            for ((w, o), (v, _)) in weight.iter_mut().zip(offset).zip(&self.gathers) {
+                if *w == 0.0 {
+                    continue;
+                }
+                let x = &v.hit;
+                if !walk.world.free(&mut scratch.stack, h.p, h.n, x.p, x.n) {
+                    *w = 0.0;
+                    continue;
+                }
+                let to = h.p - x.p;
+                let d2 = to.dot(to);
+                let d = d2.sqrt();
+                if x.surface.diffuse() {
+                    density += *w / PI;
+                    *w *= v.beta * x.surface.strength;
+                } else {
+                    let w_in = to / d;
+                    let cos = h.n.dot(w_in).abs() / d2;
+                    density += x.surface.pdf(x.n, v.wo, w_in) * cos;
+                    *w = v.beta * x.surface.scatter(x.n, v.wo, w_in) * cos;
+                }
+                *o = ((v.length_m - nearest + walk.world.metres(d) - film.gate.start_m + nearest)
+                    * per_metre) as f32;
+            }
+            let density = density * share + y.light;
+            let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
+            for w in weight.iter_mut() {
+                *w *= inverse;
+            }
+        }
+    }
+
+    /// Carries the arrivals to the pixels.
+    fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32], outside: &mut u64) {
+        let count = self.gathers.len();
+        let size = film.pixel();
+        let last = film.slots as f32 - 1.0;
+        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
+        let lowest = lowest.unwrap_or(1);
+        let bounded = walk.max_bounces < u32::MAX;
+        for (i, (v, k)) in self.gathers.iter().enumerate() {
+            let pixel = &mut pixels[k * size..(k + 1) * size];
+            let deeper = v.bounce - lowest;
+            for (y, row) in self.shared.iter().zip(self.weight.chunks(count).zip(self.offset.chunks(count))) {
+                let (weight, offset) = (row.0[i], row.1[i] + 1.0);
+                if weight == 0.0 {
+                    continue;
+                }
+                let range = y.first..y.end;
+                let a = &self.arrivals;
+                let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
+                if film.channels == 1 && !bounded {
+                    let pixel = &mut pixel[..film.slots];
+                    for (&b, &value) in bins.iter().zip(values) {
+                        let slot = (b + offset).max(0.0).min(last) as usize;
+                        pixel[slot] += weight * value;
+                    }
+                    continue;
+                }
+                let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
+                for ((&b, &value), (&spot, &bounces)) in bins.iter().zip(values).zip(rest) {
+                    if u32::from(bounces) + deeper > walk.max_bounces {
+                        continue;
+                    }
+                    let slot = (b + offset).max(0.0).min(last) as usize;
+                    film.add(pixel, slot, weight * value, usize::from(spot));
+                }
+            }
+            *outside += 0;
+        }
+    }
+}
+
+/// Follows a camera ray through near-mirrors to the first other surface. What the spots send to vertices
+/// past the first goes to `sink`.
+fn gather_point(
+    walk: &Walk,
+    rng: &mut Rng,
+    (x, y): (f32, f32),
+    scratch: &mut Scratch,
+    sink: &mut PixelSink,
+) -> Option<Vertex> {
+    let world = walk.world;
+    let hit = world.closest(&mut scratch.stack, Vec3::ZERO, world.camera.ray(x, y))?;
+    let range = hit.p.length();
+    let mut vertex = Vertex {
+        hit,
+        wo: -hit.p / range,
+        beta: 1.0,
+        length_m: world.metres(range),
+        bounce: 1,
+    };
+    loop {
+        walk.choose_lobe(rng, &mut vertex.hit);
+        if vertex.bounce > 1 {
+            walk.connect(rng, &vertex, None, ALL, scratch, sink);
+        }
+        if !walk.goes_on(&vertex) {
+            return None;
+        }
+        if !vertex.hit.surface.specular {
+            return Some(vertex);
+        }
+        let roulette = vertex.bounce > 1;
+        (_, vertex) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack)?;
+    }
+}
