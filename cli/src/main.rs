@@ -2,6 +2,7 @@
 
 mod args;
 mod assets;
+mod bench;
 mod client;
 mod dataset;
 mod demo;
@@ -66,6 +67,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
+        Command::Bench(command) => bench::run(command, settings, output).await,
         Command::Config => {
             show_settings(resolved, output);
             Ok(())

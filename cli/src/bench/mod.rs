@@ -1,0 +1,75 @@
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is.
+
+mod axes;
+mod curve;
+mod deviation;
+mod ladder;
+mod measure;
+mod peer;
+mod plot;
+mod report;
+mod scaling;
+mod scenes;
+mod tessellate;
+mod truth;
+
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    args::{Bench as Command, BenchRender},
+    error::{CliError, Code, Result},
+    output::Output,
+    settings::Settings,
+    signals,
+};
+
+pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
+    let Command::Render(args) = command;
+    check(&args)?;
+    let stop = signals::stop_on_signal()?;
+    let assets = settings.assets.clone();
+    tokio::task::spawn_blocking(move || render(&args, &assets, output, &stop))
+        .await
+        .map_err(|e| CliError::new(Code::Failed, format!("the benchmark broke: {e}")))?
+}
+
+fn check(args: &BenchRender) -> Result<()> {
+    if let Some(e) = args.error.iter().find(|e| !(**e > 0.0 && **e < 1.0)) {
+        return Err(CliError::input(format!("--error {e}: expected a share"))
+            .hint("write for example --error 10%,5%"));
+    }
+    if args.truth.is_some() && args.scenes.len() != 1 {
+        return Err(CliError::input(format!(
+            "--truth belongs to one scene, found {}",
+            args.scenes.len()
+        ))
+        .hint("name the scene that it was rendered from"));
+    }
+    Ok(())
+}
+
+fn render(
+    args: &BenchRender,
+    assets: &std::path::Path,
+    output: Output,
+    stop: &CancellationToken,
+) -> Result<()> {
+    if args.scaling {
+        let found = scaling::run(args, assets, output, stop)?;
+        output.result(&found, || report::scaling(&found));
+        return Ok(());
+    }
+    let peers = peer::read(&args.peer)?;
+    let mut results = Vec::new();
+    for name in &args.scenes {
+        let scene = scenes::load(name, args, assets)?;
+        results.push(ladder::run(&scene, args, &peers, output, stop)?);
+    }
+    if let Some(path) = &args.plot {
+        plot::draw(&results, &args.error, path)?;
+        output.say(format!("drew {}", path.display()));
+    }
+    let document = report::document(&results, args);
+    output.result(&document, || report::ladders(&results));
+    Ok(())
+}
