@@ -18,7 +18,7 @@ use picofarm_scene::{
     primitive::{self, PrimitiveSettings},
 };
 use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings as RenderSettings,
+    Budget, Gate, Progress, RenderError, Rendered, Settings as RenderSettings, Strategy,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -265,6 +265,8 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
         one_bounce: true,
         seed: args.seed,
         split: args.split,
+        groups: vec![],
+        strategy: Strategy::default(),
     };
     free_folder(&args.out)?;
     let stop = signals::stop_on_signal()?;
@@ -284,9 +286,9 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
             )
         })?;
     let start = Instant::now();
-    let (scene, watcher, rendered) = tokio::task::spawn_blocking(move || {
+    let (scene, settings, watcher, rendered) = tokio::task::spawn_blocking(move || {
         let rendered = pool.install(|| picofarm_transient::render(&scene, &settings, &watcher));
-        (scene, watcher, rendered)
+        (scene, settings, watcher, rendered)
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
@@ -367,13 +369,14 @@ fn write(out: &Path, scene: &Scene, settings: &RenderSettings, r: &Rendered) -> 
             histogram("two_se", &s.two_se),
             histogram("multi", &s.multi),
             histogram("multi_se", &s.multi_se),
+            histogram("multi_noise", &s.multi_noise),
         ]);
     }
     let attributes = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors",
+        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
         "gate": r.gate,
         "settings": settings,
         "camera": scene.camera,

@@ -111,6 +111,9 @@ pub struct Split {
     pub multi: Vec<f32>,
     /// Its standard error.
     pub multi_se: Vec<f32>,
+    /// A draw of its error, with what pixels and bins have in common: the square of any weighted sum of
+    /// it estimates the variance of that sum of `multi`, where `multi_se` alone cannot.
+    pub multi_noise: Vec<f32>,
 }
 
 /// Ground truth. Depth and its kin are those of the ray through the pixel's centre.

@@ -98,7 +98,6 @@ impl Surface {
     /// One lobe of a mix, chosen by `u` in [0, 1) in proportion to the lobes' albedos and divided by the
     /// chance of that choice, with `specular` as for the lobe alone. Pure surfaces are their own lobe.
     #[inline]
-    #[cfg_attr(not(test), expect(dead_code, reason = "for path vertices on mixes"))]
     pub fn lobe(&self, u: f32) -> Surface {
         if self.base == 0.0 {
             return *self;

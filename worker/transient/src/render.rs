@@ -84,8 +84,9 @@ pub fn render(
         seed: settings.seed,
         width,
         height,
+        split: settings.split,
     };
-    let mut image = Image::new(&frame, settings.split);
+    let mut image = Image::new(&frame);
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
     let mut rays = 0;
     let (passes, target) = match settings.budget {
@@ -148,6 +149,7 @@ pub fn render(
             two_se: s.two_se,
             multi: s.multi,
             multi_se: s.multi_se,
+            multi_noise: s.multi_noise,
         }),
         groups: image.groups,
         truth,

@@ -31,6 +31,7 @@ pub(super) struct Parts {
     pub two_se: Vec<f32>,
     pub multi: Vec<f32>,
     pub multi_se: Vec<f32>,
+    pub multi_noise: Vec<f32>,
 }
 
 /// What rounds fill.
@@ -89,7 +90,7 @@ impl<'a> Watch<'a> {
 }
 
 impl Image {
-    pub fn new(frame: &Frame, split: bool) -> Self {
+    pub fn new(frame: &Frame) -> Self {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
@@ -107,11 +108,12 @@ impl Image {
             .collect();
         Self {
             transient: empty(),
-            split: split.then(|| Parts {
+            split: frame.split.then(|| Parts {
                 two: empty(),
                 two_se: empty(),
                 multi: empty(),
                 multi_se: empty(),
+                multi_noise: empty(),
             }),
             groups: (1..frame.film.channels).map(|_| empty()).collect(),
             stats: vec![Stat::default(); pixels],
@@ -221,6 +223,7 @@ impl Image {
                     s.two[at] = mean(s.two[at], m.two);
                     s.two_se[at] = error(s.two_se[at], m.two_variance);
                     s.multi[at] = mean(s.multi[at], m.multi);
+                    s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
                     s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
                 }
             }

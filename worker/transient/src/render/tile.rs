@@ -21,6 +21,8 @@ pub(super) struct Frame<'a> {
     pub seed: u64,
     pub width: u32,
     pub height: u32,
+    /// The parts are wanted.
+    pub split: bool,
 }
 
 /// A rectangle of pixels.
@@ -55,6 +57,8 @@ pub(super) struct Bench {
     strata: Strata,
     /// One pass over the pixels that share vertices.
     pass: Vec<f32>,
+    /// The last pass of even number, where the alternating sum is wanted.
+    held: Vec<f32>,
     pub done: Done,
 }
 
@@ -65,6 +69,8 @@ pub(super) struct Done {
     sum: Vec<f32>,
     /// Σ over passes of its square, channel 0.
     square: Vec<f32>,
+    /// Σ over passes with alternating sign, channel 0; empty where not wanted.
+    alternating: Vec<f32>,
     /// Variance of the mean of the 3+ part, channel 0, pooled.
     multi_variance: Vec<f32>,
     /// Mean of the two-bounce part.
@@ -102,13 +108,17 @@ fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
 }
 
 impl Done {
-    fn reset(&mut self, film: &Film, pixels: usize) {
+    fn reset(&mut self, film: &Film, pixels: usize, split: bool) {
         let zero = |v: &mut Vec<f32>, n: usize| {
             v.clear();
             v.resize(n, 0.0);
         };
         zero(&mut self.sum, pixels * film.pixel());
         zero(&mut self.square, pixels * film.slots);
+        zero(
+            &mut self.alternating,
+            if split { pixels * film.slots } else { 0 },
+        );
         zero(&mut self.two, pixels * film.pixel());
         zero(&mut self.two_variance, pixels * film.slots);
         self.two_total_variance.clear();
@@ -134,6 +144,15 @@ impl Done {
             multi: f64::from(self.sum[wide]) / n,
             multi_variance: f64::from(self.multi_variance[narrow]),
         }
+    }
+
+    /// A draw of the 3+ part's error in a slot of pixel `k`, channel 0, with what pixels and bins have in
+    /// common; 0 with fewer than two passes.
+    pub fn noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
+        let pairs = f64::from(self.passes / 2 * 2);
+        let x = f64::from(self.alternating[k * film.slots + slot]);
+        // Σ±x over n passes has n times a pass' variance; the mean has 1/n of it.
+        x / (pairs * f64::from(self.passes)).sqrt().max(1.0)
     }
 
     /// Brings the variances up to the passes done.
@@ -199,6 +218,7 @@ impl Bench {
             blocks: Blocks::new(frame.film),
             strata: Strata::default(),
             pass: vec![],
+            held: vec![],
             done: Done::default(),
         }
     }
@@ -212,7 +232,8 @@ impl Bench {
         go_on: &dyn Fn() -> bool,
     ) -> Option<()> {
         let rays = self.scratch.stack.rays;
-        self.done.reset(frame.film, region.pixels());
+        self.done.reset(frame.film, region.pixels(), frame.split);
+        self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
         let mut end = order.count;
         while self.done.passes < end {
@@ -312,7 +333,7 @@ impl Bench {
         };
         let (down, right) = (shift(region.rows), shift(region.cols));
         let cuts = |shift: u32, length: u32| {
-            let starts = (0..length).filter(move |i| *i == 0 || (i + shift) % side == 0);
+            let starts = (0..length).filter(move |i| *i == 0 || (i + shift).is_multiple_of(side));
             starts.map(move |i| (i, (side - (i + shift) % side).min(length - i)))
         };
         let mut all = 0.0f64;
@@ -324,7 +345,6 @@ impl Bench {
                 let tile = Tile {
                     row: region.row + row,
                     col: region.col + col,
-                    rows,
                     cols,
                     width: frame.width,
                     seed: frame.seed,
@@ -357,6 +377,20 @@ impl Bench {
             *sum += v;
         }
         let pass = &pass[..film.slots];
+        if !self.done.alternating.is_empty() {
+            // Held back until its partner comes, so that the sum always has as many of either sign.
+            let odd = self.done.passes % 2 == 1;
+            let range = to * film.slots..(to + 1) * film.slots;
+            let held = &mut self.held[range.clone()];
+            let sum = &mut self.done.alternating[range];
+            for ((sum, held), v) in sum.iter_mut().zip(held).zip(&pass[..film.slots]) {
+                if odd {
+                    *sum += *held - v;
+                } else {
+                    *held = *v;
+                }
+            }
+        }
         let square = &mut self.done.square[to * film.slots..(to + 1) * film.slots];
         // Eight sums side by side: exact enough, and the compiler can keep them in one register.
         let mut totals = [0.0f32; 8];
