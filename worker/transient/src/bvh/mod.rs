@@ -9,6 +9,7 @@ mod build;
 mod bundle;
 mod bundle_leaf;
 mod lanes;
+mod plan;
 mod pyramid;
 mod simd;
 mod traverse;
