@@ -27,6 +27,7 @@ pub(super) fn available(kernel: Kernel) -> bool {
         Kernel::Avx512 => {
             std::arch::is_x86_feature_detected!("avx2")
                 && std::arch::is_x86_feature_detected!("avx512f")
+                && std::arch::is_x86_feature_detected!("avx512vl")
         }
         #[cfg(not(target_arch = "x86_64"))]
         Kernel::Avx2 | Kernel::Avx512 => false,
@@ -108,7 +109,7 @@ mod native {
 
     kernel!("avx2", Eight, closest_avx2, any_avx2, bundle_avx2);
     kernel!(
-        "avx2,avx512f",
+        "avx2,avx512f,avx512vl",
         Sixteen,
         closest_avx512,
         any_avx512,
