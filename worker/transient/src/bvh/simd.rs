@@ -1,10 +1,12 @@
 //! The kernels by instruction set: the only unsafe code of this crate.
 //!
-//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch no
-//! memory except unaligned loads and stores of one whole register, from and to slices that are checked
-//! to be that long; a prefetch may name any address. The functions `*_avx2` and `*_avx512` are reached only through a
-//! [`Bvh`](super::Bvh) of that kernel, which `build` and `with_kernel` set only where [`available`] says
-//! so. Features are enabled for these functions alone; everything below is inlined into them.
+//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch
+//! no memory except unaligned loads and stores of one whole register, from and to slices that are checked
+//! to be that long; a prefetch may name any address. The functions `*_avx2` are reached only through a
+//! [`Bvh`](super::Bvh) whose kernel is AVX2 or AVX-512, those `*_avx512` only through one whose kernel is
+//! AVX-512; `build` and `with_kernel` set these only where [`available`] says so. Features are enabled
+//! for these functions alone; everything below is inlined into them. Nothing below may be a closure that
+//! is not inlined: closures do not inherit features, which costs much speed (not correctness).
 #![cfg_attr(
     target_arch = "x86_64",
     expect(
