@@ -133,7 +133,7 @@ fn pass(bvh: &Bvh, rays: &Rays, split: bool) -> usize {
             }
         }
         Rays::Bundles { from, points } => {
-            let mut blocked = vec![false; TILE];
+            let mut blocked = [false; TILE];
             for (a, range) in from {
                 let to = &points[range.clone()];
                 if split {

@@ -150,35 +150,36 @@ impl Mirrors {
         self.list.len() * self.spots
     }
 
-    /// Chooses a spot and mirror by unshadowed contribution at `x` and a point to aim at. Returns the
-    /// sum of weights (0 = no image in reach) and the draw.
-    pub fn aim(&self, x: Vec3, n: Vec3, rng: &mut Rng, weights: &mut [f32]) -> (f32, Option<Aim>) {
+    /// Writes the unshadowed contribution at `x` of every spot by every mirror; returns their sum.
+    pub fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> f32 {
         let mut total = 0.0;
-        for (m, out) in self.list.iter().zip(weights.chunks_mut(self.spots)) {
+        for (m, out) in self.list.iter().zip(out.chunks_mut(self.spots)) {
             m.weights(x, n, out);
             for w in out.iter() {
                 total += w;
             }
         }
+        total
+    }
+
+    /// Chooses a spot and mirror by unshadowed contribution at `x` and a point to aim at; `None` with no
+    /// image in reach. `weights` has room for all choices.
+    pub fn aim(&self, x: Vec3, n: Vec3, rng: &mut Rng, weights: &mut [f32]) -> Option<Aim> {
+        let total = self.weights(x, n, weights);
         if total <= 0.0 {
-            return (0.0, None);
+            return None;
         }
-        let Some((k, w)) = pick(weights, total * rng.uniform()) else {
-            return (total, None);
-        };
+        let (k, w) = pick(weights, total * rng.uniform())?;
         let (mirror, spot) = (k / self.spots, k % self.spots);
-        let Some(shape) = self.list[mirror].shape(x, spot) else {
-            return (total, None);
-        };
+        let shape = self.list[mirror].shape(x, spot)?;
         let (a, b) = rng.circle();
         let r = shape.sigma * (-libm::logf(1.0 - rng.uniform())).sqrt();
-        let aim = Aim {
+        Some(Aim {
             target: shape.m0 + shape.t * (a * r / shape.jt) + shape.s * (b * r / shape.js),
             mirror,
             spot,
             chance: w / total,
-        };
-        (total, Some(aim))
+        })
     }
 
     /// Weight of one spot and mirror at `x`, as in [`Mirrors::aim`].
@@ -269,10 +270,33 @@ impl Mirror {
     fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
         self.images.irradiance(x, n, out);
         let hx = self.normal.dot(x) - self.offset;
-        for (i, w) in out.iter_mut().enumerate() {
-            if *w > 0.0 && !self.reflects(i, x, hx) {
-                *w = 0.0;
-            }
+        // `reflects` without branches, for all spots side by side.
+        let (im, count) = (&self.images, out.len());
+        let (px, py, pz) = (&im.px[..count], &im.py[..count], &im.pz[..count]);
+        let height = &self.height[..count];
+        let (ux, uv) = (self.u.dot(x), self.v.dot(x));
+        let side = if hx > 1e-4 {
+            1.0
+        } else if self.two_sided && hx < -1e-4 {
+            -1.0
+        } else {
+            out.fill(0.0);
+            return;
+        };
+        for i in 0..count {
+            let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
+            let d2 = dx * dx + dy * dy + dz * dz;
+            let sum = hx + height[i];
+            let t = hx / sum;
+            let margin = MARGIN * 2.0 * self.alpha * t * (1.0 - t) * d2 / sum.abs();
+            let a = ux + t * (self.u.x * dx + self.u.y * dy + self.u.z * dz);
+            let b = uv + t * (self.v.x * dx + self.v.y * dy + self.v.z * dz);
+            let inside = (side * height[i] > 1e-4)
+                & (a > self.low[0] - margin)
+                & (a < self.high[0] + margin)
+                & (b > self.low[1] - margin)
+                & (b < self.high[1] + margin);
+            out[i] = if inside { out[i] } else { 0.0 };
         }
     }
 
@@ -300,9 +324,9 @@ impl Mirror {
         let t = hx / (hx + hs);
         let im = &self.images;
         let d = Vec3::new(im.px[spot], im.py[spot], im.pz[spot]) - x;
-        let m0 = x + d * t;
         let margin = MARGIN * 2.0 * self.alpha * t * (1.0 - t) * d.dot(d) / (hx + hs).abs();
-        let (a, b) = (self.u.dot(m0), self.v.dot(m0));
+        let a = self.u.dot(x) + t * self.u.dot(d);
+        let b = self.v.dot(x) + t * self.v.dot(d);
         a > self.low[0] - margin
             && a < self.high[0] + margin
             && b > self.low[1] - margin

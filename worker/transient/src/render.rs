@@ -7,7 +7,7 @@ mod tile;
 use picofarm_scene::Scene;
 
 use self::{
-    error::{estimate, passes_for},
+    error::{Stat, estimate, passes_for},
     image::{Image, Watch},
     tile::Frame,
 };
@@ -27,8 +27,10 @@ use crate::{
 
 /// Most passes that [`Budget::Error`] spends.
 const MAX_PASSES: u32 = 1 << 16;
-/// Fewest that it spends, so that the error estimate means something.
-const MIN_PASSES: u32 = 8;
+/// Passes of its first round, enough for an error estimate that means something.
+const FIRST_PASSES: u32 = 8;
+/// Share of the progress that the first round counts for.
+const FIRST_SHARE: f32 = 0.3;
 
 /// Side in pixels of the tiles that share vertices.
 const SHARE: u32 = 8;
@@ -89,30 +91,30 @@ pub fn render(
     let mut image = Image::new(&frame);
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
     let mut rays = 0;
-    let (passes, target) = match settings.budget {
-        _ if !walks => (0, None),
-        Budget::Samples(n) => (n, None),
-        Budget::Error(target) => {
-            let (pilot, traced) = image::pilot(&frame);
-            rays += traced;
-            let two = |n| sampling.variance(n);
-            let range = (MIN_PASSES, MAX_PASSES);
-            let n = passes_for(&pilot, image::PILOT_PASSES, target, range, two);
-            (n, Some(target))
-        }
+    let passes = match settings.budget {
+        _ if !walks => 0,
+        Budget::Samples(n) => n,
+        Budget::Error(_) => FIRST_PASSES,
     };
     let plan = plan(settings, &mirrors, &sampling, passes);
-    let mut wave = passes;
+    let mut waves = vec![passes; image.tiles()];
+    let mut done = 0.0;
     let error = loop {
-        let watch = Watch::new(progress, image.passes, image.passes + wave);
-        rays += image.round(&frame, wave, target, &watch)?;
+        let until = match settings.budget {
+            Budget::Error(_) if walks && done == 0.0 => FIRST_SHARE,
+            _ => 1.0,
+        };
+        let watch = Watch::new(progress, done, until);
+        rays += image.round(&frame, &waves, &watch)?;
+        done = until;
         let error = estimate(&image.stats, image.total_variance, image.mean_passes());
-        let done = target.is_none_or(|t| error.median_relative <= t) || image.passes >= MAX_PASSES;
-        if done {
+        let Budget::Error(target) = settings.budget else {
+            break error;
+        };
+        if !walks || error.median_relative <= target || error.samples >= MAX_PASSES {
             break error;
         }
-        let spent = image.passes;
-        wave = (spent / 2).clamp(4, MAX_PASSES - spent.min(MAX_PASSES - 4));
+        waves = further(&image, &sampling, target, error.samples);
     };
 
     let mut overflow = Overflow {
@@ -159,6 +161,26 @@ pub fn render(
         plan,
         rays: rays + centres.rays + photo_rays,
     })
+}
+
+/// How many more passes each tile needs for the median error of the image to reach `target`. What the
+/// image needs on average is shared out by what the tiles need themselves, within a factor of two: tiles
+/// that are easy stop early, and no tile holds up all others.
+fn further(image: &Image, sampling: &Sampling, target: f32, spent: u32) -> Vec<u32> {
+    let two = |n| sampling.variance(n);
+    // Two per cent more than the estimate asks for, which is itself an estimate.
+    let target = 0.98 * target;
+    let all = passes_for(&image.stats, spent, target, (spent + 1, MAX_PASSES), two);
+    let own = |(spent, stats): (u32, Vec<Stat>)| {
+        let range = (all / 2, (2 * all).min(MAX_PASSES));
+        let need = passes_for(&stats, spent, target, range, two);
+        need.saturating_sub(spent)
+    };
+    let waves: Vec<u32> = image.by_tile().map(own).collect();
+    if waves.iter().all(|&n| n == 0) {
+        return vec![(spent / 8).max(1); waves.len()];
+    }
+    waves
 }
 
 /// The channels beyond 0 that each emitter's light goes to.

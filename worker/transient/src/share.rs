@@ -217,12 +217,12 @@ impl Sharing {
                 pixel: &mut pixels[k * size..(k + 1) * size],
                 factor: points as f32 / count as f32,
             };
-            let aimed = walk.aim(rng, &vertex, scratch, &mut sink);
+            let aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
             let h = &vertex.hit;
             let Some(drawn) = turns.direction(j, &h.surface, h.n, vertex.wo, rng) else {
                 continue;
             };
-            let Some((step, mut next)) = walk.follow(&vertex, drawn, aimed, &mut scratch.stack)
+            let Some((step, mut next)) = walk.follow(&vertex, drawn, aims, &mut scratch.stack)
             else {
                 continue;
             };

@@ -52,8 +52,8 @@ pub(crate) struct Step {
     n: Vec3,
     /// Density per steradian of the direction taken.
     pdf: f32,
-    /// Sum of the image weights at `p` (0 = none aimed).
-    aimed: f32,
+    /// Expected number of aims at `p`.
+    aims: f32,
 }
 
 /// Takes what a walk finds: optical path in metres, value, spot, bounces of the whole path.
@@ -96,6 +96,8 @@ const SPOTS: u32 = 4;
 pub(crate) const ALL: u32 = u32::MAX;
 /// Light vertices that a camera vertex is connected to at most.
 const LIGHTS: u32 = 2;
+/// How often a vertex of a walk aims at images: it matters less than a gather point, and costs as much.
+const AIMS: f32 = 0.25;
 /// Russian roulette keeps a path with this multiple of its throughput as probability.
 const SURVIVAL: f32 = 1.5;
 
@@ -121,13 +123,12 @@ impl Walk<'_> {
         let mut vertex = from;
         while self.goes_on(&vertex) {
             let helped = !vertex.hit.surface.specular;
-            let mut aimed = 0.0;
+            let mut aims = 0.0;
             if helped {
-                aimed = self.aim(rng, &vertex, scratch, sink);
+                aims = self.aim(rng, &vertex, AIMS, scratch, sink);
                 self.light(rng, &vertex, scratch, sink);
             }
-            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack)
-            else {
+            let Some((step, next)) = self.step(rng, &vertex, aims, true, &mut scratch.stack) else {
                 return;
             };
             vertex = next;
@@ -140,7 +141,7 @@ impl Walk<'_> {
         &self,
         rng: &mut Rng,
         v: &Vertex,
-        aimed: f32,
+        aims: f32,
         roulette: bool,
         stack: &mut Stack,
     ) -> Option<(Step, Vertex)> {
@@ -153,7 +154,7 @@ impl Walk<'_> {
             }
             weight /= survive;
         }
-        self.follow(v, (w, weight, pdf), aimed, stack)
+        self.follow(v, (w, weight, pdf), aims, stack)
     }
 
     /// One step in a given direction: (direction, f·cos/pdf, pdf per steradian).
@@ -161,7 +162,7 @@ impl Walk<'_> {
         &self,
         v: &Vertex,
         (w, weight, pdf): (Vec3, f32, f32),
-        aimed: f32,
+        aims: f32,
         stack: &mut Stack,
     ) -> Option<(Step, Vertex)> {
         let h = v.hit;
@@ -170,7 +171,7 @@ impl Walk<'_> {
             p: h.p,
             n: h.n,
             pdf,
-            aimed,
+            aims,
         };
         let next = Vertex {
             hit,
@@ -196,10 +197,15 @@ impl Walk<'_> {
         if h.surface.strength == 0.0 {
             return;
         }
-        let Scratch { stack, weights, .. } = scratch;
+        let Scratch {
+            stack,
+            weights,
+            images,
+            ..
+        } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
         if let Some(step) = step {
-            self.plain_shares(step, h, weights);
+            self.plain_shares(step, h, weights, images);
         }
         let mut each = |spot: usize, value: f32| {
             let e = &self.emitters.list[spot];
@@ -218,17 +224,18 @@ impl Walk<'_> {
 
     /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
     /// sampling, against aiming (mirrors) or light vertices (other surfaces).
-    fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32]) {
+    fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32], images: &mut [f32]) {
         if h.surface.specular {
             let Some(mirror) = self.mirrors.of(h.triangle) else {
                 return;
             };
-            if step.aimed > 0.0 {
+            if step.aims > 0.0 {
+                let total = self.mirrors.weights(step.p, step.n, images);
                 for (spot, w) in weights.iter_mut().enumerate().filter(|(_, w)| **w > 0.0) {
                     let image = self.mirrors.weight(mirror, spot, step.p, step.n);
                     if image > 0.0 {
                         let aimed = self.mirrors.pdf(mirror, spot, step.p, h.p);
-                        *w *= step.pdf / (step.pdf + image / step.aimed * aimed);
+                        *w *= step.pdf / (step.pdf + step.aims * image / total * aimed);
                     }
                 }
             }
@@ -263,30 +270,47 @@ impl Walk<'_> {
         }
     }
 
-    /// Looks for a spot's image in a planar mirror. Returns the sum of weights for later MIS.
+    /// Looks for a spot's image in a planar mirror, `often` times on average (at most once). Returns that
+    /// number, 0 without mirrors, for MIS.
     pub fn aim(
         &self,
         rng: &mut Rng,
         v: &Vertex,
+        often: f32,
         scratch: &mut Scratch,
         sink: &mut impl Sink,
     ) -> f32 {
         if self.mirrors.list.is_empty() {
             return 0.0;
         }
+        if often == 1.0 || rng.uniform() < often {
+            self.aim_once(rng, v, often, scratch, sink);
+        }
+        often
+    }
+
+    fn aim_once(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        often: f32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
         let h = &v.hit;
-        let (total, aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images);
-        let Some(aim) = aim else { return total };
+        let Some(aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images) else {
+            return;
+        };
         let to = aim.target - h.p;
         if h.n.dot(to) <= 0.0 {
-            return total;
+            return;
         }
         let from = lift(h.p, h.n);
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
-            return total;
+            return;
         };
         if self.mirrors.of(m.triangle) != Some(aim.mirror) || m.surface.strength == 0.0 {
-            return total;
+            return;
         }
         let leg = m.p - h.p;
         let w = leg.normalized();
@@ -294,15 +318,14 @@ impl Walk<'_> {
         let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &m.surface);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         if value == 0.0 || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
-            return total;
+            return;
         }
-        let aimed = aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
+        let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
         let path = v.length_m + lengths + e.path_m;
         let value = v.beta * value / (aimed + plain);
         sink.add(path, value, aim.spot, v.bounce + 2);
-        total
     }
 
     /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.

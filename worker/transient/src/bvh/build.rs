@@ -1,16 +1,9 @@
-//! Building: a binary tree from `obvhs`, collapsed to eight children a node.
+//! Building: a binary tree from `obvhs`, collapsed to eight children a node as [`Plan`] says.
 
-use obvhs::{
-    BvhBuildParams,
-    bvh2::{Bvh2, builder::build_bvh2},
-    triangle::Triangle,
-};
+use obvhs::{BvhBuildParams, bvh2::builder::build_bvh2, triangle::Triangle};
 use picofarm_scene::Vec3;
 
-use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, simd};
-
-/// Triangles in a leaf: one pack.
-const LEAF_SIZE: u32 = 8;
+use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, plan::Plan, simd};
 
 const NO_NODE: Node = Node {
     bounds: [
@@ -52,13 +45,38 @@ pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
         .collect();
     let mut params = BvhBuildParams::medium_build();
     params.pre_split = false;
-    params.max_prims_per_leaf = LEAF_SIZE;
+    params.max_prims_per_leaf = 1;
+    params.reinsertion_batch_ratio = 0.1;
+    params.post_collapse_reinsertion_batch_ratio_multiplier = 0.0;
     let tree = build_bvh2(&input, params, &mut std::time::Duration::default());
+    let plan = Plan::new(&tree);
     bvh.nodes.push(NO_NODE);
     let mut open = vec![(0usize, 0usize, 1usize)];
+    let (mut children, mut held) = (vec![], vec![]);
     while let Some((node, slot, depth)) = open.pop() {
         bvh.depth = bvh.depth.max(depth);
-        bvh.collapse(&tree, node, slot, depth, triangles, &used, &mut open);
+        plan.children(&tree, node, &mut children);
+        let mut wide = NO_NODE;
+        for (i, &c) in children.iter().enumerate() {
+            let aabb = tree.nodes[c].aabb();
+            for d in 0..3 {
+                wide.bounds[d][i] = aabb.min[d];
+                wide.bounds[3 + d][i] = aabb.max[d];
+            }
+            wide.child[i] = if plan.is_leaf(c) {
+                plan.triangles(&tree, c, &mut held);
+                for k in &mut held {
+                    *k = used[*k as usize];
+                }
+                bvh.pack(triangles, &held)
+            } else {
+                let s = bvh.nodes.len();
+                bvh.nodes.push(NO_NODE);
+                open.push((c, s, depth + 1));
+                s as u32
+            };
+        }
+        bvh.nodes[slot] = wide;
     }
     bvh
 }
@@ -92,68 +110,15 @@ pub(crate) fn normal(t: &[Vec3; 3]) -> Option<Vec3> {
 }
 
 impl Bvh {
-    #[expect(clippy::too_many_arguments, reason = "one step of a conversion loop")]
-    fn collapse(
-        &mut self,
-        tree: &Bvh2,
-        node: usize,
-        slot: usize,
-        depth: usize,
-        triangles: &[[Vec3; 3]],
-        used: &[u32],
-        open: &mut Vec<(usize, usize, usize)>,
-    ) {
-        let leaf = |n: usize| tree.nodes[n].prim_count > 0;
-        let first = |n: usize| tree.nodes[n].first_index as usize;
-        let mut children = if leaf(node) {
-            vec![node]
-        } else {
-            vec![first(node), first(node) + 1]
-        };
-        // Open the child of largest surface until eight are there.
-        while children.len() < 8 {
-            let mut widest: Option<(usize, f32)> = None;
-            for (i, &c) in children.iter().enumerate() {
-                let area = tree.nodes[c].aabb().half_area();
-                if !leaf(c) && widest.is_none_or(|(_, a)| area > a) {
-                    widest = Some((i, area));
-                }
-            }
-            let Some((i, _)) = widest else { break };
-            let c = first(children[i]);
-            children[i] = c;
-            children.push(c + 1);
-        }
-        let mut wide = NO_NODE;
-        for (i, &c) in children.iter().enumerate() {
-            let aabb = tree.nodes[c].aabb();
-            for d in 0..3 {
-                wide.bounds[d][i] = aabb.min[d];
-                wide.bounds[3 + d][i] = aabb.max[d];
-            }
-            wide.child[i] = if leaf(c) {
-                self.pack(tree, c, triangles, used)
-            } else {
-                let s = self.nodes.len();
-                self.nodes.push(NO_NODE);
-                open.push((c, s, depth + 1));
-                s as u32
-            };
-        }
-        self.nodes[slot] = wide;
-    }
-
-    fn pack(&mut self, tree: &Bvh2, leaf: usize, triangles: &[[Vec3; 3]], used: &[u32]) -> u32 {
-        let node = &tree.nodes[leaf];
+    /// Stores a leaf; returns its code as a child.
+    fn pack(&mut self, triangles: &[[Vec3; 3]], held: &[u32]) -> u32 {
         let start = self.packs.len() as u32;
-        let range = node.first_index as usize..(node.first_index + node.prim_count) as usize;
-        for chunk in tree.primitive_indices[range].chunks(8) {
+        for chunk in held.chunks(8) {
             let mut pack = Pack {
                 vertex: [[f32::NAN; 8]; 9],
                 id: [EMPTY; 8],
             };
-            for (lane, &k) in chunk.iter().enumerate() {
-                let id = used[k as usize];
+            for (lane, &id) in chunk.iter().enumerate() {
                 for (v, p) in triangles[id as usize].iter().enumerate() {
                     for d in 0..3 {
                         pack.vertex[3 * v + d][lane] = p[d];
@@ -164,10 +129,10 @@ impl Bvh {
             self.packs.push(pack);
         }
         let count = self.packs.len() as u32 - start;
-        let last = (node.prim_count - 1) % 8;
+        let last = (held.len() as u32 - 1) % 8;
         assert!(
             start < (1 << 24) && count < 16,
-            "leaves hold at most {LEAF_SIZE} triangles and scenes fewer than 2^24 packs"
+            "leaves hold few triangles and scenes fewer than 2^24 packs"
         );
         LEAF | (count << 27) | (last << 24) | start
     }

@@ -18,7 +18,7 @@ use super::{
 /// Rays in a bundle: bits of a mask.
 pub(super) const MOST: usize = 64;
 /// Fewer rays go singly.
-const FEWEST: u32 = 3;
+pub(super) const FEWEST: usize = 6;
 
 /// One number for each ray.
 type Column = [f32; MOST];
@@ -91,7 +91,7 @@ pub(super) fn bundle<E: Lanes, W: Lanes>(
             if mask == 0 {
                 continue;
             }
-            if mask.count_ones() >= FEWEST {
+            if mask.count_ones() as usize >= FEWEST {
                 bundle.rays.take(o, &bundle.all, mask, class);
                 if let Some(pyramid) = bundle.rays.prepare::<W>() {
                     let left = trace::<E, W>(&bundle.rays, &pyramid, bvh, entries);

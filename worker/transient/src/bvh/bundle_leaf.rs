@@ -77,9 +77,9 @@ impl Rays {
             E::splat(self.o[kz]),
         ];
         let mut vertices = [[E::splat(0.0); 3]; 3];
-        for v in 0..3 {
+        for (v, vertex) in vertices.iter_mut().enumerate() {
             for (a, k) in [kx, ky, kz].into_iter().enumerate() {
-                vertices[v][a] = E::load(&pack.vertex[3 * v + k]).sub(o[a]);
+                vertex[a] = E::load(&pack.vertex[3 * v + k]).sub(o[a]);
             }
         }
         let mut hit = 0;
@@ -101,9 +101,9 @@ impl Rays {
         let mut hit = 0;
         for lane in 0..fill {
             let mut vertices = [[W::splat(0.0); 3]; 3];
-            for v in 0..3 {
+            for (v, vertex) in vertices.iter_mut().enumerate() {
                 for (a, k) in self.axes.into_iter().enumerate() {
-                    vertices[v][a] = W::splat(pack.vertex[3 * v + k][lane] - self.o[k]);
+                    vertex[a] = W::splat(pack.vertex[3 * v + k][lane] - self.o[k]);
                 }
             }
             for k in (0..self.count).step_by(W::N) {

@@ -1,10 +1,12 @@
 //! The kernels by instruction set: the only unsafe code of this crate.
 //!
-//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch no
-//! memory except unaligned loads and stores of one whole register, from and to slices that are checked
-//! to be that long; a prefetch may name any address. The functions `*_avx2` and `*_avx512` are reached only through a
-//! [`Bvh`](super::Bvh) of that kernel, which `build` and `with_kernel` set only where [`available`] says
-//! so. Features are enabled for these functions alone; everything below is inlined into them.
+//! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch
+//! no memory except unaligned loads and stores of one whole register, from and to slices that are checked
+//! to be that long; a prefetch may name any address. The functions `*_avx2` are reached only through a
+//! [`Bvh`](super::Bvh) whose kernel is AVX2 or AVX-512, those `*_avx512` only through one whose kernel is
+//! AVX-512; `build` and `with_kernel` set these only where [`available`] says so. Features are enabled
+//! for these functions alone; everything below is inlined into them. Nothing below may be a closure that
+//! is not inlined: closures do not inherit features, which costs much speed (not correctness).
 #![cfg_attr(
     target_arch = "x86_64",
     expect(
@@ -27,6 +29,7 @@ pub(super) fn available(kernel: Kernel) -> bool {
         Kernel::Avx512 => {
             std::arch::is_x86_feature_detected!("avx2")
                 && std::arch::is_x86_feature_detected!("avx512f")
+                && std::arch::is_x86_feature_detected!("avx512vl")
         }
         #[cfg(not(target_arch = "x86_64"))]
         Kernel::Avx2 | Kernel::Avx512 => false,
@@ -108,7 +111,7 @@ mod native {
 
     kernel!("avx2", Eight, closest_avx2, any_avx2, bundle_avx2);
     kernel!(
-        "avx2,avx512f",
+        "avx2,avx512f,avx512vl",
         Sixteen,
         closest_avx512,
         any_avx512,

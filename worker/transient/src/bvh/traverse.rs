@@ -101,6 +101,8 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
                 } else {
                     (second, first)
                 };
+                bvh.prefetch::<L>(go.0);
+                bvh.prefetch::<L>(keep.0);
                 stack[depth] = keep;
                 depth += 1;
                 current = go.0;
@@ -110,9 +112,12 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
             stack[depth] = first;
             stack[depth + 1] = second;
             depth += 2;
+            bvh.prefetch::<L>(first.0);
+            bvh.prefetch::<L>(second.0);
             while rest != 0 {
                 let k;
                 (k, rest) = next();
+                bvh.prefetch::<L>(node.child[k]);
                 stack[depth] = (node.child[k], t[k]);
                 depth += 1;
             }

@@ -1,4 +1,4 @@
-//! From variances to error estimates, and from a pilot to a number of passes.
+//! From variances to error estimates, and from those to a number of passes.
 
 use super::tile::Region;
 use crate::api::ErrorEstimate;
@@ -87,7 +87,7 @@ fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
 }
 
 /// Median of the pixels' relative errors.
-pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
+fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
 
@@ -107,10 +107,10 @@ pub(super) fn estimate(stats: &[Stat], variance: f64, samples: u32) -> ErrorEsti
     }
 }
 
-/// The fewest passes, on a ladder of steps of about √2 from `least`, with which the pilot's median error
-/// comes down to `target`. `two` says how the two-bounce variance falls with the passes.
+/// The fewest passes, from `least` to `most`, with which pixels that stand as `stats` says after
+/// `passes` come down to a median error of `target`. `two` says how the two-bounce variance falls.
 pub(super) fn passes_for(
-    pilot: &[Stat],
+    stats: &[Stat],
     passes: u32,
     target: f32,
     (least, most): (u32, u32),
@@ -118,8 +118,8 @@ pub(super) fn passes_for(
 ) -> u32 {
     let median = |n: u32| {
         let scale = f64::from(passes) / f64::from(n);
-        let then = pilot.iter().map(|s| {
-            // As `sorted` would find it after n passes: the measured norm loses the variance of then.
+        let then = stats.iter().map(|s| {
+            // As `sorted` would find it after n passes: the measured norm loses the variance of now.
             let now = s.two_variance + s.multi_variance;
             let clean = (s.norm2 - now).max(0.1 * s.norm2);
             let two_variance = s.two_variance * two(n) / two(passes);
@@ -135,7 +135,7 @@ pub(super) fn passes_for(
     };
     let mut n = least;
     while n < most && median(n) > f64::from(target) {
-        n = (n + (n / 2).max(1)).min(most);
+        n = (n + (n / 8).max(1)).min(most);
     }
     n
 }

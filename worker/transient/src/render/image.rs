@@ -15,15 +15,6 @@ use crate::api::{Progress, RenderError};
 
 /// Side of a tile in pixels.
 const TILE: u32 = 16;
-/// Side and number of the pilot's tiles, and its passes.
-const PILOT_SIDE: u32 = 4;
-const PILOT_TILES: u32 = 5;
-pub(super) const PILOT_PASSES: u32 = 8;
-/// A tile goes on by itself while its error is above this multiple of the target, up to this multiple of
-/// the image's passes.
-const SLACK: f32 = 1.25;
-const FURTHER: u32 = 4;
-
 /// The parts with their standard errors.
 #[derive(Debug)]
 pub(super) struct Parts {
@@ -45,8 +36,6 @@ pub(super) struct Image {
     pub total_variance: f64,
     /// Energy outside the gate.
     pub overflow: f64,
-    /// Passes of every tile at least.
-    pub passes: u32,
     tiles: Vec<Region>,
     /// Passes of each tile.
     spent: Vec<u32>,
@@ -61,27 +50,26 @@ pub(super) struct Watch<'a> {
     progress: &'a dyn Progress,
     stopped: AtomicBool,
     tiles: AtomicUsize,
-    before: f32,
-    total: f32,
+    from: f32,
+    to: f32,
 }
 
 impl<'a> Watch<'a> {
-    /// A watch over the round that takes the render from `spent` to `total` passes.
-    pub fn new(progress: &'a dyn Progress, spent: u32, total: u32) -> Self {
+    /// A watch over the round that takes the render from share `from` to `to`.
+    pub fn new(progress: &'a dyn Progress, from: f32, to: f32) -> Self {
         Self {
             progress,
             stopped: AtomicBool::new(false),
             tiles: AtomicUsize::new(0),
-            before: spent as f32,
-            total: total.max(1) as f32,
+            from,
+            to,
         }
     }
 
     /// False to stop. Asked often, since a tile of many passes takes long.
     fn ask(&self, count: usize) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);
-        let before = self.before / self.total;
-        let at = before + (1.0 - before) * done as f32 / count as f32;
+        let at = self.from + (self.to - self.from) * done as f32 / count as f32;
         if !self.progress.at(at.min(1.0)) {
             self.stopped.store(true, Ordering::Relaxed);
         }
@@ -119,7 +107,6 @@ impl Image {
             stats: vec![Stat::default(); pixels],
             total_variance: 0.0,
             overflow: 0.0,
-            passes: 0,
             spent: vec![0; tiles.len()],
             tile_variance: vec![0.0; tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
@@ -127,6 +114,22 @@ impl Image {
             width: width as usize,
             bins,
         }
+    }
+
+    /// How many tiles there are.
+    pub fn tiles(&self) -> usize {
+        self.tiles.len()
+    }
+
+    /// Passes of each tile so far, and the sums of its pixels.
+    pub fn by_tile(&self) -> impl Iterator<Item = (u32, Vec<Stat>)> {
+        self.tiles.iter().zip(&self.spent).map(|(region, &spent)| {
+            let pixel = |k: u32| {
+                let (row, col) = (region.row + k / region.cols, region.col + k % region.cols);
+                self.stats[row as usize * self.width + col as usize]
+            };
+            (spent, (0..region.rows * region.cols).map(pixel).collect())
+        })
     }
 
     /// Passes of a tile on average.
@@ -137,18 +140,15 @@ impl Image {
         all.div_ceil(pixels.max(1)) as u32
     }
 
-    /// `wave` more passes over every tile; with a target, tiles that are far from it go on. Returns the
-    /// rays traced.
+    /// More passes over the tiles, as many as `waves` says for each. Returns the rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
-        wave: u32,
-        target: Option<f32>,
+        waves: &[u32],
         watch: &Watch,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
         let spent = self.spent.clone();
-        let first = self.passes == 0;
         let count = tiles.len();
         let image = Mutex::new(&mut *self);
         let rays: Vec<Option<u64>> = (0..count)
@@ -159,12 +159,12 @@ impl Image {
                     if watch.stopped.load(Ordering::Relaxed) {
                         return None;
                     }
+                    if waves[t] == 0 && spent[t] > 0 {
+                        return Some(0);
+                    }
                     let order = Order {
                         first: spent[t],
-                        count: wave,
-                        further: target
-                            .filter(|_| first)
-                            .map(|e| (SLACK * e, FURTHER * wave)),
+                        count: waves[t],
                     };
                     bench.render(frame, &tiles[t], &order, &|| watch.ask(count))?;
                     let mut image = image.lock().unwrap_or_else(|e| e.into_inner());
@@ -179,7 +179,6 @@ impl Image {
         for r in rays {
             all += r.ok_or(RenderError::Stopped)?;
         }
-        self.passes += wave;
         self.total_variance = self.tile_variance.iter().sum();
         self.overflow = self.tile_overflow.iter().sum();
         Ok(all)
@@ -245,51 +244,4 @@ impl Image {
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
         self.spent[t] += done.passes;
     }
-}
-
-/// Renders small tiles all over the image with few passes, to see how many the image needs. Returns the
-/// pixels' sums and the rays traced.
-pub(super) fn pilot(frame: &Frame) -> (Vec<Stat>, u64) {
-    let starts = |length: u32| -> Vec<u32> {
-        let side = PILOT_SIDE.min(length);
-        let count = PILOT_TILES.min(length / side);
-        (0..count)
-            .map(|i| {
-                (length * (2 * i + 1) / (2 * count))
-                    .saturating_sub(side / 2)
-                    .min(length - side)
-            })
-            .collect()
-    };
-    let columns = starts(frame.width);
-    let regions: Vec<Region> = starts(frame.height)
-        .into_iter()
-        .flat_map(|row| {
-            columns.iter().map(move |&col| Region {
-                row,
-                col,
-                rows: PILOT_SIDE.min(frame.height),
-                cols: PILOT_SIDE.min(frame.width),
-            })
-        })
-        .collect();
-    // Passes from the far end of the range, so that no render repeats the pilot's random numbers.
-    let order = Order {
-        first: u32::MAX - PILOT_PASSES,
-        count: PILOT_PASSES,
-        further: None,
-    };
-    let found: Vec<(Vec<Stat>, u64)> = regions
-        .into_par_iter()
-        .map_init(
-            || Bench::new(frame),
-            |bench, region| {
-                bench.render(frame, &region, &order, &|| true);
-                let stats = (0..region.pixels()).map(|k| bench.done.stat(frame.film, k));
-                (stats.collect(), bench.done.rays)
-            },
-        )
-        .collect();
-    let rays = found.iter().map(|f| f.1).sum();
-    (found.into_iter().flat_map(|f| f.0).collect(), rays)
 }

@@ -1,7 +1,7 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{MULTI_REACH, Stat, TWO_REACH, pool, relative_median};
+use super::error::{MULTI_REACH, TWO_REACH, pool};
 use crate::{
     api::Overflow,
     film::{Blocks, Film},
@@ -40,13 +40,11 @@ impl Region {
     }
 }
 
-/// Passes to do: the first one's number, how many, and, where the tile may go on by itself, the error to
-/// reach and the most passes.
+/// Passes to do: the first one's number, and how many.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Order {
     pub first: u32,
     pub count: u32,
-    pub further: Option<(f32, u32)>,
 }
 
 /// Buffers of one thread.
@@ -172,20 +170,6 @@ impl Done {
         pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
     }
 
-    /// What pixel `k` adds to the error estimate.
-    pub fn stat(&self, film: &Film, k: usize) -> Stat {
-        let mut stat = Stat::default();
-        for slot in 1..film.slots - 1 {
-            let m = self.moments(film, k, slot);
-            let h = m.two + m.multi;
-            stat.norm2 += h * h;
-            stat.total += h;
-            stat.two_variance += m.two_variance;
-            stat.multi_variance += m.multi_variance;
-        }
-        stat
-    }
-
     /// Variance of the tile's whole energy. Pixels that share vertices err together, so this is not the
     /// sum of theirs.
     pub fn total_variance(&self) -> f64 {
@@ -235,27 +219,11 @@ impl Bench {
         self.done.reset(frame.film, region.pixels(), frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
-        let mut end = order.count;
-        while self.done.passes < end {
+        while self.done.passes < order.count {
             if !go_on() {
                 return None;
             }
             self.pass(frame, region, order.first + self.done.passes);
-            let passes = self.done.passes;
-            if let Some((target, most)) = order.further
-                && passes == end
-                && end < most
-            {
-                let film = frame.film;
-                self.done.estimate(film, region);
-                let stats = (0..region.pixels()).map(|k| self.done.stat(film, k));
-                let error = relative_median(stats);
-                if error > f64::from(target) {
-                    // Variance falls as 1/passes.
-                    let need = f64::from(passes) * (error / f64::from(target)).powi(2);
-                    end = (need.ceil().min(f64::from(most)) as u32).max(passes + 1);
-                }
-            }
         }
         self.done.estimate(frame.film, region);
         self.done.rays = self.scratch.stack.rays - rays;
