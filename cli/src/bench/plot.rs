@@ -33,7 +33,8 @@ struct Line {
     dash: usize,
 }
 
-/// Draws one line a scene and variant (solid, discs) and one a peer (dashed, squares).
+/// Draws one line a scene and variant (solid, discs, a colour each) and one a peer (dashed, squares, in the colour of
+/// the scene's first variant).
 ///
 /// # Errors
 /// The file cannot be written.
@@ -80,19 +81,21 @@ pub fn draw(found: &[Outcome], targets: &[f64], path: &Path) -> Result<()> {
 
 fn lines(found: &[Outcome]) -> Vec<Line> {
     let mut lines = Vec::new();
-    for (k, scene) in found.iter().enumerate() {
-        let colour = COLOURS[k % COLOURS.len()];
+    let mut first = 0;
+    for scene in found {
+        let colour = |k: usize| COLOURS[(first + k) % COLOURS.len()];
         let name = |of: &str| format!("{} {of}", scene.scene);
         let ours = scene
             .variants
             .iter()
-            .map(|v| (name(&v.name), v.points(), 0));
+            .enumerate()
+            .map(|(k, v)| (name(&v.name), v.points(), 0, colour(k)));
         let peers = scene
             .peers
             .iter()
             .enumerate()
-            .map(|(i, p)| (name(&p.name), p.points(), DASH * (i + 1)));
-        lines.extend(ours.chain(peers).map(|(name, mut points, dash)| {
+            .map(|(i, p)| (name(&p.name), p.points(), DASH * (i + 1), colour(0)));
+        lines.extend(ours.chain(peers).map(|(name, mut points, dash, colour)| {
             points.retain(|p| p.0 > 0.0 && p.1 > 0.0);
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
             Line {
@@ -102,6 +105,7 @@ fn lines(found: &[Outcome]) -> Vec<Line> {
                 dash,
             }
         }));
+        first += scene.variants.len();
     }
     lines
 }
