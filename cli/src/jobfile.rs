@@ -49,7 +49,7 @@ pub fn template(kind: SceneKindArg) -> String {
          max_bounces = 0           # 0 = until the gate ends\n\
          # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
          # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
-         # strategy = { share = 1, image_lobes = false }  # ways of finding light, chosen by hand\n\n\
+         # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach\n\
          dataset = \"rooms\"\n\

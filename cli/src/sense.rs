@@ -15,7 +15,7 @@ use crate::{
     args::SceneSense,
     error::{CliError, Code, Result},
     output::{Output, duration},
-    roles, scene,
+    render, roles,
 };
 
 pub async fn run(args: SceneSense, output: Output) -> Result<()> {

@@ -87,7 +87,7 @@ fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
 }
 
 /// Median of the pixels' relative errors.
-fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
+pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
 

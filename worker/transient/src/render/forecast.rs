@@ -6,9 +6,12 @@ use serde::{Deserialize, Serialize};
 use super::{
     FIRST_PASSES, MAX_PASSES,
     error::{Stat, median_after, passes_for},
-    tile::{Bench, Frame, Order, Region},
+    tile::{Bench, Done, Frame, Order, Region},
 };
-use crate::api::{Budget, Plan, Progress, RenderError};
+use crate::{
+    api::{Budget, Plan, Progress, RenderError},
+    film::Film,
+};
 
 /// Side and number of the tiles looked at along each side of the image, and their passes.
 const SIDE: u32 = 16;
@@ -135,7 +138,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
                 bench
                     .render(frame, &region, &order, &|| true)
                     .expect("nobody stops it");
-                let stats = (0..region.pixels()).map(|k| bench.done.stat(frame.film, k));
+                let stats = (0..region.pixels()).map(|k| stat(&bench.done, frame.film, k));
                 (stats.collect(), bench.done.rays)
             },
         )
@@ -144,4 +147,18 @@ fn look(frame: &Frame, passes: u32) -> Found {
         rays: found.iter().map(|f| f.1).sum::<u64>() as f64 / pixels as f64,
         stats: found.into_iter().flat_map(|f| f.0).collect(),
     }
+}
+
+/// A pixel's sums, in render units: only their ratios count.
+fn stat(done: &Done, film: &Film, k: usize) -> Stat {
+    let mut stat = Stat::default();
+    for slot in 1..film.slots - 1 {
+        let m = done.moments(film, k, slot);
+        let h = m.two + m.multi;
+        stat.norm2 += h * h;
+        stat.total += h;
+        stat.two_variance += m.two_variance;
+        stat.multi_variance += m.multi_variance;
+    }
+    stat
 }
