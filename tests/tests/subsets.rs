@@ -180,9 +180,9 @@ fn a_plan_says_what_a_render_would_do_and_writes_nothing() {
         ];
         cli.json(&[&args[..], &GATE].concat())
     };
-    let (coarse, fine) = (goal("40%"), goal("10%"));
+    let (coarse, fine) = (goal("40%"), goal("2%"));
     assert!(
-        error(&fine) <= 0.1 && error(&fine) < error(&coarse),
+        error(&fine) <= 0.02 && error(&fine) < error(&coarse),
         "{fine} {coarse}"
     );
     assert!(fine["rays"].as_u64() > coarse["rays"].as_u64());
@@ -262,36 +262,27 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     farm.run(&["dataset", "picture", "store/rooms", "--out", "pictures"])
         .ok();
 
-    // The same data set with other subsets is refused by name, and with another strategy by its key.
+    // The same data set with other settings is refused by name.
     for (name, render, part) in [
         (
             "fewer",
             "subsets = [4]\nper_spot = true\n",
-            "subsets = [4, 25], but [4]",
+            "render.subsets is [4,25] there and [4] here",
         ),
-        ("none", "", "subsets = [4, 25], but []"),
+        ("none", "", "render.per_spot is true there and unset here"),
         (
             "other",
             &render.replace("share = 4", "share = 2"),
-            "another output.dataset",
+            "render.strategy is {\"share\":4} there",
         ),
     ] {
-        let file = format!("{name}.toml");
         let text = job
             .toml()
             .replace("[render]", &format!("[render]\n{render}"));
-        let text = plain(text).replace("max_failures = 3", "max_failures = 1");
-        fs::write(farm.scratch.join(&file), text).unwrap();
-        let ended = farm.run(&["job", "submit", &file, "--json"]);
-        let message = match ended.code {
-            Some(0) => {
-                let id = ended.json()["job"].as_str().unwrap().to_owned();
-                farm.run(&["job", "wait", &id]).code(5);
-                farm.events_of(&id, "dead")[0]["message"].to_string()
-            }
-            _ => ended.stderr,
-        };
-        assert!(message.contains(part), "{name}: {message}");
+        fs::write(farm.scratch.join("other.toml"), plain(text)).unwrap();
+        let ended = farm.run(&["job", "submit", "other.toml"]);
+        println!("{name}");
+        ended.fails(3, &["output.dataset", part]);
     }
 }
 

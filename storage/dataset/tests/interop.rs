@@ -41,15 +41,24 @@ async fn zarr_python_and_xarray_read_the_same_values() {
         let expected = folder.path().join("expected");
         let render = folder.path().join("render");
         std::fs::create_dir(&expected).unwrap();
-        let spec = spec(profile);
+        let spec = DatasetSpec {
+            per_spot: true,
+            ..spec(profile)
+        };
         let (store, prefix) = open_store(data.to_str().unwrap()).unwrap();
         let dataset = Dataset::create_or_open(store, prefix, &spec).await.unwrap();
         let mut scene = Scene::new(&spec, 8);
         scene.transient[123] = 5e8 / scene.scale;
-        dataset
-            .publish(1, &scene.record(), &provenance())
-            .await
-            .unwrap();
+        let alone: Vec<Vec<f32>> = (9..18).map(|i| Scene::new(&spec, i).transient).collect();
+        let subsets = [SubsetRecord {
+            quantity: Quantity::TransientSpots,
+            planes: alone.iter().map(Vec::as_slice).collect(),
+        }];
+        let record = SceneRecord {
+            subsets: &subsets,
+            ..scene.record()
+        };
+        dataset.publish(1, &record, &provenance()).await.unwrap();
 
         let h = dataset.read_transient(1).await.unwrap();
         let code = SquareRoot::new(0.25, scene.scale);
@@ -58,9 +67,18 @@ async fn zarr_python_and_xarray_read_the_same_values() {
             folder: &expected,
             shapes: Map::new(),
         };
+        let alone = alone.concat();
+        let each: Vec<u16> = alone.iter().map(|h| code.encode(*h)).collect();
+        let (one, nine) = (&[36, 40, 24], &[9, 36, 40, 24]);
         match profile {
-            Profile::SqrtU16 { .. } => e.add("transient", "<u2", &[36, 40, 24], &q),
-            Profile::PlainF32 => e.add("transient", "<f4", &[36, 40, 24], &scene.transient),
+            Profile::SqrtU16 { .. } => {
+                e.add("transient", "<u2", one, &q);
+                e.add("transient_spots", "<u2", nine, &each);
+            }
+            Profile::PlainF32 => {
+                e.add("transient", "<f4", one, &scene.transient);
+                e.add("transient_spots", "<f4", nine, &alone);
+            }
         }
         let f32s = [
             (Quantity::Intensity, vec![36, 40]),

@@ -34,6 +34,8 @@ const MAX_PASSES: u32 = 1 << 16;
 const FIRST_PASSES: u32 = 8;
 /// Share of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
+/// Aimed at, as a share of the error asked for, since the estimate is itself an estimate.
+const GOAL: f32 = 0.98;
 
 /// Side in pixels of the tiles that share vertices.
 const SHARE: u32 = 8;
@@ -202,8 +204,7 @@ fn run(
 /// that are easy stop early, and no tile holds up all others.
 fn further(image: &Image, sampling: &Sampling, target: f32, spent: u32) -> Vec<u32> {
     let two = |n| sampling.variance(n);
-    // Two per cent more than the estimate asks for, which is itself an estimate.
-    let target = 0.98 * target;
+    let target = GOAL * target;
     let all = passes_for(&image.stats, spent, target, (spent + 1, MAX_PASSES), two);
     let own = |(spent, stats): (u32, Vec<Stat>)| {
         let range = (all / 2, (2 * all).min(MAX_PASSES));

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    FIRST_PASSES, MAX_PASSES,
-    error::{Stat, median_after, passes_for},
+    FIRST_PASSES, GOAL, MAX_PASSES,
+    error::{Stat, median_after, passes_for, relative_median},
     tile::{Bench, Done, Frame, Order, Region},
 };
 use crate::{
@@ -69,17 +69,24 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
         return Forecast {
             plan,
             passes: 0,
-            error: super::error::relative_median(found.stats.iter().copied()) as f32,
+            error: relative_median(found.tiles.concat().into_iter()) as f32,
             rays: rays + (found.rays * all) as u64,
         };
     }
     let (one, found) = (look(frame, 1), look(frame, PASSES));
     let two = |n: u32| frame.sampling.variance(n);
-    let passes = match *budget {
-        Budget::Samples(n) => n,
+    let stats = found.tiles.concat();
+    let (passes, error) = match *budget {
+        Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
         Budget::Error(target) => {
-            let range = (FIRST_PASSES, MAX_PASSES);
-            passes_for(&found.stats, PASSES, target, range, two)
+            // As `further` shares them out.
+            let most = (FIRST_PASSES, MAX_PASSES);
+            let n = passes_for(&stats, PASSES, GOAL * target, most, two);
+            let own = (FIRST_PASSES.max(n / 2), (2 * n).min(MAX_PASSES));
+            let tiles = found.tiles.iter();
+            let spent = tiles.map(|t| passes_for(t, PASSES, GOAL * target, own, two));
+            let mean = spent.sum::<u32>().div_ceil(found.tiles.len() as u32);
+            (mean, median_after(&stats, PASSES, n, &two))
         }
     };
     // Rays of a pixel: two bounces take side² times something, and each pass takes the same.
@@ -91,14 +98,15 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
     Forecast {
         plan,
         passes,
-        error: median_after(&found.stats, PASSES, passes, &two) as f32,
+        error: error as f32,
         rays: rays + (of_pixel * all) as u64,
     }
 }
 
 /// What was found in the tiles looked at.
 struct Found {
-    stats: Vec<Stat>,
+    /// The pixels of each.
+    tiles: Vec<Vec<Stat>>,
     /// Rays of one pixel.
     rays: f64,
 }
@@ -145,7 +153,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
         .collect();
     Found {
         rays: found.iter().map(|f| f.1).sum::<u64>() as f64 / pixels as f64,
-        stats: found.into_iter().flat_map(|f| f.0).collect(),
+        tiles: found.into_iter().map(|f| f.0).collect(),
     }
 }
 
