@@ -93,6 +93,9 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
     Ok(writer.notes)
 }
 
+/// (file, id of the material) of each part that a mesh is written as.
+type Parts = Vec<(String, String)>;
+
 struct Writer<'a> {
     folder: &'a Path,
     materials: Vec<Material>,
@@ -107,7 +110,7 @@ impl Writer<'_> {
     /// Writes every mesh; the text of all shapes.
     fn shapes(&mut self, scene: &Scene) -> Result<String, SceneError> {
         // Meshes that are written, with the (file, material) of their parts.
-        let mut written: Vec<(Arc<Mesh>, Vec<(String, String)>)> = Vec::new();
+        let mut written: Vec<(Arc<Mesh>, Parts)> = Vec::new();
         let mut out = String::new();
         for (k, object) in scene.objects.iter().enumerate() {
             let known = written.iter().position(|w| Arc::ptr_eq(&w.0, &object.mesh));
@@ -135,7 +138,7 @@ impl Writer<'_> {
     }
 
     /// Writes one mesh, a file for each material that it uses.
-    fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Vec<(String, String)>, SceneError> {
+    fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Parts, SceneError> {
         let mut out = Vec::new();
         for (m, material) in mesh.materials.iter().enumerate() {
             let Some(part) = part(mesh, m as u32) else {

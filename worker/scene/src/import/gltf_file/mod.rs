@@ -184,6 +184,8 @@ struct Walk<'a> {
     path: &'a Path,
     buffers: &'a Buffers,
     images: Images<(usize, Wrap)>,
+    /// Vertices and corners read so far.
+    corners: usize,
     meshes: BTreeMap<usize, Option<Arc<Mesh>>>,
     objects: Vec<(Option<u32>, Object)>,
     labels: Vec<String>,
@@ -206,6 +208,7 @@ impl<'a> Walk<'a> {
             path,
             buffers,
             images: Images::default(),
+            corners: 0,
             meshes: BTreeMap::new(),
             objects: Vec::new(),
             labels,
