@@ -5,7 +5,8 @@
 //! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
 //! a diffuse and a conductor; `bitmap` textures; references, `<default>` parameters, and every transform. A shape
 //! without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
-//! Integrators, samplers and media are skipped; any other plugin is an error that names it.
+//! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
+//! takes its axis as it is: one of another length than 1 shears.
 //!
 //! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
 //! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all

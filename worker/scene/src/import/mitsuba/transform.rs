@@ -36,9 +36,12 @@ impl Matrix {
         m
     }
 
-    /// Rotation by `degrees` about an axis (Rodrigues).
-    pub(super) fn rotation(axis: [f64; 3], degrees: f64) -> Result<Matrix, String> {
-        let [x, y, z] = unit(axis).ok_or("rotate: the axis has no direction; set x, y or z")?;
+    /// Rotation by `degrees` about an axis (Rodrigues). As in Mitsuba, an axis of another length than 1 is not
+    /// normalised: it shears.
+    pub(super) fn rotation([x, y, z]: [f64; 3], degrees: f64) -> Result<Matrix, String> {
+        if [x, y, z] == [0.0; 3] {
+            return Err("rotate: the axis has no direction; set x, y or z".into());
+        }
         let (s, c) = libm::sincos(degrees.to_radians());
         let t = 1.0 - c;
         Ok(Matrix([
