@@ -40,7 +40,7 @@ fn an_exported_scene_comes_back() {
     scene
         .provenance
         .notes
-        .insert("a--b".into(), "--> <x/>".into());
+        .insert("a---b".into(), "--> <x/> \u{ffff} \u{1f600} ü\n".into());
     let notes = export::write_mitsuba(&scene, &path).expect("writes");
     assert_eq!(notes, Vec::<String>::new());
     let back = read_scene(&path).expect("reads");

@@ -76,11 +76,7 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
         xml.push_str(text);
         xml.push('\n');
     };
-    // Two hyphens end a comment; in JSON they only occur within strings.
-    line(&format!(
-        "<!-- picofarm {} -->",
-        json.replace("--", "-\\u002d")
-    ));
+    line(&format!("<!-- picofarm {} -->", for_comment(&json)));
     line("<integrator type=\"path\"/>");
     line(&sensor_text(&scene.camera));
     line(writer.text.trim_end());
@@ -91,6 +87,22 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
     line("</scene>");
     write_whole(file, xml.as_bytes())?;
     Ok(writer.notes)
+}
+
+/// JSON that any XML comment can hold: plain ASCII without two hyphens in a row. Whatever else there is stands in
+/// strings, where it can be escaped.
+fn for_comment(json: &str) -> String {
+    let mut out = String::with_capacity(json.len());
+    for c in json.chars() {
+        if c.is_ascii() && !c.is_ascii_control() && !(c == '-' && out.ends_with('-')) {
+            out.push(c);
+        } else {
+            for unit in c.encode_utf16(&mut [0; 2]) {
+                write!(out, "\\u{unit:04x}").expect("strings take every text");
+            }
+        }
+    }
+    out
 }
 
 /// (file, id of the material) of each part that a mesh is written as.
