@@ -1,4 +1,5 @@
-//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`) and the reference scenes' JSON.
+//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`), Mitsuba 3 (XML, and its dictionary as JSON), PLY meshes and
+//! the reference scenes' JSON.
 
 mod buffers;
 mod fingerprint;
