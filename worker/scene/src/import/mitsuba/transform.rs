@@ -120,3 +120,25 @@ fn unit(v: [f64; 3]) -> Option<[f64; 3]> {
     let length = v.iter().map(|x| x * x).sum::<f64>().sqrt();
     (length > 0.0 && length.is_finite()).then(|| v.map(|x| x / length))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rotations_are_mitsubas_also_about_axes_of_other_lengths() {
+        // Mitsuba 3.9.1: <rotate x="1" y="0.3" angle="-20"/>
+        let expected = [
+            [1.0, 0.0180922, -0.102606],
+            [0.0180922, 0.94512, 0.34202],
+            [0.102606, -0.34202, 0.939693],
+        ];
+        let found = Matrix::rotation([1.0, 0.3, 0.0], -20.0).unwrap();
+        for (r, row) in expected.iter().enumerate() {
+            for (c, x) in row.iter().enumerate() {
+                assert!((found.0[r][c] - x).abs() < 2e-6, "{found:?}");
+            }
+        }
+        assert!(Matrix::rotation([0.0; 3], 1.0).is_err());
+    }
+}
