@@ -112,12 +112,7 @@ pub fn render(
     if settings.one_bounce && frame.walk.max_bounces >= 1 {
         let mut stack = world.bvh.stack();
         let peaks = one::peaks(&world, &mut stack, &emitters);
-        one::add(
-            &peaks,
-            &settings.gate,
-            &mut image.transient,
-            &mut overflow,
-        );
+        one::add(&peaks, &settings.gate, &mut image.transient, &mut overflow);
         rays += stack.rays;
     }
     let inside: f64 = image.transient.iter().map(|&v| f64::from(v)).sum();

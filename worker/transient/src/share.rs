@@ -41,7 +41,12 @@ pub(crate) struct Effort {
 
 impl Effort {
     pub fn from_env() -> Self {
-        let get = |k: &str, d: f32| std::env::var(k).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
+        let get = |k: &str, d: f32| {
+            std::env::var(k)
+                .ok()
+                .and_then(|v| v.parse().ok())
+                .unwrap_or(d)
+        };
         Self {
             side: get("E_SIDE", 4.0) as u32,
             camera: get("E_CAMERA", 1.0),
@@ -142,7 +147,10 @@ impl Sharing {
         a.bounces.clear();
         let size = film.pixel();
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {
-            let (row, col) = (tile.row + k as u32 / tile.cols, tile.col + k as u32 % tile.cols);
+            let (row, col) = (
+                tile.row + k as u32 / tile.cols,
+                tile.col + k as u32 % tile.cols,
+            );
             let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
             let mut sink = PixelSink {
                 film,
@@ -161,7 +169,13 @@ impl Sharing {
         let count = self.gathers.len() as f32;
         let pool = effort.pool.min((count * 4.0) as u32).max(2);
         let mut lights = std::mem::take(&mut scratch.pool);
-        lights.fill(walk.world, walk.emitters, pool, &mut rng, &mut scratch.stack);
+        lights.fill(
+            walk.world,
+            walk.emitters,
+            pool,
+            &mut rng,
+            &mut scratch.stack,
+        );
         scratch.pool = lights;
         let camera = (count * effort.camera).round().max(1.0) as u32;
         let light = (count * effort.light).round().max(1.0) as u32;
@@ -395,7 +409,11 @@ impl Sharing {
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             let deeper = v.bounce - lowest;
-            for (y, row) in self.shared.iter().zip(self.weight.chunks(count).zip(self.offset.chunks(count))) {
+            for (y, row) in self
+                .shared
+                .iter()
+                .zip(self.weight.chunks(count).zip(self.offset.chunks(count)))
+            {
                 let (weight, offset) = (row.0[i], row.1[i] + 1.0);
                 if weight == 0.0 {
                     continue;

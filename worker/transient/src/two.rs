@@ -27,7 +27,11 @@ impl Sampling {
         // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
         // its width: wider pixels straddle more bins.
         let pixel = 1.0 / i.fx.min(i.fy);
-        let base = std::env::var("E_TWO").ok().and_then(|v| v.parse().ok()).unwrap_or(4.0f32) * (pixel * 128.0).sqrt();
+        let base = std::env::var("E_TWO")
+            .ok()
+            .and_then(|v| v.parse().ok())
+            .unwrap_or(4.0f32)
+            * (pixel * 128.0).sqrt();
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
                 h.surface.specular

@@ -120,7 +120,8 @@ impl Walk<'_> {
                 aimed = self.aim(rng, &vertex, scratch, sink);
                 self.light(rng, &vertex, scratch, sink);
             }
-            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack) else {
+            let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack)
+            else {
                 return;
             };
             vertex = next;

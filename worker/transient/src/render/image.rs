@@ -246,7 +246,11 @@ pub(super) fn pilot(frame: &Frame) -> (Vec<Stat>, u64) {
         let side = PILOT_SIDE.min(length);
         let count = PILOT_TILES.min(length / side);
         (0..count)
-            .map(|i| (length * (2 * i + 1) / (2 * count)).saturating_sub(side / 2).min(length - side))
+            .map(|i| {
+                (length * (2 * i + 1) / (2 * count))
+                    .saturating_sub(side / 2)
+                    .min(length - side)
+            })
             .collect()
     };
     let columns = starts(frame.width);

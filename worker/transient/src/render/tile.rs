@@ -165,7 +165,11 @@ impl Done {
     pub fn overflow(&self, film: &Film) -> f64 {
         let mut all = Overflow::default();
         let n = f64::from(self.passes.max(1));
-        for (sum, two) in self.sum.chunks(film.pixel()).zip(self.two.chunks(film.pixel())) {
+        for (sum, two) in self
+            .sum
+            .chunks(film.pixel())
+            .zip(self.two.chunks(film.pixel()))
+        {
             all.take(film, sum, 1.0 / n);
             all.take(film, two, 1.0);
         }
