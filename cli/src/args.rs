@@ -282,11 +282,40 @@ pub enum Scene {
     },
     /// Say what a scene file holds
     Show {
-        /// A .glb, .gltf or .json scene
+        /// A .glb, .gltf, .xml (Mitsuba) or .json scene
         file: PathBuf,
     },
+    /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or one .ply mesh
+    Export(SceneExport),
     /// Render one scene file without a farm into a small Zarr group
     Render(SceneRender),
+    /// Measure a rendered scene with a sensor: pulse, jitter, photon noise, wider bins
+    Sense(SceneSense),
+}
+
+#[derive(Args)]
+pub struct SceneExport {
+    /// A .glb, .gltf, .xml (Mitsuba), .json or .ply scene
+    pub file: PathBuf,
+    /// Where to write it: a file, or a folder for scene.glb, scene.xml or scene.ply
+    #[arg(long, value_name = "DIR_OR_FILE")]
+    pub out: PathBuf,
+    /// Format [default: by the extension of --out]
+    #[arg(long, value_enum)]
+    pub format: Option<FormatArg>,
+    /// Aim this many laser spots over the camera's view, in place of the file's laser: 1, 4, 16, 25 or 100
+    #[arg(long)]
+    pub spots: Option<u32>,
+    /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say otherwise
+    #[arg(long)]
+    pub frame: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum FormatArg {
+    Glb,
+    Mitsuba,
+    Ply,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -297,7 +326,7 @@ pub enum GeneratorArg {
 
 #[derive(Args)]
 pub struct SceneRender {
-    /// A .glb, .gltf or .json scene
+    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
     pub file: PathBuf,
     /// Folder for the Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
@@ -394,6 +423,54 @@ pub struct GateArgs {
     /// Number of bins
     #[arg(long, default_value_t = 637)]
     pub bins: u32,
+}
+
+#[derive(Args)]
+pub struct SceneSense {
+    /// A Zarr group that `picofarm scene render` wrote; it is only read
+    pub render: PathBuf,
+    /// Folder for the new Zarr group (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Sensor settings (TOML); the options below go before them
+    #[arg(long, value_name = "FILE")]
+    pub sensor: Option<PathBuf>,
+    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw it from [default: 10..400]
+    #[arg(long, value_name = "LOW..HIGH")]
+    pub peak_photons: Option<String>,
+    /// Photons for a unit of the transient, instead of a peak
+    #[arg(long, value_name = "N", conflicts_with = "peak_photons")]
+    pub photons_per_unit: Option<f64>,
+    /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor [default: fwhm:128]
+    #[arg(long, value_name = "PULSE")]
+    pub pulse: Option<String>,
+    /// Timing jitter, full width at half maximum in picoseconds [default: 50]
+    #[arg(long, value_name = "PS")]
+    pub jitter_ps: Option<f64>,
+    /// Jitter as in the published code: the pulse is shifted by floor(N(0, 2.654)) bins, once a scene
+    #[arg(long, conflicts_with = "jitter_ps")]
+    pub jitter_sb3d: bool,
+    /// Ambient and dark counts, photons a bin (before --rebin) [default: 0]
+    #[arg(long, value_name = "RATE")]
+    pub dark: Option<f64>,
+    /// Sum this many adjacent bins [default: 1]
+    #[arg(long, value_name = "BINS")]
+    pub rebin: Option<u32>,
+    /// Write the expected photons instead of drawing counts
+    #[arg(long)]
+    pub no_poisson: bool,
+    /// Pile-up: at most one photon a pixel and pulse is seen, of so many pulses [default: all photons are]
+    #[arg(long, value_name = "pulses:N")]
+    pub dead_time: Option<String>,
+    /// Seed of the random numbers
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Number of the scene, which gives scenes of one seed random numbers of their own
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub scene: u64,
+    /// Threads [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
 }
 
 #[derive(Subcommand)]

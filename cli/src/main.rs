@@ -16,6 +16,7 @@ mod output;
 mod picture;
 mod roles;
 mod scene;
+mod sense;
 mod settings;
 mod signals;
 

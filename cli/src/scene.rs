@@ -12,23 +12,23 @@ use std::{
 
 use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_scene::{
-    Bsdf, Scene, export,
+    Bsdf, LaserGrid, Scene, export,
     furnished::{self, FurnishedSettings},
-    import,
+    import::{self, ImportOptions},
     primitive::{self, PrimitiveSettings},
 };
 use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings as RenderSettings,
+    Budget, Gate, Progress, RenderError, Rendered, Settings as RenderSettings, Strategy,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::{GeneratorArg, Scene as Command, SceneRender},
+    args::{FormatArg, GeneratorArg, Scene as Command, SceneExport, SceneRender},
     assets,
     error::{CliError, Code, Result, io},
     output::{Meter, Output, duration},
-    roles,
+    roles, sense,
     settings::Settings,
     signals,
 };
@@ -61,8 +61,63 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
             output.result(&facts, || describe(&scene));
             Ok(())
         }
+        Command::Export(args) => export_scene(&args, output),
         Command::Render(args) => render(args, output).await,
+        Command::Sense(args) => sense::run(args, output).await,
     }
+}
+
+/// `scene export`.
+fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
+    let spots = args.spots.or(args.frame.then_some(25));
+    let grid = |n: u32| {
+        let what = format!("--spots {n}: there are grids of 1, 4, 16, 25 and 100 spots");
+        LaserGrid::new(n).ok_or_else(|| CliError::input(what))
+    };
+    let options = ImportOptions {
+        laser: spots.map(grid).transpose()?,
+        frame: args.frame,
+        ..ImportOptions::default()
+    };
+    let extension = args.out.extension().and_then(|e| e.to_str());
+    let (format, name) = match (args.format, extension) {
+        (Some(FormatArg::Glb), _) | (None, Some("glb")) => (FormatArg::Glb, "scene.glb"),
+        (Some(FormatArg::Mitsuba), _) | (None, Some("xml")) => (FormatArg::Mitsuba, "scene.xml"),
+        (Some(FormatArg::Ply), _) | (None, Some("ply")) => (FormatArg::Ply, "scene.ply"),
+        _ => {
+            return Err(
+                CliError::input(format!("--out {}: names no format", args.out.display()))
+                    .hint("end it in .glb, .xml or .ply, or state --format glb, mitsuba or ply"),
+            );
+        }
+    };
+    let scene = import::read_scene_with(&args.file, &options)?;
+    let mut out = args.out.clone();
+    if extension.is_none() || out.is_dir() {
+        std::fs::create_dir_all(&out)
+            .map_err(|e| io(format!("cannot make {}", out.display()), &e))?;
+        out.push(name);
+    }
+    let mut notes = Vec::new();
+    match format {
+        FormatArg::Glb => export::write_glb(&scene, &out)?,
+        FormatArg::Mitsuba => notes = export::write_mitsuba(&scene, &out)?,
+        FormatArg::Ply => {
+            export::write_ply(&scene, &out)?;
+            notes.push("camera, laser, BSDFs and textures have no place in a PLY".into());
+        }
+    }
+    output.result(
+        &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count(), "notes": notes}),
+        || {
+            let mut text = format!("wrote {}: {} objects, {} triangles", out.display(), scene.objects.len(), scene.triangle_count());
+            for note in &notes {
+                text += &format!("\n  {note}");
+            }
+            text
+        },
+    );
+    Ok(())
 }
 
 fn generate(
@@ -110,6 +165,10 @@ fn facts(scene: &Scene) -> serde_json::Value {
     let rough = materials()
         .filter(|m| matches!(m.bsdf, Bsdf::RoughConductor { .. }))
         .count();
+    let mixed = materials()
+        .filter(|m| matches!(m.bsdf, Bsdf::Mixed { .. }))
+        .count();
+    let textured = materials().filter(|m| m.texture.is_some()).count();
     json!({
         "name": scene.name,
         "objects": scene.objects.len(),
@@ -117,6 +176,8 @@ fn facts(scene: &Scene) -> serde_json::Value {
         "labels": labels,
         "mirror_materials": mirrors,
         "rough_conductor_materials": rough,
+        "mixed_materials": mixed,
+        "textured_materials": textured,
         "camera": scene.camera,
         "laser_origin": scene.laser.origin,
         "beams": scene.laser.beams.len(),
@@ -134,11 +195,14 @@ fn describe(scene: &Scene) -> String {
         .collect();
     let i = &scene.camera.intrinsics;
     let mut text = format!(
-        "{}: {} objects, {} triangles, {} mirror materials\nlabels: {}\ncamera: {}x{} pixels, focal length {} px, at {:?}\nlaser: {} beams from {:?}\nsource: {}\n",
+        "{}: {} objects, {} triangles\nmaterials: {} mirror, {} rough conductor, {} mixed, {} textured\nlabels: {}\ncamera: {}x{} pixels, focal length {} px, at {:?}\nlaser: {} beams from {:?}\nsource: {}\n",
         scene.name,
         scene.objects.len(),
         scene.triangle_count(),
         f["mirror_materials"],
+        f["rough_conductor_materials"],
+        f["mixed_materials"],
+        f["textured_materials"],
         labels.join(", "),
         i.width,
         i.height,
@@ -201,6 +265,8 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
         one_bounce: true,
         seed: args.seed,
         split: args.split,
+        groups: vec![],
+        strategy: Strategy::default(),
     };
     free_folder(&args.out)?;
     let stop = signals::stop_on_signal()?;
@@ -220,9 +286,9 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
             )
         })?;
     let start = Instant::now();
-    let (scene, watcher, rendered) = tokio::task::spawn_blocking(move || {
+    let (scene, settings, watcher, rendered) = tokio::task::spawn_blocking(move || {
         let rendered = pool.install(|| picofarm_transient::render(&scene, &settings, &watcher));
-        (scene, watcher, rendered)
+        (scene, settings, watcher, rendered)
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
@@ -260,7 +326,7 @@ async fn render(args: SceneRender, output: Output) -> Result<()> {
 }
 
 /// Refuses early what the writer would refuse after the render.
-fn free_folder(out: &Path) -> Result<()> {
+pub fn free_folder(out: &Path) -> Result<()> {
     let taken = match std::fs::read_dir(out) {
         Ok(mut entries) => entries.next().is_some(),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,
@@ -303,13 +369,14 @@ fn write(out: &Path, scene: &Scene, settings: &RenderSettings, r: &Rendered) -> 
             histogram("two_se", &s.two_se),
             histogram("multi", &s.multi),
             histogram("multi_se", &s.multi_se),
+            histogram("multi_noise", &s.multi_noise),
         ]);
     }
     let attributes = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors",
+        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
         "gate": r.gate,
         "settings": settings,
         "camera": scene.camera,

@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Gate, Progress, RenderError, Rendered, Settings};
+use picofarm_transient::{Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy};
 use rustix::time::{ClockId, clock_gettime};
 use tokio_util::sync::CancellationToken;
 
@@ -47,6 +47,8 @@ pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
         one_bounce: false,
         seed,
         split: false,
+        groups: vec![],
+        strategy: Strategy::default(),
     }
 }
 

@@ -39,10 +39,15 @@ pub fn quadruple(scene: &mut Scene) {
 
 fn cut(mesh: &Mesh) -> Mesh {
     let mut positions = mesh.positions.clone();
+    let mut uv = mesh.uv.clone();
     let mut middles = BTreeMap::<(u32, u32), u32>::new();
     let mut middle = |a: u32, b: u32| {
         *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
             positions.push((positions[a as usize] + positions[b as usize]) * 0.5);
+            if !uv.is_empty() {
+                let (s, t) = (uv[a as usize], uv[b as usize]);
+                uv.push([0, 1].map(|k| (s[k] + t[k]) * 0.5));
+            }
             positions.len() as u32 - 1
         })
     };
@@ -54,6 +59,7 @@ fn cut(mesh: &Mesh) -> Mesh {
     Mesh {
         name: mesh.name.clone(),
         positions,
+        uv,
         triangles,
         triangle_material: mesh
             .triangle_material

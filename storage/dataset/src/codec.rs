@@ -26,7 +26,21 @@ impl ChunkCodec {
     /// Codec of an array's objects, or of the inner chunks of its shards.
     pub fn new(layout: &Layout) -> Self {
         let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
-        let data_type = match layout.element {
+        Self::of_element(
+            &layout.chunk_codecs(),
+            std::iter::once(1).chain(shape.iter().copied()),
+            layout.element,
+            layout.quantity.name(),
+        )
+    }
+
+    fn of_element(
+        codecs: &Value,
+        shape: impl IntoIterator<Item = u64>,
+        element: Element,
+        name: &'static str,
+    ) -> Self {
+        let data_type = match element {
             Element::F32 => data_type::float32(),
             Element::U8 => data_type::uint8(),
             Element::U16 => data_type::uint16(),
@@ -34,14 +48,14 @@ impl ChunkCodec {
             Element::U32 => data_type::uint32(),
         };
         // The fill value plays no part in these codecs; only its size must fit.
-        let fill = FillValue::from(vec![0u8; layout.element.size() as usize]);
+        let fill = FillValue::from(vec![0u8; element.size() as usize]);
         Self::from_parts(
-            &layout.chunk_codecs(),
-            std::iter::once(1).chain(shape.iter().copied()),
+            codecs,
+            shape,
             data_type,
             fill,
-            layout.element.size() as usize,
-            layout.quantity.name(),
+            element.size() as usize,
+            name,
         )
     }
 
@@ -57,16 +71,9 @@ impl ChunkCodec {
         )
     }
 
-    /// A codec of other f32 chunks (see `render_group`).
-    pub fn plain_f32(codecs: &Value, shape: &[u64]) -> Self {
-        Self::from_parts(
-            codecs,
-            shape.iter().copied(),
-            data_type::float32(),
-            FillValue::from(0.0f32),
-            4,
-            "array",
-        )
+    /// A codec of other chunks (see `render_group`).
+    pub fn plain(codecs: &Value, shape: &[u64], element: Element) -> Self {
+        Self::of_element(codecs, shape.iter().copied(), element, "array")
     }
 
     fn from_parts(

@@ -1,4 +1,5 @@
-//! Small Zarr v3 groups of plain f32 arrays in a local folder, for single renders and comparisons.
+//! Small Zarr v3 groups of plain arrays in a local folder, for single renders and comparisons; see `render_read` for
+//! the way back.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,13 +10,15 @@ use serde_json::{Map, Value, json};
 use crate::codec::ChunkCodec;
 use crate::dataset::{METADATA, pretty};
 use crate::error::DatasetError;
+use crate::layout::Element;
+use crate::read::Stored;
 
 /// Values of the largest chunk.
 const CHUNK_VALUES: u64 = 1 << 20;
 
 /// An array of a render group.
 #[derive(Debug, Clone, Copy)]
-pub struct RenderArray<'a> {
+pub struct RenderArray<'a, T = f32> {
     /// Name: letters, digits, `_` and `-`.
     pub name: &'a str,
     /// Shape.
@@ -23,18 +26,18 @@ pub struct RenderArray<'a> {
     /// A name for each dimension; dimensions of equal name must have equal length, as xarray demands.
     pub dimension_names: &'a [&'a str],
     /// Values in row-major order; any bits are kept.
-    pub data: &'a [f32],
+    pub data: &'a [T],
 }
 
-/// Writes a Zarr v3 group of plain f32 arrays with `attributes` to the new folder `dir`. All or nothing: the group is
+/// Writes a Zarr v3 group of plain arrays with `attributes` to the new folder `dir`. All or nothing: the group is
 /// written beside `dir` and renamed into place.
 ///
 /// # Errors
 /// [`DatasetError::Invalid`] for unfit arrays and where `dir` exists and is not empty (nothing is overwritten);
 /// [`DatasetError::Io`].
-pub fn write_render_group(
+pub fn write_render_group<T: Stored + Send + Sync>(
     dir: &Path,
-    arrays: &[RenderArray<'_>],
+    arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
 ) -> Result<(), DatasetError> {
     check(arrays)?;
@@ -63,7 +66,7 @@ pub fn write_render_group(
     written
 }
 
-fn check(arrays: &[RenderArray<'_>]) -> Result<(), DatasetError> {
+fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), DatasetError> {
     for (i, array) in arrays.iter().enumerate() {
         let invalid = |what: String| {
             Err(DatasetError::invalid(
@@ -119,51 +122,38 @@ fn refuse_occupied(dir: &Path) -> Result<(), DatasetError> {
     }
 }
 
-fn write_into(
+fn write_into<T: Stored + Send + Sync>(
     dir: &Path,
-    arrays: &[RenderArray<'_>],
+    arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
 ) -> Result<(), DatasetError> {
     let mut consolidated = Map::new();
     for array in arrays {
         let chunk = chunk_shape(array.shape);
-        let codecs = json!([
-            {"name": "bytes", "configuration": {"endian": "little"}},
-            {"name": "blosc", "configuration": {
-                "cname": "zstd", "clevel": 3, "shuffle": "shuffle", "typesize": 4, "blocksize": 0,
-            }},
-            {"name": "crc32c"},
-        ]);
+        let codecs = codecs(T::ELEMENT);
         let metadata = json!({
             "zarr_format": 3,
             "node_type": "array",
             "shape": array.shape,
-            "data_type": "float32",
+            "data_type": T::ELEMENT.name(),
             "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": 0.0,
+            "chunk_key_encoding": key_encoding(),
+            "fill_value": if T::ELEMENT == Element::F32 { json!(0.0) } else { json!(0) },
             "codecs": codecs,
             "attributes": {},
             "dimension_names": array.dimension_names,
         });
         let folder = dir.join(array.name);
         write(&folder.join(METADATA), &pretty(&metadata))?;
-        let codec = ChunkCodec::plain_f32(&codecs, &chunk);
-        let grid: Vec<u64> = array
-            .shape
-            .iter()
-            .zip(&chunk)
-            .map(|(s, c)| s.div_ceil(*c))
-            .collect();
+        let codec = ChunkCodec::plain(&codecs, &chunk, T::ELEMENT);
+        let grid = grid(array.shape, &chunk);
         (0..grid.iter().product::<u64>())
             .into_par_iter()
             .try_for_each(|at| {
                 let at = unravel(at, &grid);
                 let values = gather(array, &chunk, &at);
                 let bytes = codec.encode(bytemuck::cast_slice(&values))?;
-                let mut path = folder.join("c");
-                path.extend(at.iter().map(u64::to_string));
-                write(&path, &bytes)
+                write(&chunk_path(&folder, &at), &bytes)
             })?;
         consolidated.insert(array.name.to_string(), metadata);
     }
@@ -174,6 +164,34 @@ fn write_into(
         "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": consolidated},
     });
     write(&dir.join(METADATA), &pretty(&root))
+}
+
+/// How the chunks of a render group's arrays are coded.
+pub(crate) fn codecs(element: Element) -> Value {
+    json!([
+        {"name": "bytes", "configuration": {"endian": "little"}},
+        {"name": "blosc", "configuration": {
+            "cname": "zstd", "clevel": 3, "shuffle": "shuffle", "typesize": element.size(), "blocksize": 0,
+        }},
+        {"name": "crc32c"},
+    ])
+}
+
+/// How their chunks are named.
+pub(crate) fn key_encoding() -> Value {
+    json!({"name": "default", "configuration": {"separator": "/"}})
+}
+
+/// Number of chunks along each dimension.
+pub(crate) fn grid(shape: &[u64], chunk: &[u64]) -> Vec<u64> {
+    let sizes = shape.iter().zip(chunk);
+    sizes.map(|(s, c)| s.div_ceil(*c)).collect()
+}
+
+pub(crate) fn chunk_path(folder: &Path, at: &[u64]) -> PathBuf {
+    let mut path = folder.join("c");
+    path.extend(at.iter().map(u64::to_string));
+    path
 }
 
 fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), DatasetError> {
@@ -199,7 +217,7 @@ fn chunk_shape(shape: &[u64]) -> Vec<u64> {
     chunk
 }
 
-fn unravel(mut index: u64, shape: &[u64]) -> Vec<u64> {
+pub(crate) fn unravel(mut index: u64, shape: &[u64]) -> Vec<u64> {
     let mut at = vec![0; shape.len()];
     for (at, n) in at.iter_mut().zip(shape).rev() {
         *at = index % n;
@@ -209,26 +227,47 @@ fn unravel(mut index: u64, shape: &[u64]) -> Vec<u64> {
 }
 
 /// The values of a chunk, 0 outside the array.
-fn gather(array: &RenderArray<'_>, chunk: &[u64], at: &[u64]) -> Vec<f32> {
-    let mut values = vec![0f32; chunk.iter().product::<u64>() as usize];
+fn gather<T: Stored>(array: &RenderArray<'_, T>, chunk: &[u64], at: &[u64]) -> Vec<T> {
+    let mut values = vec![T::zeroed(); chunk.iter().product::<u64>() as usize];
+    for run in runs(array.shape, chunk, at) {
+        values[run.chunk..][..run.len].copy_from_slice(&array.data[run.array..][..run.len]);
+    }
+    values
+}
+
+/// Contiguous values that a chunk and its array share.
+pub(crate) struct Run {
+    /// Where they start in the chunk.
+    pub chunk: usize,
+    /// Where they start in the array.
+    pub array: usize,
+    pub len: usize,
+}
+
+/// The runs of chunk `at`, those outside the array left out.
+pub(crate) fn runs<'a>(
+    shape: &'a [u64],
+    chunk: &'a [u64],
+    at: &'a [u64],
+) -> impl Iterator<Item = Run> + 'a {
     let last = chunk.last().copied().unwrap_or(1);
-    let length = array.shape.last().copied().unwrap_or(1);
+    let length = shape.last().copied().unwrap_or(1);
     let start = at.last().copied().unwrap_or(0) * last;
     let len = last.min(length - start) as usize;
     let outer = &chunk[..chunk.len().saturating_sub(1)];
-    for (row, target) in values.chunks_exact_mut(last as usize).enumerate() {
-        let within = unravel(row as u64, outer);
-        let mut source = 0;
-        let mut inside = true;
-        for (d, within) in within.iter().enumerate() {
+    (0..outer.iter().product::<u64>()).filter_map(move |row| {
+        let mut array = 0;
+        for (d, within) in unravel(row, outer).iter().enumerate() {
             let index = at[d] * chunk[d] + within;
-            inside &= index < array.shape[d];
-            source = source * array.shape[d] + index;
+            if index >= shape[d] {
+                return None;
+            }
+            array = array * shape[d] + index;
         }
-        if inside {
-            let source = (source * length + start) as usize;
-            target[..len].copy_from_slice(&array.data[source..source + len]);
-        }
-    }
-    values
+        Some(Run {
+            chunk: (row * last) as usize,
+            array: (array * length + start) as usize,
+            len,
+        })
+    })
 }

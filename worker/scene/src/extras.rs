@@ -58,5 +58,6 @@ pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
     match material.bsdf {
         Bsdf::Diffuse { .. } => (0.0, 1.0),
         Bsdf::RoughConductor { alpha, .. } => (1.0, alpha.sqrt()),
+        Bsdf::Mixed { alpha, weight, .. } => (weight, alpha.sqrt()),
     }
 }

@@ -1,6 +1,10 @@
 //! Materials: how a surface scatters at the laser's wavelength, and what colour a camera sees.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
+
+use crate::Texture;
 
 /// Microfacet normal distribution of a rough conductor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -8,6 +12,8 @@ use serde::{Deserialize, Serialize};
 pub enum Distribution {
     /// Beckmann (Walter et al. 2007), with its rational G1.
     Beckmann,
+    /// GGX, also called Trowbridge-Reitz (Walter et al. 2007), with Smith's exact G1.
+    Ggx,
 }
 
 /// Scattering at the laser's wavelength. f is the BRDF in 1/sr.
@@ -29,10 +35,61 @@ pub enum Bsdf {
         /// Scale in [0, 1]; 1 is lossless apart from masking.
         reflectance: f32,
     },
+    /// A Lambertian and a rough conductor side by side (Mitsuba's `blendbsdf` of `diffuse` and `roughconductor`):
+    /// f = (1 − weight) · reflectance/π + weight · conductor.
+    Mixed {
+        /// Albedo of the Lambertian part, in [0, 1].
+        reflectance: f32,
+        /// Roughness α of the conductor.
+        alpha: f32,
+        /// The conductor's microfacet distribution.
+        distribution: Distribution,
+        /// Scale of the conductor, in [0, 1].
+        specular_reflectance: f32,
+        /// Share of the conductor, in [0, 1].
+        weight: f32,
+    },
+}
+
+impl Bsdf {
+    /// The same surface with every reflectance multiplied by `factor`: what a texel does to it.
+    pub fn scaled(self, factor: f32) -> Self {
+        match self {
+            Bsdf::Diffuse { reflectance } => Bsdf::Diffuse {
+                reflectance: reflectance * factor,
+            },
+            Bsdf::RoughConductor {
+                alpha,
+                distribution,
+                reflectance,
+            } => Bsdf::RoughConductor {
+                alpha,
+                distribution,
+                reflectance: reflectance * factor,
+            },
+            Bsdf::Mixed {
+                reflectance,
+                alpha,
+                distribution,
+                specular_reflectance,
+                weight,
+            } => Bsdf::Mixed {
+                reflectance: reflectance * factor,
+                alpha,
+                distribution,
+                specular_reflectance: specular_reflectance * factor,
+                weight,
+            },
+        }
+    }
 }
 
 /// A named surface material.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+///
+/// With a texture, the albedo at a point is `rgb` times the texel's linear RGB, channel by channel, and every
+/// reflectance of `bsdf` is multiplied by the **mean of the texel's three channels**: nobody knows a texture at the
+/// laser's wavelength, and so a grey texture does to the laser just what it does to the image.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Material {
     /// Name, for people.
     pub name: String,
@@ -40,6 +97,8 @@ pub struct Material {
     pub bsdf: Bsdf,
     /// Linear RGB albedo for the companion image, each in [0, 1].
     pub rgb: [f32; 3],
+    /// Scales the albedo from point to point; needs a mesh with texture coordinates.
+    pub texture: Option<Arc<Texture>>,
     /// Scatters on both sides of the facet; otherwise black from behind.
     pub two_sided: bool,
 }
@@ -52,6 +111,7 @@ impl Material {
             name: name.into(),
             bsdf: Bsdf::Diffuse { reflectance },
             rgb,
+            texture: None,
             two_sided: true,
         }
     }
@@ -66,17 +126,39 @@ impl Material {
                 reflectance: 1.0,
             },
             rgb: [1.0; 3],
+            texture: None,
             two_sided: true,
         }
     }
 
-    /// True for surfaces in the specular mask: rough conductors with α ≤ [`Material::SPECULAR_ALPHA`].
+    /// Factors of the albedo at a point of texture space: that of `rgb`, and the one of the reflectances
+    /// (the mean of the three). Ones without a texture.
+    pub fn factors(&self, uv: [f32; 2]) -> ([f32; 3], f32) {
+        match &self.texture {
+            None => ([1.0; 3], 1.0),
+            Some(texture) => {
+                let [r, g, b] = texture.at(uv);
+                ([r, g, b], (r + g + b) / 3.0)
+            }
+        }
+    }
+
+    /// True for surfaces in the specular mask, at which beams are not spots but fold: rough conductors with
+    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix. A mix below that scatters enough by its
+    /// Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
-        matches!(self.bsdf, Bsdf::RoughConductor { alpha, .. } if alpha <= Self::SPECULAR_ALPHA)
+        match self.bsdf {
+            Bsdf::Diffuse { .. } => false,
+            Bsdf::RoughConductor { alpha, .. } => alpha <= Self::SPECULAR_ALPHA,
+            Bsdf::Mixed { alpha, weight, .. } => weight >= 0.5 && alpha <= Self::SPECULAR_ALPHA,
+        }
     }
 
     /// Roughness up to which a conductor counts as a mirror for masks and for aiming beams.
     pub const SPECULAR_ALPHA: f32 = 0.1;
+
+    /// Smallest roughness of a conductor.
+    pub const MIN_ALPHA: f32 = 1e-3;
 
     /// Physical limits; the message says what was expected.
     pub(crate) fn check(&self) -> Result<(), String> {
@@ -87,15 +169,32 @@ impl Material {
                 Err(format!("{name} = {v} lies outside [0, 1]"))
             }
         };
+        let rough = |alpha: f32| {
+            if (Self::MIN_ALPHA..=1.0).contains(&alpha) {
+                Ok(())
+            } else {
+                Err(format!("alpha = {alpha} lies outside [0.001, 1]"))
+            }
+        };
         match self.bsdf {
             Bsdf::Diffuse { reflectance } => unit("reflectance", reflectance)?,
             Bsdf::RoughConductor {
                 alpha, reflectance, ..
             } => {
-                if !(1e-3..=1.0).contains(&alpha) {
-                    return Err(format!("alpha = {alpha} lies outside [0.001, 1]"));
-                }
+                rough(alpha)?;
                 unit("reflectance", reflectance)?;
+            }
+            Bsdf::Mixed {
+                reflectance,
+                alpha,
+                specular_reflectance,
+                weight,
+                ..
+            } => {
+                rough(alpha)?;
+                unit("reflectance", reflectance)?;
+                unit("specular_reflectance", specular_reflectance)?;
+                unit("weight", weight)?;
             }
         }
         self.rgb.iter().try_for_each(|&v| unit("rgb", v))

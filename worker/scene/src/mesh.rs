@@ -9,6 +9,8 @@ pub struct Mesh {
     pub name: String,
     /// Vertex positions in the mesh's own frame, metres.
     pub positions: Vec<Vec3>,
+    /// Texture coordinates (u, v), one a vertex, v down; empty without textures.
+    pub uv: Vec<[f32; 2]>,
     /// Vertex indices, three a triangle.
     pub triangles: Vec<[u32; 3]>,
     /// Index into `materials`, one a triangle.

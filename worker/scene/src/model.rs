@@ -99,14 +99,14 @@ pub enum SceneError {
         attempts: u32,
     },
     /// Furniture assets that the job names are not here.
-    #[error(
-        "assets {name:?} are not installed ({looked}); run `picofarm assets install`, or set assets = \"parametric\""
-    )]
+    #[error("assets {name:?} are not installed ({looked}); {mend}, or set assets = \"parametric\"")]
     Assets {
         /// Which asset source.
         name: String,
         /// Where it was looked for.
         looked: String,
+        /// How to come by them.
+        mend: &'static str,
     },
     /// Furniture assets cannot be fetched.
     #[error("assets cannot be installed: {what}")]
@@ -169,6 +169,35 @@ impl Scene {
                 if let Err(what) = m.check() {
                     return bad(format!("{at}.materials[{}]", m.name), what);
                 }
+                if m.texture.is_some() && mesh.uv.is_empty() {
+                    return bad(
+                        format!("{at}.materials[{}].texture", m.name),
+                        "the mesh has no texture coordinates; export it with them, or drop the texture".into(),
+                    );
+                }
+            }
+            if !mesh.uv.is_empty() && mesh.uv.len() != mesh.positions.len() {
+                return bad(
+                    format!("{at}.uv"),
+                    format!(
+                        "{} texture coordinates for {} vertices; give one a vertex, or none",
+                        mesh.uv.len(),
+                        mesh.positions.len()
+                    ),
+                );
+            }
+            if let Some(k) = mesh
+                .uv
+                .iter()
+                .position(|uv| !uv.iter().all(|x| x.is_finite()))
+            {
+                return bad(
+                    format!("{at}.uv[{k}]"),
+                    format!(
+                        "{:?} is not finite; repair the texture coordinates",
+                        mesh.uv[k]
+                    ),
+                );
             }
         }
         if let Err((field, what)) = self.camera.check() {

@@ -162,7 +162,7 @@ fn settings_and_libraries_must_fit_together() {
         .expect_err("no such library")
         .to_string();
     assert!(
-        unknown.contains("\"parametric\" or \"sweethome3d\""),
+        unknown.contains("\"parametric\", \"sweethome3d\" or \"gltf\""),
         "{unknown}"
     );
     let absent = AssetLibrary::sweethome3d(&PathBuf::from("/nowhere")).expect_err("nothing there");

@@ -1,33 +1,16 @@
 //! Foreign files: what is understood, and errors that name the file, the field and the way out.
 
+#[allow(dead_code)]
+mod common;
+
 use std::path::{Path, PathBuf};
 
-use base64_free::data_uri;
+use common::data_uri;
 use picofarm_scene::{
     Bsdf, Distribution, LaserGrid, Scene, SceneError, Vec3, export,
     import::{ImportOptions, read_reference_json, read_scene, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
-
-/// Buffers inside the JSON, without a base64 crate.
-mod base64_free {
-    /// A base64 data URI.
-    pub fn data_uri(bytes: &[u8]) -> String {
-        const DIGITS: &[u8; 64] =
-            b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-        let mut out = String::from("data:application/octet-stream;base64,");
-        for chunk in bytes.chunks(3) {
-            let mut three = [0; 3];
-            three[..chunk.len()].copy_from_slice(chunk);
-            let word = u32::from_be_bytes([0, three[0], three[1], three[2]]);
-            for k in 0..4 {
-                let digit = DIGITS[(word >> (18 - 6 * k)) as usize & 63];
-                out.push(if k > chunk.len() { '=' } else { digit as char });
-            }
-        }
-        out
-    }
-}
 
 /// One triangle under a turned, moved node.
 fn gltf(buffer_uri: &str, camera_and_laser: &str) -> String {
@@ -92,7 +75,7 @@ fn a_foreign_gltf_is_understood() {
     assert!((p - Vec3::new(0.0, 0.0, 4.0)).length() < 1e-6, "{p:?}");
     let expected = Bsdf::RoughConductor {
         alpha: 0.2f32 * 0.2,
-        distribution: Distribution::Beckmann,
+        distribution: Distribution::Ggx,
         reflectance: 1.0,
     };
     assert_eq!(scene.objects[0].mesh.materials[0].bsdf, expected);

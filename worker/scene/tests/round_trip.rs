@@ -6,6 +6,9 @@ use picofarm_scene::{
     primitive::{self, PrimitiveSettings},
 };
 
+#[allow(dead_code)]
+mod common;
+
 fn scene() -> Scene {
     let settings = PrimitiveSettings {
         width: 96,
@@ -17,9 +20,17 @@ fn scene() -> Scene {
 
 #[test]
 fn a_written_scene_reads_back_exactly() {
+    comes_back(scene());
+}
+
+#[test]
+fn textures_and_mixes_read_back_exactly() {
+    comes_back(common::textured_room());
+}
+
+fn comes_back(scene: Scene) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("room.glb");
-    let scene = scene();
     export::write_glb(&scene, &path).expect("writes");
     let back = read_scene(&path).expect("reads");
     assert_eq!(back.name, scene.name);
@@ -78,7 +89,7 @@ fn a_roughness_edited_elsewhere_takes_effect() {
         .flat_map(|o| &o.mesh.materials)
         .find_map(|m| match m.bsdf {
             Bsdf::RoughConductor { alpha, .. } => Some(alpha),
-            Bsdf::Diffuse { .. } => None,
+            _ => None,
         });
     assert_eq!(alpha, Some(0.25));
     assert!(back.provenance.notes.contains_key("import.materials"));

@@ -1,6 +1,7 @@
 //! Rays per second of CPU time, one thread, in a furnished room and two finer tessellations of it.
 //!
-//! `cargo bench -p picofarm-transient --bench rays -- [--export DIR] [--rounds N] [--kernel avx2|portable]`
+//! `cargo bench -p picofarm-transient --bench rays -- [--export DIR] [--rounds N] [--only RAYS]
+//! [--kernel avx2|portable]`
 //! prints a table: mesh, set of rays, millions of rays a CPU-second (best round). `--export` also writes
 //! the meshes and rays as raw little-endian files, for other ray tracers (`tests/peers/embree_rays.py`).
 
@@ -46,6 +47,7 @@ fn main() {
     let export = value("--export").map(PathBuf::from);
     let rounds = value("--rounds").map_or(3, |n| n.parse().expect("--rounds takes a number"));
     let kernel = value("--kernel");
+    let only = value("--only");
     let settings = furnished::FurnishedSettings {
         width: SIDE,
         height: SIDE,
@@ -72,6 +74,9 @@ fn main() {
         }
         let mut total = [0.0f64; 2];
         for (name, set) in &sets {
+            if only.as_ref().is_some_and(|o| o != name) {
+                continue;
+            }
             let (count, seconds) = best(&bvh, set, rounds, false);
             row(&mesh, name, count, seconds);
             if let Rays::Bundles { .. } = set {

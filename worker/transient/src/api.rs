@@ -5,7 +5,7 @@ use picofarm_scene::Spot;
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-1";
+pub const RENDERER_VERSION: &str = "transient-2";
 
 /// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -28,8 +28,21 @@ pub enum Budget {
     Error(f32),
 }
 
+/// Ways of finding light, to be chosen by hand; the default lets the renderer choose by the scene. Every
+/// choice gives the same expected result, some at far more noise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Strategy {
+    /// Side in pixels of the tiles that share vertices, 1 to 16; 1 = every pixel by itself.
+    pub share: Option<u32>,
+    /// Walks connect to light vertices drawn from the spots.
+    pub light_vertices: Option<bool>,
+    /// Aim at the spots' mirror images in planar near-mirrors.
+    pub image_lobes: Option<bool>,
+}
+
 /// Settings of one render.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Settings {
     /// The gate.
     pub gate: Gate,
@@ -43,6 +56,13 @@ pub struct Settings {
     pub seed: u64,
     /// Keep the two-bounce and 3+ parts with their standard errors.
     pub split: bool,
+    /// Groups of beams, by index, of which histograms of their own are wanted from the same pass: subsets
+    /// of a grid, or each beam alone.
+    #[serde(default)]
+    pub groups: Vec<Vec<u32>>,
+    /// Ways of finding light.
+    #[serde(default)]
+    pub strategy: Strategy,
 }
 
 /// Told how far a render is; may end it.
@@ -64,6 +84,8 @@ pub struct Rendered {
     pub transient: Vec<f32>,
     /// The parts, where asked for.
     pub split: Option<Split>,
+    /// The histograms of [`Settings::groups`], each as `transient`.
+    pub groups: Vec<Vec<f32>>,
     /// Ground truth from the same rays.
     pub truth: GroundTruth,
     /// The spots, world space, in the order of the scene's beams; `None` where a beam meets nothing.
@@ -89,6 +111,9 @@ pub struct Split {
     pub multi: Vec<f32>,
     /// Its standard error.
     pub multi_se: Vec<f32>,
+    /// A draw of its error, with what pixels and bins have in common: the square of any weighted sum of
+    /// it estimates the variance of that sum of `multi`, where `multi_se` alone cannot.
+    pub multi_noise: Vec<f32>,
 }
 
 /// Ground truth. Depth and its kin are those of the ray through the pixel's centre.
@@ -115,9 +140,7 @@ pub struct GroundTruth {
 /// Energy outside the gate, same units as the histogram summed over pixels and bins.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Overflow {
-    /// Contributions dropped.
-    pub count: u64,
-    /// Their energy.
+    /// Energy dropped.
     pub energy: f64,
     /// Share of all energy found.
     pub share: f64,
@@ -126,13 +149,14 @@ pub struct Overflow {
 /// How noisy a render is, estimated from the variance between passes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ErrorEstimate {
-    /// Median over pixels of ‖standard error‖₂ / ‖h‖₂ over the bins (one bounce left out).
+    /// Median over pixels of ‖standard error‖₂ / ‖h‖₂ over the bins (one bounce left out). Pixels of a
+    /// neighbourhood share vertices: their errors are alike, and sums over them err more than by chance.
     pub median_relative: f32,
     /// The same, 95th percentile.
     pub p95_relative: f32,
-    /// Standard error of the total energy / total energy.
+    /// Standard error of the total energy / total energy, with what pixels have in common.
     pub total_relative: f32,
-    /// Camera paths per pixel used.
+    /// Camera paths per pixel used, on average over the pixels.
     pub samples: u32,
 }
 

@@ -1,19 +1,23 @@
-//! Scattering: Lambertian and Beckmann rough conductor (Walter et al., EGSR 2007), for two directions on
-//! the same side of a facet.
+//! Scattering: Lambertian, rough conductor (Beckmann or GGX; Walter et al., EGSR 2007) and the mix of
+//! both, for two directions on the same side of a facet.
 
 use std::f32::consts::PI;
 
-use picofarm_scene::{Bsdf, Material, Vec3};
+use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
 use crate::rng::Rng;
 
-/// A material's scattering, ready for use.
+/// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Surface {
-    /// Lambertian: ρ/π. Conductor: its reflectance. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
     pub strength: f32,
     /// Roughness; 0 for Lambertian surfaces.
     pub alpha: f32,
+    /// Lambertian part ρ/π of a mix times its share; 0 for pure surfaces.
+    pub base: f32,
+    /// The conductor is GGX, otherwise Beckmann.
+    pub ggx: bool,
     /// Scatters from both sides.
     pub two_sided: bool,
     /// Counts as a mirror (specular mask).
@@ -22,24 +26,65 @@ pub(crate) struct Surface {
 
 impl Surface {
     pub fn new(m: &Material) -> Self {
-        let (strength, alpha) = match m.bsdf {
-            Bsdf::Diffuse { reflectance } => (reflectance / PI, 0.0),
-            Bsdf::RoughConductor {
-                alpha, reflectance, ..
-            } => (reflectance, alpha),
-        };
-        Self {
-            strength,
-            alpha,
+        let pure = Self {
+            strength: 0.0,
+            alpha: 0.0,
+            base: 0.0,
+            ggx: false,
             two_sided: m.two_sided,
             specular: m.is_specular(),
+        };
+        let rough = |alpha, distribution, strength| Self {
+            strength,
+            alpha,
+            ggx: distribution == Distribution::Ggx,
+            ..pure
+        };
+        match m.bsdf {
+            Bsdf::Diffuse { reflectance } => Self {
+                strength: reflectance / PI,
+                ..pure
+            },
+            Bsdf::RoughConductor {
+                alpha,
+                distribution,
+                reflectance,
+            } => rough(alpha, distribution, reflectance),
+            Bsdf::Mixed {
+                reflectance,
+                alpha,
+                distribution,
+                specular_reflectance,
+                weight,
+            } => {
+                let strength = weight * specular_reflectance;
+                let base = (1.0 - weight) * reflectance / PI;
+                // A mix has two lobes that scatter; with one it is pure.
+                if strength == 0.0 && base > 0.0 {
+                    return Self {
+                        strength: base,
+                        ..pure
+                    };
+                }
+                Self {
+                    base,
+                    ..rough(alpha, distribution, strength)
+                }
+            }
         }
     }
 
     /// The same surface, scattering nothing.
     pub fn black(self) -> Self {
+        self.scaled(0.0)
+    }
+
+    /// The same surface, scattering `factor` times as much.
+    #[inline(always)]
+    pub fn scaled(self, factor: f32) -> Self {
         Self {
-            strength: 0.0,
+            strength: self.strength * factor,
+            base: self.base * factor,
             ..self
         }
     }
@@ -48,6 +93,38 @@ impl Surface {
     #[inline(always)]
     pub fn diffuse(&self) -> bool {
         self.alpha == 0.0
+    }
+
+    /// One lobe of a mix, chosen by `u` in [0, 1) in proportion to the lobes' albedos and divided by the
+    /// chance of that choice, with `specular` as for the lobe alone. Pure surfaces are their own lobe.
+    #[inline]
+    pub fn lobe(&self, u: f32) -> Surface {
+        if self.base == 0.0 {
+            return *self;
+        }
+        let total = self.strength + self.base * PI;
+        if u * total < self.strength {
+            return Self {
+                strength: total,
+                base: 0.0,
+                specular: self.alpha <= Material::SPECULAR_ALPHA,
+                ..*self
+            };
+        }
+        Self {
+            strength: total / PI,
+            alpha: 0.0,
+            base: 0.0,
+            ggx: false,
+            specular: false,
+            ..*self
+        }
+    }
+
+    /// Chance with which [`Surface::sample`] draws from the conductor of a mix.
+    #[inline(always)]
+    fn share(&self) -> f32 {
+        self.strength / (self.strength + self.base * PI)
     }
 
     /// f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
@@ -60,60 +137,101 @@ impl Surface {
         if self.diffuse() {
             return self.strength * co;
         }
-        let d = self.beckmann(n, i + o);
+        let d = self.density(n, i + o);
         if d == 0.0 {
-            return 0.0;
+            return self.base * co;
         }
-        self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci)
+        self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
     }
 
     /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.
     #[inline]
     pub fn sample(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
-        let (t, b) = frame(n);
         if self.diffuse() {
-            let (x, y, r2) = rng.disc();
-            let z = (1.0 - r2).sqrt();
-            let o = (t * x + b * y + n * z).normalized();
-            let c = n.dot(o);
-            return (c > 0.0).then_some((o, self.strength * PI, c / PI));
+            let (o, c) = cosine(n, rng)?;
+            return Some((o, self.strength * PI, c / PI));
         }
-        let (x, y) = rng.circle();
-        let slope = self.alpha * (-libm::logf(1.0 - rng.uniform())).sqrt();
-        let h = (t * (slope * x) + b * (slope * y) + n).normalized();
+        if self.base == 0.0 {
+            return self.sample_conductor(n, i, rng);
+        }
+        let o = if rng.uniform() < self.share() {
+            self.sample_conductor(n, i, rng)?.0
+        } else {
+            cosine(n, rng)?.0
+        };
+        let pdf = self.pdf(n, i, o);
+        (pdf > 0.0).then(|| (o, self.scatter(n, i, o) / pdf, pdf))
+    }
+
+    #[inline]
+    fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
+        let (t, b) = frame(n);
+        let ci = n.dot(i);
+        let h = if self.ggx {
+            visible_ggx(self.alpha, [t.dot(i), b.dot(i), ci], rng)
+        } else {
+            let (x, y) = rng.circle();
+            let slope = self.alpha * (-libm::logf(1.0 - rng.uniform())).sqrt();
+            [slope * x, slope * y, 1.0]
+        };
+        let h = (t * h[0] + b * h[1] + n * h[2]).normalized();
         let ih = i.dot(h);
         if ih <= 0.0 {
             return None;
         }
         let o = (h * (2.0 * ih) - i).normalized();
-        let (ci, co, ch) = (n.dot(i), n.dot(o), n.dot(h));
+        let (co, ch) = (n.dot(o), n.dot(h));
         if !(ci > 0.0 && co > 0.0) {
             return None;
         }
+        let d = self.density(n, i + o);
+        if self.ggx {
+            let pdf = self.masking(ci) * d / (4.0 * ci);
+            return Some((o, self.strength * self.masking(co), pdf));
+        }
         let weight = self.strength * self.masking(ci) * self.masking(co) * ih / (ci * ch);
-        Some((o, weight, self.beckmann(n, i + o) * ch / (4.0 * ih)))
+        Some((o, weight, d * ch / (4.0 * ih)))
     }
 
     /// Density per steradian with which [`Surface::sample`] draws `o`.
     #[inline]
     pub fn pdf(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
-        let co = n.dot(o);
-        if !(co > 0.0 && n.dot(i) > 0.0) {
+        let (ci, co) = (n.dot(i), n.dot(o));
+        if !(co > 0.0 && ci > 0.0) {
             return 0.0;
         }
         if self.diffuse() {
             return co / PI;
         }
-        let h = (i + o).normalized();
-        self.beckmann(n, i + o) * n.dot(h) / (4.0 * i.dot(h))
+        let d = self.density(n, i + o);
+        let conductor = if self.ggx {
+            self.masking(ci) * d / (4.0 * ci)
+        } else {
+            let h = (i + o).normalized();
+            d * n.dot(h) / (4.0 * i.dot(h))
+        };
+        if self.base == 0.0 {
+            return conductor;
+        }
+        let share = self.share();
+        share * conductor + (1.0 - share) * co / PI
     }
 
     /// D(h) for h along `sum` = i + o. The slope comes from n × h: 1 − cos² would cancel at small α.
     #[inline]
-    fn beckmann(&self, n: Vec3, sum: Vec3) -> f32 {
+    fn density(&self, n: Vec3, sum: Vec3) -> f32 {
         let (c, s) = (n.dot(sum), n.cross(sum));
         let (c2, s2) = (c * c, s.dot(s));
         let a2 = self.alpha * self.alpha;
+        if self.ggx {
+            let r = 1.0 / (c2 + s2);
+            let spread = (c2 + s2 / a2) * r;
+            return if c > 0.0 {
+                1.0 / (PI * a2 * spread * spread)
+            } else {
+                0.0
+            };
+        }
         let x = s2 / (c2 * a2);
         // e^-80 is beneath everything that f32 can add to anything.
         if c <= 0.0 || x > 80.0 {
@@ -123,17 +241,51 @@ impl Surface {
         libm::expf(-x) / (PI * a2 * cos2 * cos2)
     }
 
-    /// Walter's rational approximation of G1.
+    /// G1: Smith's for GGX, Walter's rational approximation for Beckmann.
     #[inline]
     fn masking(&self, c: f32) -> f32 {
         let tan = (1.0 - c * c).max(0.0).sqrt() / c;
-        let a = 1.0 / (self.alpha * tan);
+        let slope = self.alpha * tan;
+        if self.ggx {
+            return 2.0 / (1.0 + (1.0 + slope * slope).sqrt());
+        }
+        let a = 1.0 / slope;
         if a < 1.6 {
             (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a)
         } else {
             1.0
         }
     }
+}
+
+/// A cosine-distributed direction around `n`, and its cosine.
+#[inline]
+fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
+    let (t, b) = frame(n);
+    let (x, y, r2) = rng.disc();
+    let z = (1.0 - r2).sqrt();
+    let o = (t * x + b * y + n * z).normalized();
+    let c = n.dot(o);
+    (c > 0.0).then_some((o, c))
+}
+
+/// A half vector of GGX among those that `i` sees, in the facet's frame and of any length (Heitz, JCGT
+/// 2018): its weights never exceed 1, however rough or grazing.
+#[inline]
+fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {
+    let v = Vec3::new(alpha * i[0], alpha * i[1], i[2]).normalized();
+    let flat = v.x * v.x + v.y * v.y;
+    let t = if flat > 0.0 {
+        Vec3::new(-v.y, v.x, 0.0) / flat.sqrt()
+    } else {
+        Vec3::new(1.0, 0.0, 0.0)
+    };
+    let b = v.cross(t);
+    let (x, y, _) = rng.disc();
+    let s = 0.5 * (1.0 + v.z);
+    let y = (1.0 - s) * (1.0 - x * x).max(0.0).sqrt() + s * y;
+    let h = t * x + b * y + v * (1.0 - x * x - y * y).max(0.0).sqrt();
+    [alpha * h.x, alpha * h.y, h.z.max(0.0)]
 }
 
 /// Two unit vectors that complete `n` to a right-handed frame (Duff et al., JCGT 2017).
@@ -149,51 +301,5 @@ pub(crate) fn frame(n: Vec3) -> (Vec3, Vec3) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::rng::Stream;
-
-    #[test]
-    fn sampling_weights_agree_with_density_and_energy_stays_below_one() {
-        let n = Vec3::new(0.2, -0.5, 0.8).normalized();
-        let (t, _) = frame(n);
-        for alpha in [0.0, 0.01, 0.1, 0.4] {
-            for grazing in [0.1f32, 0.7, 1.2] {
-                let i = (n + t * libm::tanf(grazing)).normalized();
-                let s = Surface {
-                    strength: if alpha == 0.0 { 1.0 / PI } else { 1.0 },
-                    alpha,
-                    two_sided: true,
-                    specular: false,
-                };
-                let mut rng = Rng::new(1, Stream::Paths, 0, 0);
-                let (mut sum, count) = (0.0f64, 20_000);
-                for _ in 0..count {
-                    if let Some((o, w, pdf)) = s.sample(n, i, &mut rng) {
-                        sum += f64::from(w);
-                        let expected = s.scatter(n, i, o) / pdf;
-                        assert!((w - expected).abs() < 2e-2 * w, "{alpha} {w} {expected}");
-                        assert!((s.pdf(n, i, o) - pdf).abs() <= 1e-2 * pdf);
-                    }
-                }
-                let albedo = sum / f64::from(count);
-                assert!(albedo < 1.02, "{alpha} {grazing} {albedo}");
-            }
-        }
-    }
-
-    #[test]
-    fn scattering_is_reciprocal() {
-        let n = Vec3::new(0.0, 1.0, 0.0);
-        let a = Vec3::new(0.3, 1.0, 0.1).normalized();
-        let b = Vec3::new(-0.4, 0.8, 0.2).normalized();
-        let s = Surface {
-            strength: 0.9,
-            alpha: 0.3,
-            two_sided: true,
-            specular: false,
-        };
-        let (ab, ba) = (s.scatter(n, a, b) / n.dot(b), s.scatter(n, b, a) / n.dot(a));
-        assert!((ab - ba).abs() < 1e-5 * ab);
-    }
-}
+#[path = "bsdf/tests.rs"]
+mod tests;

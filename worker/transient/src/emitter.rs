@@ -6,7 +6,7 @@ use crate::{
     api::RenderError,
     bsdf::Surface,
     bvh::Stack,
-    world::{Hit, World, lift},
+    world::{World, lift},
 };
 
 /// Mirrors a beam may meet before it is given up.
@@ -78,13 +78,16 @@ pub(crate) struct Emitter {
 }
 
 impl Emitter {
-    fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, surface: Surface) -> Self {
+    fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, material: u32) -> Self {
+        let surface = world.surfaces[material as usize];
         let p = world.inward(spot.point);
         // The spot does not say whether its side is the facet's front: look at the facet beneath it.
         let beneath = world.closest(stack, lift(p, spot.normal), -spot.normal);
-        let dark = |h: &Hit| (h.p - p).length() < 1e-3 && h.surface.strength == 0.0;
+        // It also knows the texture there.
+        let beneath = beneath.filter(|h| (h.p - p).length() < 1e-3);
         let surface = match beneath {
-            Some(h) if !surface.two_sided && dark(&h) => surface.black(),
+            Some(h) if !surface.two_sided && h.surface.strength == 0.0 => surface.black(),
+            Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
         Self {
@@ -167,6 +170,8 @@ impl Columns {
 pub(crate) struct Emitters {
     /// The sources.
     pub list: Vec<Emitter>,
+    /// Their places, lifted off the surface, for shadow rays.
+    pub lifted: Vec<Vec3>,
     /// The Lambertian ones in columns.
     pub columns: Columns,
     /// Indices of the others.
@@ -180,6 +185,7 @@ impl Emitters {
         let mut stack = world.bvh.stack();
         let mut all = Self {
             list: vec![],
+            lifted: vec![],
             columns: Columns::default(),
             glossy: vec![],
             on_mirror: vec![],
@@ -190,7 +196,7 @@ impl Emitters {
                 .objects
                 .get(spot.object as usize)
                 .and_then(|o| o.mesh.materials.get(spot.material as usize));
-            let Some(material) = material else {
+            if material.is_none() {
                 return Err(RenderError::Invalid {
                     field: format!("laser.beams[{beam}].spot"),
                     what: format!(
@@ -198,7 +204,7 @@ impl Emitters {
                         spot.object, spot.material
                     ),
                 });
-            };
+            }
             let unit = |v: Vec3| v.is_finite() && (v.length() - 1.0).abs() < 1e-3;
             if !(spot.point.is_finite() && unit(spot.normal) && unit(spot.arriving)) {
                 return Err(RenderError::Invalid {
@@ -206,7 +212,8 @@ impl Emitters {
                     what: "needs a finite point and unit normal and arriving directions".into(),
                 });
             }
-            let e = Emitter::new(world, &mut stack, beam, spot, Surface::new(material));
+            let surface = world.first_surface[spot.object as usize] + spot.material;
+            let e = Emitter::new(world, &mut stack, beam, spot, surface);
             let index = all.list.len();
             let strength = if e.surface.diffuse() {
                 e.surface.strength
@@ -222,6 +229,7 @@ impl Emitters {
                     all.on_mirror.push(index);
                 }
             }
+            all.lifted.push(lift(e.p, e.n));
             all.list.push(e);
         }
         Ok(all)

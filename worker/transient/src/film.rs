@@ -63,12 +63,6 @@ impl Film {
         }
     }
 
-    /// True for the slots before and behind the gate.
-    #[inline]
-    pub fn outside(&self, slot: usize) -> bool {
-        slot == 0 || slot + 1 == self.slots
-    }
-
     /// Adds a value to a pixel's channels.
     #[inline]
     pub fn add(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
@@ -86,39 +80,37 @@ pub(crate) struct PixelSink<'a> {
     pub film: &'a Film,
     pub pixel: &'a mut [f32],
     pub factor: f32,
-    /// Counts contributions outside the gate.
-    pub outside: &'a mut u64,
 }
 
 impl Sink for PixelSink<'_> {
     #[inline]
     fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32) {
         let slot = self.film.slot(path_m);
-        *self.outside += u64::from(self.film.outside(slot));
         self.film.add(self.pixel, slot, self.factor * value, spot);
     }
 }
 
-/// Two-bounce contributions of one pixel: sums, and squared differences of pairs of strata.
+/// Two-bounce contributions of one pixel: sums, and squared contrasts of blocks of 2×2 strata (one
+/// diagonal less the other: what changes linearly over the pixel cancels, what chance does stays).
 #[derive(Debug)]
-pub(crate) struct Pairs {
+pub(crate) struct Blocks {
     /// Σ of contributions, as [`Film::pixel`] slots.
     pub sum: Vec<f32>,
-    /// Σ over pairs of (difference by slot of channel 0)².
+    /// Σ over blocks of (contrast by slot of channel 0)².
     pub square: Vec<f32>,
-    /// Σ over pairs of (difference of the whole)².
+    /// Σ over blocks of (contrast of the whole)².
     pub total_square: f64,
-    difference: Vec<f32>,
+    contrast: Vec<f32>,
     touched: Vec<u32>,
 }
 
-impl Pairs {
+impl Blocks {
     pub fn new(film: &Film) -> Self {
         Self {
             sum: vec![0.0; film.pixel()],
             square: vec![0.0; film.slots],
             total_square: 0.0,
-            difference: vec![0.0; film.slots],
+            contrast: vec![0.0; film.slots],
             touched: vec![],
         }
     }
@@ -129,21 +121,21 @@ impl Pairs {
         self.total_square = 0.0;
     }
 
-    /// Adds one stratum's contribution; `sign` is −1 for the second of a pair.
+    /// Adds one stratum's contribution; `sign` tells its diagonal.
     #[inline]
     pub fn add(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
         film.add(&mut self.sum, slot, value, spot);
-        if self.difference[slot] == 0.0 {
+        if self.contrast[slot] == 0.0 {
             self.touched.push(slot as u32);
         }
-        self.difference[slot] += sign * value;
+        self.contrast[slot] += sign * value;
     }
 
-    /// Ends a pair.
+    /// Ends a block.
     pub fn finish(&mut self) {
         let mut total = 0.0f64;
         for b in self.touched.drain(..) {
-            let v = std::mem::take(&mut self.difference[b as usize]);
+            let v = std::mem::take(&mut self.contrast[b as usize]);
             self.square[b as usize] += v * v;
             total += f64::from(v);
         }

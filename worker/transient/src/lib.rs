@@ -13,6 +13,7 @@ mod plan;
 mod pool;
 mod render;
 mod rng;
+pub mod sensor;
 mod share;
 mod truth;
 mod two;

@@ -1,15 +1,12 @@
 //! Exactly one bounce: laser → spot → camera, a point of light in one pixel and one bin.
 
-use crate::{
-    api::{Gate, Overflow},
-    bvh::Stack,
-    emitter::Emitters,
-    world::World,
-};
+use crate::{api::Gate, bvh::Stack, emitter::Emitters, world::World};
 
 /// One spot seen directly.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peak {
+    /// Emitter.
+    pub spot: usize,
     /// Row-major pixel.
     pub pixel: usize,
     /// Optical path, metres.
@@ -24,7 +21,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
     let c = &world.camera;
     let i = &c.intrinsics;
     let mut peaks = vec![];
-    for e in &emitters.list {
+    for (spot, e) in emitters.list.iter().enumerate() {
         let q = c.direction_to_camera(e.p);
         let d = e.p.length();
         if !(q.z > 0.0 && d > 0.0) {
@@ -41,6 +38,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
         let area = 1.0 / (f64::from(i.fx) * f64::from(i.fy));
         let value = f64::from(intensity) / (metres * metres * cos * cos * cos * area);
         peaks.push(Peak {
+            spot,
             pixel: y as usize * i.width as usize + x as usize,
             path_m: e.path_m + metres,
             value: value as f32,
@@ -49,15 +47,11 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
     peaks
 }
 
-/// Adds the peaks to a histogram; what lies outside the gate goes to `outside`.
-pub(crate) fn add(peaks: &[Peak], gate: &Gate, transient: &mut [f32], outside: &mut Overflow) {
-    for p in peaks {
-        match gate.bin(p.path_m) {
-            Some(b) => transient[p.pixel * gate.bins as usize + b as usize] += p.value,
-            None => {
-                outside.count += 1;
-                outside.energy += f64::from(p.value);
-            }
-        }
+/// Adds a peak to a histogram; returns false where it lies outside the gate.
+pub(crate) fn add(p: &Peak, gate: &Gate, transient: &mut [f32]) -> bool {
+    let bin = gate.bin(p.path_m);
+    if let Some(b) = bin {
+        transient[p.pixel * gate.bins as usize + b as usize] += p.value;
     }
+    bin.is_some()
 }

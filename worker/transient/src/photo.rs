@@ -98,7 +98,7 @@ fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) ->
         let Some(h) = world.closest(stack, from, d) else {
             return tint.map(|t| 0.6 * t);
         };
-        let albedo = world.rgb[world.surface[h.triangle as usize] as usize];
+        let albedo = world.albedo(&h);
         for k in 0..3 {
             tint[k] *= albedo[k];
         }

@@ -30,6 +30,9 @@ const MAX_PASSES: u32 = 1 << 16;
 /// Fewest that it spends, so that the error estimate means something.
 const MIN_PASSES: u32 = 8;
 
+/// Side in pixels of the tiles that share vertices.
+const SHARE: u32 = 8;
+
 /// Renders a scene. Runs on the caller's rayon pool; the result is bit-identical for any number of
 /// threads, and on any machine.
 ///
@@ -46,7 +49,11 @@ pub fn render(
     let world = World::new(scene);
     let spots = find_spots(&world, &scene.laser.beams);
     let emitters = Emitters::new(scene, &world, &spots)?;
-    let mirrors = Mirrors::find(&world, &emitters);
+    let mirrors = if settings.strategy.image_lobes.unwrap_or(true) {
+        Mirrors::find(&world, &emitters)
+    } else {
+        Mirrors::default()
+    };
     let mut centres = truth::centres(&world);
     let mut truth = truth::ground_truth(scene, &world, &emitters, &mut centres, spots.len());
     let (rgb, photo_rays) = photo::photo(&world, settings.seed);
@@ -55,7 +62,9 @@ pub fn render(
 
     let intrinsics = scene.camera.intrinsics;
     let (width, height) = (intrinsics.width, intrinsics.height);
-    let film = Film::new(&settings.gate, 0, vec![vec![]; emitters.list.len()]);
+    let of_spot = groups_of(settings, &emitters, spots.len())?;
+    let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
+    let strategy = &settings.strategy;
     let frame = Frame {
         walk: Walk {
             world: &world,
@@ -63,6 +72,7 @@ pub fn render(
             mirrors: &mirrors,
             gate: &settings.gate,
             max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
+            lights: strategy.light_vertices.unwrap_or(true),
             shortest_m: emitters
                 .list
                 .iter()
@@ -70,12 +80,13 @@ pub fn render(
         },
         film: &film,
         sampling: &sampling,
-        effort: Effort::from_env(),
+        effort: Effort::new(strategy.share.unwrap_or(SHARE)),
         seed: settings.seed,
         width,
         height,
+        split: settings.split,
     };
-    let mut image = Image::new(&frame, settings.split);
+    let mut image = Image::new(&frame);
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
     let mut rays = 0;
     let (passes, target) = match settings.budget {
@@ -105,14 +116,21 @@ pub fn render(
     };
 
     let mut overflow = Overflow {
-        count: image.outside,
         energy: image.overflow,
         share: 0.0,
     };
     if settings.one_bounce && frame.walk.max_bounces >= 1 {
         let mut stack = world.bvh.stack();
         let peaks = one::peaks(&world, &mut stack, &emitters);
-        one::add(&peaks, &settings.gate, &mut image.transient, &mut overflow);
+        for peak in &peaks {
+            if !one::add(peak, &settings.gate, &mut image.transient) {
+                overflow.energy += f64::from(peak.value);
+            }
+            for &channel in &film.of_spot[peak.spot] {
+                let group = &mut image.groups[usize::from(channel) - 1];
+                one::add(peak, &settings.gate, group);
+            }
+        }
         rays += stack.rays;
     }
     let inside: f64 = image.transient.iter().map(|&v| f64::from(v)).sum();
@@ -131,7 +149,9 @@ pub fn render(
             two_se: s.two_se,
             multi: s.multi,
             multi_se: s.multi_se,
+            multi_noise: s.multi_noise,
         }),
+        groups: image.groups,
         truth,
         spots,
         overflow,
@@ -139,6 +159,31 @@ pub fn render(
         plan,
         rays: rays + centres.rays + photo_rays,
     })
+}
+
+/// The channels beyond 0 that each emitter's light goes to.
+fn groups_of(
+    settings: &Settings,
+    emitters: &Emitters,
+    beams: usize,
+) -> Result<Vec<Vec<u16>>, RenderError> {
+    for (g, group) in settings.groups.iter().enumerate() {
+        if let Some(beam) = group.iter().find(|&&b| b as usize >= beams) {
+            return Err(RenderError::Invalid {
+                field: format!("groups[{g}]"),
+                what: format!("names beam {beam}, but the laser has {beams}, counted from 0"),
+            });
+        }
+    }
+    let channels = |beam: usize| {
+        let in_group = |g: &Vec<u32>| g.contains(&(beam as u32));
+        (1u16..)
+            .zip(&settings.groups)
+            .filter(|(_, g)| in_group(g))
+            .map(|(c, _)| c)
+            .collect()
+    };
+    Ok(emitters.list.iter().map(|e| channels(e.beam)).collect())
 }
 
 fn check(settings: &Settings) -> Result<(), RenderError> {
@@ -163,6 +208,22 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
     }
     if g.bins == 0 || g.bins > 1 << 20 {
         return bad("gate.bins", format!("is {}, expected 1 to 1048576", g.bins));
+    }
+    if settings
+        .strategy
+        .share
+        .is_some_and(|s| !(1..=16).contains(&s))
+    {
+        return bad(
+            "strategy.share",
+            "expected a tile of 1 to 16 pixels a side".into(),
+        );
+    }
+    if settings.groups.len() > 1024 {
+        return bad(
+            "groups",
+            format!("has {}, expected at most 1024", settings.groups.len()),
+        );
     }
     match settings.budget {
         Budget::Samples(n) if n > MAX_PASSES * 16 => bad(

@@ -1,14 +1,15 @@
-//! Exactly two bounces: stratified sub-pixel samples, each connected to every spot. No random walk.
+//! Exactly two bounces: stratified sub-pixel samples, each connected to every spot, a whole
+//! pixel's samples at once. No random walk.
 
 use picofarm_scene::Vec3;
 
 use crate::{
     emitter::Emitters,
-    film::{Film, Pairs},
+    film::{Blocks, Film},
     rng::Rng,
     truth::Centres,
     walk::{Scratch, Walk},
-    world::World,
+    world::{Hit, World, lift},
 };
 
 /// How finely pixels are sampled.
@@ -27,11 +28,7 @@ impl Sampling {
         // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
         // its width: wider pixels straddle more bins.
         let pixel = 1.0 / i.fx.min(i.fy);
-        let base = std::env::var("E_TWO")
-            .ok()
-            .and_then(|v| v.parse().ok())
-            .unwrap_or(4.0f32)
-            * (pixel * 128.0).sqrt();
+        let base = 4.0 * (pixel * 128.0).sqrt();
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
                 h.surface.specular
@@ -74,57 +71,103 @@ impl Sampling {
     }
 }
 
-/// Adds one pixel's two-bounce samples to `pairs`; returns how many there were.
-pub(crate) fn sample_pixel(
-    walk: &Walk,
-    film: &Film,
-    (row, col, side): (u32, u32, u32),
-    rng: &mut Rng,
-    scratch: &mut Scratch,
-    (pairs, outside): (&mut Pairs, &mut u64),
-) -> u32 {
-    let count = side * side;
-    for stratum in 0..count {
-        let (a, b) = ((stratum % side) as f32, (stratum / side) as f32);
-        let (a, b) = (a + rng.uniform(), b + rng.uniform());
-        let d = walk
-            .world
-            .camera
-            .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
-        let odd = stratum % 2 == 1;
-        let sign = if odd { -1.0 } else { 1.0 };
-        connect(walk, film, (d, sign), scratch, (pairs, outside));
-        if odd {
-            pairs.finish();
-        }
-    }
-    count
+/// Buffers of one thread.
+#[derive(Debug, Default)]
+pub(crate) struct Strata {
+    hits: Vec<Option<Hit>>,
+    /// Places of the hits, lifted off the surface.
+    lifted: Vec<Vec3>,
+    range_m: Vec<f64>,
+    /// `[stratum][spot]`.
+    weights: Vec<f32>,
+    ends: Vec<Vec3>,
+    ends_of: Vec<usize>,
+    blocked: Vec<bool>,
+    /// `[stratum][spot]`: slot, and value where the spot is seen.
+    found: Vec<(u32, f32)>,
 }
 
-fn connect(
-    walk: &Walk,
-    film: &Film,
-    (d, sign): (Vec3, f32),
-    scratch: &mut Scratch,
-    (pairs, outside): (&mut Pairs, &mut u64),
-) {
-    let (world, emitters) = (walk.world, walk.emitters);
-    let Scratch { stack, weights, .. } = scratch;
-    let Some(h) = world.closest(stack, Vec3::ZERO, d) else {
-        return;
-    };
-    if h.surface.strength == 0.0 {
-        return;
-    }
-    let range = h.p.length();
-    emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
-    let to_camera = world.metres(range);
-    for (spot, (e, &w)) in emitters.list.iter().zip(weights.iter()).enumerate() {
-        if w > 0.0 && world.free(stack, h.p, h.n, e.p, e.n) {
-            let path = e.path_m + world.metres((e.p - h.p).length()) + to_camera;
-            let slot = film.slot(path);
-            *outside += u64::from(film.outside(slot));
-            pairs.add(film, slot, w, sign, spot);
+impl Strata {
+    /// Adds one pixel's two-bounce samples to `blocks`; returns how many there were. `side` is even.
+    pub fn sample_pixel(
+        &mut self,
+        walk: &Walk,
+        film: &Film,
+        (row, col, side): (u32, u32, u32),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+        blocks: &mut Blocks,
+    ) -> u32 {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let (count, spots) = ((side * side) as usize, emitters.list.len());
+        self.hits.clear();
+        self.lifted.clear();
+        self.range_m.clear();
+        self.weights.clear();
+        self.weights.resize(count * spots, 0.0);
+        self.found.clear();
+        self.found.resize(count * spots, (0, 0.0));
+        for (stratum, weights) in self.weights.chunks_mut(spots).enumerate() {
+            // Four in a row are a block: two above, two below.
+            let (block, corner) = (stratum as u32 / 4, stratum as u32 % 4);
+            let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
+            let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
+            let d = world
+                .camera
+                .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
+            let hit = world
+                .closest(&mut scratch.stack, Vec3::ZERO, d)
+                .filter(|h| h.surface.strength > 0.0);
+            let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
+                let range = h.p.length();
+                emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
+                (lift(h.p, h.n), range)
+            });
+            self.hits.push(hit);
+            self.lifted.push(lifted);
+            self.range_m.push(world.metres(range));
         }
+        for (spot, e) in emitters.list.iter().enumerate() {
+            self.ends.clear();
+            self.ends_of.clear();
+            for stratum in 0..count {
+                if self.weights[stratum * spots + spot] > 0.0 {
+                    self.ends.push(self.lifted[stratum]);
+                    self.ends_of.push(stratum);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            world.bvh.occluded_bundle(
+                &mut scratch.stack,
+                emitters.lifted[spot],
+                &self.ends,
+                &mut self.blocked,
+            );
+            for (&stratum, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                let hit = self.hits[stratum].as_ref().filter(|_| !blocked);
+                if let Some(h) = hit {
+                    let leg = world.metres((e.p - h.p).length());
+                    let slot = film.slot(e.path_m + leg + self.range_m[stratum]);
+                    let at = stratum * spots + spot;
+                    self.found[at] = (slot as u32, self.weights[at]);
+                }
+            }
+        }
+        for (stratum, found) in self.found.chunks(spots).enumerate() {
+            let sign = if matches!(stratum % 4, 0 | 3) {
+                1.0
+            } else {
+                -1.0
+            };
+            for (spot, &(slot, value)) in found.iter().enumerate() {
+                if value > 0.0 {
+                    blocks.add(film, slot as usize, value, sign, spot);
+                }
+            }
+            if stratum % 4 == 3 {
+                blocks.finish();
+            }
+        }
+        count as u32
     }
 }

@@ -25,6 +25,8 @@ pub(crate) struct Walk<'a> {
     pub gate: &'a Gate,
     /// Longest path in bounces.
     pub max_bounces: u32,
+    /// Walks connect to light vertices.
+    pub lights: bool,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
 }
@@ -108,7 +110,11 @@ impl Walk<'_> {
 
     /// Settles a surface of several lobes on one of them.
     #[inline]
-    pub fn choose_lobe(&self, _rng: &mut Rng, _hit: &mut Hit) {}
+    pub fn choose_lobe(&self, rng: &mut Rng, hit: &mut Hit) {
+        if hit.surface.base > 0.0 {
+            hit.surface = hit.surface.lobe(rng.uniform());
+        }
+    }
 
     /// Walks on from a vertex: everything beyond it except its own connection to the spots.
     pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
@@ -139,15 +145,26 @@ impl Walk<'_> {
         stack: &mut Stack,
     ) -> Option<(Step, Vertex)> {
         let h = v.hit;
-        let (w, weight, pdf) = h.surface.sample(h.n, v.wo, rng)?;
-        let mut beta = v.beta * weight;
+        let (w, mut weight, pdf) = h.surface.sample(h.n, v.wo, rng)?;
         if roulette {
-            let survive = (SURVIVAL * beta).min(0.95);
+            let survive = (SURVIVAL * v.beta * weight).min(0.95);
             if rng.uniform() >= survive {
                 return None;
             }
-            beta /= survive;
+            weight /= survive;
         }
+        self.follow(v, (w, weight, pdf), aimed, stack)
+    }
+
+    /// One step in a given direction: (direction, f·cos/pdf, pdf per steradian).
+    pub fn follow(
+        &self,
+        v: &Vertex,
+        (w, weight, pdf): (Vec3, f32, f32),
+        aimed: f32,
+        stack: &mut Stack,
+    ) -> Option<(Step, Vertex)> {
+        let h = v.hit;
         let hit = self.world.closest(stack, lift(h.p, h.n), w)?;
         let step = Step {
             p: h.p,
@@ -158,7 +175,7 @@ impl Walk<'_> {
         let next = Vertex {
             hit,
             wo: -w,
-            beta,
+            beta: v.beta * weight,
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
         };
@@ -215,6 +232,9 @@ impl Walk<'_> {
                     }
                 }
             }
+            return;
+        }
+        if !self.lights {
             return;
         }
         let back = step.p - h.p;
@@ -287,6 +307,9 @@ impl Walk<'_> {
 
     /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
     fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
+        if !self.lights {
+            return;
+        }
         let h = &v.hit;
         let Scratch {
             stack,

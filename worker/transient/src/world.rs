@@ -2,7 +2,9 @@
 //! origin and lengths scaled by a power of two so that the scene is a few units wide. That makes every
 //! offset scale-aware and results follow the physical law whatever the scene's size and place.
 
-use picofarm_scene::{Camera, Scene, Vec3};
+use std::sync::Arc;
+
+use picofarm_scene::{Camera, Material, Scene, Texture, Vec3};
 
 use crate::{
     bsdf::Surface,
@@ -24,10 +26,15 @@ pub(crate) struct World {
     pub object: Vec<u32>,
     /// Scattering by surface index.
     pub surfaces: Vec<Surface>,
+    /// Index into `surfaces` of every object's first material.
+    pub first_surface: Vec<u32>,
     /// Material index in its mesh, by surface index.
     pub material: Vec<u32>,
     /// Linear RGB albedo by surface index.
     pub rgb: Vec<[f32; 3]>,
+    /// Textures by surface index, and texture coordinates of every triangle; empty without textures.
+    textures: Vec<Option<Arc<Texture>>>,
+    uv: Vec<[[f32; 2]; 3]>,
     /// Laser position, render units.
     pub laser: Vec3,
     /// Render units per metre: a power of two.
@@ -56,12 +63,20 @@ impl World {
         let centre = wide(origin);
         let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
         let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
+        let textured = |m: &Material| m.texture.is_some();
+        let textured = scene
+            .objects
+            .iter()
+            .any(|o| o.mesh.materials.iter().any(textured));
+        let (mut textures, mut uv, mut first_surface) = (vec![], vec![], vec![]);
         for (index, o) in scene.objects.iter().enumerate() {
             let first = surfaces.len() as u32;
+            first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
                 surfaces.push(Surface::new(m));
                 material.push(k as u32);
                 rgb.push(m.rgb);
+                textures.push(m.texture.clone());
             }
             let rows = o.to_world.linear.map(wide);
             let shift = wide(o.to_world.translation);
@@ -75,6 +90,9 @@ impl World {
             let placed: Vec<[f64; 3]> = o.mesh.positions.iter().map(|&p| place(p)).collect();
             for (t, &m) in o.mesh.triangles.iter().zip(&o.mesh.triangle_material) {
                 points.push(t.map(|v| placed[v as usize]));
+                if textured {
+                    uv.push(t.map(|v| o.mesh.uv.get(v as usize).copied().unwrap_or_default()));
+                }
                 surface.push(first + m);
                 object.push(index as u32);
             }
@@ -100,8 +118,11 @@ impl World {
             surface,
             object,
             surfaces,
+            first_surface,
             material,
             rgb,
+            textures: if textured { textures } else { vec![] },
+            uv,
             laser: (scene.laser.origin - origin) * scale,
             scale,
             camera: scene.camera,
@@ -131,9 +152,13 @@ impl World {
         let i = id as usize;
         let geometric = self.normals[i];
         let front = geometric.dot(direction) <= 0.0;
-        let surface = self.surfaces[self.surface[i] as usize];
+        let p = point(&self.triangles[i], origin, direction);
+        let mut surface = self.surfaces[self.surface[i] as usize];
+        if let Some(texel) = self.texel(id, p) {
+            surface = surface.scaled((texel[0] + texel[1] + texel[2]) / 3.0);
+        }
         Some(Hit {
-            p: point(&self.triangles[i], origin, direction),
+            p,
             n: if front { geometric } else { -geometric },
             triangle: id,
             surface: if front || surface.two_sided {
@@ -142,6 +167,31 @@ impl World {
                 surface.black()
             },
         })
+    }
+
+    /// The texture's colour at a point of a triangle; `None` without a texture.
+    #[inline]
+    fn texel(&self, triangle: u32, p: Vec3) -> Option<[f32; 3]> {
+        let i = triangle as usize;
+        let texture = self.textures.get(self.surface[i] as usize)?.as_ref()?;
+        let [a, b, c] = self.triangles[i];
+        let n = self.normals[i];
+        let area = |a: Vec3, b: Vec3| n.dot((a - p).cross(b - p));
+        let (u, v, w) = (area(b, c), area(c, a), area(a, b));
+        let whole = 1.0 / (u + v + w);
+        let (u, v, w) = (u * whole, v * whole, w * whole);
+        let [a, b, c] = self.uv[i];
+        let at = |k: usize| a[k] * u + b[k] * v + c[k] * w;
+        Some(texture.at([at(0), at(1)]))
+    }
+
+    /// Linear RGB albedo at a hit.
+    pub fn albedo(&self, h: &Hit) -> [f32; 3] {
+        let rgb = self.rgb[self.surface[h.triangle as usize] as usize];
+        match self.texel(h.triangle, h.p) {
+            Some(texel) => std::array::from_fn(|k| rgb[k] * texel[k]),
+            None => rgb,
+        }
     }
 
     /// Where the line from `origin` along `direction` meets the plane of a triangle.

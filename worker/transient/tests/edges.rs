@@ -27,7 +27,7 @@ fn an_empty_scene_renders_to_nothing() {
     assert!(r.truth.depth.iter().all(|&d| d == 0.0));
     assert!(r.truth.instance.iter().all(|&i| i == 0));
     assert_eq!(r.truth.visibility.len(), 16);
-    assert_eq!(r.overflow.count, 0);
+    assert_eq!(r.overflow.energy, 0.0);
     assert_eq!(r.error.median_relative, 0.0);
 }
 
@@ -141,10 +141,10 @@ fn what_falls_outside_the_gate_is_counted_and_never_clipped() {
             bin_width_m: 0.05,
             bins: 80,
         },
-        ..whole
+        ..whole.clone()
     };
     let (all, some) = (ok(&s, &whole), ok(&s, &narrow));
-    assert!(some.overflow.count > 0 && all.overflow.share < 1e-3);
+    assert!(some.overflow.energy > 0.0 && all.overflow.share < 1e-3);
     // Two bounces use the same random numbers in both renders.
     let (a, b) = (all.split.unwrap(), some.split.unwrap());
     for k in 0..64 {

@@ -168,24 +168,18 @@ fn the_histogram_of_many_spots_is_the_sum_of_their_own() {
                 &one,
                 &Settings {
                     budget: Budget::Samples(64),
-                    ..set
+                    ..set.clone()
                 },
             );
             let s = r.split.unwrap();
             two += energy(&s.two);
             multi += energy(&s.multi);
-            variance += s
-                .multi_se
-                .iter()
-                .map(|&e| f64::from(e).powi(2))
-                .sum::<f64>();
+            variance +=
+                (f64::from(r.error.total_relative) * (energy(&s.two) + energy(&s.multi))).powi(2);
             peaks += energy(&r.transient) - energy(&s.two) - energy(&s.multi);
         }
-        variance += whole
-            .multi_se
-            .iter()
-            .map(|&e| f64::from(e).powi(2))
-            .sum::<f64>();
+        let all = energy(&whole.two) + energy(&whole.multi);
+        variance += (f64::from(together.error.total_relative) * all).powi(2);
         let one = energy(&together.transient) - energy(&whole.two) - energy(&whole.multi);
         assert!((one / peaks - 1.0).abs() < 1e-4, "{one} {peaks}");
         assert!((energy(&whole.two) / two - 1.0).abs() < 0.01);
@@ -212,7 +206,7 @@ fn scenes_scaled_and_moved_obey_the_physical_law() {
             spot.point = spot.point * scale;
             spot.path_m *= scale;
         }
-        let mut scaled = set;
+        let mut scaled = set.clone();
         scaled.gate.start_m *= f64::from(scale);
         scaled.gate.bin_width_m *= f64::from(scale);
         let r = ok(&s, &scaled);

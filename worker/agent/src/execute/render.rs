@@ -8,7 +8,9 @@ use picofarm_proto::{
     model::{Budget, JobSpec},
 };
 use picofarm_scene::{AssetLibrary, Camera, Scene};
-use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
+use picofarm_transient::{
+    Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings, Strategy,
+};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tracing::debug;
@@ -147,6 +149,8 @@ fn settings(spec: &JobSpec, key: &TaskKey) -> Settings {
         one_bounce: true,
         seed: u64::from_le_bytes(head),
         split: false,
+        groups: vec![],
+        strategy: Strategy::default(),
     }
 }
 

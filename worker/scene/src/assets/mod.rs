@@ -3,6 +3,7 @@
 mod catalogue;
 mod category;
 mod devices;
+mod folder;
 mod install;
 mod obj;
 mod parametric;
@@ -25,8 +26,12 @@ pub use install::install;
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";
+/// Name of the library of a folder of glTF models.
+const GLTF: &str = "gltf";
 /// Name of the library of Sweet Home 3D's furniture.
 const SWEETHOME3D: &str = "sweethome3d";
+
+const INSTALL: &str = "run `picofarm assets install`";
 
 /// Where a model comes from.
 #[derive(Debug, Clone)]
@@ -35,6 +40,8 @@ enum Recipe {
     Built(parametric::Build, u64),
     /// An entry of a furniture library.
     Stored(Arc<Archive>, Item),
+    /// A row of a folder's list.
+    File(folder::Row),
 }
 
 /// A model ready for use, and what was changed to make it so.
@@ -104,6 +111,7 @@ impl AssetLibrary {
             return Err(SceneError::Assets {
                 name: SWEETHOME3D.into(),
                 looked: format!("no .sh3f file in {}", dir.display()),
+                mend: INSTALL,
             });
         }
         let (mut assets, mut hash, mut newest) = (Vec::new(), Sha256::new(), String::new());
@@ -127,8 +135,34 @@ impl AssetLibrary {
         Ok(Self::new(SWEETHOME3D, fingerprint, assets))
     }
 
-    /// The library called `name` (`parametric` or `sweethome3d`). Files are looked for in each of `dirs`
-    /// and its subfolder `sweethome3d`, then where Debian installs them.
+    /// A folder of `.glb` models and the list of them, `assets.csv`, with a line `path,label,up,front,scale` and
+    /// one for each model: its file in the folder, a name of [`crate::LABELS`], the axes that point up and to the
+    /// front (`x`, `-x`, … `-z`), and metres per unit. Columns `name`, `elevation` (metres over the floor, of what
+    /// hangs) and `attribution` may follow; any order of columns will do. Each model is read when first needed;
+    /// those that cannot be read or have more than 100,000 triangles are left out.
+    ///
+    /// The fingerprint covers the list, and of every model its length and its first and last 64 KiB.
+    ///
+    /// # Errors
+    /// [`SceneError::Assets`] if the folder has no list, [`SceneError::Read`] for a file that cannot be read,
+    /// [`SceneError::Format`] naming file, line and column otherwise.
+    pub fn gltf(dir: &Path) -> Result<Self, SceneError> {
+        let list = folder::open(dir)?;
+        let assets = list.rows.into_iter().map(|row| Asset {
+            name: row.name.clone(),
+            label: row.label,
+            elevation: row.elevation,
+            attribution: row.attribution.clone(),
+            size: None,
+            recipe: Recipe::File(row),
+            loaded: OnceLock::new(),
+        });
+        let fingerprint = format!("{GLTF}:{}", list.digest);
+        Ok(Self::new(GLTF, fingerprint, assets.collect()))
+    }
+
+    /// The library called `name` (`parametric`, `sweethome3d` or `gltf`). Files are looked for in each of `dirs`
+    /// and its subfolder of the library's name; those of Sweet Home 3D also where Debian installs them.
     ///
     /// # Errors
     /// [`SceneError::Assets`] if its files are in none of the folders, [`SceneError::Invalid`] for a
@@ -157,13 +191,33 @@ impl AssetLibrary {
                     None => Err(SceneError::Assets {
                         name: name.into(),
                         looked: format!("no .sh3f file in {folders:?}"),
+                        mend: INSTALL,
                     }),
                 }
+            }
+            GLTF => {
+                let folders: Vec<PathBuf> = dirs
+                    .iter()
+                    .flat_map(|d| [d.join(GLTF), d.clone()])
+                    .collect();
+                let found = folders.iter().find(|d| d.join(folder::LIST).is_file());
+                found.map_or_else(
+                    || {
+                        Err(SceneError::Assets {
+                            name: name.into(),
+                            looked: format!("no {} in {folders:?}", folder::LIST),
+                            mend: folder::WRITE,
+                        })
+                    },
+                    |folder| Self::gltf(folder),
+                )
             }
             other => Err(SceneError::Invalid {
                 scene: "assets".into(),
                 field: "assets".into(),
-                what: format!("{other:?} is not known; use \"parametric\" or \"{SWEETHOME3D}\""),
+                what: format!(
+                    "{other:?} is not known; use \"parametric\", \"{SWEETHOME3D}\" or \"{GLTF}\""
+                ),
             }),
         }
     }
@@ -250,6 +304,10 @@ impl Asset {
                 Recipe::Stored(archive, item) => {
                     let l = obj::load(archive, item)?;
                     (l.mesh, l.made_opaque, l.untextured)
+                }
+                Recipe::File(row) => {
+                    let (mesh, made_opaque) = folder::load(row)?;
+                    (mesh, made_opaque, false)
                 }
             };
             Some(Loaded {

@@ -128,7 +128,7 @@ fn stretch(mesh: &mut Mesh, size: [f32; 3]) -> Result<(), String> {
     Ok(())
 }
 
-fn drop_degenerate(mesh: &mut Mesh) {
+pub(super) fn drop_degenerate(mesh: &mut Mesh) {
     let keep: Vec<bool> = mesh
         .triangles
         .iter()

@@ -9,10 +9,10 @@ use crate::{
     extras::{FORMAT, Keyed, MaterialExtras, NodeExtras, SceneExtras, metallic_roughness},
 };
 
-const COMPONENT_F32: u32 = 5126;
-const COMPONENT_U32: u32 = 5125;
-const TARGET_VERTICES: u32 = 34962;
-const TARGET_INDICES: u32 = 34963;
+use super::{
+    binary::{Accessor, Binary, BufferView},
+    textures::{ImageEntry, SamplerEntry, TextureEntry, TextureInfo, Textures},
+};
 
 /// glTF 2.0's top level, as far as we write it. Field order is the order on disk.
 #[derive(Debug, Serialize)]
@@ -27,6 +27,12 @@ pub(super) struct Document {
     meshes: Vec<MeshEntry>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     materials: Vec<MaterialEntry>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    textures: Vec<TextureEntry>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    samplers: Vec<SamplerEntry>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    images: Vec<ImageEntry>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     accessors: Vec<Accessor>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -93,6 +99,8 @@ struct Primitive {
 struct Attributes {
     #[serde(rename = "POSITION")]
     position: usize,
+    #[serde(rename = "TEXCOORD_0", skip_serializing_if = "Option::is_none")]
+    coordinates: Option<usize>,
 }
 
 #[derive(Debug, Serialize)]
@@ -108,30 +116,10 @@ struct MaterialEntry {
 #[serde(rename_all = "camelCase")]
 struct Pbr {
     base_color_factor: [f32; 4],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    base_color_texture: Option<TextureInfo>,
     metallic_factor: f32,
     roughness_factor: f32,
-}
-
-#[derive(Debug, Serialize)]
-#[serde(rename_all = "camelCase")]
-struct Accessor {
-    buffer_view: usize,
-    component_type: u32,
-    count: usize,
-    r#type: &'static str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    min: Option<Vec3>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    max: Option<Vec3>,
-}
-
-#[derive(Debug, Serialize)]
-#[serde(rename_all = "camelCase")]
-struct BufferView {
-    buffer: u32,
-    byte_offset: usize,
-    byte_length: usize,
-    target: u32,
 }
 
 #[derive(Debug, Serialize)]
@@ -140,73 +128,20 @@ struct Buffer {
     byte_length: usize,
 }
 
-/// Accessors and the binary chunk while they grow.
-#[derive(Debug, Default)]
-struct Binary {
-    bytes: Vec<u8>,
-    views: Vec<BufferView>,
-    accessors: Vec<Accessor>,
-}
-
-impl Binary {
-    fn push(
-        &mut self,
-        words: impl Iterator<Item = [u8; 4]>,
-        target: u32,
-        accessor: Accessor,
-    ) -> usize {
-        let start = self.bytes.len();
-        self.bytes.extend(words.flatten());
-        self.views.push(BufferView {
-            buffer: 0,
-            byte_offset: start,
-            byte_length: self.bytes.len() - start,
-            target,
-        });
-        self.accessors.push(accessor);
-        self.accessors.len() - 1
-    }
-
-    fn positions(&mut self, mesh: &Mesh) -> usize {
-        let (min, max) = mesh.bounds().unzip();
-        let accessor = Accessor {
-            buffer_view: self.views.len(),
-            component_type: COMPONENT_F32,
-            count: mesh.positions.len(),
-            r#type: "VEC3",
-            min,
-            max,
-        };
-        let words = mesh.positions.iter().flat_map(|p| [p.x, p.y, p.z]);
-        self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
-    }
-
-    fn indices(&mut self, triangles: &[[u32; 3]]) -> usize {
-        let accessor = Accessor {
-            buffer_view: self.views.len(),
-            component_type: COMPONENT_U32,
-            count: triangles.len() * 3,
-            r#type: "SCALAR",
-            min: None,
-            max: None,
-        };
-        let words = triangles.iter().flatten().map(|v| v.to_le_bytes());
-        self.push(words, TARGET_INDICES, accessor)
-    }
-}
-
 impl Document {
     /// The document and its binary chunk; `mesh_of[i]` is the mesh of object i.
     pub(super) fn new(scene: &Scene, meshes: &[Arc<Mesh>], mesh_of: &[usize]) -> (Self, Vec<u8>) {
         let mut binary = Binary::default();
+        let mut textures = Textures::default();
         let mut materials: Vec<MaterialEntry> = Vec::new();
-        let mesh_entries = meshes
+        let mesh_entries: Vec<MeshEntry> = meshes
             .iter()
             .map(|mesh| {
                 let mut grouped = Mesh::clone(mesh);
                 grouped.make_canonical();
                 let base = materials.len();
-                materials.extend(grouped.materials.iter().map(material_entry));
+                let entries = grouped.materials.iter();
+                materials.extend(entries.map(|m| material_entry(m, &mut textures)));
                 MeshEntry {
                     name: grouped.name.clone(),
                     primitives: primitives(&grouped, base, &mut binary),
@@ -232,6 +167,7 @@ impl Document {
             .collect();
         nodes.push(camera_node(&scene.camera));
 
+        let (images, samplers, textures) = textures.entries(&mut binary);
         let document = Self {
             asset: Asset {
                 version: "2.0",
@@ -250,6 +186,9 @@ impl Document {
             cameras: [camera_entry(&scene.camera)],
             meshes: mesh_entries,
             materials,
+            textures,
+            samplers,
+            images,
             accessors: binary.accessors,
             buffer_views: binary.views,
             buffers: if binary.bytes.is_empty() {
@@ -267,11 +206,15 @@ impl Document {
 /// One primitive a material that is used; all share the mesh's vertices.
 fn primitives(mesh: &Mesh, base: usize, binary: &mut Binary) -> Vec<Primitive> {
     let position = binary.positions(mesh);
+    let coordinates = binary.coordinates(mesh);
     let mut out = Vec::new();
     let mut start = 0;
     for run in mesh.triangle_material.chunk_by(|a, b| a == b) {
         out.push(Primitive {
-            attributes: Attributes { position },
+            attributes: Attributes {
+                position,
+                coordinates,
+            },
             indices: binary.indices(&mesh.triangles[start..start + run.len()]),
             material: base + run[0] as usize,
         });
@@ -291,7 +234,7 @@ fn scene_extras(scene: &Scene) -> SceneExtras {
     }
 }
 
-fn material_entry(material: &Material) -> MaterialEntry {
+fn material_entry(material: &Material, textures: &mut Textures) -> MaterialEntry {
     let (metallic_factor, roughness_factor) = metallic_roughness(material);
     let [r, g, b] = material.rgb;
     MaterialEntry {
@@ -299,6 +242,7 @@ fn material_entry(material: &Material) -> MaterialEntry {
         double_sided: material.two_sided,
         pbr_metallic_roughness: Pbr {
             base_color_factor: [r, g, b, 1.0],
+            base_color_texture: material.texture.as_ref().map(|t| textures.info(t)),
             metallic_factor,
             roughness_factor,
         },

@@ -1,7 +1,11 @@
 //! Writing scenes as canonical `.glb` files: one binary glTF 2.0 file that any viewer opens and that
 //! [`crate::import`] reads back exactly. The same scene gives the same bytes.
 
+mod binary;
 mod document;
+pub(crate) mod mitsuba;
+mod ply;
+mod textures;
 
 use std::{
     io::Write,
@@ -9,8 +13,10 @@ use std::{
     sync::Arc,
 };
 
-use crate::{Mesh, Scene, SceneError};
+use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
+use image::ImageEncoder;
+pub use mitsuba::write_mitsuba;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;
@@ -83,20 +89,55 @@ pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
 /// # Errors
 /// As [`glb_bytes`], and [`SceneError::Write`] naming the file.
 pub fn write_glb(scene: &Scene, path: &Path) -> Result<(), SceneError> {
-    let bytes = glb_bytes(scene)?;
-    let failed = |source| SceneError::Write {
-        path: path.to_path_buf(),
-        source,
-    };
+    write_whole(path, &glb_bytes(scene)?)
+}
+
+/// Writes the whole scene as one PLY mesh in world space, for programs that look at shapes only: faces carry
+/// their sRGB colour and the index of their object (`instance`). Camera, laser, BSDFs and textures are left out.
+///
+/// # Errors
+/// As [`write_glb`]; [`SceneError::Invalid`] also for more than 2³² vertices.
+pub fn write_ply(scene: &Scene, path: &Path) -> Result<(), SceneError> {
+    scene.validate()?;
+    let vertices: usize = scene.objects.iter().map(|o| o.mesh.positions.len()).sum();
+    if u32::try_from(vertices).is_err() {
+        return Err(SceneError::Invalid {
+            scene: scene.name.clone(),
+            field: "ply".into(),
+            what: format!("{vertices} vertices exceed the 2³² of a PLY; use fewer"),
+        });
+    }
+    write_whole(path, &ply::scene_bytes(scene))
+}
+
+/// Writes a file so that it appears whole or not at all.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(format!(".{}.partial", std::process::id()));
     let partial: PathBuf = path.with_file_name(name);
     let written = std::fs::File::create(&partial)
-        .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| std::fs::rename(&partial, path));
     written.map_err(|source| {
         // The partial file is ours alone; the error that matters is the first.
         let _ = std::fs::remove_file(&partial);
-        failed(source)
+        SceneError::Write {
+            path: path.to_path_buf(),
+            source,
+        }
     })
+}
+
+/// A texture as 8-bit RGB PNG.
+fn png(texture: &Texture) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut bytes)
+        .write_image(
+            texture.texels().as_flattened(),
+            texture.width(),
+            texture.height(),
+            image::ExtendedColorType::Rgb8,
+        )
+        .expect("memory takes every image whose size fits its texels");
+    bytes
 }

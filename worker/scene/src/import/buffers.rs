@@ -10,7 +10,7 @@ use gltf::{
 
 use crate::SceneError;
 
-use super::format_error;
+use super::{format_error, read_file};
 
 /// Bytes of every buffer, by index.
 #[derive(Debug)]
@@ -30,9 +30,7 @@ impl Buffers {
             if let Source::Uri(uri) = source
                 && let Some(file) = buffer_file(path, uri)
             {
-                return std::fs::read(&file)
-                    .map_err(|source| SceneError::Read { path: file, source })
-                    .and_then(|data| checked(path, &at, data, buffer.length()));
+                return read_file(&file).and_then(|data| checked(path, &at, data, buffer.length()));
             }
             let data =
                 gltf::buffer::Data::from_source_and_blob(source, base, &mut blob).map_err(|e| {
@@ -53,6 +51,22 @@ impl Buffers {
     /// A buffer's bytes, for the readers of the `gltf` crate.
     pub(super) fn get(&self, buffer: &gltf::Buffer<'_>) -> Option<&[u8]> {
         self.0.get(buffer.index()).map(Vec::as_slice)
+    }
+
+    /// The bytes of a view.
+    pub(super) fn view(&self, view: &gltf::buffer::View<'_>) -> Result<&[u8], String> {
+        let buffer = self
+            .0
+            .get(view.buffer().index())
+            .map_or(&[][..], Vec::as_slice);
+        let end = view.offset().checked_add(view.length());
+        end.and_then(|end| buffer.get(view.offset()..end)).ok_or_else(|| {
+            format!(
+                "bufferViews[{}] does not fit its buffer of {} bytes; the file is damaged, export it again",
+                view.index(),
+                buffer.len()
+            )
+        })
     }
 
     /// Checks an accessor's type and that it lies inside its view and buffer; the readers of the `gltf`

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use gltf::buffer::Source;
+use gltf::{buffer::Source, image};
 use sha2::{Digest, Sha256};
 
-use super::{buffers::buffer_file, read_file};
+use super::{buffers::buffer_file, is_xml, mitsuba, read_file};
 use crate::SceneError;
 
 /// SHA-256 of a scene's content, hexadecimal. For a file that stands alone (every `.glb` and reference scene of ours)
@@ -16,12 +16,26 @@ use crate::SceneError;
 pub fn fingerprint(path: &Path) -> Result<String, SceneError> {
     let bytes = read_file(path)?;
     let mut hash = Sha256::new_with_prefix(&bytes);
+    if is_xml(&bytes) || bytes.trim_ascii_start().first() == Some(&b'{') {
+        for external in mitsuba::files(path, &bytes) {
+            let data = read_file(&external)?;
+            hash.update(external.file_name().unwrap_or_default().as_encoded_bytes());
+            hash.update((data.len() as u64).to_le_bytes());
+            hash.update(&data);
+        }
+    }
     // Other files, unreadable ones too, stand alone.
     if let Ok(file) = gltf::Gltf::from_slice_without_validation(&bytes) {
-        for buffer in file.document.buffers() {
-            if let Source::Uri(uri) = buffer.source()
-                && let Some(external) = buffer_file(path, uri)
-            {
+        let buffers = file.document.buffers().filter_map(|b| match b.source() {
+            Source::Uri(uri) => Some(uri),
+            Source::Bin => None,
+        });
+        let images = file.document.images().filter_map(|i| match i.source() {
+            image::Source::Uri { uri, .. } => Some(uri),
+            image::Source::View { .. } => None,
+        });
+        for uri in buffers.chain(images) {
+            if let Some(external) = buffer_file(path, uri) {
                 let data = read_file(&external)?;
                 hash.update(uri.as_bytes());
                 hash.update((data.len() as u64).to_le_bytes());

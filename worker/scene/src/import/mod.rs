@@ -3,6 +3,9 @@
 mod buffers;
 mod fingerprint;
 mod gltf_file;
+mod image;
+mod mitsuba;
+mod ply;
 mod reference;
 
 use std::path::Path;
@@ -19,6 +22,8 @@ pub struct ImportOptions {
     pub camera: Option<Camera>,
     /// Use this grid over the camera's view in place of the file's laser.
     pub laser: Option<LaserGrid>,
+    /// Put a camera in front of a lone mesh (PLY) where no camera is stated: 60°, on its +z side, seeing all of it.
+    pub frame: bool,
 }
 
 /// Reads a scene with its own camera and laser; see [`read_scene_with`].
@@ -29,15 +34,16 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
     read_scene_with(path, &ImportOptions::default())
 }
 
-/// Reads a scene by its content: `glTF` magic or a JSON object with `asset` is glTF, a JSON object with
-/// `meshes` and `spots` is a reference scene.
+/// Reads a scene by its content: `glTF` magic or a JSON object with `asset` is glTF, `ply` a lone mesh, XML or a
+/// JSON object with `"type": "scene"` a Mitsuba scene, and a JSON object with `meshes` and `spots` a reference scene.
 ///
-/// A glTF file written by [`crate::export`] comes back exactly. Of other files, metallic materials
-/// (factor ≥ 0.5) become Beckmann conductors with α = roughness², everything else Lambertian with the
-/// base colour; textures, lines and points are left out, with a note in the provenance. Materials
-/// without our extras scatter on both sides. The camera is the first camera node; its image gets
-/// 64 rows (see [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or
-/// `laser_directions` in a node's extras, or from `options`.
+/// Files written by [`crate::export`] come back exactly. Of other glTF files, metals become GGX conductors with
+/// α = roughness², metals in part a mix, everything else Lambertian with the base colour, all two-sided; base
+/// colour textures are read. The camera is the first camera node; its image gets 64 rows (see
+/// [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or `laser_directions` in a node's extras,
+/// or from `options`. Of Mitsuba scenes, a subset is understood (see `ARCHITECTURE.md`); beams are `projector`
+/// emitters of at most 2°. A PLY needs camera and laser from `options`. Whatever a format holds that our scenes do
+/// not is named in the provenance's notes, under keys that start with `import.`.
 ///
 /// # Errors
 /// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Format`]
@@ -46,10 +52,15 @@ pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, Sc
     let bytes = read_file(path)?;
     let mut scene = if bytes.starts_with(b"glTF") {
         gltf_file::read(path, &bytes, options)?
+    } else if ply::is_ply(&bytes) {
+        ply::read(path, &bytes, options)?
+    } else if is_xml(&bytes) {
+        mitsuba::read_xml(path, &bytes, options)?
     } else {
         match sniff(path, &bytes)? {
             Kind::Gltf => gltf_file::read(path, &bytes, options)?,
             Kind::Reference => reference::parse(path, &bytes)?,
+            Kind::Mitsuba => mitsuba::read_dictionary(path, &bytes, options)?,
         }
     };
     if let Some(camera) = options.camera {
@@ -61,9 +72,23 @@ pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, Sc
     validated(path, scene)
 }
 
+/// One glTF file as one mesh in its own frame, with the notes on what was dropped; its numbers are unchecked.
+pub(crate) fn read_model(
+    path: &Path,
+) -> Result<(crate::Mesh, std::collections::BTreeMap<String, String>), SceneError> {
+    gltf_file::read_model(path, &read_file(path)?)
+}
+
 enum Kind {
     Gltf,
     Reference,
+    Mitsuba,
+}
+
+/// True for text that starts like XML.
+fn is_xml(bytes: &[u8]) -> bool {
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    text.trim_ascii_start().first() == Some(&b'<')
 }
 
 fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
@@ -72,26 +97,39 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
         asset: Option<serde::de::IgnoredAny>,
         meshes: Option<serde::de::IgnoredAny>,
         spots: Option<serde::de::IgnoredAny>,
+        r#type: Option<serde_json::Value>,
     }
-    let expected = "expected binary glTF (.glb), glTF JSON (.gltf) or a reference scene (.json)";
-    let keys: Keys = serde_json::from_slice(bytes).map_err(|e| {
-        format_error(
-            path,
-            format!("{expected}, found neither glTF nor JSON: {e}"),
-        )
-    })?;
+    let expected = "expected binary glTF (.glb), glTF JSON (.gltf), a Mitsuba scene (.xml, or its dictionary as \
+                    .json), PLY (.ply) or a reference scene (.json)";
+    let keys: Keys = serde_json::from_slice(bytes)
+        .map_err(|e| format_error(path, format!("{expected}, found none of them: {e}")))?;
     match (keys.asset, keys.meshes, keys.spots) {
+        _ if keys.r#type.is_some_and(|t| t == "scene") => Ok(Kind::Mitsuba),
         (Some(_), _, _) => Ok(Kind::Gltf),
         (None, Some(_), Some(_)) => Ok(Kind::Reference),
         _ => Err(format_error(
             path,
-            format!("{expected}; this JSON has neither `asset` (glTF) nor `meshes` and `spots`"),
+            format!(
+                "{expected}; this JSON has neither `asset` (glTF) nor `meshes` and `spots` (reference) nor \
+                 `\"type\": \"scene\"` (Mitsuba)"
+            ),
         )),
     }
 }
 
+/// Largest file read, bytes.
+const MAX_FILE_BYTES: u64 = 8 << 30;
+
+/// A regular file's bytes: a path inside a scene file may name anything, devices too.
 fn read_file(path: &Path) -> Result<Vec<u8>, SceneError> {
-    std::fs::read(path).map_err(|source| SceneError::Read {
+    let read = || {
+        let about = std::fs::metadata(path)?;
+        if !about.is_file() || about.len() > MAX_FILE_BYTES {
+            return Err(std::io::Error::other("not a file of at most 8 GiB"));
+        }
+        std::fs::read(path)
+    };
+    read().map_err(|source| SceneError::Read {
         path: path.to_path_buf(),
         source,
     })

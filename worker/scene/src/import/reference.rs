@@ -188,6 +188,7 @@ fn mesh(file: &FileMesh) -> Result<Mesh, String> {
         name: file.name.clone(),
         triangle_material: vec![0; triangles.len()],
         positions,
+        uv: Vec::new(),
         triangles,
         materials: vec![material(&file.name, &file.bsdf)?],
     })
@@ -228,6 +229,7 @@ fn material(name: &str, file: &FileBsdf) -> Result<Material, String> {
         name: name.to_owned(),
         bsdf,
         rgb: [grey; 3],
+        texture: None,
         two_sided: false,
     })
 }

@@ -4,331 +4,259 @@
 //! monotonic, so a ray that meets a box meets every box around it, and the tree above the leaves decides
 //! nothing. A bundle may therefore reach the leaves in any way that misses none, as long as each pair of
 //! ray and leaf, and of ray and triangle, is judged by the single ray's operations. Here the nodes are
-//! culled by the pyramid around all rays, eight children at a time.
+//! culled by a [`Pyramid`] around all rays, eight children at a time.
 
 use picofarm_scene::Vec3;
 
 use super::{
-    Bvh, EMPTY, LEAF, Pack,
+    Bvh, EMPTY, LEAF, Stack,
     lanes::Lanes,
-    last_fill, packs,
-    traverse::{inverse, largest, traverse},
-    usable,
+    pyramid::Pyramid,
+    traverse::{inverse, traverse},
 };
 
 /// Rays in a bundle: bits of a mask.
-const MOST: usize = 64;
+pub(super) const MOST: usize = 64;
 /// Fewer rays go singly.
-const FEWEST: usize = 3;
-/// Relative margin of the pyramid: over thirty times the rounding error of a slab test.
-const MARGIN: f32 = 4e-6;
-/// Absolute margin, for numbers that underflow.
-const TINY: f32 = 1e-30;
+const FEWEST: u32 = 3;
 
-/// The class of a ray that is not usable.
-const USELESS: u8 = 6;
+/// One number for each ray.
+type Column = [f32; MOST];
+
+/// Rays from one point whose largest components lie on the same axis with the same sign, ray by ray;
+/// lanes beyond the last ray repeat the first.
+#[derive(Debug, Clone)]
+pub(super) struct Rays {
+    pub o: Vec3,
+    pub count: usize,
+    /// x and y of the shear, and the axis of the largest component.
+    pub axes: [usize; 3],
+    /// The largest component is negative.
+    pub negative: bool,
+    /// Direction: to − from.
+    pub d: [Column; 3],
+    pub inverse: [Column; 3],
+    /// Shear: x, y, z of Woop et al.
+    pub shear: [Column; 3],
+}
+
+/// Working memory for bundles.
+#[derive(Debug, Clone)]
+pub(super) struct Scratch {
+    /// Directions of all rays of a call, whatever their class.
+    all: [Column; 3],
+    rays: Rays,
+}
+
+impl Scratch {
+    pub(super) fn new() -> Self {
+        let zeros = [[0.0; MOST]; 3];
+        Self {
+            all: zeros,
+            rays: Rays {
+                o: Vec3::ZERO,
+                count: 0,
+                axes: [0, 1, 2],
+                negative: false,
+                d: zeros,
+                inverse: zeros,
+                shear: zeros,
+            },
+        }
+    }
+}
 
 /// Answers `occluded` for every segment from `o`; the tree has nodes. `E` has eight lanes.
 #[inline(always)]
 pub(super) fn bundle<E: Lanes, W: Lanes>(
     bvh: &Bvh,
-    stack: &mut [(u32, f32)],
+    stack: &mut Stack,
     o: Vec3,
     to: &[Vec3],
     blocked: &mut [bool],
 ) {
+    let Stack {
+        entries, bundle, ..
+    } = stack;
     for (to, blocked) in to.chunks(MOST).zip(blocked.chunks_mut(MOST)) {
-        // Rays whose largest component is the same, with the same sign, make a bundle.
-        let mut class = [USELESS; MOST];
-        let mut present = 0u32;
-        for (c, &p) in class.iter_mut().zip(to) {
-            let d = p - o;
-            if usable(o, d, 1.0) {
-                let k = largest(d);
-                *c = (2 * k) as u8 + u8::from(d[k] < 0.0);
-            }
-            present |= 1 << *c;
+        let [x, y, z] = &mut bundle.all;
+        for (((x, y), z), p) in x.iter_mut().zip(y).zip(z).zip(to) {
+            (*x, *y, *z) = (p.x - o.x, p.y - o.y, p.z - o.z);
         }
-        if present & (1 << USELESS) != 0 {
-            for (b, _) in blocked.iter_mut().zip(class).filter(|(_, c)| *c == USELESS) {
-                *b = true;
+        let whole = u64::MAX >> (MOST - to.len());
+        let (usable, classes) = classes::<W>(o, &bundle.all, to.len());
+        let mut free = 0;
+        for (class, mask) in classes.into_iter().enumerate() {
+            let mask = mask & usable & whole;
+            if mask == 0 {
+                continue;
             }
-            present &= !(1 << USELESS);
-        }
-        while present != 0 {
-            let c = present.trailing_zeros() as u8;
-            present &= present - 1;
-            let mut index = [0u8; MOST];
-            let mut count = 0;
-            for i in 0..to.len() {
-                index[count & (MOST - 1)] = i as u8;
-                count += usize::from(class[i] == c);
-            }
-            let index = &index[..count];
-            let done = (count >= FEWEST)
-                .then(|| Rays::new::<W>(o, to, index, usize::from(c / 2), c % 2 == 1))
-                .flatten();
-            if let Some(rays) = done {
-                let free = rays.trace::<E, W>(bvh, stack);
-                for (k, &i) in index.iter().enumerate() {
-                    blocked[usize::from(i)] = free >> k & 1 == 0;
-                }
-            } else {
-                for &i in index {
-                    let i = usize::from(i);
-                    blocked[i] = traverse::<E, true>(bvh, stack, o, to[i] - o, 1.0).1 != EMPTY;
+            if mask.count_ones() >= FEWEST {
+                bundle.rays.take(o, &bundle.all, mask, class);
+                if let Some(pyramid) = bundle.rays.prepare::<W>() {
+                    let left = trace::<E, W>(&bundle.rays, &pyramid, bvh, entries);
+                    free |= spread(left, mask);
+                    continue;
                 }
             }
+            let mut rest = mask;
+            while rest != 0 {
+                let i = rest.trailing_zeros() as usize & (MOST - 1);
+                rest &= rest - 1;
+                let d = Vec3::new(bundle.all[0][i], bundle.all[1][i], bundle.all[2][i]);
+                let hit = traverse::<E, true>(bvh, entries, o, d, 1.0).1 != EMPTY;
+                free |= u64::from(!hit) << i;
+            }
+        }
+        for (i, b) in blocked.iter_mut().enumerate() {
+            *b = free >> i & 1 == 0;
         }
     }
 }
 
-/// Rays of one class, ray by ray; lanes beyond the last ray repeat the first.
-struct Rays {
-    o: Vec3,
-    count: usize,
-    /// The largest axis, and the other two in the order of the shear.
-    axes: [usize; 3],
-    negative: bool,
-    inverse: [[f32; MOST]; 3],
-    /// Shear: x, y, z of Woop et al.
-    shear: [[f32; MOST]; 3],
-    /// The pyramid: range of x and of y at unit depth, and the largest depth.
-    slope: [(f32, f32); 2],
-    depth: f32,
+/// Bit k of `bits` goes to the k-th set bit of `mask`.
+#[inline(always)]
+fn spread(mut bits: u64, mut mask: u64) -> u64 {
+    if mask & mask.wrapping_add(1) == 0 {
+        return bits;
+    }
+    let mut out = 0;
+    while mask != 0 {
+        let lowest = mask & mask.wrapping_neg();
+        out |= lowest * (bits & 1);
+        bits >>= 1;
+        mask ^= lowest;
+    }
+    out
+}
+
+/// Which rays are usable (the single ray's rule), and which have their largest component on +x, −x, +y,
+/// −y, +z, −z. Bits from `count` on are arbitrary.
+#[inline(always)]
+fn classes<W: Lanes>(o: Vec3, d: &[Column; 3], count: usize) -> (u64, [u64; 6]) {
+    let zero = W::splat(0.0);
+    let (most, least) = (W::splat(f32::MAX), W::splat(f32::MIN));
+    let sum = W::splat(o.x + o.y + o.z);
+    let (mut usable, mut classes) = (0, [0u64; 6]);
+    for k in (0..count).step_by(W::N) {
+        let (x, y, z) = (
+            W::load(&d[0][k..]),
+            W::load(&d[1][k..]),
+            W::load(&d[2][k..]),
+        );
+        let sum = sum.add(x).add(y).add(z);
+        let dot = x.mul(x).add(y.mul(y)).add(z.mul(z));
+        let good = sum.le(most) & least.le(sum) & dot.gt(zero);
+        usable |= u64::from(good) << k;
+        let ax = x.max(zero.sub(x));
+        let ay = y.max(zero.sub(y));
+        let az = z.max(zero.sub(z));
+        let on_z = ax.le(az) & ay.le(az);
+        let on_y = ax.le(ay) & !on_z;
+        let on_x = !on_z & !on_y & (u32::MAX >> (32 - W::N));
+        let (nx, ny, nz) = (zero.gt(x), zero.gt(y), zero.gt(z));
+        classes[0] |= u64::from(on_x & !nx) << k;
+        classes[1] |= u64::from(on_x & nx) << k;
+        classes[2] |= u64::from(on_y & !ny) << k;
+        classes[3] |= u64::from(on_y & ny) << k;
+        classes[4] |= u64::from(on_z & !nz) << k;
+        classes[5] |= u64::from(on_z & nz) << k;
+    }
+    (usable, classes)
 }
 
 impl Rays {
-    /// `None` where the numbers are so large or small that the pyramid's margins would not hold.
+    /// Takes the rays of `mask`, all of one class.
     #[inline(always)]
-    fn new<W: Lanes>(
-        o: Vec3,
-        to: &[Vec3],
-        index: &[u8],
-        kz: usize,
-        negative: bool,
-    ) -> Option<Self> {
-        let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
-        if negative {
-            std::mem::swap(&mut kx, &mut ky);
+    fn take(&mut self, o: Vec3, all: &[Column; 3], mask: u64, class: usize) {
+        let kz = class / 2;
+        self.o = o;
+        self.negative = class % 2 == 1;
+        self.axes = [(kz + 1) % 3, (kz + 2) % 3, kz];
+        if self.negative {
+            self.axes.swap(0, 1);
         }
-        let mut d = [[0.0f32; MOST]; 3];
-        let padded = index.len().next_multiple_of(W::N);
-        for k in 0..padded {
-            let p = to[usize::from(*index.get(k).unwrap_or(&index[0]))] - o;
-            (d[0][k], d[1][k], d[2][k]) = (p.x, p.y, p.z);
-        }
-        let mut rays = Self {
-            o,
-            count: index.len(),
-            axes: [kx, ky, kz],
-            negative,
-            inverse: [[0.0; MOST]; 3],
-            shear: [[0.0; MOST]; 3],
-            slope: [(0.0, 0.0); 2],
-            depth: 0.0,
-        };
-        for a in 0..3 {
-            for k in 0..padded {
-                rays.inverse[a][k] = inverse(d[a][k]);
+        self.count = mask.count_ones() as usize;
+        if mask & mask.wrapping_add(1) == 0 {
+            for (d, all) in self.d.iter_mut().zip(all) {
+                d.copy_from_slice(all);
             }
-        }
-        for k in 0..padded {
-            rays.shear[0][k] = d[kx][k] / d[kz][k];
-            rays.shear[1][k] = d[ky][k] / d[kz][k];
-            rays.shear[2][k] = 1.0 / d[kz][k];
-        }
-        let range = |a: &[f32; MOST]| {
-            let (mut low, mut high) = (W::load(a), W::load(a));
-            for k in (W::N..padded).step_by(W::N) {
-                low = low.min(W::load(&a[k..]));
-                high = high.max(W::load(&a[k..]));
-            }
-            let (mut l, mut h) = ([0.0f32; 16], [0.0f32; 16]);
-            low.store(&mut l);
-            high.store(&mut h);
-            let low = l[..W::N].iter().fold(f32::INFINITY, |a, &b| a.min(b));
-            (
-                low,
-                h[..W::N].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)),
-            )
-        };
-        let (low, high) = range(&d[kz]);
-        let (near, far) = if negative { (-high, -low) } else { (low, high) };
-        let widest = o.x.abs().max(o.y.abs()).max(o.z.abs()).max(far);
-        if !(near > 1e-9 && widest < 1e9) {
-            return None;
-        }
-        rays.depth = far + far * MARGIN;
-        // Components below 1e-18 count as that in the slab test.
-        let least = 2e-18 / near;
-        for a in 0..2 {
-            let (low, high) = range(&rays.shear[a]);
-            let (low, high) = if negative { (-high, -low) } else { (low, high) };
-            rays.slope[a] = (
-                low - (low.abs() * MARGIN + least),
-                high + (high.abs() * MARGIN + least),
-            );
-        }
-        Some(rays)
-    }
-
-    /// The rays that nothing blocks, as a mask.
-    #[inline(always)]
-    fn trace<E: Lanes, W: Lanes>(&self, bvh: &Bvh, stack: &mut [(u32, f32)]) -> u64 {
-        let [kx, ky, kz] = self.axes;
-        let (near, far) = if self.negative {
-            (3 + kz, kz)
         } else {
-            (kz, 3 + kz)
-        };
-        let sign = E::splat(if self.negative { -1.0 } else { 1.0 });
-        let o = [E::splat(self.o.x), E::splat(self.o.y), E::splat(self.o.z)];
-        let slope = self.slope.map(|(a, b)| (E::splat(a), E::splat(b)));
-        let (zero, tiny) = (E::splat(0.0), E::splat(TINY));
-        let deepest = E::splat(self.depth);
-        let mut free = u64::MAX >> (MOST - self.count);
-        let (mut current, mut depth) = (0u32, 0);
-        loop {
-            let node = &bvh.nodes[current as usize];
-            let from_o = |k: usize, a: usize| E::load(&node.bounds[k]).sub(o[a]);
-            let z0 = from_o(near, kz).mul(sign);
-            let z1 = from_o(far, kz).mul(sign);
-            let mut mask = z0.le(deepest) & zero.sub(tiny).le(z1);
-            let (z0, z1) = (z0.max(zero), z1.min(deepest));
-            for (a, (low, high)) in [kx, ky].into_iter().zip(slope) {
-                let low = z0.mul(low).min(z1.mul(low)).sub(tiny);
-                let high = z0.mul(high).max(z1.mul(high)).add(tiny);
-                mask &= from_o(a, a).le(high) & low.le(from_o(3 + a, a));
+            let mut rest = mask;
+            for k in 0..self.count {
+                let i = rest.trailing_zeros() as usize & (MOST - 1);
+                rest &= rest - 1;
+                self.d[0][k] = all[0][i];
+                self.d[1][k] = all[1][i];
+                self.d[2][k] = all[2][i];
             }
-            while mask != 0 {
-                let i = mask.trailing_zeros() as usize & 7;
-                mask &= mask - 1;
-                let child = node.child[i];
-                if child & LEAF == 0 {
-                    stack[depth].0 = child;
-                    depth += 1;
-                    continue;
-                }
-                let met = self.meet::<W>(&node.bounds, i, free);
-                if met != 0 {
-                    free &= !self.leaf::<E, W>(bvh, child, met);
-                    if free == 0 {
-                        return 0;
-                    }
-                }
-            }
-            if depth == 0 {
-                return free;
-            }
-            depth -= 1;
-            current = stack[depth].0;
         }
     }
 
-    /// Which of the rays `of` meet box `i` of a node: the single ray's slab test, a lane for each ray.
+    /// Works out slopes and shears, and the pyramid: `None` where the numbers are so large or small that
+    /// its margins would not hold.
     #[inline(always)]
-    fn meet<W: Lanes>(&self, bounds: &[[f32; 8]; 6], i: usize, of: u64) -> u64 {
-        let low: [W; 3] = std::array::from_fn(|a| W::splat(bounds[a][i] - self.o[a]));
-        let high: [W; 3] = std::array::from_fn(|a| W::splat(bounds[3 + a][i] - self.o[a]));
-        let slack = W::splat(1.0 + 4.0 * f32::EPSILON);
-        let mut met = 0;
-        for k in (0..self.count).step_by(W::N) {
-            let lanes = of >> k & (u64::MAX >> (64 - W::N));
-            if lanes == 0 {
-                continue;
-            }
-            // Which plane is nearer depends on the sign; as min and max they are the same numbers.
-            let plane = |a: usize| {
-                let inverse = W::load(&self.inverse[a][k..]);
-                let (p, q) = (low[a].mul(inverse), high[a].mul(inverse));
-                (p.min(q), p.max(q))
-            };
-            let ((nx, fx), (ny, fy), (nz, fz)) = (plane(0), plane(1), plane(2));
-            let t0 = nx.max(ny).max(nz.max(W::splat(0.0)));
-            let t1 = fx.min(fy).min(fz).mul(slack).min(W::splat(1.0));
-            met |= (u64::from(t0.le(t1)) & lanes) << k;
+    fn prepare<W: Lanes>(&mut self) -> Option<Pyramid> {
+        let padded = self.count.next_multiple_of(W::N);
+        for d in &mut self.d {
+            let first = d[0];
+            d[self.count..padded].fill(first);
         }
-        met
-    }
-
-    /// Which of the rays `of` meet a triangle of a leaf.
-    #[inline(always)]
-    fn leaf<E: Lanes, W: Lanes>(&self, bvh: &Bvh, leaf: u32, of: u64) -> u64 {
-        let range = packs(leaf);
-        let last = range.end - 1;
-        let mut hit = 0;
-        for p in range {
-            let pack = &bvh.packs[p];
-            let fill = if p == last { last_fill(leaf) } else { 8 };
-            let left = of & !hit;
-            // A register of triangles for each ray, or one of rays for each triangle?
-            if left.count_ones() as usize <= fill * self.count.div_ceil(W::N) {
-                hit |= self.by_ray::<E>(pack, left);
-            } else {
-                hit |= self.by_triangle::<W>(pack, fill, left);
-            }
-        }
-        hit
-    }
-
-    #[inline(always)]
-    fn by_ray<E: Lanes>(&self, pack: &Pack, mut of: u64) -> u64 {
         let [kx, ky, kz] = self.axes;
-        let at = |v: usize, k: usize| E::load(&pack.vertex[3 * v + k]).sub(E::splat(self.o[k]));
-        let vertices = std::array::from_fn(|v| [at(v, kx), at(v, ky), at(v, kz)]);
-        let mut hit = 0;
-        while of != 0 {
-            let k = of.trailing_zeros() as usize & (MOST - 1);
-            of &= of - 1;
-            let shear = std::array::from_fn(|a| E::splat(self.shear[a][k]));
-            hit |= u64::from(meets(&vertices, &shear) != 0) << k;
-        }
-        hit
-    }
-
-    #[inline(always)]
-    fn by_triangle<W: Lanes>(&self, pack: &Pack, fill: usize, of: u64) -> u64 {
-        let mut hit = 0;
-        for lane in 0..fill {
-            let at = |v: usize, k: usize| W::splat(pack.vertex[3 * v + k][lane] - self.o[k]);
-            let vertices = std::array::from_fn(|v| {
-                [
-                    at(v, self.axes[0]),
-                    at(v, self.axes[1]),
-                    at(v, self.axes[2]),
-                ]
-            });
-            for k in (0..self.count).step_by(W::N) {
-                let lanes = (of & !hit) >> k & (u64::MAX >> (64 - W::N));
-                if lanes == 0 {
-                    continue;
+        for k in (0..padded).step_by(W::N) {
+            for (out, d) in self.inverse.iter_mut().zip(&self.d) {
+                for (out, d) in out[k..k + W::N].iter_mut().zip(&d[k..k + W::N]) {
+                    *out = inverse(*d);
                 }
-                let shear = std::array::from_fn(|a| W::load(&self.shear[a][k..]));
-                hit |= (u64::from(meets(&vertices, &shear)) & lanes) << k;
             }
+            let z = W::load(&self.d[kz][k..]);
+            W::load(&self.d[kx][k..])
+                .div(z)
+                .store(&mut self.shear[0][k..]);
+            W::load(&self.d[ky][k..])
+                .div(z)
+                .store(&mut self.shear[1][k..]);
+            W::splat(1.0).div(z).store(&mut self.shear[2][k..]);
         }
-        hit
+        Pyramid::around::<W>(self, padded)
     }
 }
 
-/// The triangle test of the single ray with limit 1: vertices relative to the origin, axes in the order
-/// of the shear.
+/// The rays that nothing blocks, as a mask.
 #[inline(always)]
-fn meets<L: Lanes>(v: &[[L; 3]; 3], [sx, sy, sz]: &[L; 3]) -> u32 {
-    let shear = |p: &[L; 3]| (p[0].sub(sx.mul(p[2])), p[1].sub(sy.mul(p[2])));
-    let ((ax, ay), (bx, by), (cx, cy)) = (shear(&v[0]), shear(&v[1]), shear(&v[2]));
-    let (az, bz, cz) = (v[0][2], v[1][2], v[2][2]);
-    let zero = L::splat(0.0);
-    let u = cx.mul(by).sub(cy.mul(bx));
-    let v = ax.mul(cy).sub(ay.mul(cx));
-    let w = bx.mul(ay).sub(by.mul(ax));
-    let (low, high) = (u.min(v).min(w), u.max(v).max(w));
-    let inside = zero.le(low) | high.le(zero);
-    if inside == 0 {
-        return 0;
+fn trace<E: Lanes, W: Lanes>(
+    rays: &Rays,
+    pyramid: &Pyramid,
+    bvh: &Bvh,
+    stack: &mut [(u32, f32)],
+) -> u64 {
+    let mut free = u64::MAX >> (MOST - rays.count);
+    let (mut current, mut depth) = (0u32, 0);
+    loop {
+        let node = &bvh.nodes[current as usize];
+        let mut mask = pyramid.children::<E>(node);
+        while mask != 0 {
+            let i = mask.trailing_zeros() as usize & 7;
+            mask &= mask - 1;
+            let child = node.child[i];
+            if child & LEAF == 0 {
+                bvh.prefetch::<E>(child);
+                stack[depth].0 = child;
+                depth += 1;
+                continue;
+            }
+            let met = rays.meet::<W>(&node.bounds, i, free);
+            if met != 0 {
+                free &= !rays.leaf::<E, W>(bvh, child, met);
+                if free == 0 {
+                    return 0;
+                }
+            }
+        }
+        if depth == 0 {
+            return free;
+        }
+        depth -= 1;
+        current = stack[depth].0;
     }
-    let det = u.add(v).add(w);
-    let t = sz.mul(u.mul(az).add(v.mul(bz)).add(w.mul(cz))).div(det);
-    inside & det.differs(zero) & t.gt(zero) & t.le(L::splat(1.0))
 }

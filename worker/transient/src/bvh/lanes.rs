@@ -5,6 +5,9 @@
 pub(super) trait Lanes: Copy {
     /// How many lanes: 8 or 16.
     const N: usize;
+    /// Asks for `x` to be brought near; a hint.
+    #[inline(always)]
+    fn prefetch<T>(_x: &T) {}
     fn splat(x: f32) -> Self;
     /// The first `N` of `a`.
     fn load(a: &[f32]) -> Self;
@@ -16,6 +19,10 @@ pub(super) trait Lanes: Copy {
     fn div(self, o: Self) -> Self;
     fn min(self, o: Self) -> Self;
     fn max(self, o: Self) -> Self;
+    /// The least of all lanes, none of which is NaN.
+    fn least(self) -> f32;
+    /// The greatest of all lanes, none of which is NaN.
+    fn greatest(self) -> f32;
     fn le(self, o: Self) -> u32;
     fn gt(self, o: Self) -> u32;
     /// Not equal and neither NaN.
@@ -69,6 +76,14 @@ impl Lanes for [f32; 8] {
     #[inline(always)]
     fn max(self, o: Self) -> Self {
         zip(self, o, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    fn least(self) -> f32 {
+        self.into_iter().fold(f32::INFINITY, f32::min)
+    }
+    #[inline(always)]
+    fn greatest(self) -> f32 {
+        self.into_iter().fold(f32::NEG_INFINITY, f32::max)
     }
     #[inline(always)]
     fn le(self, o: Self) -> u32 {

@@ -7,7 +7,9 @@
 
 mod build;
 mod bundle;
+mod bundle_leaf;
 mod lanes;
+mod pyramid;
 mod simd;
 mod traverse;
 
@@ -24,7 +26,7 @@ struct Node {
 }
 
 /// Eight triangles: vertex components a.xyz, b.xyz, c.xyz; NaN in unused lanes, which never hit.
-#[repr(C, align(32))]
+#[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
 struct Pack {
     vertex: [[f32; 8]; 9],
@@ -74,6 +76,7 @@ pub struct Bvh {
 #[derive(Debug)]
 pub struct Stack {
     entries: Vec<(u32, f32)>,
+    bundle: Box<bundle::Scratch>,
     /// Rays traced with this stack.
     pub rays: u64,
 }
@@ -97,6 +100,7 @@ impl Bvh {
     pub fn stack(&self) -> Stack {
         Stack {
             entries: vec![(0, 0.0); 8 * (self.depth + 2)],
+            bundle: Box::new(bundle::Scratch::new()),
             rays: 0,
         }
     }
@@ -159,6 +163,16 @@ impl Bvh {
             Kernel::Avx512 => simd::bundle_avx512(self, stack, from, to, blocked),
             Kernel::Avx2 => simd::bundle_avx2(self, stack, from, to, blocked),
             Kernel::Portable => simd::bundle_portable(self, stack, from, to, blocked),
+        }
+    }
+
+    /// Brings a child's node or first pack near.
+    #[inline(always)]
+    fn prefetch<L: lanes::Lanes>(&self, child: u32) {
+        if child & LEAF == 0 {
+            L::prefetch(&self.nodes[child as usize]);
+        } else {
+            L::prefetch(&self.packs[packs(child).start]);
         }
     }
 

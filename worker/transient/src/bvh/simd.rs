@@ -2,7 +2,7 @@
 //!
 //! Proof: the intrinsics here need AVX2 ([`native::Eight`]) or AVX-512F ([`native::Sixteen`]) and touch no
 //! memory except unaligned loads and stores of one whole register, from and to slices that are checked
-//! to be that long. The functions `*_avx2` and `*_avx512` are reached only through a
+//! to be that long; a prefetch may name any address. The functions `*_avx2` and `*_avx512` are reached only through a
 //! [`Bvh`](super::Bvh) of that kernel, which `build` and `with_kernel` set only where [`available`] says
 //! so. Features are enabled for these functions alone; everything below is inlined into them.
 #![cfg_attr(
@@ -42,7 +42,7 @@ pub(super) fn any_portable(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> 
 }
 
 pub(super) fn bundle_portable(b: &Bvh, s: &mut Stack, o: Vec3, to: &[Vec3], blocked: &mut [bool]) {
-    bundle::<[f32; 8], [f32; 8]>(b, &mut s.entries, o, to, blocked);
+    bundle::<[f32; 8], [f32; 8]>(b, s, o, to, blocked);
 }
 
 #[cfg(not(target_arch = "x86_64"))]
@@ -98,7 +98,7 @@ mod native {
             ) {
                 #[target_feature(enable = $feature)]
                 fn run(b: &Bvh, s: &mut Stack, o: Vec3, to: &[Vec3], blocked: &mut [bool]) {
-                    bundle::<Eight, $wide>(b, &mut s.entries, o, to, blocked);
+                    bundle::<Eight, $wide>(b, s, o, to, blocked);
                 }
                 // SAFETY: as above.
                 unsafe { run(b, s, o, to, blocked) }
@@ -126,11 +126,18 @@ mod native {
     /// Lanes over one register type. Comparisons are `$compare!(predicate, a, b)`.
     macro_rules! lanes {
         ($t:ident, $n:literal, $splat:ident, $load:ident, $store:ident, $add:ident, $sub:ident,
-         $mul:ident, $div:ident, $min:ident, $max:ident, $compare:ident) => {
+         $mul:ident, $div:ident, $min:ident, $max:ident, $least:ident, $greatest:ident, $compare:ident) => {
             // SAFETY of every block: the instructions exist wherever a value of this type does (module
             // proof), and the slices are as long as a register.
             impl Lanes for $t {
                 const N: usize = $n;
+                #[inline(always)]
+                fn prefetch<T>(x: &T) {
+                    let start = std::ptr::from_ref(x).cast::<i8>();
+                    for line in (0..size_of::<T>()).step_by(64) {
+                        unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(line)) };
+                    }
+                }
                 #[inline(always)]
                 fn splat(x: f32) -> Self {
                     Self(unsafe { $splat(x) })
@@ -170,6 +177,14 @@ mod native {
                     Self(unsafe { $max(self.0, o.0) })
                 }
                 #[inline(always)]
+                fn least(self) -> f32 {
+                    unsafe { $least(self.0) }
+                }
+                #[inline(always)]
+                fn greatest(self) -> f32 {
+                    unsafe { $greatest(self.0) }
+                }
+                #[inline(always)]
                 fn le(self, o: Self) -> u32 {
                     unsafe { $compare!(_CMP_LE_OQ, self.0, o.0) }
                 }
@@ -184,6 +199,21 @@ mod native {
             }
         };
     }
+
+    /// Folds a register in halves.
+    macro_rules! fold8 {
+        ($name:ident, $f:ident) => {
+            #[inline]
+            #[target_feature(enable = "avx2")]
+            fn $name(a: __m256) -> f32 {
+                let a = $f(_mm256_castps256_ps128(a), _mm256_extractf128_ps::<1>(a));
+                let a = $f(a, _mm_movehl_ps(a, a));
+                _mm_cvtss_f32($f(a, _mm_shuffle_ps::<1>(a, a)))
+            }
+        };
+    }
+    fold8!(least8, _mm_min_ps);
+    fold8!(greatest8, _mm_max_ps);
 
     macro_rules! compare8 {
         ($p:ident, $a:expr, $b:expr) => {
@@ -209,6 +239,8 @@ mod native {
         _mm256_div_ps,
         _mm256_min_ps,
         _mm256_max_ps,
+        least8,
+        greatest8,
         compare8
     );
     lanes!(
@@ -223,6 +255,8 @@ mod native {
         _mm512_div_ps,
         _mm512_min_ps,
         _mm512_max_ps,
+        _mm512_reduce_min_ps,
+        _mm512_reduce_max_ps,
         compare16
     );
 }

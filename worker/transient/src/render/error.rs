@@ -1,6 +1,55 @@
 //! From variances to error estimates, and from a pilot to a number of passes.
 
+use super::tile::Region;
 use crate::api::ErrorEstimate;
+
+/// Bins on either side over which the variance of the 3+ part and of the two-bounce part is pooled.
+pub(super) const MULTI_REACH: usize = 3;
+pub(super) const TWO_REACH: usize = 1;
+/// Share of a pixel's mean variance that every bin gets on top.
+const FLOOR: f32 = 0.003;
+
+/// Pools variances in place over 3×3 pixels and a few bins, within a region's `[row][col][slot]`.
+///
+/// A bin that few paths reach has a sample variance that is mostly luck, and often nearly nothing; its
+/// neighbours have nearly the same true variance, and together they know it. The floor stands for paths
+/// that might come and did not. Over many seeds the rms of (h − mean) / error is then 1 within a few
+/// percent, where single sample variances give any number.
+pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: usize) {
+    let (rows, cols) = (region.rows as usize, region.cols as usize);
+    let mut other = vec![0.0f32; variance.len()];
+    // Along the bins.
+    for (out, v) in other.chunks_mut(slots).zip(variance.chunks(slots)) {
+        let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
+        for (k, o) in out.iter_mut().enumerate() {
+            let near = &v[k.saturating_sub(reach)..(k + reach + 1).min(slots)];
+            *o = near.iter().sum::<f32>() / near.len() as f32 + floor;
+        }
+    }
+    // Along rows and columns of pixels.
+    mean_of_three(variance, &other, slots, cols, |k| k / cols * cols);
+    other.copy_from_slice(variance);
+    mean_of_three(variance, &other, slots * cols, rows, |_| 0);
+}
+
+/// out\[k\] = mean of from\[k − 1..=k + 1\], items of `size`, within the `count` items from `first(k)`.
+fn mean_of_three(
+    out: &mut [f32],
+    from: &[f32],
+    size: usize,
+    count: usize,
+    first: impl Fn(usize) -> usize,
+) {
+    for (k, out) in out.chunks_mut(size).enumerate() {
+        let low = (k.max(1) - 1).max(first(k));
+        let high = (k + 1).min(first(k) + count - 1);
+        let share = 1.0 / (high - low + 1) as f32;
+        for (i, o) in out.iter_mut().enumerate() {
+            let sum: f32 = (low..=high).map(|j| from[j * size + i]).sum();
+            *o = sum * share;
+        }
+    }
+}
 
 /// A pixel's sums for the error estimate.
 #[derive(Debug, Clone, Copy, Default)]

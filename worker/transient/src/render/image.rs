@@ -31,6 +31,7 @@ pub(super) struct Parts {
     pub two_se: Vec<f32>,
     pub multi: Vec<f32>,
     pub multi_se: Vec<f32>,
+    pub multi_noise: Vec<f32>,
 }
 
 /// What rounds fill.
@@ -38,13 +39,12 @@ pub(super) struct Parts {
 pub(super) struct Image {
     pub transient: Vec<f32>,
     pub split: Option<Parts>,
+    pub groups: Vec<Vec<f32>>,
     pub stats: Vec<Stat>,
     /// Variance of the image's whole energy.
     pub total_variance: f64,
     /// Energy outside the gate.
     pub overflow: f64,
-    /// Contributions outside the gate.
-    pub outside: u64,
     /// Passes of every tile at least.
     pub passes: u32,
     tiles: Vec<Region>,
@@ -90,7 +90,7 @@ impl<'a> Watch<'a> {
 }
 
 impl Image {
-    pub fn new(frame: &Frame, split: bool) -> Self {
+    pub fn new(frame: &Frame) -> Self {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
@@ -108,16 +108,17 @@ impl Image {
             .collect();
         Self {
             transient: empty(),
-            split: split.then(|| Parts {
+            split: frame.split.then(|| Parts {
                 two: empty(),
                 two_se: empty(),
                 multi: empty(),
                 multi_se: empty(),
+                multi_noise: empty(),
             }),
+            groups: (1..frame.film.channels).map(|_| empty()).collect(),
             stats: vec![Stat::default(); pixels],
             total_variance: 0.0,
             overflow: 0.0,
-            outside: 0,
             passes: 0,
             spent: vec![0; tiles.len()],
             tile_variance: vec![0.0; tiles.len()],
@@ -222,7 +223,15 @@ impl Image {
                     s.two[at] = mean(s.two[at], m.two);
                     s.two_se[at] = error(s.two_se[at], m.two_variance);
                     s.multi[at] = mean(s.multi[at], m.multi);
+                    s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
                     s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
+                }
+            }
+            for (g, group) in self.groups.iter_mut().enumerate() {
+                for bin in 0..bins {
+                    let h = &mut group[pixel * bins + bin];
+                    let x = done.value(film, k, g + 1, bin + 1);
+                    *h = (f64::from(*h) * a + x * unit * b) as f32;
                 }
             }
             let old = self.stats[pixel];
@@ -234,7 +243,6 @@ impl Image {
         }
         self.tile_variance[t] = blend(self.tile_variance[t], done.total_variance() * unit2);
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
-        self.outside += done.outside;
         self.spent[t] += done.passes;
     }
 }

@@ -1,13 +1,13 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{Stat, relative_median};
+use super::error::{MULTI_REACH, Stat, TWO_REACH, pool, relative_median};
 use crate::{
     api::Overflow,
-    film::{Film, Pairs},
+    film::{Blocks, Film},
     rng::{Rng, Stream},
     share::{Effort, Sharing, Tile},
-    two::{self, Sampling},
+    two::{Sampling, Strata},
     walk::{Scratch, Walk},
 };
 
@@ -21,6 +21,8 @@ pub(super) struct Frame<'a> {
     pub seed: u64,
     pub width: u32,
     pub height: u32,
+    /// The parts are wanted.
+    pub split: bool,
 }
 
 /// A rectangle of pixels.
@@ -51,9 +53,12 @@ pub(super) struct Order {
 pub(super) struct Bench {
     scratch: Scratch,
     sharing: Sharing,
-    pairs: Pairs,
+    blocks: Blocks,
+    strata: Strata,
     /// One pass over the pixels that share vertices.
     pass: Vec<f32>,
+    /// The last pass of even number, where the alternating sum is wanted.
+    held: Vec<f32>,
     pub done: Done,
 }
 
@@ -64,8 +69,10 @@ pub(super) struct Done {
     sum: Vec<f32>,
     /// Σ over passes of its square, channel 0.
     square: Vec<f32>,
-    /// Σ over passes of (a pixel's whole pass)².
-    total_square: Vec<f64>,
+    /// Σ over passes with alternating sign, channel 0; empty where not wanted.
+    alternating: Vec<f32>,
+    /// Variance of the mean of the 3+ part, channel 0, pooled.
+    multi_variance: Vec<f32>,
     /// Mean of the two-bounce part.
     two: Vec<f32>,
     /// Variance of that mean, channel 0.
@@ -75,7 +82,6 @@ pub(super) struct Done {
     /// Σ and Σ² over passes of the whole tile.
     all: (f64, f64),
     pub passes: u32,
-    pub outside: u64,
     pub rays: u64,
 }
 
@@ -102,22 +108,23 @@ fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
 }
 
 impl Done {
-    fn reset(&mut self, film: &Film, pixels: usize) {
+    fn reset(&mut self, film: &Film, pixels: usize, split: bool) {
         let zero = |v: &mut Vec<f32>, n: usize| {
             v.clear();
             v.resize(n, 0.0);
         };
         zero(&mut self.sum, pixels * film.pixel());
         zero(&mut self.square, pixels * film.slots);
+        zero(
+            &mut self.alternating,
+            if split { pixels * film.slots } else { 0 },
+        );
         zero(&mut self.two, pixels * film.pixel());
         zero(&mut self.two_variance, pixels * film.slots);
-        for v in [&mut self.total_square, &mut self.two_total_variance] {
-            v.clear();
-            v.resize(pixels, 0.0);
-        }
+        self.two_total_variance.clear();
+        self.two_total_variance.resize(pixels, 0.0);
         self.all = (0.0, 0.0);
         self.passes = 0;
-        self.outside = 0;
     }
 
     /// Two-bounce and 3+ means of any channel's slot of pixel `k`.
@@ -130,14 +137,39 @@ impl Done {
     /// Means and variances of a slot of pixel `k`, channel 0.
     pub fn moments(&self, film: &Film, k: usize, slot: usize) -> Moments {
         let (wide, narrow) = (k * film.pixel() + slot, k * film.slots + slot);
-        let (sum, square) = (f64::from(self.sum[wide]), f64::from(self.square[narrow]));
-        let (multi, multi_variance) = mean(sum, square, f64::from(self.passes));
+        let n = f64::from(self.passes.max(1));
         Moments {
             two: f64::from(self.two[wide]),
             two_variance: f64::from(self.two_variance[narrow]),
-            multi,
-            multi_variance,
+            multi: f64::from(self.sum[wide]) / n,
+            multi_variance: f64::from(self.multi_variance[narrow]),
         }
+    }
+
+    /// A draw of the 3+ part's error in a slot of pixel `k`, channel 0, with what pixels and bins have in
+    /// common; 0 with fewer than two passes.
+    pub fn noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
+        let pairs = f64::from(self.passes / 2 * 2);
+        let x = f64::from(self.alternating[k * film.slots + slot]);
+        // Σ±x over n passes has n times a pass' variance; the mean has 1/n of it.
+        x / (pairs * f64::from(self.passes)).sqrt().max(1.0)
+    }
+
+    /// Brings the variances up to the passes done.
+    fn estimate(&mut self, film: &Film, region: &Region) {
+        let n = f64::from(self.passes);
+        self.multi_variance.clear();
+        for (sum, square) in self
+            .sum
+            .chunks(film.pixel())
+            .zip(self.square.chunks(film.slots))
+        {
+            let both = sum[..film.slots].iter().zip(square);
+            self.multi_variance.extend(
+                both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
+            );
+        }
+        pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
     }
 
     /// What pixel `k` adds to the error estimate.
@@ -183,8 +215,10 @@ impl Bench {
         Self {
             scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
             sharing: Sharing::default(),
-            pairs: Pairs::new(frame.film),
+            blocks: Blocks::new(frame.film),
+            strata: Strata::default(),
             pass: vec![],
+            held: vec![],
             done: Done::default(),
         }
     }
@@ -198,7 +232,8 @@ impl Bench {
         go_on: &dyn Fn() -> bool,
     ) -> Option<()> {
         let rays = self.scratch.stack.rays;
-        self.done.reset(frame.film, region.pixels());
+        self.done.reset(frame.film, region.pixels(), frame.split);
+        self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
         let mut end = order.count;
         while self.done.passes < end {
@@ -212,6 +247,7 @@ impl Bench {
                 && end < most
             {
                 let film = frame.film;
+                self.done.estimate(film, region);
                 let stats = (0..region.pixels()).map(|k| self.done.stat(film, k));
                 let error = relative_median(stats);
                 if error > f64::from(target) {
@@ -221,6 +257,7 @@ impl Bench {
                 }
             }
         }
+        self.done.estimate(frame.film, region);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -256,26 +293,27 @@ impl Bench {
                 index as u64,
                 u64::from(order.first),
             );
-            self.pairs.clear();
-            let strata = two::sample_pixel(
+            self.blocks.clear();
+            let strata = self.strata.sample_pixel(
                 walk,
                 film,
                 (row, col, side),
                 &mut rng,
                 &mut self.scratch,
-                (&mut self.pairs, &mut self.done.outside),
+                &mut self.blocks,
             );
             let n = 1.0 / strata as f32;
             let wide = &mut self.done.two[k * film.pixel()..(k + 1) * film.pixel()];
-            for (out, v) in wide.iter_mut().zip(&self.pairs.sum) {
+            for (out, v) in wide.iter_mut().zip(&self.blocks.sum) {
                 *out = v * n;
             }
             let narrow = &mut self.done.two_variance[k * film.slots..(k + 1) * film.slots];
-            for (out, v) in narrow.iter_mut().zip(&self.pairs.square) {
+            for (out, v) in narrow.iter_mut().zip(&self.blocks.square) {
                 *out = v * n * n;
             }
-            self.done.two_total_variance[k] = self.pairs.total_square * f64::from(n * n);
+            self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
+        pool(&mut self.done.two_variance, region, film.slots, TWO_REACH);
         Some(())
     }
 
@@ -295,7 +333,7 @@ impl Bench {
         };
         let (down, right) = (shift(region.rows), shift(region.cols));
         let cuts = |shift: u32, length: u32| {
-            let starts = (0..length).filter(move |i| *i == 0 || (i + shift) % side == 0);
+            let starts = (0..length).filter(move |i| *i == 0 || (i + shift).is_multiple_of(side));
             starts.map(move |i| (i, (side - (i + shift) % side).min(length - i)))
         };
         let mut all = 0.0f64;
@@ -307,7 +345,6 @@ impl Bench {
                 let tile = Tile {
                     row: region.row + row,
                     col: region.col + col,
-                    rows,
                     cols,
                     width: frame.width,
                     seed: frame.seed,
@@ -318,7 +355,6 @@ impl Bench {
                     &tile,
                     &mut self.scratch,
                     &mut self.pass,
-                    &mut self.done.outside,
                 );
                 for k in 0..count as u32 {
                     let (r, c) = (row + k / cols, col + k % cols);
@@ -341,6 +377,20 @@ impl Bench {
             *sum += v;
         }
         let pass = &pass[..film.slots];
+        if !self.done.alternating.is_empty() {
+            // Held back until its partner comes, so that the sum always has as many of either sign.
+            let odd = self.done.passes % 2 == 1;
+            let range = to * film.slots..(to + 1) * film.slots;
+            let held = &mut self.held[range.clone()];
+            let sum = &mut self.done.alternating[range];
+            for ((sum, held), v) in sum.iter_mut().zip(held).zip(&pass[..film.slots]) {
+                if odd {
+                    *sum += *held - v;
+                } else {
+                    *held = *v;
+                }
+            }
+        }
         let square = &mut self.done.square[to * film.slots..(to + 1) * film.slots];
         // Eight sums side by side: exact enough, and the compiler can keep them in one register.
         let mut totals = [0.0f32; 8];
@@ -353,7 +403,6 @@ impl Bench {
             }
         }
         let total: f64 = totals.iter().map(|&t| f64::from(t)).sum();
-        self.done.total_square[to] += total * total;
         total
     }
 }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use picofarm_scene::{
     Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Vec3,
 };
-use picofarm_transient::{Budget, Gate, Progress, Settings};
+use picofarm_transient::{Budget, Gate, Progress, Settings, Strategy};
 
 /// Lets every render run to its end.
 pub struct Quiet;
@@ -41,6 +41,8 @@ pub fn settings(budget: Budget) -> Settings {
         one_bounce: false,
         seed: 1,
         split: true,
+        groups: vec![],
+        strategy: Strategy::default(),
     }
 }
 
@@ -50,6 +52,7 @@ pub fn grey(reflectance: f32) -> Material {
         name: "grey".into(),
         bsdf: Bsdf::Diffuse { reflectance },
         rgb: [reflectance; 3],
+        texture: None,
         two_sided: true,
     }
 }
@@ -62,6 +65,7 @@ pub fn object(name: &str, positions: Vec<Vec3>, triangles: Vec<[u32; 3]>, m: Mat
             positions,
             triangles,
             materials: vec![m],
+            uv: vec![],
         }),
         to_world: Affine::IDENTITY,
         label: 0,

@@ -80,6 +80,7 @@ fn build(json: &Value) -> Scene {
             name: "reference".into(),
             bsdf: bsdf(&m["bsdf"]),
             rgb: [0.5; 3],
+            texture: None,
             two_sided: false,
         };
         objects.push(object(
@@ -118,14 +119,16 @@ pub struct Report {
     pub ratio: f64,
     /// Standard error of the ratio, both sides counted.
     pub ratio_se: f64,
-    /// Root mean square of z over groups of 8×8 pixels × 13 bins, both variances counted.
+    /// Root mean square of the deviation over groups of 8×8 pixels × 13 bins, in units of its expected
+    /// value, both variances counted.
     pub z_rms: f64,
-    /// Largest |z|.
+    /// Largest deviation in units of the reference's standard error.
     pub z_max: f64,
 }
 
-/// Compares a 64×64×637 part with its standard error with the reference.
-pub fn compare(h: &[f32], se: &[f32], r: &Part) -> Report {
+/// Compares a 64×64×637 part and a draw of its error (`None` = small beside the reference's) with the
+/// reference.
+pub fn compare(h: &[f32], noise: Option<&[f32]>, r: &Part) -> Report {
     let bins = 637;
     let (mut errors, mut noises) = (vec![], vec![]);
     for k in 0..64 * 64 {
@@ -146,7 +149,7 @@ pub fn compare(h: &[f32], se: &[f32], r: &Part) -> Report {
         v.sort_by(f64::total_cmp);
         v[v.len() / 2]
     };
-    let (mut z2, mut z_max, mut groups) = (0.0, 0.0f64, 0u32);
+    let (mut z2, mut expected, mut z_max) = (0.0, 0.0, 0.0f64);
     let (mut sum, mut reference, mut variance) = (0.0, 0.0, 0.0);
     for row in 0..8 {
         for col in 0..8 {
@@ -157,18 +160,19 @@ pub fn compare(h: &[f32], se: &[f32], r: &Part) -> Report {
                     let at = (y * 64 + x) * bins + block * 13;
                     for i in at..at + 13 {
                         d += f64::from(h[i]) - f64::from(r.mean[i]);
-                        own += f64::from(se[i]).powi(2);
+                        own += noise.map_or(0.0, |n| f64::from(n[i]));
                         theirs += f64::from(r.se[i]).powi(2);
                         sum += f64::from(h[i]);
                         reference += f64::from(r.mean[i]);
                     }
                 }
-                variance += own + theirs;
+                // Groups share little: their own errors may be added as independent.
+                variance += own * own + theirs;
                 if theirs > 0.0 {
-                    let z = d / (own + theirs).sqrt();
-                    z2 += z * z;
-                    z_max = z_max.max(z.abs());
-                    groups += 1;
+                    let z2_here = d * d / theirs;
+                    z2 += z2_here;
+                    expected += 1.0 + own * own / theirs;
+                    z_max = z_max.max(z2_here.sqrt());
                 }
             }
         }
@@ -178,7 +182,7 @@ pub fn compare(h: &[f32], se: &[f32], r: &Part) -> Report {
         reference_median: median(&mut noises),
         ratio: sum / reference,
         ratio_se: variance.sqrt() / reference,
-        z_rms: (z2 / f64::from(groups)).sqrt(),
+        z_rms: (z2 / expected).sqrt(),
         z_max,
     }
 }

@@ -1,25 +1,25 @@
 //! glTF 2.0 to scene: node transforms, labels and ids from extras, materials, camera and laser.
 
+mod material;
+mod mesh;
 mod parts;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use gltf::{
-    Gltf, Node,
-    accessor::{DataType, Dimensions},
-    mesh::Mode,
-};
+use gltf::{Gltf, Node};
 use serde::de::DeserializeOwned;
 
 use crate::{
-    Affine, Camera, Mesh, Object, Provenance, Scene, SceneError, Vec3,
+    Affine, Camera, Mesh, Object, Provenance, Scene, SceneError, Vec3, Wrap,
     extras::{FORMAT, Keyed, NodeExtras, SceneExtras},
 };
 
 use parts::laser_of;
 
-use super::{ImportOptions, buffers::Buffers, compose, format_error};
+use super::{ImportOptions, buffers::Buffers, compose, format_error, image::Images};
 
+/// Deepest nesting of nodes.
+const MAX_DEPTH: usize = 1000;
 /// Category of nodes without a `label`.
 const UNLABELLED: &str = "unlabelled";
 
@@ -29,20 +29,8 @@ pub(super) fn read(
     bytes: &[u8],
     options: &ImportOptions,
 ) -> Result<Scene, SceneError> {
-    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
-        format_error(
-            path,
-            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
-        )
-    })?;
-    let buffers = Buffers::read(path, &document, blob)?;
-    let root = document
-        .default_scene()
-        .or_else(|| document.scenes().next())
-        .ok_or_else(|| {
-            format_error(path, "scenes: the file has none; export at least one scene")
-        })?;
-    is_a_forest(path, &document, &root)?;
+    let (document, buffers) = open(path, bytes)?;
+    let root = root(path, &document)?;
     let ours: Option<SceneExtras> = keyed(
         path,
         "scene.extras.picofarm",
@@ -59,20 +47,65 @@ pub(super) fn read(
             ),
         ));
     }
-    let mut walk = Walk {
-        path,
-        buffers: &buffers,
-        meshes: BTreeMap::new(),
-        objects: Vec::new(),
-        labels: ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone()),
-        camera: None,
-        laser: None,
-        notes: BTreeMap::new(),
-    };
-    for node in root.nodes() {
-        walk.node(&node, &Affine::IDENTITY, None)?;
-    }
+    let labels = ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone());
+    let walk = Walk::over(path, &document, &buffers, labels)?;
     walk.finish(&root, ours, options)
+}
+
+/// Reads `.glb` or `.gltf` bytes as one mesh in the file's own frame, with the notes on what was dropped. Cameras
+/// and lasers are not looked for; the caller checks the numbers.
+pub(super) fn read_model(
+    path: &Path,
+    bytes: &[u8],
+) -> Result<(Mesh, BTreeMap<String, String>), SceneError> {
+    let (document, buffers) = open(path, bytes)?;
+    let walk = Walk::over(path, &document, &buffers, Vec::new())?;
+    let mut all = Mesh {
+        name: path
+            .file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into(),
+        ..Mesh::default()
+    };
+    for (_, object) in &walk.objects {
+        let (mesh, base) = (&object.mesh, all.positions.len());
+        let slot = all.materials.len() as u32;
+        let place = |p: &Vec3| object.to_world.point(*p);
+        all.positions.extend(mesh.positions.iter().map(place));
+        if !mesh.uv.is_empty() {
+            all.uv.resize(base, [0.0; 2]);
+            all.uv.extend(&mesh.uv);
+        }
+        if !all.uv.is_empty() {
+            all.uv.resize(all.positions.len(), [0.0; 2]);
+        }
+        let shift = |t: &[u32; 3]| t.map(|v| v + base as u32);
+        all.triangles.extend(mesh.triangles.iter().map(shift));
+        let shift = |m: &u32| m + slot;
+        all.triangle_material
+            .extend(mesh.triangle_material.iter().map(shift));
+        all.materials.extend(mesh.materials.iter().cloned());
+    }
+    Ok((all, walk.notes))
+}
+
+fn open(path: &Path, bytes: &[u8]) -> Result<(gltf::Document, Buffers), SceneError> {
+    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
+        format_error(
+            path,
+            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
+        )
+    })?;
+    let buffers = Buffers::read(path, &document, blob)?;
+    Ok((document, buffers))
+}
+
+fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>, SceneError> {
+    document
+        .default_scene()
+        .or_else(|| document.scenes().next())
+        .ok_or_else(|| format_error(path, "scenes: the file has none; export at least one scene"))
 }
 
 /// Every node has one parent at most, and the scene's own nodes have none; otherwise a walk might not end.
@@ -123,6 +156,7 @@ fn keyed<T: DeserializeOwned>(
 struct Walk<'a> {
     path: &'a Path,
     buffers: &'a Buffers,
+    images: Images<(usize, Wrap)>,
     meshes: BTreeMap<usize, Option<Arc<Mesh>>>,
     objects: Vec<(Option<u32>, Object)>,
     labels: Vec<String>,
@@ -131,13 +165,45 @@ struct Walk<'a> {
     notes: BTreeMap<String, String>,
 }
 
-impl Walk<'_> {
+impl<'a> Walk<'a> {
+    /// Everything that the document's scene places.
+    fn over(
+        path: &'a Path,
+        document: &gltf::Document,
+        buffers: &'a Buffers,
+        labels: Vec<String>,
+    ) -> Result<Self, SceneError> {
+        let root = root(path, document)?;
+        is_a_forest(path, document, &root)?;
+        let mut walk = Walk {
+            path,
+            buffers,
+            images: Images::default(),
+            meshes: BTreeMap::new(),
+            objects: Vec::new(),
+            labels,
+            camera: None,
+            laser: None,
+            notes: BTreeMap::new(),
+        };
+        walk.dropped_parts(document);
+        for node in root.nodes() {
+            walk.node(&node, &Affine::IDENTITY, None, 0)?;
+        }
+        Ok(walk)
+    }
+
     fn node(
         &mut self,
         node: &Node<'_>,
         parent: &Affine,
         label: Option<&str>,
+        depth: usize,
     ) -> Result<(), SceneError> {
+        if depth > MAX_DEPTH {
+            let what = format!("nodes[{}]: nested deeper than {MAX_DEPTH}", node.index());
+            return Err(format_error(self.path, what));
+        }
         let to_world = compose(parent, &affine(node.transform().matrix()));
         let at = format!("nodes[{}].extras", node.index());
         let extras: NodeExtras = match node.extras() {
@@ -162,7 +228,7 @@ impl Walk<'_> {
             self.laser = Some((to_world, extras.clone()));
         }
         for child in node.children() {
-            self.node(&child, &to_world, label)?;
+            self.node(&child, &to_world, label, depth + 1)?;
         }
         Ok(())
     }
@@ -212,89 +278,6 @@ impl Walk<'_> {
             },
         ));
         Ok(())
-    }
-
-    /// A mesh's triangles over one vertex list; `None` (with a note) if it has only lines or points.
-    fn mesh(&mut self, file: &gltf::Mesh<'_>) -> Result<Option<Mesh>, SceneError> {
-        let path = self.path;
-        let mut mesh = Mesh {
-            name: file.name().unwrap_or("mesh").to_owned(),
-            ..Mesh::default()
-        };
-        // Primitives often share their vertices: first vertex of each POSITION accessor, and material.
-        let mut vertex_base: BTreeMap<usize, u32> = BTreeMap::new();
-        let mut material_index: BTreeMap<Option<usize>, u32> = BTreeMap::new();
-        for primitive in file.primitives() {
-            let at = format!("meshes[{}].primitives[{}]", file.index(), primitive.index());
-            let fail = |what: String| format_error(path, format!("{at}: {what}"));
-            if matches!(
-                primitive.mode(),
-                Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip
-            ) {
-                self.notes
-                    .insert("dropped".into(), "points and lines".into());
-                continue;
-            }
-            let Some(accessor) = primitive.get(&gltf::Semantic::Positions) else {
-                return Err(fail(
-                    "has no POSITION; export the mesh with its vertices".into(),
-                ));
-            };
-            self.buffers
-                .check(&accessor, Dimensions::Vec3, &[DataType::F32])
-                .map_err(fail)?;
-            if let Some(indices) = primitive.indices() {
-                self.buffers
-                    .check(
-                        &indices,
-                        Dimensions::Scalar,
-                        &[DataType::U8, DataType::U16, DataType::U32],
-                    )
-                    .map_err(fail)?;
-            }
-            let reader = primitive.reader(|b| self.buffers.get(&b));
-            let base = match vertex_base.get(&accessor.index()) {
-                Some(&base) => base,
-                None => {
-                    let base = mesh.positions.len() as u32;
-                    mesh.positions.extend(
-                        reader
-                            .read_positions()
-                            .into_iter()
-                            .flatten()
-                            .map(Vec3::from),
-                    );
-                    vertex_base.insert(accessor.index(), base);
-                    base
-                }
-            };
-            let corners: Vec<u32> = match reader.read_indices() {
-                Some(indices) => indices.into_u32().collect(),
-                None => (0..accessor.count() as u32).collect(),
-            };
-            if let Some(&v) = corners.iter().find(|&&v| v as usize >= accessor.count()) {
-                return Err(fail(format!(
-                    "index {v} points past {} vertices",
-                    accessor.count()
-                )));
-            }
-            let triangles = triangles(&corners, primitive.mode());
-            let material = primitive.material();
-            let slot = match material_index.get(&material.index()) {
-                Some(&slot) => slot,
-                None => {
-                    mesh.materials.push(self.material(&material)?);
-                    let slot = mesh.materials.len() as u32 - 1;
-                    material_index.insert(material.index(), slot);
-                    slot
-                }
-            };
-            mesh.triangle_material
-                .extend(triangles.iter().map(|_| slot));
-            mesh.triangles
-                .extend(triangles.iter().map(|t| t.map(|v| v + base)));
-        }
-        Ok((!mesh.triangles.is_empty()).then_some(mesh))
     }
 
     fn finish(
@@ -364,32 +347,5 @@ fn affine(m: [[f32; 4]; 4]) -> Affine {
     Affine {
         linear: [row(0), row(1), row(2)],
         translation: Vec3::new(m[3][0], m[3][1], m[3][2]),
-    }
-}
-
-/// Corners as triangles: lists, strips (every second one turned) and fans.
-fn triangles(corners: &[u32], mode: Mode) -> Vec<[u32; 3]> {
-    match mode {
-        Mode::TriangleStrip => corners
-            .windows(3)
-            .enumerate()
-            .map(|(k, w)| {
-                if k % 2 == 0 {
-                    [w[0], w[1], w[2]]
-                } else {
-                    [w[1], w[0], w[2]]
-                }
-            })
-            .collect(),
-        Mode::TriangleFan => corners
-            .get(1..)
-            .unwrap_or_default()
-            .windows(2)
-            .map(|w| [corners[0], w[0], w[1]])
-            .collect(),
-        _ => corners
-            .chunks_exact(3)
-            .map(|t| [t[0], t[1], t[2]])
-            .collect(),
     }
 }

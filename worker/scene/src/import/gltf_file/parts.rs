@@ -1,75 +1,20 @@
-//! Materials, cameras and lasers of a glTF file.
+//! Cameras and lasers of a glTF file.
 
 use std::path::Path;
 
 use gltf::camera::Projection;
 
 use crate::{
-    Affine, Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, LaserGrid, Material, SceneError,
-    Vec3,
-    extras::{MaterialExtras, NodeExtras, metallic_roughness},
+    Affine, Beam, Camera, Intrinsics, Laser, LaserGrid, SceneError, Vec3, extras::NodeExtras,
     import::format_error,
 };
 
-use super::{Walk, keyed};
+use super::Walk;
 
 /// Rows given to a camera whose file states no resolution; callers resize.
 const DEFAULT_ROWS: u32 = 64;
-/// Smallest roughness α of an imported conductor.
-const MIN_ALPHA: f32 = 1e-3;
-/// Standard parameters closer than this to those we would write leave our extras in force.
-const SAME_FACTOR: f32 = 1e-3;
 
 impl Walk<'_> {
-    pub(super) fn material(&mut self, file: &gltf::Material<'_>) -> Result<Material, SceneError> {
-        let pbr = file.pbr_metallic_roughness();
-        let [r, g, b, alpha] = pbr.base_color_factor();
-        let name = file.name().unwrap_or("material").to_owned();
-        if pbr.base_color_texture().is_some() || pbr.metallic_roughness_texture().is_some() {
-            self.notes.insert(
-                "textures".into(),
-                "ignored; base colour and roughness factors used".into(),
-            );
-        }
-        if alpha < 1.0 || file.alpha_mode() == gltf::material::AlphaMode::Blend {
-            self.notes.insert(
-                "transparency".into(),
-                "ignored; such materials are opaque".into(),
-            );
-        }
-        let mut material = Material::diffuse(name, [r, g, b]);
-        if pbr.metallic_factor() >= 0.5 {
-            let alpha = pbr.roughness_factor() * pbr.roughness_factor();
-            material.bsdf = Bsdf::RoughConductor {
-                alpha: alpha.max(MIN_ALPHA),
-                distribution: Distribution::Beckmann,
-                reflectance: (r + g + b) / 3.0,
-            };
-        }
-        let at = format!("materials[{}].extras.picofarm", file.index().unwrap_or(0));
-        let ours: Option<MaterialExtras> =
-            keyed(self.path, &at, file.extras().as_deref().map(|r| r.get()))?;
-        if let Some(ours) = ours {
-            let exact = Material {
-                bsdf: ours.bsdf,
-                two_sided: ours.two_sided,
-                ..material.clone()
-            };
-            // Someone who edits the file in another program changes the standard factors: they win then.
-            let (metallic, roughness) = metallic_roughness(&exact);
-            let same = (metallic - pbr.metallic_factor()).abs() < SAME_FACTOR
-                && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
-            if same {
-                return Ok(exact);
-            }
-            self.notes.insert(
-                "materials".into(),
-                "edited since export; standard factors used".into(),
-            );
-        }
-        Ok(material)
-    }
-
     pub(super) fn camera_of(
         &self,
         to_world: &Affine,

@@ -1,0 +1,225 @@
+//! Writing a scene for Mitsuba 3: `scene.xml`, `meshes/*.ply` and `textures/*.png`, which
+//! `mitsuba.load_file` reads and [`crate::import`] too. What Mitsuba has no words for (labels, spots,
+//! provenance, exact BSDFs) stands in a comment of the XML.
+
+pub(crate) mod text;
+
+use std::{collections::BTreeMap, fmt::Write as _, path::Path, sync::Arc};
+
+use crate::{
+    Material, Mesh, Scene, SceneError, Texture,
+    extras::{FORMAT, SceneExtras},
+};
+
+use super::{ply, png, write_whole};
+use text::{
+    Extras, MaterialExtras, ObjectExtras, TextureExtras, beam_text, bsdf_text, matrix_text,
+    sensor_text,
+};
+
+/// Writes the scene to `file` (an `.xml`) with its meshes and textures in folders beside it. Returns what
+/// Mitsuba's model cannot hold, a sentence each; often nothing.
+///
+/// A mesh is written once per material that it uses. Colours are the materials' `rgb`, scaled so that their mean
+/// is the reflectance at the laser's wavelength. Every beam is a `projector` of 0.1°.
+///
+/// # Errors
+/// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`], [`SceneError::Write`] naming the file.
+pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneError> {
+    scene.validate()?;
+    let folder = file.parent().unwrap_or(Path::new(""));
+    for name in ["meshes", "textures"] {
+        let path = folder.join(name);
+        std::fs::create_dir_all(&path).map_err(|source| SceneError::Write { path, source })?;
+    }
+    let mut writer = Writer {
+        folder,
+        materials: Vec::new(),
+        textures: Vec::new(),
+        text: String::new(),
+        known: BTreeMap::new(),
+        notes: Vec::new(),
+    };
+    let shapes = writer.shapes(scene)?;
+    let i = &scene.camera.intrinsics;
+    if i.fx != i.fy {
+        let what = format!("pixels are not square (fx {}, fy {}): fx used", i.fx, i.fy);
+        writer.notes.push(what);
+    }
+    let extras = Extras {
+        scene: SceneExtras {
+            format: FORMAT,
+            name: scene.name.clone(),
+            labels: scene.labels.clone(),
+            camera: scene.camera,
+            laser: scene.laser.clone(),
+            provenance: scene.provenance.clone(),
+        },
+        objects: scene
+            .objects
+            .iter()
+            .map(|o| ObjectExtras {
+                name: o.name.clone(),
+                label: scene.labels[usize::from(o.label)].clone(),
+                mesh: o.mesh.name.clone(),
+            })
+            .collect(),
+        materials: writer.known,
+    };
+    let json = serde_json::to_string(&extras).map_err(|e| SceneError::Invalid {
+        scene: scene.name.clone(),
+        field: "extras".into(),
+        what: format!("cannot be written as JSON: {e}"),
+    })?;
+    let mut xml = String::from("<scene version=\"3.0.0\">\n");
+    let mut line = |text: &str| {
+        xml.push_str(text);
+        xml.push('\n');
+    };
+    // Two hyphens end a comment; in JSON they only occur within strings.
+    line(&format!(
+        "<!-- picofarm {} -->",
+        json.replace("--", "-\\u002d")
+    ));
+    line("<integrator type=\"path\"/>");
+    line(&sensor_text(&scene.camera));
+    line(writer.text.trim_end());
+    line(shapes.trim_end());
+    for (k, beam) in scene.laser.beams.iter().enumerate() {
+        line(&beam_text(k, scene.laser.origin, beam));
+    }
+    line("</scene>");
+    write_whole(file, xml.as_bytes())?;
+    Ok(writer.notes)
+}
+
+struct Writer<'a> {
+    folder: &'a Path,
+    materials: Vec<Material>,
+    textures: Vec<Arc<Texture>>,
+    /// The BSDFs.
+    text: String,
+    known: BTreeMap<String, MaterialExtras>,
+    notes: Vec<String>,
+}
+
+impl Writer<'_> {
+    /// Writes every mesh; the text of all shapes.
+    fn shapes(&mut self, scene: &Scene) -> Result<String, SceneError> {
+        // Meshes that are written, with the (file, material) of their parts.
+        let mut written: Vec<(Arc<Mesh>, Vec<(String, String)>)> = Vec::new();
+        let mut out = String::new();
+        for (k, object) in scene.objects.iter().enumerate() {
+            let known = written.iter().position(|w| Arc::ptr_eq(&w.0, &object.mesh));
+            let known = match known {
+                Some(known) => known,
+                None => {
+                    let parts = self.mesh(written.len(), &object.mesh)?;
+                    written.push((object.mesh.clone(), parts));
+                    written.len() - 1
+                }
+            };
+            let place = matrix_text(&object.to_world);
+            for (p, (file, material)) in written[known].1.iter().enumerate() {
+                writeln!(
+                    out,
+                    "<shape type=\"ply\" id=\"object{k}.{p}\"><string name=\"filename\" value=\"{file}\"/>\
+                     <boolean name=\"face_normals\" value=\"true\"/>\
+                     <transform name=\"to_world\"><matrix value=\"{place}\"/></transform>\
+                     <ref id=\"{material}\"/></shape>"
+                )
+                .expect("strings take every text");
+            }
+        }
+        Ok(out)
+    }
+
+    /// Writes one mesh, a file for each material that it uses.
+    fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Vec<(String, String)>, SceneError> {
+        let mut out = Vec::new();
+        for (m, material) in mesh.materials.iter().enumerate() {
+            let Some(part) = part(mesh, m as u32) else {
+                continue;
+            };
+            let file = format!("meshes/{index:04}-{m}.ply");
+            write_whole(&self.folder.join(&file), &ply::mesh_bytes(&part))?;
+            out.push((file, self.material(material)?));
+        }
+        Ok(out)
+    }
+
+    /// The id of a material, which is written if new.
+    fn material(&mut self, material: &Material) -> Result<String, SceneError> {
+        if let Some(k) = self.materials.iter().position(|m| m == material) {
+            return Ok(format!("material{k}"));
+        }
+        let id = format!("material{}", self.materials.len());
+        self.materials.push(material.clone());
+        let texture = match &material.texture {
+            None => None,
+            Some(texture) => Some(TextureExtras {
+                file: self.texture(texture)?,
+                name: texture.name().to_owned(),
+                wrap: texture.wrap(),
+            }),
+        };
+        let written = bsdf_text(&id, material, texture.as_ref());
+        for (file, image) in &written.images {
+            write_whole(&self.folder.join(file), &png(image))?;
+        }
+        if written.clamped {
+            let what = format!("material {:?}: colours cut off at 1", material.name);
+            self.notes.push(what);
+        }
+        self.text.push_str(&written.text);
+        self.text.push('\n');
+        let extras = MaterialExtras {
+            name: material.name.clone(),
+            bsdf: material.bsdf,
+            rgb: material.rgb,
+            two_sided: material.two_sided,
+            texture,
+        };
+        self.known.insert(id.clone(), extras);
+        Ok(id)
+    }
+
+    /// The file of a texture, which is written if new.
+    fn texture(&mut self, texture: &Arc<Texture>) -> Result<String, SceneError> {
+        let known = self.textures.iter().position(|t| t == texture);
+        let index = match known {
+            Some(k) => k,
+            None => {
+                self.textures.push(texture.clone());
+                let file = format!("textures/{}.png", self.textures.len() - 1);
+                write_whole(&self.folder.join(file), &png(texture))?;
+                self.textures.len() - 1
+            }
+        };
+        Ok(format!("textures/{index}.png"))
+    }
+}
+
+/// The facets of one material with the vertices that they use, in their order; `None` without facets.
+fn part(mesh: &Mesh, material: u32) -> Option<Mesh> {
+    let facets = mesh.triangles.iter().zip(&mesh.triangle_material);
+    let facets: Vec<[u32; 3]> = facets.filter(|f| *f.1 == material).map(|f| *f.0).collect();
+    if facets.is_empty() {
+        return None;
+    }
+    let mut used: Vec<u32> = facets.iter().flatten().copied().collect();
+    used.sort_unstable();
+    used.dedup();
+    let slot = |v: u32| used.binary_search(&v).expect("used vertices are listed") as u32;
+    Some(Mesh {
+        name: mesh.name.clone(),
+        triangles: facets.iter().map(|t| t.map(slot)).collect(),
+        positions: used.iter().map(|&v| mesh.positions[v as usize]).collect(),
+        uv: if mesh.uv.is_empty() {
+            Vec::new()
+        } else {
+            used.iter().map(|&v| mesh.uv[v as usize]).collect()
+        },
+        ..Mesh::default()
+    })
+}

@@ -1,0 +1,333 @@
+//! Materials of a glTF file: what maps to Lambertian, conductor, mix and albedo texture, and a note on
+//! whatever does not.
+
+use std::path::Path;
+
+use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
+
+use crate::{
+    Bsdf, Distribution, Material, SceneError, Texture, Wrap,
+    extras::{MaterialExtras, metallic_roughness},
+    import::{buffers::buffer_file, format_error, image, read_file},
+};
+
+use super::{Walk, keyed};
+
+/// Standard parameters closer than this to those we would write leave our extras in force.
+const SAME_FACTOR: f32 = 1e-3;
+/// Metalness closer than this to 0 or 1 is taken for it.
+const PURE: f32 = 0.01;
+/// Specular factors up to this are the coat of an ordinary dielectric.
+const DIELECTRIC: f32 = 0.08;
+/// Extensions whose content is used, or noted by name below.
+const KNOWN: [&str; 9] = [
+    "KHR_texture_transform",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "KHR_materials_volume",
+    "KHR_lights_punctual",
+];
+
+/// Which texture coordinates a material uses, and what is done to them: (offset, rotation, scale).
+pub(super) struct Coordinates {
+    pub(super) set: u32,
+    pub(super) transform: Option<([f32; 2], f32, [f32; 2])>,
+}
+
+/// What a material's parameters come to, whichever way they are stated.
+struct Standard<'a> {
+    rgb: [f32; 3],
+    bsdf: Bsdf,
+    texture: Option<gltf::texture::Info<'a>>,
+}
+
+impl Walk<'_> {
+    pub(super) fn note(&mut self, key: &str, what: impl Into<String>) {
+        self.notes.insert(key.into(), what.into());
+    }
+
+    /// Notes what a document holds that no scene of ours does.
+    pub(super) fn dropped_parts(&mut self, document: &gltf::Document) {
+        if document.skins().len() > 0 || document.animations().len() > 0 {
+            self.note("animation", "ignored; nodes and meshes are at rest");
+        }
+        if document.lights().is_some_and(|l| l.len() > 0) {
+            self.note("lights", "ignored; only the laser shines");
+        }
+        let unknown: Vec<&str> = document
+            .extensions_used()
+            .filter(|e| !KNOWN.contains(e))
+            .collect();
+        if !unknown.is_empty() {
+            self.note("extensions", format!("ignored: {}", unknown.join(", ")));
+        }
+    }
+
+    /// The texture coordinates that a material's albedo texture asks for.
+    pub(super) fn coordinates(&mut self, file: &gltf::Material<'_>) -> Coordinates {
+        let Some(info) = albedo_texture(file) else {
+            return Coordinates {
+                set: 0,
+                transform: None,
+            };
+        };
+        let transform = info.texture_transform();
+        Coordinates {
+            set: transform
+                .as_ref()
+                .and_then(gltf::texture::TextureTransform::tex_coord)
+                .unwrap_or(info.tex_coord()),
+            transform: transform.map(|t| (t.offset(), t.rotation(), t.scale())),
+        }
+    }
+
+    /// A material as ours; `has_uv` says whether the mesh brings the texture coordinates it asks for.
+    pub(super) fn material(
+        &mut self,
+        file: &gltf::Material<'_>,
+        has_uv: bool,
+    ) -> Result<Material, SceneError> {
+        let at = format!("materials[{}]", file.index().unwrap_or(0));
+        self.dropped_features(file);
+        let standard = match file.pbr_specular_glossiness() {
+            Some(pbr) => self.specular_glossiness(&pbr),
+            None => self.metallic_roughness(file, &at)?,
+        };
+        let mut material =
+            Material::diffuse(file.name().unwrap_or("material").to_owned(), standard.rgb);
+        material.bsdf = standard.bsdf;
+        if let Some(info) = standard.texture {
+            if has_uv {
+                material.texture = Some(self.texture(&info.texture(), &at)?);
+            } else {
+                self.note(
+                    "textures",
+                    "left out where a mesh has no texture coordinates",
+                );
+            }
+        }
+        let pbr = file.pbr_metallic_roughness();
+        let extras = format!("{at}.extras.picofarm");
+        let ours: Option<MaterialExtras> = keyed(
+            self.path,
+            &extras,
+            file.extras().as_deref().map(|r| r.get()),
+        )?;
+        if let Some(ours) = ours {
+            let exact = Material {
+                bsdf: ours.bsdf,
+                two_sided: ours.two_sided,
+                ..material.clone()
+            };
+            // Someone who edits the file in another program changes the standard factors: they win then.
+            let (metallic, roughness) = metallic_roughness(&exact);
+            let same = (metallic - pbr.metallic_factor()).abs() < SAME_FACTOR
+                && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
+            if same {
+                return Ok(exact);
+            }
+            self.note("materials", "edited since export; standard factors used");
+        }
+        Ok(material)
+    }
+
+    fn metallic_roughness<'f>(
+        &mut self,
+        file: &gltf::Material<'f>,
+        at: &str,
+    ) -> Result<Standard<'f>, SceneError> {
+        let pbr = file.pbr_metallic_roughness();
+        let [r, g, b, opacity] = pbr.base_color_factor();
+        if opacity < 1.0 {
+            self.note("transparency", "ignored; such materials are opaque");
+        }
+        let (mut metallic, mut roughness) = (pbr.metallic_factor(), pbr.roughness_factor());
+        if let Some(info) = pbr.metallic_roughness_texture() {
+            let texture = self.texture(&info.texture(), at)?;
+            let texels = texture.texels();
+            let mean = |channel: usize| {
+                let sum: f64 = texels.iter().map(|t| f64::from(t[channel])).sum();
+                (sum / texels.len() as f64 / 255.0) as f32
+            };
+            (roughness, metallic) = (roughness * mean(1), metallic * mean(2));
+            self.note(
+                "metallic_roughness_textures",
+                "replaced by their means over the image",
+            );
+        }
+        let mean = (r + g + b) / 3.0;
+        // glTF's own BRDF is GGX with α = roughness².
+        let alpha = (roughness * roughness).max(Material::MIN_ALPHA);
+        let bsdf = mixed(metallic, alpha, mean, mean);
+        Ok(Standard {
+            rgb: [r, g, b],
+            bsdf,
+            texture: pbr.base_color_texture(),
+        })
+    }
+
+    fn specular_glossiness<'f>(
+        &mut self,
+        pbr: &gltf::material::PbrSpecularGlossiness<'f>,
+    ) -> Standard<'f> {
+        let [r, g, b, opacity] = pbr.diffuse_factor();
+        if opacity < 1.0 {
+            self.note("transparency", "ignored; such materials are opaque");
+        }
+        if pbr.specular_glossiness_texture().is_some() {
+            self.note("specular_glossiness_textures", "ignored; factors used");
+        }
+        let specular = pbr.specular_factor();
+        let most = specular.iter().fold(0.0f32, |a, &b| a.max(b)).min(1.0);
+        if most <= DIELECTRIC {
+            return Standard {
+                rgb: [r, g, b],
+                bsdf: mixed(0.0, 1.0, (r + g + b) / 3.0, 0.0),
+                texture: pbr.diffuse_texture(),
+            };
+        }
+        if pbr.diffuse_texture().is_some() {
+            self.note(
+                "specular_glossiness",
+                "diffuse textures scale the specular part too",
+            );
+        }
+        let rough = 1.0 - pbr.glossiness_factor();
+        let alpha = (rough * rough).max(Material::MIN_ALPHA);
+        let share = specular.iter().sum::<f32>() / 3.0 / most;
+        let mix = |diffuse: f32, specular: f32| (1.0 - most) * diffuse + specular;
+        Standard {
+            rgb: [
+                mix(r, specular[0]),
+                mix(g, specular[1]),
+                mix(b, specular[2]),
+            ],
+            bsdf: mixed(most, alpha, (r + g + b) / 3.0, share),
+            texture: pbr.diffuse_texture(),
+        }
+    }
+
+    /// Notes the features of a material that our model has no words for.
+    fn dropped_features(&mut self, file: &gltf::Material<'_>) {
+        if file.alpha_mode() != AlphaMode::Opaque {
+            self.note("transparency", "ignored; such materials are opaque");
+        }
+        if file.transmission().is_some() || file.volume().is_some() {
+            self.note("transmission", "ignored; such materials are opaque");
+        }
+        if file.emissive_factor() != [0.0; 3] || file.emissive_strength().is_some() {
+            self.note("emission", "ignored; only the laser shines");
+        }
+        if file.normal_texture().is_some() || file.occlusion_texture().is_some() {
+            self.note("normal_and_occlusion_textures", "ignored");
+        }
+        if file.ior().is_some() || file.specular().is_some() {
+            self.note(
+                "coats",
+                "KHR_materials_ior and _specular: dielectrics are Lambertian",
+            );
+        }
+        if file.unlit() {
+            self.note(
+                "unlit",
+                "such materials are Lambertian with their base colour",
+            );
+        }
+        let others: Vec<&String> = file
+            .extensions()
+            .into_iter()
+            .flat_map(|e| e.keys())
+            .collect();
+        for name in others {
+            if !KNOWN.contains(&name.as_str()) {
+                self.note(&format!("materials.{name}"), "ignored");
+            }
+        }
+    }
+
+    fn texture(
+        &mut self,
+        file: &gltf::Texture<'_>,
+        at: &str,
+    ) -> Result<std::sync::Arc<Texture>, SceneError> {
+        let sampler = file.sampler();
+        if sampler.wrap_s() != sampler.wrap_t() {
+            self.note("textures.wrap", "wrapT differs from wrapS, which is used");
+        }
+        if sampler.mag_filter() == Some(gltf::texture::MagFilter::Nearest) {
+            self.note("textures.filter", "nearest; bilinear used");
+        }
+        let wrap = match sampler.wrap_s() {
+            WrappingMode::ClampToEdge => Wrap::Clamp,
+            WrappingMode::MirroredRepeat => Wrap::Mirror,
+            WrappingMode::Repeat => Wrap::Repeat,
+        };
+        let image = file.source();
+        let (path, buffers) = (self.path, self.buffers);
+        let fail = |what: String| {
+            let at = format!("{at}: images[{}]", image.index());
+            format_error(path, format!("{at}: {what}"))
+        };
+        let external = match image.source() {
+            Source::Uri { uri, .. } => buffer_file(path, uri),
+            Source::View { .. } => None,
+        };
+        let held;
+        let bytes: &[u8] = match (&external, image.source()) {
+            (Some(file), _) => {
+                held = read_file(file)?;
+                &held
+            }
+            (None, Source::View { view, .. }) => buffers.view(&view).map_err(fail)?,
+            (None, Source::Uri { uri, .. }) => {
+                let source = gltf::buffer::Source::Uri(uri);
+                held = gltf::buffer::Data::from_source_and_blob(source, None, &mut None)
+                    .map_err(|e| fail(format!("data URI cannot be read ({e})")))?
+                    .0;
+                &held
+            }
+        };
+        let stem = external.as_deref().and_then(Path::file_stem);
+        let name = match (image.name(), stem) {
+            (Some(name), _) => name.to_owned(),
+            (None, Some(stem)) => stem.to_string_lossy().into_owned(),
+            (None, None) => format!("image{}", image.index()),
+        };
+        self.images
+            .get((image.index(), wrap), || image::decode(&name, bytes, wrap))
+            .map_err(fail)
+    }
+}
+
+fn albedo_texture<'a>(file: &gltf::Material<'a>) -> Option<gltf::texture::Info<'a>> {
+    match file.pbr_specular_glossiness() {
+        Some(pbr) => pbr.diffuse_texture(),
+        None => file.pbr_metallic_roughness().base_color_texture(),
+    }
+}
+
+/// A GGX mix, or what is left of it near either end.
+fn mixed(weight: f32, alpha: f32, reflectance: f32, specular_reflectance: f32) -> Bsdf {
+    let distribution = Distribution::Ggx;
+    if weight < PURE {
+        Bsdf::Diffuse { reflectance }
+    } else if weight > 1.0 - PURE {
+        Bsdf::RoughConductor {
+            alpha,
+            distribution,
+            reflectance: specular_reflectance,
+        }
+    } else {
+        Bsdf::Mixed {
+            reflectance,
+            alpha,
+            distribution,
+            specular_reflectance,
+            weight,
+        }
+    }
+}

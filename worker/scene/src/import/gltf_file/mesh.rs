@@ -1,0 +1,183 @@
+//! Meshes of a glTF file: their primitives over one vertex list, with texture coordinates.
+
+use std::collections::BTreeMap;
+
+use gltf::{
+    Accessor, Semantic,
+    accessor::{DataType, Dimensions},
+    mesh::Mode,
+};
+
+use crate::{Mesh, SceneError, Vec3, import::format_error};
+
+use super::{Walk, material::Coordinates};
+
+/// Most vertices or corners of one file's meshes, as declared: beyond it the file is taken for damaged.
+const MAX_CORNERS: usize = 1 << 30;
+
+/// What decides whether primitives can share vertices: accessor of the positions, that of the texture
+/// coordinates, and what is done to these.
+type VertexKey = (usize, Option<usize>, [u32; 5]);
+
+impl Walk<'_> {
+    /// A mesh's triangles over one vertex list; `None` (with a note) if it has only lines or points.
+    pub(super) fn mesh(&mut self, file: &gltf::Mesh<'_>) -> Result<Option<Mesh>, SceneError> {
+        let path = self.path;
+        let mut mesh = Mesh {
+            name: file.name().unwrap_or("mesh").to_owned(),
+            ..Mesh::default()
+        };
+        let mut vertex_base: BTreeMap<VertexKey, u32> = BTreeMap::new();
+        let mut material_index: BTreeMap<(Option<usize>, bool), u32> = BTreeMap::new();
+        for primitive in file.primitives() {
+            let at = format!("meshes[{}].primitives[{}]", file.index(), primitive.index());
+            let fail = |what: String| format_error(path, format!("{at}: {what}"));
+            if matches!(
+                primitive.mode(),
+                Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip
+            ) {
+                self.note("dropped", "points and lines");
+                continue;
+            }
+            let Some(accessor) = primitive.get(&Semantic::Positions) else {
+                return Err(fail(
+                    "has no POSITION; export the mesh with its vertices".into(),
+                ));
+            };
+            if primitive.get(&Semantic::Colors(0)).is_some() {
+                self.note("vertex_colours", "ignored; materials' colours used");
+            }
+            if primitive.morph_targets().len() > 0 {
+                self.note("morphs", "ignored; meshes are in their base shape");
+            }
+            self.buffers
+                .check(&accessor, Dimensions::Vec3, &[DataType::F32])
+                .map_err(fail)?;
+            if let Some(indices) = primitive.indices() {
+                let types = [DataType::U8, DataType::U16, DataType::U32];
+                self.buffers
+                    .check(&indices, Dimensions::Scalar, &types)
+                    .map_err(fail)?;
+            }
+            let material = primitive.material();
+            let coordinates = self.coordinates(&material);
+            let uv_accessor = primitive.get(&Semantic::TexCoords(coordinates.set));
+            if let Some(uv) = &uv_accessor {
+                self.check_uv(uv, accessor.count()).map_err(fail)?;
+            }
+            let slot = match material_index.get(&(material.index(), uv_accessor.is_some())) {
+                Some(&slot) => slot,
+                None => {
+                    let read = self.material(&material, uv_accessor.is_some())?;
+                    mesh.materials.push(read);
+                    let slot = mesh.materials.len() as u32 - 1;
+                    material_index.insert((material.index(), uv_accessor.is_some()), slot);
+                    slot
+                }
+            };
+            let reader = primitive.reader(|b| self.buffers.get(&b));
+            let key = (
+                accessor.index(),
+                uv_accessor.map(|a| a.index()),
+                coordinates.bits(),
+            );
+            let base = match vertex_base.get(&key) {
+                Some(&base) => base,
+                None => {
+                    let base = mesh.positions.len();
+                    if base + accessor.count() > MAX_CORNERS {
+                        return Err(fail(format!(
+                            "more than {MAX_CORNERS} vertices; split the mesh"
+                        )));
+                    }
+                    let read = reader.read_positions().into_iter().flatten();
+                    mesh.positions.extend(read.map(Vec3::from));
+                    if let Some(uv) = reader.read_tex_coords(coordinates.set) {
+                        mesh.uv.resize(base, [0.0; 2]);
+                        mesh.uv
+                            .extend(uv.into_f32().map(|uv| coordinates.placed(uv)));
+                    }
+                    if !mesh.uv.is_empty() {
+                        mesh.uv.resize(mesh.positions.len(), [0.0; 2]);
+                    }
+                    vertex_base.insert(key, base as u32);
+                    base as u32
+                }
+            };
+            let corners: Vec<u32> = match reader.read_indices() {
+                Some(indices) => indices.into_u32().collect(),
+                None => (0..accessor.count() as u32).collect(),
+            };
+            if let Some(&v) = corners.iter().find(|&&v| v as usize >= accessor.count()) {
+                return Err(fail(format!(
+                    "index {v} points past {} vertices",
+                    accessor.count()
+                )));
+            }
+            let triangles = triangles(&corners, primitive.mode());
+            mesh.triangle_material
+                .extend(triangles.iter().map(|_| slot));
+            mesh.triangles
+                .extend(triangles.iter().map(|t| t.map(|v| v + base)));
+        }
+        Ok((!mesh.triangles.is_empty()).then_some(mesh))
+    }
+
+    fn check_uv(&self, uv: &Accessor<'_>, vertices: usize) -> Result<(), String> {
+        let types = [DataType::F32, DataType::U8, DataType::U16];
+        self.buffers.check(uv, Dimensions::Vec2, &types)?;
+        if uv.count() != vertices {
+            return Err(format!(
+                "accessors[{}]: {} texture coordinates for {vertices} vertices",
+                uv.index(),
+                uv.count()
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Coordinates {
+    /// A point of texture space after KHR_texture_transform: scaled, turned, moved.
+    fn placed(&self, [u, v]: [f32; 2]) -> [f32; 2] {
+        let Some((offset, rotation, scale)) = self.transform else {
+            return [u, v];
+        };
+        let (s, c) = (libm::sinf(rotation), libm::cosf(rotation));
+        let (u, v) = (u * scale[0], v * scale[1]);
+        [offset[0] + c * u + s * v, offset[1] - s * u + c * v]
+    }
+
+    fn bits(&self) -> [u32; 5] {
+        self.transform.map_or([0; 5], |(o, r, s)| {
+            [o[0], o[1], r, s[0], s[1]].map(f32::to_bits)
+        })
+    }
+}
+
+/// Corners as triangles: lists, strips (every second one turned) and fans.
+fn triangles(corners: &[u32], mode: Mode) -> Vec<[u32; 3]> {
+    match mode {
+        Mode::TriangleStrip => corners
+            .windows(3)
+            .enumerate()
+            .map(|(k, w)| {
+                if k % 2 == 0 {
+                    [w[0], w[1], w[2]]
+                } else {
+                    [w[1], w[0], w[2]]
+                }
+            })
+            .collect(),
+        Mode::TriangleFan => corners
+            .get(1..)
+            .unwrap_or_default()
+            .windows(2)
+            .map(|w| [corners[0], w[0], w[1]])
+            .collect(),
+        _ => corners
+            .chunks_exact(3)
+            .map(|t| [t[0], t[1], t[2]])
+            .collect(),
+    }
+}

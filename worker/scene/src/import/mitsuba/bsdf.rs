@@ -1,0 +1,417 @@
+//! Mitsuba's BSDFs as materials.
+
+use std::{path::PathBuf, rc::Rc, sync::Arc};
+
+use crate::{
+    Bsdf, Distribution, Material, Texture, Wrap,
+    export::mitsuba::text::{MaterialExtras, bsdf_text},
+    import::{image, read_file},
+    texture::srgb_byte,
+};
+
+use super::{
+    Reader,
+    node::{Node, Value},
+    transform::Matrix,
+};
+
+/// Deepest nesting of BSDFs, references included.
+const MAX_DEPTH: usize = 8;
+/// Normal-incidence reflectance (linear RGB) of the metals that scenes name most.
+const METALS: [(&str, [f32; 3]); 5] = [
+    ("Ag", [0.972, 0.960, 0.915]),
+    ("Al", [0.913, 0.922, 0.924]),
+    ("Au", [1.0, 0.766, 0.336]),
+    ("Cr", [0.550, 0.556, 0.554]),
+    ("Cu", [0.955, 0.638, 0.538]),
+];
+const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these";
+
+/// A material, and what its textures do to texture coordinates.
+#[derive(Debug, Clone)]
+pub(super) struct Look {
+    pub(super) material: Material,
+    pub(super) to_uv: Matrix,
+}
+
+/// A colour, or white with a texture.
+#[derive(Debug, Clone)]
+struct Colour {
+    rgb: [f32; 3],
+    texture: Option<(Arc<Texture>, Matrix)>,
+}
+
+impl Colour {
+    fn grey(level: f32) -> Self {
+        Self {
+            rgb: [level; 3],
+            texture: None,
+        }
+    }
+
+    fn mean(&self) -> f32 {
+        (self.rgb[0] + self.rgb[1] + self.rgb[2]) / 3.0
+    }
+}
+
+/// A BSDF by its two parts.
+struct Parts {
+    diffuse: Option<Colour>,
+    conductor: Option<(Colour, f32, Distribution)>,
+    weight: f32,
+    two_sided: bool,
+}
+
+impl Reader<'_> {
+    /// The material of a BSDF; ours, exactly, where its text is as we wrote it.
+    pub(super) fn look(&mut self, node: &Rc<Node>) -> Result<Look, String> {
+        let key = Rc::as_ptr(node).addr();
+        if let Some(known) = self.looks.get(&key) {
+            return Ok(known.clone());
+        }
+        let look = match self.exact(node)? {
+            Some(material) => Look {
+                material,
+                to_uv: Matrix::IDENTITY,
+            },
+            None => {
+                let parts = self.parts(node, 0)?;
+                assemble(node, parts)?
+            }
+        };
+        self.looks.insert(key, look.clone());
+        Ok(look)
+    }
+
+    fn exact(&mut self, node: &Node) -> Result<Option<Material>, String> {
+        let known = self.extras.as_ref().and_then(|e| e.materials.get(&node.id));
+        let Some(known) = known.cloned() else {
+            return Ok(None);
+        };
+        let MaterialExtras {
+            name,
+            bsdf,
+            rgb,
+            two_sided,
+            texture,
+        } = &known;
+        let texture = match texture {
+            None => None,
+            Some(t) => {
+                let file = self.folder.join(&t.file);
+                Some(self.image(node, &file, &t.name, t.wrap, false)?)
+            }
+        };
+        let material = Material {
+            name: name.clone(),
+            bsdf: *bsdf,
+            rgb: *rgb,
+            texture,
+            two_sided: *two_sided,
+        };
+        if bsdf_text(&node.id, &material, known.texture.as_ref()).text == node.text {
+            return Ok(Some(material));
+        }
+        self.note("materials", "edited since export; standard parameters used");
+        Ok(None)
+    }
+
+    fn parts(&mut self, node: &Node, depth: usize) -> Result<Parts, String> {
+        if depth > MAX_DEPTH {
+            return Err(node.fail(format!("nested deeper than {MAX_DEPTH}")));
+        }
+        match node.kind.as_str() {
+            "diffuse" => {
+                self.ignored(node, &["reflectance"]);
+                let colour = self.colour(node, "reflectance")?;
+                Ok(Parts {
+                    diffuse: Some(colour.unwrap_or(Colour::grey(0.5))),
+                    conductor: None,
+                    weight: 0.0,
+                    two_sided: false,
+                })
+            }
+            "roughconductor" | "conductor" => {
+                let conductor = self.conductor(node)?;
+                Ok(Parts {
+                    diffuse: None,
+                    conductor: Some(conductor),
+                    weight: 1.0,
+                    two_sided: false,
+                })
+            }
+            "twosided" => {
+                let inner = self.children(node, "bsdf")?;
+                let [inner] = inner.as_slice() else {
+                    return Err(node.fail(format!(
+                        "expected one BSDF for both sides, found {}",
+                        inner.len()
+                    )));
+                };
+                let parts = self.parts(inner, depth + 1)?;
+                Ok(Parts {
+                    two_sided: true,
+                    ..parts
+                })
+            }
+            "blendbsdf" => self.blend(node, depth),
+            other => Err(node.fail(format!("bsdf {other:?} is not supported; {SUBSET}"))),
+        }
+    }
+
+    fn blend(&mut self, node: &Node, depth: usize) -> Result<Parts, String> {
+        let weight = node.number("weight")?.ok_or_else(|| {
+            node.fail("weight: expected a number (textures as weights are not supported)")
+        })? as f32;
+        if !(0.0..=1.0).contains(&weight) {
+            return Err(node.fail(format!("weight: {weight} lies outside [0, 1]")));
+        }
+        let inner = self.children(node, "bsdf")?;
+        let [a, b] = inner.as_slice() else {
+            return Err(node.fail(format!("expected two BSDFs, found {}", inner.len())));
+        };
+        let (a, b) = (self.parts(a, depth + 1)?, self.parts(b, depth + 1)?);
+        let two_sided = a.two_sided && b.two_sided;
+        match (a, b) {
+            (
+                Parts {
+                    diffuse: Some(diffuse),
+                    conductor: None,
+                    ..
+                },
+                Parts {
+                    diffuse: None,
+                    conductor: Some(conductor),
+                    ..
+                },
+            ) => Ok(Parts {
+                diffuse: Some(diffuse),
+                conductor: Some(conductor),
+                weight,
+                two_sided,
+            }),
+            (
+                Parts {
+                    diffuse: None,
+                    conductor: Some(conductor),
+                    ..
+                },
+                Parts {
+                    diffuse: Some(diffuse),
+                    conductor: None,
+                    ..
+                },
+            ) => Ok(Parts {
+                diffuse: Some(diffuse),
+                conductor: Some(conductor),
+                weight: 1.0 - weight,
+                two_sided,
+            }),
+            _ => Err(node.fail("expected a diffuse and a conductor")),
+        }
+    }
+
+    fn conductor(&mut self, node: &Node) -> Result<(Colour, f32, Distribution), String> {
+        self.ignored(
+            node,
+            &[
+                "alpha",
+                "alpha_u",
+                "alpha_v",
+                "distribution",
+                "material",
+                "specular_reflectance",
+                "sample_visible",
+            ],
+        );
+        let alpha = if node.kind == "conductor" {
+            self.note(
+                "smooth_conductors",
+                format!("are rough ones of α = {}", Material::MIN_ALPHA),
+            );
+            Material::MIN_ALPHA
+        } else {
+            let (u, v) = (node.number("alpha_u")?, node.number("alpha_v")?);
+            if u != v {
+                return Err(node.fail("alpha_u and alpha_v differ: anisotropy is not supported"));
+            }
+            let alpha = node.number("alpha")?.or(u).unwrap_or(0.1) as f32;
+            if alpha < Material::MIN_ALPHA {
+                self.note(
+                    "alpha",
+                    format!("below {0} raised to {0}", Material::MIN_ALPHA),
+                );
+            }
+            alpha.max(Material::MIN_ALPHA)
+        };
+        let distribution = match node.text("distribution")?.unwrap_or("beckmann") {
+            "beckmann" => Distribution::Beckmann,
+            "ggx" => Distribution::Ggx,
+            other => {
+                return Err(node.fail(format!("distribution: {other:?}; use beckmann or ggx")));
+            }
+        };
+        let fresnel = match node.text("material")? {
+            Some("none") => [1.0; 3],
+            Some(name) if METALS.iter().any(|(known, _)| *known == name) => {
+                self.note("metals", "Fresnel reflectance at normal incidence used");
+                METALS
+                    .iter()
+                    .find(|(known, _)| *known == name)
+                    .map_or([1.0; 3], |m| m.1)
+            }
+            found => {
+                return Err(node.fail(format!(
+                    "material: {}; use \"none\" with specular_reflectance, or one of Ag, Al, Au, Cr, Cu",
+                    found.map_or("missing (Mitsuba's default is Cu)".into(), |m| format!("{m:?} is not known"))
+                )));
+            }
+        };
+        let mut colour = self
+            .colour(node, "specular_reflectance")?
+            .unwrap_or(Colour::grey(1.0));
+        for (c, f) in colour.rgb.iter_mut().zip(fresnel) {
+            *c *= f;
+        }
+        Ok((colour, alpha, distribution))
+    }
+
+    /// A colour parameter: numbers, or a bitmap.
+    fn colour(&mut self, node: &Node, name: &str) -> Result<Option<Colour>, String> {
+        let rgb = match node.parameters.get(name) {
+            Some(Value::Colour(rgb)) => Some(*rgb),
+            Some(Value::Number(x)) => Some([*x as f32; 3]),
+            Some(Value::Vector(v)) => Some(v.map(|x| x as f32)),
+            Some(_) => return Err(node.fail(format!("{name}: expected a colour"))),
+            None => None,
+        };
+        if let Some(rgb) = rgb {
+            return Ok(Some(Colour { rgb, texture: None }));
+        }
+        match self.children_named(node, name)?.as_slice() {
+            [] => Ok(None),
+            [texture] => {
+                let texture = self.bitmap(&texture.clone())?;
+                Ok(Some(Colour {
+                    rgb: [1.0; 3],
+                    texture: Some(texture),
+                }))
+            }
+            _ => Err(node.fail(format!("{name}: stated twice"))),
+        }
+    }
+
+    fn bitmap(&mut self, node: &Node) -> Result<(Arc<Texture>, Matrix), String> {
+        if node.kind != "bitmap" {
+            return Err(node.fail(format!(
+                "texture {:?} is not supported; use bitmap",
+                node.kind
+            )));
+        }
+        self.ignored(
+            node,
+            &["filename", "filter_type", "wrap_mode", "raw", "to_uv"],
+        );
+        let filename = node
+            .text("filename")?
+            .ok_or_else(|| node.fail("needs a filename"))?;
+        let wrap = match node.text("wrap_mode")?.unwrap_or("repeat") {
+            "repeat" => Wrap::Repeat,
+            "mirror" => Wrap::Mirror,
+            "clamp" => Wrap::Clamp,
+            other => {
+                return Err(node.fail(format!("wrap_mode: {other:?}; use repeat, mirror or clamp")));
+            }
+        };
+        if node.text("filter_type")? == Some("nearest") {
+            self.note("textures.filter", "nearest; bilinear used");
+        }
+        let file = self.folder.join(filename);
+        let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+        let raw = node.switch("raw")?.unwrap_or(false);
+        let texture = self.image(node, &file, &stem, wrap, raw)?;
+        Ok((texture, node.transform("to_uv")?))
+    }
+
+    fn image(
+        &mut self,
+        node: &Node,
+        file: &PathBuf,
+        name: &str,
+        wrap: Wrap,
+        raw: bool,
+    ) -> Result<Arc<Texture>, String> {
+        let decode = || {
+            let bytes = read_file(file).map_err(|e| e.to_string())?;
+            let texture = image::decode(name, &bytes, wrap)?;
+            if !raw {
+                return Ok(texture);
+            }
+            // `raw` texels are linear already; ours are sRGB-encoded.
+            let encoded = |t: &[u8; 3]| t.map(|c| srgb_byte(f32::from(c) / 255.0));
+            let texels = texture.texels().iter().map(encoded).collect();
+            Texture::new(name, texture.width(), texture.height(), texels, wrap)
+        };
+        self.images
+            .get((file.clone(), wrap, raw), decode)
+            .map_err(|e| node.fail(e))
+    }
+}
+
+fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
+    let texture_of = |c: &Option<Colour>| c.as_ref().and_then(|c| c.texture.clone());
+    let diffuse = texture_of(&parts.diffuse);
+    let conductor = texture_of(&parts.conductor.as_ref().map(|c| c.0.clone()));
+    let texture = match (&parts.diffuse, &parts.conductor) {
+        (Some(_), Some(_)) => match (diffuse, conductor) {
+            (None, None) => None,
+            (Some(a), Some(b)) if a == b => Some(a),
+            _ => {
+                return Err(
+                    node.fail("a texture scales both parts of a mix: give both the same bitmap")
+                );
+            }
+        },
+        _ => diffuse.or(conductor),
+    };
+    let (rgb, bsdf) = match (parts.diffuse, parts.conductor) {
+        (Some(d), None) => (
+            d.rgb,
+            Bsdf::Diffuse {
+                reflectance: d.mean(),
+            },
+        ),
+        (None, Some((s, alpha, distribution))) => (
+            s.rgb,
+            Bsdf::RoughConductor {
+                alpha,
+                distribution,
+                reflectance: s.mean(),
+            },
+        ),
+        (Some(d), Some((s, alpha, distribution))) => {
+            let w = parts.weight;
+            let rgb = std::array::from_fn(|k| (1.0 - w) * d.rgb[k] + w * s.rgb[k]);
+            let bsdf = Bsdf::Mixed {
+                reflectance: d.mean(),
+                alpha,
+                distribution,
+                specular_reflectance: s.mean(),
+                weight: w,
+            };
+            (rgb, bsdf)
+        }
+        (None, None) => return Err(node.fail("has no BSDF")),
+    };
+    let (texture, to_uv) = texture.map_or((None, Matrix::IDENTITY), |(t, m)| (Some(t), m));
+    let name = if node.id.is_empty() {
+        &node.kind
+    } else {
+        &node.id
+    };
+    let mut material = Material::diffuse(name.clone(), rgb);
+    material.bsdf = bsdf;
+    material.texture = texture;
+    material.two_sided = parts.two_sided;
+    Ok(Look { material, to_uv })
+}

@@ -1,0 +1,263 @@
+//! Mitsuba's Python dictionary, written as JSON: `type` keys, `to_world` as rows of numbers.
+
+use std::{collections::BTreeSet, fmt, rc::Rc};
+
+use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
+
+use super::{
+    node::{Child, Node, Value, triple},
+    transform::Matrix,
+};
+
+/// Plugins by what they are; a dictionary does not say.
+const TAGS: [(&str, &[&str]); 6] = [
+    (
+        "shape",
+        &["ply", "obj", "rectangle", "cube", "sphere", "disk"],
+    ),
+    (
+        "bsdf",
+        &[
+            "diffuse",
+            "roughconductor",
+            "conductor",
+            "twosided",
+            "blendbsdf",
+        ],
+    ),
+    ("sensor", &["perspective"]),
+    (
+        "emitter",
+        &[
+            "projector",
+            "spot",
+            "point",
+            "area",
+            "constant",
+            "envmap",
+            "directional",
+            "directionalarea",
+            "angulararea",
+        ],
+    ),
+    ("texture", &["bitmap"]),
+    (
+        "film",
+        &[
+            "hdrfilm",
+            "specfilm",
+            "transient_hdr_film",
+            "phasor_hdr_film",
+        ],
+    ),
+];
+/// What says how to render, which is the job's business.
+const SKIPPED: [&str; 21] = [
+    "path",
+    "direct",
+    "volpath",
+    "volpathmis",
+    "aov",
+    "depth",
+    "ptracer",
+    "prb",
+    "stokes",
+    "moment",
+    "transient_path",
+    "transient_volpath",
+    "transient_prbvolpath",
+    "transient_nlos_path",
+    "independent",
+    "stratified",
+    "multijitter",
+    "orthogonal",
+    "ldsampler",
+    "box",
+    "gaussian",
+];
+
+/// JSON whose keys keep their order: it decides which BSDF of a blend is the first.
+enum Json {
+    Null,
+    Switch(bool),
+    Number(f64),
+    Text(String),
+    List(Vec<Json>),
+    Fields(Vec<(String, Json)>),
+}
+
+impl Json {
+    fn text(&self) -> Option<&str> {
+        match self {
+            Json::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Json {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Any;
+        impl<'de> Visitor<'de> for Any {
+            type Value = Json;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("JSON")
+            }
+
+            fn visit_unit<E>(self) -> Result<Json, E> {
+                Ok(Json::Null)
+            }
+
+            fn visit_bool<E>(self, value: bool) -> Result<Json, E> {
+                Ok(Json::Switch(value))
+            }
+
+            fn visit_f64<E: serde::de::Error>(self, value: f64) -> Result<Json, E> {
+                // Through f32, so that what was written as f32 comes back.
+                let value = value as f32;
+                if value.is_finite() {
+                    Ok(Json::Number(f64::from(value)))
+                } else {
+                    Err(E::custom("a number is too large"))
+                }
+            }
+
+            fn visit_i64<E: serde::de::Error>(self, value: i64) -> Result<Json, E> {
+                self.visit_f64(value as f64)
+            }
+
+            fn visit_u64<E: serde::de::Error>(self, value: u64) -> Result<Json, E> {
+                self.visit_f64(value as f64)
+            }
+
+            fn visit_str<E>(self, value: &str) -> Result<Json, E> {
+                Ok(Json::Text(value.to_owned()))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Json, A::Error> {
+                let mut all = Vec::new();
+                while let Some(item) = items.next_element()? {
+                    all.push(item);
+                }
+                Ok(Json::List(all))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut fields: A) -> Result<Json, A::Error> {
+                let (mut all, mut known) = (Vec::new(), BTreeSet::new());
+                while let Some((key, value)) = fields.next_entry::<String, Json>()? {
+                    if !known.insert(key.clone()) {
+                        return Err(A::Error::custom(format!("key {key:?} is stated twice")));
+                    }
+                    all.push((key, value));
+                }
+                Ok(Json::Fields(all))
+            }
+        }
+        deserializer.deserialize_any(Any)
+    }
+}
+
+fn field<'a>(fields: &'a [(String, Json)], key: &str) -> Option<&'a Json> {
+    fields.iter().find(|(k, _)| k == key).map(|(_, v)| v)
+}
+
+/// The scene's node of a dictionary.
+pub(super) fn parse(bytes: &[u8]) -> Result<Node, String> {
+    let json = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
+    let Json::Fields(root) = json else {
+        return Err("expected a dictionary".into());
+    };
+    node(&root, "scene", "scene")?.ok_or_else(|| "the scene is empty".into())
+}
+
+/// A plugin; `None` for those that are none of our business.
+fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, String> {
+    let Some(kind) = field(json, "type").and_then(Json::text) else {
+        return Err(format!("{at}: needs the key \"type\" (text)"));
+    };
+    if SKIPPED.contains(&kind) || matches!(key, "integrator" | "sampler" | "rfilter") {
+        return Ok(None);
+    }
+    let tag = TAGS.iter().find(|(_, kinds)| kinds.contains(&kind));
+    let mut out = Node {
+        tag: tag.map_or("", |(tag, _)| tag).to_owned(),
+        kind: kind.to_owned(),
+        id: field(json, "id")
+            .and_then(Json::text)
+            .unwrap_or(key)
+            .to_owned(),
+        at: format!("{at} (type {kind:?})"),
+        ..Node::default()
+    };
+    for (name, value) in json {
+        let inner = format!("{at}.{name}");
+        let wrong = |expected: &str| format!("{inner}: expected {expected}");
+        let value = match value {
+            _ if name == "type" || name == "id" => continue,
+            Json::Switch(b) => Value::Switch(*b),
+            Json::Number(n) => Value::Number(*n),
+            Json::Text(s) => Value::Text(s.clone()),
+            Json::List(items) => array(items).map_err(|e| format!("{inner}: {e}"))?,
+            Json::Fields(fields) => match field(fields, "type").and_then(Json::text) {
+                Some("ref") => {
+                    let id = field(fields, "id").and_then(Json::text);
+                    let id = id.ok_or_else(|| wrong("{\"type\": \"ref\", \"id\": …}"))?;
+                    out.children
+                        .push((name.clone(), Child::Reference(id.to_owned())));
+                    continue;
+                }
+                Some("rgb" | "spectrum" | "srgb" | "uniform") => {
+                    let value = field(fields, "value").unwrap_or(&Json::Null);
+                    let colour = flat(value).and_then(|n| triple(&n));
+                    Value::Colour(
+                        colour
+                            .map_err(|e| format!("{inner}: {e}"))?
+                            .map(|x| x as f32),
+                    )
+                }
+                _ => {
+                    if let Some(child) = node(fields, name, &inner)? {
+                        out.children
+                            .push((name.clone(), Child::Node(Rc::new(child))));
+                    }
+                    continue;
+                }
+            },
+            Json::Null => return Err(wrong("a value, found null")),
+        };
+        out.parameters.insert(name.clone(), value);
+    }
+    Ok(Some(out))
+}
+
+/// Rows of numbers, or numbers, as one list.
+fn flat(json: &Json) -> Result<Vec<f64>, String> {
+    const EXPECTED: &str = "expected numbers";
+    match json {
+        Json::Number(n) => Ok(vec![*n]),
+        Json::List(items) => {
+            let mut all = Vec::new();
+            for item in items {
+                all.extend(flat(item)?);
+            }
+            Ok(all)
+        }
+        _ => Err(EXPECTED.into()),
+    }
+}
+
+fn array(items: &[Json]) -> Result<Value, String> {
+    let all = items
+        .iter()
+        .map(flat)
+        .collect::<Result<Vec<_>, _>>()?
+        .concat();
+    match all.len() {
+        3 => triple(&all).map(Value::Vector),
+        9 | 16 => Matrix::from_numbers(&all).map(Value::Transform),
+        n => Err(format!(
+            "expected 3 numbers or a 4x4 matrix, found {n} numbers"
+        )),
+    }
+}

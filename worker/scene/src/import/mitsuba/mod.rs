@@ -1,0 +1,373 @@
+//! Mitsuba 3 scenes, as XML or as the Python dictionary written as JSON.
+//!
+//! Understood: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size); shapes `ply`,
+//! `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs `diffuse`,
+//! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
+//! a diffuse and a conductor; `bitmap` textures; references, `<default>` parameters, and every transform. A shape
+//! without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
+//! Integrators, samplers and media are skipped; any other plugin is an error that names it.
+//!
+//! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
+//! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all
+//! start at one place. Its power is not read: every beam is of unit energy. Other emitters are left out with a
+//! note. Without beams, a grid must be stated on import.
+//!
+//! **Labels.** A shape's category is its id up to the first `.` (`chair.2` is a `chair`), else `unlabelled`.
+//!
+//! Files of [`crate::export`] carry what Mitsuba has no words for in a comment of the scene that starts with
+//! `picofarm`: exact materials, labels, spots and provenance. Each is used only while the element that it
+//! belongs to still has the text that was written; edited elements count as they stand.
+
+mod bsdf;
+mod dictionary;
+mod node;
+mod shape;
+mod transform;
+mod view;
+mod xml;
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    rc::Rc,
+    sync::Arc,
+};
+
+use crate::{
+    Affine, Material, Mesh, Object, Provenance, Scene, SceneError, Wrap,
+    export::mitsuba::text::Extras,
+};
+
+use super::{ImportOptions, format_error, image::Images};
+use bsdf::Look;
+use node::{Child, Node};
+use shape::Geometry;
+use transform::Matrix;
+
+/// Category of shapes whose id names none.
+const UNLABELLED: &str = "unlabelled";
+/// Most triangles of a scene, instances counted each.
+const MAX_TRIANGLES: usize = 1 << 28;
+
+/// Reads a scene in XML; the caller validates the result.
+pub(super) fn read_xml(
+    path: &Path,
+    bytes: &[u8],
+    options: &ImportOptions,
+) -> Result<Scene, SceneError> {
+    let fail = |what: String| format_error(path, what);
+    let text = std::str::from_utf8(bytes).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
+    let (root, extras) = xml::parse(text.trim_start_matches('\u{feff}')).map_err(fail)?;
+    let extras = extras
+        .map(|text| serde_json::from_str::<Extras>(&text))
+        .transpose()
+        .map_err(|e| fail(format!("comment picofarm: {e}; remove it, or export again")))?;
+    Reader::new(path, root, extras).scene(options).map_err(fail)
+}
+
+/// Reads a scene from its dictionary in JSON; the caller validates the result.
+pub(super) fn read_dictionary(
+    path: &Path,
+    bytes: &[u8],
+    options: &ImportOptions,
+) -> Result<Scene, SceneError> {
+    let fail = |what: String| format_error(path, what);
+    let root = dictionary::parse(bytes).map_err(fail)?;
+    Reader::new(path, root, None).scene(options).map_err(fail)
+}
+
+/// The files that a scene in XML or JSON refers to, in order of their names.
+pub(super) fn files(path: &Path, bytes: &[u8]) -> Vec<PathBuf> {
+    let root = match std::str::from_utf8(bytes) {
+        Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes).ok(),
+        Ok(text) => xml::parse(text.trim_start_matches('\u{feff}'))
+            .ok()
+            .map(|x| x.0),
+        Err(_) => None,
+    };
+    let mut names = Vec::new();
+    let mut open: Vec<Rc<Node>> = root.map(Rc::new).into_iter().collect();
+    while let Some(node) = open.pop() {
+        if let Ok(Some(name)) = node.text("filename") {
+            names.push(folder(path).join(name));
+        }
+        for (_, child) in &node.children {
+            if let Child::Node(child) = child {
+                open.push(child.clone());
+            }
+        }
+    }
+    names.sort();
+    names.dedup();
+    names
+}
+
+fn folder(path: &Path) -> &Path {
+    path.parent().unwrap_or(Path::new(""))
+}
+
+struct Reader<'a> {
+    path: &'a Path,
+    folder: &'a Path,
+    root: Rc<Node>,
+    ids: BTreeMap<String, Rc<Node>>,
+    extras: Option<Extras>,
+    images: Images<(PathBuf, Wrap, bool)>,
+    /// Materials by the address of their node, which lives as long as `root`.
+    looks: BTreeMap<usize, Look>,
+    geometries: BTreeMap<PathBuf, Geometry>,
+    notes: BTreeMap<String, String>,
+}
+
+impl<'a> Reader<'a> {
+    fn new(path: &'a Path, root: Node, extras: Option<Extras>) -> Self {
+        let root = Rc::new(root);
+        let mut ids = BTreeMap::new();
+        let mut open = vec![root.clone()];
+        while let Some(node) = open.pop() {
+            for (_, child) in &node.children {
+                if let Child::Node(child) = child {
+                    open.push(child.clone());
+                }
+            }
+            if !node.id.is_empty() {
+                ids.entry(node.id.clone()).or_insert(node);
+            }
+        }
+        Self {
+            path,
+            folder: folder(path),
+            root,
+            ids,
+            extras,
+            images: Images::default(),
+            looks: BTreeMap::new(),
+            geometries: BTreeMap::new(),
+            notes: BTreeMap::new(),
+        }
+    }
+
+    fn note(&mut self, key: &str, what: impl Into<String>) {
+        self.notes.insert(key.into(), what.into());
+    }
+
+    /// Notes parameters that have no meaning here.
+    fn ignored(&mut self, node: &Node, known: &[&str]) {
+        for name in node.others(known) {
+            self.note(&format!("ignored {name}"), "this parameter is not used");
+        }
+    }
+
+    fn resolved(&self, node: &Node, child: &Child) -> Result<Rc<Node>, String> {
+        match child {
+            Child::Node(child) => Ok(child.clone()),
+            Child::Reference(id) => self.ids.get(id).cloned().ok_or_else(|| {
+                node.fail(format!("refers to {id:?}, which no element has as its id"))
+            }),
+        }
+    }
+
+    /// Children of one tag, references resolved.
+    fn children(&self, node: &Node, tag: &str) -> Result<Vec<Rc<Node>>, String> {
+        let mut found = Vec::new();
+        for (_, child) in &node.children {
+            let child = self.resolved(node, child)?;
+            if child.tag == tag {
+                found.push(child);
+            } else if child.tag.is_empty() {
+                let what = format!("plugin {:?} is not supported", child.kind);
+                return Err(child.fail(what));
+            }
+        }
+        Ok(found)
+    }
+
+    fn children_named(&self, node: &Node, name: &str) -> Result<Vec<Rc<Node>>, String> {
+        node.children
+            .iter()
+            .filter(|(n, _)| n == name)
+            .map(|(_, child)| self.resolved(node, child))
+            .collect()
+    }
+
+    fn scene(mut self, options: &ImportOptions) -> Result<Scene, String> {
+        let root = self.root.clone();
+        let shapes = self.children(&root, "shape")?;
+        let (objects, labels) = self.objects(&shapes)?;
+        let sensors = self.children(&root, "sensor")?;
+        if sensors.len() > 1 {
+            self.note("sensors", "more than one; the first is the camera");
+        }
+        let camera = match (options.camera, sensors.first()) {
+            (Some(camera), _) => camera,
+            (None, Some(sensor)) => self.camera(sensor)?,
+            (None, None) => {
+                return Err(
+                    "has no <sensor>; add a perspective one, or state a camera on import".into(),
+                );
+            }
+        };
+        let laser = match options.laser {
+            Some(grid) => grid.laser(&camera),
+            None => {
+                let emitters = self.children(&root, "emitter")?;
+                self.laser(&emitters)?.ok_or(
+                    "has no beam: add <emitter type=\"projector\"> with fov 0.1 and to_world for each, or \
+                     state a grid on import",
+                )?
+            }
+        };
+        let stem = self.path.file_stem().unwrap_or_default();
+        let (name, mut provenance) = match self.extras {
+            Some(extras) => (extras.scene.name, extras.scene.provenance),
+            None => {
+                let provenance = Provenance {
+                    source: "mitsuba".into(),
+                    ..Provenance::default()
+                };
+                (stem.to_string_lossy().into_owned(), provenance)
+            }
+        };
+        for (key, note) in self.notes {
+            provenance.notes.insert(format!("import.{key}"), note);
+        }
+        Ok(Scene {
+            name,
+            objects,
+            labels,
+            camera,
+            laser,
+            provenance,
+        })
+    }
+
+    fn objects(&mut self, shapes: &[Rc<Node>]) -> Result<(Vec<Object>, Vec<String>), String> {
+        let mut labels = self
+            .extras
+            .as_ref()
+            .map_or_else(Vec::new, |e| e.scene.labels.clone());
+        let mut objects = Vec::new();
+        let mut triangles = 0;
+        let mut shared: BTreeMap<Vec<String>, Arc<Mesh>> = BTreeMap::new();
+        let groups: Vec<&[Rc<Node>]> = shapes.chunk_by(|a, b| self.same_object(a, b)).collect();
+        for parts in groups {
+            let first = &parts[0];
+            let ours = self.our_object(first);
+            let (name, label) = match ours {
+                Some(k) => {
+                    let object = &self.extras.as_ref().expect("ours has extras").objects[k];
+                    (object.name.clone(), object.label.clone())
+                }
+                None => {
+                    let label = first.id.split('.').next().unwrap_or_default();
+                    let label = if label.is_empty() { UNLABELLED } else { label };
+                    let name = if first.id.is_empty() {
+                        &first.kind
+                    } else {
+                        &first.id
+                    };
+                    (name.clone(), label.to_owned())
+                }
+            };
+            let known = labels.iter().position(|l| *l == label);
+            let label = known.unwrap_or_else(|| {
+                labels.push(label);
+                labels.len() - 1
+            });
+            let label =
+                u16::try_from(label).map_err(|_| first.fail("more than 65535 categories"))?;
+            let (mesh, place) = self.mesh(parts, &name, ours)?;
+            triangles += mesh.triangles.len();
+            if triangles > MAX_TRIANGLES {
+                return Err(first.fail(format!("more than {MAX_TRIANGLES} triangles in all")));
+            }
+            // Equal shapes of our own files share their mesh as they did.
+            let mesh = match ours {
+                Some(_) => {
+                    let key = parts.iter().map(|p| self.identity(p)).collect();
+                    shared.entry(key).or_insert_with(|| Arc::new(mesh)).clone()
+                }
+                None => Arc::new(mesh),
+            };
+            objects.push(Object {
+                mesh,
+                to_world: place,
+                label,
+                name,
+            });
+        }
+        Ok((objects, labels))
+    }
+
+    /// What makes two shapes of our own files the same mesh: file and material.
+    fn identity(&self, node: &Node) -> String {
+        let file = node.text("filename").ok().flatten().unwrap_or_default();
+        let material = node.children.iter().find_map(|(_, c)| match c {
+            Child::Reference(id) => Some(id.as_str()),
+            Child::Node(_) => None,
+        });
+        format!("{file}\n{}", material.unwrap_or_default())
+    }
+
+    /// Index into our extras of a shape `object<k>` or `object<k>.<part>`.
+    fn our_object(&self, node: &Node) -> Option<usize> {
+        let objects = &self.extras.as_ref()?.objects;
+        let number = node.id.strip_prefix("object")?.split('.').next()?;
+        number.parse().ok().filter(|k| *k < objects.len())
+    }
+
+    fn same_object(&self, a: &Node, b: &Node) -> bool {
+        let same = self.our_object(a).is_some() && self.our_object(a) == self.our_object(b);
+        same && a.transform("to_world").ok() == b.transform("to_world").ok()
+    }
+
+    /// One mesh of a shape, or of the parts that an object of ours was written as.
+    fn mesh(
+        &mut self,
+        parts: &[Rc<Node>],
+        name: &str,
+        ours: Option<usize>,
+    ) -> Result<(Mesh, Affine), String> {
+        let mut mesh = Mesh {
+            name: name.to_owned(),
+            ..Mesh::default()
+        };
+        if let (Some(k), Some(extras)) = (ours, &self.extras) {
+            mesh.name = extras.objects[k].mesh.clone();
+        }
+        let mut place = Matrix::IDENTITY;
+        for part in parts {
+            if !self.children(part, "emitter")?.is_empty() {
+                self.note(
+                    "emitters",
+                    "other than beams are ignored; only the laser shines",
+                );
+            }
+            let look = match self.children(part, "bsdf")?.as_slice() {
+                [] => Look {
+                    material: Material {
+                        two_sided: false,
+                        ..Material::diffuse("default", [0.5; 3])
+                    },
+                    to_uv: Matrix::IDENTITY,
+                },
+                [bsdf] => self.look(bsdf)?,
+                _ => return Err(part.fail("has more than one BSDF")),
+            };
+            let (geometry, inner) = self.geometry(part)?;
+            let slot = mesh.materials.len() as u32;
+            let mut material = look.material;
+            if material.texture.is_some() && geometry.uv.is_empty() {
+                self.note(
+                    "textures",
+                    "left out where a mesh has no texture coordinates",
+                );
+                material.texture = None;
+            }
+            mesh.materials.push(material);
+            geometry.append_to(&mut mesh, slot, &look.to_uv);
+            place = part.transform("to_world")?.after(&inner);
+        }
+        Ok((mesh, place.affine()))
+    }
+}

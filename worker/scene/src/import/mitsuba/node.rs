@@ -1,0 +1,121 @@
+//! The tree that XML and the dictionary have in common: plugins with parameters and children.
+
+use std::{collections::BTreeMap, rc::Rc};
+
+use super::transform::Matrix;
+
+/// A parameter's value.
+#[derive(Debug, Clone)]
+pub(super) enum Value {
+    Number(f64),
+    Switch(bool),
+    Text(String),
+    Colour([f32; 3]),
+    Vector([f64; 3]),
+    Transform(Matrix),
+}
+
+/// A child, or the id of one.
+#[derive(Debug, Clone)]
+pub(super) enum Child {
+    Node(Rc<Node>),
+    Reference(String),
+}
+
+/// A plugin.
+#[derive(Debug, Default)]
+pub(super) struct Node {
+    /// shape, bsdf, sensor, …
+    pub(super) tag: String,
+    /// The plugin's name.
+    pub(super) kind: String,
+    /// Empty without one.
+    pub(super) id: String,
+    /// Where it stands, for errors.
+    pub(super) at: String,
+    /// Its own XML text; empty from a dictionary.
+    pub(super) text: String,
+    pub(super) parameters: BTreeMap<String, Value>,
+    /// (parameter name or empty, child), in order.
+    pub(super) children: Vec<(String, Child)>,
+}
+
+impl Node {
+    /// A message that says where.
+    pub(super) fn fail(&self, what: impl std::fmt::Display) -> String {
+        format!("{}: {what}", self.at)
+    }
+
+    fn wrong(&self, name: &str, expected: &str) -> String {
+        self.fail(format!("{name}: expected {expected}"))
+    }
+
+    pub(super) fn number(&self, name: &str) -> Result<Option<f64>, String> {
+        match self.parameters.get(name) {
+            None => Ok(None),
+            Some(Value::Number(x)) => Ok(Some(*x)),
+            Some(_) => Err(self.wrong(name, "a number")),
+        }
+    }
+
+    pub(super) fn text(&self, name: &str) -> Result<Option<&str>, String> {
+        match self.parameters.get(name) {
+            None => Ok(None),
+            Some(Value::Text(x)) => Ok(Some(x)),
+            Some(_) => Err(self.wrong(name, "a string")),
+        }
+    }
+
+    pub(super) fn switch(&self, name: &str) -> Result<Option<bool>, String> {
+        match self.parameters.get(name) {
+            None => Ok(None),
+            Some(Value::Switch(x)) => Ok(Some(*x)),
+            Some(_) => Err(self.wrong(name, "true or false")),
+        }
+    }
+
+    pub(super) fn vector(&self, name: &str) -> Result<Option<[f64; 3]>, String> {
+        match self.parameters.get(name) {
+            None => Ok(None),
+            Some(Value::Vector(x)) => Ok(Some(*x)),
+            Some(_) => Err(self.wrong(name, "a point or vector")),
+        }
+    }
+
+    pub(super) fn transform(&self, name: &str) -> Result<Matrix, String> {
+        match self.parameters.get(name) {
+            None => Ok(Matrix::IDENTITY),
+            Some(Value::Transform(x)) => Ok(*x),
+            Some(_) => Err(self.wrong(name, "a transform")),
+        }
+    }
+
+    /// Names of parameters that are not among `known`.
+    pub(super) fn others(&self, known: &[&str]) -> Vec<String> {
+        let names = self.parameters.keys();
+        names
+            .filter(|n| !known.contains(&n.as_str()))
+            .map(|n| format!("{} {}", self.kind, n))
+            .collect()
+    }
+}
+
+/// Numbers separated by commas or white space; each through f32, so that what was written as f32 comes back.
+pub(super) fn numbers(text: &str) -> Result<Vec<f64>, String> {
+    text.split(|c: char| c == ',' || c.is_ascii_whitespace())
+        .filter(|w| !w.is_empty())
+        .map(|w| match w.parse::<f32>() {
+            Ok(x) if x.is_finite() => Ok(f64::from(x)),
+            _ => Err(format!("expected a finite number, found {w:?}")),
+        })
+        .collect()
+}
+
+/// One number for all three, or three.
+pub(super) fn triple(n: &[f64]) -> Result<[f64; 3], String> {
+    match *n {
+        [x] => Ok([x; 3]),
+        [x, y, z] => Ok([x, y, z]),
+        _ => Err(format!("expected 1 or 3 numbers, found {}", n.len())),
+    }
+}

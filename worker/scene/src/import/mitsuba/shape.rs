@@ -1,0 +1,294 @@
+//! Mitsuba's shapes as meshes in their own frame.
+
+use std::{io::Cursor, path::Path};
+
+use crate::{
+    Mesh, Vec3,
+    import::{ply, read_file},
+};
+
+use super::{Reader, node::Node, transform::Matrix};
+
+/// Facets of a tessellated sphere from pole to pole, and half of those around.
+const SPHERE_ROWS: u32 = 48;
+/// Facets of a tessellated disk.
+const DISK_SECTORS: u32 = 96;
+
+/// Geometry without materials.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Geometry {
+    pub(super) positions: Vec<Vec3>,
+    pub(super) uv: Vec<[f32; 2]>,
+    pub(super) triangles: Vec<[u32; 3]>,
+}
+
+impl Geometry {
+    fn vertex(&mut self, p: [f32; 3], uv: [f32; 2]) {
+        self.positions.push(Vec3::from(p));
+        self.uv.push(uv);
+    }
+
+    fn turned(mut self) -> Self {
+        for t in &mut self.triangles {
+            t.swap(1, 2);
+        }
+        self
+    }
+
+    /// Appends this geometry to a mesh, its facets with material `slot`.
+    pub(super) fn append_to(&self, mesh: &mut Mesh, slot: u32, to_uv: &Matrix) {
+        let base = mesh.positions.len();
+        mesh.positions.extend(&self.positions);
+        if !self.uv.is_empty() {
+            mesh.uv.resize(base, [0.0; 2]);
+            mesh.uv.extend(self.uv.iter().map(|uv| placed(to_uv, *uv)));
+        }
+        if !mesh.uv.is_empty() {
+            mesh.uv.resize(mesh.positions.len(), [0.0; 2]);
+        }
+        let shift = |t: &[u32; 3]| t.map(|v| v + base as u32);
+        mesh.triangles.extend(self.triangles.iter().map(shift));
+        mesh.triangle_material
+            .extend(self.triangles.iter().map(|_| slot));
+    }
+}
+
+fn placed(to_uv: &Matrix, [u, v]: [f32; 2]) -> [f32; 2] {
+    if *to_uv == Matrix::IDENTITY {
+        return [u, v];
+    }
+    let (u, v) = (f64::from(u), f64::from(v));
+    [0, 1].map(|r| {
+        let m = to_uv.0[r];
+        // Mitsuba takes the third column of a 3×3 as the shift, the fourth of a 4×4.
+        (m[0] * u + m[1] * v + m[2] + m[3]) as f32
+    })
+}
+
+impl Reader<'_> {
+    /// A shape's geometry, and what its own parameters add to `to_world`.
+    pub(super) fn geometry(&mut self, node: &Node) -> Result<(Geometry, Matrix), String> {
+        const COMMON: [&str; 4] = [
+            "to_world",
+            "flip_normals",
+            "face_normals",
+            "flip_tex_coords",
+        ];
+        let mut place = Matrix::IDENTITY;
+        let geometry = match node.kind.as_str() {
+            "ply" | "obj" => {
+                let mut known = COMMON.to_vec();
+                known.push("filename");
+                self.ignored(node, &known);
+                self.file(node)?
+            }
+            "rectangle" => {
+                self.ignored(node, &COMMON);
+                rectangle()
+            }
+            "cube" => {
+                self.ignored(node, &COMMON);
+                cube()
+            }
+            "disk" => {
+                self.ignored(node, &COMMON);
+                self.note("disks", format!("have {DISK_SECTORS} flat sectors"));
+                disk()
+            }
+            "sphere" => {
+                self.ignored(node, &["to_world", "flip_normals", "center", "radius"]);
+                let rows = SPHERE_ROWS;
+                self.note(
+                    "spheres",
+                    format!("have {} by {rows} flat facets", 2 * rows),
+                );
+                let radius = node.number("radius")?.unwrap_or(1.0);
+                if radius.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
+                    return Err(node.fail("radius: must be positive"));
+                }
+                let centre = node.vector("center")?.unwrap_or([0.0; 3]);
+                place = Matrix::translation(centre).after(&Matrix::scale([radius; 3]));
+                sphere()
+            }
+            other => {
+                return Err(node.fail(format!(
+                    "shape {other:?} is not supported; use ply, obj, rectangle, cube, sphere or disk"
+                )));
+            }
+        };
+        let turned = node.switch("flip_normals")?.unwrap_or(false);
+        Ok((if turned { geometry.turned() } else { geometry }, place))
+    }
+
+    fn file(&mut self, node: &Node) -> Result<Geometry, String> {
+        let filename = node
+            .text("filename")?
+            .ok_or_else(|| node.fail("needs a filename"))?;
+        let path = self.folder.join(filename);
+        // OBJ counts v upwards, PLY as we do.
+        let obj = node.kind == "obj";
+        let flip = node.switch("flip_tex_coords")?.unwrap_or(obj);
+        let mut geometry = match self.geometries.get(&path) {
+            Some(known) => known.clone(),
+            None => {
+                let bytes = read_file(&path).map_err(|e| node.fail(e))?;
+                let read = if obj {
+                    read_obj(&bytes)
+                } else {
+                    self.read_ply(&bytes)
+                };
+                let geometry = read.map_err(|e| node.fail(format!("{}: {e}", path.display())))?;
+                self.geometries.insert(path, geometry.clone());
+                geometry
+            }
+        };
+        if flip {
+            for uv in &mut geometry.uv {
+                uv[1] = 1.0 - uv[1];
+            }
+        }
+        Ok(geometry)
+    }
+
+    fn read_ply(&mut self, bytes: &[u8]) -> Result<Geometry, String> {
+        let ply = ply::parse(bytes)?;
+        if ply.colour.is_some() {
+            self.note("vertex_colours", "ignored; materials' colours used");
+        }
+        if ply.skipped > 0 {
+            self.note("faces", "with fewer than three corners left out");
+        }
+        Ok(Geometry {
+            positions: ply.positions,
+            uv: ply.uv,
+            triangles: ply.triangles,
+        })
+    }
+}
+
+fn read_obj(bytes: &[u8]) -> Result<Geometry, String> {
+    let options = tobj::LoadOptions {
+        triangulate: true,
+        single_index: true,
+        ignore_points: true,
+        ignore_lines: true,
+        ..tobj::LoadOptions::default()
+    };
+    // Mitsuba takes the material from the shape, never from the OBJ.
+    let nothing = |_: &Path| Ok((Vec::new(), Default::default()));
+    let (models, _) = tobj::load_obj_buf(&mut Cursor::new(bytes), &options, nothing)
+        .map_err(|e| format!("is not readable OBJ: {e}"))?;
+    let mut all = Geometry::default();
+    for model in models {
+        let (base, part) = (all.positions.len() as u32, model.mesh);
+        let points = part.positions.as_chunks::<3>().0;
+        all.positions.extend(points.iter().map(|p| Vec3::from(*p)));
+        let coordinates = part.texcoords.as_chunks::<2>().0;
+        if coordinates.len() == points.len() {
+            all.uv.resize(base as usize, [0.0; 2]);
+            all.uv.extend(coordinates);
+        }
+        if !all.uv.is_empty() {
+            all.uv.resize(all.positions.len(), [0.0; 2]);
+        }
+        let corners = part.indices.as_chunks::<3>().0;
+        all.triangles
+            .extend(corners.iter().map(|t| t.map(|v| v + base)));
+    }
+    if all.triangles.is_empty() {
+        return Err("has no faces".into());
+    }
+    Ok(all)
+}
+
+fn rectangle() -> Geometry {
+    let mut g = Geometry::default();
+    for [u, v] in [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0f32]] {
+        g.vertex([2.0 * u - 1.0, 2.0 * v - 1.0, 0.0], [u, v]);
+    }
+    g.triangles = vec![[0, 1, 2], [0, 2, 3]];
+    g
+}
+
+/// The cube from −1 to 1, each face with the whole image.
+fn cube() -> Geometry {
+    const FACES: [[[f32; 3]; 4]; 6] = [
+        [
+            [1., -1., -1.],
+            [1., -1., 1.],
+            [-1., -1., 1.],
+            [-1., -1., -1.],
+        ],
+        [[1., 1., -1.], [-1., 1., -1.], [-1., 1., 1.], [1., 1., 1.]],
+        [[1., -1., -1.], [1., 1., -1.], [1., 1., 1.], [1., -1., 1.]],
+        [[1., -1., 1.], [1., 1., 1.], [-1., 1., 1.], [-1., -1., 1.]],
+        [
+            [-1., -1., 1.],
+            [-1., 1., 1.],
+            [-1., 1., -1.],
+            [-1., -1., -1.],
+        ],
+        [
+            [1., 1., -1.],
+            [1., -1., -1.],
+            [-1., -1., -1.],
+            [-1., 1., -1.],
+        ],
+    ];
+    let mut g = Geometry::default();
+    for face in FACES {
+        let base = g.positions.len() as u32;
+        for (p, uv) in face
+            .into_iter()
+            .zip([[0., 1.], [1., 1.], [1., 0.], [0., 0.]])
+        {
+            g.vertex(p, uv);
+        }
+        g.triangles.push([base, base + 1, base + 2]);
+        g.triangles.push([base + 3, base, base + 2]);
+    }
+    g
+}
+
+/// The unit disk that faces +z; u is the radius, v the angle.
+fn disk() -> Geometry {
+    let mut g = Geometry::default();
+    for k in 0..=DISK_SECTORS {
+        let v = k as f32 / DISK_SECTORS as f32;
+        let (s, c) = libm::sincosf(std::f32::consts::TAU * v);
+        g.vertex([0.0; 3], [0.0, v]);
+        g.vertex([c, s, 0.0], [1.0, v]);
+        if k > 0 {
+            g.triangles.push([2 * k - 2, 2 * k - 1, 2 * k + 1]);
+        }
+    }
+    g
+}
+
+/// The unit sphere with its poles on z; u is the azimuth, v the polar angle.
+fn sphere() -> Geometry {
+    let (rows, columns) = (SPHERE_ROWS, 2 * SPHERE_ROWS);
+    let mut g = Geometry::default();
+    for r in 0..=rows {
+        let v = r as f32 / rows as f32;
+        let (flat, z) = libm::sincosf(std::f32::consts::PI * v);
+        for c in 0..=columns {
+            let u = c as f32 / columns as f32;
+            let (y, x) = libm::sincosf(std::f32::consts::TAU * u);
+            g.vertex([flat * x, flat * y, z], [u, v]);
+        }
+    }
+    let at = |r: u32, c: u32| r * (columns + 1) + c;
+    for r in 0..rows {
+        for c in 0..columns {
+            let [a, b, d, e] = [at(r, c), at(r + 1, c), at(r + 1, c + 1), at(r, c + 1)];
+            if r + 1 < rows {
+                g.triangles.push([a, b, d]);
+            }
+            if r > 0 {
+                g.triangles.push([a, d, e]);
+            }
+        }
+    }
+    g
+}

@@ -1,0 +1,167 @@
+//! Mitsuba's sensor as the camera, and its narrow emitters as the laser's beams.
+
+use crate::{
+    Beam, Camera, Intrinsics, Laser, Vec3,
+    export::mitsuba::text::{beam_text, sensor_text},
+};
+
+use super::{Reader, node::Node};
+
+/// Widest full angle of an emitter that counts as a beam, degrees.
+const BEAM_DEG: f64 = 2.0;
+/// Mitsuba's film where none is stated.
+const FILM: [f64; 2] = [768.0, 576.0];
+
+impl Reader<'_> {
+    pub(super) fn camera(&mut self, node: &Node) -> Result<Camera, String> {
+        if let Some(extras) = &self.extras {
+            if sensor_text(&extras.scene.camera) == node.text {
+                return Ok(extras.scene.camera);
+            }
+            self.note(
+                "camera",
+                "edited since export; the sensor's parameters used",
+            );
+        }
+        if node.kind != "perspective" {
+            let what = format!("sensor {:?} is not supported; use perspective", node.kind);
+            return Err(node.fail(what));
+        }
+        self.ignored(
+            node,
+            &[
+                "to_world",
+                "fov",
+                "fov_axis",
+                "near_clip",
+                "far_clip",
+                "principal_point_offset_x",
+                "principal_point_offset_y",
+                "focus_distance",
+            ],
+        );
+        let mut film = FILM;
+        for child in self.children(node, "film")? {
+            for (k, name) in ["width", "height"].into_iter().enumerate() {
+                film[k] = child.number(name)?.unwrap_or(film[k]);
+            }
+            if child.parameters.keys().any(|k| k.starts_with("crop_")) {
+                return Err(child.fail("crop windows are not supported; remove them"));
+            }
+        }
+        let whole = |x: f64| (1.0..=65536.0).contains(&x) && x.fract() == 0.0;
+        if !film.iter().all(|&x| whole(x)) {
+            return Err(node.fail("film: width and height must be whole numbers from 1 to 65536"));
+        }
+        let [width, height] = film;
+        let fov = node
+            .number("fov")?
+            .ok_or_else(|| node.fail("needs fov, in degrees (focal_length is not supported)"))?;
+        if !(0.001..=179.0).contains(&fov) {
+            return Err(node.fail(format!("fov: {fov}; expected 0.001 to 179 degrees")));
+        }
+        let across = match node.text("fov_axis")?.unwrap_or("x") {
+            "x" => width,
+            "y" => height,
+            "diagonal" => (width * width + height * height).sqrt(),
+            "smaller" => width.min(height),
+            "larger" => width.max(height),
+            other => {
+                return Err(node.fail(format!(
+                    "fov_axis: {other:?}; use x, y, diagonal, smaller or larger"
+                )));
+            }
+        };
+        let f = (across * 0.5 / libm::tan(fov.to_radians() * 0.5)) as f32;
+        let offset = |name: &str| Ok::<_, String>(0.5 - node.number(name)?.unwrap_or(0.0));
+        let pose = node.transform("to_world")?;
+        let axis = |k: usize| {
+            pose.axis(k)
+                .ok_or_else(|| node.fail("to_world: has no inverse"))
+        };
+        Ok(Camera {
+            intrinsics: Intrinsics {
+                fx: f,
+                fy: f,
+                cx: (width * offset("principal_point_offset_x")?) as f32,
+                cy: (height * offset("principal_point_offset_y")?) as f32,
+                width: width as u32,
+                height: height as u32,
+            },
+            origin: pose.affine().translation,
+            right: -axis(0)?,
+            down: -axis(1)?,
+            forward: axis(2)?,
+        })
+    }
+
+    /// The laser of the emitters that are beams; `None` without any.
+    pub(super) fn laser(
+        &mut self,
+        emitters: &[std::rc::Rc<Node>],
+    ) -> Result<Option<Laser>, String> {
+        let mut beams: Vec<(Vec3, Vec3, &Node)> = Vec::new();
+        for node in emitters {
+            let angle = match node.kind.as_str() {
+                "projector" => node.number("fov")?,
+                "spot" => Some(2.0 * node.number("cutoff_angle")?.unwrap_or(20.0)),
+                _ => None,
+            };
+            match angle {
+                Some(angle) if angle <= BEAM_DEG => {
+                    let pose = node.transform("to_world")?;
+                    let along = pose
+                        .axis(2)
+                        .ok_or_else(|| node.fail("to_world: has no inverse"))?;
+                    beams.push((pose.affine().translation, along, node));
+                }
+                Some(angle) => {
+                    return Err(node.fail(format!(
+                        "is {angle} degrees wide and so no beam; narrow it to {BEAM_DEG} degrees or less"
+                    )));
+                }
+                None => self.note(
+                    "emitters",
+                    "other than beams are ignored; only the laser shines",
+                ),
+            }
+        }
+        if let Some(extras) = &self.extras {
+            let ours = &extras.scene.laser;
+            let same = ours.beams.len() == beams.len()
+                && ours
+                    .beams
+                    .iter()
+                    .zip(&beams)
+                    .enumerate()
+                    .all(|(k, (b, (_, _, node)))| beam_text(k, ours.origin, b) == node.text);
+            if same {
+                return Ok(Some(ours.clone()));
+            }
+            self.note(
+                "laser",
+                "edited since export; the emitters' parameters used",
+            );
+        }
+        let Some(&(origin, _, _)) = beams.first() else {
+            return Ok(None);
+        };
+        let reach = 1e-5 * (1.0 + origin.length());
+        if let Some((other, _, node)) = beams
+            .iter()
+            .find(|(o, _, _)| (*o - origin).length() > reach)
+        {
+            return Err(node.fail(format!(
+                "starts at {other:?}, the first beam at {origin:?}; a laser has one place"
+            )));
+        }
+        let beams = beams.iter().map(|&(_, direction, _)| Beam {
+            direction,
+            spot: None,
+        });
+        Ok(Some(Laser {
+            origin,
+            beams: beams.collect(),
+        }))
+    }
+}

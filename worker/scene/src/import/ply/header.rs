@@ -1,0 +1,135 @@
+//! The header of a PLY file: its format, and what each element consists of.
+
+/// Longest header read, bytes.
+const MAX_HEADER: usize = 1 << 16;
+
+/// How numbers are written after the header.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Encoding {
+    Ascii,
+    Little,
+    Big,
+}
+
+/// Type of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Number {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Number {
+    pub(super) fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    fn named(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+}
+
+/// One property: a number, or with `length` a list of them.
+#[derive(Debug)]
+pub(super) struct Property {
+    pub(super) name: String,
+    pub(super) number: Number,
+    pub(super) length: Option<Number>,
+}
+
+#[derive(Debug)]
+pub(super) struct Element {
+    pub(super) name: String,
+    pub(super) count: usize,
+    pub(super) properties: Vec<Property>,
+}
+
+impl Element {
+    /// Index of the property with one of these names.
+    pub(super) fn find(&self, names: &[&str]) -> Option<usize> {
+        self.properties
+            .iter()
+            .position(|p| names.contains(&p.name.as_str()))
+    }
+}
+
+/// Format, elements, and the offset at which the body starts.
+pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), String> {
+    let (mut at, mut encoding, mut elements) = (0, None, Vec::<Element>::new());
+    for number in 1.. {
+        let rest = &bytes[at..bytes.len().min(MAX_HEADER)];
+        let Some(end) = rest.iter().position(|&b| b == b'\n') else {
+            return Err("header: has no line end_header; the file is cut short".into());
+        };
+        let line = std::str::from_utf8(&rest[..end])
+            .map_err(|_| format!("header line {number}: is not text"))?
+            .trim();
+        at += end + 1;
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        let fail = |what: &str| Err(format!("header line {number} ({line:?}): {what}"));
+        match words.as_slice() {
+            [] | ["ply" | "comment" | "obj_info", ..] => {}
+            ["format", format, ..] => {
+                encoding = Some(match *format {
+                    "ascii" => Encoding::Ascii,
+                    "binary_little_endian" => Encoding::Little,
+                    "binary_big_endian" => Encoding::Big,
+                    _ => return fail("expected ascii, binary_little_endian or binary_big_endian"),
+                });
+            }
+            ["element", name, count] => {
+                let Ok(count) = count.parse() else {
+                    return fail("expected a count");
+                };
+                elements.push(Element {
+                    name: (*name).to_owned(),
+                    count,
+                    properties: Vec::new(),
+                });
+            }
+            ["property", kind @ .., name] => {
+                let (length, number) = match kind {
+                    ["list", length, item] => (Some(*length), *item),
+                    [number] => (None, *number),
+                    _ => return fail("expected a type and a name"),
+                };
+                let length = length.map(|l| Number::named(l).ok_or(l)).transpose();
+                let (Ok(length), Some(number)) = (length, Number::named(number)) else {
+                    return fail("this type is not known; use char … double");
+                };
+                let Some(element) = elements.last_mut() else {
+                    return fail("comes before any element");
+                };
+                element.properties.push(Property {
+                    name: (*name).to_owned(),
+                    number,
+                    length,
+                });
+            }
+            ["end_header"] => break,
+            _ => return fail("expected format, comment, element, property or end_header"),
+        }
+    }
+    let encoding = encoding.ok_or("header: has no format line")?;
+    Ok((encoding, elements, at))
+}

@@ -1,0 +1,379 @@
+//! The whole chain from transients to counts.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    bins::{check_factor, pixels},
+    convolve::Convolver,
+    draw::{PixelKey, Purpose, binomial, poisson},
+    kernel::Kernel,
+    settings::{DeadTime, Jitter, Scale, Sensor, SensorError},
+};
+
+/// Highest rate a bin may have, photons; sums of bins must fit u32 besides.
+const MAX_RATE: f64 = 1e9;
+
+/// What a sensor looks at.
+#[derive(Debug, Clone, Copy)]
+pub struct Histograms<'a> {
+    /// h, all bounces, `[pixel][bin]`; finite and at least 0.
+    pub transient: &'a [f32],
+    /// The exactly-two-bounce part of it, in the same shape, which sets the scale. `None`: the whole transient does
+    /// (in most pixels the brightest bin is the two-bounce peak all the same).
+    pub two_bounce: Option<&'a [f32]>,
+    /// Bins of a pixel.
+    pub bins: usize,
+    /// Width of a bin, picoseconds; [`super::PS_PER_M`] times metres of path.
+    pub bin_width_ps: f64,
+}
+
+/// The sensor's image.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Values {
+    /// Counted photons, `[pixel][bin]`.
+    Counts(Vec<u32>),
+    /// Expected photons, `[pixel][bin]`, where no noise was asked for.
+    Rate(Vec<f32>),
+}
+
+/// What was measured, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensed {
+    /// The image.
+    pub values: Values,
+    /// Bins of a pixel after rebinning.
+    pub bins: usize,
+    /// Width of such a bin, picoseconds.
+    pub bin_width_ps: f64,
+    /// Photons for a unit of h.
+    pub scale: f64,
+    /// The peak that set the scale, photons; `None` for a fixed scale and for scenes without light.
+    pub peak_photons: Option<f64>,
+    /// Bins by which the pulse was shifted (`sb3d_compat` jitter; otherwise 0).
+    pub shift_bins: i64,
+    /// What is not in the image.
+    pub dropped: Dropped,
+}
+
+/// Expected photons that are not in the image, of all pixels.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Dropped {
+    /// Pushed out of the gate by pulse and jitter.
+    pub outside_photons: f64,
+    /// Their share of all light, dark counts left out.
+    pub outside_share: f64,
+    /// Bins of a pixel left over by rebinning.
+    pub bins: usize,
+    /// Photons in these bins, dark counts included.
+    pub bins_photons: f64,
+    /// Photons not seen for pile-up.
+    pub pile_up_photons: f64,
+}
+
+/// One pixel's part in the totals.
+#[derive(Debug, Clone, Copy, Default)]
+struct Facts {
+    light: f64,
+    outside: f64,
+    left_over: f64,
+    pile_up: f64,
+    fault: Option<Fault>,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Fault {
+    Value { bin: usize, value: f32 },
+    TooBright { bin: usize, rate: f64 },
+}
+
+impl Sensor {
+    /// Measures scene `scene`. All random numbers depend on (`seed`, `scene`, pixel, bin) alone. Uses rayon's current pool.
+    ///
+    /// # Errors
+    /// [`SensorError::Invalid`]: an unusable setting, shapes that do not agree, a value of h that is negative or not
+    /// finite, a transient with light but no peak to scale by, or a bin of more than 10⁹ photons (2³² after rebinning).
+    pub fn sense(&self, h: &Histograms<'_>, seed: u64, scene: u64) -> Result<Sensed, SensorError> {
+        let count = check(self, h)?;
+        let kernel = Kernel::new(self, h.bin_width_ps)?;
+        let shift_bins = self.shift(seed, scene);
+        let convolver = Convolver::new(&kernel.shifted(shift_bins), h.bins);
+        let (scale, peak_photons) = self.scale_of(h, &convolver, seed, scene)?;
+        let chain = Chain {
+            sensor: self,
+            h,
+            convolver,
+            scale,
+            factor: self.rebin as usize,
+            out_bins: h.bins / self.rebin as usize,
+            seed,
+            scene,
+        };
+        let len = count * chain.out_bins;
+        let (values, facts) = if self.poisson {
+            let mut counts = vec![0u32; len];
+            let facts = chain.run(&mut counts, Chain::count);
+            (Values::Counts(counts), facts)
+        } else {
+            let mut rate = vec![0f32; len];
+            let facts = chain.run(&mut rate, Chain::expect);
+            (Values::Rate(rate), facts)
+        };
+        Ok(Sensed {
+            values,
+            bins: chain.out_bins,
+            bin_width_ps: h.bin_width_ps * f64::from(self.rebin),
+            scale,
+            peak_photons,
+            shift_bins,
+            dropped: total(&facts, h.bins % chain.factor)?,
+        })
+    }
+
+    fn shift(&self, seed: u64, scene: u64) -> i64 {
+        match self.jitter {
+            Jitter::Gaussian { .. } => 0,
+            Jitter::Sb3dCompat { sigma_bins } => {
+                let mut draws = PixelKey::new(seed, Purpose::Roll, scene, 0).bin(0);
+                (sigma_bins * draws.normal()).floor() as i64
+            }
+        }
+    }
+
+    /// Photons for a unit of h, and the peak that set it.
+    fn scale_of(
+        &self,
+        h: &Histograms<'_>,
+        convolver: &Convolver,
+        seed: u64,
+        scene: u64,
+    ) -> Result<(f64, Option<f64>), SensorError> {
+        let photons = match self.scale {
+            Scale::Fixed { photons_per_unit } => return Ok((photons_per_unit, None)),
+            Scale::Peak { photons } => photons,
+            Scale::PeakRange { low, high } => {
+                let u = PixelKey::new(seed, Purpose::Peak, scene, 0)
+                    .bin(0)
+                    .uniform();
+                low + (high - low) * u
+            }
+        };
+        let part = h.two_bounce.unwrap_or(h.transient);
+        match median_peak(part, h.bins, convolver) {
+            Some(peak) => Ok((photons / peak, Some(photons))),
+            // Nothing to see: any scale gives the same image.
+            None if h.transient.iter().all(|h| *h == 0.0) => Ok((1.0, None)),
+            None => Err(SensorError::new(
+                "sensor.scale",
+                "the two-bounce part has no light although the transient has; \
+                 use a fixed scale (photons_per_unit) for this scene",
+            )),
+        }
+    }
+}
+
+/// The median over the pixels with light of the brightest bin; `None` where no pixel has any.
+fn median_peak(h: &[f32], bins: usize, convolver: &Convolver) -> Option<f64> {
+    let mut peaks: Vec<f64> = h
+        .par_chunks(bins)
+        .map_init(
+            || (convolver.clone(), vec![0.0; bins]),
+            |(convolver, rate), h| {
+                convolver.run(h, rate);
+                rate.iter().copied().fold(0.0, f64::max)
+            },
+        )
+        .filter(|peak| *peak > 0.0)
+        .collect();
+    let middle = peaks.len().checked_sub(1)? / 2;
+    Some(*peaks.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+fn check(sensor: &Sensor, h: &Histograms<'_>) -> Result<usize, SensorError> {
+    sensor.check()?;
+    let count = pixels(h.transient.len(), h.bins)?;
+    check_factor(h.bins, sensor.rebin as usize)?;
+    if let Some(two) = h.two_bounce
+        && two.len() != h.transient.len()
+    {
+        return Err(SensorError::new(
+            "two_bounce",
+            format!(
+                "expected {} values as in the transient, found {}",
+                h.transient.len(),
+                two.len()
+            ),
+        ));
+    }
+    Ok(count)
+}
+
+/// What all pixels share.
+struct Chain<'a> {
+    sensor: &'a Sensor,
+    h: &'a Histograms<'a>,
+    convolver: Convolver,
+    scale: f64,
+    factor: usize,
+    out_bins: usize,
+    seed: u64,
+    scene: u64,
+}
+
+impl Chain<'_> {
+    fn run<T: Send>(
+        &self,
+        out: &mut [T],
+        finish: impl Fn(&Self, usize, &[f64], &mut [T]) -> Option<Fault> + Sync,
+    ) -> Vec<Facts> {
+        out.par_chunks_mut(self.out_bins)
+            .zip(self.h.transient.par_chunks(self.h.bins))
+            .enumerate()
+            .map_init(
+                || (self.convolver.clone(), vec![0.0; self.h.bins]),
+                |(convolver, rate), (pixel, (out, h))| {
+                    let mut facts = self.rate(convolver, h, rate);
+                    if facts.fault.is_none() {
+                        facts.fault = finish(self, pixel, rate, out);
+                    }
+                    facts
+                },
+            )
+            .collect()
+    }
+
+    /// Step 1: the expected photons of each bin.
+    fn rate(&self, convolver: &mut Convolver, h: &[f32], rate: &mut [f64]) -> Facts {
+        if let Some(bin) = h.iter().position(|h| !(0.0..=f32::MAX).contains(h)) {
+            let fault = Some(Fault::Value { bin, value: h[bin] });
+            return Facts {
+                fault,
+                ..Facts::default()
+            };
+        }
+        let outside = self.scale * convolver.run(h, rate);
+        let (mut light, mut brightest) = (0.0, 0.0);
+        for r in rate.iter_mut() {
+            let photons = self.scale * *r;
+            light += photons;
+            *r = photons + self.sensor.dark_per_bin;
+            brightest = if *r > brightest { *r } else { brightest };
+        }
+        let too_bright = || {
+            let bin = rate.iter().position(|r| *r == brightest).unwrap_or(0);
+            Fault::TooBright {
+                bin,
+                rate: brightest,
+            }
+        };
+        Facts {
+            light: light + outside,
+            outside,
+            left_over: rate[self.out_bins * self.factor..].iter().sum(),
+            pile_up: self.piled_up(rate),
+            fault: (brightest > MAX_RATE).then(too_bright),
+        }
+    }
+
+    /// Expected photons lost to pile-up.
+    fn piled_up(&self, rate: &[f64]) -> f64 {
+        let Some(DeadTime::FirstPhoton { pulses }) = self.sensor.dead_time else {
+            return 0.0;
+        };
+        let (all, n) = (rate.iter().sum::<f64>(), pulses as f64);
+        all + n * libm::expm1(-all / n)
+    }
+
+    /// Expected counts, rebinned.
+    fn expect(&self, _pixel: usize, rate: &[f64], out: &mut [f32]) -> Option<Fault> {
+        let mut earlier = 0.0;
+        for (out, group) in out.iter_mut().zip(rate.chunks_exact(self.factor)) {
+            let sum: f64 = match self.sensor.dead_time {
+                None => group.iter().sum(),
+                Some(DeadTime::FirstPhoton { pulses }) => {
+                    let n = pulses as f64;
+                    let arriving = group.iter().sum::<f64>() / n;
+                    // The bins' probabilities telescope.
+                    let seen = -n * libm::exp(-earlier) * libm::expm1(-arriving);
+                    earlier += arriving;
+                    seen
+                }
+            };
+            *out = sum as f32;
+        }
+        None
+    }
+
+    /// Drawn counts, rebinned.
+    fn count(&self, pixel: usize, rate: &[f64], out: &mut [u32]) -> Option<Fault> {
+        let key = PixelKey::new(self.seed, Purpose::Counts, self.scene, pixel as u64);
+        let mut waiting = match self.sensor.dead_time {
+            Some(DeadTime::FirstPhoton { pulses }) => pulses,
+            None => 0,
+        };
+        let per_pulse = 1.0 / waiting as f64;
+        for (i, (out, group)) in out
+            .iter_mut()
+            .zip(rate.chunks_exact(self.factor))
+            .enumerate()
+        {
+            let mut sum = 0;
+            for (j, rate) in group.iter().enumerate() {
+                let mut draws = key.bin((i * self.factor + j) as u64);
+                sum += if self.sensor.dead_time.is_some() {
+                    let seen = binomial(waiting, rate * per_pulse, &mut draws);
+                    waiting -= seen;
+                    seen
+                } else {
+                    poisson(*rate, &mut draws)
+                };
+            }
+            let Ok(sum) = u32::try_from(sum) else {
+                let bin = i * self.factor;
+                return Some(Fault::TooBright {
+                    bin,
+                    rate: sum as f64,
+                });
+            };
+            *out = sum;
+        }
+        None
+    }
+}
+
+/// Sums in the order of the pixels; the first fault is the error.
+fn total(facts: &[Facts], left_over_bins: usize) -> Result<Dropped, SensorError> {
+    let mut dropped = Dropped {
+        bins: left_over_bins,
+        ..Dropped::default()
+    };
+    let mut light = 0.0;
+    for (pixel, f) in facts.iter().enumerate() {
+        match f.fault {
+            None => {}
+            Some(Fault::Value { bin, value }) => {
+                return Err(SensorError::new(
+                    format!("transient[pixel {pixel}][bin {bin}]"),
+                    format!("expected a finite value of at least 0, found {value}"),
+                ));
+            }
+            Some(Fault::TooBright { bin, rate }) => {
+                return Err(SensorError::new(
+                    format!("transient[pixel {pixel}][bin {bin}]"),
+                    format!(
+                        "{rate:.3e} photons are more than a bin holds ({MAX_RATE:.0e}, and 4.3e9 after rebinning); \
+                         choose a smaller sensor.scale"
+                    ),
+                ));
+            }
+        }
+        light += f.light;
+        dropped.outside_photons += f.outside;
+        dropped.bins_photons += f.left_over;
+        dropped.pile_up_photons += f.pile_up;
+    }
+    if light > 0.0 {
+        dropped.outside_share = dropped.outside_photons / light;
+    }
+    Ok(dropped)
+}

@@ -1,0 +1,56 @@
+//! Multiplexing: all spots flash at once, so their histograms add up.
+
+use super::settings::SensorError;
+
+/// The 25 of the 100 spots of a 10×10 grid (row by row) that are lit by 25 beams: rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9.
+pub const SPOTS_25_OF_100: [usize; 25] = {
+    let mut spots = [0; 25];
+    let mut i = 0;
+    while i < 25 {
+        spots[i] = i / 5 * 20 + i % 5 * 2 + 1;
+        i += 1;
+    }
+    spots
+};
+
+/// The 4 of the 100 spots of a 10×10 grid that are lit by 4 beams.
+pub const SPOTS_4_OF_100: [usize; 4] = [22, 27, 72, 77];
+
+/// h(p, b) = Σ h_i(p, b) over the spots i in `chosen`, summed as f64 in that order. `per_spot` is `[spot][pixel][bin]`
+/// (or any `[spot][…]`) with `spots` spots; the result has the shape of one of them. A spot chosen twice counts twice.
+///
+/// # Errors
+/// [`SensorError::Invalid`] where `per_spot` does not divide into `spots`, or a chosen spot is not among them.
+pub fn multiplex(
+    per_spot: &[f32],
+    spots: usize,
+    chosen: &[usize],
+) -> Result<Vec<f32>, SensorError> {
+    if spots == 0 || !per_spot.len().is_multiple_of(spots) {
+        return Err(SensorError::new(
+            "per_spot",
+            format!(
+                "expected equally many values for each of {spots} spots, found {} values",
+                per_spot.len()
+            ),
+        ));
+    }
+    if let Some(i) = chosen.iter().position(|s| *s >= spots) {
+        return Err(SensorError::new(
+            format!("chosen[{i}]"),
+            format!(
+                "expected one of the spots 0 to {}, found {}",
+                spots - 1,
+                chosen[i]
+            ),
+        ));
+    }
+    let len = per_spot.len() / spots;
+    let mut sums = vec![0f64; len];
+    for spot in chosen {
+        for (sum, h) in sums.iter_mut().zip(&per_spot[spot * len..][..len]) {
+            *sum += f64::from(*h);
+        }
+    }
+    Ok(sums.into_iter().map(|sum| sum as f32).collect())
+}
