@@ -377,7 +377,7 @@ pub struct BenchRender {
     #[arg(long, value_name = "N")]
     pub triangles: Option<usize>,
     /// Camera paths per pixel of each rung
-    #[arg(long, value_delimiter = ',', default_value = "4,16,64,256", value_name = "N,…",
+    #[arg(long, value_delimiter = ',', default_value = "2,8,32,128", value_name = "N,…",
           value_parser = clap::value_parser!(u32).range(1..))]
     pub ladder: Vec<u32>,
     /// Renders for each rung, each with a seed of its own; times and errors are averaged
@@ -396,6 +396,10 @@ pub struct BenchRender {
     /// Threads of the measured renders (the converged one uses all cores)
     #[arg(long, default_value_t = 1)]
     pub threads: usize,
+    /// Measure also without each way of finding light: vertices shared between pixels, light vertices,
+    /// image lobes of mirrors
+    #[arg(long)]
+    pub strategies: bool,
     /// Measurements of another renderer, written by tests/peers; may be given several times
     #[arg(long, value_name = "FILE")]
     pub peer: Vec<PathBuf>,
@@ -403,7 +407,7 @@ pub struct BenchRender {
     #[arg(long, value_name = "FILE")]
     pub plot: Option<PathBuf>,
     /// Instead: how the time to the first error grows with triangles, spots, bins and pixels
-    #[arg(long, conflicts_with_all = ["ladder", "seeds", "truth_samples", "truth", "peer", "plot", "triangles", "spots"])]
+    #[arg(long, conflicts_with_all = ["ladder", "seeds", "truth_samples", "truth", "peer", "plot", "triangles", "spots", "strategies"])]
     pub scaling: bool,
     /// With --scaling: small sizes, for a look in a minute or two
     #[arg(long, requires = "scaling")]

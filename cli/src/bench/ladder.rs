@@ -26,11 +26,26 @@ struct Variant {
     change: fn(&mut Settings),
 }
 
-/// What is compared, each with a ladder of its own. The first is how `picofarm scene render` works.
-const VARIANTS: [Variant; 1] = [Variant {
-    name: "picofarm",
-    change: |_| {},
-}];
+/// What is compared, each with a ladder of its own. The first is how `picofarm scene render` works; the
+/// others, on request, each leave out one way of finding light.
+const VARIANTS: [Variant; 4] = [
+    Variant {
+        name: "picofarm",
+        change: |_| {},
+    },
+    Variant {
+        name: "- sharing",
+        change: |s| s.strategy.share = Some(1),
+    },
+    Variant {
+        name: "- light vertices",
+        change: |s| s.strategy.light_vertices = Some(false),
+    },
+    Variant {
+        name: "- image lobes",
+        change: |s| s.strategy.image_lobes = Some(false),
+    },
+];
 
 /// What was found for one scene.
 #[derive(Debug, Serialize)]
@@ -146,7 +161,8 @@ pub fn run(
             truth::render(scene, args, samples, &all_cores)?
         }
     };
-    let variants = VARIANTS
+    let measured = if args.strategies { VARIANTS.len() } else { 1 };
+    let variants = VARIANTS[..measured]
         .iter()
         .map(|v| climb(v, scene, args, &truth, &bench))
         .collect::<Result<Vec<_>>>()?;
@@ -290,7 +306,7 @@ fn warnings(found: &Outcome) -> Vec<String> {
     let mut warnings = vec![];
     if found.truth_noise > QUIET * smallest {
         warnings.push(format!(
-            "the truth's own noise ({:.2} %) is large beside the smallest error ({:.2} %): raise --truth-samples",
+            "the truth's own noise ({:.2} %) is large beside the smallest error ({:.2} %): take a better one",
             100.0 * found.truth_noise,
             100.0 * smallest,
         ));

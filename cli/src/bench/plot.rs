@@ -80,8 +80,7 @@ pub fn draw(found: &[Outcome], targets: &[f64], path: &Path) -> Result<()> {
 
 fn lines(found: &[Outcome]) -> Vec<Line> {
     let mut lines = Vec::new();
-    for (k, scene) in found.iter().enumerate() {
-        let colour = COLOURS[k % COLOURS.len()];
+    for scene in found {
         let name = |of: &str| format!("{} {of}", scene.scene);
         let ours = scene
             .variants
@@ -92,16 +91,16 @@ fn lines(found: &[Outcome]) -> Vec<Line> {
             .iter()
             .enumerate()
             .map(|(i, p)| (name(&p.name), p.points(), DASH * (i + 1)));
-        lines.extend(ours.chain(peers).map(|(name, mut points, dash)| {
+        for (name, mut points, dash) in ours.chain(peers) {
             points.retain(|p| p.0 > 0.0 && p.1 > 0.0);
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Line {
+            lines.push(Line {
                 name,
                 points,
-                colour,
+                colour: COLOURS[lines.len() % COLOURS.len()],
                 dash,
-            }
-        }));
+            });
+        }
     }
     lines
 }
