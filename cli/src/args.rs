@@ -1,8 +1,12 @@
 //! The command line: one definition feeds the parser, the help, and the completions.
 
+mod render;
+
 use std::{net::SocketAddr, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+
+pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -289,6 +293,8 @@ pub enum Scene {
     Export(SceneExport),
     /// Render one scene file without a farm into a small Zarr group
     Render(SceneRender),
+    /// Say what rendering a scene file would take, without rendering it
+    Plan(ScenePlan),
     /// Measure a rendered scene with a sensor: pulse, jitter, photon noise, wider bins
     Sense(SceneSense),
 }
@@ -324,109 +330,10 @@ pub enum GeneratorArg {
     Primitive,
 }
 
-#[derive(Args)]
-pub struct SceneRender {
-    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
-    pub file: PathBuf,
-    /// Folder for the Zarr group (must not exist, or be empty)
-    #[arg(long, value_name = "DIR")]
-    pub out: PathBuf,
-    /// Image width and height in pixels [default: the scene's own]
-    #[arg(long, value_name = "PX")]
-    pub resolution: Option<u32>,
-    /// Render until the median per-pixel error falls to this share, e.g. 10%
-    #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
-    pub error: Option<f64>,
-    /// Camera paths per pixel [default: 64]
-    #[arg(long)]
-    pub samples: Option<u32>,
-    /// Seed of the random numbers
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Longest path in bounces [default: until the gate ends]
-    #[arg(long)]
-    pub max_bounces: Option<u32>,
-    /// Keep two-bounce and 3+ parts and their standard errors: arrays two, multi, two_se, multi_se
-    #[arg(long)]
-    pub split: bool,
-    /// Threads [default: all cores]
-    #[arg(long)]
-    pub threads: Option<usize>,
-    #[command(flatten)]
-    pub gate: GateArgs,
-}
-
 #[derive(Subcommand)]
 pub enum Bench {
     /// Measure the renderer: CPU time against the true error, beside a converged render of the same scene
     Render(BenchRender),
-}
-
-#[derive(Args)]
-pub struct BenchRender {
-    /// Scene files, or presets: furnished, primitive, furnished:SEED, primitive:SEED
-    #[arg(default_values = ["furnished", "primitive"], value_name = "SCENE")]
-    pub scenes: Vec<String>,
-    /// Image width and height in pixels [default: 32; with --scaling 256, with --quick 32]
-    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub resolution: Option<u32>,
-    /// Laser spots of the presets: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25)]
-    pub spots: u32,
-    /// Split triangles into four until the scene has at least this many
-    #[arg(long, value_name = "N")]
-    pub triangles: Option<usize>,
-    /// Camera paths per pixel of each rung
-    #[arg(long, value_delimiter = ',', default_value = "2,8,32,128", value_name = "N,…",
-          value_parser = clap::value_parser!(u32).range(1..))]
-    pub ladder: Vec<u32>,
-    /// Renders for each rung, each with a seed of its own; times and errors are averaged
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
-    pub seeds: u64,
-    /// Camera paths per pixel of the converged render [default: 16 times the largest rung, at least 8 times what the stopping rule took]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
-    pub truth_samples: Option<u32>,
-    /// Compare against this converged render, a folder from `picofarm scene render --split` (one scene)
-    #[arg(long, value_name = "DIR", conflicts_with = "truth_samples")]
-    pub truth: Option<PathBuf>,
-    /// Errors to give the time for; the stopping rule is tried with the first
-    #[arg(long, value_delimiter = ',', default_value = "10%,5%,2%", value_name = "E,…",
-          value_parser = picofarm_proto::model::parse_share)]
-    pub error: Vec<f64>,
-    /// Threads of the measured renders (the converged one uses all cores)
-    #[arg(long, default_value_t = 1)]
-    pub threads: usize,
-    /// Measure also without each way of finding light: vertices shared between pixels, light vertices,
-    /// image lobes of mirrors
-    #[arg(long)]
-    pub strategies: bool,
-    /// Measurements of another renderer, written by tests/peers; may be given several times
-    #[arg(long, value_name = "FILE")]
-    pub peer: Vec<PathBuf>,
-    /// Draw time against error into this PNG
-    #[arg(long, value_name = "FILE")]
-    pub plot: Option<PathBuf>,
-    /// Instead: how the time to the first error grows with triangles, spots, bins and pixels
-    #[arg(long, conflicts_with_all = ["ladder", "seeds", "truth_samples", "truth", "peer", "plot", "triangles", "spots", "strategies"])]
-    pub scaling: bool,
-    /// With --scaling: small sizes, for a look in a minute or two
-    #[arg(long, requires = "scaling")]
-    pub quick: bool,
-    #[command(flatten)]
-    pub gate: GateArgs,
-}
-
-#[derive(Args)]
-pub struct GateArgs {
-    /// Start of the time gate, metres of optical path
-    #[arg(long, default_value_t = 1.0, value_name = "M")]
-    pub gate_start_m: f64,
-    /// Bin width, metres of optical path
-    #[arg(long, default_value_t = 0.0384, value_name = "M")]
-    pub bin_width_m: f64,
-    /// Number of bins
-    #[arg(long, default_value_t = 637)]
-    pub bins: u32,
 }
 
 #[derive(Args)]

@@ -56,7 +56,7 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
 fn info_json(place: &str, info: &Summary) -> serde_json::Value {
     json!({
         "dataset": place, "spec": info.spec, "scenes": info.scenes, "bytes": info.bytes,
-        "max_sigma": info.max_sigma, "rms_sigma": info.rms_sigma, "overflow": info.overflow,
+        "noise": info.noise, "max_sigma": info.max_sigma, "rms_sigma": info.rms_sigma, "overflow": info.overflow,
     })
 }
 
@@ -90,7 +90,27 @@ fn describe(place: &str, info: &Summary) -> String {
         s.spots,
         s.profile,
         info.overflow,
-    )
+    ) + &further(info)
+}
+
+/// What only some data sets have.
+fn further(info: &Summary) -> String {
+    let mut text = String::new();
+    let sizes = info.spec.subsets.sizes();
+    let mut alone: Vec<String> = sizes.iter().map(|n| format!("{n} of them")).collect();
+    if info.spec.per_spot {
+        alone.push("each alone".into());
+    }
+    if !alone.is_empty() {
+        text += &format!("transients also of the spots: {}\n", alone.join(", "));
+    }
+    if let Some(noise) = info.noise {
+        text += &format!(
+            "Monte Carlo error {:.1} %, median over pixels, then over scenes\n",
+            100.0 * noise
+        );
+    }
+    text
 }
 
 async fn open(place: &str) -> Result<Dataset> {

@@ -46,7 +46,10 @@ pub fn template(kind: SceneKindArg) -> String {
          bin_width_m = 0.0384      # metres of optical path (128 ps)\n\
          bins = 637\n\
          samples = 32              # camera paths per pixel; or: error = \"10%\"\n\
-         max_bounces = 0           # 0 = until the gate ends\n\n\
+         max_bounces = 0           # 0 = until the gate ends\n\
+         # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
+         # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
+         # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach\n\
          dataset = \"rooms\"\n\
@@ -93,6 +96,8 @@ pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSp
         .hint("leave the field out, or use the picofarm version that made the data set"));
     }
     spec.check()?;
+    picofarm_agent::strategy(&spec.render.strategy)
+        .map_err(|e| CliError::input(format!("render.strategy: {e}")))?;
     picofarm_dataset::Profile::parse(&spec.output.profile)
         .map_err(|e| CliError::input(format!("output.profile: {e}")))?;
     if !spec.output.store.contains("://") {
@@ -179,6 +184,37 @@ mod tests {
             "{}",
             error.message
         );
+    }
+
+    #[test]
+    fn subsets_and_strategies_can_be_switched_on_in_the_template() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = template(SceneKindArg::Primitive)
+            .replace("spots = 25 ", "spots = 100 ")
+            .replace("# subsets", "subsets")
+            .replace("# per_spot", "per_spot")
+            .replace("# strategy", "strategy");
+        let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
+        assert_eq!(spec.render.subsets, [4, 25]);
+        assert!(spec.render.per_spot);
+        assert_eq!(spec.render.strategy.len(), 2);
+        let wrong = text.replace("image_lobes", "lobes");
+        let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
+        assert!(
+            error.message.contains("render.strategy: \"lobes\"")
+                && error.message.contains("image_lobes"),
+            "{}",
+            error.message
+        );
+    }
+
+    #[test]
+    fn an_error_may_be_asked_for_instead_of_paths() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = template(SceneKindArg::Primitive).replace("samples = 32", "error = \"10%\"");
+        let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
+        let budget = picofarm_proto::model::Budget::Error(0.1);
+        assert_eq!(spec.render.budget, budget);
     }
 
     #[test]

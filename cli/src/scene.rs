@@ -1,36 +1,22 @@
 //! `picofarm scene …`: single scenes without a farm.
 
-use std::{
-    collections::BTreeMap,
-    path::Path,
-    sync::{
-        Mutex,
-        atomic::{AtomicU32, Ordering},
-    },
-    time::Instant,
-};
+use std::collections::BTreeMap;
 
-use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_scene::{
     Bsdf, LaserGrid, Scene, export,
     furnished::{self, FurnishedSettings},
     import::{self, ImportOptions},
     primitive::{self, PrimitiveSettings},
 };
-use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings as RenderSettings, Strategy,
-};
 use serde_json::json;
-use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::{FormatArg, GeneratorArg, Scene as Command, SceneExport, SceneRender},
+    args::{FormatArg, GeneratorArg, Scene as Command, SceneExport},
     assets,
-    error::{CliError, Code, Result, io},
-    output::{Meter, Output, duration},
-    roles, sense,
+    error::{CliError, Result, io},
+    output::Output,
+    render, sense,
     settings::Settings,
-    signals,
 };
 
 pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
@@ -62,7 +48,8 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
             Ok(())
         }
         Command::Export(args) => export_scene(&args, output),
-        Command::Render(args) => render(args, output).await,
+        Command::Render(args) => render::render(args, output).await,
+        Command::Plan(args) => render::plan(args, output).await,
         Command::Sense(args) => sense::run(args, output).await,
     }
 }
@@ -219,174 +206,4 @@ fn describe(scene: &Scene) -> String {
         text += &format!("  {line}\n");
     }
     text
-}
-
-/// Shows progress; a cancelled token stops the render.
-struct Watcher {
-    done: AtomicU32,
-    meter: Mutex<Meter>,
-    stop: CancellationToken,
-}
-
-impl Progress for Watcher {
-    fn at(&self, done: f32) -> bool {
-        let share = (done * 1e6) as u32;
-        if self.done.fetch_max(share, Ordering::Relaxed) < share
-            && let Ok(mut meter) = self.meter.try_lock()
-        {
-            meter.at(f64::from(done), "rendering".into());
-        }
-        !self.stop.is_cancelled()
-    }
-}
-
-async fn render(args: SceneRender, output: Output) -> Result<()> {
-    let mut scene = import::read_scene(&args.file)?;
-    if let Some(px) = args.resolution {
-        if !(1..=4096).contains(&px) {
-            return Err(CliError::input(format!(
-                "--resolution {px}: expected 1 to 4096 pixels"
-            )));
-        }
-        let i = &mut scene.camera.intrinsics;
-        *i = i.resized(px, px);
-    }
-    let settings = RenderSettings {
-        gate: Gate {
-            start_m: args.gate.gate_start_m,
-            bin_width_m: args.gate.bin_width_m,
-            bins: args.gate.bins,
-        },
-        budget: match args.error {
-            Some(e) => Budget::Error(e as f32),
-            None => Budget::Samples(args.samples.unwrap_or(64)),
-        },
-        max_bounces: args.max_bounces,
-        one_bounce: true,
-        seed: args.seed,
-        split: args.split,
-        groups: vec![],
-        strategy: Strategy::default(),
-    };
-    free_folder(&args.out)?;
-    let stop = signals::stop_on_signal()?;
-    let threads = args.threads.unwrap_or_else(roles::cores).max(1);
-    let watcher = Watcher {
-        done: AtomicU32::new(0),
-        meter: Mutex::new(Meter::new(output)),
-        stop,
-    };
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build()
-        .map_err(|e| {
-            CliError::new(
-                Code::Resource,
-                format!("cannot start {threads} threads: {e}"),
-            )
-        })?;
-    let start = Instant::now();
-    let (scene, settings, watcher, rendered) = tokio::task::spawn_blocking(move || {
-        let rendered = pool.install(|| picofarm_transient::render(&scene, &settings, &watcher));
-        (scene, settings, watcher, rendered)
-    })
-    .await
-    .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
-    if let Ok(meter) = watcher.meter.into_inner() {
-        meter.finish();
-    }
-    let rendered = rendered.map_err(|e| match e {
-        RenderError::Stopped => signals::interrupted("nothing was written"),
-        e => CliError::input(e),
-    })?;
-    let seconds = start.elapsed().as_secs_f64();
-    write(&args.out, &scene, &settings, &rendered)?;
-    let e = &rendered.error;
-    output.result(
-        &json!({
-            "out": args.out, "seconds": seconds, "threads": threads, "rays": rendered.rays,
-            "error": e, "overflow": rendered.overflow, "plan": rendered.plan,
-        }),
-        || {
-            let mut text = format!(
-                "{}: {} paths a pixel, median error {:.2} %, total {:.2} %, {} on {threads} thread(s), {:.1} M rays\n",
-                args.out.display(), e.samples, e.median_relative * 100.0, e.total_relative * 100.0,
-                duration(seconds), rendered.rays as f64 / 1e6,
-            );
-            for line in &rendered.plan.strategies {
-                text += &format!("  {line}\n");
-            }
-            for line in &rendered.plan.approximations {
-                text += &format!("  approximated: {line}\n");
-            }
-            text
-        },
-    );
-    Ok(())
-}
-
-/// Refuses early what the writer would refuse after the render.
-pub fn free_folder(out: &Path) -> Result<()> {
-    let taken = match std::fs::read_dir(out) {
-        Ok(mut entries) => entries.next().is_some(),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,
-        Err(e) => return Err(io(format!("--out {}", out.display()), &e)),
-    };
-    if taken {
-        return Err(
-            CliError::input(format!("--out {}: the folder is not empty", out.display()))
-                .hint("name a new folder; nothing is overwritten"),
-        );
-    }
-    Ok(())
-}
-
-fn write(out: &Path, scene: &Scene, settings: &RenderSettings, r: &Rendered) -> Result<()> {
-    let (h, w, b) = (
-        u64::from(r.height),
-        u64::from(r.width),
-        u64::from(r.gate.bins),
-    );
-    let cube = [h, w, b];
-    let histogram = |name, data| RenderArray {
-        name,
-        shape: &cube,
-        dimension_names: &["row", "column", "bin"],
-        data,
-    };
-    let mut arrays = vec![
-        histogram("transient", &r.transient),
-        RenderArray {
-            name: "depth",
-            shape: &cube[..2],
-            dimension_names: &["row", "column"],
-            data: &r.truth.depth,
-        },
-    ];
-    if let Some(s) = &r.split {
-        arrays.extend([
-            histogram("two", &s.two),
-            histogram("two_se", &s.two_se),
-            histogram("multi", &s.multi),
-            histogram("multi_se", &s.multi_se),
-            histogram("multi_noise", &s.multi_noise),
-        ]);
-    }
-    let attributes = json!({
-        "scene": scene.name,
-        "provenance": scene.provenance,
-        "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
-        "gate": r.gate,
-        "settings": settings,
-        "camera": scene.camera,
-        "laser_origin": scene.laser.origin,
-        "spots": r.spots,
-        "error": r.error,
-        "overflow": r.overflow,
-        "plan": r.plan,
-        "renderer": picofarm_transient::RENDERER_VERSION,
-    });
-    let attributes = attributes.as_object().expect("written as an object");
-    write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
 }

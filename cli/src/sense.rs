@@ -15,12 +15,12 @@ use crate::{
     args::SceneSense,
     error::{CliError, Code, Result},
     output::{Output, duration},
-    roles, scene,
+    render, roles,
 };
 
 pub async fn run(args: SceneSense, output: Output) -> Result<()> {
     let sensor = options::settings(&args)?;
-    scene::free_folder(&args.out)?;
+    render::free_folder(&args.out)?;
     let threads = args.threads.unwrap_or_else(roles::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)

@@ -56,8 +56,7 @@ pub fn stage_key(spec: &JobSpec) -> StageKey {
             "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
         }),
     };
-    // serde_json's maps are sorted by key, so this text is canonical.
-    let text = serde_json::json!({
+    let description = serde_json::json!({
         "task": "render",
         "scenes": scenes,
         "seed": spec.scenes.seed,
@@ -65,9 +64,8 @@ pub fn stage_key(spec: &JobSpec) -> StageKey {
         "spots": spec.scenes.spots,
         "render": serde_json::to_value(&spec.render).expect("settings are plain data"),
         "profile": spec.output.profile,
-    })
-    .to_string();
-    StageKey(Sha256::digest(text.as_bytes()).into())
+    });
+    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
 /// The key of task `index` of a stage.
@@ -90,8 +88,13 @@ pub fn scene_seed(seed: u64, index: u64) -> u64 {
 
 /// SHA-256 over the whole spec: two submissions with equal hash are the same job.
 pub fn spec_hash(spec: &JobSpec) -> String {
-    let text = serde_json::to_value(spec)
-        .expect("a spec is plain data")
-        .to_string();
-    hex::encode(Sha256::digest(text.as_bytes()))
+    let description = serde_json::to_value(spec).expect("a spec is plain data");
+    hex::encode(Sha256::digest(canonical(description).as_bytes()))
+}
+
+/// JSON with the members of each object sorted. Whether serde_json sorts them by itself depends on its feature
+/// `preserve_order`, which any crate of a build may switch on.
+fn canonical(mut description: serde_json::Value) -> String {
+    description.sort_all_objects();
+    description.to_string()
 }

@@ -126,3 +126,29 @@ fn a_quick_study_of_growth_has_an_exponent_for_each_axis() {
         assert!(axis["points"].as_array().unwrap().len() >= 2, "{axis}");
     }
 }
+
+#[test]
+fn strategies_are_compared_row_by_row() {
+    let scratch = Scratch::new("bench-strategies");
+    let cli = Cli::new(scratch.path());
+    let compared = [
+        "--error",
+        "50%",
+        "--strategies",
+        "default,share=1+image-lobes=off",
+        "--plot",
+        "plot.png",
+    ];
+    let found = cli.json(&[&TINY[..], &compared].concat());
+    let variants = found["scenes"][0]["variants"].as_array().unwrap();
+    let names: Vec<_> = variants
+        .iter()
+        .map(|v| v["name"].as_str().unwrap())
+        .collect();
+    assert_eq!(names, ["picofarm", "share=1+image-lobes=off"]);
+    let rays = |k: usize| variants[k]["rungs"][1]["rays"].as_u64().unwrap();
+    assert_ne!(rays(0), rays(1), "they work in other ways: {found}");
+    assert!(scratch.join("plot.png").is_file());
+    cli.run(&[&TINY[..], &["--strategies", "default,sharing=1"]].concat())
+        .fails(2, &["sharing", "light_vertices"]);
+}

@@ -5,7 +5,7 @@ use picofarm_transient::{Budget, Gate, Settings};
 use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::BenchRender, error::Result, output::Output};
+use crate::{args::BenchRender, choices::Variant, error::Result, output::Output};
 
 use super::{
     curve::{Crossing, crossing},
@@ -19,33 +19,6 @@ use super::{
 const QUIET: f64 = 0.5;
 /// The stopping rule holds if the true error is at most this much above the target.
 const SLACK: f64 = 1.1;
-
-/// A way to render that is measured beside the others.
-struct Variant {
-    name: &'static str,
-    change: fn(&mut Settings),
-}
-
-/// What is compared, each with a ladder of its own. The first is how `picofarm scene render` works; the
-/// others, on request, each leave out one way of finding light.
-const VARIANTS: [Variant; 4] = [
-    Variant {
-        name: "picofarm",
-        change: |_| {},
-    },
-    Variant {
-        name: "- sharing",
-        change: |s| s.strategy.share = Some(1),
-    },
-    Variant {
-        name: "- light vertices",
-        change: |s| s.strategy.light_vertices = Some(false),
-    },
-    Variant {
-        name: "- image lobes",
-        change: |s| s.strategy.image_lobes = Some(false),
-    },
-];
 
 /// What was found for one scene.
 #[derive(Debug, Serialize)]
@@ -98,7 +71,7 @@ pub struct Target {
     pub at: Option<Crossing>,
 }
 
-/// A render with an error asked for.
+/// A render with an error asked for, in the way of the first variant.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Stopping {
     pub target: f64,
@@ -151,7 +124,10 @@ pub fn run(
     let bench = Bench::new(Some(args.threads), output, stop)?;
     let target = args.error[0];
     let what = format!("{}: until {} %", scene.name, target * 100.0);
-    let until = settings(args, Budget::Error(target as f32), 1);
+    let until = Settings {
+        strategy: args.strategies[0].strategy,
+        ..settings(args, Budget::Error(target as f32), 1)
+    };
     let until = bench.render(scene, &until, &what)?;
     let truth = match &args.truth {
         Some(dir) => truth::read(dir, scene, gate(args))?,
@@ -161,8 +137,8 @@ pub fn run(
             truth::render(scene, args, samples, &all_cores)?
         }
     };
-    let measured = if args.strategies { VARIANTS.len() } else { 1 };
-    let variants = VARIANTS[..measured]
+    let variants = args
+        .strategies
         .iter()
         .map(|v| climb(v, scene, args, &truth, &bench))
         .collect::<Result<Vec<_>>>()?;
@@ -223,8 +199,10 @@ fn climb(
     for &samples in &args.ladder {
         let mut each = Vec::new();
         for seed in 1..=args.seeds {
-            let mut settings = settings(args, Budget::Samples(samples), seed);
-            (variant.change)(&mut settings);
+            let settings = Settings {
+                strategy: variant.strategy,
+                ..settings(args, Budget::Samples(samples), seed)
+            };
             let what = format!("{}: {}, {samples} paths a pixel", scene.name, variant.name);
             let measured = bench.render(scene, &settings, &what)?;
             each.push(compare(&measured, truth));
@@ -234,7 +212,7 @@ fn climb(
     }
     let points: Vec<_> = rungs.iter().map(|r| (r.cpu_s, r.error.median)).collect();
     Ok(Curve {
-        name: variant.name.into(),
+        name: variant.name.clone(),
         to: targets(&points, &args.error),
         rungs,
         plan,

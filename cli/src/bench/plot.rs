@@ -33,7 +33,8 @@ struct Line {
     dash: usize,
 }
 
-/// Draws one line a scene and variant (solid, discs) and one a peer (dashed, squares).
+/// Draws one line a scene and variant (solid, discs, a colour each) and one a peer (dashed, squares, in the colour of
+/// the scene's first variant).
 ///
 /// # Errors
 /// The file cannot be written.

@@ -1,9 +1,12 @@
 //! Jobs on the wire.
 
+use std::collections::BTreeMap;
+
 use super::{ConvertError, required};
 use crate::{
     model::{
-        Budget, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind, SceneSource,
+        Budget, Choice, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind,
+        SceneSource, SpecError,
     },
     wire,
 };
@@ -81,8 +84,28 @@ impl TryFrom<wire::RenderSettings> for RenderSettings {
             },
             max_bounces: w.max_bounces,
             renderer: w.renderer,
+            subsets: w.subsets,
+            per_spot: w.per_spot,
+            strategy: strategy(w.strategy)?,
         })
     }
+}
+
+fn strategy(w: Vec<wire::StrategyChoice>) -> Result<BTreeMap<String, Choice>, ConvertError> {
+    use wire::strategy_choice::Choice as C;
+    let mut all = BTreeMap::new();
+    for w in w {
+        let choice = match required(w.choice, "render.strategy.choice")? {
+            C::On(on) => Choice::On(on),
+            C::Size(size) => Choice::Size(size),
+        };
+        if let Some((name, _)) = all.get_key_value(&w.name) {
+            let what = format!("{name:?} is chosen twice");
+            return Err(SpecError::new("render.strategy", what).into());
+        }
+        all.insert(w.name, choice);
+    }
+    Ok(all)
 }
 
 impl From<JobSpec> for wire::JobSpec {
@@ -139,6 +162,7 @@ impl From<SceneSource> for wire::SceneSource {
 impl From<RenderSettings> for wire::RenderSettings {
     fn from(m: RenderSettings) -> Self {
         use wire::render_settings::Budget as B;
+        use wire::strategy_choice::Choice as C;
         wire::RenderSettings {
             resolution: m.resolution,
             gate_start_m: m.gate_start_m,
@@ -150,6 +174,19 @@ impl From<RenderSettings> for wire::RenderSettings {
             }),
             max_bounces: m.max_bounces,
             renderer: m.renderer,
+            subsets: m.subsets,
+            per_spot: m.per_spot,
+            strategy: m
+                .strategy
+                .into_iter()
+                .map(|(name, choice)| wire::StrategyChoice {
+                    name,
+                    choice: Some(match choice {
+                        Choice::On(on) => C::On(on),
+                        Choice::Size(size) => C::Size(size),
+                    }),
+                })
+                .collect(),
         }
     }
 }

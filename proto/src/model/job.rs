@@ -1,6 +1,8 @@
 //! A job: which scenes, rendered how, stored where. The TOML job file has exactly these fields; see
 //! [`JobSpec::check`] for their limits and the `Default` impls for what may be left out.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use super::text::{RenderSettingsText, SceneSourceText};
@@ -129,6 +131,26 @@ pub struct RenderSettings {
     pub max_bounces: u32,
     /// Version of the renderer, part of every task key; filled in at submission where left out.
     pub renderer: String,
+    /// Subsets of the 10×10 grid of spots that get histograms of their own, from the same rays: 4 and 25, ascending.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub subsets: Vec<u32>,
+    /// Each spot gets a histogram of its own, from the same rays.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub per_spot: bool,
+    /// The renderer's ways of finding light that are chosen by hand, by name; the others are left to the renderer,
+    /// which knows their names.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub strategy: BTreeMap<String, Choice>,
+}
+
+/// A choice by hand, of [`RenderSettings::strategy`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Choice {
+    /// Used or not.
+    On(bool),
+    /// A size, in the unit that the name stands for.
+    Size(u32),
 }
 
 /// How much multi-bounce work to do.
@@ -152,6 +174,9 @@ impl Default for RenderSettings {
             budget: Budget::Samples(32),
             max_bounces: 0,
             renderer: String::new(),
+            subsets: vec![],
+            per_spot: false,
+            strategy: BTreeMap::new(),
         }
     }
 }
@@ -204,6 +229,18 @@ impl JobSpec {
         }
         self.scenes.check()?;
         self.render.check()?;
+        if let [smallest, ..] = self.render.subsets[..]
+            && self.scenes.spots != 100
+        {
+            return fail(
+                "render.subsets",
+                format!(
+                    "{smallest} is a subset of the 10x10 grid, which scenes.spots = {} is not; set scenes.spots = 100, \
+                     or leave subsets out",
+                    self.scenes.spots
+                ),
+            );
+        }
         if self.output.store.is_empty() {
             return fail("output.store", "is empty; give a path or URL".into());
         }
@@ -264,6 +301,9 @@ impl SceneSource {
 }
 
 impl RenderSettings {
+    /// The subsets of the 10×10 grid of spots there are.
+    pub const SUBSETS: [u32; 2] = [4, 25];
+
     fn check(&self) -> Result<(), SpecError> {
         let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
         if !(1..=4096).contains(&self.resolution) {
@@ -286,6 +326,32 @@ impl RenderSettings {
         }
         if !(1..=65_536).contains(&self.bins) {
             return fail("bins", format!("{} lies outside 1..=65536", self.bins));
+        }
+        if let Some(n) = self.subsets.iter().find(|n| !Self::SUBSETS.contains(n)) {
+            return fail(
+                "subsets",
+                format!(
+                    "{n} is no subset of the 10x10 grid of spots; there are {:?}",
+                    Self::SUBSETS
+                ),
+            );
+        }
+        if !self.subsets.is_sorted_by(|a, b| a < b) {
+            return fail(
+                "subsets",
+                format!("{:?} must name each once, ascending", self.subsets),
+            );
+        }
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        if let Some(name) = self
+            .strategy
+            .keys()
+            .find(|n| n.is_empty() || !n.chars().all(plain))
+        {
+            return fail(
+                "strategy",
+                format!("{name:?} is no name such as light_vertices"),
+            );
         }
         match self.budget {
             Budget::Samples(n) if !(2..=1_048_576).contains(&n) => fail(

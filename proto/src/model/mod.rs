@@ -6,8 +6,8 @@ pub mod status;
 mod text;
 
 pub use job::{
-    Budget, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind, SceneSource,
-    SpecError,
+    Budget, Choice, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind,
+    SceneSource, SpecError,
 };
 pub use lease::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
 pub use status::{Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, TaskCounts};

@@ -1,9 +1,11 @@
 //! The shapes a job is written in (TOML file, stored JSON): every field known, every other one refused.
 //! They become the model types by `TryFrom`, whose errors name the field.
 
+use std::collections::BTreeMap;
+
 use serde::Deserialize;
 
-use super::job::{Budget, RenderSettings, SceneFile, SceneKind, SceneSource, SpecError};
+use super::job::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource, SpecError};
 
 /// `[scenes]`.
 #[derive(Deserialize)]
@@ -82,6 +84,12 @@ pub(super) struct RenderSettingsText {
     error: Option<Share>,
     max_bounces: Option<u32>,
     renderer: Option<String>,
+    #[serde(default)]
+    subsets: Vec<u32>,
+    #[serde(default)]
+    per_spot: bool,
+    #[serde(default)]
+    strategy: BTreeMap<String, Choice>,
 }
 
 #[derive(Deserialize)]
@@ -126,6 +134,9 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             }
             (None, None) => default.budget,
         };
+        // The order in which somebody names them shall not make other results of them.
+        let mut subsets = text.subsets;
+        subsets.sort_unstable();
         Ok(RenderSettings {
             resolution: text.resolution.unwrap_or(default.resolution),
             gate_start_m: text.gate_start_m.unwrap_or(default.gate_start_m),
@@ -134,6 +145,9 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             budget,
             max_bounces: text.max_bounces.unwrap_or(default.max_bounces),
             renderer: text.renderer.unwrap_or_default(),
+            subsets,
+            per_spot: text.per_spot,
+            strategy: text.strategy,
         })
     }
 }

@@ -117,22 +117,32 @@ impl Dataset {
     }
 
     fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
-        let arrays = Quantity::ALL.map(|quantity| {
+        let array = |quantity: Quantity| {
             let layout = quantity.layout(&spec);
             let codec = ChunkCodec::new(&layout);
             ArrayCodec { layout, codec }
-        });
+        };
         Self {
             store,
             prefix,
             spec,
-            arrays: arrays.into(),
+            arrays: spec.quantities().into_iter().map(array).collect(),
         }
     }
 
+    /// An array that every data set has.
     pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
+        self.array_of(quantity)
+            .expect("only transients of subsets may be missing")
+    }
+
+    /// The array of any quantity.
+    pub(crate) fn array_of(&self, quantity: Quantity) -> Result<&ArrayCodec, DatasetError> {
         let found = self.arrays.iter().find(|a| a.layout.quantity == quantity);
-        found.expect("every data set has all quantities")
+        found.ok_or_else(|| {
+            let what = format!("the data set has no array {}", quantity.name());
+            DatasetError::invalid("quantity", what)
+        })
     }
 
     pub(crate) fn path(&self, key: &str) -> Path {
@@ -194,8 +204,9 @@ pub(crate) fn pretty(value: &Value) -> Bytes {
 
 /// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.
 pub(crate) fn root_metadata(spec: &DatasetSpec) -> Value {
-    let arrays: Map<String, Value> = Quantity::ALL
-        .iter()
+    let arrays: Map<String, Value> = spec
+        .quantities()
+        .into_iter()
         .map(|q| (q.name().to_string(), q.layout(spec).metadata(spec.scenes)))
         .collect();
     let decode = match spec.profile {

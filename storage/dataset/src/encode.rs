@@ -1,6 +1,8 @@
 //! A scene's record to the bytes of its objects. Deterministic: the same record gives the same bytes, whatever
 //! the number of threads.
 
+use std::collections::BTreeMap;
+
 use bytes::Bytes;
 use rayon::prelude::*;
 
@@ -8,7 +10,9 @@ use crate::codec::ChunkCodec;
 use crate::dataset::ArrayCodec;
 use crate::error::DatasetError;
 use crate::layout::{Layout, Quantity};
-use crate::manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, sha256_hex};
+use crate::manifest::{
+    ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
+};
 use crate::record::{Provenance, SceneRecord};
 use crate::shard;
 use crate::spec::{DatasetSpec, Profile};
@@ -35,13 +39,26 @@ pub(crate) fn encode_scene(
 ) -> Result<EncodedScene, DatasetError> {
     record.check(spec)?;
     let mut coded = None;
+    let mut subsets = BTreeMap::new();
     let mut objects = Vec::with_capacity(arrays.len());
     let mut bytes = Vec::with_capacity(arrays.len());
     for array in arrays {
         let object = match array.layout.quantity {
             Quantity::Transient => {
-                let transient = encode_transient(spec, array, record)?;
+                let planes = [record.transient];
+                let transient = encode_transient(spec, array, &planes, record.scale)?;
                 coded = Some((transient.error, transient.overflow));
+                transient.shard
+            }
+            quantity if quantity.is_transient() => {
+                let subset = record.subsets.iter().find(|s| s.quantity == quantity);
+                let planes = &subset.expect("checked with the record").planes;
+                let transient = encode_transient(spec, array, planes, record.scale)?;
+                let coding = SubsetCoding {
+                    error: transient.error.finish(),
+                    overflow: transient.overflow,
+                };
+                subsets.insert(quantity.name().to_string(), coding);
                 transient.shard
             }
             quantity => array.codec.encode(&small_array(spec, quantity, record))?,
@@ -63,6 +80,7 @@ pub(crate) fn encode_scene(
         error: error.finish(),
         provenance: provenance.clone(),
         overflow,
+        subsets,
         objects,
     };
     Ok(EncodedScene { manifest, bytes })
@@ -83,12 +101,21 @@ struct CodedTile {
 fn encode_transient(
     spec: &DatasetSpec,
     array: &ArrayCodec,
-    record: &SceneRecord<'_>,
+    planes: &[&[f32]],
+    scale: f32,
 ) -> Result<CodedTransient, DatasetError> {
     let tiles = Tiles::new(spec, &array.layout);
     let coded = (0..tiles.count())
         .into_par_iter()
-        .map(|tile| encode_tile(spec, &tiles, &array.codec, tile, record))
+        .map(|tile| {
+            let source = Source {
+                name: array.layout.quantity.name(),
+                planes,
+                plane_len: spec.transient_len(),
+                scale,
+            };
+            encode_tile(spec, &tiles, &array.codec, tile, &source)
+        })
         .collect::<Result<Vec<_>, _>>()?;
     let mut error = ErrorSums::default();
     let mut overflow = Vec::new();
@@ -103,7 +130,7 @@ fn encode_transient(
             "{} bins exceed what 16 bits hold at {} photons per unit (at most {MAX_OVERFLOW} may); \
              choose a smaller scale, a larger delta or the plain-f32 profile",
             overflow.len(),
-            record.scale
+            scale
         );
         return Err(DatasetError::invalid("record.scale", what));
     }
@@ -115,25 +142,41 @@ fn encode_transient(
     })
 }
 
+/// The values of a transient: its planes one after the other.
+struct Source<'a> {
+    name: &'a str,
+    planes: &'a [&'a [f32]],
+    plane_len: usize,
+    scale: f32,
+}
+
+impl Source<'_> {
+    /// Values of a run, which lies in one plane.
+    fn run(&self, run: &Run) -> &[f32] {
+        let plane = self.planes[run.image / self.plane_len];
+        &plane[run.image % self.plane_len..][..run.len]
+    }
+}
+
 fn encode_tile(
     spec: &DatasetSpec,
     tiles: &Tiles,
     codec: &ChunkCodec,
     tile: usize,
-    record: &SceneRecord<'_>,
+    source: &Source<'_>,
 ) -> Result<CodedTile, DatasetError> {
     let mut error = ErrorSums::default();
     let mut overflow = Vec::new();
     let bytes = match spec.profile {
         Profile::SqrtU16 { delta } => {
-            let code = SquareRoot::new(delta, record.scale);
+            let code = SquareRoot::new(delta, source.scale);
             let mut q = vec![0u16; tiles.tile_len()];
             for run in tiles.runs(tile) {
-                let h = &record.transient[run.image..run.image + run.len];
+                let h = source.run(&run);
                 let q = &mut q[run.tile..run.tile + run.len];
                 let facts = code.encode_run(h, q, &mut error);
                 if facts.invalid {
-                    return Err(invalid_value(h, run.image));
+                    return Err(invalid_value(source.name, h, run.image));
                 }
                 if facts.saturated {
                     let saturated = q.iter().enumerate().filter(|(_, q)| **q == SATURATED);
@@ -145,9 +188,9 @@ fn encode_tile(
         Profile::PlainF32 => {
             let mut values = vec![0f32; tiles.tile_len()];
             for run in tiles.runs(tile) {
-                let h = &record.transient[run.image..run.image + run.len];
+                let h = source.run(&run);
                 if !h.iter().all(|h| (0.0..=f32::MAX).contains(h)) {
-                    return Err(invalid_value(h, run.image));
+                    return Err(invalid_value(source.name, h, run.image));
                 }
                 values[run.tile..run.tile + run.len].copy_from_slice(h);
             }
@@ -161,20 +204,22 @@ fn encode_tile(
     })
 }
 
-fn invalid_value(h: &[f32], start: usize) -> DatasetError {
+fn invalid_value(name: &str, h: &[f32], start: usize) -> DatasetError {
     let at = h
         .iter()
         .position(|h| !(0.0..=f32::MAX).contains(h))
         .unwrap_or(0);
     DatasetError::invalid(
-        format!("record.transient[{}]", start + at),
+        format!("record.{name}[{}]", start + at),
         format!("expected a finite value of at least 0, found {}", h[at]),
     )
 }
 
-/// The inner chunks of a transient, row by row.
+/// The inner chunks of a transient, plane by plane and row by row.
 pub(crate) struct Tiles {
-    /// Image size in pixels (rows, columns).
+    /// Images, one below the other: row r of plane p counts as row p·rows + r.
+    planes: usize,
+    /// Size of one in pixels (rows, columns).
     image: [usize; 2],
     /// Tile size in pixels.
     side: [usize; 2],
@@ -200,8 +245,12 @@ impl Tiles {
     pub fn new(spec: &DatasetSpec, layout: &Layout) -> Self {
         let inner = layout.inner.as_ref().expect("transients are sharded");
         let image = [spec.height as usize, spec.width as usize];
-        let side = [inner[0] as usize, inner[1] as usize];
+        let [.., down, across, _] = inner[..] else {
+            unreachable!("transients have rows, columns and bins");
+        };
+        let side = [down as usize, across as usize];
         Self {
+            planes: layout.planes(),
             image,
             side,
             grid: [image[0].div_ceil(side[0]), image[1].div_ceil(side[1])],
@@ -210,7 +259,7 @@ impl Tiles {
     }
 
     pub fn count(&self) -> usize {
-        self.grid[0] * self.grid[1]
+        self.planes * self.grid[0] * self.grid[1]
     }
 
     pub fn tile_len(&self) -> usize {
@@ -224,21 +273,26 @@ impl Tiles {
         rows: &std::ops::Range<usize>,
         columns: &std::ops::Range<usize>,
     ) -> bool {
-        let (top, left) = self.corner(tile);
-        top < rows.end
-            && top + self.side[0] > rows.start
+        let left = self.corner(tile).1;
+        let band = self.rows_of(tile);
+        band.start < rows.end
+            && band.end > rows.start
             && left < columns.end
             && left + self.side[1] > columns.start
     }
 
     fn corner(&self, tile: usize) -> (usize, usize) {
+        let (plane, band) = (
+            self.row_of(tile) / self.grid[0],
+            self.row_of(tile) % self.grid[0],
+        );
         (
-            tile / self.grid[1] * self.side[0],
+            plane * self.image[0] + band * self.side[0],
             tile % self.grid[1] * self.side[1],
         )
     }
 
-    /// Which row of tiles a tile is in.
+    /// Which row of tiles a tile is in, counted through all planes.
     pub fn row_of(&self, tile: usize) -> usize {
         tile / self.grid[1]
     }
@@ -246,13 +300,14 @@ impl Tiles {
     /// The image rows of a tile, cut at the image's edge.
     pub fn rows_of(&self, tile: usize) -> std::ops::Range<usize> {
         let top = self.corner(tile).0;
-        top..(top + self.side[0]).min(self.image[0])
+        let end = (self.row_of(tile) / self.grid[0] + 1) * self.image[0];
+        top..(top + self.side[0]).min(end)
     }
 
     pub fn runs(&self, tile: usize) -> impl Iterator<Item = Run> + '_ {
         let (top, left) = self.corner(tile);
         let columns = self.side[1].min(self.image[1] - left);
-        let rows = self.side[0].min(self.image[0] - top);
+        let rows = self.rows_of(tile).len();
         (0..rows).map(move |r| Run {
             image: ((top + r) * self.image[1] + left) * self.bins,
             tile: r * self.side[1] * self.bins,
@@ -267,7 +322,10 @@ impl Tiles {
 /// Native-endian bytes of a quantity other than the transient.
 fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>) -> Vec<u8> {
     match quantity {
-        Quantity::Transient => unreachable!("transients are coded by tiles"),
+        Quantity::Transient
+        | Quantity::Transient4
+        | Quantity::Transient25
+        | Quantity::TransientSpots => unreachable!("transients are coded by tiles"),
         Quantity::Intensity => {
             let bins = spec.gate.bins as usize;
             let sums: Vec<f32> = record

@@ -40,7 +40,25 @@ pub enum Quantity {
     Laser,
     /// Photons per unit of h, f32; NaN where the scene is missing.
     Scale,
+    /// h of the 4 of the 100 spots of [`Self::spots_of_100`] alone, coded as the transient, with the same scale.
+    Transient4,
+    /// h of the 25 of the 100 spots of [`Self::spots_of_100`] alone, likewise.
+    Transient25,
+    /// h of each spot alone: `[spot][row][column][bin]`, likewise.
+    TransientSpots,
 }
+
+/// Rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9 of the 10×10 grid.
+const SPOTS_25: [u32; 25] = {
+    let mut spots = [0; 25];
+    let mut i = 0;
+    while i < 25 {
+        spots[i] = (i / 5 * 20 + i % 5 * 2 + 1) as u32;
+        i += 1;
+    }
+    spots
+};
+const SPOTS_4: [u32; 4] = [22, 27, 72, 77];
 
 /// Element type of an array (public only for the sealed trait behind [`crate::Stored`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,8 +107,8 @@ pub(crate) struct Layout {
 }
 
 impl Quantity {
-    /// All quantities, in the order of their objects in a manifest.
-    pub const ALL: [Self; 15] = [
+    /// All quantities there are, in the order of their objects in a manifest; see [`DatasetSpec::quantities`].
+    pub const ALL: [Self; 18] = [
         Self::Transient,
         Self::Intensity,
         Self::Depth,
@@ -106,7 +124,27 @@ impl Quantity {
         Self::Camera,
         Self::Laser,
         Self::Scale,
+        Self::Transient4,
+        Self::Transient25,
+        Self::TransientSpots,
     ];
+
+    /// Whether it is a transient, coded with the data set's profile.
+    pub fn is_transient(self) -> bool {
+        matches!(
+            self,
+            Self::Transient | Self::Transient4 | Self::Transient25 | Self::TransientSpots
+        )
+    }
+
+    /// Which of the 100 spots of a 10×10 grid (row by row) make up this transient; empty for other quantities.
+    pub fn spots_of_100(self) -> &'static [u32] {
+        match self {
+            Self::Transient4 => &SPOTS_4,
+            Self::Transient25 => &SPOTS_25,
+            _ => &[],
+        }
+    }
 
     /// Name of the Zarr array.
     pub fn name(self) -> &'static str {
@@ -126,6 +164,9 @@ impl Quantity {
             Self::Camera => "camera",
             Self::Laser => "laser",
             Self::Scale => "scale",
+            Self::Transient4 => "transient_4",
+            Self::Transient25 => "transient_25",
+            Self::TransientSpots => "transient_spots",
         }
     }
 
@@ -136,30 +177,15 @@ impl Quantity {
         const IMAGE: &[&str] = &["scene", "row", "column"];
         let (element, shape, dimensions, attributes): (_, _, &'static [&'static str], _) =
             match self {
-                Self::Transient => {
+                Self::Transient | Self::Transient4 | Self::Transient25 => {
                     let dims = &["scene", "row", "column", "bin"];
-                    let (element, attributes) = match spec.profile {
-                        Profile::SqrtU16 { delta } => (
-                            U16,
-                            json!({
-                                "long_name": "transient histogram, square-root code",
-                                "delta": delta,
-                                "decode": format!("h = (q*{})**2 / scale in float32", delta / 2.0),
-                                "decoded_units": "1/(m2 sr), radiance per unit pulse energy in each bin",
-                                "saturated_code": crate::squareroot::SATURATED,
-                                "saturated": "exact values stand in manifests/<scene>.json, 'overflow'",
-                            }),
-                        ),
-                        Profile::PlainF32 => (
-                            F32,
-                            json!({
-                                "long_name": "transient histogram",
-                                "units": "1/(m2 sr)",
-                                "decode": "h = stored value",
-                            }),
-                        ),
-                    };
+                    let (element, attributes) = self.coding(spec);
                     (element, vec![h, w, b], dims, attributes)
+                }
+                Self::TransientSpots => {
+                    let dims = &["scene", "spot", "row", "column", "bin"];
+                    let (element, attributes) = self.coding(spec);
+                    (element, vec![n, h, w, b], dims, attributes)
                 }
                 Self::Intensity => {
                     let a = json!({"long_name": "sum of the transient over all bins, before coding", "units": "1/(m2 sr)"});
@@ -227,8 +253,10 @@ impl Quantity {
                     (F32, vec![], &["scene"], a)
                 }
             };
-        let inner =
-            (self == Self::Transient).then(|| vec![h.min(INNER_SIDE), w.min(INNER_SIDE), b]);
+        let inner = self.is_transient().then(|| {
+            let inner = [1, h.min(INNER_SIDE), w.min(INNER_SIDE), b];
+            inner[4 - shape.len()..].to_vec()
+        });
         let object_shape = match &inner {
             Some(inner) => shape
                 .iter()
@@ -254,7 +282,55 @@ impl Quantity {
     }
 }
 
+impl Quantity {
+    /// Element type and attributes of a transient.
+    fn coding(self, spec: &DatasetSpec) -> (Element, Value) {
+        let of = match self {
+            Self::Transient => "",
+            Self::TransientSpots => " of each spot alone",
+            _ => " of some of the spots",
+        };
+        let saturated = match self {
+            Self::Transient => "overflow".to_owned(),
+            _ => format!("subsets.{}.overflow", self.name()),
+        };
+        let (element, mut attributes) = match spec.profile {
+            Profile::SqrtU16 { delta } => (
+                Element::U16,
+                json!({
+                    "long_name": format!("transient histogram{of}, square-root code"),
+                    "delta": delta,
+                    "decode": format!("h = (q*{})**2 / scale in float32", delta / 2.0),
+                    "decoded_units": "1/(m2 sr), radiance per unit pulse energy in each bin",
+                    "saturated_code": crate::squareroot::SATURATED,
+                    "saturated": format!("exact values stand in manifests/<scene>.json, '{saturated}'"),
+                }),
+            ),
+            Profile::PlainF32 => (
+                Element::F32,
+                json!({
+                    "long_name": format!("transient histogram{of}"),
+                    "units": "1/(m2 sr)",
+                    "decode": "h = stored value",
+                }),
+            ),
+        };
+        if !self.spots_of_100().is_empty() {
+            attributes["spots"] = json!(self.spots_of_100());
+        }
+        (element, attributes)
+    }
+}
+
 impl Layout {
+    /// Images in an object: one for each spot of `transient_spots`, otherwise one.
+    pub fn planes(&self) -> usize {
+        match self.quantity {
+            Quantity::TransientSpots => self.shape[0] as usize,
+            _ => 1,
+        }
+    }
+
     /// Key of the scene's object, relative to the data set.
     pub fn key(&self, scene: u64) -> String {
         format!(
@@ -283,7 +359,7 @@ impl Layout {
             | Quantity::Camera
             | Quantity::Laser
             | Quantity::Scale => json!([bytes, crc]),
-            Quantity::Transient if self.element == Element::U16 => {
+            quantity if quantity.is_transient() && self.element == Element::U16 => {
                 json!([bytes, blosc("bitshuffle"), crc])
             }
             _ if typesize == 1 => json!([bytes, blosc("noshuffle"), crc]),

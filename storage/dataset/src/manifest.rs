@@ -1,9 +1,12 @@
 //! A scene's manifest: the durable record that it is complete, what it consists of and where it came from.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::error::DatasetError;
+use crate::layout::Quantity;
 use crate::record::Provenance;
 use crate::spec::Profile;
 use crate::squareroot::EncodeError;
@@ -25,6 +28,16 @@ pub struct ObjectEntry {
     pub sha256: String,
 }
 
+/// How a further transient was coded.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SubsetCoding {
+    /// Error of the code.
+    pub error: EncodeError,
+    /// Saturated bins: (flat index in `[row][column][bin]`, of `transient_spots` in `[spot][row][column][bin]`; exact
+    /// value of h), by index.
+    pub overflow: Vec<(u64, f32)>,
+}
+
 /// What a published scene consists of. A pure function of the task: its bytes come out the same in every run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
@@ -44,6 +57,9 @@ pub struct Manifest {
     pub provenance: Provenance,
     /// Saturated bins: (flat index in `[row][column][bin]`, exact value of h), by index.
     pub overflow: Vec<(u64, f32)>,
+    /// The same of the further transients, by the names of their arrays.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub subsets: BTreeMap<String, SubsetCoding>,
     /// The scene's objects.
     pub objects: Vec<ObjectEntry>,
 }
@@ -62,6 +78,14 @@ impl Manifest {
     /// The entry of an object.
     pub fn object(&self, key: &str) -> Option<&ObjectEntry> {
         self.objects.iter().find(|o| o.key == key)
+    }
+
+    /// Saturated bins of a transient.
+    pub fn overflow_of(&self, quantity: Quantity) -> &[(u64, f32)] {
+        match quantity {
+            Quantity::Transient => &self.overflow,
+            other => self.subsets.get(other.name()).map_or(&[], |s| &s.overflow),
+        }
     }
 
     pub(crate) fn to_bytes(&self) -> Vec<u8> {

@@ -8,7 +8,7 @@ use futures::TryStreamExt;
 use object_store::{ObjectStore, ObjectStoreExt};
 use rayon::prelude::*;
 
-use crate::dataset::Dataset;
+use crate::dataset::{ArrayCodec, Dataset};
 use crate::encode::Tiles;
 use crate::error::DatasetError;
 use crate::layout::{Element, Quantity};
@@ -85,10 +85,28 @@ impl Dataset {
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
     pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        self.read_histogram(scene, Quantity::Transient).await
+    }
+
+    /// h of a scene from any of the data set's transients: `[row][column][bin]`, for `TransientSpots`
+    /// `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the data set has no such transient; those of [`Self::read_transient`].
+    pub async fn read_histogram(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let array = self.array_of(quantity)?;
+        if !quantity.is_transient() {
+            let what = format!("{} is no transient; use read", quantity.name());
+            return Err(DatasetError::invalid("quantity", what));
+        }
         let manifest = self.manifest(scene).await?;
-        let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
+        let path = self.path(&array.layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
-        self.decode_shard(&manifest, &bytes)
+        self.decode_shard(&manifest, array, &bytes)
     }
 
     /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
@@ -124,7 +142,8 @@ impl Dataset {
             .filter(|tile| tiles.touches(*tile, &window[0], &window[1]))
             .collect();
         let chunks = self.fetch_tiles(&manifest, &tiles, &wanted).await?;
-        self.decode_window(&manifest, &tiles, chunks, window)
+        let array = self.array(Quantity::Transient);
+        self.decode_window(&manifest, array, &tiles, chunks, window)
     }
 
     /// The coded bytes of the wanted tiles; `None` = all fill value.
@@ -180,9 +199,10 @@ impl Dataset {
     pub(crate) fn decode_shard(
         &self,
         manifest: &Manifest,
+        array: &ArrayCodec,
         bytes: &Bytes,
     ) -> Result<Vec<f32>, DatasetError> {
-        let tiles = Tiles::new(&self.spec, &self.array(Quantity::Transient).layout);
+        let tiles = Tiles::new(&self.spec, &array.layout);
         let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
             let what = format!("{} bytes are too few", bytes.len());
             return Err(DatasetError::codec("cannot read a shard's index", what));
@@ -193,8 +213,9 @@ impl Dataset {
             .map(|entry| entry.map(|r| bytes.slice(r.start as usize..r.end as usize)))
             .enumerate()
             .collect();
-        let image = [0..self.spec.height as usize, 0..self.spec.width as usize];
-        self.decode_window(manifest, &tiles, chunks, image)
+        let rows = array.layout.planes() * self.spec.height as usize;
+        let image = [0..rows, 0..self.spec.width as usize];
+        self.decode_window(manifest, array, &tiles, chunks, image)
     }
 
     /// Decodes tiles into a window and applies the overflow list. Bands of tiles are decoded at once, each straight
@@ -202,6 +223,7 @@ impl Dataset {
     fn decode_window(
         &self,
         manifest: &Manifest,
+        array: &ArrayCodec,
         tiles: &Tiles,
         chunks: Vec<(usize, Option<Bytes>)>,
         [rows, columns]: [Range<usize>; 2],
@@ -228,10 +250,10 @@ impl Dataset {
                     columns: columns.clone(),
                     target,
                 };
-                self.decode_band(manifest.scale, tiles, chunks, window)
+                self.decode_band(manifest.scale, (array, tiles), chunks, window)
             })
             .collect::<Result<Vec<bool>, DatasetError>>()?;
-        for (index, value) in &manifest.overflow {
+        for (index, value) in manifest.overflow_of(array.layout.quantity) {
             let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
             let width = self.spec.width as usize;
             let (row, column) = (pixel / width, pixel % width);
@@ -253,12 +275,12 @@ impl Dataset {
     fn decode_band(
         &self,
         scale: f32,
-        tiles: &Tiles,
+        (array, tiles): (&ArrayCodec, &Tiles),
         chunks: &[(usize, Option<Bytes>)],
         window: Window<'_>,
     ) -> Result<bool, DatasetError> {
         let bins = self.spec.gate.bins as usize;
-        let codec = &self.array(Quantity::Transient).codec;
+        let codec = &array.codec;
         let mut saturated = false;
         for (tile, bytes) in chunks {
             // Without bytes the tile is all fill value, which the window holds already.
@@ -289,21 +311,21 @@ impl Dataset {
         Ok(saturated)
     }
 
-    /// The stored values of a quantity other than the transient, in the shape [`Quantity`] states.
+    /// The stored values of a quantity that is no transient, in the shape [`Quantity`] states.
     ///
     /// # Errors
-    /// [`DatasetError::Invalid`] where `T` is not the stored type or the transient is asked for;
+    /// [`DatasetError::Invalid`] where `T` is not the stored type or a transient is asked for;
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
     pub async fn read<T: Stored>(
         &self,
         scene: u64,
         quantity: Quantity,
     ) -> Result<Vec<T>, DatasetError> {
-        let array = self.array(quantity);
-        if quantity == Quantity::Transient {
+        let array = self.array_of(quantity)?;
+        if quantity.is_transient() {
             return Err(DatasetError::invalid(
                 "quantity",
-                "transients are read by read_transient",
+                "transients are read by read_transient and read_histogram",
             ));
         }
         if array.layout.element != T::ELEMENT {

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::DatasetError;
+use crate::layout::Quantity;
 use crate::spec::DatasetSpec;
 
 /// Pinhole intrinsics in pixels; pixel (u, v) has its centre at (u + 0.5, v + 0.5).
@@ -35,6 +36,8 @@ pub struct Spot {
 pub struct SceneRecord<'a> {
     /// h: `[row][column][bin]`, 1/(m² sr), finite and not negative.
     pub transient: &'a [f32],
+    /// The further transients of the data set ([`DatasetSpec::quantities`]), in that order.
+    pub subsets: &'a [SubsetRecord<'a>],
     /// z-depth, metres; 0 = nothing.
     pub depth: &'a [f32],
     /// Distance along the ray, metres; 0 = nothing.
@@ -64,6 +67,15 @@ pub struct SceneRecord<'a> {
     pub scale: f32,
 }
 
+/// The transient of a subset of the spots, or of each alone.
+#[derive(Debug, Clone)]
+pub struct SubsetRecord<'a> {
+    /// `Transient4`, `Transient25` or `TransientSpots`.
+    pub quantity: Quantity,
+    /// h, each `[row][column][bin]`: one for each spot of `TransientSpots`, otherwise one.
+    pub planes: Vec<&'a [f32]>,
+}
+
 /// Where a scene came from: a pure function of the task (no times, no attempt, no lease epoch, no machine), since the
 /// manifest that holds it must come out the same when the task is run again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -79,6 +91,37 @@ pub struct Provenance {
 }
 
 impl SceneRecord<'_> {
+    fn check_subsets(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
+        let expected: Vec<Quantity> = spec.quantities();
+        let expected: Vec<Quantity> = expected
+            .into_iter()
+            .filter(|q| q.is_transient() && *q != Quantity::Transient)
+            .collect();
+        let names = |q: &[Quantity]| q.iter().map(|q| q.name()).collect::<Vec<_>>().join(", ");
+        let found: Vec<Quantity> = self.subsets.iter().map(|s| s.quantity).collect();
+        if found != expected {
+            let what = format!(
+                "expected those of the data set ({}), found ({})",
+                names(&expected),
+                names(&found)
+            );
+            return Err(DatasetError::invalid("record.subsets", what));
+        }
+        for subset in self.subsets {
+            let planes = match subset.quantity {
+                Quantity::TransientSpots => spec.spots as usize,
+                _ => 1,
+            };
+            let len = spec.transient_len();
+            if subset.planes.len() != planes || subset.planes.iter().any(|p| p.len() != len) {
+                let what = format!("expected {planes} histograms of {len} values each");
+                let field = format!("record.subsets.{}", subset.quantity.name());
+                return Err(DatasetError::invalid(field, what));
+            }
+        }
+        Ok(())
+    }
+
     /// Lengths and values fit the specification.
     pub(crate) fn check(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
         let pixels = spec.pixels();
@@ -104,6 +147,7 @@ impl SceneRecord<'_> {
                 return Err(DatasetError::invalid(format!("record.{field}"), what));
             }
         }
+        self.check_subsets(spec)?;
         check_values(
             "depth",
             self.depth,

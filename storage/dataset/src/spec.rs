@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
+use crate::layout::Quantity;
 
 /// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -46,10 +47,73 @@ pub struct DatasetSpec {
     pub width: u32,
     /// Illumination spots of each scene.
     pub spots: u32,
+    /// Subsets of the spots that have transients of their own (`transient_4`, `transient_25`).
+    #[serde(default, skip_serializing_if = "Subsets::is_empty")]
+    pub subsets: Subsets,
+    /// Each spot has a transient of its own (`transient_spots`).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub per_spot: bool,
     /// The gate.
     pub gate: Gate,
     /// Codec of the transients.
     pub profile: Profile,
+}
+
+/// A set of subsets of the 10×10 grid of spots, named by their sizes; see [`crate::Quantity::spots_of_100`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
+pub struct Subsets {
+    four: bool,
+    twenty_five: bool,
+}
+
+impl Subsets {
+    /// None of them.
+    pub const NONE: Self = Self {
+        four: false,
+        twenty_five: false,
+    };
+
+    /// The subsets of the given sizes.
+    ///
+    /// # Errors
+    /// A message that names a size there is no subset of.
+    pub fn of(sizes: &[u32]) -> Result<Self, String> {
+        let mut subsets = Self::NONE;
+        for size in sizes {
+            match size {
+                4 => subsets.four = true,
+                25 => subsets.twenty_five = true,
+                other => return Err(format!("{other} is not one of 4, 25")),
+            }
+        }
+        Ok(subsets)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::NONE
+    }
+
+    /// Their sizes, ascending.
+    pub fn sizes(self) -> Vec<u32> {
+        let all = [(self.four, 4), (self.twenty_five, 25)];
+        all.into_iter().filter(|s| s.0).map(|s| s.1).collect()
+    }
+}
+
+impl TryFrom<Vec<u32>> for Subsets {
+    type Error = String;
+
+    fn try_from(sizes: Vec<u32>) -> Result<Self, String> {
+        Self::of(&sizes)
+    }
+}
+
+impl From<Subsets> for Vec<u32> {
+    fn from(subsets: Subsets) -> Self {
+        subsets.sizes()
+    }
 }
 
 impl Profile {
@@ -98,6 +162,16 @@ impl DatasetSpec {
                 ));
             }
         }
+        if !self.subsets.is_empty() && self.spots != 100 {
+            return Err(DatasetError::invalid(
+                "spec.subsets",
+                format!(
+                    "{:?} are subsets of a grid of 100 spots, found {} spots",
+                    self.subsets.sizes(),
+                    self.spots
+                ),
+            ));
+        }
         if !self.gate.start_m.is_finite() {
             return Err(DatasetError::invalid(
                 "spec.gate.start_m",
@@ -138,12 +212,33 @@ impl DatasetSpec {
         self.pixels() * self.gate.bins as usize
     }
 
+    /// The quantities that its scenes have, in the order of their objects in a manifest.
+    pub fn quantities(&self) -> Vec<Quantity> {
+        let has = |q: &Quantity| match q {
+            Quantity::Transient4 => self.subsets.four,
+            Quantity::Transient25 => self.subsets.twenty_five,
+            Quantity::TransientSpots => self.per_spot,
+            _ => true,
+        };
+        Quantity::ALL.into_iter().filter(has).collect()
+    }
+
     /// The first field, other than the number of scenes, in which `asked` differs: (field, stored, asked).
     pub(crate) fn difference(&self, asked: &Self) -> Option<(&'static str, String, String)> {
         let pairs = [
             ("height", self.height.to_string(), asked.height.to_string()),
             ("width", self.width.to_string(), asked.width.to_string()),
             ("spots", self.spots.to_string(), asked.spots.to_string()),
+            (
+                "subsets",
+                format!("{:?}", self.subsets.sizes()),
+                format!("{:?}", asked.subsets.sizes()),
+            ),
+            (
+                "per_spot",
+                self.per_spot.to_string(),
+                asked.per_spot.to_string(),
+            ),
             (
                 "gate.start_m",
                 self.gate.start_m.to_string(),

@@ -10,7 +10,6 @@ use serde_json::Value;
 
 use crate::dataset::{Dataset, METADATA};
 use crate::error::DatasetError;
-use crate::layout::Quantity;
 use crate::manifest::{Manifest, sha256_hex};
 use crate::objects;
 use crate::spec::DatasetSpec;
@@ -124,6 +123,9 @@ pub struct Summary {
     pub rms_sigma: Option<(f64, f64)>,
     /// Saturated bins kept in overflow lists.
     pub overflow: u64,
+    /// Median over the scenes of the Monte Carlo error that the renderer states (`error.median_relative` in the
+    /// provenance's plan: median over pixels of standard error / h); `None` where no scene states one.
+    pub noise: Option<f64>,
 }
 
 impl Dataset {
@@ -199,7 +201,9 @@ impl Dataset {
             max_sigma: 0.0,
             rms_sigma: None,
             overflow: 0,
+            noise: None,
         };
+        let mut noise = Vec::new();
         let reads: Vec<_> = scenes
             .into_iter()
             .map(|scene| self.manifest(scene))
@@ -209,10 +213,17 @@ impl Dataset {
             summary.bytes += manifest.total_bytes();
             summary.overflow += manifest.overflow.len() as u64;
             summary.max_sigma = summary.max_sigma.max(manifest.error.max_sigma);
+            for subset in manifest.subsets.values() {
+                summary.overflow += subset.overflow.len() as u64;
+                summary.max_sigma = summary.max_sigma.max(subset.error.max_sigma);
+            }
+            noise.extend(manifest.provenance.plan["error"]["median_relative"].as_f64());
             let rms = manifest.error.rms_sigma;
             let (low, high) = summary.rms_sigma.unwrap_or((rms, rms));
             summary.rms_sigma = Some((low.min(rms), high.max(rms)));
         }
+        noise.sort_by(f64::total_cmp);
+        summary.noise = noise.get(noise.len() / 2).copied();
         Ok(summary)
     }
 
@@ -355,7 +366,7 @@ impl Dataset {
             .iter()
             .find(|a| a.layout.key(manifest.scene) == object.key)?;
         let decoded = match array.layout.quantity {
-            Quantity::Transient => self.decode_shard(manifest, &bytes).map(drop),
+            q if q.is_transient() => self.decode_shard(manifest, array, &bytes).map(drop),
             _ => array.codec.decode(&bytes).map(drop),
         };
         decoded.err().map(|e| Fault::Undecodable(e.to_string()))

@@ -11,5 +11,5 @@ mod session;
 
 pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
-pub use execute::renderer_version;
 pub use execute::{Control, Executor, Output, Task, TaskError};
+pub use execute::{check_memory, render_bytes, renderer_version, strategy, strategy_names};

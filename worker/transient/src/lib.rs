@@ -23,4 +23,4 @@ mod world;
 pub use api::*;
 pub use bvh::{Bvh, Kernel, Stack};
 pub use emitter::trace_spots;
-pub use render::render;
+pub use render::{Forecast, plan, render};

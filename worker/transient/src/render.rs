@@ -1,13 +1,16 @@
 //! The driver: checks, preparation, tiles over the image, and the stopping rule.
 
 mod error;
+mod forecast;
 mod image;
 mod tile;
 
 use picofarm_scene::Scene;
 
+pub use self::forecast::Forecast;
 use self::{
     error::{Stat, estimate, passes_for},
+    forecast::{Ended, Unwatched},
     image::{Image, Watch},
     tile::Frame,
 };
@@ -17,7 +20,7 @@ use crate::{
     film::Film,
     lobe::Mirrors,
     one, photo,
-    plan::plan,
+    plan::plan as decide,
     share::Effort,
     truth,
     two::Sampling,
@@ -46,6 +49,32 @@ pub fn render(
     settings: &Settings,
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
+    run(scene, settings, progress, false).map_err(|ended| match ended {
+        Ended::Failed(error) => error,
+        Ended::Planned(_) => unreachable!("only a plan ends with one"),
+    })
+}
+
+/// What [`render`] would do, from a few small tiles of the image instead of all of it. Runs on the
+/// caller's rayon pool.
+///
+/// # Errors
+/// Those of [`render`].
+pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError> {
+    match run(scene, settings, &Unwatched, true) {
+        Err(Ended::Planned(forecast)) => Ok(forecast),
+        Err(Ended::Failed(error)) => Err(error),
+        Ok(_) => unreachable!("a plan ends before the render"),
+    }
+}
+
+/// Everything up to the first pass, and the render where it is not only to be planned.
+fn run(
+    scene: &Scene,
+    settings: &Settings,
+    progress: &dyn Progress,
+    only_plan: bool,
+) -> Result<Rendered, Ended> {
     check(settings)?;
     scene.validate()?;
     let world = World::new(scene);
@@ -96,9 +125,14 @@ pub fn render(
         Budget::Samples(n) => n,
         Budget::Error(_) => FIRST_PASSES,
     };
-    let plan = plan(settings, &mirrors, &sampling, passes);
+    let plan = decide(settings, &mirrors, &sampling, passes);
     let mut waves = vec![passes; image.tiles()];
     let mut done = 0.0;
+    if only_plan {
+        let rays = centres.rays + photo_rays;
+        let forecast = forecast::forecast(&frame, &settings.budget, plan, rays);
+        return Err(Ended::Planned(forecast));
+    }
     let error = loop {
         let until = match settings.budget {
             Budget::Error(_) if walks && done == 0.0 => FIRST_SHARE,

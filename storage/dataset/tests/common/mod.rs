@@ -16,6 +16,8 @@ pub fn spec(profile: Profile) -> DatasetSpec {
         height: 36,
         width: 40,
         spots: 9,
+        subsets: Subsets::NONE,
+        per_spot: false,
         gate: Gate {
             start_m: 1.0,
             bin_width_m: 0.0384,
@@ -102,6 +104,7 @@ impl Scene {
     pub fn record(&self) -> SceneRecord<'_> {
         SceneRecord {
             transient: &self.transient,
+            subsets: &[],
             depth: &self.depth,
             range: &self.range,
             normal: &self.normal,

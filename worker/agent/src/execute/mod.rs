@@ -1,9 +1,11 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
+mod memory;
 mod output;
 mod render;
 mod runner;
 mod scenes;
+mod subsets;
 
 use std::{
     fmt,
@@ -19,8 +21,10 @@ use picofarm_proto::{
     model::JobSpec,
 };
 
+pub use memory::{check_memory, render_bytes};
 pub use render::{RenderExecutor, renderer_version};
 pub(crate) use runner::Runner;
+pub use subsets::{strategy, strategy_names};
 
 /// One task to run.
 #[derive(Debug, Clone)]

@@ -8,7 +8,8 @@ use std::{
 };
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, open_store, probe,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
+    probe,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -139,6 +140,9 @@ fn dataset_spec(spec: &JobSpec) -> Result<DatasetSpec, TaskError> {
         height: render.resolution,
         width: render.resolution,
         spots: spec.scenes.spots,
+        subsets: Subsets::of(&render.subsets)
+            .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,
+        per_spot: render.per_spot,
         gate: Gate {
             start_m: render.gate_start_m,
             bin_width_m: render.bin_width_m,

@@ -2,23 +2,23 @@
 
 use std::{path::PathBuf, time::Duration};
 
-use picofarm_dataset::{Intrinsics, Provenance, SceneRecord, Spot, photon_scale};
+use picofarm_dataset::{
+    DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
+};
 use picofarm_proto::{
     key::TaskKey,
     model::{Budget, JobSpec},
 };
 use picofarm_scene::{AssetLibrary, Camera, Scene};
-use picofarm_transient::{
-    Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings, Strategy,
-};
+use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tracing::debug;
 
 use super::{
-    Control, Executor, Output, Task, TaskError,
+    Control, Executor, Output, Task, TaskError, memory,
     output::{Stores, manifest_sha256, of_dataset},
-    scenes,
+    scenes, subsets,
 };
 
 /// Photons in the median pixel's brightest bin: the measurement's convention for the stored scale.
@@ -91,7 +91,12 @@ impl Executor for RenderExecutor {
             triangles = scene.triangle_count(),
             "scene made"
         );
-        let settings = settings(spec, &key);
+        let settings = settings(spec, dataset.spec(), &key)?;
+        if !settings.groups.is_empty() {
+            let side = spec.render.resolution;
+            memory::check_memory(&settings, side, side, rayon::current_num_threads())
+                .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
+        }
         let rendered =
             picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
         let camera = &scene.camera;
@@ -100,7 +105,8 @@ impl Executor for RenderExecutor {
             .iter()
             .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
             .collect();
-        let record = record(&scene, &rendered, &spots);
+        let subsets = subsets::records(dataset.spec(), &rendered);
+        let record = record(&scene, &rendered, &subsets, &spots);
         let provenance = Provenance {
             task_key: key.to_string(),
             renderer: spec.render.renderer.clone(),
@@ -132,10 +138,12 @@ impl Progress for Watched<'_> {
 
 /// The renderer's settings for a task. The seed is the head of the task's key, so that nothing but the task
 /// decides the numbers.
-fn settings(spec: &JobSpec, key: &TaskKey) -> Settings {
+fn settings(spec: &JobSpec, dataset: &DatasetSpec, key: &TaskKey) -> Result<Settings, TaskError> {
     let render = &spec.render;
     let head = key.0[..8].try_into().expect("a key has 32 bytes");
-    Settings {
+    let strategy = subsets::strategy(&render.strategy)
+        .map_err(|what| TaskError::User(format!("render.strategy: {what}")))?;
+    Ok(Settings {
         gate: Gate {
             start_m: render.gate_start_m,
             bin_width_m: render.bin_width_m,
@@ -149,18 +157,33 @@ fn settings(spec: &JobSpec, key: &TaskKey) -> Settings {
         one_bounce: true,
         seed: u64::from_le_bytes(head),
         split: false,
-        groups: vec![],
-        strategy: Strategy::default(),
+        groups: subsets::groups(dataset),
+        strategy,
+    })
+}
+
+/// The field that asks for further histograms.
+fn asked(spec: &JobSpec) -> &'static str {
+    if spec.render.per_spot {
+        "per_spot"
+    } else {
+        "subsets"
     }
 }
 
 /// The render as the data set takes it.
-fn record<'a>(scene: &Scene, rendered: &'a Rendered, spots: &'a [Option<Spot>]) -> SceneRecord<'a> {
+fn record<'a>(
+    scene: &Scene,
+    rendered: &'a Rendered,
+    subsets: &'a [SubsetRecord<'a>],
+    spots: &'a [Option<Spot>],
+) -> SceneRecord<'a> {
     let (camera, truth) = (&scene.camera, &rendered.truth);
     let i = camera.intrinsics;
     let (r, d, f, o) = (camera.right, camera.down, camera.forward, camera.origin);
     SceneRecord {
         transient: &rendered.transient,
+        subsets,
         depth: &truth.depth,
         range: &truth.range,
         normal: &truth.normal,

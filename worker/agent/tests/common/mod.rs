@@ -267,6 +267,7 @@ pub fn spec(store: &str) -> JobSpec {
             budget: Budget::Samples(2),
             max_bounces: 2,
             renderer: picofarm_agent::renderer_version(),
+            ..RenderSettings::default()
         },
         output: OutputSettings {
             store: store.into(),

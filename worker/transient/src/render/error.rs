@@ -87,7 +87,7 @@ fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
 }
 
 /// Median of the pixels' relative errors.
-fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
+pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
 
@@ -107,6 +107,25 @@ pub(super) fn estimate(stats: &[Stat], variance: f64, samples: u32) -> ErrorEsti
     }
 }
 
+/// The median error after `n` passes of pixels that stand as `stats` says after `passes`.
+pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u32) -> f64) -> f64 {
+    let scale = f64::from(passes) / f64::from(n);
+    let then = stats.iter().map(|s| {
+        // As `sorted` would find it after n passes: the measured norm loses the variance of now.
+        let now = s.two_variance + s.multi_variance;
+        let clean = (s.norm2 - now).max(0.1 * s.norm2);
+        let two_variance = s.two_variance * two(n) / two(passes);
+        let multi_variance = s.multi_variance * scale;
+        Stat {
+            norm2: clean + two_variance + multi_variance,
+            two_variance,
+            multi_variance,
+            total: s.total,
+        }
+    });
+    relative_median(then)
+}
+
 /// The fewest passes, from `least` to `most`, with which pixels that stand as `stats` says after
 /// `passes` come down to a median error of `target`. `two` says how the two-bounce variance falls.
 pub(super) fn passes_for(
@@ -116,25 +135,8 @@ pub(super) fn passes_for(
     (least, most): (u32, u32),
     two: impl Fn(u32) -> f64,
 ) -> u32 {
-    let median = |n: u32| {
-        let scale = f64::from(passes) / f64::from(n);
-        let then = stats.iter().map(|s| {
-            // As `sorted` would find it after n passes: the measured norm loses the variance of now.
-            let now = s.two_variance + s.multi_variance;
-            let clean = (s.norm2 - now).max(0.1 * s.norm2);
-            let two_variance = s.two_variance * two(n) / two(passes);
-            let multi_variance = s.multi_variance * scale;
-            Stat {
-                norm2: clean + two_variance + multi_variance,
-                two_variance,
-                multi_variance,
-                total: s.total,
-            }
-        });
-        relative_median(then)
-    };
     let mut n = least;
-    while n < most && median(n) > f64::from(target) {
+    while n < most && median_after(stats, passes, n, &two) > f64::from(target) {
         n = (n + (n / 8).max(1)).min(most);
     }
     n

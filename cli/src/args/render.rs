@@ -1,0 +1,131 @@
+//! The arguments of commands that render: `scene render`, `scene plan`, `bench render`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::{
+    choices::{Chosen, Variant},
+    groups::{Group, Named},
+};
+
+/// What to render and how.
+#[derive(Args)]
+pub struct RenderArgs {
+    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+    pub file: PathBuf,
+    /// Image width and height in pixels [default: the scene's own]
+    #[arg(long, value_name = "PX")]
+    pub resolution: Option<u32>,
+    /// Render until the median per-pixel error falls to this share, e.g. 10%
+    #[arg(long, conflicts_with = "samples", value_parser = picofarm_proto::model::parse_share)]
+    pub error: Option<f64>,
+    /// Camera paths per pixel [default: 64]
+    #[arg(long)]
+    pub samples: Option<u32>,
+    /// Seed of the random numbers
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Longest path in bounces [default: until the gate ends]
+    #[arg(long)]
+    pub max_bounces: Option<u32>,
+    /// Histograms of subsets of the spots too, from the same rays: 4 and 25 of a 10x10 grid, or per-spot for each beam
+    #[arg(long, value_delimiter = ',', value_name = "4|25|per-spot,…", value_parser = crate::groups::parse)]
+    pub groups: Vec<Group>,
+    /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given several times
+    #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::groups::parse_named)]
+    pub group: Vec<Named>,
+    /// Choose ways of finding light by hand, e.g. share=1,image-lobes=off [default: the renderer chooses by the scene]
+    #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
+    pub strategy: Vec<Chosen>,
+    /// Threads [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[command(flatten)]
+    pub gate: GateArgs,
+}
+
+#[derive(Args)]
+pub struct SceneRender {
+    #[command(flatten)]
+    pub render: RenderArgs,
+    /// Folder for the Zarr group (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Keep two-bounce and 3+ parts and their standard errors: arrays two, multi, two_se, multi_se
+    #[arg(long)]
+    pub split: bool,
+}
+
+#[derive(Args)]
+pub struct ScenePlan {
+    #[command(flatten)]
+    pub render: RenderArgs,
+}
+
+#[derive(Args)]
+pub struct BenchRender {
+    /// Scene files, or presets: furnished, primitive, furnished:SEED, primitive:SEED
+    #[arg(default_values = ["furnished", "primitive"], value_name = "SCENE")]
+    pub scenes: Vec<String>,
+    /// Image width and height in pixels [default: 32; with --scaling 256, with --quick 32]
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub resolution: Option<u32>,
+    /// Laser spots of the presets: 1, 4, 16, 25 or 100
+    #[arg(long, default_value_t = 25)]
+    pub spots: u32,
+    /// Split triangles into four until the scene has at least this many
+    #[arg(long, value_name = "N")]
+    pub triangles: Option<usize>,
+    /// Camera paths per pixel of each rung
+    #[arg(long, value_delimiter = ',', default_value = "2,8,32,128", value_name = "N,…",
+          value_parser = clap::value_parser!(u32).range(1..))]
+    pub ladder: Vec<u32>,
+    /// Renders for each rung, each with a seed of its own; times and errors are averaged
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
+    pub seeds: u64,
+    /// Camera paths per pixel of the converged render [default: 16 times the largest rung, at least 8 times what the stopping rule took]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
+    pub truth_samples: Option<u32>,
+    /// Compare against this converged render, a folder from `picofarm scene render --split` (one scene)
+    #[arg(long, value_name = "DIR", conflicts_with = "truth_samples")]
+    pub truth: Option<PathBuf>,
+    /// Errors to give the time for; the stopping rule is tried with the first
+    #[arg(long, value_delimiter = ',', default_value = "10%,5%,2%", value_name = "E,…",
+          value_parser = picofarm_proto::model::parse_share)]
+    pub error: Vec<f64>,
+    /// Threads of the measured renders (the converged one uses all cores)
+    #[arg(long, default_value_t = 1)]
+    pub threads: usize,
+    /// Measurements of another renderer, written by tests/peers; may be given several times
+    #[arg(long, value_name = "FILE")]
+    pub peer: Vec<PathBuf>,
+    /// Ways of finding light to compare: default, or choices as for `scene render --strategy`, joined by +
+    #[arg(long, value_delimiter = ',', default_value = "default", value_name = "default|NAME=VALUE[+…],…",
+          value_parser = crate::choices::variant)]
+    pub strategies: Vec<Variant>,
+    /// Draw time against error into this PNG
+    #[arg(long, value_name = "FILE")]
+    pub plot: Option<PathBuf>,
+    /// Instead: how the time to the first error grows with triangles, spots, bins and pixels
+    #[arg(long, conflicts_with_all = ["ladder", "seeds", "truth_samples", "truth", "peer", "plot", "triangles", "spots", "strategies"])]
+    pub scaling: bool,
+    /// With --scaling: small sizes, for a look in a minute or two
+    #[arg(long, requires = "scaling")]
+    pub quick: bool,
+    #[command(flatten)]
+    pub gate: GateArgs,
+}
+
+#[derive(Args)]
+pub struct GateArgs {
+    /// Start of the time gate, metres of optical path
+    #[arg(long, default_value_t = 1.0, value_name = "M")]
+    pub gate_start_m: f64,
+    /// Bin width, metres of optical path
+    #[arg(long, default_value_t = 0.0384, value_name = "M")]
+    pub bin_width_m: f64,
+    /// Number of bins
+    #[arg(long, default_value_t = 637)]
+    pub bins: u32,
+}

@@ -1,0 +1,128 @@
+//! `--strategy` and `--strategies`: the renderer's ways of finding light, chosen by hand.
+
+use std::collections::BTreeMap;
+
+use picofarm_proto::model::Choice;
+use picofarm_transient::Strategy;
+
+use crate::error::{CliError, Result};
+
+/// One choice: the name as in [`Strategy`], and what is chosen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Chosen {
+    name: String,
+    choice: Choice,
+}
+
+/// A way to render that a benchmark compares with others.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Variant {
+    pub name: String,
+    pub strategy: Strategy,
+}
+
+/// Reads `share=1` or `image-lobes=off`.
+///
+/// # Errors
+/// A message that lists the names there are.
+pub fn parse(text: &str) -> Result<Chosen, String> {
+    let Some((name, value)) = text.split_once('=') else {
+        let all = picofarm_agent::strategy_names().join(", ");
+        return Err(format!(
+            "expected NAME=VALUE with a number, on or off; the names are {all}"
+        ));
+    };
+    let name = name.trim().replace('-', "_");
+    let choice = match value.trim() {
+        "on" | "true" => Choice::On(true),
+        "off" | "false" => Choice::On(false),
+        number => Choice::Size(
+            number
+                .parse()
+                .map_err(|_| format!("{name} = {number:?}: expected a number, on or off"))?,
+        ),
+    };
+    picofarm_agent::strategy(&BTreeMap::from([(name.clone(), choice)]))?;
+    Ok(Chosen { name, choice })
+}
+
+/// All choices together.
+///
+/// # Errors
+/// One is made twice.
+pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
+    let mut all = BTreeMap::new();
+    for c in chosen {
+        if all.insert(c.name.clone(), c.choice).is_some() {
+            return Err(CliError::input(format!(
+                "--strategy: {} is chosen twice",
+                c.name
+            )));
+        }
+    }
+    picofarm_agent::strategy(&all).map_err(|e| CliError::input(format!("--strategy: {e}")))
+}
+
+/// Reads `default`, `share=1` or `share=1+image-lobes=off`.
+///
+/// # Errors
+/// Those of [`parse`], or a choice made twice.
+pub fn variant(text: &str) -> Result<Variant, String> {
+    if text == "default" {
+        return Ok(Variant {
+            name: "picofarm".into(),
+            strategy: Strategy::default(),
+        });
+    }
+    let chosen = text.split('+').map(parse).collect::<Result<Vec<_>, _>>()?;
+    Ok(Variant {
+        name: text.into(),
+        strategy: together(&chosen).map_err(|e| e.message)?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn choices_are_read_with_dashes_or_underscores() {
+        let read = |text: &[&str]| {
+            let chosen: Vec<_> = text.iter().map(|t| parse(t).unwrap()).collect();
+            together(&chosen)
+        };
+        let all = read(&["share=2", "image-lobes=off", "light_vertices=on"]).unwrap();
+        assert_eq!(all.share, Some(2));
+        assert_eq!(all.image_lobes, Some(false));
+        assert_eq!(all.light_vertices, Some(true));
+        assert_eq!(read(&[]).unwrap(), Strategy::default());
+        let twice = read(&["share=1", "share=2"]).unwrap_err();
+        assert!(twice.message.contains("share is chosen twice"));
+    }
+
+    #[test]
+    fn what_is_unknown_is_answered_with_what_is_known() {
+        for (text, part) in [
+            ("lobes=off", "image_lobes"),
+            ("share", "NAME=VALUE"),
+            ("share=few", "\"few\""),
+            ("share=on", "number"),
+            ("image-lobes=3", "off"),
+        ] {
+            let error = parse(text).unwrap_err();
+            assert!(error.contains(part), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn variants_have_the_name_they_were_given() {
+        assert_eq!(variant("default").unwrap().strategy, Strategy::default());
+        let both = variant("share=1+image-lobes=off").unwrap();
+        assert_eq!(both.name, "share=1+image-lobes=off");
+        assert_eq!(
+            (both.strategy.share, both.strategy.image_lobes),
+            (Some(1), Some(false))
+        );
+        assert!(variant("share=1+share=2").unwrap_err().contains("twice"));
+    }
+}

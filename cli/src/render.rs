@@ -1,0 +1,332 @@
+//! `picofarm scene render` and `picofarm scene plan`: one scene file on this machine, without a farm.
+
+use std::{
+    path::Path,
+    sync::{
+        Mutex,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Instant,
+};
+
+use picofarm_dataset::{RenderArray, write_render_group};
+use picofarm_scene::{Scene, import};
+use picofarm_transient::{Budget, Forecast, Gate, Progress, RenderError, Rendered, Settings};
+use serde_json::json;
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    args::{RenderArgs, ScenePlan, SceneRender},
+    choices,
+    error::{CliError, Code, Result, io},
+    groups::{self, Wanted},
+    output::{Meter, Output, bytes, duration},
+    roles, signals,
+};
+
+/// Shows progress; a cancelled token stops the render.
+struct Watcher {
+    done: AtomicU32,
+    meter: Mutex<Meter>,
+    stop: CancellationToken,
+}
+
+impl Progress for Watcher {
+    fn at(&self, done: f32) -> bool {
+        let share = (done * 1e6) as u32;
+        if self.done.fetch_max(share, Ordering::Relaxed) < share
+            && let Ok(mut meter) = self.meter.try_lock()
+        {
+            meter.at(f64::from(done), "rendering".into());
+        }
+        !self.stop.is_cancelled()
+    }
+}
+
+/// A scene and how it is rendered.
+struct Order {
+    scene: Scene,
+    settings: Settings,
+    wanted: Vec<Wanted>,
+    threads: usize,
+}
+
+impl Order {
+    /// Reads the scene and checks the arguments against it.
+    fn new(args: &RenderArgs, split: bool) -> Result<Self> {
+        let mut scene = import::read_scene(&args.file)?;
+        if let Some(px) = args.resolution {
+            if !(1..=4096).contains(&px) {
+                return Err(CliError::input(format!(
+                    "--resolution {px}: expected 1 to 4096 pixels"
+                )));
+            }
+            let i = &mut scene.camera.intrinsics;
+            *i = i.resized(px, px);
+        }
+        let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
+        let settings = Settings {
+            gate: Gate {
+                start_m: args.gate.gate_start_m,
+                bin_width_m: args.gate.bin_width_m,
+                bins: args.gate.bins,
+            },
+            budget: match args.error {
+                Some(e) => Budget::Error(e as f32),
+                None => Budget::Samples(args.samples.unwrap_or(64)),
+            },
+            max_bounces: args.max_bounces,
+            one_bounce: true,
+            seed: args.seed,
+            split,
+            groups: wanted.iter().flat_map(|w| w.groups.clone()).collect(),
+            strategy: choices::together(&args.strategy)?,
+        };
+        Ok(Self {
+            scene,
+            settings,
+            wanted,
+            threads: args.threads.unwrap_or_else(roles::cores).max(1),
+        })
+    }
+
+    fn pool(&self) -> Result<rayon::ThreadPool> {
+        let threads = self.threads;
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .map_err(|e| {
+                let what = format!("cannot start {threads} threads: {e}");
+                CliError::new(Code::Resource, what)
+            })
+    }
+
+    /// Bytes that the histograms take.
+    fn memory(&self) -> u64 {
+        let i = &self.scene.camera.intrinsics;
+        picofarm_agent::render_bytes(&self.settings, i.width, i.height, self.threads)
+    }
+}
+
+/// `scene render`.
+///
+/// # Errors
+/// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
+pub async fn render(args: SceneRender, output: Output) -> Result<()> {
+    free_folder(&args.out)?;
+    let order = Order::new(&args.render, args.split)?;
+    let i = order.scene.camera.intrinsics;
+    picofarm_agent::check_memory(&order.settings, i.width, i.height, order.threads)
+        .map_err(|e| CliError::new(Code::Resource, e))?;
+    let watcher = Watcher {
+        done: AtomicU32::new(0),
+        meter: Mutex::new(Meter::new(output)),
+        stop: signals::stop_on_signal()?,
+    };
+    let pool = order.pool()?;
+    let start = Instant::now();
+    let (order, watcher, rendered) = tokio::task::spawn_blocking(move || {
+        let run = || picofarm_transient::render(&order.scene, &order.settings, &watcher);
+        let rendered = pool.install(run);
+        (order, watcher, rendered)
+    })
+    .await
+    .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
+    if let Ok(meter) = watcher.meter.into_inner() {
+        meter.finish();
+    }
+    let mut rendered = rendered.map_err(|e| match e {
+        RenderError::Stopped => signals::interrupted("nothing was written"),
+        e => CliError::input(e),
+    })?;
+    let seconds = start.elapsed().as_secs_f64();
+    let subsets = subsets(&mut rendered, &order.wanted);
+    write(&args.out, &order, &rendered, &subsets)?;
+    let (e, threads) = (&rendered.error, order.threads);
+    let arrays: Vec<&str> = order.wanted.iter().map(|w| w.array.as_str()).collect();
+    output.result(
+        &json!({
+            "out": args.out, "seconds": seconds, "threads": threads, "rays": rendered.rays,
+            "error": e, "overflow": rendered.overflow, "plan": rendered.plan, "subsets": arrays,
+        }),
+        || {
+            let mut text = format!(
+                "{}: {} paths a pixel, median error {:.2} %, total {:.2} %, {} on {threads} thread(s), {:.1} M rays\n",
+                args.out.display(), e.samples, e.median_relative * 100.0, e.total_relative * 100.0,
+                duration(seconds), rendered.rays as f64 / 1e6,
+            );
+            if !arrays.is_empty() {
+                text += &format!("  also {}\n", arrays.join(", "));
+            }
+            text + &decided(&rendered.plan)
+        },
+    );
+    Ok(())
+}
+
+/// `scene plan`.
+///
+/// # Errors
+/// A scene or arguments that cannot be used.
+pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
+    let order = Order::new(&args.render, false)?;
+    let pool = order.pool()?;
+    let (order, forecast) = tokio::task::spawn_blocking(move || {
+        let run = || picofarm_transient::plan(&order.scene, &order.settings);
+        let forecast = pool.install(run);
+        (order, forecast)
+    })
+    .await
+    .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
+    let forecast = forecast.map_err(CliError::input)?;
+    let memory = order.memory();
+    let Forecast {
+        plan,
+        passes,
+        error,
+        rays,
+    } = &forecast;
+    let i = &order.scene.camera.intrinsics;
+    output.result(
+        &json!({
+            "scene": order.scene.name, "width": i.width, "height": i.height,
+            "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
+            "strategies": plan.strategies, "approximations": plan.approximations,
+            "samples": passes, "error": error, "rays": rays, "memory_bytes": memory,
+        }),
+        || {
+            let head = format!(
+                "{}: {}x{} pixels x {} bins, {} spots\n\
+                 about {passes} paths a pixel, median error {:.1} %, {:.1} M rays, {} for histograms\n",
+                order.scene.name,
+                i.width,
+                i.height,
+                order.settings.gate.bins,
+                order.scene.laser.beams.len(),
+                error * 100.0,
+                *rays as f64 / 1e6,
+                bytes(memory),
+            );
+            head + &decided(plan)
+        },
+    );
+    Ok(())
+}
+
+/// The renderer's decisions, one a line.
+fn decided(plan: &picofarm_transient::Plan) -> String {
+    let strategies = plan.strategies.iter().map(|line| format!("  {line}\n"));
+    let approximations = plan.approximations.iter();
+    strategies
+        .chain(approximations.map(|line| format!("  approximated: {line}\n")))
+        .collect()
+}
+
+/// Refuses early what the writer would refuse after the render.
+///
+/// # Errors
+/// The folder is not empty, or cannot be looked into.
+pub fn free_folder(out: &Path) -> Result<()> {
+    let taken = match std::fs::read_dir(out) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,
+        Err(e) => return Err(io(format!("--out {}", out.display()), &e)),
+    };
+    if taken {
+        return Err(
+            CliError::input(format!("--out {}: the folder is not empty", out.display()))
+                .hint("name a new folder; nothing is overwritten"),
+        );
+    }
+    Ok(())
+}
+
+/// Takes the groups out of the render, one run of values for each array. Each group is let go as soon as it is copied,
+/// so that histograms of a hundred spots never lie in memory twice.
+fn subsets(rendered: &mut Rendered, wanted: &[Wanted]) -> Vec<Vec<f32>> {
+    let mut groups = std::mem::take(&mut rendered.groups).into_iter();
+    let one = rendered.transient.len();
+    let join = |wanted: &Wanted| {
+        if !wanted.per_spot {
+            return groups.next().unwrap_or_default();
+        }
+        let count = wanted.groups.len();
+        let mut all = Vec::with_capacity(count * one);
+        groups.by_ref().take(count).for_each(|g| all.extend(g));
+        all
+    };
+    wanted.iter().map(join).collect()
+}
+
+fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Result<()> {
+    let Order {
+        scene,
+        settings,
+        wanted,
+        ..
+    } = order;
+    let (h, w, b) = (
+        u64::from(r.height),
+        u64::from(r.width),
+        u64::from(r.gate.bins),
+    );
+    let cube = [h, w, b];
+    let each = [scene.laser.beams.len() as u64, h, w, b];
+    let histogram = |name, data| RenderArray {
+        name,
+        shape: &cube,
+        dimension_names: &["row", "column", "bin"],
+        data,
+    };
+    let mut arrays = vec![
+        histogram("transient", &r.transient),
+        RenderArray {
+            name: "depth",
+            shape: &cube[..2],
+            dimension_names: &["row", "column"],
+            data: &r.truth.depth,
+        },
+    ];
+    for (wanted, data) in wanted.iter().zip(subsets) {
+        arrays.push(match wanted.per_spot {
+            false => histogram(&wanted.array, data),
+            true => RenderArray {
+                name: &wanted.array,
+                shape: &each,
+                dimension_names: &["spot", "row", "column", "bin"],
+                data,
+            },
+        });
+    }
+    if let Some(s) = &r.split {
+        arrays.extend([
+            histogram("two", &s.two),
+            histogram("two_se", &s.two_se),
+            histogram("multi", &s.multi),
+            histogram("multi_se", &s.multi_se),
+            histogram("multi_noise", &s.multi_noise),
+        ]);
+    }
+    let beams: serde_json::Map<_, _> = wanted
+        .iter()
+        .map(|w| (w.array.clone(), json!(w.groups.concat())))
+        .collect();
+    let attributes = json!({
+        "scene": scene.name,
+        "provenance": scene.provenance,
+        "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
+        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
+        "subsets": beams,
+        "gate": r.gate,
+        "settings": settings,
+        "camera": scene.camera,
+        "laser_origin": scene.laser.origin,
+        "spots": r.spots,
+        "error": r.error,
+        "overflow": r.overflow,
+        "plan": r.plan,
+        "renderer": picofarm_transient::RENDERER_VERSION,
+    });
+    let attributes = attributes.as_object().expect("written as an object");
+    write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
+}

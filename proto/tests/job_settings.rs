@@ -1,0 +1,102 @@
+//! Job settings from file to model to wire and back, what is refused, and what a key depends on.
+
+use picofarm_proto::{
+    key::{spec_hash, stage_key},
+    model::{Choice, JobSpec, SpecError},
+    wire,
+};
+
+fn read(scenes: &str, render: &str) -> Result<JobSpec, toml::de::Error> {
+    toml::from_str(&format!(
+        "name = \"test\"\n[scenes]\nkind = \"primitive\"\ncount = 3\nseed = 1\n{scenes}\n\
+         [render]\nresolution = 16\nsamples = 4\nrenderer = \"r\"\n{render}\n\
+         [output]\nstore = \"/store\"\ndataset = \"rooms\"\n"
+    ))
+}
+
+fn good(render: &str) -> JobSpec {
+    let spec = read("spots = 100", render).unwrap();
+    spec.check().unwrap();
+    spec
+}
+
+fn complaint(scenes: &str, render: &str) -> SpecError {
+    read(scenes, render).unwrap().check().unwrap_err()
+}
+
+#[test]
+fn a_job_without_subsets_keeps_the_key_it_had_before_there_were_any() {
+    assert_eq!(
+        stage_key(&good("")).to_string(),
+        "a65f63ca6fb2563240587717a1b36e8917c6a63f1d3f9517bf979c1df92df2d4"
+    );
+    let named = good("subsets = []\nper_spot = false\nstrategy = {}");
+    assert_eq!(stage_key(&named), stage_key(&good("")));
+    assert_eq!(spec_hash(&named), spec_hash(&good("")));
+}
+
+#[test]
+fn other_subsets_and_other_strategies_are_other_results() {
+    let jobs = [
+        "",
+        "subsets = [4]",
+        "subsets = [25]",
+        "subsets = [4, 25]",
+        "per_spot = true",
+        "strategy = { share = 1 }",
+        "strategy = { share = 2 }",
+        "strategy = { image_lobes = false }",
+        "strategy = { image_lobes = true }",
+    ];
+    let keys = jobs.map(|job| stage_key(&good(job)));
+    for (i, key) in keys.iter().enumerate() {
+        assert!(!keys[..i].contains(key), "{:?}", jobs[i]);
+    }
+    let reversed = stage_key(&good("subsets = [25, 4]"));
+    assert_eq!(keys[3], reversed, "their order changes nothing");
+}
+
+#[test]
+fn subsets_and_strategies_survive_the_wire_and_the_catalog() {
+    let spec = good(
+        "subsets = [25, 4]\nper_spot = true\nstrategy = { share = 1, light_vertices = false }",
+    );
+    assert_eq!(spec.render.subsets, [4, 25]);
+    assert_eq!(spec.render.strategy["light_vertices"], Choice::On(false));
+    let back = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
+    assert_eq!(back, spec);
+    let stored = serde_json::to_string(&spec).unwrap();
+    assert_eq!(serde_json::from_str::<JobSpec>(&stored).unwrap(), spec);
+}
+
+#[test]
+fn what_cannot_be_used_is_named() {
+    let at = |scenes: &str, render: &str| {
+        let error = complaint(scenes, render);
+        (error.field, error.what)
+    };
+    let (field, what) = at("spots = 25", "subsets = [4]");
+    assert!(
+        field == "render.subsets" && what.contains("scenes.spots = 25"),
+        "{what}"
+    );
+    let (field, what) = at("spots = 100", "subsets = [16]");
+    assert!(field == "render.subsets" && what.contains("16"), "{what}");
+    let (field, what) = at("spots = 100", "subsets = [4, 4]");
+    assert!(field == "render.subsets" && what.contains("once"), "{what}");
+    assert_eq!(
+        at("", "strategy = { \"image-lobes\" = true }").0,
+        "render.strategy"
+    );
+    let wrong = read("", "strategy = { share = \"much\" }").unwrap_err();
+    assert!(wrong.to_string().contains("share"), "{wrong}");
+
+    let mut twice = wire::JobSpec::from(good("strategy = { share = 1 }"));
+    let strategy = &mut twice.render.as_mut().unwrap().strategy;
+    strategy.push(strategy[0].clone());
+    let error = JobSpec::try_from(twice).unwrap_err();
+    assert!(
+        error.to_string().contains("\"share\" is chosen twice"),
+        "{error}"
+    );
+}

@@ -1,0 +1,164 @@
+//! What a render would take, from a few tiles of it.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    FIRST_PASSES, MAX_PASSES,
+    error::{Stat, median_after, passes_for},
+    tile::{Bench, Done, Frame, Order, Region},
+};
+use crate::{
+    api::{Budget, Plan, Progress, RenderError},
+    film::Film,
+};
+
+/// Side and number of the tiles looked at along each side of the image, and their passes.
+const SIDE: u32 = 16;
+const TILES: u32 = 3;
+const PASSES: u32 = 8;
+
+/// What a render would do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Forecast {
+    /// What the renderer decides for the scene.
+    pub plan: Plan,
+    /// Passes (camera paths per pixel) on average over the pixels; 0 where no walk is needed.
+    pub passes: u32,
+    /// Median per-pixel relative error that they come to; see [`crate::ErrorEstimate`].
+    pub error: f32,
+    /// Rays of the whole render.
+    pub rays: u64,
+}
+
+/// How a render ends before its result.
+pub(super) enum Ended {
+    Failed(RenderError),
+    /// It was only to be planned.
+    Planned(Forecast),
+}
+
+impl From<RenderError> for Ended {
+    fn from(error: RenderError) -> Self {
+        Self::Failed(error)
+    }
+}
+
+impl From<picofarm_scene::SceneError> for Ended {
+    fn from(error: picofarm_scene::SceneError) -> Self {
+        Self::Failed(error.into())
+    }
+}
+
+/// Lets a plan go on to its end.
+pub(super) struct Unwatched;
+
+impl Progress for Unwatched {
+    fn at(&self, _done: f32) -> bool {
+        true
+    }
+}
+
+/// Renders a few tiles with a few passes and scales up; `rays` are those of the ground truth.
+pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) -> Forecast {
+    let walks = frame.walk.max_bounces >= 3 && !frame.walk.emitters.list.is_empty();
+    let side = |n: u32| f64::from(frame.sampling.sides(n).0);
+    let all = f64::from(frame.width) * f64::from(frame.height);
+    if !walks {
+        let found = look(frame, 0);
+        return Forecast {
+            plan,
+            passes: 0,
+            error: super::error::relative_median(found.stats.iter().copied()) as f32,
+            rays: rays + (found.rays * all) as u64,
+        };
+    }
+    let (one, found) = (look(frame, 1), look(frame, PASSES));
+    let two = |n: u32| frame.sampling.variance(n);
+    let passes = match *budget {
+        Budget::Samples(n) => n,
+        Budget::Error(target) => {
+            let range = (FIRST_PASSES, MAX_PASSES);
+            passes_for(&found.stats, PASSES, target, range, two)
+        }
+    };
+    // Rays of a pixel: two bounces take side² times something, and each pass takes the same.
+    let (s1, s8) = (side(1).powi(2), side(PASSES).powi(2));
+    let eight = f64::from(PASSES);
+    let of_two = ((eight * one.rays - found.rays) / (eight * s1 - s8)).clamp(0.0, found.rays / s8);
+    let of_pass = (found.rays - of_two * s8) / eight;
+    let of_pixel = of_two * side(passes).powi(2) + of_pass * f64::from(passes);
+    Forecast {
+        plan,
+        passes,
+        error: median_after(&found.stats, PASSES, passes, &two) as f32,
+        rays: rays + (of_pixel * all) as u64,
+    }
+}
+
+/// What was found in the tiles looked at.
+struct Found {
+    stats: Vec<Stat>,
+    /// Rays of one pixel.
+    rays: f64,
+}
+
+fn look(frame: &Frame, passes: u32) -> Found {
+    let starts = |length: u32| -> Vec<u32> {
+        let side = SIDE.min(length);
+        let count = TILES.min(length / side);
+        let middle = |i| length * (2 * i + 1) / (2 * count);
+        (0..count)
+            .map(|i| middle(i).saturating_sub(side / 2).min(length - side))
+            .collect()
+    };
+    let columns = starts(frame.width);
+    let regions: Vec<Region> = starts(frame.height)
+        .into_iter()
+        .flat_map(|row| {
+            columns.iter().map(move |&col| Region {
+                row,
+                col,
+                rows: SIDE.min(frame.height),
+                cols: SIDE.min(frame.width),
+            })
+        })
+        .collect();
+    let pixels: usize = regions.iter().map(Region::pixels).sum();
+    // Passes from the far end of the range: the render's own would be no forecast.
+    let order = Order {
+        first: u32::MAX - PASSES,
+        count: passes,
+    };
+    let found: Vec<(Vec<Stat>, u64)> = regions
+        .into_par_iter()
+        .map_init(
+            || Bench::new(frame),
+            |bench, region| {
+                bench
+                    .render(frame, &region, &order, &|| true)
+                    .expect("nobody stops it");
+                let stats = (0..region.pixels()).map(|k| stat(&bench.done, frame.film, k));
+                (stats.collect(), bench.done.rays)
+            },
+        )
+        .collect();
+    Found {
+        rays: found.iter().map(|f| f.1).sum::<u64>() as f64 / pixels as f64,
+        stats: found.into_iter().flat_map(|f| f.0).collect(),
+    }
+}
+
+/// A pixel's sums, in render units: only their ratios count.
+fn stat(done: &Done, film: &Film, k: usize) -> Stat {
+    let mut stat = Stat::default();
+    for slot in 1..film.slots - 1 {
+        let m = done.moments(film, k, slot);
+        let h = m.two + m.multi;
+        stat.norm2 += h * h;
+        stat.total += h;
+        stat.two_variance += m.two_variance;
+        stat.multi_variance += m.multi_variance;
+    }
+    stat
+}
