@@ -277,11 +277,13 @@ impl Walk<'_> {
         let h = &v.hit;
         let (total, aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images);
         let Some(aim) = aim else { return total };
-        let to = aim.target - h.p;
-        if h.n.dot(to) <= 0.0 {
+        if h.n.dot(aim.target - h.p) <= 0.0 {
             return total;
         }
+        // From where the ray starts, not from `h.p`: it must meet the mirror where its density is known,
+        // and narrow lobes are no wider than the lift.
         let from = lift(h.p, h.n);
+        let to = aim.target - from;
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
             return total;
         };

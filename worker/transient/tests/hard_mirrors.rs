@@ -251,7 +251,7 @@ fn light_to_and_fro_between_two_facing_mirrors_is_that_of_the_rows_of_images() {
     );
     let mut s = scene(vec![wall(-1.0), wall(1.0), ceiling, plate], 8, &[]);
     s.laser.beams.push(beam_to(at, v(0.0, 1.0, 0.0), 3));
-    let (corner, right, down) = (v(-0.5, 0.5, -0.5), v(1.0, 0.0, 0.0), v(0.0, 0.0, 1.0));
+    let (corner, right, down) = (v(0.5, 0.5, -0.5), v(-1.0, 0.0, 0.0), v(0.0, 0.0, 1.0));
     s.camera = framed(Vec3::ZERO, corner, right, down, (8, 8));
     let brute = Brute::new(&s);
     let (f, mut expected) = (0.7 / PI, [0.0f64; 6]);
