@@ -16,8 +16,8 @@ use crate::api::{Progress, RenderError};
 /// Side of a tile in pixels.
 const TILE: u32 = 16;
 /// Side and number of the pilot's tiles, and its passes.
-const PILOT_SIDE: u32 = 4;
-const PILOT_TILES: u32 = 5;
+const PILOT_SIDE: u32 = 8;
+const PILOT_TILES: u32 = 3;
 pub(super) const PILOT_PASSES: u32 = 8;
 /// A tile goes on by itself while its error is above this multiple of the target, up to this multiple of
 /// the image's passes.
@@ -212,8 +212,6 @@ impl Image {
                 self.transient[at] = h;
                 stat.norm2 += f64::from(h) * f64::from(h);
                 stat.total += f64::from(h);
-                stat.two_variance += m.two_variance;
-                stat.multi_variance += m.multi_variance;
                 if let Some(s) = &mut self.split {
                     let mean = |old: f32, x: f64| (f64::from(old) * a + x * unit * b) as f32;
                     let error = |old: f32, x: f64| {
@@ -234,6 +232,7 @@ impl Image {
                     *h = (f64::from(*h) * a + x * unit * b) as f32;
                 }
             }
+            (stat.two_variance, stat.multi_variance) = done.pixel_variance(k);
             let old = self.stats[pixel];
             self.stats[pixel] = Stat {
                 two_variance: blend(old.two_variance, stat.two_variance * unit2),
