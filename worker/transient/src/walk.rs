@@ -304,11 +304,13 @@ impl Walk<'_> {
         let Some(aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images) else {
             return;
         };
-        let to = aim.target - h.p;
-        if h.n.dot(to) <= 0.0 {
+        if h.n.dot(aim.target - h.p) <= 0.0 {
             return;
         }
+        // From where the ray starts, not from `h.p`: it must meet the mirror where its density is known,
+        // and narrow lobes are no wider than the lift.
         let from = lift(h.p, h.n);
+        let to = aim.target - from;
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
             return;
         };

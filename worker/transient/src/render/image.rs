@@ -221,8 +221,6 @@ impl Image {
                 self.transient[at] = h;
                 stat.norm2 += f64::from(h) * f64::from(h);
                 stat.total += f64::from(h);
-                stat.two_variance += m.two_variance;
-                stat.multi_variance += m.multi_variance;
                 if let Some(s) = &mut self.split {
                     let mean = |old: f32, x: f64| (f64::from(old) * a + x * unit * b) as f32;
                     let error = |old: f32, x: f64| {
@@ -243,6 +241,7 @@ impl Image {
                     *h = (f64::from(*h) * a + x * unit * b) as f32;
                 }
             }
+            (stat.two_variance, stat.multi_variance) = done.pixel_variance(k);
             let old = self.stats[pixel];
             self.stats[pixel] = Stat {
                 two_variance: blend(old.two_variance, stat.two_variance * unit2),
