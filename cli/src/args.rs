@@ -108,7 +108,7 @@ pub struct Demo {
     /// Camera paths per pixel for three bounces and more
     #[arg(long, default_value_t = 32)]
     pub samples: u32,
-    /// Furniture: auto, parametric or sweethome3d
+    /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
 }
@@ -280,7 +280,7 @@ pub enum Scene {
         /// Image width and height in pixels
         #[arg(long, default_value_t = 256, value_name = "PX")]
         resolution: u32,
-        /// Furniture: auto, parametric or sweethome3d
+        /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
         #[arg(long, default_value = "auto")]
         assets: String,
     },

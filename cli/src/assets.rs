@@ -12,8 +12,10 @@ use crate::{
     settings::Settings,
 };
 
-/// The libraries that can be asked for by name, best first.
-const NAMES: [&str; 2] = ["sweethome3d", "parametric"];
+/// The libraries that can be asked for by name.
+const NAMES: [&str; 3] = ["sweethome3d", "parametric", "gltf"];
+/// Those that `auto` chooses among, best first: a folder of somebody's own models is asked for by name.
+const AUTO: [&str; 2] = ["sweethome3d", "parametric"];
 
 /// The library that a job's `assets` names: a name, a fingerprint, or `auto` for the best installed.
 ///
@@ -22,7 +24,7 @@ const NAMES: [&str; 2] = ["sweethome3d", "parametric"];
 pub fn library(name: &str, dir: &Path) -> Result<AssetLibrary> {
     let dirs = [dir.to_owned()];
     if name == "auto" {
-        for name in NAMES {
+        for name in AUTO {
             match AssetLibrary::find(name, &dirs) {
                 Err(SceneError::Assets { .. }) => {}
                 found => return Ok(found?),

@@ -114,7 +114,10 @@ pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
     }
     match &spec.scenes.kind {
         SceneKind::Furnished { assets, .. }
-            if matches!(assets.as_str(), "" | "auto" | "parametric" | "sweethome3d") =>
+            if matches!(
+                assets.as_str(),
+                "" | "auto" | "parametric" | "sweethome3d" | "gltf"
+            ) =>
         {
             Err(SpecError::new(
                 "scenes.assets",

@@ -3,8 +3,9 @@
 usage: check_mitsuba.py PICOFARM SCENE [SEED]
 
 PICOFARM is the program; SCENE a scene file, or `furnished` or `primitive` to generate one from SEED. Needs mitsuba,
-numpy and zarr. Each pixel's centre is traced by Mitsuba (scalar_rgb) through the exported XML; depths must agree
-within 1 mm on 99.9 % of the pixels. The export must also come back with the same number of triangles.
+numpy and zarr. Each pixel's centre is traced by Mitsuba (scalar_rgb) through the exported XML, or through SCENE itself
+where that is a Mitsuba scene; depths must agree within 1 mm on 99.9 % of the pixels. The export must also come back
+with the same number of triangles.
 """
 
 import json
@@ -39,7 +40,7 @@ def main(picofarm, scene, seed="7"):
     ours = zarr.open_group(folder / "ours", mode="r")["depth"][:]
 
     mi.set_variant("scalar_rgb")
-    theirs = mi.load_file(str(exported))
+    theirs = mi.load_file(str(scene if str(scene).endswith(".xml") else exported))
     sensor = theirs.sensors()[0]
     pose = np.array(sensor.world_transform().matrix)
     origin, forward = pose[:3, 3], pose[:3, 2]

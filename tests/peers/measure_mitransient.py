@@ -260,8 +260,11 @@ def measure(mode, d, args, truth):
     if not args.ladder:
         # Up until the error is near the target: what little is left is extrapolated with error ~ time^-1/2.
         spp, error = args.first, climb(args.first)
-        while error > 1.2 * args.target and sum(r["cpu_seconds"] for r in rungs) < args.limit:
-            spp = int(np.ceil(spp * min((error / args.target) ** 2 * 1.1, 8)))
+        while error > 1.2 * args.target:
+            more = min((error / args.target) ** 2 * 1.1, 8)
+            if rungs[-1]["cpu_seconds"] * more > args.limit:
+                break
+            spp = int(np.ceil(spp * more))
             error = climb(spp)
     i = args.resolution
     return {"scene": d["name"], "mode": mode, "width": i, "height": i, "bins": d["histogram"]["bins"],
@@ -278,7 +281,8 @@ def main():
                         help="samples a pixel and render; default: climb until close to --target")
     parser.add_argument("--first", type=int, default=64, help="first rung without --ladder")
     parser.add_argument("--target", type=float, default=0.1)
-    parser.add_argument("--limit", type=float, default=600, help="CPU seconds after which climbing ends")
+    parser.add_argument("--limit", type=float, default=150,
+                        help="CPU seconds that a rung may take without --ladder; what lies beyond is extrapolated")
     parser.add_argument("--resolution", type=int, default=64)
     args = parser.parse_args()
 

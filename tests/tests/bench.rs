@@ -59,8 +59,9 @@ fn a_tiny_benchmark_prints_tables_json_and_a_picture() {
     let png = std::fs::read(scratch.join("plot.png")).unwrap();
     assert!(png.starts_with(b"\x89PNG\r\n\x1a\n") && png.len() > 1000);
 
-    let found = cli.json(&[&TINY[..], &["--error", "30%"]].concat());
+    let found = cli.json(&[&TINY[..], &["--error", "30%", "--strategies"]].concat());
     let scene = &found["scenes"][0];
+    assert_eq!(scene["variants"].as_array().unwrap().len(), 4, "{found}");
     let rungs = scene["variants"][0]["rungs"].as_array().unwrap();
     assert_eq!(rungs.len(), 2, "{found}");
     let error = |k: usize| rungs[k]["error"]["median"].as_f64().unwrap();

@@ -56,6 +56,48 @@ fn a_generated_scene_is_the_same_file_each_time_and_shows_what_it_holds() {
 }
 
 #[test]
+fn an_exported_scene_is_read_back_in_every_format() {
+    let scratch = Scratch::new("export");
+    let cli = Cli::new(scratch.path());
+    let generate = ["scene", "generate", "--kind", "primitive", "--spots", "4"];
+    cli.run(&[&generate[..], &["--out", "room.glb"]].concat())
+        .ok();
+    let triangles = cli.json(&["scene", "show", "room.glb"])["triangles"].clone();
+    for (out, format, file) in [
+        ("copy.glb", None, "copy.glb"),
+        ("there", Some("mitsuba"), "there/scene.xml"),
+    ] {
+        let mut export = vec!["scene", "export", "room.glb", "--out", out];
+        export.extend(format.into_iter().flat_map(|f| ["--format", f]));
+        cli.run(&export).ok();
+        let facts = cli.json(&["scene", "show", file]);
+        assert_eq!(
+            (&facts["triangles"], &facts["beams"]),
+            (&triangles, &4.into())
+        );
+        assert_eq!(facts["mirror_materials"], 1);
+    }
+    let read = |name| std::fs::read(scratch.join(name)).unwrap();
+    assert!(read("room.glb") == read("copy.glb"), "nothing is lost");
+
+    cli.run(&["scene", "export", "room.glb", "--out", "room.ply"])
+        .ok();
+    let alone = cli.run(&["scene", "export", "room.ply", "--out", "mesh.glb"]);
+    alone.fails(3, &["room.ply", "--frame"]);
+    cli.run(&[
+        "scene", "export", "room.ply", "--frame", "--out", "mesh.glb",
+    ])
+    .ok();
+    let facts = cli.json(&["scene", "show", "mesh.glb"]);
+    assert_eq!(
+        (&facts["triangles"], &facts["beams"]),
+        (&triangles, &25.into())
+    );
+    let nameless = cli.run(&["scene", "export", "room.glb", "--out", "room.usd"]);
+    nameless.fails(3, &["room.usd", "--format"]);
+}
+
+#[test]
 fn the_parts_of_a_split_render_add_up_to_the_whole() {
     let scratch = Scratch::new("split");
     let cli = Cli::new(scratch.path());

@@ -78,7 +78,7 @@ pub struct BenchRender {
     #[arg(long, value_name = "N")]
     pub triangles: Option<usize>,
     /// Camera paths per pixel of each rung
-    #[arg(long, value_delimiter = ',', default_value = "4,16,64,256", value_name = "N,…",
+    #[arg(long, value_delimiter = ',', default_value = "2,8,32,128", value_name = "N,…",
           value_parser = clap::value_parser!(u32).range(1..))]
     pub ladder: Vec<u32>,
     /// Renders for each rung, each with a seed of its own; times and errors are averaged

@@ -284,7 +284,7 @@ fn warnings(found: &Outcome) -> Vec<String> {
     let mut warnings = vec![];
     if found.truth_noise > QUIET * smallest {
         warnings.push(format!(
-            "the truth's own noise ({:.2} %) is large beside the smallest error ({:.2} %): raise --truth-samples",
+            "the truth's own noise ({:.2} %) is large beside the smallest error ({:.2} %): take a better one",
             100.0 * found.truth_noise,
             100.0 * smallest,
         ));

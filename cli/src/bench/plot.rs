@@ -81,31 +81,27 @@ pub fn draw(found: &[Outcome], targets: &[f64], path: &Path) -> Result<()> {
 
 fn lines(found: &[Outcome]) -> Vec<Line> {
     let mut lines = Vec::new();
-    let mut first = 0;
     for scene in found {
-        let colour = |k: usize| COLOURS[(first + k) % COLOURS.len()];
         let name = |of: &str| format!("{} {of}", scene.scene);
         let ours = scene
             .variants
             .iter()
-            .enumerate()
-            .map(|(k, v)| (name(&v.name), v.points(), 0, colour(k)));
+            .map(|v| (name(&v.name), v.points(), 0));
         let peers = scene
             .peers
             .iter()
             .enumerate()
-            .map(|(i, p)| (name(&p.name), p.points(), DASH * (i + 1), colour(0)));
-        lines.extend(ours.chain(peers).map(|(name, mut points, dash, colour)| {
+            .map(|(i, p)| (name(&p.name), p.points(), DASH * (i + 1)));
+        for (name, mut points, dash) in ours.chain(peers) {
             points.retain(|p| p.0 > 0.0 && p.1 > 0.0);
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Line {
+            lines.push(Line {
                 name,
                 points,
-                colour,
+                colour: COLOURS[lines.len() % COLOURS.len()],
                 dash,
-            }
-        }));
-        first += scene.variants.len();
+            });
+        }
     }
     lines
 }

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use crate::{args::BenchRender, output::table};
 
 use super::{
-    curve::{Crossing, three_digits},
+    curve::{Crossing, How, three_digits},
     ladder::{Outcome, Rung},
     scaling::{Axis, Scaling},
 };
@@ -35,18 +35,23 @@ fn asked(share: f64) -> String {
     format!("{} %", (share * 1e6).round() / 1e4)
 }
 
+fn plural(n: usize) -> &'static str {
+    if n == 1 { "" } else { "s" }
+}
+
 fn ladder(found: &Outcome) -> String {
     let mut text = format!(
-        "{}: {}x{} pixels x {} bins, {} spots, {} triangles, {} thread{}\n\
+        "{}: {}x{} pixels x {} bins, {} spot{}, {} triangles, {} thread{}\n\
          truth: {}; its own noise {} %\n\n",
         found.scene,
         found.width,
         found.height,
         found.bins,
         found.spots,
+        plural(found.spots),
         found.triangles,
         found.threads,
-        if found.threads == 1 { "" } else { "s" },
+        plural(found.threads),
         found.truth,
         percent(found.truth_noise),
     );
@@ -71,6 +76,10 @@ fn ladder(found: &Outcome) -> String {
     text += &right_aligned(&rows);
     text += "\n";
     text += &right_aligned(&times(found));
+    if !found.peers.is_empty() {
+        text +=
+            "~ beyond the last rung, error ~ time^-1/2; < the cheapest rung is better already\n";
+    }
     for warning in &found.warnings {
         text += &format!("warning: {warning}\n");
     }
@@ -109,8 +118,16 @@ fn times(found: &Outcome) -> Vec<Vec<String>> {
         row.extend(peer.to.iter().map(|t| shown(t.at)));
         rows.push(row);
         let mut row = vec!["  ratio".to_owned()];
-        let ratio = |r: &Option<f64>| r.map_or("-".into(), |r| format!("{}x", three_digits(r)));
-        row.extend(peer.ratio.iter().map(ratio));
+        let each = peer.ratio.iter().zip(&peer.to).zip(&found.variants[0].to);
+        row.extend(each.map(
+            |((ratio, theirs), ours)| match (ratio, theirs.at, ours.at) {
+                (Some(r), Some(a), Some(b)) => {
+                    let exact = [a, b].iter().all(|c| c.how == How::Interpolated);
+                    format!("{}{}x", if exact { "" } else { "~" }, three_digits(*r))
+                }
+                _ => "-".into(),
+            },
+        ));
         rows.push(row);
     }
     rows

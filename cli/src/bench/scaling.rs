@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 use crate::{args::BenchRender, error::Result, output::Output};
 
 use super::{
-    curve::exponent,
+    curve::{exponent, three_digits},
     measure::{Bench, settings},
     scenes::{load, resize, with_spots},
     tessellate::quadruple,
@@ -100,6 +100,7 @@ pub fn run(
     resize(&mut scene, pixels);
     let study = Study {
         bench: Bench::new(Some(args.threads), output, stop)?,
+        output,
         args,
     };
     let base = study.size(&scene, args.gate.bins, "base")?;
@@ -122,6 +123,7 @@ pub fn run(
 
 struct Study<'a> {
     bench: Bench<'a>,
+    output: Output,
     args: &'a BenchRender,
 }
 
@@ -133,6 +135,9 @@ impl Study<'_> {
         let what = format!("{}: {what}, until {} %", scene.name, target * 100.0);
         let measured = self.bench.render(scene, &settings, &what)?;
         let r = &measured.rendered;
+        // A full study takes long: what is known is shown at once.
+        let cpu = three_digits(measured.cpu_s);
+        self.output.say(format!("{what}: {cpu} CPU s"));
         Ok(Size {
             pixels: r.width,
             bins,

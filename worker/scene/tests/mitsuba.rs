@@ -10,8 +10,11 @@ use picofarm_scene::{
     import::{self, ImportOptions, read_scene, read_scene_with},
 };
 
+/// Object, corners, texture coordinates and material.
+type Facet = (usize, [Vec3; 3], Vec<[f32; 2]>, String);
+
 /// Corners of all triangles in world space with their materials' names, in order.
-fn soup(scene: &Scene) -> Vec<(usize, [Vec3; 3], Vec<[f32; 2]>, String)> {
+fn soup(scene: &Scene) -> Vec<Facet> {
     let mut all = Vec::new();
     for (k, o) in scene.objects.iter().enumerate() {
         let mut mesh = picofarm_scene::Mesh::clone(&o.mesh);
@@ -37,7 +40,7 @@ fn an_exported_scene_comes_back() {
     scene
         .provenance
         .notes
-        .insert("a--b".into(), "--> <x/>".into());
+        .insert("a---b".into(), "--> <x/> \u{ffff} \u{1f600} ü\n".into());
     let notes = export::write_mitsuba(&scene, &path).expect("writes");
     assert_eq!(notes, Vec::<String>::new());
     let back = read_scene(&path).expect("reads");

@@ -121,6 +121,12 @@ impl Surface {
         }
     }
 
+    /// The conductor alone, as it is in a mix.
+    #[inline(always)]
+    pub fn gloss(self) -> Self {
+        Self { base: 0.0, ..self }
+    }
+
     /// Chance with which [`Surface::sample`] draws from the conductor of a mix.
     #[inline(always)]
     fn share(&self) -> f32 {

@@ -67,9 +67,12 @@ impl Pool {
             let Some((w, weight, pdf)) = e.surface.sample(e.n, e.back, rng) else {
                 continue;
             };
-            let Some(hit) = world.closest(stack, lift(e.p, e.n), w) else {
+            let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
                 continue;
             };
+            if hit.surface.base > 0.0 {
+                hit.surface = hit.surface.lobe(rng.uniform());
+            }
             if weight == 0.0 || hit.surface.specular || hit.surface.strength == 0.0 {
                 continue;
             }

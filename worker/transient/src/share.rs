@@ -238,7 +238,12 @@ impl Sharing {
                     end: 0,
                 });
             } else {
-                walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
+                // Gather points connect to no light vertices, so there is nothing to share this with.
+                let alone = Walk {
+                    lights: false,
+                    ..*walk
+                };
+                alone.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
                 walk.run(rng, next, scratch, &mut sink);
             }
         }

@@ -110,7 +110,8 @@ impl Walk<'_> {
             && v.length_m + self.shortest_m < self.gate.end_m()
     }
 
-    /// Settles a surface of several lobes on one of them.
+    /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
+    /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
     #[inline]
     pub fn choose_lobe(&self, rng: &mut Rng, hit: &mut Hit) {
         if hit.surface.base > 0.0 {
@@ -154,7 +155,9 @@ impl Walk<'_> {
             }
             weight /= survive;
         }
-        self.follow(v, (w, weight, pdf), aims, stack)
+        let (step, mut next) = self.follow(v, (w, weight, pdf), aims, stack)?;
+        self.choose_lobe(rng, &mut next.hit);
+        Some((step, next))
     }
 
     /// One step in a given direction: (direction, f·cos/pdf, pdf per steradian).
@@ -301,11 +304,13 @@ impl Walk<'_> {
         let Some(aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images) else {
             return;
         };
-        let to = aim.target - h.p;
-        if h.n.dot(to) <= 0.0 {
+        if h.n.dot(aim.target - h.p) <= 0.0 {
             return;
         }
+        // From where the ray starts, not from `h.p`: it must meet the mirror where its density is known,
+        // and narrow lobes are no wider than the lift.
         let from = lift(h.p, h.n);
+        let to = aim.target - from;
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
             return;
         };
@@ -315,7 +320,9 @@ impl Walk<'_> {
         let leg = m.p - h.p;
         let w = leg.normalized();
         let e = &self.emitters.list[aim.spot];
-        let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &m.surface);
+        let there = self
+            .emitters
+            .weight(aim.spot, m.p, m.n, -w, &m.surface.gloss());
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         if value == 0.0 || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
             return;

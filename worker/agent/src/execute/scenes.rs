@@ -17,7 +17,7 @@ use tracing::{info, warn};
 use super::TaskError;
 
 /// Names of the furniture libraries that this program knows.
-const LIBRARIES: [&str; 2] = ["parametric", "sweethome3d"];
+const LIBRARIES: [&str; 3] = ["parametric", "sweethome3d", "gltf"];
 
 /// Finds the furniture on this machine. A library that is not installed is no error: jobs that need it go
 /// to other workers.

@@ -1,5 +1,5 @@
-//! Writing scenes as canonical `.glb` files: one binary glTF 2.0 file that any viewer opens and that
-//! [`crate::import`] reads back exactly. The same scene gives the same bytes.
+//! Writing scenes: as canonical `.glb` (one binary glTF 2.0 file that any viewer opens and that
+//! [`crate::import`] reads back exactly), for Mitsuba 3, or as one PLY mesh. The same scene gives the same bytes.
 
 mod binary;
 mod document;

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use gltf::{buffer::Source, image};
 use sha2::{Digest, Sha256};
 
 use super::{buffers::buffer_file, is_xml, mitsuba, read_file};
@@ -26,14 +25,9 @@ pub fn fingerprint(path: &Path) -> Result<String, SceneError> {
     }
     // Other files, unreadable ones too, stand alone.
     if let Ok(file) = gltf::Gltf::from_slice_without_validation(&bytes) {
-        let buffers = file.document.buffers().filter_map(|b| match b.source() {
-            Source::Uri(uri) => Some(uri),
-            Source::Bin => None,
-        });
-        let images = file.document.images().filter_map(|i| match i.source() {
-            image::Source::Uri { uri, .. } => Some(uri),
-            image::Source::View { .. } => None,
-        });
+        let json = file.document.as_json();
+        let buffers = json.buffers.iter().filter_map(|b| b.uri.as_deref());
+        let images = json.images.iter().filter_map(|i| i.uri.as_deref());
         for uri in buffers.chain(images) {
             if let Some(external) = buffer_file(path, uri) {
                 let data = read_file(&external)?;

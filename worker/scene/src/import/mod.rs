@@ -1,4 +1,5 @@
-//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`) and the reference scenes' JSON.
+//! Reading scenes from files: glTF 2.0 (`.glb`, `.gltf`), Mitsuba 3 (XML, and its dictionary as JSON), PLY meshes and
+//! the reference scenes' JSON.
 
 mod buffers;
 mod fingerprint;
@@ -41,9 +42,14 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 /// α = roughness², metals in part a mix, everything else Lambertian with the base colour, all two-sided; base
 /// colour textures are read. The camera is the first camera node; its image gets 64 rows (see
 /// [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or `laser_directions` in a node's extras,
-/// or from `options`. Of Mitsuba scenes, a subset is understood (see `ARCHITECTURE.md`); beams are `projector`
-/// emitters of at most 2°. A PLY needs camera and laser from `options`. Whatever a format holds that our scenes do
-/// not is named in the provenance's notes, under keys that start with `import.`.
+/// or from `options`.
+///
+/// Of Mitsuba 3, this is understood: sensor `perspective`; shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and
+/// `sphere`; BSDFs `diffuse`, `roughconductor`, `conductor`, `twosided`, and `blendbsdf` of a diffuse and a
+/// conductor; `bitmap` textures. Beams are emitters `projector` of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°)
+/// that start at one place; a shape's category is its id up to the first `.`. A PLY needs camera and laser from
+/// `options`. Whatever a format holds that our scenes do not is named in the provenance's notes, under keys that
+/// start with `import.`, or refused.
 ///
 /// # Errors
 /// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Format`]

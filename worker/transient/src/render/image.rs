@@ -13,8 +13,13 @@ use super::{
 };
 use crate::api::{Progress, RenderError};
 
-/// Side of a tile in pixels.
-const TILE: u32 = 16;
+/// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
+/// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
+const LARGE_TILE: u32 = 32;
+const SMALL_TILE: u32 = 16;
+/// Pixels from which an image is large, channels from which a pixel has many histograms.
+const LARGE: usize = 1 << 16;
+const MANY: usize = 5;
 /// The parts with their standard errors.
 #[derive(Debug)]
 pub(super) struct Parts {
@@ -83,14 +88,19 @@ impl Image {
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
         let empty = || vec![0.0f32; pixels * bins];
-        let tiles: Vec<Region> = (0..height)
-            .step_by(TILE as usize)
+        let side = if pixels >= LARGE && frame.film.channels < MANY {
+            LARGE_TILE
+        } else {
+            SMALL_TILE
+        };
+        let starts = |length: u32| (0..length).step_by(side as usize);
+        let tiles: Vec<Region> = starts(height)
             .flat_map(|row| {
-                (0..width).step_by(TILE as usize).map(move |col| Region {
+                starts(width).map(move |col| Region {
                     row,
                     col,
-                    rows: TILE.min(height - row),
-                    cols: TILE.min(width - col),
+                    rows: side.min(height - row),
+                    cols: side.min(width - col),
                 })
             })
             .collect();
@@ -211,8 +221,6 @@ impl Image {
                 self.transient[at] = h;
                 stat.norm2 += f64::from(h) * f64::from(h);
                 stat.total += f64::from(h);
-                stat.two_variance += m.two_variance;
-                stat.multi_variance += m.multi_variance;
                 if let Some(s) = &mut self.split {
                     let mean = |old: f32, x: f64| (f64::from(old) * a + x * unit * b) as f32;
                     let error = |old: f32, x: f64| {
@@ -233,6 +241,7 @@ impl Image {
                     *h = (f64::from(*h) * a + x * unit * b) as f32;
                 }
             }
+            (stat.two_variance, stat.multi_variance) = done.pixel_variance(k);
             let old = self.stats[pixel];
             self.stats[pixel] = Stat {
                 two_variance: blend(old.two_variance, stat.two_variance * unit2),

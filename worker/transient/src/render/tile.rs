@@ -77,6 +77,9 @@ pub(super) struct Done {
     two_variance: Vec<f32>,
     /// Variance of the sum over slots of the two-bounce mean.
     two_total_variance: Vec<f64>,
+    /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
+    /// many slots are sure enough by themselves, and pooling would lend bright pixels' noise to dim ones.
+    pixel_variance: Vec<(f64, f64)>,
     /// Σ and Σ² over passes of the whole tile.
     all: (f64, f64),
     pub passes: u32,
@@ -105,6 +108,11 @@ fn mean(sum: f64, square: f64, n: f64) -> (f64, f64) {
     (sum / n, spread / n)
 }
 
+/// Sum over the gate's slots.
+fn inside(film: &Film, slots: &[f32]) -> f64 {
+    slots[1..film.slots - 1].iter().map(|&v| f64::from(v)).sum()
+}
+
 impl Done {
     fn reset(&mut self, film: &Film, pixels: usize, split: bool) {
         let zero = |v: &mut Vec<f32>, n: usize| {
@@ -121,6 +129,8 @@ impl Done {
         zero(&mut self.two_variance, pixels * film.slots);
         self.two_total_variance.clear();
         self.two_total_variance.resize(pixels, 0.0);
+        self.pixel_variance.clear();
+        self.pixel_variance.resize(pixels, (0.0, 0.0));
         self.all = (0.0, 0.0);
         self.passes = 0;
     }
@@ -167,7 +177,19 @@ impl Done {
                 both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
             );
         }
+        for (out, v) in self
+            .pixel_variance
+            .iter_mut()
+            .zip(self.multi_variance.chunks(film.slots))
+        {
+            out.1 = inside(film, v);
+        }
         pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
+    }
+
+    /// Σ over the gate's slots of both parts' variances in pixel `k`.
+    pub fn pixel_variance(&self, k: usize) -> (f64, f64) {
+        self.pixel_variance[k]
     }
 
     /// Variance of the tile's whole energy. Pixels that share vertices err together, so this is not the
@@ -280,6 +302,10 @@ impl Bench {
                 *out = v * n * n;
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
+        }
+        let variances = self.done.two_variance.chunks(film.slots);
+        for (out, v) in self.done.pixel_variance.iter_mut().zip(variances) {
+            out.0 = inside(film, v);
         }
         pool(&mut self.done.two_variance, region, film.slots, TWO_REACH);
         Some(())

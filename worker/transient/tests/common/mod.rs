@@ -1,15 +1,17 @@
 //! Helpers of the integration tests: small scenes, settings, and the reference transients.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod brute;
 pub mod npz;
 pub mod reference;
 
 use std::sync::Arc;
 
 use picofarm_scene::{
-    Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Vec3,
+    Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Spot,
+    Vec3,
 };
-use picofarm_transient::{Budget, Gate, Progress, Settings, Strategy};
+use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, Strategy, render};
 
 /// Lets every render run to its end.
 pub struct Quiet;
@@ -159,4 +161,71 @@ pub fn scene(objects: Vec<Object>, size: u32, directions: &[Vec3]) -> Scene {
 
 pub fn energy(h: &[f32]) -> f64 {
     h.iter().map(|&x| f64::from(x)).sum()
+}
+
+/// A beam that ends on a stated spot, with the laser at the origin.
+pub fn beam_to(point: Vec3, normal: Vec3, object: u32) -> Beam {
+    Beam {
+        direction: point.normalized(),
+        spot: Some(Spot {
+            point,
+            normal,
+            arriving: point.normalized(),
+            path_m: point.length(),
+            object,
+            material: 0,
+        }),
+    }
+}
+
+/// A camera at `origin` whose image is just the parallelogram that `corner`, `right` and `down` span (at
+/// right angles to each other, seen at a right angle).
+pub fn framed(origin: Vec3, corner: Vec3, right: Vec3, down: Vec3, (w, h): (u32, u32)) -> Camera {
+    let (r, d) = (right.normalized(), down.normalized());
+    let forward = r.cross(d);
+    let depth = (corner - origin).dot(forward);
+    let (fx, fy) = (
+        w as f32 * depth / right.length(),
+        h as f32 * depth / down.length(),
+    );
+    Camera {
+        intrinsics: Intrinsics {
+            fx,
+            fy,
+            cx: -(corner - origin).dot(r) / depth * fx,
+            cy: -(corner - origin).dot(d) / depth * fy,
+            width: w,
+            height: h,
+        },
+        origin,
+        right: r,
+        down: d,
+        forward,
+    }
+}
+
+/// Renders what must render.
+pub fn ok(scene: &Scene, settings: &Settings) -> Rendered {
+    render(scene, settings, &Quiet).unwrap()
+}
+
+/// Energy of the 3+ part and the standard error of the whole.
+pub fn multi_energy(r: &Rendered) -> (f64, f64) {
+    let se = f64::from(r.error.total_relative) * energy(&r.transient);
+    (energy(&r.split.as_ref().unwrap().multi), se)
+}
+
+/// Fails unless `got` is `expected` within a relative `tolerance` and four standard errors.
+#[track_caller]
+pub fn near(what: &str, got: f64, expected: f64, tolerance: f64, se: f64) {
+    println!(
+        "{what}: {:+.3} % ± {:.3} %",
+        100.0 * (got / expected - 1.0),
+        100.0 * se / expected
+    );
+    let slack = tolerance * expected.abs() + 4.0 * se;
+    assert!(
+        (got - expected).abs() <= slack,
+        "{what}: {got:e} instead of {expected:e} ± {slack:e}"
+    );
 }

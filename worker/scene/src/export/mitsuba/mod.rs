@@ -76,11 +76,7 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
         xml.push_str(text);
         xml.push('\n');
     };
-    // Two hyphens end a comment; in JSON they only occur within strings.
-    line(&format!(
-        "<!-- picofarm {} -->",
-        json.replace("--", "-\\u002d")
-    ));
+    line(&format!("<!-- picofarm {} -->", for_comment(&json)));
     line("<integrator type=\"path\"/>");
     line(&sensor_text(&scene.camera));
     line(writer.text.trim_end());
@@ -92,6 +88,25 @@ pub fn write_mitsuba(scene: &Scene, file: &Path) -> Result<Vec<String>, SceneErr
     write_whole(file, xml.as_bytes())?;
     Ok(writer.notes)
 }
+
+/// JSON that any XML comment can hold: plain ASCII without two hyphens in a row. Whatever else there is stands in
+/// strings, where it can be escaped.
+fn for_comment(json: &str) -> String {
+    let mut out = String::with_capacity(json.len());
+    for c in json.chars() {
+        if c.is_ascii() && !c.is_ascii_control() && !(c == '-' && out.ends_with('-')) {
+            out.push(c);
+        } else {
+            for unit in c.encode_utf16(&mut [0; 2]) {
+                write!(out, "\\u{unit:04x}").expect("strings take every text");
+            }
+        }
+    }
+    out
+}
+
+/// (file, id of the material) of each part that a mesh is written as.
+type Parts = Vec<(String, String)>;
 
 struct Writer<'a> {
     folder: &'a Path,
@@ -107,7 +122,7 @@ impl Writer<'_> {
     /// Writes every mesh; the text of all shapes.
     fn shapes(&mut self, scene: &Scene) -> Result<String, SceneError> {
         // Meshes that are written, with the (file, material) of their parts.
-        let mut written: Vec<(Arc<Mesh>, Vec<(String, String)>)> = Vec::new();
+        let mut written: Vec<(Arc<Mesh>, Parts)> = Vec::new();
         let mut out = String::new();
         for (k, object) in scene.objects.iter().enumerate() {
             let known = written.iter().position(|w| Arc::ptr_eq(&w.0, &object.mesh));
@@ -135,7 +150,7 @@ impl Writer<'_> {
     }
 
     /// Writes one mesh, a file for each material that it uses.
-    fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Vec<(String, String)>, SceneError> {
+    fn mesh(&mut self, index: usize, mesh: &Mesh) -> Result<Parts, SceneError> {
         let mut out = Vec::new();
         for (m, material) in mesh.materials.iter().enumerate() {
             let Some(part) = part(mesh, m as u32) else {

@@ -12,8 +12,8 @@ use crate::{Mesh, SceneError, Vec3, import::format_error};
 
 use super::{Walk, material::Coordinates};
 
-/// Most vertices or corners of one file's meshes, as declared: beyond it the file is taken for damaged.
-const MAX_CORNERS: usize = 1 << 30;
+/// Most vertices and corners that one file may place in its meshes: accessors can be used many times over.
+const MAX_CORNERS: usize = 1 << 28;
 
 /// What decides whether primitives can share vertices: accessor of the positions, that of the texture
 /// coordinates, and what is done to these.
@@ -59,6 +59,13 @@ impl Walk<'_> {
                     .check(&indices, Dimensions::Scalar, &types)
                     .map_err(fail)?;
             }
+            let corners = primitive.indices().map_or(0, |i| i.count());
+            self.corners += accessor.count().max(corners);
+            if self.corners > MAX_CORNERS {
+                return Err(fail(format!(
+                    "more than {MAX_CORNERS} vertices in all; split the scene"
+                )));
+            }
             let material = primitive.material();
             let coordinates = self.coordinates(&material);
             let uv_accessor = primitive.get(&Semantic::TexCoords(coordinates.set));
@@ -85,11 +92,6 @@ impl Walk<'_> {
                 Some(&base) => base,
                 None => {
                     let base = mesh.positions.len();
-                    if base + accessor.count() > MAX_CORNERS {
-                        return Err(fail(format!(
-                            "more than {MAX_CORNERS} vertices; split the mesh"
-                        )));
-                    }
                     let read = reader.read_positions().into_iter().flatten();
                     mesh.positions.extend(read.map(Vec3::from));
                     if let Some(uv) = reader.read_tex_coords(coordinates.set) {

@@ -6,7 +6,7 @@ mod parts;
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use gltf::{Gltf, Node};
+use gltf::{Gltf, Node, Semantic, json::validation::Checked};
 use serde::de::DeserializeOwned;
 
 use crate::{
@@ -91,14 +91,41 @@ pub(super) fn read_model(
 }
 
 fn open(path: &Path, bytes: &[u8]) -> Result<(gltf::Document, Buffers), SceneError> {
-    let Gltf { document, blob } = Gltf::from_slice(bytes).map_err(|e| {
-        format_error(
-            path,
-            format!("is not readable glTF 2.0 ({e}); copy or export it again"),
-        )
-    })?;
+    let fail = |e: gltf::Error| {
+        let what = format!("is not readable glTF 2.0 ({e}); copy or export it again");
+        format_error(path, what)
+    };
+    let Gltf { document, blob } = Gltf::from_slice_without_validation(bytes).map_err(fail)?;
+    let json = document.into_json();
+    unguarded(&json).map_err(|what| format_error(path, what))?;
+    let document = gltf::Document::from_json(json).map_err(fail)?;
     let buffers = Buffers::read(path, &document, blob)?;
     Ok((document, buffers))
+}
+
+/// What the `gltf` crate relies on before or without checking it.
+fn unguarded(json: &gltf::json::Root) -> Result<(), String> {
+    let position = Checked::Valid(Semantic::Positions);
+    for (m, mesh) in json.meshes.iter().enumerate() {
+        for (p, primitive) in mesh.primitives.iter().enumerate() {
+            let accessor = primitive.attributes.get(&position);
+            if accessor.is_some_and(|a| a.value() >= json.accessors.len()) {
+                return Err(format!(
+                    "meshes[{m}].primitives[{p}].attributes.POSITION: no such accessor; export the file again"
+                ));
+            }
+        }
+    }
+    let whole = |i: &gltf::json::Image| match i.buffer_view {
+        Some(_) => i.mime_type.is_some(),
+        None => i.uri.is_some(),
+    };
+    match json.images.iter().position(|i| !whole(i)) {
+        Some(k) => Err(format!(
+            "images[{k}]: needs a uri, or a bufferView with mimeType; export the file again"
+        )),
+        None => Ok(()),
+    }
 }
 
 fn root<'a>(path: &Path, document: &'a gltf::Document) -> Result<gltf::Scene<'a>, SceneError> {
@@ -157,6 +184,8 @@ struct Walk<'a> {
     path: &'a Path,
     buffers: &'a Buffers,
     images: Images<(usize, Wrap)>,
+    /// Vertices and corners read so far.
+    corners: usize,
     meshes: BTreeMap<usize, Option<Arc<Mesh>>>,
     objects: Vec<(Option<u32>, Object)>,
     labels: Vec<String>,
@@ -179,6 +208,7 @@ impl<'a> Walk<'a> {
             path,
             buffers,
             images: Images::default(),
+            corners: 0,
             meshes: BTreeMap::new(),
             objects: Vec::new(),
             labels,

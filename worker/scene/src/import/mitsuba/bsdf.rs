@@ -1,6 +1,6 @@
 //! Mitsuba's BSDFs as materials.
 
-use std::{path::PathBuf, rc::Rc, sync::Arc};
+use std::{path::Path, rc::Rc, sync::Arc};
 
 use crate::{
     Bsdf, Distribution, Material, Texture, Wrap,
@@ -336,7 +336,7 @@ impl Reader<'_> {
     fn image(
         &mut self,
         node: &Node,
-        file: &PathBuf,
+        file: &Path,
         name: &str,
         wrap: Wrap,
         raw: bool,
@@ -353,7 +353,7 @@ impl Reader<'_> {
             Texture::new(name, texture.width(), texture.height(), texels, wrap)
         };
         self.images
-            .get((file.clone(), wrap, raw), decode)
+            .get((file.to_path_buf(), wrap, raw), decode)
             .map_err(|e| node.fail(e))
     }
 }

@@ -5,7 +5,8 @@
 //! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
 //! a diffuse and a conductor; `bitmap` textures; references, `<default>` parameters, and every transform. A shape
 //! without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
-//! Integrators, samplers and media are skipped; any other plugin is an error that names it.
+//! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
+//! takes its axis as it is: one of another length than 1 shears.
 //!
 //! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
 //! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all
@@ -46,8 +47,8 @@ use transform::Matrix;
 
 /// Category of shapes whose id names none.
 const UNLABELLED: &str = "unlabelled";
-/// Most triangles of a scene, instances counted each.
-const MAX_TRIANGLES: usize = 1 << 28;
+/// Most vertices and triangles of a scene, instances counted each.
+const MAX_SIZE: usize = 1 << 28;
 
 /// Reads a scene in XML; the caller validates the result.
 pub(super) fn read_xml(
@@ -247,7 +248,7 @@ impl<'a> Reader<'a> {
             .as_ref()
             .map_or_else(Vec::new, |e| e.scene.labels.clone());
         let mut objects = Vec::new();
-        let mut triangles = 0;
+        let mut size = 0;
         let mut shared: BTreeMap<Vec<String>, Arc<Mesh>> = BTreeMap::new();
         let groups: Vec<&[Rc<Node>]> = shapes.chunk_by(|a, b| self.same_object(a, b)).collect();
         for parts in groups {
@@ -277,9 +278,11 @@ impl<'a> Reader<'a> {
             let label =
                 u16::try_from(label).map_err(|_| first.fail("more than 65535 categories"))?;
             let (mesh, place) = self.mesh(parts, &name, ours)?;
-            triangles += mesh.triangles.len();
-            if triangles > MAX_TRIANGLES {
-                return Err(first.fail(format!("more than {MAX_TRIANGLES} triangles in all")));
+            size += mesh.positions.len() + mesh.triangles.len();
+            if size > MAX_SIZE {
+                return Err(first.fail(format!(
+                    "more than {MAX_SIZE} vertices and triangles in all"
+                )));
             }
             // Equal shapes of our own files share their mesh as they did.
             let mesh = match ours {

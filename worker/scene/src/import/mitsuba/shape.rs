@@ -172,7 +172,6 @@ fn read_obj(bytes: &[u8]) -> Result<Geometry, String> {
         single_index: true,
         ignore_points: true,
         ignore_lines: true,
-        ..tobj::LoadOptions::default()
     };
     // Mitsuba takes the material from the shape, never from the OBJ.
     let nothing = |_: &Path| Ok((Vec::new(), Default::default()));

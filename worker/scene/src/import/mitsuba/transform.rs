@@ -36,9 +36,12 @@ impl Matrix {
         m
     }
 
-    /// Rotation by `degrees` about an axis (Rodrigues).
-    pub(super) fn rotation(axis: [f64; 3], degrees: f64) -> Result<Matrix, String> {
-        let [x, y, z] = unit(axis).ok_or("rotate: the axis has no direction; set x, y or z")?;
+    /// Rotation by `degrees` about an axis (Rodrigues). As in Mitsuba, an axis of another length than 1 is not
+    /// normalised: it shears.
+    pub(super) fn rotation([x, y, z]: [f64; 3], degrees: f64) -> Result<Matrix, String> {
+        if [x, y, z] == [0.0; 3] {
+            return Err("rotate: the axis has no direction; set x, y or z".into());
+        }
         let (s, c) = libm::sincos(degrees.to_radians());
         let t = 1.0 - c;
         Ok(Matrix([
@@ -116,4 +119,26 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 fn unit(v: [f64; 3]) -> Option<[f64; 3]> {
     let length = v.iter().map(|x| x * x).sum::<f64>().sqrt();
     (length > 0.0 && length.is_finite()).then(|| v.map(|x| x / length))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rotations_are_mitsubas_also_about_axes_of_other_lengths() {
+        // Mitsuba 3.9.1: <rotate x="1" y="0.3" angle="-20"/>
+        let expected = [
+            [1.0, 0.0180922, -0.102606],
+            [0.0180922, 0.94512, 0.34202],
+            [0.102606, -0.34202, 0.939693],
+        ];
+        let found = Matrix::rotation([1.0, 0.3, 0.0], -20.0).unwrap();
+        for (r, row) in expected.iter().enumerate() {
+            for (c, x) in row.iter().enumerate() {
+                assert!((found.0[r][c] - x).abs() < 2e-6, "{found:?}");
+            }
+        }
+        assert!(Matrix::rotation([0.0; 3], 1.0).is_err());
+    }
 }

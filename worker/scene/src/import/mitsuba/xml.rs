@@ -13,6 +13,8 @@ use super::{
 const MAX_DEPTH: usize = 32;
 /// Most elements of a file.
 const MAX_NODES: u32 = 4_000_000;
+/// Longest attribute with its parameters replaced, bytes.
+const MAX_VALUE: usize = 1 << 16;
 /// Elements that are plugins.
 const PLUGINS: [&str; 7] = [
     "scene", "shape", "bsdf", "sensor", "emitter", "texture", "film",
@@ -84,10 +86,15 @@ impl<'a> Parser<'a> {
         let mut names: Vec<&String> = self.defaults.keys().collect();
         names.sort_by_key(|n| std::cmp::Reverse(n.len()));
         for known in names {
-            value = value.replace(&format!("${known}"), &self.defaults[known]);
-            if value.len() > 1 << 16 {
-                break;
+            let (key, new) = (format!("${known}"), &self.defaults[known]);
+            let count = value.matches(&key).count();
+            if count > 0 && value.len() + count * new.len() > MAX_VALUE {
+                return Err(format!(
+                    "{}: {name}: longer than {MAX_VALUE} bytes",
+                    self.at(e)
+                ));
             }
+            value = value.replace(&key, new);
         }
         if value.contains('$') {
             return Err(format!(
