@@ -63,22 +63,51 @@ pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
     picofarm_agent::strategy(&all).map_err(|e| CliError::input(format!("--strategy: {e}")))
 }
 
-/// Reads `default`, `share=1` or `share=1+image-lobes=off`.
+/// What one word of `--strategies` stands for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ways(Vec<Variant>);
+
+/// Reads `default`, `each` (each way of finding light left out in turn), `share=1` or `share=1+image-lobes=off`.
 ///
 /// # Errors
 /// Those of [`parse`], or a choice made twice.
-pub fn variant(text: &str) -> Result<Variant, String> {
-    if text == "default" {
-        return Ok(Variant {
-            name: "picofarm".into(),
-            strategy: Strategy::default(),
-        });
+pub fn ways(text: &str) -> Result<Ways, String> {
+    let default = Variant {
+        name: "picofarm".into(),
+        strategy: Strategy::default(),
+    };
+    let of = |text: &str| -> Result<Variant, String> {
+        let chosen = text.split('+').map(parse).collect::<Result<Vec<_>, _>>()?;
+        Ok(Variant {
+            name: text.into(),
+            strategy: together(&chosen).map_err(|e| e.message)?,
+        })
+    };
+    match text {
+        "default" => Ok(Ways(vec![default])),
+        "each" => {
+            // What is no switch is a size, and 1 makes nothing of it.
+            let without = |name: String| {
+                let name = name.replace('_', "-");
+                of(&format!("{name}=off")).or_else(|_| of(&format!("{name}=1")))
+            };
+            let names = picofarm_agent::strategy_names().into_iter();
+            let all = names.map(without).collect::<Result<Vec<_>, _>>()?;
+            Ok(Ways([vec![default], all].concat()))
+        }
+        _ => Ok(Ways(vec![of(text)?])),
     }
-    let chosen = text.split('+').map(parse).collect::<Result<Vec<_>, _>>()?;
-    Ok(Variant {
-        name: text.into(),
-        strategy: together(&chosen).map_err(|e| e.message)?,
-    })
+}
+
+/// All ways to compare, each once, in order.
+pub fn variants(ways: &[Ways]) -> Vec<Variant> {
+    let mut all: Vec<Variant> = vec![];
+    for way in ways.iter().flat_map(|w| &w.0) {
+        if !all.contains(way) {
+            all.push(way.clone());
+        }
+    }
+    all
 }
 
 #[cfg(test)]
@@ -115,14 +144,22 @@ mod tests {
     }
 
     #[test]
-    fn variants_have_the_name_they_were_given() {
-        assert_eq!(variant("default").unwrap().strategy, Strategy::default());
-        let both = variant("share=1+image-lobes=off").unwrap();
-        assert_eq!(both.name, "share=1+image-lobes=off");
-        assert_eq!(
-            (both.strategy.share, both.strategy.image_lobes),
-            (Some(1), Some(false))
-        );
-        assert!(variant("share=1+share=2").unwrap_err().contains("twice"));
+    fn ways_have_the_name_they_were_given() {
+        let all = |words: &[&str]| {
+            let ways: Vec<_> = words.iter().map(|w| ways(w).unwrap()).collect();
+            variants(&ways)
+        };
+        let found = all(&["default", "share=1+image-lobes=off", "default"]);
+        let names: Vec<_> = found.iter().map(|v| v.name.as_str()).collect();
+        assert_eq!(names, ["picofarm", "share=1+image-lobes=off"]);
+        assert_eq!(found[0].strategy, Strategy::default());
+        let both = found[1].strategy;
+        assert_eq!((both.share, both.image_lobes), (Some(1), Some(false)));
+        assert!(ways("share=1+share=2").unwrap_err().contains("twice"));
+
+        let each = all(&["each"]);
+        assert_eq!(each.len(), 1 + picofarm_agent::strategy_names().len());
+        assert_eq!(each[1].name, "share=1");
+        assert!(each.iter().any(|v| v.name == "light-vertices=off"));
     }
 }

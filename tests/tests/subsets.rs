@@ -266,10 +266,14 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     for (name, render, part) in [
         (
             "fewer",
-            "subsets = [4]\nper_spot = true\n",
+            "subsets = [4]\nper_spot = true\nstrategy = { share = 4 }\n",
             "render.subsets is [4,25] there and [4] here",
         ),
-        ("none", "", "render.per_spot is true there and unset here"),
+        (
+            "none",
+            "subsets = [4, 25]\nstrategy = { share = 4 }\n",
+            "render.per_spot is true there and unset here",
+        ),
         (
             "other",
             &render.replace("share = 4", "share = 2"),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::{
-    choices::{Chosen, Variant},
+    choices::{Chosen, Ways},
     groups::{Group, Named},
 };
 
@@ -100,10 +100,11 @@ pub struct BenchRender {
     /// Measurements of another renderer, written by tests/peers; may be given several times
     #[arg(long, value_name = "FILE")]
     pub peer: Vec<PathBuf>,
-    /// Ways of finding light to compare: default, or choices as for `scene render --strategy`, joined by +
-    #[arg(long, value_delimiter = ',', default_value = "default", value_name = "default|NAME=VALUE[+…],…",
-          value_parser = crate::choices::variant)]
-    pub strategies: Vec<Variant>,
+    /// Ways of finding light to compare: default, choices as for `scene render --strategy`, joined by +, or each, which
+    /// leaves out one in turn (also what the option stands for without a value)
+    #[arg(long, value_delimiter = ',', num_args = 0..=1, default_value = "default", default_missing_value = "each",
+          value_name = "default|each|NAME=VALUE[+…],…", value_parser = crate::choices::ways)]
+    pub strategies: Vec<Ways>,
     /// Draw time against error into this PNG
     #[arg(long, value_name = "FILE")]
     pub plot: Option<PathBuf>,

@@ -5,7 +5,12 @@ use picofarm_transient::{Budget, Gate, Settings};
 use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 
-use crate::{args::BenchRender, choices::Variant, error::Result, output::Output};
+use crate::{
+    args::BenchRender,
+    choices::{Variant, variants},
+    error::Result,
+    output::Output,
+};
 
 use super::{
     curve::{Crossing, crossing},
@@ -124,8 +129,9 @@ pub fn run(
     let bench = Bench::new(Some(args.threads), output, stop)?;
     let target = args.error[0];
     let what = format!("{}: until {} %", scene.name, target * 100.0);
+    let ways = variants(&args.strategies);
     let until = Settings {
-        strategy: args.strategies[0].strategy,
+        strategy: ways[0].strategy,
         ..settings(args, Budget::Error(target as f32), 1)
     };
     let until = bench.render(scene, &until, &what)?;
@@ -137,8 +143,7 @@ pub fn run(
             truth::render(scene, args, samples, &all_cores)?
         }
     };
-    let variants = args
-        .strategies
+    let variants = ways
         .iter()
         .map(|v| climb(v, scene, args, &truth, &bench))
         .collect::<Result<Vec<_>>>()?;
