@@ -124,7 +124,7 @@ impl Walk<'_> {
             let mut aimed = 0.0;
             if helped {
                 aimed = self.aim(rng, &vertex, scratch, sink);
-                self.light(rng, &vertex, scratch, sink);
+                self.light(rng, &vertex, false, scratch, sink);
             }
             let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack)
             else {
@@ -307,9 +307,17 @@ impl Walk<'_> {
         total
     }
 
-    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
-    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
-        if !self.lights {
+    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution; to all kinds or, for
+    /// vertices that a tile's shared vertices serve as well, to glossy ones alone.
+    pub fn light(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        gloss_alone: bool,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        if !self.lights || (gloss_alone && !scratch.pool.has_gloss()) {
             return;
         }
         let h = &v.hit;
@@ -319,7 +327,11 @@ impl Walk<'_> {
             pool,
             ..
         } = scratch;
-        pool.weights(h, v.wo, lights);
+        if gloss_alone {
+            pool.glossy_weights(h, v.wo, lights);
+        } else {
+            pool.weights(h, v.wo, lights);
+        }
         draw(lights, LIGHTS, rng.uniform(), |i, value| {
             let y = &pool.list[i];
             let there = &y.hit;
