@@ -206,8 +206,8 @@ fn another_seed_gives_other_bits_and_the_same_light() {
 /// copy both from the failure's message.
 #[test]
 fn the_bits_are_those_written_down() {
-    const VERSION: &str = "transient-2";
-    const HASH: u64 = 0;
+    const VERSION: &str = "transient-3";
+    const HASH: u64 = 0xa81b_ba8e_3030_0278;
     let found = hash(&ok(&everything(20), &set(Budget::Samples(4))));
     assert_eq!(
         (RENDERER_VERSION, found),
