@@ -20,7 +20,7 @@ const MAX_REFLECTIONS: u32 = 64;
 /// [`RenderError::Scene`] where the scene is invalid.
 pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
     scene.validate()?;
-    let world = World::new(scene);
+    let world = World::new(scene)?;
     Ok(find_spots(&world, &scene.laser.beams))
 }
 
@@ -206,6 +206,14 @@ impl Emitters {
                 });
             }
             let unit = |v: Vec3| v.is_finite() && (v.length() - 1.0).abs() < 1e-3;
+            let far = |v: Vec3| v.x.abs().max(v.y.abs()).max(v.z.abs()) > 1e9;
+            if far(spot.point - world.camera.origin) || !(0.0..=1e12).contains(&spot.path_m) {
+                return Err(RenderError::Invalid {
+                    field: format!("laser.beams[{beam}].spot"),
+                    what: "needs a point within 1e9 m of the camera and a path of 0 to 1e12 m"
+                        .into(),
+                });
+            }
             if !(spot.point.is_finite() && unit(spot.normal) && unit(spot.arriving)) {
                 return Err(RenderError::Invalid {
                     field: format!("laser.beams[{beam}].spot"),

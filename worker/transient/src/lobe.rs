@@ -2,8 +2,8 @@
 //!
 //! A surface point x sees a spot s through a mirror of roughness α around one point m₀, where the image
 //! of s lies behind it. Over the mirror's plane, the half vector's slope grows linearly around m₀, so a
-//! Gaussian in slope, carried to the plane by that linear map, is close to the lobe's own shape. Where
-//! it is not (grazing, spots at the mirror's foot), MIS with BSDF sampling keeps the estimate unbiased
+//! Gaussian in slope (GGX: its own heavy-tailed distribution), carried to the plane by that linear map, is
+//! close to the lobe's own shape. Where it is not (grazing, spots at the mirror's foot), MIS with BSDF sampling keeps the estimate unbiased
 //! and its variance bounded.
 
 use std::f32::consts::PI;
@@ -38,6 +38,7 @@ pub(crate) struct Mirror {
     low: [f32; 2],
     high: [f32; 2],
     alpha: f32,
+    ggx: bool,
     two_sided: bool,
     images: Columns,
     /// Signed distance of each spot from the plane.
@@ -173,7 +174,13 @@ impl Mirrors {
         let (mirror, spot) = (k / self.spots, k % self.spots);
         let shape = self.list[mirror].shape(x, spot)?;
         let (a, b) = rng.circle();
-        let r = shape.sigma * (-libm::logf(1.0 - rng.uniform())).sqrt();
+        let u = rng.uniform();
+        let r = shape.sigma
+            * if self.list[mirror].ggx {
+                (u / (1.0 - u)).sqrt()
+            } else {
+                (-libm::logf(1.0 - u)).sqrt()
+            };
         Some(Aim {
             target: shape.m0 + shape.t * (a * r / shape.jt) + shape.s * (b * r / shape.js),
             mirror,
@@ -197,13 +204,17 @@ impl Mirrors {
         let (a, b) = (shape.t.dot(d) * shape.jt, shape.s.dot(d) * shape.js);
         let s2 = shape.sigma * shape.sigma;
         let e = (a * a + b * b) / s2;
-        if e > 80.0 {
+        let falloff = if mirror.ggx {
+            1.0 / ((1.0 + e) * (1.0 + e))
+        } else if e > 80.0 {
             return 0.0;
-        }
+        } else {
+            libm::expf(-e)
+        };
         let to = m - x;
         let d2 = to.dot(to);
         let cos = mirror.normal.dot(to).abs() / d2.sqrt();
-        libm::expf(-e) / (PI * s2) * shape.jt * shape.js * d2 / cos
+        falloff / (PI * s2) * shape.jt * shape.js * d2 / cos
     }
 }
 
@@ -261,6 +272,7 @@ impl Mirror {
             low,
             high,
             alpha: surface.alpha,
+            ggx: surface.ggx,
             two_sided: surface.two_sided,
             images,
             height,

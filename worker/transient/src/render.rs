@@ -79,7 +79,7 @@ fn run(
 ) -> Result<Rendered, Ended> {
     check(settings)?;
     scene.validate()?;
-    let world = World::new(scene);
+    let world = World::new(scene)?;
     let spots = find_spots(&world, &scene.laser.beams);
     let emitters = Emitters::new(scene, &world, &spots)?;
     let mirrors = if settings.strategy.image_lobes.unwrap_or(true) {

@@ -218,6 +218,7 @@ impl Sharing {
                 factor: points as f32 / count as f32,
             };
             let aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
+            walk.light(rng, &vertex, true, scratch, &mut sink);
             let h = &vertex.hit;
             let Some(drawn) = turns.direction(j, &h.surface, h.n, vertex.wo, rng) else {
                 continue;
@@ -238,12 +239,7 @@ impl Sharing {
                     end: 0,
                 });
             } else {
-                // Gather points connect to no light vertices, so there is nothing to share this with.
-                let alone = Walk {
-                    lights: false,
-                    ..*walk
-                };
-                alone.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
+                walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
                 walk.run(rng, next, scratch, &mut sink);
             }
         }

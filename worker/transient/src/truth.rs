@@ -64,7 +64,8 @@ pub(crate) fn ground_truth(
     for (k, hit) in centres.hits.iter().enumerate() {
         let Some(h) = hit else { continue };
         let q = world.camera.direction_to_camera(h.p);
-        truth.depth[k] = world.metres(q.z) as f32;
+        // Rays at right angles to the axis round to either side of it.
+        truth.depth[k] = world.metres(q.z).max(0.0) as f32;
         truth.range[k] = world.metres(h.p.length()) as f32;
         let n = world.camera.direction_to_camera(h.n);
         truth.normal[3 * k..3 * k + 3].copy_from_slice(&<[f32; 3]>::from(n));

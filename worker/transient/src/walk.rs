@@ -127,7 +127,7 @@ impl Walk<'_> {
             let mut aims = 0.0;
             if helped {
                 aims = self.aim(rng, &vertex, AIMS, scratch, sink);
-                self.light(rng, &vertex, scratch, sink);
+                self.light(rng, &vertex, false, scratch, sink);
             }
             let Some((step, next)) = self.step(rng, &vertex, aims, true, &mut scratch.stack) else {
                 return;
@@ -335,9 +335,17 @@ impl Walk<'_> {
         sink.add(path, value, aim.spot, v.bounce + 2);
     }
 
-    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
-    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
-        if !self.lights {
+    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution; to all kinds or, for
+    /// vertices that a tile's shared vertices serve as well, to glossy ones alone.
+    pub fn light(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        gloss_alone: bool,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        if !self.lights || (gloss_alone && !scratch.pool.has_gloss()) {
             return;
         }
         let h = &v.hit;
@@ -347,7 +355,11 @@ impl Walk<'_> {
             pool,
             ..
         } = scratch;
-        pool.weights(h, v.wo, lights);
+        if gloss_alone {
+            pool.glossy_weights(h, v.wo, lights);
+        } else {
+            pool.weights(h, v.wo, lights);
+        }
         draw(lights, LIGHTS, rng.uniform(), |i, value| {
             let y = &pool.list[i];
             let there = &y.hit;

@@ -7,9 +7,15 @@ use std::sync::Arc;
 use picofarm_scene::{Camera, Material, Scene, Texture, Vec3};
 
 use crate::{
+    api::RenderError,
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
 };
+
+/// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
+/// product of lengths leaves f32.
+const WIDEST_M: f64 = 1e9;
+const NARROWEST_M: f64 = 1e-6;
 
 /// Geometry, materials and camera in render units.
 #[derive(Debug)]
@@ -57,7 +63,9 @@ pub(crate) struct Hit {
 }
 
 impl World {
-    pub fn new(scene: &Scene) -> Self {
+    /// # Errors
+    /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
+    pub fn new(scene: &Scene) -> Result<Self, RenderError> {
         let origin = scene.camera.origin;
         let wide = |v: Vec3| [f64::from(v.x), f64::from(v.y), f64::from(v.z)];
         let centre = wide(origin);
@@ -102,6 +110,16 @@ impl World {
             .flatten()
             .flatten()
             .fold(0.0f64, |a, x| a.max(x.abs()));
+        let laser = wide(scene.laser.origin - origin);
+        let reach = laser.iter().fold(widest, |a, x| a.max(x.abs()));
+        if reach > WIDEST_M || (widest > 0.0 && widest < NARROWEST_M) {
+            return Err(RenderError::Invalid {
+                field: "objects".into(),
+                what: format!(
+                    "reach {reach:e} m from the camera, expected {NARROWEST_M:e} to {WIDEST_M:e}; check the scene's unit and remove stray vertices"
+                ),
+            });
+        }
         let scale = scale_for(widest);
         let triangles: Vec<[Vec3; 3]> = points
             .iter()
@@ -111,7 +129,7 @@ impl World {
             .iter()
             .map(|t| normal(t).unwrap_or_default())
             .collect();
-        Self {
+        Ok(Self {
             bvh: Bvh::build(&triangles),
             triangles,
             normals,
@@ -126,7 +144,7 @@ impl World {
             laser: (scene.laser.origin - origin) * scale,
             scale,
             camera: scene.camera,
-        }
+        })
     }
 
     /// World metres → render units.
@@ -215,7 +233,7 @@ impl World {
 
 /// The power of two that brings `widest` into [4, 8).
 fn scale_for(widest: f64) -> f32 {
-    if !(widest.is_finite() && widest > 1e-30 && widest < 1e30) {
+    if widest == 0.0 {
         return 1.0;
     }
     let mut scale = 1.0f64;

@@ -167,7 +167,7 @@ fn a_render_stopped_and_started_again_gives_the_same_bits() {
     let s = everything(24);
     let budget = set(Budget::Samples(6));
     let whole = hash(&ok(&s, &budget));
-    for after in [1, 40, 700] {
+    for after in [1, 40, 300] {
         let stop = StopAfter(AtomicU64::new(after));
         let stopped = render(&s, &budget, &stop);
         assert!(
@@ -206,8 +206,8 @@ fn another_seed_gives_other_bits_and_the_same_light() {
 /// copy both from the failure's message.
 #[test]
 fn the_bits_are_those_written_down() {
-    const VERSION: &str = "transient-2";
-    const HASH: u64 = 0;
+    const VERSION: &str = "transient-3";
+    const HASH: u64 = 0xa81b_ba8e_3030_0278;
     let found = hash(&ok(&everything(20), &set(Budget::Samples(4))));
     assert_eq!(
         (RENDERER_VERSION, found),

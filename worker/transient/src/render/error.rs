@@ -8,8 +8,11 @@ pub(super) const MULTI_REACH: usize = 3;
 pub(super) const TWO_REACH: usize = 1;
 /// Share of a pixel's mean variance that every bin gets on top.
 const FLOOR: f32 = 0.003;
+/// Share of a bin's own sample variance: edges and peaks stand out from their neighbours by it. Without it
+/// the brightest bins deviate by 1.25 to 1.4 of what is stored for them.
+const OWN: f32 = 0.5;
 
-/// Pools variances in place over 3×3 pixels and a few bins, within a region's `[row][col][slot]`.
+/// Pools variances in place, half of each, over 3×3 pixels and a few bins, within a region's `[row][col][slot]`.
 ///
 /// A bin that few paths reach has a sample variance that is mostly luck, and often nearly nothing; its
 /// neighbours have nearly the same true variance, and together they know it. The floor stands for paths
@@ -18,6 +21,7 @@ const FLOOR: f32 = 0.003;
 pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: usize) {
     let (rows, cols) = (region.rows as usize, region.cols as usize);
     let mut other = vec![0.0f32; variance.len()];
+    let own = variance.to_vec();
     // Along the bins.
     for (out, v) in other.chunks_mut(slots).zip(variance.chunks(slots)) {
         let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
@@ -30,6 +34,9 @@ pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: u
     mean_of_three(variance, &other, slots, cols, |k| k / cols * cols);
     other.copy_from_slice(variance);
     mean_of_three(variance, &other, slots * cols, rows, |_| 0);
+    for (v, own) in variance.iter_mut().zip(&own) {
+        *v += OWN * (own - *v);
+    }
 }
 
 /// out\[k\] = mean of from\[k − 1..=k + 1\], items of `size`, within the `count` items from `first(k)`.
