@@ -2,6 +2,7 @@
 
 mod error;
 mod image;
+mod splat;
 mod tile;
 
 use picofarm_scene::Scene;
@@ -9,10 +10,12 @@ use picofarm_scene::Scene;
 use self::{
     error::{estimate, passes_for},
     image::{Image, Watch},
+    splat::Splats,
     tile::Frame,
 };
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
+    caustic::Caustics,
     emitter::{Emitters, find_spots},
     film::Film,
     lobe::Mirrors,
@@ -65,19 +68,27 @@ pub fn render(
     let of_spot = groups_of(settings, &emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
+    let mut walk = Walk {
+        world: &world,
+        emitters: &emitters,
+        mirrors: &mirrors,
+        gate: &settings.gate,
+        max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
+        lights: strategy.light_vertices.unwrap_or(true),
+        caustics: None,
+        shortest_m: emitters
+            .list
+            .iter()
+            .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
+    };
+    let caustics = match strategy.caustics {
+        Some(false) => None,
+        wanted => Caustics::find(&world, &emitters)
+            .filter(|c| walk.max_bounces >= 3 && (wanted.is_some() || c.pay(&walk, settings.seed))),
+    };
+    walk.caustics = caustics.as_ref();
     let frame = Frame {
-        walk: Walk {
-            world: &world,
-            emitters: &emitters,
-            mirrors: &mirrors,
-            gate: &settings.gate,
-            max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
-            lights: strategy.light_vertices.unwrap_or(true),
-            shortest_m: emitters
-                .list
-                .iter()
-                .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
-        },
+        walk,
         film: &film,
         sampling: &sampling,
         effort: Effort::new(strategy.share.unwrap_or(SHARE)),
@@ -87,6 +98,7 @@ pub fn render(
         split: settings.split,
     };
     let mut image = Image::new(&frame);
+    let mut splats = walk.caustics.map(|c| (c, Splats::new(&frame)));
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
     let mut rays = 0;
     let (passes, target) = match settings.budget {
@@ -101,12 +113,18 @@ pub fn render(
             (n, Some(target))
         }
     };
-    let plan = plan(settings, &mirrors, &sampling, passes);
+    let plan = plan(settings, &walk, &sampling, passes);
     let mut wave = passes;
     let error = loop {
         let watch = Watch::new(progress, image.passes, image.passes + wave);
         rays += image.round(&frame, wave, target, &watch)?;
-        let error = estimate(&image.stats, image.total_variance, image.mean_passes());
+        let error = match &mut splats {
+            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            Some((caustics, splats)) => {
+                rays += splats.round((&frame, caustics), wave, &watch)?;
+                splats.estimate(&frame, &image)
+            }
+        };
         let done = target.is_none_or(|t| error.median_relative <= t) || image.passes >= MAX_PASSES;
         if done {
             break error;
@@ -114,6 +132,9 @@ pub fn render(
         let spent = image.passes;
         wave = (spent / 2).clamp(4, MAX_PASSES - spent.min(MAX_PASSES - 4));
     };
+    if let Some((_, splats)) = &splats {
+        splats.join(&frame, &mut image);
+    }
 
     let mut overflow = Overflow {
         energy: image.overflow,

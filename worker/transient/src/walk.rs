@@ -4,11 +4,13 @@
 
 use std::f32::consts::PI;
 
-use picofarm_scene::Vec3;
+use picofarm_scene::{Material, Vec3};
 
 use crate::{
     api::Gate,
+    bsdf::Surface,
     bvh::Stack,
+    caustic::Caustics,
     emitter::Emitters,
     lobe::Mirrors,
     pool::{self, Pool},
@@ -27,6 +29,8 @@ pub(crate) struct Walk<'a> {
     pub max_bounces: u32,
     /// Walks connect to light vertices.
     pub lights: bool,
+    /// Light paths by way of near-mirrors, where they pay.
+    pub caustics: Option<&'a Caustics>,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
 }
@@ -43,6 +47,23 @@ pub(crate) struct Vertex {
     pub length_m: f64,
     /// Bounces up to and with this vertex.
     pub bounce: u32,
+    /// The vertex before it is a near-mirror's.
+    pub after_mirror: bool,
+    /// [`Vertex::open`] of the vertex before it.
+    pub open_before: bool,
+}
+
+impl Vertex {
+    /// True where light paths ([`crate::caustic`]) reach the last vertex up to here that is not a
+    /// near-mirror's: it is what the camera sees directly, or such a vertex comes before it too.
+    #[inline]
+    pub fn open(&self) -> bool {
+        if self.hit.surface.specular {
+            self.open_before
+        } else {
+            !self.after_mirror
+        }
+    }
 }
 
 /// How a vertex was reached, for MIS.
@@ -73,6 +94,8 @@ pub(crate) struct Scratch {
     lights: Vec<f32>,
     /// Light vertices that walks connect to.
     pub pool: Pool,
+    /// Light vertices beyond near-mirrors.
+    pub caustics: Pool,
 }
 
 impl Scratch {
@@ -83,6 +106,7 @@ impl Scratch {
             images: vec![0.0; mirrors.choices()],
             lights: vec![],
             pool: Pool::default(),
+            caustics: Pool::default(),
         }
     }
 }
@@ -116,6 +140,14 @@ impl Walk<'_> {
         }
     }
 
+    /// Settles a mix of a Lambertian and a near-mirror on one of them.
+    #[inline]
+    pub fn settle(&self, rng: &mut Rng, hit: &mut Hit) {
+        if hit.surface.alpha <= Material::SPECULAR_ALPHA {
+            self.choose_lobe(rng, hit);
+        }
+    }
+
     /// Walks on from a vertex: everything beyond it except its own connection to the spots.
     pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
         let mut vertex = from;
@@ -124,13 +156,17 @@ impl Walk<'_> {
             let mut aimed = 0.0;
             if helped {
                 aimed = self.aim(rng, &vertex, scratch, sink);
-                self.light(rng, &vertex, scratch, sink);
+                if self.lights {
+                    self.light(rng, &vertex, (false, LIGHTS), scratch, sink);
+                }
+                self.caustics(rng, &vertex, LIGHTS, scratch, sink);
             }
             let Some((step, next)) = self.step(rng, &vertex, aimed, true, &mut scratch.stack)
             else {
                 return;
             };
             vertex = next;
+            self.settle(rng, &mut vertex.hit);
             self.connect(rng, &vertex, helped.then_some(&step), SPOTS, scratch, sink);
         }
     }
@@ -178,6 +214,8 @@ impl Walk<'_> {
             beta: v.beta * weight,
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
+            after_mirror: h.surface.specular,
+            open_before: v.open(),
         };
         Some((step, next))
     }
@@ -196,8 +234,18 @@ impl Walk<'_> {
         if h.surface.strength == 0.0 {
             return;
         }
+        let images = self.mirrors.of(h.triangle).is_some() && step.is_some();
+        let caustic = self.caustics.is_some() && h.surface.specular && v.open();
+        if caustic && !images {
+            return;
+        }
         let Scratch { stack, weights, .. } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
+        if caustic {
+            for &spot in &self.emitters.glossy {
+                weights[spot] = 0.0;
+            }
+        }
         if let Some(step) = step {
             self.plain_shares(step, h, weights);
         }
@@ -291,7 +339,12 @@ impl Walk<'_> {
         let leg = m.p - h.p;
         let w = leg.normalized();
         let e = &self.emitters.list[aim.spot];
-        let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &m.surface);
+        // A mix' Lambertian part is left to the others.
+        let mirror = Surface {
+            base: 0.0,
+            ..m.surface
+        };
+        let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &mirror);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         if value == 0.0 || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
             return total;
@@ -305,25 +358,46 @@ impl Walk<'_> {
         total
     }
 
-    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution.
-    fn light(&self, rng: &mut Rng, v: &Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
-        if !self.lights {
-            return;
+    /// Connects a vertex that is not a near-mirror's to `count` light vertices beyond near-mirrors.
+    pub fn caustics(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        count: u32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        if self.caustics.is_some() && !scratch.caustics.list.is_empty() {
+            self.light(rng, v, (true, count), scratch, sink);
         }
+    }
+
+    /// Connects a vertex to a few light vertices, those beyond near-mirrors or the others, drawn by
+    /// unshadowed contribution.
+    fn light(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        (beyond, count): (bool, u32),
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
         let h = &v.hit;
         let Scratch {
             stack,
             lights,
             pool,
+            caustics,
             ..
         } = scratch;
+        let pool = if beyond { caustics } else { pool };
         pool.weights(h, v.wo, lights);
-        draw(lights, LIGHTS, rng.uniform(), |i, value| {
+        draw(lights, count, rng.uniform(), |i, value| {
             let y = &pool.list[i];
-            let there = &y.hit;
-            if self.world.free(stack, h.p, h.n, there.p, there.n) {
+            let (there, bounces) = (&y.hit, v.bounce + y.bounces);
+            if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
                 let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
-                sink.add(path, v.beta * value, y.spot, v.bounce + 2);
+                sink.add(path, v.beta * value, y.spot, bounces);
             }
         });
     }
