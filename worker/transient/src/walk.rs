@@ -408,7 +408,8 @@ impl Walk<'_> {
 #[inline]
 fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
     let total: f32 = weights.iter().sum();
-    if !(total > 0.0 && total.is_finite()) {
+    // Beneath the least normal number a step could be 0.
+    if !(total > 1e-30 && total.is_finite()) {
         return;
     }
     let step = total / count as f32;
