@@ -274,7 +274,10 @@ impl Sharing {
                     end: 0,
                 });
             } else {
-                walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
+                // Gather points aim at images but connect to no light vertices, which a step from them
+                // would otherwise share its paths with.
+                let step = next.hit.surface.specular.then_some(&step);
+                walk.connect(rng, &next, step, ALL, scratch, &mut sink);
                 walk.run(rng, next, scratch, &mut sink);
             }
         }

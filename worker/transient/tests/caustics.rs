@@ -39,18 +39,14 @@ fn furnished(things: Vec<Object>, size: u32) -> Scene {
     let mut objects = room(v(-1.5, -1.0, -2.5), v(1.5, 1.0, 0.5), &grey(0.6));
     objects.extend(things);
     let mut s = scene(objects, size, &[]);
-    s.laser.beams = vec![
-        beam(v(-1.5, 0.3, -1.2), v(1.0, 0.0, 0.0), 0),
-        beam(v(0.6, -1.0, -1.6), v(0.0, 1.0, 0.0), 0),
-    ];
-    let walls = picofarm_transient::trace_spots(&{
-        let mut s = s.clone();
-        s.laser.beams.iter_mut().for_each(|b| b.spot = None);
-        s
-    });
-    for (beam, found) in s.laser.beams.iter_mut().zip(walls.unwrap()) {
-        beam.spot = found;
-    }
+    let towards = [v(-1.5, 0.3, -1.2), v(0.9, -1.0, -1.0)];
+    s.laser.beams = towards
+        .iter()
+        .map(|p| Beam {
+            direction: p.normalized(),
+            spot: None,
+        })
+        .collect();
     s
 }
 
@@ -266,16 +262,165 @@ fn sum(x: &[(f64, f64)]) -> (f64, f64) {
 
 #[test]
 fn caustics_of_a_curved_near_mirror_are_far_less_noisy_than_by_chance() {
-    for (alpha, passes) in [(0.03, 1024), (0.01, 1024)] {
-        let ball = sphere(v(0.0, -1.6, -1.0), 0.6, 4, Material::mirror("ball", alpha));
-        let s = stage(ball);
-        let off = over_seeds(&s, 8, |seed| with(Some(false), passes, seed), pixels);
-        let on = over_seeds(&s, 8, |seed| with(None, passes / 16, seed), pixels);
-        let (off, on) = (sum(&off), sum(&on));
-        println!(
-            "alpha {alpha} off {off:?} on {on:?} factor {}",
-            off.1 / on.1 * 16.0
+    let s = stage(sphere(
+        v(0.0, -1.6, -1.0),
+        0.6,
+        4,
+        Material::mirror("ball", 0.03),
+    ));
+    let off = over_seeds(&s, 8, |seed| with(Some(false), 512, seed), pixels);
+    let on = over_seeds(&s, 8, |seed| with(None, 32, seed), pixels);
+    let (off, on) = (sum(&off), sum(&on));
+    let factor = off.1 / on.1 * 512.0 / 32.0;
+    println!("off {off:?} on {on:?} factor {factor:.0}");
+    assert!(factor > 100.0);
+    // 64 pixels, nearly independent by chance alone.
+    let error = ((off.1 + on.1) / 8.0).sqrt();
+    assert!((off.0 - on.0).abs() < 5.0 * error, "{off:?} {on:?}");
+}
+
+#[test]
+fn groups_share_the_light_out_and_threads_change_nothing() {
+    let mut s = furnished(vec![ball(Material::mirror("ball", 0.01))], 12);
+    let wanted = Settings {
+        groups: vec![vec![0], vec![1], vec![0, 1]],
+        max_bounces: Some(5),
+        ..with(None, 4, 7)
+    };
+    let on = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.unwrap()
+            .install(|| render(&s, &wanted, &Quiet).unwrap())
+    };
+    let (one, two) = (on(1), on(2));
+    assert_eq!(one.transient, two.transient);
+    assert_eq!(one.groups, two.groups);
+    let (a, b) = (one.split.unwrap(), two.split.unwrap());
+    assert_eq!(a.multi_se, b.multi_se);
+    assert_eq!(a.multi_noise, b.multi_noise);
+    assert!(
+        one.plan
+            .strategies
+            .iter()
+            .any(|s| s.contains("light paths"))
+    );
+    for (k, &h) in one.transient.iter().enumerate() {
+        let apart = one.groups[0][k] + one.groups[1][k];
+        let near = |x: f32| (x - h).abs() <= 1e-4 * h.abs() + 1e-9;
+        assert!(near(apart) && near(one.groups[2][k]), "{k}: {h} {apart}");
+    }
+    // Alone, each spot has the light of its group.
+    let mine: Vec<f64> = one.groups.iter().map(|g| energy(g)).collect();
+    for spot in 0..2 {
+        let all = s.laser.beams.clone();
+        s.laser.beams = vec![all[spot]];
+        let alone = Settings {
+            groups: vec![],
+            ..wanted.clone()
+        };
+        let alone = energy(&render(&s, &alone, &Quiet).unwrap().transient);
+        assert!((alone / mine[spot] - 1.0).abs() < 0.1, "{alone} {mine:?}");
+        s.laser.beams = all;
+    }
+}
+
+#[test]
+fn light_paths_are_left_out_where_nothing_calls_for_them() {
+    let bits = |s: &Scene, caustics, max_bounces| {
+        let settings = Settings {
+            max_bounces,
+            ..with(caustics, 2, 3)
+        };
+        let r = render(s, &settings, &Quiet).unwrap();
+        let paths = r.plan.strategies.iter().any(|s| s.contains("light paths"));
+        (r.transient, paths)
+    };
+    let floor = quad(
+        v(-1.4, -0.99, -2.4),
+        v(0.0, 0.0, 2.6),
+        v(2.8, 0.0, 0.0),
+        Material::mirror("floor", 0.01),
+    );
+    let ball = ball(Material::mirror("ball", 0.01));
+    for (things, max_bounces) in [(vec![], None), (vec![floor], None), (vec![ball], Some(2))] {
+        let s = furnished(things, 8);
+        let (auto, off) = (
+            bits(&s, None, max_bounces),
+            bits(&s, Some(false), max_bounces),
         );
+        assert!(!auto.1);
+        assert_eq!(auto, off);
+    }
+}
+
+#[test]
+fn the_stated_error_counts_light_paths_in() {
+    let s = furnished(vec![ball(Material::mirror("ball", 0.08))], 8);
+    let seeds = 12;
+    let all: Vec<Rendered> = (0..seeds)
+        .map(|seed| render(&s, &with(Some(true), 16, 100 + seed), &Quiet).unwrap())
+        .collect();
+    let n = seeds as f64;
+    let totals: Vec<f64> = all.iter().map(|r| energy(&r.transient)).collect();
+    let mean = totals.iter().sum::<f64>() / n;
+    let spread = totals.iter().map(|t| (t - mean).powi(2)).sum::<f64>() / (n - 1.0);
+    let stated = all
+        .iter()
+        .map(|r| f64::from(r.error.total_relative).powi(2));
+    let stated = stated.sum::<f64>() / n * mean * mean;
+    let ratio = (spread / stated).sqrt();
+    // Bin by bin.
+    let multi = |r: &Rendered, k: usize| f64::from(r.split.as_ref().unwrap().multi[k]);
+    let (mut found, mut said) = (0.0, 0.0);
+    for k in 0..all[0].transient.len() {
+        let mean = all.iter().map(|r| multi(r, k)).sum::<f64>() / n;
+        found += all
+            .iter()
+            .map(|r| (multi(r, k) - mean).powi(2))
+            .sum::<f64>()
+            / (n - 1.0);
+        let se = |r: &Rendered| f64::from(r.split.as_ref().unwrap().multi_se[k]).powi(2);
+        said += all.iter().map(se).sum::<f64>() / n;
+    }
+    let bins = (found / said).sqrt();
+    println!("total {ratio} bins {bins}");
+    assert!((0.5..2.0).contains(&ratio), "{ratio}");
+    assert!((0.7..1.4).contains(&bins), "{bins}");
+}
+
+#[test]
+fn light_vertices_leave_nothing_out_on_glossy_surfaces() {
+    let glossy = Material {
+        bsdf: Bsdf::RoughConductor {
+            alpha: 0.3,
+            distribution: Distribution::Beckmann,
+            reflectance: 0.8,
+        },
+        ..grey(0.8)
+    };
+    let s = furnished(vec![ball(glossy)], 8);
+    let make = |lights: bool| {
+        move |seed| Settings {
+            max_bounces: Some(3),
+            strategy: Strategy {
+                light_vertices: Some(lights),
+                ..Strategy::default()
+            },
+            ..with(None, 64, seed)
+        }
+    };
+    let a = over_seeds(&s, 8, make(false), parts);
+    let b = over_seeds(&s, 8, make(true), parts);
+    for (a, b) in a.iter().zip(&b) {
+        let error = ((a.1 + b.1) / 8.0).sqrt();
+        println!(
+            "without {:.6} with {:.6} error {:.5} z {:.2}",
+            a.0,
+            b.0,
+            error / a.0,
+            (b.0 - a.0) / error
+        );
+        assert!((b.0 - a.0).abs() < 4.5 * error);
     }
 }
 
