@@ -5,7 +5,7 @@ use picofarm_scene::Spot;
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-2";
+pub const RENDERER_VERSION: &str = "transient-3";
 
 /// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -43,7 +43,7 @@ pub(crate) struct Effort {
 }
 
 /// Light vertices beyond near-mirrors that a gather point is connected to at most.
-const BEYOND: u32 = 4;
+const BEYOND: u32 = 2;
 
 impl Effort {
     /// The effort for tiles of `side` pixels. The numbers minimise error² × CPU time on furnished rooms

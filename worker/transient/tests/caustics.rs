@@ -2,9 +2,13 @@
 
 mod common;
 
+use std::sync::Arc;
+
 use common::{Quiet, energy, grey, quad, room, scene, settings, sphere, v};
-use picofarm_scene::{Beam, Bsdf, Distribution, Material, Object, Scene, Spot, Vec3};
-use picofarm_transient::{Budget, Rendered, Settings, Strategy, render};
+use picofarm_scene::{
+    Beam, Bsdf, Distribution, Intrinsics, Material, Mesh, Object, Scene, Spot, Vec3,
+};
+use picofarm_transient::{Budget, Rendered, Settings, Strategy, render, trace_spots};
 
 const BINS: usize = 637;
 
@@ -113,7 +117,7 @@ fn parts(r: &Rendered) -> Vec<f64> {
     ]
 }
 
-/// With and without light paths: the same within `limit` errors of the means, which are small.
+/// With and without light paths: the same within a few errors of the means over seeds, which are `small`.
 fn same(name: &str, s: &Scene, (off, on): (u32, u32), max_bounces: Option<u32>, small: f64) {
     let seeds = 8;
     let make = |caustics, passes| {
@@ -136,20 +140,17 @@ fn same(name: &str, s: &Scene, (off, on): (u32, u32), max_bounces: Option<u32>, 
             a.1 * f64::from(off) / (b.1 * f64::from(on))
         );
         assert!(z.abs() < 4.5, "{name} part {k}: {a:?} {b:?}");
-        assert!(
-            error < 2.0 * small * a.0,
-            "{name} part {k} is too noisy to tell"
-        );
+        let limit = if k == 0 { small } else { 5.0 * small };
+        assert!(error < limit * a.0, "{name} part {k} is too noisy to tell");
     }
-    assert!(a[0].1.sqrt() / (seeds as f64).sqrt() < small * a[0].0);
 }
 
 #[test]
 fn light_paths_and_chance_find_the_same_light() {
-    let s = furnished(vec![ball(Material::mirror("ball", 0.08))], 8);
-    same("all bounces", &s, (256, 64), None, 0.02);
-    same("three bounces", &s, (256, 64), Some(3), 0.04);
-    same("four bounces", &s, (256, 64), Some(4), 0.03);
+    let s = furnished(vec![ball(Material::mirror("ball", 0.1))], 8);
+    same("all bounces", &s, (192, 32), None, 0.02);
+    same("three bounces", &s, (192, 32), Some(3), 0.04);
+    same("four bounces", &s, (192, 32), Some(4), 0.03);
 }
 
 #[test]
@@ -164,7 +165,7 @@ fn mixes_and_rows_of_mirrors_are_parted_without_a_rest() {
     same(
         "mix and plane",
         &furnished(things, 8),
-        (256, 64),
+        (192, 32),
         None,
         0.02,
     );
@@ -183,7 +184,7 @@ fn mixes_and_rows_of_mirrors_are_parted_without_a_rest() {
     same(
         "two planes",
         &furnished(vec![far, plane], 8),
-        (256, 64),
+        (192, 32),
         None,
         0.02,
     );
@@ -214,7 +215,7 @@ fn a_glossy_receiver_and_a_spot_on_a_mirror_are_covered() {
     let point = towards * reach;
     let found = {
         let mut probe = s.clone();
-        probe.objects[6].mesh = std::sync::Arc::new(picofarm_scene::Mesh {
+        probe.objects[6].mesh = Arc::new(Mesh {
             materials: vec![grey(0.5)],
             ..(*probe.objects[6].mesh).clone()
         });
@@ -222,14 +223,14 @@ fn a_glossy_receiver_and_a_spot_on_a_mirror_are_covered() {
             direction: point.normalized(),
             spot: None,
         }];
-        picofarm_transient::trace_spots(&probe).unwrap()[0].unwrap()
+        trace_spots(&probe).unwrap()[0].unwrap()
     };
     assert_eq!(found.object, 6);
     s.laser.beams[1] = Beam {
         direction: point.normalized(),
         spot: Some(found),
     };
-    same("glossy floor", &s, (256, 64), None, 0.03);
+    same("glossy floor", &s, (192, 32), None, 0.03);
 }
 
 /// A screen before the camera, a lit plate to its left, and what throws light onto the screen from below.
@@ -247,7 +248,7 @@ fn stage(extra: Object) -> Scene {
         grey(0.7),
     );
     let mut s = scene(vec![screen, plate, extra], 8, &[]);
-    s.camera.intrinsics = picofarm_scene::Intrinsics::from_fov(40.0, 8, 8);
+    s.camera.intrinsics = Intrinsics::from_fov(40.0, 8, 8);
     s.laser.beams = vec![
         beam(v(-1.5, 0.2, -0.5), v(1.0, 0.0, 0.0), 1),
         beam(v(-1.5, -0.3, -0.9), v(1.0, 0.0, 0.0), 1),
@@ -433,62 +434,29 @@ fn light_paths_by_way_of_a_planar_mirror_agree_with_its_image_lobes() {
         Material::mirror("floor", 0.01),
     );
     let s = stage(floor);
-    for max_bounces in [Some(3), Some(4), None] {
-        let make = |caustics: bool| {
-            move |seed| Settings {
-                max_bounces,
-                strategy: Strategy {
-                    caustics: Some(caustics),
-                    image_lobes: Some(!caustics),
-                    ..Strategy::default()
-                },
-                ..with(None, 64, seed)
-            }
+    let make = |caustics: bool, passes| {
+        let strategy = Strategy {
+            caustics: Some(caustics),
+            image_lobes: Some(!caustics),
+            ..Strategy::default()
         };
-        let lobes = over_seeds(&s, 8, make(false), parts);
-        let paths = over_seeds(&s, 8, make(true), parts);
-        for (a, b) in lobes.iter().zip(&paths) {
-            let error = ((a.1 + b.1) / 8.0).sqrt();
-            println!(
-                "{max_bounces:?} lobes {:.6} paths {:.6} error {:.4} z {:.2} v {:.2}",
-                a.0,
-                b.0,
-                error / a.0,
-                (b.0 - a.0) / error,
-                a.1 / b.1
-            );
+        move |seed| Settings {
+            max_bounces: Some(4),
+            strategy,
+            ..with(None, passes, seed)
         }
+    };
+    let lobes = over_seeds(&s, 8, make(false, 32), parts);
+    let paths = over_seeds(&s, 8, make(true, 256), parts);
+    for (a, b) in lobes.iter().zip(&paths) {
+        let error = ((a.1 + b.1) / 8.0).sqrt();
+        let z = (b.0 - a.0) / error;
+        println!(
+            "lobes {:.6} paths {:.6} error {:.4} z {z:.2}",
+            a.0,
+            b.0,
+            error / a.0
+        );
+        assert!(z.abs() < 4.5 && error < 0.03 * a.0, "{a:?} {b:?}");
     }
-}
-
-#[test]
-#[ignore = "experiment"]
-fn deep() {
-    let get = |k: &str, d: f32| std::env::var(k).map_or(d, |v| v.parse().unwrap());
-    let (off, on) = (get("OFF", 256.0) as u32, get("ON", 64.0) as u32);
-    let alpha = get("ALPHA", 0.1);
-    let max = get("MAX", 0.0) as u32;
-    let max = (max > 0).then_some(max);
-    let plane = || {
-        quad(
-            v(1.49, -0.9, -2.2),
-            v(0.0, 0.0, 1.8),
-            v(0.0, 1.6, 0.0),
-            Material::mirror("plane", alpha),
-        )
-    };
-    let coat = || mixed(alpha, get("WEIGHT", 0.4));
-    let things = match std::env::var("WHAT").unwrap_or_default().as_str() {
-        "mix" => vec![ball(coat())],
-        "mixplane" => vec![ball(coat()), plane()],
-        "ballplane" => vec![ball(Material::mirror("ball", alpha)), plane()],
-        "flatmix" => vec![quad(
-            v(1.49, -0.9, -2.2),
-            v(0.0, 0.0, 1.8),
-            v(0.0, 1.6, 0.0),
-            coat(),
-        )],
-        _ => vec![ball(Material::mirror("ball", alpha))],
-    };
-    same("deep", &furnished(things, 8), (off, on), max, 1.0);
 }

@@ -12,11 +12,10 @@ use crate::{
     api::{ErrorEstimate, RenderError},
     caustic::{Caustics, Splat, splat},
     rng::{Rng, Stream},
-    walk::Scratch,
 };
 
 /// Light paths of a pass for each pixel.
-const PATHS: f64 = 2.0;
+const PATHS: f64 = 4.0;
 /// Light paths that one random stream makes.
 const CHUNK: u32 = 1024;
 
@@ -63,9 +62,8 @@ impl Splats {
             let found: Vec<(Vec<Splat>, u64)> = (0..count.div_ceil(CHUNK))
                 .into_par_iter()
                 .map_init(
-                    || Scratch::new(walk.world, walk.emitters, walk.mirrors),
-                    |scratch, chunk| {
-                        let stack = &mut scratch.stack;
+                    || walk.world.bvh.stack(),
+                    |stack, chunk| {
                         let before = stack.rays;
                         let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
                         let paths = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
