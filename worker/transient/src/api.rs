@@ -39,6 +39,9 @@ pub struct Strategy {
     pub light_vertices: Option<bool>,
     /// Aim at the spots' mirror images in planar near-mirrors.
     pub image_lobes: Option<bool>,
+    /// Light paths from the spots for what comes by way of near-mirrors that have no image lobes: curved
+    /// ones, and several in a row.
+    pub caustics: Option<bool>,
 }
 
 /// Settings of one render.

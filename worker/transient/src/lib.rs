@@ -4,6 +4,7 @@
 mod api;
 mod bsdf;
 mod bvh;
+mod caustic;
 mod emitter;
 mod film;
 mod lobe;

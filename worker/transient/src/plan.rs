@@ -2,17 +2,12 @@
 
 use crate::{
     api::{Plan, Settings},
-    lobe::Mirrors,
     two::Sampling,
+    walk::Walk,
 };
 
 /// The plan that `render` follows.
-pub(crate) fn plan(
-    settings: &Settings,
-    mirrors: &Mirrors,
-    sampling: &Sampling,
-    paths: u32,
-) -> Plan {
+pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths: u32) -> Plan {
     let (mut strategies, mut approximations) = (vec![], vec![]);
     let longest = settings.max_bounces.unwrap_or(u32::MAX);
     if settings.one_bounce {
@@ -35,17 +30,26 @@ pub(crate) fn plan(
             "three and more: camera paths, connected to spots and to light vertices by contribution"
                 .into(),
         );
+        let mirrors = walk.mirrors;
         let planes = mirrors.list.len();
         if planes > 0 {
             strategies.push(format!("image lobes: {planes} planar mirrors"));
         }
-        if mirrors.curved_share > 0.01 {
+        let curved = mirrors.curved_share > 0.01;
+        if walk.caustics.is_some() {
+            strategies.push(
+                "light paths: caustics from curved near-mirrors and from several in a row".into(),
+            );
+            approximations.push(
+                "caustics that are seen by way of a near-mirror are unbiased but noisy".into(),
+            );
+        } else if curved {
             approximations.push(format!(
                 "light reflected by curved near-mirrors ({:.0} % of the mirror area) is unbiased but noisy",
                 100.0 * mirrors.curved_share
             ));
         }
-        if planes > 1 {
+        if planes > 1 && walk.caustics.is_none() {
             approximations.push(
                 "light that meets two near-mirrors in a row on its way from a spot is unbiased but noisy"
                     .into(),

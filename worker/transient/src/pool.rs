@@ -10,9 +10,11 @@ use picofarm_scene::{Material, Vec3};
 use crate::{
     bsdf::Surface,
     bvh::Stack,
+    caustic::Caustics,
     emitter::{Columns, Emitters},
     rng::Rng,
-    world::{Hit, World, lift},
+    walk::Walk,
+    world::{Hit, lift},
 };
 
 /// One light vertex.
@@ -29,6 +31,8 @@ pub(crate) struct LightVertex {
     pub path_m: f64,
     /// Emitter.
     pub spot: usize,
+    /// Bounces up to and with this vertex, counted from the spot as the first.
+    pub bounces: u32,
 }
 
 /// The light vertices of one batch.
@@ -43,17 +47,9 @@ pub(crate) struct Pool {
 impl Pool {
     /// Draws `count` vertices anew, spread evenly over the spots. Vertices on mirrors are left out: a
     /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them).
-    pub fn fill(
-        &mut self,
-        world: &World,
-        emitters: &Emitters,
-        count: u32,
-        rng: &mut Rng,
-        stack: &mut Stack,
-    ) {
-        self.list.clear();
-        self.glossy.clear();
-        self.columns.clear();
+    pub fn fill(&mut self, walk: &Walk, count: u32, rng: &mut Rng, stack: &mut Stack) {
+        let (world, emitters) = (walk.world, walk.emitters);
+        self.clear();
         let spots = emitters.list.len();
         if spots == 0 {
             return;
@@ -71,31 +67,56 @@ impl Pool {
             let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
                 continue;
             };
-            if hit.surface.base > 0.0 {
-                hit.surface = hit.surface.lobe(rng.uniform());
-            }
+            walk.choose_lobe(rng, &mut hit);
             if weight == 0.0 || hit.surface.specular || hit.surface.strength == 0.0 {
                 continue;
             }
             let leg = hit.p - e.p;
             let d2 = leg.dot(leg);
             let flux = weight / (chance * count as f32);
-            let lambert = if hit.surface.diffuse() {
-                hit.surface.strength
-            } else {
-                self.glossy.push(self.list.len());
-                0.0
-            };
-            self.columns.push(hit.p, hit.n, flux * lambert);
-            self.list.push(LightVertex {
+            self.push(LightVertex {
                 hit,
                 back: -w,
                 flux,
                 density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,
+                bounces: 2,
             });
         }
+    }
+
+    /// Fills the pool with vertices beyond near-mirrors, from `count` light paths.
+    pub fn fill_beyond(
+        &mut self,
+        (walk, caustics): (&Walk, &Caustics),
+        count: u32,
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) {
+        self.clear();
+        for l in 0..count {
+            if let Some(z) = caustics.trace(walk, (l, count), rng, stack) {
+                self.push(z);
+            }
+        }
+    }
+
+    fn clear(&mut self) {
+        self.list.clear();
+        self.glossy.clear();
+        self.columns.clear();
+    }
+
+    fn push(&mut self, y: LightVertex) {
+        let lambert = if y.hit.surface.diffuse() {
+            y.hit.surface.strength
+        } else {
+            self.glossy.push(self.list.len());
+            0.0
+        };
+        self.columns.push(y.hit.p, y.hit.n, y.flux * lambert);
+        self.list.push(y);
     }
 
     /// Writes the unshadowed contribution of every vertex to a surface point, MIS weight included.

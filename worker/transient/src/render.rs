@@ -3,6 +3,7 @@
 mod error;
 mod forecast;
 mod image;
+mod splat;
 mod tile;
 
 use picofarm_scene::Scene;
@@ -12,10 +13,12 @@ use self::{
     error::{Stat, estimate, passes_for},
     forecast::{Ended, Unwatched},
     image::{Image, Watch},
+    splat::Splats,
     tile::Frame,
 };
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
+    caustic::Caustics,
     emitter::{Emitters, find_spots},
     film::Film,
     lobe::Mirrors,
@@ -98,19 +101,27 @@ fn run(
     let of_spot = groups_of(settings, &emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
+    let mut walk = Walk {
+        world: &world,
+        emitters: &emitters,
+        mirrors: &mirrors,
+        gate: &settings.gate,
+        max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
+        lights: strategy.light_vertices.unwrap_or(true),
+        caustics: None,
+        shortest_m: emitters
+            .list
+            .iter()
+            .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
+    };
+    let caustics = match strategy.caustics {
+        Some(false) => None,
+        wanted => Caustics::find(&world, &emitters)
+            .filter(|c| walk.max_bounces >= 3 && (wanted.is_some() || c.pay(&walk, settings.seed))),
+    };
+    walk.caustics = caustics.as_ref();
     let frame = Frame {
-        walk: Walk {
-            world: &world,
-            emitters: &emitters,
-            mirrors: &mirrors,
-            gate: &settings.gate,
-            max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
-            lights: strategy.light_vertices.unwrap_or(true),
-            shortest_m: emitters
-                .list
-                .iter()
-                .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
-        },
+        walk,
         film: &film,
         sampling: &sampling,
         effort: Effort::new(strategy.share.unwrap_or(SHARE)),
@@ -120,6 +131,7 @@ fn run(
         split: settings.split,
     };
     let mut image = Image::new(&frame);
+    let mut splats = walk.caustics.map(|c| (c, Splats::new(&frame)));
     let walks = frame.walk.max_bounces >= 3 && !emitters.list.is_empty();
     let mut rays = 0;
     let passes = match settings.budget {
@@ -127,7 +139,7 @@ fn run(
         Budget::Samples(n) => n,
         Budget::Error(_) => FIRST_PASSES,
     };
-    let plan = decide(settings, &mirrors, &sampling, passes);
+    let plan = decide(settings, &walk, &sampling, passes);
     let mut waves = vec![passes; image.tiles()];
     let mut done = 0.0;
     if only_plan {
@@ -141,9 +153,17 @@ fn run(
             _ => 1.0,
         };
         let watch = Watch::new(progress, done, until);
+        let before = image.mean_passes();
         rays += image.round(&frame, &waves, &watch)?;
         done = until;
-        let error = estimate(&image.stats, image.total_variance, image.mean_passes());
+        let error = match &mut splats {
+            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            Some((caustics, splats)) => {
+                let wave = image.mean_passes() - before;
+                rays += splats.round((&frame, caustics), wave, &watch)?;
+                splats.estimate(&frame, &image)
+            }
+        };
         let Budget::Error(target) = settings.budget else {
             break error;
         };
@@ -152,6 +172,9 @@ fn run(
         }
         waves = further(&image, &sampling, target, error.samples);
     };
+    if let Some((_, splats)) = &splats {
+        splats.join(&frame, &mut image);
+    }
 
     let mut overflow = Overflow {
         energy: image.overflow,

@@ -19,6 +19,8 @@ pub(crate) enum Stream {
     Photo = 3,
     /// Where tiles that share vertices begin.
     Grid = 4,
+    /// Light paths by way of near-mirrors.
+    Caustic = 5,
 }
 
 fn splitmix(mut z: u64) -> u64 {

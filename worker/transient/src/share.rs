@@ -21,7 +21,7 @@ use crate::{
     emitter::Columns,
     film::{Film, PixelSink},
     rng::{Rng, Stream},
-    walk::{ALL, Scratch, Sink, Vertex, Walk},
+    walk::{ALL, Lights, Scratch, Sink, Vertex, Walk},
     world::{Hit, lift},
 };
 
@@ -38,7 +38,14 @@ pub(crate) struct Effort {
     pub walks: u32,
     /// Light vertices that walks of one pass connect to.
     pub pool: u32,
+    /// Light paths by way of near-mirrors, for each pixel, where there are any.
+    pub beyond: f32,
 }
+
+/// Light vertices beyond near-mirrors that a gather point is connected to at most.
+const BEYOND: u32 = 2;
+/// Glossy light vertices that a gather point is connected to at most.
+const GLOSSY: u32 = 2;
 
 impl Effort {
     /// The effort for tiles of `side` pixels. The numbers minimise error² × CPU time on furnished rooms
@@ -50,6 +57,7 @@ impl Effort {
             light: 0.5,
             walks: 1,
             pool: 16,
+            beyond: 1.0,
         }
     }
 }
@@ -168,8 +176,9 @@ impl Sharing {
         if walk.lights {
             let few = effort.pool.min((count * 4.0) as u32);
             let Scratch { pool, stack, .. } = scratch;
-            pool.fill(walk.world, walk.emitters, few, &mut rng, stack);
+            pool.fill(walk, few, &mut rng, stack);
         }
+        self.beyond_mirrors((walk, film, effort), &mut rng, scratch, pixels);
         let camera = (count * effort.camera).round().max(1.0) as u32;
         let light = (count * effort.light).round().max(1.0) as u32;
         self.draw_from_camera((walk, film), camera, &mut rng, scratch, pixels);
@@ -190,6 +199,35 @@ impl Sharing {
             }
             self.columns
                 .push(v.hit.p, v.hit.n, if diffuse { 1.0 } else { 0.0 });
+        }
+    }
+
+    /// Draws light vertices beyond near-mirrors for this pass and connects the gather points to them.
+    fn beyond_mirrors(
+        &mut self,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+        pixels: &mut [f32],
+    ) {
+        let Some(caustics) = walk.caustics else {
+            return;
+        };
+        let size = film.pixel();
+        let count = (effort.beyond * (pixels.len() / size) as f32).max(8.0) as u32;
+        let Scratch {
+            caustics: pool,
+            stack,
+            ..
+        } = scratch;
+        pool.fill_beyond((walk, caustics), count, rng, stack);
+        for (v, k) in &self.gathers {
+            let mut sink = PixelSink {
+                film,
+                pixel: &mut pixels[k * size..(k + 1) * size],
+                factor: 1.0,
+            };
+            walk.light(rng, v, Lights::Beyond, BEYOND, scratch, &mut sink);
         }
     }
 
@@ -218,7 +256,7 @@ impl Sharing {
                 factor: points as f32 / count as f32,
             };
             let aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
-            walk.light(rng, &vertex, true, scratch, &mut sink);
+            walk.light(rng, &vertex, Lights::Glossy, GLOSSY, scratch, &mut sink);
             let h = &vertex.hit;
             let Some(drawn) = turns.direction(j, &h.surface, h.n, vertex.wo, rng) else {
                 continue;
@@ -338,6 +376,8 @@ impl Sharing {
                 beta: 1.0,
                 length_m: nearest,
                 bounce,
+                after_mirror: false,
+                open_before: false,
             };
             sink.factor = 1.0 / effort.walks.max(1) as f32;
             for _ in 0..effort.walks {
@@ -554,6 +594,8 @@ fn gather_point(
         beta: 1.0,
         length_m: world.metres(range),
         bounce: 1,
+        after_mirror: false,
+        open_before: false,
     };
     loop {
         walk.choose_lobe(rng, &mut vertex.hit);

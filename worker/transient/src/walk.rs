@@ -9,6 +9,7 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Gate,
     bvh::Stack,
+    caustic::Caustics,
     emitter::Emitters,
     lobe::Mirrors,
     pool::{self, Pool},
@@ -27,6 +28,8 @@ pub(crate) struct Walk<'a> {
     pub max_bounces: u32,
     /// Walks connect to light vertices.
     pub lights: bool,
+    /// Light paths by way of near-mirrors, where they pay.
+    pub caustics: Option<&'a Caustics>,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
 }
@@ -43,6 +46,23 @@ pub(crate) struct Vertex {
     pub length_m: f64,
     /// Bounces up to and with this vertex.
     pub bounce: u32,
+    /// The vertex before it is a near-mirror's.
+    pub after_mirror: bool,
+    /// [`Vertex::open`] of the vertex before it.
+    pub open_before: bool,
+}
+
+impl Vertex {
+    /// True where light paths ([`crate::caustic`]) reach the last vertex up to here that is not a
+    /// near-mirror's: it is what the camera sees directly, or such a vertex comes before it too.
+    #[inline]
+    pub fn open(&self) -> bool {
+        if self.hit.surface.specular {
+            self.open_before
+        } else {
+            !self.after_mirror
+        }
+    }
 }
 
 /// How a vertex was reached, for MIS.
@@ -54,6 +74,17 @@ pub(crate) struct Step {
     pdf: f32,
     /// Expected number of aims at `p`.
     aims: f32,
+}
+
+/// Kinds of light vertices.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Lights {
+    /// All that spots light directly.
+    All,
+    /// The glossy ones among those, for vertices that a tile's shared vertices serve as well.
+    Glossy,
+    /// Those beyond near-mirrors.
+    Beyond,
 }
 
 /// Takes what a walk finds: optical path in metres, value, spot, bounces of the whole path.
@@ -73,6 +104,8 @@ pub(crate) struct Scratch {
     lights: Vec<f32>,
     /// Light vertices that walks connect to.
     pub pool: Pool,
+    /// Light vertices beyond near-mirrors.
+    pub caustics: Pool,
 }
 
 impl Scratch {
@@ -83,6 +116,7 @@ impl Scratch {
             images: vec![0.0; mirrors.choices()],
             lights: vec![],
             pool: Pool::default(),
+            caustics: Pool::default(),
         }
     }
 }
@@ -127,7 +161,8 @@ impl Walk<'_> {
             let mut aims = 0.0;
             if helped {
                 aims = self.aim(rng, &vertex, AIMS, scratch, sink);
-                self.light(rng, &vertex, false, scratch, sink);
+                self.light(rng, &vertex, Lights::All, LIGHTS, scratch, sink);
+                self.light(rng, &vertex, Lights::Beyond, LIGHTS, scratch, sink);
             }
             let Some((step, next)) = self.step(rng, &vertex, aims, true, &mut scratch.stack) else {
                 return;
@@ -182,6 +217,8 @@ impl Walk<'_> {
             beta: v.beta * weight,
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
+            after_mirror: h.surface.specular,
+            open_before: v.open(),
         };
         Some((step, next))
     }
@@ -200,6 +237,11 @@ impl Walk<'_> {
         if h.surface.strength == 0.0 {
             return;
         }
+        let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
+        let caustic = self.caustics.is_some() && h.surface.specular && v.open();
+        if caustic && !planar {
+            return;
+        }
         let Scratch {
             stack,
             weights,
@@ -207,6 +249,11 @@ impl Walk<'_> {
             ..
         } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
+        if caustic {
+            for &spot in &self.emitters.glossy {
+                weights[spot] = 0.0;
+            }
+        }
         if let Some(step) = step {
             self.plain_shares(step, h, weights, images);
         }
@@ -335,37 +382,48 @@ impl Walk<'_> {
         sink.add(path, value, aim.spot, v.bounce + 2);
     }
 
-    /// Connects a vertex to a few light vertices, drawn by unshadowed contribution; to all kinds or, for
-    /// vertices that a tile's shared vertices serve as well, to glossy ones alone.
+    /// Connects a vertex that is not a near-mirror's to `count` light vertices of some kind, drawn by
+    /// unshadowed contribution.
     pub fn light(
         &self,
         rng: &mut Rng,
         v: &Vertex,
-        gloss_alone: bool,
+        which: Lights,
+        count: u32,
         scratch: &mut Scratch,
         sink: &mut impl Sink,
     ) {
-        if !self.lights || (gloss_alone && !scratch.pool.has_gloss()) {
-            return;
-        }
         let h = &v.hit;
         let Scratch {
             stack,
             lights,
             pool,
+            caustics,
             ..
         } = scratch;
-        if gloss_alone {
+        let pool = match which {
+            Lights::Beyond => caustics,
+            _ => pool,
+        };
+        let wanted = match which {
+            Lights::All => self.lights,
+            Lights::Glossy => self.lights && pool.has_gloss(),
+            Lights::Beyond => self.caustics.is_some() && !pool.list.is_empty(),
+        };
+        if !wanted {
+            return;
+        }
+        if which == Lights::Glossy {
             pool.glossy_weights(h, v.wo, lights);
         } else {
             pool.weights(h, v.wo, lights);
         }
-        draw(lights, LIGHTS, rng.uniform(), |i, value| {
+        draw(lights, count, rng.uniform(), |i, value| {
             let y = &pool.list[i];
-            let there = &y.hit;
-            if self.world.free(stack, h.p, h.n, there.p, there.n) {
+            let (there, bounces) = (&y.hit, v.bounce + y.bounces);
+            if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
                 let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
-                sink.add(path, v.beta * value, y.spot, v.bounce + 2);
+                sink.add(path, v.beta * value, y.spot, bounces);
             }
         });
     }
@@ -376,7 +434,8 @@ impl Walk<'_> {
 #[inline]
 fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
     let total: f32 = weights.iter().sum();
-    if !(total > 0.0 && total.is_finite()) {
+    // Beneath the least normal number a step could be 0.
+    if !(total > 1e-30 && total.is_finite()) {
         return;
     }
     let step = total / count as f32;

@@ -251,6 +251,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                         share,
                         light_vertices,
                         image_lobes,
+                        ..Strategy::default()
                     },
                 }
             },

@@ -90,11 +90,17 @@ fn light_by_way_of_a_planar_mirror_is_that_of_the_spots_image() {
 }
 
 #[test]
-fn a_curved_near_mirror_is_named_as_noisy() {
+fn a_curved_near_mirror_is_named_as_noisy_where_no_light_paths_go() {
     let ball = sphere(v(0.0, -3.0, -1.0), 0.5, 3, Material::mirror("ball", 0.01));
-    let r = render(&stage(ball), &three(), &Quiet).unwrap();
-    assert!(!r.plan.strategies.iter().any(|s| s.contains("image lobes")));
-    assert!(r.plan.approximations.iter().any(|a| a.contains("curved")));
+    let mut settings = three();
+    for caustics in [true, false] {
+        settings.strategy.caustics = Some(caustics);
+        let r = render(&stage(ball.clone()), &settings, &Quiet).unwrap();
+        let named = |all: &[String], what: &str| all.iter().any(|s| s.contains(what));
+        assert!(!named(&r.plan.strategies, "image lobes"));
+        assert_eq!(named(&r.plan.strategies, "light paths"), caustics);
+        assert_eq!(named(&r.plan.approximations, "curved"), !caustics);
+    }
 }
 
 #[test]

@@ -71,6 +71,11 @@ impl<'a> Watch<'a> {
         }
     }
 
+    /// False to stop.
+    pub fn go_on(&self) -> bool {
+        self.ask(1)
+    }
+
     /// False to stop. Asked often, since a tile of many passes takes long.
     fn ask(&self, count: usize) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);

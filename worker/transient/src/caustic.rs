@@ -1,0 +1,352 @@
+//! Light that comes by way of near-mirrors, found from the spots' side.
+//!
+//! A camera path finds a spot in a curved near-mirror only by chance, and likewise a spot behind two
+//! mirrors. Light paths go there by themselves. So that no path is counted twice, paths are parted in
+//! two *classes*, by geometry alone. Call an event *specular* where the light leaves by a near-mirror's
+//! lobe (a mix of two lobes counts as the lobe that scattered). A path belongs to light paths where
+//!
+//! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point z;
+//! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::lobe`] knows and the spot is
+//!    Lambertian: those have images to aim at;
+//! 3. z is what the camera sees directly, or the event before z (read from the camera) is not specular.
+//!
+//! Light paths cover that class and nothing else: z is drawn into the image where the camera sees it, and
+//! is a light vertex ([`crate::pool`]) for every other point. [`crate::walk`] leaves out just these:
+//! [`crate::walk::Vertex::open`] carries condition 3 along a camera path. What is left to chance are
+//! caustics seen by way of a near-mirror.
+//!
+//! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
+//! scattering, joined by the balance heuristic.
+
+use picofarm_scene::{Material, Vec3};
+
+use crate::{
+    bvh::Stack,
+    emitter::Emitters,
+    film::Film,
+    pool::LightVertex,
+    rng::{Rng, Stream},
+    walk::Walk,
+    world::{Hit, World, lift},
+};
+
+/// Density of a light vertex that nothing else finds: its share in MIS is 1 to the last bit.
+const ALONE: f32 = 1e30;
+/// Entries of the table of near-mirror triangles by spot; beyond that all spots share one row.
+const TABLE: usize = 1 << 22;
+/// Specular events before Russian roulette sets in.
+const SURE: u32 = 3;
+/// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
+const PROBE: u32 = 4096;
+const PAYS: f64 = 1e-3;
+
+/// Near-mirrors as targets of light paths.
+#[derive(Debug)]
+pub(crate) struct Caustics {
+    /// Triangles with a near-mirror's lobe, and their areas in render units.
+    triangles: Vec<u32>,
+    areas: Vec<f32>,
+    /// Place in `triangles` by triangle, [`NONE`] for most.
+    place: Vec<u32>,
+    /// Running sums of the triangles' weights, one row a spot, or one row for all.
+    rows: Vec<f64>,
+    /// Running sums of the spots' weights.
+    spots: Vec<f64>,
+}
+
+const NONE: u32 = u32::MAX;
+
+/// One light path's contribution to the image.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Splat {
+    /// Row-major pixel.
+    pub pixel: u32,
+    /// Slot of the film.
+    pub slot: u32,
+    /// Emitter.
+    pub spot: u16,
+    /// Radiance averaged over the pixel, render units.
+    pub value: f32,
+}
+
+/// How many of a batch of light paths begin which way.
+#[derive(Debug, Clone, Copy)]
+struct Shares {
+    aimed: u32,
+    plain: u32,
+}
+
+/// The first leg: spot, point on the near-mirror, unit direction back, flux there, path from the laser.
+struct Start {
+    spot: usize,
+    hit: Hit,
+    back: Vec3,
+    flux: f32,
+    path_m: f64,
+}
+
+/// Index of the entry of running sums in which `at` in [0, 1) of their total falls, the rest of `at`
+/// within it in [0, 1), and its chance.
+fn pick(sums: &[f64], at: f64) -> Option<(usize, f64, f64)> {
+    let total = *sums.last()?;
+    if !(total > 0.0 && total.is_finite()) {
+        return None;
+    }
+    let at = at * total;
+    let k = sums.partition_point(|&s| s <= at).min(sums.len() - 1);
+    let before = if k == 0 { 0.0 } else { sums[k - 1] };
+    let width = sums[k] - before;
+    (width > 0.0).then(|| (k, ((at - before) / width).clamp(0.0, 1.0), width / total))
+}
+
+impl Caustics {
+    /// The near-mirrors of a scene; `None` where there are none.
+    pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
+        let narrow = |t: usize| {
+            let s = &world.surfaces[world.surface[t] as usize];
+            let lobe = s.alpha > 0.0 && s.alpha <= Material::SPECULAR_ALPHA && s.strength > 0.0;
+            lobe && world.normals[t] != Vec3::ZERO
+        };
+        let all = 0..world.triangles.len();
+        let triangles: Vec<u32> = all.filter(|&t| narrow(t)).map(|t| t as u32).collect();
+        if triangles.is_empty() || emitters.list.is_empty() {
+            return None;
+        }
+        let mut place = vec![NONE; world.triangles.len()];
+        let mut areas = vec![];
+        for (k, &t) in triangles.iter().enumerate() {
+            place[t as usize] = k as u32;
+            let [a, b, c] = world.triangles[t as usize];
+            areas.push(0.5 * (b - a).cross(c - a).length());
+        }
+        let mut table = Self {
+            triangles,
+            areas,
+            place,
+            rows: vec![],
+            spots: vec![],
+        };
+        table.weigh(world, emitters);
+        Some(table)
+    }
+
+    /// Fills the running sums.
+    fn weigh(&mut self, world: &World, emitters: &Emitters) {
+        let apart = self.triangles.len() * emitters.list.len() <= TABLE;
+        let mut spots = 0.0;
+        for e in &emitters.list {
+            // A narrow lobe is not to be judged by the middle of a triangle.
+            let wide = e.surface.diffuse() || e.surface.alpha > Material::SPECULAR_ALPHA;
+            let mut sum = 0.0;
+            for (&t, &area) in self.triangles.iter().zip(&self.areas) {
+                let [a, b, c] = world.triangles[t as usize];
+                let to = (a + b + c) / 3.0 - e.p;
+                let d2 = to.dot(to).max(area);
+                let w = to.normalized();
+                let cos = -world.normals[t as usize].dot(w);
+                let surface = &world.surfaces[world.surface[t as usize] as usize];
+                let cos = if surface.two_sided {
+                    cos.abs()
+                } else {
+                    cos.max(0.0)
+                };
+                if wide {
+                    sum += f64::from(area * cos / d2 * e.intensity(w));
+                }
+                if apart {
+                    self.rows.push(sum);
+                }
+            }
+            spots += sum;
+            self.spots.push(spots);
+        }
+        if !apart {
+            let mut sum = 0.0;
+            self.rows.extend(self.areas.iter().map(|&a| {
+                sum += f64::from(a);
+                sum
+            }));
+        }
+    }
+
+    /// A spot's row of running sums.
+    fn row(&self, spot: usize) -> &[f64] {
+        let n = self.triangles.len();
+        let at = if self.rows.len() > n { spot * n } else { 0 };
+        &self.rows[at..at + n]
+    }
+
+    /// Density per area of aiming from `spot` at a point of the `k`-th triangle.
+    fn density(&self, spot: usize, k: usize) -> f32 {
+        let chance = |sums: &[f64], k: usize| {
+            let before = if k == 0 { 0.0 } else { sums[k - 1] };
+            let total = sums[sums.len() - 1];
+            if total > 0.0 {
+                (sums[k] - before) / total
+            } else {
+                0.0
+            }
+        };
+        let share = chance(&self.spots, spot) * chance(self.row(spot), k);
+        share as f32 / self.areas[k]
+    }
+
+    fn shares(&self, count: u32) -> Shares {
+        let aims = self.spots.last().is_some_and(|&s| s > 0.0);
+        let plain = if aims { count / 4 } else { count };
+        Shares {
+            aimed: count - plain,
+            plain,
+        }
+    }
+
+    /// Light path `l` of a batch of `count`: calls `each` with the surface point z that it ends on, if it
+    /// ends on one. The sum over the batch is an estimate.
+    pub fn trace(
+        &self,
+        walk: &Walk,
+        (l, count): (u32, u32),
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) -> Option<LightVertex> {
+        let world = walk.world;
+        let Start {
+            spot,
+            mut hit,
+            back: mut wo,
+            mut flux,
+            mut path_m,
+        } = self.start(walk, (l, self.shares(count)), rng, stack)?;
+        let images = walk.emitters.columns.strength[spot] > 0.0;
+        let aimed_at = images && walk.mirrors.of(hit.triangle).is_some();
+        let mut events = 1;
+        loop {
+            // The spot, the events, and z.
+            if events + 2 > walk.max_bounces || path_m >= walk.gate.end_m() {
+                return None;
+            }
+            let (w, mut weight, _) = hit.surface.sample(hit.n, wo, rng)?;
+            if events >= SURE {
+                let survive = weight.min(0.95);
+                if rng.uniform() >= survive {
+                    return None;
+                }
+                weight /= survive;
+            }
+            flux *= weight;
+            let mut next = world.closest(stack, lift(hit.p, hit.n), w)?;
+            walk.choose_lobe(rng, &mut next);
+            path_m += world.metres((next.p - hit.p).length());
+            (hit, wo) = (next, -w);
+            if hit.surface.strength == 0.0 || flux == 0.0 {
+                return None;
+            }
+            if hit.surface.specular {
+                events += 1;
+                continue;
+            }
+            return (events > 1 || !aimed_at).then_some(LightVertex {
+                hit,
+                back: wo,
+                flux,
+                density: ALONE,
+                path_m,
+                spot,
+                bounces: events + 2,
+            });
+        }
+    }
+
+    /// The leg from a spot to a near-mirror.
+    fn start(
+        &self,
+        walk: &Walk,
+        (l, shares): (u32, Shares),
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) -> Option<Start> {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let spots = emitters.list.len();
+        let (spot, mut hit) = if l < shares.aimed {
+            let at = (f64::from(l) + f64::from(rng.uniform())) / f64::from(shares.aimed);
+            let (spot, rest, _) = pick(&self.spots, at)?;
+            let (k, _, _) = pick(self.row(spot), rest)?;
+            let t = self.triangles[k];
+            let [a, b, c] = world.triangles[t as usize];
+            // Uniform on the triangle.
+            let (r, v) = (rng.uniform().sqrt(), rng.uniform());
+            let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
+            let from = emitters.lifted[spot];
+            let hit = world.closest(stack, from, p - from)?;
+            if hit.triangle != t {
+                return None;
+            }
+            (spot, hit)
+        } else {
+            let at = (l - shares.aimed) as f32 + rng.uniform();
+            let at = at / shares.plain as f32 * spots as f32;
+            let spot = (at as usize).min(spots - 1);
+            let e = &emitters.list[spot];
+            let (w, _, _) = e.surface.sample(e.n, e.back, rng)?;
+            (spot, world.closest(stack, emitters.lifted[spot], w)?)
+        };
+        let k = self.place[hit.triangle as usize];
+        walk.choose_lobe(rng, &mut hit);
+        if k == NONE || !hit.surface.specular || hit.surface.strength == 0.0 {
+            return None;
+        }
+        let e = &emitters.list[spot];
+        let to = hit.p - e.p;
+        let d2 = to.dot(to);
+        let d = d2.sqrt();
+        let w = to / d;
+        let turn = hit.n.dot(w).abs() / d2;
+        let aimed = shares.aimed as f32 * self.density(spot, k as usize);
+        let plain = shares.plain as f32 / spots as f32 * e.surface.pdf(e.n, e.back, w) * turn;
+        let density = aimed + plain;
+        let flux = e.intensity(w) * turn / density;
+        (density > 0.0 && flux > 0.0).then(|| Start {
+            spot,
+            hit,
+            back: -w,
+            flux,
+            path_m: e.path_m + world.metres(d),
+        })
+    }
+
+    /// True where the spots send a share of their power by near-mirrors that makes light paths pay.
+    pub fn pay(&self, walk: &Walk, seed: u64) -> bool {
+        let mut stack = walk.world.bvh.stack();
+        let mut rng = Rng::new(seed, Stream::Caustic, 0, u64::MAX);
+        let found = (0..PROBE).filter_map(|l| self.trace(walk, (l, PROBE), &mut rng, &mut stack));
+        let flux: f64 = found.map(|z| f64::from(z.flux)).sum();
+        flux > PAYS * walk.emitters.list.len() as f64
+    }
+}
+
+/// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
+/// distance d and angle θ gives I/(d² cos³θ) over the pixel's area on the film at unit distance.
+pub(crate) fn splat(walk: &Walk, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<Splat> {
+    let world = walk.world;
+    let i = &world.camera.intrinsics;
+    let p = z.hit.p;
+    let q = world.camera.direction_to_camera(p);
+    let d = p.length();
+    if !(q.z > 0.0 && d > 0.0) {
+        return None;
+    }
+    let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
+    let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
+    let intensity = z.flux * z.hit.surface.scatter(z.hit.n, z.back, -p / d);
+    if !inside || intensity == 0.0 || !world.seen(stack, p, z.hit.n) {
+        return None;
+    }
+    let cos = q.z / d;
+    let value = intensity * i.fx * i.fy / (d * d * cos * cos * cos);
+    Some(Splat {
+        pixel: y as u32 * i.width + x as u32,
+        slot: film.slot(z.path_m + world.metres(d)) as u32,
+        spot: z.spot as u16,
+        value,
+    })
+}
