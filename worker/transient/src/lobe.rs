@@ -2,9 +2,9 @@
 //!
 //! A surface point x sees a spot s through a mirror of roughness α around one point m₀, where the image
 //! of s lies behind it. Over the mirror's plane, the half vector's slope grows linearly around m₀, so a
-//! Gaussian in slope (GGX: its own heavy-tailed distribution), carried to the plane by that linear map, is
-//! close to the lobe's own shape. Where it is not (grazing, spots at the mirror's foot), MIS with BSDF sampling keeps the estimate unbiased
-//! and its variance bounded.
+//! Gaussian in slope (for GGX its own heavy-tailed distribution), carried to the plane by that linear
+//! map, is close to the lobe's own shape. Where it is not (grazing, spots at the mirror's foot), MIS with
+//! BSDF sampling keeps the estimate unbiased and its variance bounded.
 
 use std::f32::consts::PI;
 

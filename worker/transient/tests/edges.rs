@@ -245,3 +245,26 @@ fn ground_truth_follows_the_pixel_centres() {
     }
     assert!(r.truth.rgb.iter().all(|&c| (0.0..=1.0).contains(&c)));
 }
+
+#[test]
+fn a_scene_too_wide_or_too_small_for_f32_is_named() {
+    for scale in [1e12f32, 1e-9] {
+        let mut s = grey_room(2);
+        for o in &mut s.objects {
+            let mut mesh = (*o.mesh).clone();
+            mesh.positions.iter_mut().for_each(|p| *p = *p * scale);
+            o.mesh = mesh.into();
+        }
+        let error = render(&s, &few(), &Quiet).unwrap_err().to_string();
+        assert!(
+            error.contains("objects") && error.contains("unit"),
+            "{error}"
+        );
+    }
+    let mut s = grey_room(2);
+    let mut spot = picofarm_transient::trace_spots(&s).unwrap()[0].unwrap();
+    spot.path_m = f32::NAN;
+    s.laser.beams[0].spot = Some(spot);
+    let error = render(&s, &few(), &Quiet).unwrap_err().to_string();
+    assert!(error.contains("laser.beams[0].spot"), "{error}");
+}

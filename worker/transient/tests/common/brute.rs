@@ -4,6 +4,7 @@
 use std::f64::consts::PI;
 
 use picofarm_scene::{Bsdf, Distribution, Scene, Vec3};
+use picofarm_transient::Gate;
 
 /// A point or direction, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -154,7 +155,7 @@ impl Brute {
         let d = to.length();
         let w = to * (1.0 / d);
         let (cs, cx) = (-s.n.dot(w), x.n.dot(w));
-        if !(cs > 0.0 && cx > 0.0) || !self.free(x.p, s.p) {
+        if !(cs > 0.0 && cx > 0.0 && self.free(x.p, s.p)) {
             return (0.0, 0.0);
         }
         let intensity = f(s.bsdf, s.n, back, w * -1.0) * cs;
@@ -204,6 +205,27 @@ impl Brute {
             .map(|&(a, b)| (a / n, ((b / n - (a / n).powi(2)) / n).max(0.0).sqrt()))
             .collect()
     }
+}
+
+/// Exactly two bounces by quadrature: `[pixel][bin]`.
+pub fn two_by_quadrature(s: &Scene, g: &Gate, n: usize) -> Vec<f64> {
+    let brute = Brute::new(s);
+    let i = s.camera.intrinsics;
+    let bins = g.bins as usize;
+    let (w, h) = (i.width as usize, i.height as usize);
+    let mut all = vec![0.0; w * h * bins];
+    for k in 0..w * h {
+        brute.pixel(k % w, k / w, n, |x, wo| {
+            for spot in 0..s.laser.beams.len() {
+                let (value, path) = brute.lit(x, wo, spot);
+                let path = path + (x.p - P::from(s.camera.origin)).length();
+                if let Some(b) = g.bin(path) {
+                    all[k * bins + b as usize] += value / (n * n) as f64;
+                }
+            }
+        });
+    }
+    all
 }
 
 /// The BRDF, 1/sr, for unit directions that leave the surface.
