@@ -39,6 +39,9 @@ pub struct Strategy {
     pub light_vertices: Option<bool>,
     /// Aim at the spots' mirror images in planar near-mirrors.
     pub image_lobes: Option<bool>,
+    /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
+    /// unlooked at: [`Overflow`] is then a lower bound.
+    pub ellipsoidal: Option<bool>,
 }
 
 /// Settings of one render.
@@ -137,7 +140,8 @@ pub struct GroundTruth {
     pub rgb: Vec<f32>,
 }
 
-/// Energy outside the gate, same units as the histogram summed over pixels and bins.
+/// Energy outside the gate, same units as the histogram summed over pixels and bins. A lower bound where
+/// the plan says that the gate is narrow ([`Strategy::ellipsoidal`]).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Overflow {
     /// Energy dropped.

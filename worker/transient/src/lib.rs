@@ -4,6 +4,7 @@
 mod api;
 mod bsdf;
 mod bvh;
+mod ellipsoid;
 mod emitter;
 mod film;
 mod lobe;

@@ -11,6 +11,7 @@ pub(crate) fn plan(
     settings: &Settings,
     mirrors: &Mirrors,
     sampling: &Sampling,
+    narrow: bool,
     paths: u32,
 ) -> Plan {
     let (mut strategies, mut approximations) = (vec![], vec![]);
@@ -51,6 +52,14 @@ pub(crate) fn plan(
                     .into(),
             );
         }
+    }
+    if narrow {
+        if longest >= 3 {
+            strategies.push("narrow gate: ellipsoidal connections".into());
+        }
+        approximations.push(
+            "light outside the narrow gate is not looked for: the overflow is a lower bound".into(),
+        );
     }
     Plan {
         strategies,

@@ -13,6 +13,7 @@ use self::{
 };
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
+    ellipsoid::{self, Patches, Window},
     emitter::{Emitters, find_spots},
     film::Film,
     lobe::Mirrors,
@@ -65,6 +66,10 @@ pub fn render(
     let of_spot = groups_of(settings, &emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
+    let narrow = strategy
+        .ellipsoidal
+        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world, &emitters));
+    let patches = narrow.then(|| Patches::new(&world, &emitters));
     let frame = Frame {
         walk: Walk {
             world: &world,
@@ -77,10 +82,12 @@ pub fn render(
                 .list
                 .iter()
                 .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
+            window: narrow.then(|| Window::new(&settings.gate)),
+            patches: patches.as_ref(),
         },
         film: &film,
         sampling: &sampling,
-        effort: Effort::new(strategy.share.unwrap_or(SHARE)),
+        effort: Effort::new(strategy.share.unwrap_or(SHARE), narrow),
         seed: settings.seed,
         width,
         height,
@@ -101,7 +108,7 @@ pub fn render(
             (n, Some(target))
         }
     };
-    let plan = plan(settings, &mirrors, &sampling, passes);
+    let plan = plan(settings, &mirrors, &sampling, narrow, passes);
     let mut wave = passes;
     let error = loop {
         let watch = Watch::new(progress, image.passes, image.passes + wave);

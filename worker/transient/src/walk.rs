@@ -9,6 +9,7 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Gate,
     bvh::Stack,
+    ellipsoid::{Patches, Window},
     emitter::Emitters,
     lobe::Mirrors,
     pool::{self, Pool},
@@ -29,6 +30,10 @@ pub(crate) struct Walk<'a> {
     pub lights: bool,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
+    /// With a narrow gate: the path lengths that count; whatever else is found is not looked at.
+    pub window: Option<Window>,
+    /// With a narrow gate: where shared vertices are drawn for it.
+    pub patches: Option<&'a Patches>,
 }
 
 /// A vertex of a path from the camera.
@@ -106,6 +111,44 @@ impl Walk<'_> {
         v.hit.surface.strength > 0.0
             && v.bounce + 2 <= self.max_bounces
             && v.length_m + self.shortest_m < self.gate.end_m()
+            && self.in_time(v.hit.p, v.length_m)
+    }
+
+    /// False where a narrow gate ends before the shortest path by way of `p`.
+    #[inline]
+    pub fn in_time(&self, p: Vec3, length_m: f64) -> bool {
+        self.window
+            .is_none_or(|w| length_m + self.emitters.shortest_m(self.world, p) < w.end_m)
+    }
+
+    /// Drops the weights of spots whose path by way of a surface point misses a narrow gate. Returns
+    /// whether any is left.
+    pub fn keep_in_window(&self, p: Vec3, length_m: f64, weights: &mut [f32]) -> bool {
+        if self.window.is_none() {
+            return true;
+        }
+        let mut any = false;
+        for (spot, w) in weights.iter_mut().enumerate().filter(|(_, w)| **w > 0.0) {
+            if self.in_window(p, length_m, spot) {
+                any = true;
+            } else {
+                *w = 0.0;
+            }
+        }
+        any
+    }
+
+    /// Whether a path from one of the spots with a weight by way of a surface point can count.
+    pub fn any_in_window(&self, p: Vec3, length_m: f64, weights: &[f32]) -> bool {
+        let mut lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
+        self.window.is_none() || lit.any(|(spot, _)| self.in_window(p, length_m, spot))
+    }
+
+    #[inline]
+    fn in_window(&self, p: Vec3, length_m: f64, spot: usize) -> bool {
+        let e = &self.emitters.list[spot];
+        let path = length_m + self.world.metres((e.p - p).length()) + e.path_m;
+        self.window.is_none_or(|w| w.holds(path))
     }
 
     /// Settles a surface of several lobes on one of them.
@@ -198,6 +241,9 @@ impl Walk<'_> {
         }
         let Scratch { stack, weights, .. } = scratch;
         self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
+        if !self.keep_in_window(h.p, v.length_m, weights) {
+            return;
+        }
         if let Some(step) = step {
             self.plain_shares(step, h, weights);
         }
@@ -293,13 +339,14 @@ impl Walk<'_> {
         let e = &self.emitters.list[aim.spot];
         let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &m.surface);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
-        if value == 0.0 || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
+        let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
+        let path = v.length_m + lengths + e.path_m;
+        let counts = value != 0.0 && self.window.is_none_or(|w| w.holds(path));
+        if !counts || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
             return total;
         }
         let aimed = aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
-        let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
-        let path = v.length_m + lengths + e.path_m;
         let value = v.beta * value / (aimed + plain);
         sink.add(path, value, aim.spot, v.bounce + 2);
         total
@@ -318,6 +365,12 @@ impl Walk<'_> {
             ..
         } = scratch;
         pool.weights(h, v.wo, lights);
+        if let Some(window) = &self.window {
+            for (w, y) in lights.iter_mut().zip(&pool.list) {
+                let path = v.length_m + self.world.metres((y.hit.p - h.p).length()) + y.path_m;
+                *w = if window.holds(path) { *w } else { 0.0 };
+            }
+        }
         draw(lights, LIGHTS, rng.uniform(), |i, value| {
             let y = &pool.list[i];
             let there = &y.hit;
