@@ -92,14 +92,11 @@ impl Shells {
                 .iter()
                 .map(|(v, _)| (v.hit.p, (v.length_m * scale) as f32)),
         );
-        self.towards = self.points.iter().fold(Vec3::ZERO, |a, x| a + x.0)
-            / self.points.len().max(1) as f32;
+        self.towards =
+            self.points.iter().fold(Vec3::ZERO, |a, x| a + x.0) / self.points.len().max(1) as f32;
         self.reach(patches, gathers);
         let patches_count = patches.len();
-        let (start, end) = (
-            (gate.start_m * scale) as f32,
-            (gate.end_m() * scale) as f32,
-        );
+        let (start, end) = ((gate.start_m * scale) as f32, (gate.end_m() * scale) as f32);
         self.density.clear();
         self.density.resize(patches_count, 0.0);
         let rows = patches.path.chunks_exact(patches_count.max(1));

@@ -51,9 +51,9 @@ impl Effort {
             side,
             camera: 1.0,
             light: 0.5,
-            shell: if narrow { env("SHELL", 1.0) } else { 0.0 },
+            shell: if narrow { 1.0 } else { 0.0 },
             walks: 1,
-            pool: if narrow { env("POOL", 16.0) as u32 } else { 16 },
+            pool: 16,
         }
     }
 }
@@ -355,7 +355,8 @@ impl Sharing {
                 walk_on(&mut sink, scratch);
             }
             emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
-            if sink.list.bins.len() == y.first && !walk.any_in_window(h.p, nearest, &scratch.weights)
+            if sink.list.bins.len() == y.first
+                && !walk.any_in_window(h.p, nearest, &scratch.weights)
             {
                 continue;
             }
@@ -645,8 +646,4 @@ mod tests {
         assert_eq!(floor(f32::INFINITY, 638.0), 638);
         assert_eq!(floor(1_048_577.5, 1_048_577.0), 1_048_577);
     }
-}
-
-pub(crate) fn env(n: &str, d: f32) -> f32 {
-    std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d)
 }

@@ -253,3 +253,50 @@ impl Patches {
 fn area(t: &[Vec3; 3]) -> f32 {
     (t[1] - t[0]).cross(t[2] - t[0]).length() * 0.5
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bare(triangles: &[[Vec3; 3]], size: f32) -> (Patches, Vec<Piece>) {
+        let (mut all, mut cut) = (Patches::default(), vec![]);
+        for (t, &corners) in triangles.iter().enumerate() {
+            let link = all.halve(t as u32, corners, size, HALVINGS, &mut cut);
+            all.of_triangle.push(link);
+        }
+        (all, cut)
+    }
+
+    #[test]
+    fn every_point_of_a_halved_triangle_is_found_in_its_piece() {
+        let corner = |x, y, z| Vec3::new(x, y, z);
+        let (a, b, c) = (
+            corner(0.0, 0.0, 0.0),
+            corner(4.0, 0.1, 0.0),
+            corner(0.3, 0.4, 1.0),
+        );
+        let (all, cut) = bare(&[[a, b, c]], 0.5);
+        assert!(cut.len() > 8, "{}", cut.len());
+        let whole: f32 = cut.iter().map(|p| area(&p.corners)).sum();
+        assert!((whole / area(&[a, b, c]) - 1.0).abs() < 1e-5);
+        let n = (b - a).cross(c - a);
+        for (k, piece) in cut.iter().enumerate() {
+            let [p, q, r] = piece.corners;
+            for (u, v) in [(0.3, 0.3), (0.8, 0.1), (0.1, 0.8), (0.05, 0.05)] {
+                let at = p * u + q * v + r * (1.0 - u - v);
+                let part = |s: Vec3, t: Vec3| n.dot((s - at).cross(t - at)) / n.dot(n);
+                let found = all.at(0, [part(b, c), part(c, a), part(a, b)]);
+                assert_eq!(found, Some(k));
+            }
+        }
+    }
+
+    #[test]
+    fn triangles_left_out_are_in_no_patch() {
+        let all = Patches {
+            of_triangle: vec![NONE],
+            ..Patches::default()
+        };
+        assert_eq!(all.at(0, [0.2, 0.3, 0.5]), None);
+    }
+}

@@ -1,7 +1,7 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{MULTI_REACH, Stat, TWO_REACH, pool, relative_median};
+use super::error::{MULTI_REACH, Stat, TWO_REACH, pool, relative_median, shut_out};
 use crate::{
     api::Overflow,
     film::{Blocks, Film},
@@ -156,7 +156,7 @@ impl Done {
     }
 
     /// Brings the variances up to the passes done.
-    fn estimate(&mut self, film: &Film, region: &Region) {
+    fn estimate(&mut self, film: &Film, region: &Region, narrow: bool) {
         let n = f64::from(self.passes);
         self.multi_variance.clear();
         for (sum, square) in self
@@ -168,6 +168,9 @@ impl Done {
             self.multi_variance.extend(
                 both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
             );
+        }
+        if narrow {
+            shut_out(&mut self.multi_variance, film.slots);
         }
         pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
     }
@@ -236,6 +239,7 @@ impl Bench {
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
         let mut end = order.count;
+        let narrow = frame.walk.window.is_some();
         while self.done.passes < end {
             if !go_on() {
                 return None;
@@ -247,7 +251,7 @@ impl Bench {
                 && end < most
             {
                 let film = frame.film;
-                self.done.estimate(film, region);
+                self.done.estimate(film, region, narrow);
                 let stats = (0..region.pixels()).map(|k| self.done.stat(film, k));
                 let error = relative_median(stats);
                 if error > f64::from(target) {
@@ -257,7 +261,7 @@ impl Bench {
                 }
             }
         }
-        self.done.estimate(frame.film, region);
+        self.done.estimate(frame.film, region, narrow);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -312,6 +316,9 @@ impl Bench {
                 *out = v * n * n;
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
+        }
+        if walk.window.is_some() {
+            shut_out(&mut self.done.two_variance, film.slots);
         }
         pool(&mut self.done.two_variance, region, film.slots, TWO_REACH);
         Some(())
