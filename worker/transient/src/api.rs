@@ -42,6 +42,9 @@ pub struct Strategy {
     /// Light paths from the spots for what comes by way of near-mirrors that have no image lobes: curved
     /// ones, and several in a row.
     pub caustics: Option<bool>,
+    /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
+    /// unlooked at: [`Overflow`] is then a lower bound.
+    pub ellipsoidal: Option<bool>,
 }
 
 /// Settings of one render.
@@ -140,7 +143,8 @@ pub struct GroundTruth {
     pub rgb: Vec<f32>,
 }
 
-/// Energy outside the gate, same units as the histogram summed over pixels and bins.
+/// Energy outside the gate, same units as the histogram summed over pixels and bins. A lower bound where
+/// the plan says that the gate is narrow ([`Strategy::ellipsoidal`]).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Overflow {
     /// Energy dropped.

@@ -279,4 +279,12 @@ impl Emitters {
         }
         f * e.intensity(-w) / d2
     }
+
+    /// Shortest optical path from the laser by way of a spot to `x`, metres.
+    pub fn shortest_m(&self, world: &World, x: Vec3) -> f64 {
+        let each = self.list.iter();
+        each.fold(f64::INFINITY, |a, e| {
+            a.min(e.path_m + world.metres((x - e.p).length()))
+        })
+    }
 }

@@ -5,6 +5,7 @@ mod api;
 mod bsdf;
 mod bvh;
 mod caustic;
+mod ellipsoid;
 mod emitter;
 mod film;
 mod lobe;

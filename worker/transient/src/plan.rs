@@ -56,6 +56,14 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
             );
         }
     }
+    if walk.window.is_some() {
+        if longest >= 3 {
+            strategies.push("narrow gate: ellipsoidal connections".into());
+        }
+        approximations.push(
+            "light outside the narrow gate is not looked for: the overflow is a lower bound".into(),
+        );
+    }
     Plan {
         strategies,
         approximations,

@@ -19,6 +19,7 @@ use self::{
 use crate::{
     api::{Budget, Overflow, Progress, RenderError, Rendered, Settings, Split},
     caustic::Caustics,
+    ellipsoid::{self, Patches, Window},
     emitter::{Emitters, find_spots},
     film::Film,
     lobe::Mirrors,
@@ -101,6 +102,10 @@ fn run(
     let of_spot = groups_of(settings, &emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
+    let narrow = strategy
+        .ellipsoidal
+        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world, &emitters));
+    let patches = narrow.then(|| Patches::new(&world, &emitters));
     let mut walk = Walk {
         world: &world,
         emitters: &emitters,
@@ -109,6 +114,8 @@ fn run(
         max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
+        window: narrow.then(|| Window::new(&settings.gate)),
+        patches: patches.as_ref(),
         shortest_m: emitters
             .list
             .iter()
@@ -124,7 +131,7 @@ fn run(
         walk,
         film: &film,
         sampling: &sampling,
-        effort: Effort::new(strategy.share.unwrap_or(SHARE)),
+        effort: Effort::new(strategy.share.unwrap_or(SHARE), narrow),
         seed: settings.seed,
         width,
         height,

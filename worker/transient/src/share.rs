@@ -18,6 +18,7 @@ use picofarm_scene::Vec3;
 
 use crate::{
     bsdf::{Surface, frame},
+    ellipsoid::{Patches, Shells},
     emitter::Columns,
     film::{Film, PixelSink},
     rng::{Rng, Stream},
@@ -34,6 +35,8 @@ pub(crate) struct Effort {
     pub camera: f32,
     /// Shared vertices drawn from spots, for each pixel.
     pub light: f32,
+    /// Shared vertices drawn in a narrow gate's shells, for each pixel.
+    pub shell: f32,
     /// Walks from each shared vertex.
     pub walks: u32,
     /// Light vertices that walks of one pass connect to.
@@ -50,11 +53,12 @@ const GLOSSY: u32 = 2;
 impl Effort {
     /// The effort for tiles of `side` pixels. The numbers minimise error² × CPU time on furnished rooms
     /// with 1 and 25 spots, where the optimum is flat: twice as many vertices or walks cost within 10 %.
-    pub fn new(side: u32) -> Self {
+    pub fn new(side: u32, narrow: bool) -> Self {
         Self {
             side,
             camera: 1.0,
             light: 0.5,
+            shell: if narrow { 1.0 } else { 0.0 },
             walks: 1,
             pool: 16,
             beyond: 1.0,
@@ -66,7 +70,7 @@ impl Effort {
 #[derive(Debug, Clone, Copy)]
 struct Shared {
     hit: Hit,
-    /// Expected number of such vertices per area, from the spots' side.
+    /// Expected number of such vertices per area, from the spots' side and in a narrow gate's shells.
     light: f32,
     /// Its arrivals.
     first: usize,
@@ -131,6 +135,7 @@ pub(crate) struct Sharing {
     /// `[shared][gather]`: value of an arrival at the pixel, and path in bins to add.
     weight: Vec<f32>,
     offset: Vec<f32>,
+    shells: Shells,
 }
 
 impl Sharing {
@@ -183,6 +188,10 @@ impl Sharing {
         let light = (count * effort.light).round().max(1.0) as u32;
         self.draw_from_camera((walk, film), camera, &mut rng, scratch, pixels);
         self.draw_from_spots(walk, light, &mut rng, scratch);
+        if let Some(patches) = walk.patches {
+            let count = (count * effort.shell).round().max(1.0) as u32;
+            self.draw_in_shells((walk, patches), count, &mut rng);
+        }
         self.light_up((walk, film, effort), light, &mut rng, scratch);
         self.connect((walk, film), camera, scratch);
         self.spread((walk, film), pixels);
@@ -309,6 +318,29 @@ impl Sharing {
         }
     }
 
+    /// Draws shared vertices in the shells of a narrow gate.
+    fn draw_in_shells(&mut self, (walk, patches): (&Walk, &Patches), count: u32, rng: &mut Rng) {
+        let place = (walk.world, patches);
+        self.shells
+            .lay((walk.world, patches, walk.gate), &self.gathers, count);
+        let start = f64::from(rng.uniform());
+        for j in 0..count {
+            let at = (f64::from(j) + start) / f64::from(count);
+            let Some(mut hit) = self.shells.draw(place, at, rng) else {
+                continue;
+            };
+            walk.choose_lobe(rng, &mut hit);
+            if hit.surface.diffuse() {
+                self.shared.push(Shared {
+                    hit,
+                    light: 0.0,
+                    first: 0,
+                    end: 0,
+                });
+            }
+        }
+    }
+
     /// Finds what arrives at every shared vertex: from all spots directly, from beyond by walks.
     fn light_up(
         &mut self,
@@ -328,7 +360,15 @@ impl Sharing {
         let share = drawn as f32 / emitters.list.len() as f32;
         for y in &mut self.shared {
             y.first = self.arrivals.bins.len();
+            y.end = y.first;
             let h = &y.hit;
+            let window = walk
+                .window
+                .map(|w| self.shells.window(walk.world, &w, h.p, nearest));
+            let walk = &Walk { window, ..*walk };
+            if !walk.in_time(h.p, nearest) {
+                continue;
+            }
             let mut sink = ArrivalSink {
                 list: &mut self.arrivals,
                 base_m: nearest,
@@ -336,7 +376,31 @@ impl Sharing {
                 factor: 1.0,
             };
             let mut density = 0.0;
+            let vertex = Vertex {
+                hit: *h,
+                wo: h.n,
+                beta: 1.0,
+                length_m: nearest,
+                bounce,
+                after_mirror: false,
+                open_before: false,
+            };
+            let mut walk_on = |sink: &mut ArrivalSink, scratch: &mut Scratch| {
+                sink.factor = 1.0 / effort.walks.max(1) as f32;
+                for _ in 0..effort.walks {
+                    walk.run(rng, vertex, scratch, sink);
+                }
+                sink.factor = 1.0;
+            };
+            if walk.window.is_some() {
+                walk_on(&mut sink, scratch);
+            }
             emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
+            if sink.list.bins.len() == y.first
+                && !walk.any_in_window(h.p, nearest, &scratch.weights)
+            {
+                continue;
+            }
             self.ends.clear();
             self.ends_of.clear();
             for (spot, &w) in scratch.weights.iter().enumerate() {
@@ -366,22 +430,17 @@ impl Sharing {
                         e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
                     };
                     let path = nearest + walk.world.metres(d) + e.path_m;
-                    sink.add(path, w, spot, bounce + 1);
+                    if walk.window.is_none_or(|w| w.holds(path)) {
+                        sink.add(path, w, spot, bounce + 1);
+                    }
                 }
             }
             y.light = density * share;
-            let vertex = Vertex {
-                hit: *h,
-                wo: h.n,
-                beta: 1.0,
-                length_m: nearest,
-                bounce,
-                after_mirror: false,
-                open_before: false,
-            };
-            sink.factor = 1.0 / effort.walks.max(1) as f32;
-            for _ in 0..effort.walks {
-                walk.run(rng, vertex, scratch, &mut sink);
+            if let Some(patches) = walk.patches {
+                y.light += self.shells.density((walk.world, patches), h);
+            }
+            if walk.window.is_none() {
+                walk_on(&mut sink, scratch);
             }
             y.end = sink.list.bins.len();
         }
@@ -405,6 +464,9 @@ impl Sharing {
             .chunks_mut(count)
             .zip(self.offset.chunks_mut(count));
         for (y, (weight, offset)) in self.shared.iter().zip(rows) {
+            if walk.window.is_some() && y.first == y.end {
+                continue;
+            }
             let h = &y.hit;
             self.columns.irradiance(h.p, h.n, weight);
             for &i in &self.glossy {

@@ -10,6 +10,7 @@ use crate::{
     api::Gate,
     bvh::Stack,
     caustic::Caustics,
+    ellipsoid::{Patches, Window},
     emitter::Emitters,
     lobe::Mirrors,
     pool::{self, Pool},
@@ -32,6 +33,10 @@ pub(crate) struct Walk<'a> {
     pub caustics: Option<&'a Caustics>,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
+    /// With a narrow gate: the path lengths that count; whatever else is found is not looked at.
+    pub window: Option<Window>,
+    /// With a narrow gate: where shared vertices are drawn for it.
+    pub patches: Option<&'a Patches>,
 }
 
 /// A vertex of a path from the camera.
@@ -142,6 +147,44 @@ impl Walk<'_> {
         v.hit.surface.strength > 0.0
             && v.bounce + 2 <= self.max_bounces
             && v.length_m + self.shortest_m < self.gate.end_m()
+            && self.in_time(v.hit.p, v.length_m)
+    }
+
+    /// False where a narrow gate ends before the shortest path by way of `p`.
+    #[inline]
+    pub fn in_time(&self, p: Vec3, length_m: f64) -> bool {
+        self.window
+            .is_none_or(|w| length_m + self.emitters.shortest_m(self.world, p) < w.end_m)
+    }
+
+    /// Drops the weights of spots whose path by way of a surface point misses a narrow gate. Returns
+    /// whether any is left.
+    pub fn keep_in_window(&self, p: Vec3, length_m: f64, weights: &mut [f32]) -> bool {
+        if self.window.is_none() {
+            return true;
+        }
+        let mut any = false;
+        for (spot, w) in weights.iter_mut().enumerate().filter(|(_, w)| **w > 0.0) {
+            if self.in_window(p, length_m, spot) {
+                any = true;
+            } else {
+                *w = 0.0;
+            }
+        }
+        any
+    }
+
+    /// Whether a path from one of the spots with a weight by way of a surface point can count.
+    pub fn any_in_window(&self, p: Vec3, length_m: f64, weights: &[f32]) -> bool {
+        let mut lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
+        self.window.is_none() || lit.any(|(spot, _)| self.in_window(p, length_m, spot))
+    }
+
+    #[inline]
+    fn in_window(&self, p: Vec3, length_m: f64, spot: usize) -> bool {
+        let e = &self.emitters.list[spot];
+        let path = length_m + self.world.metres((e.p - p).length()) + e.path_m;
+        self.window.is_none_or(|w| w.holds(path))
     }
 
     /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
@@ -253,6 +296,9 @@ impl Walk<'_> {
             for &spot in &self.emitters.glossy {
                 weights[spot] = 0.0;
             }
+        }
+        if !self.keep_in_window(h.p, v.length_m, weights) {
+            return;
         }
         if let Some(step) = step {
             self.plain_shares(step, h, weights, images);
@@ -371,13 +417,14 @@ impl Walk<'_> {
             .emitters
             .weight(aim.spot, m.p, m.n, -w, &m.surface.gloss());
         let value = h.surface.scatter(h.n, v.wo, w) * there;
-        if value == 0.0 || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
+        let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
+        let path = v.length_m + lengths + e.path_m;
+        let counts = value != 0.0 && self.window.is_none_or(|w| w.holds(path));
+        if !counts || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
             return;
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
-        let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
-        let path = v.length_m + lengths + e.path_m;
         let value = v.beta * value / (aimed + plain);
         sink.add(path, value, aim.spot, v.bounce + 2);
     }
@@ -417,6 +464,12 @@ impl Walk<'_> {
             pool.glossy_weights(h, v.wo, lights);
         } else {
             pool.weights(h, v.wo, lights);
+        }
+        if let Some(window) = &self.window {
+            for (w, y) in lights.iter_mut().zip(&pool.list) {
+                let path = v.length_m + self.world.metres((y.hit.p - h.p).length()) + y.path_m;
+                *w = if window.holds(path) { *w } else { 0.0 };
+            }
         }
         draw(lights, count, rng.uniform(), |i, value| {
             let y = &pool.list[i];

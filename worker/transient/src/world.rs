@@ -167,15 +167,26 @@ impl World {
     #[inline]
     pub fn closest(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (_, id) = self.bvh.closest(stack, origin, direction, f32::INFINITY)?;
+        let front = self.normals[id as usize].dot(direction) <= 0.0;
+        let p = point(&self.triangles[id as usize], origin, direction);
+        Some(self.hit(id, p, front))
+    }
+
+    /// A point of a triangle as seen from a place.
+    pub fn on(&self, triangle: u32, p: Vec3, from: Vec3) -> Hit {
+        let front = self.normals[triangle as usize].dot(from - p) >= 0.0;
+        self.hit(triangle, p, front)
+    }
+
+    #[inline(always)]
+    fn hit(&self, id: u32, p: Vec3, front: bool) -> Hit {
         let i = id as usize;
         let geometric = self.normals[i];
-        let front = geometric.dot(direction) <= 0.0;
-        let p = point(&self.triangles[i], origin, direction);
         let mut surface = self.surfaces[self.surface[i] as usize];
         if let Some(texel) = self.texel(id, p) {
             surface = surface.scaled((texel[0] + texel[1] + texel[2]) / 3.0);
         }
-        Some(Hit {
+        Hit {
             p,
             n: if front { geometric } else { -geometric },
             triangle: id,
@@ -184,7 +195,7 @@ impl World {
             } else {
                 surface.black()
             },
-        })
+        }
     }
 
     /// The texture's colour at a point of a triangle; `None` without a texture.
@@ -192,15 +203,22 @@ impl World {
     fn texel(&self, triangle: u32, p: Vec3) -> Option<[f32; 3]> {
         let i = triangle as usize;
         let texture = self.textures.get(self.surface[i] as usize)?.as_ref()?;
+        let [u, v, w] = self.barycentric(triangle, p);
+        let [a, b, c] = self.uv[i];
+        let at = |k: usize| a[k] * u + b[k] * v + c[k] * w;
+        Some(texture.at([at(0), at(1)]))
+    }
+
+    /// Barycentric coordinates of a point of a triangle.
+    #[inline(always)]
+    pub fn barycentric(&self, triangle: u32, p: Vec3) -> [f32; 3] {
+        let i = triangle as usize;
         let [a, b, c] = self.triangles[i];
         let n = self.normals[i];
         let area = |a: Vec3, b: Vec3| n.dot((a - p).cross(b - p));
         let (u, v, w) = (area(b, c), area(c, a), area(a, b));
         let whole = 1.0 / (u + v + w);
-        let (u, v, w) = (u * whole, v * whole, w * whole);
-        let [a, b, c] = self.uv[i];
-        let at = |k: usize| a[k] * u + b[k] * v + c[k] * w;
-        Some(texture.at([at(0), at(1)]))
+        [u * whole, v * whole, w * whole]
     }
 
     /// Linear RGB albedo at a hit.

@@ -39,6 +39,15 @@ pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: u
     }
 }
 
+/// Keeps what lies outside a narrow gate out of the pool: the slots before and after the gate take the
+/// value of the bin next to them.
+pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
+    for v in variance.chunks_mut(slots) {
+        v[0] = v[1];
+        v[slots - 1] = v[slots - 2];
+    }
+}
+
 /// out\[k\] = mean of from\[k − 1..=k + 1\], items of `size`, within the `count` items from `first(k)`.
 fn mean_of_three(
     out: &mut [f32],

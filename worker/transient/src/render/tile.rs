@@ -1,7 +1,7 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{MULTI_REACH, TWO_REACH, pool};
+use super::error::{MULTI_REACH, TWO_REACH, pool, shut_out};
 use crate::{
     api::Overflow,
     film::{Blocks, Film},
@@ -164,7 +164,7 @@ impl Done {
     }
 
     /// Brings the variances up to the passes done.
-    fn estimate(&mut self, film: &Film, region: &Region) {
+    fn estimate(&mut self, film: &Film, region: &Region, narrow: bool) {
         let n = f64::from(self.passes);
         self.multi_variance.clear();
         for (sum, square) in self
@@ -176,6 +176,9 @@ impl Done {
             self.multi_variance.extend(
                 both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
             );
+        }
+        if narrow {
+            shut_out(&mut self.multi_variance, film.slots);
         }
         for (out, v) in self
             .pixel_variance
@@ -241,13 +244,14 @@ impl Bench {
         self.done.reset(frame.film, region.pixels(), frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
+        let narrow = frame.walk.window.is_some();
         while self.done.passes < order.count {
             if !go_on() {
                 return None;
             }
             self.pass(frame, region, order.first + self.done.passes);
         }
-        self.done.estimate(frame.film, region);
+        self.done.estimate(frame.film, region, narrow);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -302,6 +306,9 @@ impl Bench {
                 *out = v * n * n;
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
+        }
+        if walk.window.is_some() {
+            shut_out(&mut self.done.two_variance, film.slots);
         }
         let variances = self.done.two_variance.chunks(film.slots);
         for (out, v) in self.done.pixel_variance.iter_mut().zip(variances) {
