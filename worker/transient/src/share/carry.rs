@@ -1,0 +1,275 @@
+//! Carrying light: what arrives at the shared vertices, and what of it reaches each pixel.
+
+use std::f32::consts::PI;
+
+use super::{ArrivalSink, Effort, Sharing};
+use crate::{
+    film::Film,
+    rng::Rng,
+    walk::{Scratch, Sink, Vertex, Walk},
+    world::lift,
+};
+
+impl Sharing {
+    /// Finds what arrives at every shared vertex: from all spots directly, from beyond by walks.
+    pub(super) fn light_up(
+        &mut self,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        drawn: u32,
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+    ) {
+        let emitters = walk.emitters;
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        let nearest = self
+            .gathers
+            .iter()
+            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
+        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
+        let bounce = lowest.unwrap_or(1) + 1;
+        let share = drawn as f32 / emitters.list.len() as f32;
+        for y in &mut self.shared {
+            y.first = self.arrivals.bins.len();
+            y.end = y.first;
+            let h = &y.hit;
+            let window = walk
+                .window
+                .map(|w| self.shells.window(walk.world, &w, h.p, nearest));
+            let walk = &Walk { window, ..*walk };
+            if !walk.in_time(h.p, nearest) {
+                continue;
+            }
+            let mut sink = ArrivalSink {
+                list: &mut self.arrivals,
+                base_m: nearest,
+                per_metre,
+                factor: 1.0,
+            };
+            let mut density = 0.0;
+            let vertex = Vertex {
+                hit: *h,
+                wo: h.n,
+                beta: 1.0,
+                length_m: nearest,
+                bounce,
+                after_mirror: false,
+                open_before: false,
+            };
+            let mut walk_on = |sink: &mut ArrivalSink, scratch: &mut Scratch| {
+                sink.factor = 1.0 / effort.walks.max(1) as f32;
+                for _ in 0..effort.walks {
+                    walk.run(rng, vertex, scratch, sink);
+                }
+                sink.factor = 1.0;
+            };
+            if walk.window.is_some() {
+                walk_on(&mut sink, scratch);
+            }
+            emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
+            if sink.list.bins.len() == y.first
+                && !walk.any_in_window(h.p, nearest, &scratch.weights)
+            {
+                continue;
+            }
+            self.ends.clear();
+            self.ends_of.clear();
+            for (spot, &w) in scratch.weights.iter().enumerate() {
+                if w > 0.0 {
+                    self.ends.push(emitters.lifted[spot]);
+                    self.ends_of.push(spot);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            walk.world.bvh.occluded_bundle(
+                &mut scratch.stack,
+                lift(h.p, h.n),
+                &self.ends,
+                &mut self.blocked,
+            );
+            for (&spot, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
+                if !blocked {
+                    let to = h.p - e.p;
+                    let d2 = to.dot(to);
+                    let d = d2.sqrt();
+                    let strength = emitters.columns.strength[spot];
+                    density += if strength > 0.0 {
+                        w / (strength * h.surface.strength * PI)
+                    } else {
+                        let out = to / d;
+                        e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
+                    };
+                    let path = nearest + walk.world.metres(d) + e.path_m;
+                    if walk.window.is_none_or(|w| w.holds(path)) {
+                        sink.add(path, w, spot, bounce + 1);
+                    }
+                }
+            }
+            y.light = density * share;
+            if let Some(patches) = walk.patches {
+                y.light += self.shells.density((walk.world, patches), h);
+            }
+            if walk.window.is_none() {
+                walk_on(&mut sink, scratch);
+            }
+            y.end = sink.list.bins.len();
+        }
+    }
+
+    /// Weighs every pair of shared vertex and gather point.
+    pub(super) fn connect(
+        &mut self,
+        (walk, film): (&Walk, &Film),
+        drawn: u32,
+        scratch: &mut Scratch,
+    ) {
+        let count = self.gathers.len();
+        self.weight.clear();
+        self.offset.clear();
+        self.weight.resize(count * self.shared.len(), 0.0);
+        self.offset.resize(count * self.shared.len(), 0.0);
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        let nearest = self
+            .gathers
+            .iter()
+            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
+        let share = drawn as f32 / count as f32;
+        let rows = self
+            .weight
+            .chunks_mut(count)
+            .zip(self.offset.chunks_mut(count));
+        for (y, (weight, offset)) in self.shared.iter().zip(rows) {
+            if walk.window.is_some() && y.first == y.end {
+                continue;
+            }
+            let h = &y.hit;
+            self.columns.irradiance(h.p, h.n, weight);
+            for &i in &self.glossy {
+                let x = &self.gathers[i].0.hit;
+                let to = x.p - h.p;
+                let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
+                weight[i] = if seen { 1.0 } else { 0.0 };
+            }
+            self.ends.clear();
+            self.ends_of.clear();
+            for (i, (w, (v, _))) in weight.iter().zip(&self.gathers).enumerate() {
+                if *w > 0.0 {
+                    self.ends.push(lift(v.hit.p, v.hit.n));
+                    self.ends_of.push(i);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            walk.world.bvh.occluded_bundle(
+                &mut scratch.stack,
+                lift(h.p, h.n),
+                &self.ends,
+                &mut self.blocked,
+            );
+            for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                if blocked {
+                    weight[i] = 0.0;
+                }
+            }
+            let mut density = 0.0;
+            for ((w, o), (v, _)) in weight.iter_mut().zip(offset).zip(&self.gathers) {
+                if *w == 0.0 {
+                    continue;
+                }
+                let x = &v.hit;
+                let to = h.p - x.p;
+                let d2 = to.dot(to);
+                let d = d2.sqrt();
+                if x.surface.diffuse() {
+                    density += *w / PI;
+                    *w *= v.beta * x.surface.strength;
+                } else {
+                    let w_in = to / d;
+                    let cos = h.n.dot(w_in).abs() / d2;
+                    density += x.surface.pdf(x.n, v.wo, w_in) * cos;
+                    *w = v.beta * x.surface.scatter(x.n, v.wo, w_in) * cos;
+                }
+                *o = ((v.length_m - nearest + walk.world.metres(d) - film.gate.start_m + nearest)
+                    * per_metre) as f32;
+            }
+            let density = density * share + y.light;
+            let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
+            for w in weight.iter_mut() {
+                *w *= inverse;
+            }
+        }
+    }
+
+    /// Carries the arrivals to the pixels.
+    pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        let count = self.gathers.len();
+        let size = film.pixel();
+        let last = film.slots as f32 - 1.0;
+        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
+        let lowest = lowest.unwrap_or(1);
+        let bounded = walk.max_bounces < u32::MAX;
+        for (i, (v, k)) in self.gathers.iter().enumerate() {
+            let pixel = &mut pixels[k * size..(k + 1) * size];
+            let deeper = v.bounce - lowest;
+            for (y, row) in self
+                .shared
+                .iter()
+                .zip(self.weight.chunks(count).zip(self.offset.chunks(count)))
+            {
+                let (weight, offset) = (row.0[i], row.1[i] + 1.0);
+                if weight == 0.0 {
+                    continue;
+                }
+                let range = y.first..y.end;
+                let a = &self.arrivals;
+                let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
+                if film.channels == 1 && !bounded {
+                    let pixel = &mut pixel[..film.slots];
+                    // Slots eight at a time: that part the compiler can do side by side.
+                    for (bins, values) in bins.chunks(8).zip(values.chunks(8)) {
+                        let mut slots = [0u32; 8];
+                        for (slot, &b) in slots.iter_mut().zip(bins) {
+                            *slot = floor(b + offset, last);
+                        }
+                        for (&slot, &value) in slots.iter().zip(values) {
+                            pixel[slot as usize] += weight * value;
+                        }
+                    }
+                    continue;
+                }
+                let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
+                for ((&b, &value), (&spot, &bounces)) in bins.iter().zip(values).zip(rest) {
+                    if u32::from(bounces) + deeper > walk.max_bounces {
+                        continue;
+                    }
+                    let slot = floor(b + offset, last) as usize;
+                    film.add(pixel, slot, weight * value, usize::from(spot));
+                }
+            }
+        }
+    }
+}
+
+/// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
+/// bits, without the checks of a cast. (An x within rounding of an integer may fall to either side.)
+#[inline(always)]
+fn floor(x: f32, last: f32) -> u32 {
+    let half = x.max(0.5).min(last + 0.5) - 0.5;
+    (half + 8_388_608.0).to_bits() & 0x007f_ffff
+}
+
+#[cfg(test)]
+mod tests {
+    use super::floor;
+
+    #[test]
+    fn slots_are_whole_parts_within_their_range() {
+        for k in 0..4000u32 {
+            for part in [0.01, 0.3, 0.5, 0.7, 0.99] {
+                assert_eq!(floor(k as f32 + part, 638.0), k.min(638));
+            }
+        }
+        assert_eq!(floor(-7.5, 638.0), 0);
+        assert_eq!(floor(f32::INFINITY, 638.0), 638);
+        assert_eq!(floor(1_048_577.5, 1_048_577.0), 1_048_577);
+    }
+}

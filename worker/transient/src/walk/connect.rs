@@ -1,0 +1,251 @@
+//! Connecting a walk's vertices: to the spots, to their images in mirrors, and to light vertices.
+
+use std::f32::consts::PI;
+
+use super::{ALL, Lights, Scratch, Sink, Step, Vertex, Walk};
+use crate::{
+    pool,
+    rng::Rng,
+    world::{Hit, lift},
+};
+
+impl Walk<'_> {
+    /// Connects a vertex to `count` spots, drawn by unshadowed contribution.
+    pub fn connect(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        step: Option<&Step>,
+        count: u32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        let h = &v.hit;
+        if h.surface.strength == 0.0 {
+            return;
+        }
+        let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
+        let caustic = self.caustics.is_some() && h.surface.specular && v.open();
+        if caustic && !planar {
+            return;
+        }
+        let Scratch {
+            stack,
+            weights,
+            images,
+            ..
+        } = scratch;
+        self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
+        if caustic {
+            for &spot in &self.emitters.glossy {
+                weights[spot] = 0.0;
+            }
+        }
+        if !self.keep_in_window(h.p, v.length_m, weights) {
+            return;
+        }
+        if let Some(step) = step {
+            self.plain_shares(step, h, weights, images);
+        }
+        let mut each = |spot: usize, value: f32| {
+            let e = &self.emitters.list[spot];
+            if self.world.free(stack, h.p, h.n, e.p, e.n) {
+                let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
+                sink.add(path, v.beta * value, spot, v.bounce + 1);
+            }
+        };
+        if count == ALL {
+            let lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
+            lit.for_each(|(spot, &w)| each(spot, w));
+        } else {
+            draw(weights, count, rng.uniform(), each);
+        }
+    }
+
+    /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
+    /// sampling, against aiming (mirrors) or light vertices (other surfaces).
+    fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32], images: &mut [f32]) {
+        if h.surface.specular {
+            let Some(mirror) = self.mirrors.of(h.triangle) else {
+                return;
+            };
+            if step.aims > 0.0 {
+                let total = self.mirrors.weights(step.p, step.n, images);
+                for (spot, w) in weights.iter_mut().enumerate().filter(|(_, w)| **w > 0.0) {
+                    let image = self.mirrors.weight(mirror, spot, step.p, step.n);
+                    if image > 0.0 {
+                        let aimed = self.mirrors.pdf(mirror, spot, step.p, h.p);
+                        *w *= step.pdf / (step.pdf + step.aims * image / total * aimed);
+                    }
+                }
+            }
+            return;
+        }
+        if !self.lights {
+            return;
+        }
+        let back = step.p - h.p;
+        let b2 = back.dot(back);
+        let plain = step.pdf * h.n.dot(back).abs() / (b2 * b2.sqrt());
+        let strength = &self.emitters.columns.strength;
+        if h.surface.diffuse() {
+            // Both Lambertian: weight = strength · f · cos cos / d², and the light vertex' density is
+            // share(cos / π) · cos / d².
+            let light = pool::share(self.emitters, 1.0 / (PI * h.surface.strength));
+            for (w, &s) in weights.iter_mut().zip(strength) {
+                let weighed = *w * plain / (plain + light * *w / s);
+                *w = if s > 0.0 { weighed } else { *w };
+            }
+        }
+        for (i, w) in weights.iter_mut().enumerate() {
+            if *w > 0.0 && !(h.surface.diffuse() && strength[i] > 0.0) {
+                let e = &self.emitters.list[i];
+                let to = h.p - e.p;
+                let d2 = to.dot(to);
+                let dir = to / d2.sqrt();
+                let pdf = e.surface.pdf(e.n, e.back, dir);
+                let light = pool::share(self.emitters, pdf) * h.n.dot(dir).abs() / d2;
+                *w *= plain / (plain + light);
+            }
+        }
+    }
+
+    /// Looks for a spot's image in a planar mirror, `often` times on average (at most once). Returns that
+    /// number, 0 without mirrors, for MIS.
+    pub fn aim(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        often: f32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) -> f32 {
+        if self.mirrors.list.is_empty() {
+            return 0.0;
+        }
+        if often == 1.0 || rng.uniform() < often {
+            self.aim_once(rng, v, often, scratch, sink);
+        }
+        often
+    }
+
+    fn aim_once(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        often: f32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        let h = &v.hit;
+        let Some(aim) = self.mirrors.aim(h.p, h.n, rng, &mut scratch.images) else {
+            return;
+        };
+        if h.n.dot(aim.target - h.p) <= 0.0 {
+            return;
+        }
+        // From where the ray starts, not from `h.p`: it must meet the mirror where its density is known,
+        // and narrow lobes are no wider than the lift.
+        let from = lift(h.p, h.n);
+        let to = aim.target - from;
+        let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
+            return;
+        };
+        if self.mirrors.of(m.triangle) != Some(aim.mirror) || m.surface.strength == 0.0 {
+            return;
+        }
+        let leg = m.p - h.p;
+        let w = leg.normalized();
+        let e = &self.emitters.list[aim.spot];
+        let there = self
+            .emitters
+            .weight(aim.spot, m.p, m.n, -w, &m.surface.gloss());
+        let value = h.surface.scatter(h.n, v.wo, w) * there;
+        let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
+        let path = v.length_m + lengths + e.path_m;
+        let counts = value != 0.0 && self.window.is_none_or(|w| w.holds(path));
+        if !counts || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
+            return;
+        }
+        let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
+        let plain = h.surface.pdf(h.n, v.wo, w);
+        let value = v.beta * value / (aimed + plain);
+        sink.add(path, value, aim.spot, v.bounce + 2);
+    }
+
+    /// Connects a vertex that is not a near-mirror's to `count` light vertices of some kind, drawn by
+    /// unshadowed contribution.
+    pub fn light(
+        &self,
+        rng: &mut Rng,
+        v: &Vertex,
+        which: Lights,
+        count: u32,
+        scratch: &mut Scratch,
+        sink: &mut impl Sink,
+    ) {
+        let h = &v.hit;
+        let Scratch {
+            stack,
+            lights,
+            pool,
+            caustics,
+            ..
+        } = scratch;
+        let pool = match which {
+            Lights::Beyond => caustics,
+            _ => pool,
+        };
+        let wanted = match which {
+            Lights::All => self.lights,
+            Lights::Glossy => self.lights && pool.has_gloss(),
+            Lights::Beyond => self.caustics.is_some() && !pool.list.is_empty(),
+        };
+        if !wanted {
+            return;
+        }
+        if which == Lights::Glossy {
+            pool.glossy_weights(h, v.wo, lights);
+        } else {
+            pool.weights(h, v.wo, lights);
+        }
+        if let Some(window) = &self.window {
+            for (w, y) in lights.iter_mut().zip(&pool.list) {
+                let path = v.length_m + self.world.metres((y.hit.p - h.p).length()) + y.path_m;
+                *w = if window.holds(path) { *w } else { 0.0 };
+            }
+        }
+        draw(lights, count, rng.uniform(), |i, value| {
+            let y = &pool.list[i];
+            let (there, bounces) = (&y.hit, v.bounce + y.bounces);
+            if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
+                let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
+                sink.add(path, v.beta * value, y.spot, bounces);
+            }
+        });
+    }
+}
+
+/// Systematic sampling: draws `count` times in proportion to `weights`, from one random number, and
+/// calls `each` once for every entry drawn with its share of the sum. Unbiased for the sum.
+#[inline]
+fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
+    let total: f32 = weights.iter().sum();
+    // Beneath the least normal number a step could be 0.
+    if !(total > 1e-30 && total.is_finite()) {
+        return;
+    }
+    let step = total / count as f32;
+    let (mut sum, mut next) = (0.0, u * step);
+    for (i, &w) in weights.iter().enumerate() {
+        sum += w;
+        let mut times = 0;
+        while next < sum {
+            times += 1;
+            next += step;
+        }
+        if times > 0 {
+            each(i, times as f32 * step);
+        }
+    }
+}
