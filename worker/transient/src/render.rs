@@ -68,7 +68,7 @@ pub fn render(
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
-        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world, &emitters));
+        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world));
     let patches = narrow.then(|| Patches::new(&world, &emitters));
     let frame = Frame {
         walk: Walk {
