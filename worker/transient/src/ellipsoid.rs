@@ -170,8 +170,8 @@ impl Shells {
                 self.seen[k] += cos * side / (d2 + r * r);
             }
         }
-        for k in 0..count {
-            let more = SWELL * radius[k] + 0.125 * (self.far[k] - self.near[k]) + 1e-6;
+        for (k, &radius) in radius.iter().enumerate() {
+            let more = SWELL * radius + 0.125 * (self.far[k] - self.near[k]) + 1e-6;
             self.near[k] -= more;
             self.far[k] += more;
             if patches.one_sided[k] {
