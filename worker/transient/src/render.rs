@@ -104,7 +104,7 @@ fn run(
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
-        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world, &emitters));
+        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world));
     let patches = narrow.then(|| Patches::new(&world, &emitters));
     let mut walk = Walk {
         world: &world,
