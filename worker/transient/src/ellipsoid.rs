@@ -15,7 +15,6 @@ use picofarm_scene::Vec3;
 pub(crate) use self::patches::Patches;
 use crate::{
     api::Gate,
-    emitter::Emitters,
     rng::Rng,
     walk::Vertex,
     world::{Hit, World},
@@ -29,10 +28,16 @@ const SWELL: f32 = 1.2;
 /// Room for rounding in what is left out, as a share of the gate's end.
 const ROUNDING: f64 = 1e-5;
 
+/// Scene diagonals in a gate at most for ellipsoidal connections to pay, by error² × CPU time on furnished
+/// rooms with 1 and 25 spots: gains of 0.8 to 2.6 at 1/200 to 1/50, of 0.9 to 1.1 at 1/12 and losses beyond.
+const NARROW: f64 = 1.0 / 40.0;
+
 /// True where ellipsoidal connections pay.
-pub(crate) fn pays(gate: &Gate, world: &World, emitters: &Emitters) -> bool {
-    let _ = (world, emitters);
-    gate.bin_width_m * f64::from(gate.bins) < 1.0
+pub(crate) fn pays(gate: &Gate, world: &World) -> bool {
+    let all = || world.triangles.iter().flatten();
+    let low = all().fold(Vec3::ZERO, |a, &p| a.min(p));
+    let high = all().fold(Vec3::ZERO, |a, &p| a.max(p));
+    gate.bin_width_m * f64::from(gate.bins) < NARROW * world.metres((high - low).length())
 }
 
 /// A range of optical path, metres.
@@ -165,7 +170,7 @@ impl Shells {
                 self.seen[k] += cos * side / (d2 + r * r);
             }
         }
-        for (k, radius) in radius.iter().enumerate() {
+        for (k, &radius) in radius.iter().enumerate() {
             let more = SWELL * radius + 0.125 * (self.far[k] - self.near[k]) + 1e-6;
             self.near[k] -= more;
             self.far[k] += more;

@@ -39,7 +39,7 @@ pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: u
     }
 }
 
-/// Keeps what lies outside a narrow gate out of the pool: the slots before and after the gate take the
+/// Keeps what lies outside the gate out of the pool: the slots before and after the gate take the
 /// value of the bin next to them.
 pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
     for v in variance.chunks_mut(slots) {

@@ -164,7 +164,7 @@ impl Done {
     }
 
     /// Brings the variances up to the passes done.
-    fn estimate(&mut self, film: &Film, region: &Region, narrow: bool) {
+    fn estimate(&mut self, film: &Film, region: &Region) {
         let n = f64::from(self.passes);
         self.multi_variance.clear();
         for (sum, square) in self
@@ -177,9 +177,7 @@ impl Done {
                 both.map(|(&sum, &square)| mean(f64::from(sum), f64::from(square), n).1 as f32),
             );
         }
-        if narrow {
-            shut_out(&mut self.multi_variance, film.slots);
-        }
+        shut_out(&mut self.multi_variance, film.slots);
         for (out, v) in self
             .pixel_variance
             .iter_mut()
@@ -244,14 +242,13 @@ impl Bench {
         self.done.reset(frame.film, region.pixels(), frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
-        let narrow = frame.walk.window.is_some();
         while self.done.passes < order.count {
             if !go_on() {
                 return None;
             }
             self.pass(frame, region, order.first + self.done.passes);
         }
-        self.done.estimate(frame.film, region, narrow);
+        self.done.estimate(frame.film, region);
         self.done.rays = self.scratch.stack.rays - rays;
         Some(())
     }
@@ -307,9 +304,7 @@ impl Bench {
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
-        if walk.window.is_some() {
-            shut_out(&mut self.done.two_variance, film.slots);
-        }
+        shut_out(&mut self.done.two_variance, film.slots);
         let variances = self.done.two_variance.chunks(film.slots);
         for (out, v) in self.done.pixel_variance.iter_mut().zip(variances) {
             out.0 = inside(film, v);
