@@ -125,8 +125,9 @@ fn narrow_gates_show_the_same_light_as_the_whole_gate_with_less_noise() {
         let (on_, off_, whole_) = (of(&on, 0), of(&off, 0), of(&whole, at as usize));
         for (name, other) in [("off", &off_), ("whole gate", &whole_)] {
             let (rms, most) = apart(&on_, other);
+            // Of a single bin there are four sums, whose errors come from 16 runs.
             assert!(
-                rms < 1.8 && most < 5.0,
+                rms < if bins == 1 { 2.5 } else { 1.8 } && most < 5.0,
                 "{bins} bins, on against {name}: z rms {rms}, most {most}: {on_:?} {other:?}"
             );
         }

@@ -9,6 +9,9 @@ use crate::{emitter::Emitters, world::World};
 const COUNT: f32 = 3000.0;
 /// A triangle is halved at most this often.
 const HALVINGS: u32 = 24;
+/// Pieces from which triangles stay whole: long needles would make millions. Larger pieces are only drawn
+/// less well.
+const MOST: usize = 1 << 17;
 /// Cosine above which triangles of a patch count as lying in one plane.
 const FLAT: f32 = 0.98;
 
@@ -113,7 +116,7 @@ impl Patches {
         let length = |k: usize| (corners[(k + 1) % 3] - corners[k]).length();
         let edge = (1..3).fold(0, |a, k| if length(k) > length(a) { k } else { a });
         let next = (edge + 1) % 3;
-        if length(edge) <= size || left == 0 {
+        if length(edge) <= size || left == 0 || cut.len() >= MOST {
             cut.push(Piece {
                 triangle,
                 corners,
