@@ -8,7 +8,7 @@
 #   PICOFARM      the release binary [default: built here]
 #   RESOLUTION    width and height [64]
 #   TRUTH_ERROR   noise of the truth that both are measured against [3%]
-#   LADDER        picofarm's rungs [16,64,256,1024]
+#   LADDER        picofarm's rungs [2,8,32,128]
 #   OUT           folder for everything that is written; truths and measurements in it are used again [new folder]
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -40,7 +40,7 @@ for scene in "$@"; do
   [ -f "$out/$name.mitransient.json" ] || "$here/mitransient.sh" "$scene" --resolution "$resolution" \
     --truth "$out/$name.truth" --out "$out/$name.mitransient.json"
   "$PICOFARM" bench render "$scene" --resolution "$resolution" --truth "$out/$name.truth" \
-    --ladder "${LADDER:-16,64,256,1024}" --peer "$out/$name.mitransient.json" --plot "$out/$name.png"
+    --ladder "${LADDER:-2,8,32,128}" --peer "$out/$name.mitransient.json" --plot "$out/$name.png"
   echo
 done
 echo "files: $out"
