@@ -144,7 +144,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
             || Bench::new(frame),
             |bench, region| {
                 bench
-                    .render(frame, &region, &order, &|| true)
+                    .render(frame, &region, &order, &|_| true)
                     .expect("nobody stops it");
                 let stats = (0..region.pixels()).map(|k| stat(&bench.done, frame.film, k));
                 (stats.collect(), bench.done.rays)

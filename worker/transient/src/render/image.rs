@@ -73,13 +73,13 @@ impl<'a> Watch<'a> {
 
     /// False to stop.
     pub fn go_on(&self) -> bool {
-        self.ask(1)
+        self.ask(1, 0.0)
     }
 
     /// False to stop. Asked often, since a tile of many passes takes long.
-    fn ask(&self, count: usize) -> bool {
+    fn ask(&self, count: usize, share: f32) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);
-        let at = self.from + (self.to - self.from) * done as f32 / count as f32;
+        let at = self.from + (self.to - self.from) * (done as f32 + share) / count as f32;
         if !self.progress.at(at.min(1.0)) {
             self.stopped.store(true, Ordering::Relaxed);
         }
@@ -181,7 +181,7 @@ impl Image {
                         first: spent[t],
                         count: waves[t],
                     };
-                    bench.render(frame, &tiles[t], &order, &|| watch.ask(count))?;
+                    bench.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
                     let mut image = image.lock().unwrap_or_else(|e| e.into_inner());
                     image.join(frame, t, &bench.done);
                     drop(image);

@@ -230,20 +230,21 @@ impl Bench {
         }
     }
 
-    /// Renders a region into `done`; `None` when `go_on` says to stop.
+    /// Renders a region into `done`; `None` when `go_on`, told the share done, says
+    /// to stop.
     pub fn render(
         &mut self,
         frame: &Frame,
         region: &Region,
         order: &Order,
-        go_on: &dyn Fn() -> bool,
+        go_on: &dyn Fn(f32) -> bool,
     ) -> Option<()> {
         let rays = self.scratch.stack.rays;
         self.done.reset(frame.film, region.pixels(), frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
         while self.done.passes < order.count {
-            if !go_on() {
+            if !go_on(self.done.passes as f32 / order.count as f32) {
                 return None;
             }
             self.pass(frame, region, order.first + self.done.passes);
@@ -259,7 +260,7 @@ impl Bench {
         frame: &Frame,
         region: &Region,
         order: &Order,
-        go_on: &dyn Fn() -> bool,
+        go_on: &dyn Fn(f32) -> bool,
     ) -> Option<()> {
         let (walk, film) = (&frame.walk, frame.film);
         if walk.max_bounces < 2 || walk.emitters.list.is_empty() {
@@ -267,7 +268,7 @@ impl Bench {
         }
         let (coarse, fine) = frame.sampling.sides(order.count);
         for k in 0..region.pixels() {
-            if !go_on() {
+            if !go_on(0.0) {
                 return None;
             }
             let row = region.row + k as u32 / region.cols;
