@@ -113,4 +113,4 @@ impl Job {
 }
 
 /// Paths a pixel for one to two seconds a scene.
-const SLOW: u32 = 2048;
+const SLOW: u32 = 768;
