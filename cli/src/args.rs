@@ -106,7 +106,7 @@ pub struct Demo {
     #[arg(long)]
     pub workers: Option<usize>,
     /// Camera paths per pixel for three bounces and more
-    #[arg(long, default_value_t = 32)]
+    #[arg(long, default_value_t = 12)]
     pub samples: u32,
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
