@@ -4,10 +4,8 @@ mod common;
 
 use std::sync::Arc;
 
-use common::{Quiet, energy, grey, quad, room, scene, settings, sphere, v};
-use picofarm_scene::{
-    Beam, Bsdf, Distribution, Intrinsics, Material, Mesh, Object, Scene, Spot, Vec3,
-};
+use common::{Quiet, beam_to, energy, grey, quad, room, scene, settings, sphere, v};
+use picofarm_scene::{Beam, Bsdf, Distribution, Intrinsics, Material, Mesh, Object, Scene};
 use picofarm_transient::{Budget, Rendered, Settings, Strategy, render, trace_spots};
 
 const BINS: usize = 637;
@@ -20,21 +18,6 @@ fn with(caustics: Option<bool>, passes: u32, seed: u64) -> Settings {
             ..Strategy::default()
         },
         ..settings(Budget::Samples(passes))
-    }
-}
-
-/// A beam whose spot is where it is said to be, on the given object.
-fn beam(point: Vec3, normal: Vec3, object: u32) -> Beam {
-    Beam {
-        direction: point.normalized(),
-        spot: Some(Spot {
-            point,
-            normal,
-            arriving: point.normalized(),
-            path_m: point.length(),
-            object,
-            material: 0,
-        }),
     }
 }
 
@@ -250,8 +233,8 @@ fn stage(extra: Object) -> Scene {
     let mut s = scene(vec![screen, plate, extra], 8, &[]);
     s.camera.intrinsics = Intrinsics::from_fov(40.0, 8, 8);
     s.laser.beams = vec![
-        beam(v(-1.5, 0.2, -0.5), v(1.0, 0.0, 0.0), 1),
-        beam(v(-1.5, -0.3, -0.9), v(1.0, 0.0, 0.0), 1),
+        beam_to(v(-1.5, 0.2, -0.5), v(1.0, 0.0, 0.0), 1),
+        beam_to(v(-1.5, -0.3, -0.9), v(1.0, 0.0, 0.0), 1),
     ];
     s
 }

@@ -6,23 +6,12 @@ mod common;
 use std::f64::consts::PI;
 
 use common::{
-    beam_to,
+    beam_to, black,
     brute::{Brute, Noise, two_by_quadrature},
-    energy, framed, grey, multi_energy, near, object, ok, quad, room, scene, settings, v,
+    energy, framed, grey, multi_energy, near, object, ok, quad, room, scene, settings, two_only, v,
 };
-use picofarm_scene::{Intrinsics, Material, Object, Scene, Vec3};
+use picofarm_scene::{Intrinsics, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Settings, trace_spots};
-
-fn two_only() -> Settings {
-    Settings {
-        max_bounces: Some(2),
-        ..settings(Budget::Samples(64))
-    }
-}
-
-fn black() -> Material {
-    grey(0.0)
-}
 
 /// Pixel sums within `each`, the image's within `whole`, bins by relative rms within `rms`.
 #[track_caller]

@@ -3,22 +3,11 @@
 mod common;
 
 use common::{
-    beam_to, brute::two_by_quadrature, energy, framed, grey, near, object, ok, quad, room, scene,
-    settings, sphere, v,
+    beam_to, black, brute::two_by_quadrature, energy, framed, grey, near, object, ok, quad, room,
+    scene, settings, sphere, two_only, v,
 };
 use picofarm_scene::{Affine, Material, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Settings, trace_spots};
-
-fn two_only() -> Settings {
-    Settings {
-        max_bounces: Some(2),
-        ..settings(Budget::Samples(64))
-    }
-}
-
-fn black() -> Material {
-    grey(0.0)
-}
 
 /// A prism of `sides` sides about a segment, without caps.
 fn rod(a: Vec3, b: Vec3, radius: f32, sides: u32, m: Material) -> Object {

@@ -11,6 +11,18 @@ use crate::{
 };
 
 impl Sharing {
+    /// Optical path to the nearest gather point, metres: where arrivals' lengths are counted from.
+    fn nearest_m(&self) -> f64 {
+        let lengths = self.gathers.iter().map(|(v, _)| v.length_m);
+        lengths.fold(f64::INFINITY, f64::min)
+    }
+
+    /// Fewest bounces up to a gather point.
+    fn lowest(&self) -> u32 {
+        let bounces = self.gathers.iter().map(|(v, _)| v.bounce);
+        bounces.min().unwrap_or(1)
+    }
+
     /// Finds what arrives at every shared vertex: from all spots directly, from beyond by walks.
     pub(super) fn light_up(
         &mut self,
@@ -21,12 +33,8 @@ impl Sharing {
     ) {
         let emitters = walk.emitters;
         let per_metre = 1.0 / film.gate.bin_width_m;
-        let nearest = self
-            .gathers
-            .iter()
-            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
-        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
-        let bounce = lowest.unwrap_or(1) + 1;
+        let nearest = self.nearest_m();
+        let bounce = self.lowest() + 1;
         let share = drawn as f32 / emitters.list.len() as f32;
         for y in &mut self.shared {
             y.first = self.arrivals.bins.len();
@@ -129,10 +137,7 @@ impl Sharing {
         self.weight.resize(count * self.shared.len(), 0.0);
         self.offset.resize(count * self.shared.len(), 0.0);
         let per_metre = 1.0 / film.gate.bin_width_m;
-        let nearest = self
-            .gathers
-            .iter()
-            .fold(f64::INFINITY, |a, (v, _)| a.min(v.length_m));
+        let nearest = self.nearest_m();
         let share = drawn as f32 / count as f32;
         let rows = self
             .weight
@@ -204,8 +209,7 @@ impl Sharing {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
-        let lowest = self.gathers.iter().map(|(v, _)| v.bounce).min();
-        let lowest = lowest.unwrap_or(1);
+        let lowest = self.lowest();
         let bounded = walk.max_bounces < u32::MAX;
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];

@@ -163,6 +163,19 @@ pub fn energy(h: &[f32]) -> f64 {
     h.iter().map(|&x| f64::from(x)).sum()
 }
 
+/// Two bounces only.
+pub fn two_only() -> Settings {
+    Settings {
+        max_bounces: Some(2),
+        ..settings(Budget::Samples(64))
+    }
+}
+
+/// A Lambertian that scatters nothing.
+pub fn black() -> Material {
+    grey(0.0)
+}
+
 /// A beam that ends on a stated spot, with the laser at the origin.
 pub fn beam_to(point: Vec3, normal: Vec3, object: u32) -> Beam {
     Beam {
