@@ -38,7 +38,9 @@ pub struct CoordinatorConfig {
     pub lease_ms: u32,
     /// How often workers report, milliseconds (default a sixth of a lease).
     pub heartbeat_ms: u32,
-    /// How often leases are looked through for expiry (default 1 s).
+    /// How long a worker whose connection broke may take to come back, milliseconds (default 1,500).
+    pub reconnect_ms: u32,
+    /// How often leases are looked through for expiry (default 250 ms).
     pub tick: Duration,
     /// Waiting times after failures.
     pub backoff: Backoff,
@@ -54,7 +56,8 @@ impl CoordinatorConfig {
             listen,
             lease_ms: 60_000,
             heartbeat_ms: 10_000,
-            tick: Duration::from_secs(1),
+            reconnect_ms: 1_500,
+            tick: Duration::from_millis(250),
             backoff: Backoff::default(),
             clock: Clock::system(),
         }
@@ -148,6 +151,7 @@ pub async fn serve(
         catalog: Arc::clone(&catalog),
         settings: Settings {
             lease_ms: config.lease_ms,
+            reconnect_ms: config.reconnect_ms,
             backoff: config.backoff,
         },
         tick: config.tick,
