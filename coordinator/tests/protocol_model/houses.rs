@@ -31,7 +31,9 @@ impl Protocol {
                 let mut range = s.houses[at].memory?;
                 let tasks = self.tasks().without(range.done);
                 let pending = range.lease.is_none() && !tasks.is_empty();
-                (pending && range.epoch < self.bounds.epochs).then_some(())?;
+                // The workers are alike: the first lease is worker 0's.
+                let first = range.epoch > 0 || worker == 0;
+                (pending && first && range.epoch < self.bounds.epochs).then_some(())?;
                 self.begin_on_range(s, me)?;
                 let to = s.worker(worker);
                 range.epoch += 1;
@@ -71,7 +73,9 @@ impl Protocol {
                 }
                 self.write(s, at, range);
             }
-            HouseStep::Adopt(Message::Hello { epoch, from }) => {
+            HouseStep::Adopt(worker) => {
+                let epoch = s.workers[usize::from(worker)].desk?.epoch;
+                let from = s.worker(worker);
                 let row = s.database.range;
                 let held = row.epoch == epoch && row.lease == Some(from);
                 (held || !self.rules.lease_adoption_is_conditional).then_some(())?;
@@ -83,17 +87,16 @@ impl Protocol {
                     done: row.done,
                 });
             }
-            HouseStep::Commit(_) | HouseStep::Adopt(_) => return None,
+            HouseStep::Commit(_) => return None,
             HouseStep::TakeOver(other) => {
                 let expired = s.database.houses.get(&other)? == &HouseRow::Expired;
-                (other != me && (expired || !self.rules.takeover_waits_for_expiry))
-                    .then_some(())?;
+                (other != me && (expired || !self.rules.takeover_waits_for_expiry)).then_some(())?;
                 self.begin(s, me)?;
                 s.database.houses.remove(&other);
-                if s.database.owner == Owner::House(other) {
-                    s.history.robbed |= !expired && s.runs(other);
-                    self.own(s, me);
-                }
+                // A row that owns nothing may lie there for ever.
+                (s.database.owner == Owner::House(other)).then_some(())?;
+                s.history.robbed |= !expired && s.runs(other);
+                self.own(s, me);
             }
             HouseStep::TakeOverCollector => {
                 let held = s.database.owner == Owner::Collector;
@@ -114,7 +117,7 @@ impl Protocol {
                 }
             }
             HouseStep::Restart => {
-                (s.faults.house_kills < self.bounds.house_kills).then_some(())?;
+                (process == 0 && s.faults.house_kills < self.bounds.house_kills).then_some(())?;
                 s.faults.house_kills += 1;
                 s.houses[at].memory = None;
                 self.open(s, process);

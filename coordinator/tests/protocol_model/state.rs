@@ -112,8 +112,6 @@ pub enum Message {
     },
     /// A finished task.
     Done { epoch: u8, from: WorkerId, task: u8 },
-    /// A worker connects and names the lease it holds.
-    Hello { epoch: u8, from: WorkerId },
 }
 
 /// How far a worker is with the task in hand.

@@ -25,7 +25,10 @@ impl Protocol {
             return Some(());
         }
         if step == WorkerStep::Restart {
-            (!holds_last && s.faults.worker_kills < self.bounds.worker_kills).then_some(())?;
+            // A worker that was never given a lease has nothing to lose.
+            let idle = s.database.range.epoch == 0;
+            let within = s.faults.worker_kills < self.bounds.worker_kills;
+            (!holds_last && !idle && within).then_some(())?;
             s.faults.worker_kills += 1;
             s.workers[at].incarnation += 1;
             s.workers[at].desk = None;
@@ -76,9 +79,6 @@ impl Protocol {
                     from: me,
                     task,
                 });
-            }
-            WorkerStep::Hello => {
-                s.network.insert(Message::Hello { epoch, from: me });
             }
             WorkerStep::Forget => {
                 (!holds_last || epoch < self.bounds.epochs).then_some(())?;
