@@ -40,7 +40,7 @@ fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage 
     let mut stage = Stage::default();
     for range in expand(stage_ref(), total, &existing, ids) {
         if matches!(range.state, RangeState::Pending { .. }) {
-            stage.receive(range);
+            stage.receive(range, &mut Changes::default());
         }
     }
     stage

@@ -22,8 +22,45 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Takes a range in hand that is this house's in the catalog.
-    pub fn receive(&mut self, range: Range) {
+    /// Takes a range in hand that is this house's in the catalog; a pending one joins its neighbours.
+    pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {
+        if self.join(&mut range, changes) {
+            changes.put(range.clone());
+        }
+        self.hold(range);
+    }
+
+    /// Makes a pending range one with its neighbours in hand, if there are any.
+    fn join(&mut self, range: &mut Range, changes: &mut Changes) -> bool {
+        if !(range.merges() && matches!(range.state, RangeState::Pending { .. })) {
+            return false;
+        }
+        let before = self
+            .pending
+            .range(..range.lo)
+            .next_back()
+            .map(|(_, b)| b)
+            .filter(|b| b.hi == range.lo && b.merges())
+            .cloned();
+        let after = self
+            .pending
+            .get(&range.hi)
+            .filter(|a| a.merges())
+            .cloned();
+        let neighbours = before.into_iter().chain(after);
+        let mut joined = false;
+        for neighbour in neighbours {
+            self.remove(&neighbour);
+            changes.remove(neighbour.id);
+            range.lo = range.lo.min(neighbour.lo);
+            range.hi = range.hi.max(neighbour.hi);
+            range.epoch = range.epoch.max(neighbour.epoch);
+            joined = true;
+        }
+        joined
+    }
+
+    fn hold(&mut self, range: Range) {
         self.count(&range, |n, by| *n += by);
         match range.state {
             RangeState::Leased(_) => {
@@ -162,33 +199,12 @@ impl Stage {
     }
 
     fn insert(&mut self, mut range: Range, changes: &mut Changes) {
-        match range.state {
-            RangeState::Done { .. } | RangeState::Dead => return changes.give(range),
-            RangeState::Leased(_) => {}
-            RangeState::Pending { .. } => {
-                let before = self
-                    .pending
-                    .range(..range.lo)
-                    .next_back()
-                    .map(|(_, b)| b)
-                    .filter(|b| b.hi == range.lo && b.merges() && range.merges())
-                    .cloned();
-                let after = self
-                    .pending
-                    .get(&range.hi)
-                    .filter(|a| range.merges() && a.merges())
-                    .cloned();
-                for neighbour in [before, after].into_iter().flatten() {
-                    self.remove(&neighbour);
-                    changes.remove(neighbour.id);
-                    range.lo = range.lo.min(neighbour.lo);
-                    range.hi = range.hi.max(neighbour.hi);
-                    range.epoch = range.epoch.max(neighbour.epoch);
-                }
-            }
+        if let RangeState::Done { .. } | RangeState::Dead = range.state {
+            return changes.give(range);
         }
+        self.join(&mut range, changes);
         changes.put(range.clone());
-        self.receive(range);
+        self.hold(range);
     }
 
     fn count(&mut self, range: &Range, change: impl FnOnce(&mut u64, u64)) {

@@ -109,7 +109,7 @@ impl Core {
                     if matches!(range.state, RangeState::Leased(_)) {
                         self.leases.insert(id, range.stage);
                     }
-                    entry.stage.receive(range);
+                    entry.stage.receive(range, &mut self.changes);
                     self.renew(id, now_ms);
                 }
                 // Of a job that is no longer active: it goes back as it would have when the job ended.
