@@ -24,6 +24,8 @@ pub struct Stage {
 impl Stage {
     /// Takes a range in hand that is this house's in the catalog; a pending one joins its neighbours.
     pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {
+        // One that was another house's for a while is not what it was here.
+        self.forget(range.id);
         if self.join(&mut range, changes) {
             changes.put(range.clone());
         }
