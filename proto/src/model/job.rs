@@ -284,12 +284,13 @@ fn place(field: &str, text: &str) -> Result<(), SpecError> {
     if text.contains('\0') {
         return fail("holds a zero byte");
     }
-    let path = text.split_once("://").map_or(text, |(_, path)| path);
-    let climbs = |part: &str| {
-        let part = part.to_ascii_lowercase().replace("%2e", ".");
-        part == ".."
-    };
-    if path.split(['/', '\\']).any(climbs) {
+    // What a URL's percent signs stand for counts too.
+    let plain = text
+        .to_ascii_lowercase()
+        .replace("%2e", ".")
+        .replace("%2f", "/")
+        .replace("%5c", "\\");
+    if plain.split(['/', '\\']).any(|part| part == "..") {
         return fail("has a part `..`; name the place itself");
     }
     if !text.contains("://") && !text.starts_with('/') {
