@@ -1,11 +1,13 @@
 //! The command line: one definition feeds the parser, the help, and the completions.
 
+mod guard;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+pub use guard::{Guard, Token};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
@@ -24,7 +26,7 @@ Exit codes:
   1    something failed that is not listed here
   2    wrong arguments
   3    bad input: a job file, scene file, setting or scene that cannot be used
-  4    the coordinator cannot be reached, or refused (another version)
+  4    the coordinator cannot be reached, or refused (another version, no access)
   5    the job ended with dead tasks, or was cancelled
   6    a data set is damaged or incomplete
   7    a resource is taken or missing: port in use, disk full, store read-only
@@ -44,6 +46,18 @@ pub struct Global {
     /// Folder with furniture assets [env: PICOFARM_ASSETS]
     #[arg(long, global = true, value_name = "DIR")]
     pub assets_dir: Option<PathBuf>,
+    /// Certificate authority of the coordinator, PEM [default: those of the system] [env: PICOFARM_CA]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
+    /// Own certificate for coordinators that want one, PEM [env: PICOFARM_CERT]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub cert: Option<PathBuf>,
+    /// Private key of --cert, PEM [env: PICOFARM_KEY]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub key: Option<PathBuf>,
+    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env: PICOFARM_TOKEN_FILE]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
     /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
     #[arg(long, global = true, value_name = "FILTER")]
     pub log: Option<String>,
@@ -68,6 +82,9 @@ pub enum Command {
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),
+    /// Say who may use a coordinator
+    #[command(subcommand)]
+    Token(Token),
     /// Furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),
@@ -124,6 +141,8 @@ pub struct Up {
     /// Workers to start; they share the cores [default: 1]
     #[arg(long, default_value_t = 1)]
     pub workers: usize,
+    #[command(flatten)]
+    pub guard: Guard,
 }
 
 #[derive(Args)]
@@ -141,9 +160,8 @@ pub struct Coordinator {
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub lease_s: f64,
-    /// Listen beyond loopback although there is no authentication yet
-    #[arg(long)]
-    pub allow_insecure: bool,
+    #[command(flatten)]
+    pub guard: Guard,
 }
 
 #[derive(Args)]
@@ -154,6 +172,9 @@ pub struct Worker {
     /// Threads to render with [default: all cores]
     #[arg(long)]
     pub threads: Option<usize>,
+    /// Touch only what lies in this path or URL (give it again for more) [default: anything]
+    #[arg(long, value_name = "URL")]
+    pub store_prefix: Vec<String>,
 }
 
 #[derive(Subcommand)]

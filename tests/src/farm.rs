@@ -56,6 +56,7 @@ impl Farm {
         let lease = self.lease_s.to_string();
         let args = [
             "coordinator",
+            "--allow-insecure",
             "--json",
             "--log",
             "info",
