@@ -2,19 +2,17 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::BTreeSet,
-    sync::Mutex,
+    collections::BTreeMap,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
+use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
     probe,
 };
-use picofarm_proto::{
-    key::TaskKey,
-    model::{JobSpec, OutputSettings},
-};
+use picofarm_proto::{key::TaskKey, model::JobSpec};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::warn;
@@ -22,11 +20,17 @@ use tracing::warn;
 use super::{Control, TaskError};
 use crate::session::backoff::{Backoff, random};
 
+/// A store and the prefix in it.
+type Place = (Arc<dyn ObjectStore>, Path);
+
+/// How often a task that waits for its store is asked whether it shall stop.
+const STOP_LOOK: Duration = Duration::from_millis(50);
+
 /// Stores, reached from the executor's own thread.
 pub(super) struct Stores {
     runtime: Handle,
-    /// Locations that passed the probe.
-    probed: Mutex<BTreeSet<String>>,
+    /// Opened stores that passed the probe, by location: their connections are kept from task to task.
+    probed: Mutex<BTreeMap<String, Place>>,
     /// How long a rendered scene is held for a store that does not take it.
     patience: Duration,
 }
@@ -41,34 +45,42 @@ impl Stores {
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
-    pub(super) fn open(&self, spec: &JobSpec) -> Result<Dataset, TaskError> {
-        let OutputSettings {
-            store: location,
-            dataset,
-            ..
-        } = &spec.output;
-        let (store, prefix) = open_store(location).map_err(of_dataset)?;
-        let probed = |s: &Self| {
-            s.probed
-                .lock()
-                .expect("no panic while locked")
-                .contains(location)
-        };
-        if !probed(self) {
-            self.runtime
-                .block_on(probe(&*store, &prefix))
-                .map_err(of_dataset)?;
-            let mut probed = self.probed.lock().expect("no panic while locked");
-            probed.insert(location.clone());
-        }
+    pub(super) fn open(&self, spec: &JobSpec, control: &Control) -> Result<Dataset, TaskError> {
+        let (store, prefix) = self.probed(&spec.output.store, control)?;
+        let prefix = prefix.join(spec.output.dataset.as_str());
         let spec = dataset_spec(spec)?;
-        self.runtime
-            .block_on(Dataset::create_or_open(
-                store,
-                prefix.join(dataset.as_str()),
-                &spec,
-            ))
-            .map_err(of_dataset)
+        self.wait(control, Dataset::create_or_open(store, prefix, &spec))
+    }
+
+    fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let known = || self.probed.lock().expect("no panic while locked");
+        if let Some(place) = known().get(location) {
+            return Ok(place.clone());
+        }
+        let (store, prefix) = open_store(location).map_err(of_dataset)?;
+        self.wait(control, probe(&*store, &prefix))?;
+        known().insert(location.to_owned(), (store.clone(), prefix.clone()));
+        Ok((store, prefix))
+    }
+
+    /// Waits for the store, unless the task shall stop: a server that is away may take minutes to be given up.
+    fn wait<T>(
+        &self,
+        control: &Control,
+        request: impl Future<Output = Result<T, DatasetError>>,
+    ) -> Result<T, TaskError> {
+        let stopped = async {
+            while !control.stopped() {
+                tokio::time::sleep(STOP_LOOK).await;
+            }
+        };
+        self.runtime.block_on(async {
+            tokio::select! {
+                biased;
+                result = request => result.map_err(of_dataset),
+                () = stopped => Err(TaskError::Stopped),
+            }
+        })
     }
 
     /// The manifest of scene `index` if this very task has published it.
@@ -77,15 +89,19 @@ impl Stores {
         dataset: &Dataset,
         index: u64,
         key: &TaskKey,
+        control: &Control,
     ) -> Result<Option<Manifest>, TaskError> {
-        let manifest = match self.runtime.block_on(dataset.published(index)) {
-            Ok(None) => return Ok(None),
-            Ok(Some(manifest)) => manifest,
-            Err(error @ DatasetError::Damaged { .. }) => {
-                warn!(%error, task = index, "a published scene is damaged; it is rendered again to mend it");
-                return Ok(None);
+        let looked = async {
+            match dataset.published(index).await {
+                Err(error @ DatasetError::Damaged { .. }) => {
+                    warn!(%error, task = index, "a published scene is damaged; it is rendered again to mend it");
+                    Ok(None)
+                }
+                other => other,
             }
-            Err(error) => return Err(of_dataset(error)),
+        };
+        let Some(manifest) = self.wait(control, looked)? else {
+            return Ok(None);
         };
         if manifest.provenance.task_key != key.to_string() {
             return Err(TaskError::User(format!(
@@ -109,12 +125,9 @@ impl Stores {
         let until = Instant::now() + self.patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {
-            let error = match self
-                .runtime
-                .block_on(dataset.publish_encoded(scene.clone()))
-            {
+            let error = match self.wait(control, dataset.publish_encoded(scene.clone())) {
                 Ok(manifest) => return Ok(manifest),
-                Err(error) => of_dataset(error),
+                Err(error) => error,
             };
             if !matches!(error, TaskError::Interrupted(_)) || Instant::now() >= until {
                 return Err(error);
@@ -165,7 +178,10 @@ pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
 pub(super) fn of_dataset(error: DatasetError) -> TaskError {
     let text = error.to_string();
     match error {
-        DatasetError::Store { .. } | DatasetError::Io { .. } => TaskError::Interrupted(text),
+        // Of the settings, the worker's environment is to blame: another one may have them.
+        DatasetError::Store { .. }
+        | DatasetError::StoreSettings { .. }
+        | DatasetError::Io { .. } => TaskError::Interrupted(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }
