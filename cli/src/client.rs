@@ -39,7 +39,13 @@ fn refused(status: &Status) -> CliError {
         | Grpc::PermissionDenied => Code::Coordinator,
         _ => Code::Failed,
     };
-    CliError::new(code, status.message())
+    CliError {
+        denied: matches!(
+            status.code(),
+            Grpc::Unauthenticated | Grpc::PermissionDenied
+        ),
+        ..CliError::new(code, status.message())
+    }
 }
 
 fn unreadable(e: ConvertError) -> CliError {

@@ -190,7 +190,10 @@ pub enum Trouble {
 
 impl Target {
     /// What went wrong with a connection or a call, as far as it can be told.
-    pub async fn trouble(&self, error: &(dyn std::error::Error + 'static)) -> Trouble {
+    pub async fn trouble(
+        &self,
+        error: &(dyn std::error::Error + Send + Sync + 'static),
+    ) -> Trouble {
         if let Some(text) = self.tls_trouble(error) {
             return Trouble::Mismatch(text);
         }
