@@ -379,7 +379,12 @@ pub enum Bench {
 #[derive(Args)]
 pub struct BenchQueue {
     /// The catalog: a SQLite file or the URL of a Postgres database [default: a new SQLite file that is removed after]
-    #[arg(long, value_name = "FILE|URL", env = "PICOFARM_CATALOG", hide_env_values = true)]
+    #[arg(
+        long,
+        value_name = "FILE|URL",
+        env = "PICOFARM_CATALOG",
+        hide_env_values = true
+    )]
     pub catalog: Option<CatalogPlace>,
     /// Simulated workers of the no-op tasks
     #[arg(long, default_value_t = 8)]
@@ -388,7 +393,12 @@ pub struct BenchQueue {
     #[arg(long, default_value_t = 200_000)]
     pub tasks: u64,
     /// Sizes of jobs to submit
-    #[arg(long, value_delimiter = ',', value_name = "N,…", default_value = "97432,1000000")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "N,…",
+        default_value = "97432,1000000"
+    )]
     pub submit: Vec<u64>,
     /// Sizes of fleets to simulate with tasks of a fixed length, e.g. 10,100,1000,4000
     #[arg(long, value_delimiter = ',', value_name = "N,…")]

@@ -197,8 +197,13 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     }
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
-    let coordinator =
-        Coordinator::start(args.catalog.clone(), args.listen, lease, Guarded::of(&args.guard)).await?;
+    let coordinator = Coordinator::start(
+        args.catalog.clone(),
+        args.listen,
+        lease,
+        Guarded::of(&args.guard),
+    )
+    .await?;
     let url = coordinator.url();
     output.result(
         &json!({"coordinator": url, "catalog": args.catalog.to_string()}),

@@ -14,7 +14,8 @@ use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     key::spec_hash,
     model::{
-        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress, WorkerHello,
+        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress,
+        WorkerHello,
     },
 };
 use tokio::{
@@ -26,7 +27,9 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, OutputHint, Prepared, Say, SessionId, Settings, Timings, place_is_free, stands_for},
+    core::{
+        Core, OutputHint, Prepared, Say, SessionId, Settings, Timings, place_is_free, stands_for,
+    },
     plan,
 };
 
@@ -424,7 +427,9 @@ impl Life<'_> {
             // Another coordinator was first.
             return Ok(match catalog.job_with(&job.spec_hash).await? {
                 Some(first) => return existed(first.id, plan),
-                None => Err(Refusal::NotNow("the same job is being submitted by someone else; try again".into())),
+                None => Err(Refusal::NotNow(
+                    "the same job is being submitted by someone else; try again".into(),
+                )),
             });
         }
         // A job without anything to run has ended by now.

@@ -489,7 +489,8 @@ async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
     for event in events {
         jobs.push(desk.job(event.job).await?);
     }
-    let text = |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
+    let text =
+        |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
     sqlx::query(
         "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message) \
          SELECT * FROM UNNEST($1::BIGINT[], $2::BIGINT[], $3::BIGINT[], $4::BIGINT[], $5::BIGINT[], $6::TEXT[], \

@@ -107,7 +107,9 @@ impl Keys {
 }
 
 /// The ranges in this house's hands.
-pub(super) async fn owned(c: &mut SqliteConnection) -> std::result::Result<Vec<Range>, sqlx::Error> {
+pub(super) async fn owned(
+    c: &mut SqliteConnection,
+) -> std::result::Result<Vec<Range>, sqlx::Error> {
     let rows = sqlx::query(
         "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
          JOIN job ON job.key = stage.job WHERE owner IS NOT NULL ORDER BY task_range.stage, lo",
@@ -312,7 +314,11 @@ async fn give(c: &mut SqliteConnection, key: i64, range: &Range) -> Result<()> {
     insert_ranges(c, &[(key, &range)], false).await
 }
 
-async fn insert_outputs(c: &mut SqliteConnection, keys: &mut Keys, outputs: &[Output]) -> Result<()> {
+async fn insert_outputs(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    outputs: &[Output],
+) -> Result<()> {
     for chunk in outputs.chunks(ROWS) {
         let mut sets = Vec::with_capacity(chunk.len());
         for output in chunk {
@@ -358,13 +364,20 @@ pub(super) async fn manifests(
         .bind(i64::from(stage.stage))
         .fetch_optional(&mut *c)
         .await?;
-        let manifest = manifest.map(|m| m.try_into().map_err(|_| sql::bad("manifest", "not 32 bytes long")));
+        let manifest = manifest.map(|m| {
+            m.try_into()
+                .map_err(|_| sql::bad("manifest", "not 32 bytes long"))
+        });
         found.push(manifest.transpose()?);
     }
     Ok(found)
 }
 
-async fn insert_events(c: &mut SqliteConnection, keys: &mut Keys, events: &[NewEvent]) -> Result<()> {
+async fn insert_events(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    events: &[NewEvent],
+) -> Result<()> {
     for chunk in events.chunks(ROWS) {
         let mut jobs = Vec::with_capacity(chunk.len());
         for event in chunk {
