@@ -5,7 +5,9 @@
 //! task, so whoever runs a task again writes the same bytes.
 
 mod codec;
+mod counts;
 mod dataset;
+mod derive;
 mod encode;
 mod error;
 mod layout;
@@ -18,11 +20,13 @@ mod render_group;
 mod render_read;
 mod shard;
 mod spec;
+mod splits;
 mod squareroot;
 mod store;
 mod verify;
 
 pub use dataset::Dataset;
+pub use derive::SceneTruth;
 pub use encode::EncodedScene;
 pub use error::DatasetError;
 pub use layout::{INNER_SIDE, Quantity};
