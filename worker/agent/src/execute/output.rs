@@ -11,10 +11,7 @@ use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
     probe,
 };
-use picofarm_proto::{
-    key::TaskKey,
-    model::{JobSpec, OutputSettings},
-};
+use picofarm_proto::{key::TaskKey, model::JobSpec};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::warn;
@@ -42,11 +39,17 @@ impl Stores {
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
     pub(super) fn open(&self, spec: &JobSpec) -> Result<Dataset, TaskError> {
-        let OutputSettings {
-            store: location,
-            dataset,
-            ..
-        } = &spec.output;
+        let place = &spec.output;
+        self.create_or_open(&place.store, &place.dataset, &dataset_spec(spec)?)
+    }
+
+    /// Creates or opens a data set to write to. The first use of a location proves that its store is safe.
+    pub(super) fn create_or_open(
+        &self,
+        location: &str,
+        dataset: &str,
+        spec: &DatasetSpec,
+    ) -> Result<Dataset, TaskError> {
         let (store, prefix) = open_store(location).map_err(of_dataset)?;
         let probed = |s: &Self| {
             s.probed
@@ -59,16 +62,31 @@ impl Stores {
                 .block_on(probe(&*store, &prefix))
                 .map_err(of_dataset)?;
             let mut probed = self.probed.lock().expect("no panic while locked");
-            probed.insert(location.clone());
+            probed.insert(location.to_owned());
         }
-        let spec = dataset_spec(spec)?;
-        self.runtime
-            .block_on(Dataset::create_or_open(
-                store,
-                prefix.join(dataset.as_str()),
-                &spec,
-            ))
-            .map_err(of_dataset)
+        self.wait(Dataset::create_or_open(store, prefix.join(dataset), spec))
+    }
+
+    /// Opens a data set to read; creates nothing.
+    pub(super) fn open_source(&self, location: &str, dataset: &str) -> Result<Dataset, TaskError> {
+        let (store, prefix) = open_store(location).map_err(of_dataset)?;
+        self.wait(Dataset::open(store, prefix.join(dataset)))
+    }
+
+    /// Waits for an operation on a data set.
+    pub(super) fn wait<T>(
+        &self,
+        operation: impl Future<Output = Result<T, DatasetError>>,
+    ) -> Result<T, TaskError> {
+        self.read(operation).map_err(of_dataset)
+    }
+
+    /// Waits for an operation whose error the caller judges.
+    pub(super) fn read<T>(
+        &self,
+        operation: impl Future<Output = Result<T, DatasetError>>,
+    ) -> Result<T, DatasetError> {
+        self.runtime.block_on(operation)
     }
 
     /// The manifest of scene `index` if this very task has published it.
@@ -82,7 +100,7 @@ impl Stores {
             Ok(None) => return Ok(None),
             Ok(Some(manifest)) => manifest,
             Err(error @ DatasetError::Damaged { .. }) => {
-                warn!(%error, task = index, "a published scene is damaged; it is rendered again to mend it");
+                warn!(%error, task = index, "a published scene is damaged; it is made again to mend it");
                 return Ok(None);
             }
             Err(error) => return Err(of_dataset(error)),
@@ -120,7 +138,7 @@ impl Stores {
                 return Err(error);
             }
             let wait = backoff.next(random());
-            warn!(%error, wait_s = wait.as_secs_f64(), "the rendered scene cannot be stored yet; trying again");
+            warn!(%error, wait_s = wait.as_secs_f64(), "the finished scene cannot be stored yet; trying again");
             let again = Instant::now() + wait;
             while Instant::now() < again {
                 if control.stopped() {
