@@ -5,8 +5,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use picofarm_tests::{Cli, Farm, Job, Signal, store};
+use picofarm_tests::{Cli, Farm, Job, Signal, store, wait::until};
 use serde_json::json;
+
+/// Scenes that take long enough together to be struck in the middle.
+const COUNT: u64 = 40;
 
 /// A farm whose store holds `count` small finished scenes.
 fn source(name: &str, count: u64) -> (Farm, Job) {
@@ -45,14 +48,14 @@ impl Reprocess {
 
 #[test]
 fn a_reprocess_killed_again_and_again_gives_what_an_undisturbed_one_gives() {
-    let (farm, job) = source("reprocess-killed", 24);
+    let (farm, job) = source("reprocess-killed", COUNT);
     let reprocess = Reprocess::of(&farm, &job);
     let sensor = ["--rebin", "4", "--peak-photons", "10..400"];
     let calm = reprocess.place("calm").display().to_string();
     let whole = reprocess.cli.json(&reprocess.args(&calm, &sensor));
     assert_eq!(
         (&whole["computed"], &whole["adopted"]),
-        (&json!(24), &json!(0))
+        (&json!(COUNT), &json!(0))
     );
 
     let stormy = reprocess.place("stormy");
@@ -60,42 +63,41 @@ fn a_reprocess_killed_again_and_again_gives_what_an_undisturbed_one_gives() {
     let args = reprocess.args(&target, &sensor);
     for round in 0..3 {
         let process = reprocess.cli.start("struck", &args);
-        while store::finished(&stormy).len() < 1 + 6 * round {
-            std::thread::yield_now();
-        }
+        let far = || (store::finished(&stormy).len() > 8 * round).then_some(());
+        until("some scenes", far);
         process.kill();
     }
     let before = store::finished(&stormy).len();
-    assert!(before < 24, "nothing was left to strike");
+    assert!(before < COUNT as usize, "nothing was left to strike");
     let rest = reprocess.cli.json(&args);
     assert_eq!(rest["adopted"], before);
-    assert_eq!(rest["computed"], 24 - before);
+    assert_eq!(rest["computed"], COUNT as usize - before);
     assert_eq!(rest["bytes"], whole["bytes"]);
     assert!(store::hashes(&stormy) == store::hashes(&reprocess.place("calm")));
     // Once more: nothing is written.
     let times = store::times(&stormy);
-    assert_eq!(reprocess.cli.json(&args)["adopted"], 24);
+    assert_eq!(reprocess.cli.json(&args)["adopted"], COUNT);
     assert!(store::times(&stormy) == times);
     reprocess.cli.run(&["dataset", "verify", &target]).ok();
 }
 
 #[test]
 fn ctrl_c_keeps_what_is_finished_and_says_how_to_go_on() {
-    let (farm, job) = source("reprocess-stopped", 24);
+    let (farm, job) = source("reprocess-stopped", COUNT);
     let reprocess = Reprocess::of(&farm, &job);
     let place = reprocess.place("counts");
     let target = place.display().to_string();
     let args = reprocess.args(&target, &[]);
     let mut process = reprocess.cli.start("stopped", &args);
-    while store::finished(&place).is_empty() {
-        std::thread::yield_now();
-    }
+    until("a scene", || {
+        (!store::finished(&place).is_empty()).then_some(())
+    });
     process.signal(Signal::Interrupt);
     process
         .end()
         .fails(130, &["interrupted", "same command again"]);
     let kept = store::finished(&place).len();
-    assert!((1..24).contains(&kept));
+    assert!((1..COUNT as usize).contains(&kept));
     assert_eq!(reprocess.cli.json(&args)["adopted"], kept);
 }
 
