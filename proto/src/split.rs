@@ -226,6 +226,18 @@ impl SplitRecord {
         }
         let made_of = scenes.len() as u64;
         let counts = settings.parts.counts(made_of)?;
+        if let Parts::Fractions(shares) = settings.parts
+            && let Some(side) = (0..3).find(|&s| shares[s] > 0.0 && counts[s] == 0)
+        {
+            return Err(SpecError::new(
+                "split.fractions",
+                format!(
+                    "{} of {made_of} scenes is less than one, and a side that is empty when the split is made stays empty: \
+                     {} would never get any; split once more scenes are published",
+                    shares[side], SIDES[side]
+                ),
+            ));
+        }
         let mut ranks: Vec<Rank> = scenes.iter().map(|s| Rank::of(settings.seed, *s)).collect();
         ranks.sort_unstable();
         let cut = |before: u64| match before {

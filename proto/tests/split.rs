@@ -137,6 +137,11 @@ fn what_cannot_be_split_so_is_named() {
         "split.fractions"
     );
     assert_eq!(complaint(Parts::Fractions([1.0, 0.0, 0.0]), 0).0, "split");
+    let (field, what) = complaint(Parts::Fractions([0.9, 0.04, 0.06]), 8);
+    assert!(
+        field == "split.fractions" && what.contains("validation"),
+        "{what}"
+    );
     let made = SplitRecord::first(&settings(0, Parts::Counts([8, 1, 1])), &first(10)).unwrap();
     for (other, field) in [
         (settings(1, Parts::Counts([8, 1, 1])), "split.seed"),

@@ -105,8 +105,10 @@ impl<'a> Export<'a> {
             let key = format!("{}/c/{k}{zeros}", array.layout.quantity.name());
             self.put(&key, bytes.into()).await?;
         }
-        let text = serde_json::to_value(&manifests).expect("manifests are plain data");
-        self.put(&format!("manifests/{k}.json"), pretty(&text))
+        // Straight to text, as manifests are stored: by way of a Value, 32-bit floats would get the digits of 64 bits.
+        let mut text = serde_json::to_vec_pretty(&manifests).expect("manifests are plain data");
+        text.push(b'\n');
+        self.put(&format!("manifests/{k}.json"), text.into())
             .await?;
         self.done.scenes += scenes.len() as u64;
         Ok(())
