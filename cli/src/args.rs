@@ -1,6 +1,7 @@
 //! The command line: one definition feeds the parser, the help, and the completions.
 
 mod data;
+mod guard;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -8,6 +9,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 pub use data::{DatasetExport, DatasetReprocess, DatasetSplit, SensorArgs};
+pub use guard::{Guard, Token};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
@@ -26,7 +28,7 @@ Exit codes:
   1    something failed that is not listed here
   2    wrong arguments
   3    bad input: a job file, scene file, setting or scene that cannot be used
-  4    the coordinator cannot be reached, or refused (another version)
+  4    the coordinator cannot be reached, or refused (another version, no access)
   5    the job ended with dead tasks, or was cancelled
   6    a data set is damaged or incomplete
   7    a resource is taken or missing: port in use, disk full, store read-only
@@ -46,6 +48,18 @@ pub struct Global {
     /// Folder with furniture assets [env: PICOFARM_ASSETS]
     #[arg(long, global = true, value_name = "DIR")]
     pub assets_dir: Option<PathBuf>,
+    /// Certificate authority of the coordinator, PEM [default: those of the system] [env: PICOFARM_CA]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
+    /// Own certificate for coordinators that want one, PEM [env: PICOFARM_CERT]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub cert: Option<PathBuf>,
+    /// Private key of --cert, PEM [env: PICOFARM_KEY]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub key: Option<PathBuf>,
+    /// File with the token that proves who you are; or set PICOFARM_TOKEN [env: PICOFARM_TOKEN_FILE]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
     /// Log filter for stderr, e.g. info or picofarm_agent=debug [env: PICOFARM_LOG]
     #[arg(long, global = true, value_name = "FILTER")]
     pub log: Option<String>,
@@ -70,6 +84,9 @@ pub enum Command {
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),
+    /// Say who may use a coordinator
+    #[command(subcommand)]
+    Token(Token),
     /// Furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),
@@ -126,6 +143,8 @@ pub struct Up {
     /// Workers to start; they share the cores [default: 1]
     #[arg(long, default_value_t = 1)]
     pub workers: usize,
+    #[command(flatten)]
+    pub guard: Guard,
 }
 
 #[derive(Args)]
@@ -143,9 +162,8 @@ pub struct Coordinator {
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub lease_s: f64,
-    /// Listen beyond loopback although there is no authentication yet
-    #[arg(long)]
-    pub allow_insecure: bool,
+    #[command(flatten)]
+    pub guard: Guard,
 }
 
 #[derive(Args)]
@@ -156,6 +174,9 @@ pub struct Worker {
     /// Threads to render with [default: all cores]
     #[arg(long)]
     pub threads: Option<usize>,
+    /// Touch only what lies in this path or URL (give it again for more) [default: anything]
+    #[arg(long, value_name = "URL")]
+    pub store_prefix: Vec<String>,
 }
 
 #[derive(Subcommand)]
@@ -249,6 +270,20 @@ pub enum Dataset {
         /// Manifests and sizes only; otherwise every object is hashed and decoded
         #[arg(long)]
         fast: bool,
+    },
+    /// Find objects that belong to no finished scene, left by killed workers, and delete them if asked to
+    Collect {
+        /// Folder or URL of the data set
+        dataset: String,
+        /// Spare what is younger, e.g. 90m, 24h or 7d; a worker may still be writing it
+        #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
+        older_than: std::time::Duration,
+        /// Delete them; otherwise only say what would be deleted
+        #[arg(long)]
+        delete: bool,
+        /// Allow ages under an hour: no worker runs on this data set now, nor will until this ends
+        #[arg(long)]
+        nothing_runs: bool,
     },
     /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
     Picture {
@@ -377,4 +412,50 @@ pub struct Doctor {
     /// Store to check [default: the current folder]
     #[arg(long, default_value = ".", value_name = "PATH_OR_URL")]
     pub store: String,
+}
+
+/// An age with its unit: `30s`, `90m`, `24h`, `7d`.
+fn age(text: &str) -> Result<std::time::Duration, String> {
+    let expected = || format!("expected a number with s, m, h or d, e.g. 24h, found {text:?}");
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let unit = match &text[digits.len()..] {
+        "s" => 1,
+        "m" => 60,
+        "h" => 3600,
+        "d" => 86_400,
+        _ => return Err(expected()),
+    };
+    let number: u64 = digits.parse().map_err(|_| expected())?;
+    let seconds = number.checked_mul(unit).ok_or_else(expected)?;
+    Ok(std::time::Duration::from_secs(seconds))
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn an_age_has_a_unit() {
+        for (text, seconds) in [
+            ("30s", 30),
+            ("90m", 5400),
+            ("24h", 86_400),
+            ("7d", 604_800),
+            ("0s", 0),
+        ] {
+            assert_eq!(super::age(text).unwrap().as_secs(), seconds);
+        }
+        for text in [
+            "",
+            "24",
+            "h",
+            "-1h",
+            "1.5h",
+            "1w",
+            "1 h",
+            "99999999999999999999d",
+            "9999999999999999999d",
+        ] {
+            let error = super::age(text).unwrap_err();
+            assert!(error.contains("e.g. 24h"), "{error}");
+        }
+    }
 }

@@ -2,24 +2,23 @@
 
 use std::time::Duration;
 
+use picofarm_agent::{Access, Bearer, Target, Trouble, lost_connection};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
     model::{Event, JobPlan, JobSpec, JobStatus},
     wire::{self, jobs_client::JobsClient},
 };
-use tonic::{
-    Code as Grpc, Status,
-    transport::{Channel, Endpoint},
-};
+use tonic::{Code as Grpc, Status, service::interceptor::InterceptedService, transport::Channel};
 
 use crate::error::{CliError, Code, Result};
 
 /// A connection to a coordinator's job service.
 #[derive(Clone)]
 pub struct Client {
-    jobs: JobsClient<Channel>,
+    jobs: JobsClient<InterceptedService<Channel, Bearer>>,
     url: String,
+    access: Access,
 }
 
 /// What a submission answered.
@@ -33,7 +32,11 @@ fn refused(status: &Status) -> CliError {
     let code = match status.code() {
         Grpc::InvalidArgument | Grpc::NotFound | Grpc::OutOfRange => Code::Input,
         Grpc::ResourceExhausted => Code::Resource,
-        Grpc::Unavailable | Grpc::FailedPrecondition | Grpc::Unimplemented => Code::Coordinator,
+        Grpc::Unavailable
+        | Grpc::FailedPrecondition
+        | Grpc::Unimplemented
+        | Grpc::Unauthenticated
+        | Grpc::PermissionDenied => Code::Coordinator,
         _ => Code::Failed,
     };
     CliError::new(code, status.message())
@@ -53,25 +56,44 @@ fn required<T>(value: Option<T>, field: &'static str) -> Result<T> {
 
 impl Client {
     /// Connects, within five seconds.
-    pub async fn connect(url: &str) -> Result<Self> {
-        let bad = |e: tonic::transport::Error| {
-            CliError::input(format!("coordinator {url:?}: {e}"))
-                .hint("give a URL such as http://127.0.0.1:7420")
-        };
-        let channel = Endpoint::from_shared(url.to_owned())
-            .map_err(bad)?
+    pub async fn connect(url: &str, access: &Access) -> Result<Self> {
+        let target = access
+            .target(url)
+            .map_err(|e| CliError::input(format!("coordinator: {e}")))?;
+        let endpoint = target.endpoint.clone();
+        let connected = endpoint
             .connect_timeout(Duration::from_secs(5))
             .connect()
-            .await
-            .map_err(|_| {
-                CliError::new(Code::Coordinator, format!("no coordinator answers at {url}")).hint(
-                    "start one with `picofarm up`, or name another with --coordinator or PICOFARM_COORDINATOR",
-                )
-            })?;
-        Ok(Self {
-            jobs: JobsClient::new(channel).max_decoding_message_size(64 << 20),
+            .await;
+        let channel = match connected {
+            Ok(channel) => channel,
+            Err(e) => return Err(no_connection(&target, url, &e).await),
+        };
+        let jobs = JobsClient::with_interceptor(channel, target.bearer.clone())
+            .max_decoding_message_size(64 << 20);
+        let mut client = Self {
+            jobs,
             url: url.to_owned(),
-        })
+            access: access.clone(),
+        };
+        if url.starts_with("https") {
+            // A client certificate is refused only after the handshake: the first call tells.
+            let asked = client
+                .jobs
+                .get_server_info(wire::GetServerInfoRequest {})
+                .await;
+            if let Err(status) = asked
+                && lost_connection(&status)
+            {
+                return Err(no_connection(&target, url, &status).await);
+            }
+        }
+        Ok(client)
+    }
+
+    /// Connects again.
+    pub async fn reconnect(&self) -> Result<Self> {
+        Self::connect(&self.url, &self.access).await
     }
 
     pub fn url(&self) -> &str {
@@ -230,6 +252,22 @@ impl Client {
             .into_iter()
             .map(|e| e.try_into().map_err(unreadable))
             .collect()
+    }
+}
+
+/// Why there is no connection.
+async fn no_connection(
+    target: &Target,
+    url: &str,
+    error: &(dyn std::error::Error + Send + Sync + 'static),
+) -> CliError {
+    match target.trouble(error).await {
+        Trouble::Mismatch(what) => CliError::new(Code::Coordinator, what),
+        Trouble::Down(_) => {
+            CliError::new(Code::Coordinator, format!("no coordinator answers at {url}")).hint(
+                "start one with `picofarm up`, or name another with --coordinator or PICOFARM_COORDINATOR",
+            )
+        }
     }
 }
 

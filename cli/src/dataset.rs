@@ -7,7 +7,9 @@ pub mod split;
 use std::path::{Path, PathBuf};
 
 use picofarm_agent::TaskError;
-use picofarm_dataset::{Dataset, DatasetError, Summary, Verification, VerifyMode, open_store};
+use picofarm_dataset::{
+    Collection, Dataset, DatasetError, MIN_GRACE, Summary, Verification, VerifyMode, open_store,
+};
 use serde_json::json;
 
 use crate::{
@@ -44,6 +46,27 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
         Command::Reprocess(args) => reprocess::run(args, output).await,
         Command::Export(args) => export::run(args, output).await,
         Command::Split(args) => split::run(args, output).await,
+        Command::Collect {
+            dataset,
+            older_than,
+            delete,
+            nothing_runs,
+        } => {
+            if older_than < MIN_GRACE && !nothing_runs {
+                return Err(CliError::input(format!(
+                    "--older-than: expected at least 1h, found {} s: a worker that is writing a scene now would lose \
+                     its objects",
+                    older_than.as_secs()
+                ))
+                .hint("give a longer age, or --nothing-runs if no worker runs on this data set"));
+            }
+            let opened = open(&dataset).await?;
+            let found = opened.collect(older_than, delete).await.map_err(failed)?;
+            output.result(&collection_json(&dataset, &found, delete), || {
+                collected(&dataset, &found, delete)
+            });
+            Ok(())
+        }
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
             let present = open(&dataset)
@@ -60,6 +83,49 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             Ok(())
         }
     }
+}
+
+fn collection_json(place: &str, found: &Collection, delete: bool) -> serde_json::Value {
+    let objects: Vec<_> = found
+        .orphans
+        .iter()
+        .map(|o| json!({"object": o.object, "bytes": o.bytes, "scene": o.scene}))
+        .collect();
+    json!({
+        "dataset": place, "deleted": delete, "objects": found.orphans.len(), "bytes": found.bytes(),
+        "orphans": objects, "young": found.young, "published": found.published,
+    })
+}
+
+fn collected(place: &str, found: &Collection, delete: bool) -> String {
+    let mut text: String = found
+        .orphans
+        .iter()
+        .map(|o| format!("{}  {}\n", o.object, bytes(o.bytes)))
+        .collect();
+    text += &format!(
+        "{place}: {} object(s), {} that belong to no finished scene{}",
+        found.orphans.len(),
+        bytes(found.bytes()),
+        match (delete, found.orphans.is_empty()) {
+            (_, true) => "",
+            (true, false) => ", deleted",
+            (false, false) => "; --delete deletes them",
+        }
+    );
+    if found.young > 0 {
+        text += &format!(
+            "\n{} younger object(s) of unfinished scenes were spared",
+            found.young
+        );
+    }
+    if found.published > 0 {
+        text += &format!(
+            "\n{} object(s) were spared: their scenes are finished by now",
+            found.published
+        );
+    }
+    text
 }
 
 fn info_json(place: &str, info: &Summary) -> serde_json::Value {
@@ -170,7 +236,9 @@ async fn open(place: &str) -> Result<Dataset> {
 fn failed(error: DatasetError) -> CliError {
     let code = match &error {
         DatasetError::Damaged { .. } | DatasetError::Conflict { .. } => Code::Damaged,
-        DatasetError::Store { .. } | DatasetError::UnsafeStore { .. } => Code::Resource,
+        DatasetError::Store { .. } | DatasetError::Io { .. } | DatasetError::UnsafeStore { .. } => {
+            Code::Resource
+        }
         _ => Code::Input,
     };
     CliError::new(code, error)

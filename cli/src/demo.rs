@@ -2,6 +2,7 @@
 
 use std::{net::SocketAddr, path::Path};
 
+use picofarm_agent::Access;
 use picofarm_proto::{
     ids::JobId,
     model::{
@@ -20,7 +21,7 @@ use crate::{
     jobfile,
     local::Local,
     output::{Output, bytes},
-    roles,
+    roles::{self, Guarded},
     settings::Settings,
     signals,
 };
@@ -75,9 +76,16 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
 
     let stop = signals::stop_on_signal()?;
     let any = SocketAddr::from(([127, 0, 0, 1], 0));
-    let mut farm =
-        Local::start(&dir.join("catalog.sqlite"), any, workers, &settings.assets).await?;
-    let mut client = Client::connect(&farm.url).await?;
+    let mut farm = Local::start(
+        &dir.join("catalog.sqlite"),
+        any,
+        workers,
+        settings,
+        Guarded::default(),
+    )
+    .await?;
+    // This process's own coordinator asks nobody who they are.
+    let mut client = Client::connect(&farm.url, &Access::default()).await?;
     let place = format!("{}/{}", spec.output.store, spec.output.dataset);
     let rendered = tokio::select! {
         status = render(&mut client, spec, output) => Some(status),
@@ -164,11 +172,12 @@ async fn show(
 /// # Errors
 /// A taken address or catalog, or a worker that ends.
 pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
-    roles::refuse_beyond_loopback(args.listen, false)?;
+    let guarded = Guarded::of(&args.guard);
+    roles::refuse_unguarded(args.listen, &args.guard, true)?;
     std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
     let stop = signals::stop_on_signal()?;
     let catalog = args.dir.join("catalog.sqlite");
-    let mut farm = Local::start(&catalog, args.listen, args.workers, &settings.assets).await?;
+    let mut farm = Local::start(&catalog, args.listen, args.workers, settings, guarded).await?;
     output.result(&json!({"coordinator": farm.url, "workers": args.workers}), || {
         format!(
             "coordinator at {} with {} worker(s); submit with `picofarm --coordinator {} job submit FILE`",

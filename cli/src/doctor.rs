@@ -33,7 +33,7 @@ pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()
         processor(),
         store(&args.store).await,
         furniture(settings),
-        coordinator(&settings.coordinator).await,
+        coordinator(settings).await,
     ];
     output.result(&checks, || {
         let rows: Vec<_> = checks
@@ -115,11 +115,13 @@ fn furniture(settings: &Settings) -> Check {
     }
 }
 
-async fn coordinator(url: &str) -> Check {
-    let answer = match Client::connect(url).await {
-        Ok(mut client) => client.server().await,
-        Err(e) => Err(e),
+async fn coordinator(settings: &Settings) -> Check {
+    let url = &settings.coordinator;
+    let ask = async {
+        let mut client = Client::connect(url, &settings.access()?).await?;
+        client.server().await
     };
+    let answer = ask.await;
     let (verdict, detail) = match answer {
         Ok((version, protocol, workers)) => (
             Verdict::Ok,

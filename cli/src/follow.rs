@@ -61,7 +61,7 @@ pub async fn follow(
             }));
         }
         tokio::time::sleep(Duration::from_millis(500)).await;
-        if let Ok(again) = Client::connect(client.url()).await {
+        if let Ok(again) = client.reconnect().await {
             *client = again;
             away = None;
         }

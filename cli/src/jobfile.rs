@@ -51,7 +51,7 @@ pub fn template(kind: SceneKindArg) -> String {
          # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
          # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
          [output]\n\
-         store = \"picofarm-data/store\"   # a folder that every worker can reach\n\
+         store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\
          profile = \"sqrt-u16\"            # or: plain-f32\n\n\
          [limits]\n\
@@ -83,7 +83,7 @@ pub fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
 /// Pins furniture, file contents, the renderer's version and the store's absolute place.
 ///
 /// # Errors
-/// A field out of its limits, a missing file, or furniture that is not installed.
+/// A field out of its limits, a store that cannot be one, a missing file, or furniture that is not installed.
 pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
     let renderer = picofarm_agent::renderer_version();
     if spec.render.renderer.is_empty() {
@@ -103,6 +103,8 @@ pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSp
     if !spec.output.store.contains("://") {
         spec.output.store = absolute(base, &spec.output.store)?.display().to_string();
     }
+    picofarm_dataset::check_location(&spec.output.store)
+        .map_err(|e| CliError::input(format!("output.store: {e}")))?;
     match &mut spec.scenes.kind {
         SceneKind::Furnished { assets: name, .. } => *name = assets::resolve(name, asset_dir)?,
         SceneKind::Primitive => {}

@@ -25,7 +25,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         _ => None,
     };
-    let mut client = Client::connect(&settings.coordinator).await?;
+    let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     match command {
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {

@@ -2,13 +2,14 @@
 
 use std::{net::SocketAddr, path::Path, time::Duration};
 
-use picofarm_agent::{AgentConfig, AgentError, Summary};
+use picofarm_agent::{Access, AgentConfig, AgentError, Summary};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     error::{CliError, Code, Result},
     roles,
+    settings::Settings,
 };
 
 /// Life of a lease: short, since after a `kill -9` of this one process the next run waits for it to end, and no network
@@ -32,10 +33,16 @@ impl Local {
         catalog: &Path,
         listen: SocketAddr,
         workers: usize,
-        assets: &Path,
+        settings: &Settings,
+        guarded: roles::Guarded,
     ) -> Result<Self> {
-        let coordinator = roles::Coordinator::start(catalog, listen, LEASE).await?;
-        let url = format!("http://{}", coordinator.address());
+        let access = if guarded.is_open() {
+            Access::default()
+        } else {
+            settings.access()?
+        };
+        let coordinator = roles::Coordinator::start(catalog, listen, LEASE, guarded).await?;
+        let url = coordinator.url();
         let mut local = Self {
             url: url.clone(),
             coordinator,
@@ -50,7 +57,9 @@ impl Local {
                 name: format!("local-{}", i + 1),
                 worker_id: None,
                 threads,
-                asset_dirs: vec![assets.to_owned()],
+                asset_dirs: vec![settings.assets.clone()],
+                access: access.clone(),
+                store_prefixes: Vec::new(),
             };
             local
                 .workers

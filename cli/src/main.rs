@@ -22,6 +22,7 @@ mod scene;
 mod sense;
 mod settings;
 mod signals;
+mod token;
 
 use std::{
     io::{IsTerminal, Write},
@@ -38,6 +39,10 @@ use crate::{
 };
 
 fn main() -> ExitCode {
+    // One provider of cryptography for everything in this program that speaks TLS.
+    rustls::crypto::aws_lc_rs::default_provider()
+        .install_default()
+        .expect("nothing has chosen one before main");
     let cli = Cli::parse();
     let json = cli.global.json;
     match start(cli) {
@@ -69,6 +74,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Job(command) => jobs::run(command, settings, output).await,
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
+        Command::Token(command) => token::run(command, output),
         Command::Assets(command) => assets::run(command, settings, output).await,
         Command::Bench(command) => bench::run(command, settings, output).await,
         Command::Config => {
@@ -88,7 +94,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
 
 fn show_settings(resolved: &Resolved, output: Output) {
     let values = serde_json::to_value(&resolved.settings).expect("settings are plain data");
-    let rows: Vec<_> = resolved
+    let mut rows: Vec<_> = resolved
         .sources
         .iter()
         .map(|(name, source)| {
@@ -96,6 +102,10 @@ fn show_settings(resolved: &Resolved, output: Output) {
             vec![(*name).to_owned(), value, source.clone()]
         })
         .collect();
+    if resolved.token {
+        let source = "environment PICOFARM_TOKEN".to_owned();
+        rows.push(vec!["token".into(), "(a secret)".into(), source]);
+    }
     let document: serde_json::Map<_, _> = rows
         .iter()
         .map(|r| {

@@ -3,7 +3,11 @@
 use std::{net::SocketAddr, path::Path, time::Duration};
 
 use picofarm_agent::{AgentConfig, AgentError};
-use picofarm_coordinator::{CoordinatorConfig, CoordinatorError, Running, serve};
+use picofarm_coordinator::{
+    CoordinatorConfig, CoordinatorError, Running,
+    auth::{Access, Quotas, TlsFiles},
+    serve,
+};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -20,18 +24,77 @@ pub fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// There is no authentication yet: beyond loopback only on request.
+/// Whom a coordinator lets in, and how much they may ask of it.
+#[derive(Default)]
+pub struct Guarded {
+    access: Access,
+    quotas: Quotas,
+}
+
+impl Guarded {
+    /// As the options say.
+    pub fn of(args: &args::Guard) -> Self {
+        let pair = args.tls_cert.clone().zip(args.tls_key.clone());
+        Self {
+            access: Access {
+                tls: pair.map(|(certificate, key)| TlsFiles {
+                    certificate,
+                    key,
+                    client_ca: args.client_ca.clone(),
+                }),
+                tokens: args.tokens.clone(),
+            },
+            quotas: Quotas {
+                jobs_per_user: args.max_jobs_per_user,
+                tasks_per_job: args.max_tasks_per_job,
+                sessions: args.max_sessions,
+            },
+        }
+    }
+
+    /// Whether whoever reaches the address may come in, over plain HTTP.
+    pub fn is_open(&self) -> bool {
+        self.access.tls.is_none() && !self.access.authenticates()
+    }
+}
+
+/// On loopback, only `up` (and `demo`) do without tokens or client certificates; beyond it, all need them and TLS;
+/// unless asked for with --allow-insecure.
 ///
 /// # Errors
-/// The address is not loopback and `allowed` is false.
-pub fn refuse_beyond_loopback(listen: SocketAddr, allowed: bool) -> Result<()> {
-    if listen.ip().is_loopback() || allowed {
+/// The options leave open what they must not.
+pub fn refuse_unguarded(listen: SocketAddr, args: &args::Guard, up: bool) -> Result<()> {
+    if args.allow_insecure {
         return Ok(());
     }
-    Err(CliError::input(format!(
-        "--listen {listen}: anyone who reaches this address could submit jobs, since there is no authentication yet"
-    ))
-    .hint("listen on 127.0.0.1, or run `picofarm coordinator --allow-insecure` on a private network"))
+    let known = args.tokens.is_some() || args.client_ca.is_some();
+    let loopback = listen.ip().is_loopback();
+    let hint = |error: CliError| {
+        error.hint(
+            "make a token with `picofarm token create --name NAME --role submit,work` and give --tokens FILE; or say \
+             --allow-insecure where everyone who reaches the address is trusted",
+        )
+    };
+    if !known && loopback && !up {
+        return Err(hint(CliError::input(format!(
+            "--listen {listen}: every user of this machine could submit jobs, since neither --tokens nor --client-ca is given"
+        ))));
+    }
+    if !known && !loopback {
+        return Err(hint(CliError::input(format!(
+            "--listen {listen}: anyone who reaches this address could submit jobs, since neither --tokens nor --client-ca is \
+             given"
+        ))));
+    }
+    if args.tls_cert.is_none() && !loopback {
+        return Err(CliError::input(format!(
+            "--listen {listen}: tokens would cross the network in the clear, since there is no TLS"
+        ))
+        .hint(
+            "give --tls-cert and --tls-key, or listen on 127.0.0.1; or say --allow-insecure where something else encrypts",
+        ));
+    }
+    Ok(())
 }
 
 /// What a worker's end means for the exit code.
@@ -44,7 +107,11 @@ pub fn agent_error(error: &AgentError) -> CliError {
     let ended = CliError::new(code, error);
     match error {
         AgentError::Refused { .. } => {
-            ended.hint("compare `picofarm --version` on both machines and install the same one")
+            if error.to_string().contains("install the same version") {
+                ended.hint("compare `picofarm --version` on both machines and install the same one")
+            } else {
+                ended
+            }
         }
         _ => ended,
     }
@@ -53,6 +120,7 @@ pub fn agent_error(error: &AgentError) -> CliError {
 /// A running coordinator.
 pub struct Coordinator {
     running: Running,
+    secure: bool,
     stop: CancellationToken,
 }
 
@@ -61,20 +129,37 @@ impl Coordinator {
     ///
     /// # Errors
     /// The catalog is in use, unreadable or of a newer version, or the address is taken.
-    pub async fn start(catalog: &Path, listen: SocketAddr, lease: Duration) -> Result<Self> {
+    pub async fn start(
+        catalog: &Path,
+        listen: SocketAddr,
+        lease: Duration,
+        guarded: Guarded,
+    ) -> Result<Self> {
         let mut config = CoordinatorConfig::new(catalog.to_owned(), listen);
         config.lease_ms = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
         config.heartbeat_ms = (config.lease_ms / 6).max(1);
         config.tick = config.tick.min(lease / 6);
+        let secure = guarded.access.tls.is_some();
+        config.access = guarded.access;
+        config.quotas = guarded.quotas;
         let stop = CancellationToken::new();
         let running = serve(config, stop.clone())
             .await
             .map_err(|e| coordinator_error(&e))?;
-        Ok(Self { running, stop })
+        Ok(Self {
+            running,
+            secure,
+            stop,
+        })
     }
 
-    pub fn address(&self) -> SocketAddr {
-        self.running.address
+    /// Where clients on this machine reach it. Certificates are for names, so with TLS this is localhost.
+    pub fn url(&self) -> String {
+        let address = self.running.address;
+        match self.secure {
+            true => format!("https://localhost:{}", address.port()),
+            false => format!("http://{address}"),
+        }
     }
 
     /// Stops it and waits until the catalog is closed.
@@ -89,7 +174,9 @@ impl Coordinator {
 
 fn coordinator_error(error: &CoordinatorError) -> CliError {
     let code = match error {
-        CoordinatorError::Config(_) => Code::Input,
+        CoordinatorError::Config(_)
+        | CoordinatorError::Credentials(_)
+        | CoordinatorError::Tokens(_) => Code::Input,
         CoordinatorError::Server(_) => Code::Failed,
         _ => Code::Resource,
     };
@@ -101,7 +188,7 @@ fn coordinator_error(error: &CoordinatorError) -> CliError {
 /// # Errors
 /// See [`Coordinator::start`].
 pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> {
-    refuse_beyond_loopback(args.listen, args.allow_insecure)?;
+    refuse_unguarded(args.listen, &args.guard, false)?;
     if !(args.lease_s >= 0.1 && args.lease_s <= 86_400.0) {
         return Err(CliError::input(format!(
             "--lease-s {}: expected 0.1 to 86400 seconds",
@@ -110,8 +197,9 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     }
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
-    let coordinator = Coordinator::start(&args.catalog, args.listen, lease).await?;
-    let url = format!("http://{}", coordinator.address());
+    let coordinator =
+        Coordinator::start(&args.catalog, args.listen, lease, Guarded::of(&args.guard)).await?;
+    let url = coordinator.url();
     output.result(
         &json!({"coordinator": url, "catalog": args.catalog}),
         || format!("coordinator at {url} on {}", args.catalog.display()),
@@ -132,6 +220,8 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         worker_id: None,
         threads: args.threads.unwrap_or_else(cores),
         asset_dirs: vec![settings.assets.clone()],
+        access: settings.access()?,
+        store_prefixes: args.store_prefix,
     };
     output.say(format!("worker {} for {}", config.name, config.coordinator));
     let summary = picofarm_agent::run(config, stop)

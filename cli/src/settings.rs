@@ -6,6 +6,8 @@ use figment::{
     Figment,
     providers::{Env, Format, Serialized, Toml},
 };
+use picofarm_agent::Access;
+use picofarm_proto::credentials::Secret;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -23,6 +25,39 @@ pub struct Settings {
     pub assets: PathBuf,
     /// Log filter.
     pub log: String,
+    /// Certificate authority of the coordinator (PEM).
+    pub ca: Option<PathBuf>,
+    /// Own certificate (PEM).
+    pub cert: Option<PathBuf>,
+    /// Its private key (PEM).
+    pub key: Option<PathBuf>,
+    /// File that holds the token.
+    pub token_file: Option<PathBuf>,
+}
+
+/// The variable that holds the token itself. No setting and no argument: those are shown and kept.
+const TOKEN: &str = "PICOFARM_TOKEN";
+
+impl Settings {
+    /// What to show to a coordinator, and whom to trust.
+    ///
+    /// # Errors
+    /// The token file cannot be used.
+    pub fn access(&self) -> Result<Access> {
+        let token = match std::env::var(TOKEN) {
+            Ok(token) if !token.trim().is_empty() => Some(Secret::new(token.trim())),
+            _ => match &self.token_file {
+                Some(path) => Some(Secret::read(path).map_err(CliError::input)?),
+                None => None,
+            },
+        };
+        Ok(Access {
+            ca: self.ca.clone(),
+            certificate: self.cert.clone(),
+            key: self.key.clone(),
+            token,
+        })
+    }
 }
 
 fn user_dir(variable: &str, fallback: &str) -> PathBuf {
@@ -39,6 +74,10 @@ impl Default for Settings {
             coordinator: "http://127.0.0.1:7420".into(),
             assets: user_dir("XDG_DATA_HOME", ".local/share").join("assets"),
             log: "warn".into(),
+            ca: None,
+            cert: None,
+            key: None,
+            token_file: None,
         }
     }
 }
@@ -47,9 +86,19 @@ impl Default for Settings {
 pub struct Resolved {
     pub settings: Settings,
     pub sources: Vec<(&'static str, String)>,
+    /// Whether the environment holds a token.
+    pub token: bool,
 }
 
-const FIELDS: [&str; 3] = ["coordinator", "assets", "log"];
+const FIELDS: [&str; 7] = [
+    "coordinator",
+    "assets",
+    "log",
+    "ca",
+    "cert",
+    "key",
+    "token_file",
+];
 
 /// Resolves the settings.
 ///
@@ -76,13 +125,15 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
         figment = figment.merge(Toml::file_exact(path));
     }
     figment = figment.merge(Env::prefixed("PICOFARM_").only(&FIELDS));
-    let flags: [(&str, Option<String>); 3] = [
+    let shown = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
+    let flags: [(&str, Option<String>); 7] = [
         ("coordinator", global.coordinator.clone()),
-        (
-            "assets",
-            global.assets_dir.as_ref().map(|p| p.display().to_string()),
-        ),
+        ("assets", shown(&global.assets_dir)),
         ("log", global.log.clone()),
+        ("ca", shown(&global.ca)),
+        ("cert", shown(&global.cert)),
+        ("key", shown(&global.key)),
+        ("token_file", shown(&global.token_file)),
     ];
     let mut sources = Vec::new();
     for (name, value) in flags {
@@ -93,13 +144,18 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
             sources.push((name, source(&figment, name, file.as_deref())));
         }
     }
+    let token = std::env::var_os(TOKEN).is_some_and(|t| !t.is_empty());
     let settings = figment.extract::<Settings>().map_err(|e| {
         CliError::input(format!("settings: {e}")).hint(format!(
             "known settings are {}; see `picofarm config`",
             FIELDS.join(", ")
         ))
     })?;
-    Ok(Resolved { settings, sources })
+    Ok(Resolved {
+        settings,
+        sources,
+        token,
+    })
 }
 
 fn source(figment: &Figment, name: &str, file: Option<&Path>) -> String {

@@ -1,18 +1,21 @@
-//! The one task that owns the core. It takes what has arrived, lets the core decide, makes the outcome durable in
-//! one commit, and only then answers: whatever waits meanwhile forms the next commit.
+//! The one task that owns the core. It takes what has arrived, claims the tasks that are wanted, lets the core decide,
+//! makes the outcome durable in one commit, and only then answers: whatever waits meanwhile forms the next commit.
 
 use std::{
-    collections::{HashMap, hash_map::Entry},
+    collections::HashMap,
     panic::AssertUnwindSafe,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use futures::FutureExt;
-use picofarm_catalog::{Catalog, CatalogError, ResultSet};
+use picofarm_catalog::{Catalog, CatalogError, Job, ResultSet};
 use picofarm_proto::{
-    ids::{JobId, LeaseRef},
-    model::{Failure, Finished, JobPlan, JobSpec, JobStatus, SpecError, TaskProgress, WorkerHello},
+    ids::{JobId, LeaseRef, StageRef},
+    key::spec_hash,
+    model::{
+        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress, WorkerHello,
+    },
 };
 use tokio::{
     sync::{mpsc, oneshot, watch},
@@ -23,13 +26,18 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, OutputHint, Say, SessionId, Settings, Submitted},
+    core::{Core, OutputHint, Prepared, Say, SessionId, Settings, Timings, place_is_free, stands_for},
+    plan,
 };
 
 /// Messages handled in one commit.
 const BATCH: usize = 1024;
 /// How long to wait before trying a catalog again that failed.
 const MEND: Duration = Duration::from_secs(1);
+/// How often the catalog hears that this house lives, and is asked for news.
+const BEAT: Duration = Duration::from_secs(1);
+/// Least time between two beats, whatever the hints.
+const BEAT_AT_LEAST: Duration = Duration::from_millis(100);
 
 /// A question whose answer may be an error in words.
 pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
@@ -41,6 +49,14 @@ pub(crate) enum Refusal {
     NotNow(String),
     Spec(SpecError),
     Catalog(String),
+}
+
+/// Answer to a submission.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Submitted {
+    pub job: JobId,
+    pub existed: bool,
+    pub plan: JobPlan,
 }
 
 /// What the rpc modules ask of the actor.
@@ -85,15 +101,11 @@ pub(crate) struct Actor {
     pub stop: CancellationToken,
 }
 
-/// An answer that waits for the commit.
-type Deferred = Box<dyn FnOnce(Result<(), &CatalogError>) + Send>;
-
 /// One life of a core: from a load of the catalog to the first failure to write it.
 struct Life<'a> {
     actor: &'a Actor,
     core: Core,
     sessions: HashMap<SessionId, mpsc::Sender<Say>>,
-    deferred: Vec<Deferred>,
 }
 
 impl Actor {
@@ -123,16 +135,18 @@ impl Actor {
 
     async fn begin(&self) -> Result<Life<'_>, CatalogError> {
         let snapshot = self.catalog.load().await?;
-        let mut timing = HashMap::new();
-        for job in &snapshot.jobs {
-            if let Entry::Vacant(entry) = timing.entry(ResultSet::of(&job.spec)) {
-                let seconds = self.catalog.timing(entry.key()).await?;
-                entry.insert(seconds);
+        let mut timings = Timings::new();
+        for stage in snapshot.jobs.iter().flat_map(Job::stages) {
+            if !timings.contains_key(&stage.set) {
+                let seconds = self.catalog.timing(&stage.set).await?;
+                timings.insert(stage.set, seconds);
             }
         }
+        tracing::debug!(house = %snapshot.house, jobs = snapshot.jobs.len(),
+            ranges = snapshot.owned.ranges.len(), "a house begins");
         let core = Core::load(
             snapshot,
-            &timing,
+            &timings,
             self.settings,
             Box::new(Uuid::now_v7),
             self.clock.now_ms(),
@@ -141,7 +155,6 @@ impl Actor {
             actor: self,
             core,
             sessions: HashMap::new(),
-            deferred: Vec::new(),
         })
     }
 }
@@ -151,11 +164,28 @@ impl Life<'_> {
         let mut tick = tokio::time::interval(self.actor.tick);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut ticked = Instant::now();
+        // The first beat at once: news that are missed between loading and now come with it.
+        let mut beaten: Option<Instant> = None;
+        let mut hinted = false;
         let mut batch = Vec::with_capacity(BATCH);
         loop {
+            let due = match beaten {
+                None => Duration::ZERO,
+                Some(at) if hinted => BEAT_AT_LEAST.saturating_sub(at.elapsed()),
+                Some(at) => BEAT.saturating_sub(at.elapsed()),
+            };
             tokio::select! {
                 biased;
-                () = self.actor.stop.cancelled() => return Ok(()),
+                () = self.actor.stop.cancelled() => return self.end().await,
+                () = tokio::time::sleep(due) => {
+                    beaten = Some(Instant::now());
+                    hinted = false;
+                    self.beat().await?;
+                }
+                () = self.actor.catalog.changed(), if !hinted => {
+                    hinted = true;
+                    continue;
+                }
                 _ = tick.tick() => {
                     let now = self.now();
                     // A stall of this process (a suspended laptop, a stopped debugger) is no worker's fault.
@@ -169,14 +199,65 @@ impl Life<'_> {
                 }
                 n = commands.recv_many(&mut batch, BATCH) => {
                     if n == 0 {
-                        return Ok(());
+                        return self.end().await;
                     }
                     self.handle(&mut batch).await?;
                 }
             }
+            self.supply().await?;
             self.core.dispatch(self.now());
             self.flush().await?;
         }
+    }
+
+    /// The orderly end of a house: what nobody runs is free for others.
+    async fn end(mut self) -> Result<(), CatalogError> {
+        self.core.give_back();
+        self.flush().await
+    }
+
+    /// Claims what connected workers could run.
+    async fn supply(&mut self) -> Result<(), CatalogError> {
+        let wants = self.core.wants(self.now());
+        if wants.is_empty() {
+            return Ok(());
+        }
+        // What is noted so far first: the catalog must know this house's ranges as they are.
+        self.flush().await?;
+        let claims = self.actor.catalog.claim(&wants).await?;
+        let now = self.now();
+        for (want, claim) in wants.iter().zip(claims) {
+            self.core.supplied(want.stage, claim, now);
+        }
+        Ok(())
+    }
+
+    /// Tells the catalog that this house lives, and hears what is new.
+    async fn beat(&mut self) -> Result<(), CatalogError> {
+        self.core.give_back();
+        self.flush().await?;
+        let news = self.actor.catalog.beat(self.core.connected()).await?;
+        let now = self.now();
+        for job in self.core.hear(news, now) {
+            if let Some(record) = self.actor.catalog.job(job).await? {
+                self.learn(&record.job).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes note of a job that is new here.
+    async fn learn(&mut self, job: &Job) -> Result<(), CatalogError> {
+        if job.state != JobState::Active || self.core.knows(job.id) {
+            return Ok(());
+        }
+        let mut timings = Timings::new();
+        for set in self.core.untimed(std::slice::from_ref(job)) {
+            let seconds = self.actor.catalog.timing(&set).await?;
+            timings.insert(set, seconds);
+        }
+        self.core.add_job(job, &timings);
+        Ok(())
     }
 
     fn now(&self) -> i64 {
@@ -185,11 +266,11 @@ impl Life<'_> {
 
     async fn handle(&mut self, batch: &mut Vec<Command>) -> Result<(), CatalogError> {
         // What the catalog holds for the tasks reported, in one go.
-        let asked: Vec<(JobId, u64)> = batch
+        let asked: Vec<(StageRef, u64)> = batch
             .iter()
             .filter_map(|command| match command {
                 Command::Worker(_, FromWorker::Done(report)) => {
-                    Some((self.core.job_of(report)?, report.index))
+                    Some((self.core.stage_of(report)?, report.index))
                 }
                 _ => None,
             })
@@ -203,62 +284,57 @@ impl Life<'_> {
                     hello,
                     say,
                 } => {
+                    // The worker brings its leases along, from whichever coordinator.
+                    self.flush().await?;
+                    let owned = self.actor.catalog.adopt(hello.id).await?;
                     let now = self.now();
+                    self.core.receive(owned, now);
                     self.sessions.insert(session, say);
                     self.core.hello(session, hello, now);
                 }
                 Command::Worker(session, said) => self.worker_said(session, said, &known),
                 Command::Plan(spec, reply) => {
                     self.flush().await?;
-                    let set = ResultSet::of(&spec);
-                    let runs = self
-                        .actor
-                        .catalog
-                        .output_runs(&set, spec.scenes.count)
-                        .await?;
-                    let plan = self
-                        .core
-                        .place_is_free(&spec)
-                        .map(|()| self.core.plan(&spec, &runs));
-                    let _ = reply.send(plan.map_err(Refusal::Spec));
+                    let answer = self.plan(&spec).await?;
+                    let _ = reply.send(answer.map(|(plan, _)| plan));
                 }
                 Command::Submit { spec, again, reply } => {
                     // First what is under way, so that no output is missed.
                     self.flush().await?;
-                    let set = ResultSet::of(&spec);
-                    let runs = self
-                        .actor
-                        .catalog
-                        .output_runs(&set, spec.scenes.count)
-                        .await?;
-                    let timing = self.actor.catalog.timing(&set).await?;
-                    let now = self.now();
-                    let submitted = self.core.submit(*spec, again, &runs, timing, now);
-                    self.defer(reply, submitted.map_err(Refusal::Spec));
+                    let answer = self.submit(*spec, again).await?;
+                    let _ = reply.send(answer);
                 }
                 Command::List(reply) => {
-                    let list = self.core.list(self.now());
-                    self.defer(reply, Ok(list));
+                    self.flush().await?;
+                    let records = self.actor.catalog.jobs().await?;
+                    let now = self.now();
+                    let list = records.into_iter().map(|r| self.core.status(r, now));
+                    let _ = reply.send(Ok(list.collect()));
                 }
                 Command::Get(id, reply) => {
-                    let status = self.core.status(id, self.now());
-                    self.defer(reply, status.ok_or(Refusal::NoSuchJob(id)));
+                    self.flush().await?;
+                    let _ = reply.send(self.status(id).await?);
                 }
                 Command::Cancel(id, reply) => {
-                    let now = self.now();
-                    let status = self.core.cancel(id, now);
-                    self.defer(reply, status.ok_or(Refusal::NoSuchJob(id)));
+                    self.flush().await?;
+                    let answer = match self.actor.catalog.job(id).await? {
+                        None => Err(Refusal::NoSuchJob(id)),
+                        Some(_) => {
+                            if self.actor.catalog.cancel(id, self.now()).await? {
+                                self.core.drop_job(id, "the job was cancelled");
+                                self.flush().await?;
+                            }
+                            self.status(id).await?
+                        }
+                    };
+                    let _ = reply.send(answer);
                 }
                 Command::Retry(id, reply) => {
-                    let now = self.now();
-                    let answer = match self.core.retry(id, now) {
-                        None => Err(Refusal::NoSuchJob(id)),
-                        Some(answer) => answer.map_err(Refusal::NotNow),
-                    };
-                    self.defer(reply, answer);
+                    self.flush().await?;
+                    let _ = reply.send(self.retry(id).await?);
                 }
                 Command::Workers(reply) => {
-                    let _ = reply.send(Ok(self.core.connected()));
+                    let _ = reply.send(Ok(self.core.everywhere()));
                 }
             }
         }
@@ -269,7 +345,7 @@ impl Life<'_> {
         &mut self,
         session: SessionId,
         said: FromWorker,
-        known: &HashMap<(JobId, u64), Option<[u8; 32]>>,
+        known: &HashMap<(StageRef, u64), Option<[u8; 32]>>,
     ) {
         let now = self.now();
         match said {
@@ -280,8 +356,8 @@ impl Life<'_> {
             FromWorker::Done(report) => {
                 let hint = self
                     .core
-                    .job_of(&report)
-                    .and_then(|job| known.get(&(job, report.index)).copied().flatten());
+                    .stage_of(&report)
+                    .and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
                 self.core.finished(session, &report, OutputHint(hint), now);
             }
             FromWorker::Failed(failure) => self.core.failed(session, &failure, now),
@@ -293,26 +369,106 @@ impl Life<'_> {
         }
     }
 
-    /// Answers after the next commit.
-    fn defer<T: Send + 'static>(&mut self, reply: Reply<T>, answer: Result<T, Refusal>) {
-        self.deferred.push(Box::new(move |committed| {
-            // Who has gone needs no answer.
-            let _ = reply.send(match committed {
-                Ok(()) => answer,
-                Err(error) => Err(Refusal::Catalog(error.to_string())),
+    async fn status(&self, id: JobId) -> Result<Result<JobStatus, Refusal>, CatalogError> {
+        let record = self.actor.catalog.job(id).await?;
+        let status = record.map(|r| self.core.status(r, self.now()));
+        Ok(status.ok_or(Refusal::NoSuchJob(id)))
+    }
+
+    /// What submitting would do, and the job that has this spec already.
+    async fn plan(
+        &self,
+        spec: &JobSpec,
+    ) -> Result<Result<(JobPlan, Option<Job>), Refusal>, CatalogError> {
+        let catalog = &self.actor.catalog;
+        let set = ResultSet::of(spec);
+        let others = catalog.jobs_at(&set.store, &set.dataset).await?;
+        if let Err(why) = place_is_free(spec, &others) {
+            return Ok(Err(Refusal::Spec(why)));
+        }
+        let runs = catalog.output_runs(&set, spec.scenes.count).await?;
+        let latest = catalog.job_with(&spec_hash(spec)).await?;
+        let plan = plan::plan(spec, &runs, latest.as_ref().map(|job| job.id));
+        Ok(Ok((plan, latest)))
+    }
+
+    async fn submit(
+        &mut self,
+        spec: JobSpec,
+        again: bool,
+    ) -> Result<Result<Submitted, Refusal>, CatalogError> {
+        let (plan, latest) = match self.plan(&spec).await? {
+            Ok(found) => found,
+            Err(why) => return Ok(Err(why)),
+        };
+        let existed = |job: JobId, plan| {
+            Ok(Ok(Submitted {
+                job,
+                existed: true,
+                plan,
+            }))
+        };
+        if let Some(job) = stands_for(latest, again) {
+            return existed(job.id, plan);
+        }
+        let catalog = &self.actor.catalog;
+        let set = ResultSet::of(&spec);
+        let runs = catalog.output_runs(&set, spec.scenes.count).await?;
+        let now = self.now();
+        let Prepared {
+            job,
+            ranges,
+            events,
+        } = self.core.prepare(spec, &runs, now);
+        if !catalog.submit(&job, &ranges, &events).await? {
+            // Another coordinator was first.
+            return Ok(match catalog.job_with(&job.spec_hash).await? {
+                Some(first) => return existed(first.id, plan),
+                None => Err(Refusal::NotNow("the same job is being submitted by someone else; try again".into())),
             });
-        }));
+        }
+        // A job without anything to run has ended by now.
+        if let Some(record) = catalog.job(job.id).await? {
+            self.learn(&record.job).await?;
+        }
+        self.actor.revision.send_modify(|n| *n += 1);
+        Ok(Ok(Submitted {
+            job: job.id,
+            existed: false,
+            plan,
+        }))
+    }
+
+    async fn retry(&mut self, id: JobId) -> Result<Result<u64, Refusal>, CatalogError> {
+        let catalog = &self.actor.catalog;
+        let Some(record) = catalog.job(id).await? else {
+            return Ok(Err(Refusal::NoSuchJob(id)));
+        };
+        if record.job.state == JobState::Cancelled {
+            return Ok(Err(Refusal::NotNow(format!(
+                "job {id} was cancelled; submit it again instead (finished tasks are reused)"
+            ))));
+        }
+        let retried = match catalog.retry(id, self.now()).await {
+            Ok(retried) => retried,
+            Err(CatalogError::Conflict(why)) => return Ok(Err(Refusal::NotNow(why))),
+            Err(error) => return Err(error),
+        };
+        if retried > 0 {
+            self.core.retried(id);
+            if let Some(record) = catalog.job(id).await? {
+                self.learn(&record.job).await?;
+            }
+        }
+        Ok(Ok(retried))
     }
 
     /// Makes what the core decided durable, then says it.
     async fn flush(&mut self) -> Result<(), CatalogError> {
         let (changes, say) = self.core.take();
         let changed = !changes.is_empty();
-        let result = self.actor.catalog.commit(changes).await;
-        for answer in self.deferred.drain(..) {
-            answer(result.as_ref().copied());
-        }
-        result?;
+        let ended = self.actor.catalog.commit(changes).await?;
+        self.core.ended(&ended);
         let mut deaf = Vec::new();
         for (session, what) in say {
             let over = what == Say::Replaced;

@@ -2,7 +2,7 @@
 
 use picofarm_catalog::{Changes, Range, RangeState, Run};
 use picofarm_proto::{
-    ids::{Epoch, Incarnation, JobId, RangeId, WorkerId},
+    ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
     model::{FailureKind, Limits},
 };
 use proptest::prelude::*;
@@ -24,8 +24,26 @@ fn counter() -> impl FnMut() -> RangeId {
     }
 }
 
-fn job() -> JobId {
-    JobId::from_uuid(Uuid::nil())
+fn stage_ref() -> StageRef {
+    StageRef {
+        job: JobId::from_uuid(Uuid::nil()),
+        stage: 0,
+    }
+}
+
+/// A stage with these tasks pending in hand.
+fn in_hand(total: u64, cut: &[bool], ids: &mut dyn FnMut() -> RangeId) -> Stage {
+    let existing: Vec<Run> = (0..total)
+        .filter(|i| cut.get(*i as usize) == Some(&true))
+        .map(|i| Run { lo: i, hi: i + 1 })
+        .collect();
+    let mut stage = Stage::default();
+    for range in expand(stage_ref(), total, &existing, ids) {
+        if matches!(range.state, RangeState::Pending { .. }) {
+            stage.receive(range, &mut Changes::default());
+        }
+    }
+    stage
 }
 
 /// What a person would write down for each task.
@@ -46,18 +64,14 @@ proptest! {
     fn ranges_follow_a_table_of_tasks(
         total in 1..40u64,
         cut in prop::collection::vec(any::<bool>(), 40),
-        ops in prop::collection::vec((0..6u8, any::<u64>(), any::<u64>(), any::<bool>()), 0..80),
+        ops in prop::collection::vec((0..5u8, any::<u64>(), any::<u64>(), any::<bool>()), 0..80),
     ) {
         let mut ids = counter();
-        let existing: Vec<Run> = (0..total)
-            .filter(|i| cut[*i as usize])
-            .map(|i| Run { lo: i, hi: i + 1 })
-            .collect();
         let mut table: Vec<Task> = (0..total)
             .map(|i| if cut[i as usize] { Task::Done } else { Task::Pending })
             .collect();
         let mut changes = Changes::default();
-        let mut stage = Stage::new(expand(job(), total, &existing, &mut ids), &mut changes);
+        let mut stage = in_hand(total, &cut, &mut ids);
         for (op, a, b, flag) in ops {
             let leased: Vec<Range> = stage.leased().map(|(r, _)| r.clone()).collect();
             let lease = (!leased.is_empty()).then(|| leased[a as usize % leased.len()].clone());
@@ -92,12 +106,8 @@ proptest! {
                         prop_assert_ne!(table[task as usize], Task::Pending);
                         continue;
                     };
-                    (range, RangeEvent::Settle { task })
-                }
-                (5, _) => {
-                    let dead = stage.dead();
-                    if dead.is_empty() { continue }
-                    (dead[a as usize % dead.len()].clone(), RangeEvent::Retry)
+                    let hi = (task + 1 + b % 3).min(range.hi);
+                    (range, RangeEvent::Settle { run: Run { lo: task, hi } })
                 }
                 _ => continue,
             };
@@ -105,8 +115,11 @@ proptest! {
             match stage.apply(&range, &event, &mut ids, &mut changes) {
                 Ok(_) => match event {
                     RangeEvent::Grant { .. } => {}
-                    RangeEvent::Finish { task, .. } | RangeEvent::Settle { task } => {
-                        table[task as usize] = Task::Done;
+                    RangeEvent::Finish { task, .. } => table[task as usize] = Task::Done,
+                    RangeEvent::Settle { run } => {
+                        for t in run.lo..run.hi {
+                            table[t as usize] = Task::Done;
+                        }
                     }
                     RangeEvent::Leave { task, retry_at_ms, .. } => {
                         table[task as usize] = if retry_at_ms.is_some() { Task::Pending } else { Task::Dead };
@@ -119,27 +132,32 @@ proptest! {
                             }
                         }
                     }
-                    RangeEvent::Retry => {
-                        for t in range.lo..range.hi {
-                            table[t as usize] = Task::Pending;
-                        }
-                    }
                 },
                 // A refused event changes nothing.
                 Err(_) => prop_assert_eq!(stage.lease(range.lease()).map(|(r, _)| r.clone()), before),
             }
-            let counts = stage.counts();
             let of = |t: Task| table.iter().filter(|x| **x == t).count() as u64;
-            prop_assert_eq!(counts.total, total);
-            prop_assert_eq!(counts.pending, of(Task::Pending));
-            prop_assert_eq!(counts.leased, of(Task::Leased));
-            prop_assert_eq!(counts.done, of(Task::Done));
-            prop_assert_eq!(counts.dead, of(Task::Dead));
+            prop_assert_eq!(stage.pending_tasks(), of(Task::Pending));
+            prop_assert_eq!(stage.leased_tasks(), of(Task::Leased));
+            prop_assert_eq!(stage.is_empty(), of(Task::Pending) + of(Task::Leased) == 0);
             for (i, task) in table.iter().enumerate() {
                 prop_assert_eq!(stage.pending_at(i as u64).is_some(), *task == Task::Pending);
             }
-            // What was written is what there is.
-            prop_assert_eq!(changes.ranges.len(), stage.rows());
+            // What leaves for the catalog is what is done or dead, each task once.
+            let mut left = vec![None; total as usize];
+            for range in changes.free.values() {
+                for t in range.lo..range.hi {
+                    prop_assert_eq!(left[t as usize], None);
+                    left[t as usize] = Some(if range.state == RangeState::Dead { Task::Dead } else { Task::Done });
+                }
+            }
+            for (t, left) in left.iter().enumerate() {
+                let marked = matches!(table[t], Task::Done) && left.is_none();
+                prop_assert!(marked || *left == Some(table[t]) || (left.is_none() && !matches!(table[t], Task::Dead)));
+            }
+            // What changed here is written as it is here.
+            let now = stage.leased().map(|(r, _)| r).all(|r| changes.ranges.get(&r.id) == Some(r));
+            prop_assert!(now);
         }
     }
 
@@ -147,7 +165,7 @@ proptest! {
     fn epochs_never_fall(grants in prop::collection::vec(any::<bool>(), 1..20)) {
         let mut ids = counter();
         let mut changes = Changes::default();
-        let mut stage = Stage::new(expand(job(), 4, &[], &mut ids), &mut changes);
+        let mut stage = in_hand(4, &[], &mut ids);
         let mut last = Epoch(0);
         for halve in grants {
             let front = stage.front(i64::MAX, true).unwrap().clone();
@@ -170,7 +188,7 @@ proptest! {
         cuts.sort_unstable();
         cuts.dedup();
         let existing: Vec<Run> = cuts.chunks_exact(2).map(|c| Run { lo: c[0], hi: c[1] }).collect();
-        let ranges = expand(job(), total, &existing, &mut counter());
+        let ranges = expand(stage_ref(), total, &existing, &mut counter());
         let mut at = 0;
         for range in &ranges {
             prop_assert_eq!(range.lo, at);
@@ -199,7 +217,7 @@ proptest! {
         let limits = Limits { max_failures: 3, max_crashes: 2 };
         let backoff = Backoff::default();
         let fresh = || picofarm_catalog::Exception {
-            job: job(), task: 0, failures: 0, crashes: 0, dead: false, last_error: String::new(),
+            stage: stage_ref(), task: 0, failures: 0, crashes: 0, dead: false, last_error: String::new(),
         };
         let (mut record, mut failures, mut crashes) = (None, 0, 0);
         for kind in kinds {

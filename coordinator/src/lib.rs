@@ -2,6 +2,7 @@
 //! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`]).
 
 mod actor;
+pub mod auth;
 pub mod budget;
 mod clock;
 mod core;

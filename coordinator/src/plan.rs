@@ -2,15 +2,15 @@
 
 use picofarm_catalog::{Range, RangeState, Run};
 use picofarm_proto::{
-    ids::{Epoch, JobId, RangeId},
+    ids::{Epoch, JobId, RangeId, StageRef},
     key::spec_hash,
     model::{JobPlan, JobSpec, SceneKind, SpecError},
 };
 
-/// The ranges of a new job: a done range for each run of existing outputs, a pending one for each gap.
+/// The ranges of a new stage: a done range for each run of existing outputs, a pending one for each gap.
 /// `existing` is ascending and disjoint.
 pub fn expand(
-    job: JobId,
+    stage: StageRef,
     count: u64,
     existing: &[Run],
     ids: &mut dyn FnMut() -> RangeId,
@@ -20,7 +20,7 @@ pub fn expand(
         if lo < hi {
             ranges.push(Range {
                 id: ids(),
-                job,
+                stage,
                 lo,
                 hi,
                 epoch: Epoch(0),

@@ -3,6 +3,7 @@
 use std::{io, net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
 
 use picofarm_catalog::{Catalog, CatalogError, SqliteCatalog};
+use picofarm_proto::credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
 use tokio::{
     net::TcpListener,
@@ -14,6 +15,7 @@ use tonic::transport::{Server, server::TcpIncoming};
 
 use crate::{
     actor::Actor,
+    auth::{Access, Gate, Guard, Quotas, TlsFiles, TokenError},
     budget::Backoff,
     clock::Clock,
     core::Settings,
@@ -22,6 +24,10 @@ use crate::{
 
 /// Largest message either way: a job of 100,000 scene files is about 15 MB.
 pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Largest message of a worker: a heartbeat or hello that names some ten thousand leases.
+const MAX_WORKER_MESSAGE_BYTES: usize = 1 << 20;
+/// Largest headers of a request.
+const MAX_HEADERS_BYTES: u32 = 16 << 10;
 /// Commands that may wait for the actor; more senders wait for room.
 const QUEUE: usize = 8192;
 /// How often an idle connection is probed, and how long an answer may take.
@@ -38,12 +44,18 @@ pub struct CoordinatorConfig {
     pub lease_ms: u32,
     /// How often workers report, milliseconds (default a sixth of a lease).
     pub heartbeat_ms: u32,
-    /// How often leases are looked through for expiry (default 1 s).
+    /// How long a worker whose connection broke may take to come back, milliseconds (default 1,500).
+    pub reconnect_ms: u32,
+    /// How often leases are looked through for expiry (default 250 ms).
     pub tick: Duration,
     /// Waiting times after failures.
     pub backoff: Backoff,
     /// The clock leases live by.
     pub clock: Clock,
+    /// Who is let in; by default anyone who reaches the address.
+    pub access: Access,
+    /// The most of everything.
+    pub quotas: Quotas,
 }
 
 impl CoordinatorConfig {
@@ -54,9 +66,12 @@ impl CoordinatorConfig {
             listen,
             lease_ms: 60_000,
             heartbeat_ms: 10_000,
-            tick: Duration::from_secs(1),
+            reconnect_ms: 1_500,
+            tick: Duration::from_millis(250),
             backoff: Backoff::default(),
             clock: Clock::system(),
+            access: Access::default(),
+            quotas: Quotas::default(),
         }
     }
 }
@@ -83,6 +98,12 @@ pub enum CoordinatorError {
     /// A time in the configuration makes no sense.
     #[error("{0}")]
     Config(String),
+    /// A certificate or key cannot be used.
+    #[error(transparent)]
+    Credentials(#[from] CredentialError),
+    /// The token file cannot be used.
+    #[error(transparent)]
+    Tokens(#[from] TokenError),
     /// The catalog cannot be used.
     #[error(transparent)]
     Catalog(#[from] CatalogError),
@@ -128,6 +149,8 @@ pub async fn serve(
             config.heartbeat_ms, config.lease_ms
         )));
     }
+    let tls = config.access.tls.as_ref().map(TlsFiles::read).transpose()?;
+    let gate = Gate::new(&config.access, shutdown.clone())?;
     let failed = |source: io::Error| match source.kind() {
         io::ErrorKind::AddrInUse => CoordinatorError::AddressInUse {
             address: config.listen,
@@ -148,6 +171,7 @@ pub async fn serve(
         catalog: Arc::clone(&catalog),
         settings: Settings {
             lease_ms: config.lease_ms,
+            reconnect_ms: config.reconnect_ms,
             backoff: config.backoff,
         },
         tick: config.tick,
@@ -164,17 +188,23 @@ pub async fn serve(
         heartbeat_ms: config.heartbeat_ms,
     };
     let actor = tokio::spawn(actor.run(queue));
-    let server = Server::builder()
+    let mut server = Server::builder();
+    if let Some(tls) = tls {
+        server = server.tls_config(tls)?;
+    }
+    let server = server
+        .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))
+        .layer(Guard::new(gate))
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
         .add_service(
-            JobsServer::new(JobsService(link.clone()))
+            JobsServer::new(JobsService::new(link.clone(), config.quotas))
                 .max_decoding_message_size(MAX_MESSAGE_BYTES)
                 .max_encoding_message_size(MAX_MESSAGE_BYTES),
         )
         .add_service(
-            FarmServer::new(FarmService::new(link))
-                .max_decoding_message_size(MAX_MESSAGE_BYTES)
+            FarmServer::new(FarmService::new(link, config.quotas))
+                .max_decoding_message_size(MAX_WORKER_MESSAGE_BYTES)
                 .max_encoding_message_size(MAX_MESSAGE_BYTES),
         )
         .serve_with_incoming_shutdown(

@@ -1,45 +1,98 @@
-//! The ranges of one job in memory: at most one row for each run of equal state, merged where they meet.
+//! What a coordinator has in hand of one stage: ranges that are leased to its workers, and pending ones that wait for
+//! them. What is done or given up leaves for the catalog.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use picofarm_catalog::{Changes, LeaseState, Mark, Range, RangeState};
-use picofarm_proto::{
-    ids::{LeaseRef, RangeId},
-    model::TaskCounts,
-};
+use picofarm_proto::ids::{LeaseRef, RangeId};
 
 use crate::transition::{self, Illegal, RangeEvent};
 
-/// All ranges of a job. Those not leased never overlap; a leased one overlaps those of tasks that left it.
+/// The ranges in hand. Pending ones never overlap; a leased one overlaps those of tasks that left it.
 #[derive(Debug, Default)]
 pub struct Stage {
-    /// Pending, done and dead, by first task.
-    resting: BTreeMap<u64, Range>,
+    /// By first task.
+    pending: BTreeMap<u64, Range>,
     leased: BTreeMap<RangeId, Range>,
     /// Pending ranges by (not before, first task).
     queue: BTreeSet<(i64, u64)>,
-    /// Kept in step with the ranges; the truth is the ranges.
-    counts: TaskCounts,
+    /// Kept in step with the ranges.
+    pending_tasks: u64,
+    leased_tasks: u64,
 }
 
 impl Stage {
-    /// A stage of these ranges, merged where they meet; what changes by it goes to `changes`.
-    pub fn new(ranges: Vec<Range>, changes: &mut Changes) -> Self {
-        let mut stage = Self::default();
-        for range in ranges {
-            stage.insert(range, changes);
+    /// Takes a range in hand that is this house's in the catalog; a pending one joins its neighbours.
+    pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {
+        // One that was another house's for a while is not what it was here.
+        self.forget(range.id);
+        if self.join(&mut range, changes) {
+            changes.put(range.clone());
         }
-        stage
+        self.hold(range);
     }
 
-    /// Tasks by state.
-    pub fn counts(&self) -> TaskCounts {
-        self.counts
+    /// Makes a pending range one with its neighbours in hand, if there are any.
+    fn join(&mut self, range: &mut Range, changes: &mut Changes) -> bool {
+        if !(range.merges() && matches!(range.state, RangeState::Pending { .. })) {
+            return false;
+        }
+        let before = self
+            .pending
+            .range(..range.lo)
+            .next_back()
+            .map(|(_, b)| b)
+            .filter(|b| b.hi == range.lo && b.merges())
+            .cloned();
+        let after = self
+            .pending
+            .get(&range.hi)
+            .filter(|a| a.merges())
+            .cloned();
+        let neighbours = before.into_iter().chain(after);
+        let mut joined = false;
+        for neighbour in neighbours {
+            self.remove(&neighbour);
+            changes.remove(neighbour.id);
+            range.lo = range.lo.min(neighbour.lo);
+            range.hi = range.hi.max(neighbour.hi);
+            range.epoch = range.epoch.max(neighbour.epoch);
+            joined = true;
+        }
+        joined
     }
 
-    /// Whether every task is done or dead.
-    pub fn ended(&self) -> bool {
-        self.counts.pending == 0 && self.counts.leased == 0
+    fn hold(&mut self, range: Range) {
+        self.count(&range, |n, by| *n += by);
+        match range.state {
+            RangeState::Leased(_) => {
+                let other = self.leased.insert(range.id, range);
+                debug_assert_eq!(other, None, "a range is received once");
+            }
+            RangeState::Pending { not_before_ms } => {
+                self.queue.insert((not_before_ms, range.lo));
+                let other = self.pending.insert(range.lo, range);
+                debug_assert_eq!(other, None, "pending ranges do not overlap");
+            }
+            RangeState::Done { .. } | RangeState::Dead => {
+                debug_assert!(false, "what is done or dead is nobody's");
+            }
+        }
+    }
+
+    /// Pending tasks in hand.
+    pub fn pending_tasks(&self) -> u64 {
+        self.pending_tasks
+    }
+
+    /// Tasks under lease that are not done.
+    pub fn leased_tasks(&self) -> u64 {
+        self.leased_tasks
+    }
+
+    /// Whether nothing is in hand.
+    pub fn is_empty(&self) -> bool {
+        self.pending.is_empty() && self.leased.is_empty()
     }
 
     /// The leased ranges.
@@ -64,12 +117,13 @@ impl Stage {
         self.leased.get(&id)
     }
 
-    /// Prolongs a lease in place; the caller writes it out.
-    pub fn renew(&mut self, id: RangeId, to_ms: i64) {
+    /// Sets the end of a lease by a function of the present one. Only in memory: what another house takes over begins a
+    /// new period anyway.
+    pub fn set_until(&mut self, id: RangeId, to_ms: impl FnOnce(i64) -> i64) {
         if let Some(range) = self.leased.get_mut(&id)
             && let RangeState::Leased(lease) = &mut range.state
         {
-            lease.until_ms = lease.until_ms.max(to_ms);
+            lease.until_ms = to_ms(lease.until_ms);
         }
     }
 
@@ -78,28 +132,30 @@ impl Stage {
         self.queue
             .iter()
             .take_while(|(not_before, _)| *not_before <= now_ms)
-            .filter_map(|(_, lo)| self.resting.get(lo))
+            .filter_map(|(_, lo)| self.pending.get(lo))
             .find(|range| suspects || range.crashes == 0)
     }
 
     /// The pending range that holds a task.
     pub fn pending_at(&self, task: u64) -> Option<&Range> {
-        let (_, range) = self.resting.range(..=task).next_back()?;
-        (task < range.hi && matches!(range.state, RangeState::Pending { .. })).then_some(range)
+        let (_, range) = self.pending.range(..=task).next_back()?;
+        (task < range.hi).then_some(range)
     }
 
-    /// First tasks of the given-up ranges.
-    pub fn dead(&self) -> Vec<Range> {
-        self.resting
-            .values()
-            .filter(|r| r.state == RangeState::Dead)
-            .cloned()
-            .collect()
+    /// Gives every pending range out of hand.
+    pub fn give_pending(&mut self, changes: &mut Changes) {
+        self.queue.clear();
+        self.pending_tasks = 0;
+        for range in std::mem::take(&mut self.pending).into_values() {
+            changes.give(range);
+        }
     }
 
-    /// Number of ranges, which is the number of rows.
-    pub fn rows(&self) -> usize {
-        self.resting.len() + self.leased.len()
+    /// Forgets a leased range that has become another house's.
+    pub fn forget(&mut self, id: RangeId) -> Option<Range> {
+        let range = self.leased.remove(&id)?;
+        self.count(&range, |n, by| *n -= by);
+        Some(range)
     }
 
     /// Lets `event` happen to `range`; returns the leased range that results first, if any.
@@ -113,7 +169,13 @@ impl Stage {
         ids: &mut dyn FnMut() -> RangeId,
         changes: &mut Changes,
     ) -> Result<Option<Range>, Illegal> {
-        let pieces = transition::next(range, event, ids)?;
+        let mut minted = Vec::new();
+        let pieces = transition::next(range, event, &mut || {
+            let id = ids();
+            minted.push(id);
+            id
+        })?;
+        changes.minted.extend(minted);
         self.remove(range);
         changes.remove(range.id);
         let leased = pieces
@@ -129,91 +191,32 @@ impl Stage {
     fn remove(&mut self, range: &Range) {
         let known = match range.state {
             RangeState::Leased(_) => self.leased.remove(&range.id),
-            _ => self.resting.remove(&range.lo),
+            _ => self.pending.remove(&range.lo),
         };
         debug_assert_eq!(known.as_ref(), Some(range), "a range is removed as it is");
         if let RangeState::Pending { not_before_ms } = range.state {
             self.queue.remove(&(not_before_ms, range.lo));
         }
-        count(range, |field, n| *field -= n, &mut self.counts);
+        self.count(range, |n, by| *n -= by);
     }
 
     fn insert(&mut self, mut range: Range, changes: &mut Changes) {
-        if !matches!(range.state, RangeState::Leased(_)) {
-            let before = self
-                .resting
-                .range(..range.lo)
-                .next_back()
-                .map(|(_, b)| b)
-                .filter(|b| b.hi == range.lo && merges(b, &range))
-                .cloned();
-            let after = self
-                .resting
-                .get(&range.hi)
-                .filter(|a| merges(&range, a))
-                .cloned();
-            for neighbour in [before, after].into_iter().flatten() {
-                self.remove(&neighbour);
-                changes.remove(neighbour.id);
-                range.lo = range.lo.min(neighbour.lo);
-                range.hi = range.hi.max(neighbour.hi);
-                range.epoch = range.epoch.max(neighbour.epoch);
-            }
+        if let RangeState::Done { .. } | RangeState::Dead = range.state {
+            return changes.give(range);
         }
-        count(&range, |field, n| *field += n, &mut self.counts);
+        self.join(&mut range, changes);
         changes.put(range.clone());
-        match range.state {
-            RangeState::Leased(_) => {
-                self.leased.insert(range.id, range);
+        self.hold(range);
+    }
+
+    fn count(&mut self, range: &Range, change: impl FnOnce(&mut u64, u64)) {
+        match &range.state {
+            RangeState::Pending { .. } => change(&mut self.pending_tasks, range.len()),
+            RangeState::Leased(lease) => {
+                let todo = lease.marks.iter().filter(|m| **m == Mark::Todo).count();
+                change(&mut self.leased_tasks, todo as u64);
             }
-            _ => {
-                if let RangeState::Pending { not_before_ms } = range.state {
-                    self.queue.insert((not_before_ms, range.lo));
-                }
-                let other = self.resting.insert(range.lo, range);
-                debug_assert_eq!(other, None, "resting ranges do not overlap");
-            }
+            RangeState::Done { .. } | RangeState::Dead => {}
         }
     }
-}
-
-/// Whether two neighbours may become one: never those under suspicion or waiting for a time.
-fn merges(a: &Range, b: &Range) -> bool {
-    a.crashes == 0
-        && b.crashes == 0
-        && a.state == b.state
-        && match a.state {
-            RangeState::Pending { not_before_ms } => not_before_ms == 0,
-            RangeState::Leased(_) => false,
-            RangeState::Done { .. } | RangeState::Dead => true,
-        }
-}
-
-fn count(range: &Range, mut change: impl FnMut(&mut u64, u64), counts: &mut TaskCounts) {
-    let n = range.len();
-    match &range.state {
-        RangeState::Pending { .. } => change(&mut counts.pending, n),
-        RangeState::Dead => change(&mut counts.dead, n),
-        RangeState::Done { reused } => {
-            change(&mut counts.done, n);
-            if *reused {
-                change(&mut counts.reused, n);
-            }
-        }
-        RangeState::Leased(lease) => {
-            for run in lease.marks.chunk_by(|a, b| a == b) {
-                let n = run.len() as u64;
-                match run[0] {
-                    Mark::Todo => change(&mut counts.leased, n),
-                    Mark::Done => change(&mut counts.done, n),
-                    Mark::Reused => {
-                        change(&mut counts.done, n);
-                        change(&mut counts.reused, n);
-                    }
-                    Mark::Left => {}
-                }
-            }
-        }
-    }
-    counts.total = counts.done + counts.leased + counts.pending + counts.dead;
 }

@@ -1,7 +1,7 @@
 //! What may happen to a range: a pure function from a range and an event to the ranges that take its place.
 //! Law: the pieces hold exactly the tasks of the range, each once (a task marked `Left` has a range of its own).
 
-use picofarm_catalog::{LeaseState, Mark, Range, RangeState};
+use picofarm_catalog::{LeaseState, Mark, Range, RangeState, Run};
 use picofarm_proto::ids::{Incarnation, RangeId, WorkerId};
 
 /// Something that happens to a range.
@@ -39,13 +39,11 @@ pub enum RangeEvent {
         /// The worker was lost: halve what is left, so that a poison task is cornered.
         halve: bool,
     },
-    /// The output of a pending task turned up.
+    /// The outputs of pending tasks turned up.
     Settle {
-        /// The task.
-        task: u64,
+        /// The tasks, all of the range.
+        run: Run,
     },
-    /// Given-up tasks become pending again.
-    Retry,
 }
 
 /// An event that cannot happen to a range in its state.
@@ -140,34 +138,22 @@ pub fn next(
         (RangeState::Leased(lease), RangeEvent::Close { halve }) => {
             Ok(closed(range, lease, *halve, ids))
         }
-        (RangeState::Pending { .. }, RangeEvent::Settle { task })
-            if (range.lo..range.hi).contains(task) =>
+        (RangeState::Pending { .. }, RangeEvent::Settle { run })
+            if range.lo <= run.lo && run.lo < run.hi && run.hi <= range.hi =>
         {
             let mut pieces = Vec::with_capacity(3);
             for (lo, hi, state) in [
-                (range.lo, *task, range.state.clone()),
-                (*task, task + 1, RangeState::Done { reused: true }),
-                (task + 1, range.hi, range.state.clone()),
+                (range.lo, run.lo, range.state.clone()),
+                (run.lo, run.hi, RangeState::Done { reused: true }),
+                (run.hi, range.hi, range.state.clone()),
             ] {
                 if lo < hi {
-                    pieces.push(piece(
-                        range,
-                        lo,
-                        hi,
-                        range.crashes,
-                        state,
-                        pieces.len(),
-                        ids,
-                    ));
+                    let n = pieces.len();
+                    pieces.push(piece(range, lo, hi, range.crashes, state, n, ids));
                 }
             }
             Ok(pieces)
         }
-        (RangeState::Dead, RangeEvent::Retry) => Ok(vec![Range {
-            crashes: 0,
-            state: RangeState::Pending { not_before_ms: 0 },
-            ..range.clone()
-        }]),
         _ => Err(illegal()),
     }
 }
@@ -241,7 +227,7 @@ fn piece(
 ) -> Range {
     Range {
         id: if earlier == 0 { range.id } else { ids() },
-        job: range.job,
+        stage: range.stage,
         lo,
         hi,
         epoch: range.epoch,

@@ -70,6 +70,26 @@ id!(
     Incarnation,
     "incarnation"
 );
+id!(
+    /// One life of a coordinator on a catalog: new at every start and after every failure to write.
+    HouseId,
+    "house"
+);
+
+/// A stage of a job; its tasks have indices from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct StageRef {
+    /// The job.
+    pub job: JobId,
+    /// Position among the job's stages.
+    pub stage: u32,
+}
+
+impl fmt::Display for StageRef {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.job, self.stage)
+    }
+}
 
 /// Fences a lease: grows at each grant of a range, so that a former holder's words no longer count.
 #[derive(

@@ -1,7 +1,8 @@
 //! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
-//! protobuf types with their conversions. No I/O.
+//! protobuf types with their conversions. No I/O, but for [`credentials`].
 
 pub mod convert;
+pub mod credentials;
 pub mod ids;
 pub mod key;
 pub mod model;

@@ -35,7 +35,8 @@ impl Cli {
     pub fn command(&self, args: &[&str]) -> Command {
         let mut command = Command::new(binary::picofarm());
         for (name, _) in std::env::vars_os() {
-            if name.to_string_lossy().starts_with("PICOFARM_") {
+            let name = name.to_string_lossy().into_owned();
+            if name.starts_with("PICOFARM_") || name.starts_with("AWS_") {
                 command.env_remove(name);
             }
         }

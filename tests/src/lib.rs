@@ -11,6 +11,7 @@ pub mod job;
 pub mod mount;
 pub mod process;
 pub mod rng;
+pub mod s3;
 pub mod scratch;
 pub mod shapes;
 pub mod store;

@@ -162,7 +162,7 @@ fn a_file_that_is_no_scene_and_one_that_is_not_there_are_told_apart() {
 fn a_taken_port_and_a_taken_catalog_are_refused_and_the_owner_goes_on() {
     let farm = Farm::start("taken");
     let address = farm.url().trim_start_matches("http://");
-    let coordinator = ["coordinator", "--catalog"];
+    let coordinator = ["coordinator", "--allow-insecure", "--catalog"];
     let other = [&coordinator[..], &["other.sqlite", "--listen", address]].concat();
     farm.run(&other)
         .fails(7, &[address, "in use", "another port"]);
@@ -181,11 +181,15 @@ fn a_taken_port_and_a_taken_catalog_are_refused_and_the_owner_goes_on() {
 }
 
 #[test]
-fn listening_beyond_loopback_is_refused_while_there_is_no_authentication() {
+fn listening_without_authentication_is_refused() {
     let scratch = Scratch::new("beyond-loopback");
     let cli = Cli::new(scratch.path());
     cli.run(&["coordinator", "--listen", "0.0.0.0:0"])
-        .fails(3, &["0.0.0.0:0", "--allow-insecure"]);
+        .fails(3, &["0.0.0.0:0", "--tokens", "--allow-insecure"]);
+    cli.run(&["coordinator", "--listen", "127.0.0.1:0"])
+        .fails(3, &["127.0.0.1:0", "--tokens", "--allow-insecure"]);
+    cli.run(&["up", "--listen", "0.0.0.0:0"])
+        .fails(3, &["0.0.0.0:0", "--tokens", "--allow-insecure"]);
 }
 
 #[test]

@@ -115,7 +115,7 @@ impl Work {
     fn all(&self, output: Output) -> Result<Done> {
         let (scenes, room) = self
             .reprocessor
-            .source(&self.settings)
+            .source(&self.settings, &Control::default())
             .map_err(task_failed)?;
         if scenes.is_empty() {
             return Err(CliError::input(format!(

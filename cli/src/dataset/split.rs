@@ -28,10 +28,11 @@ pub async fn run(args: DatasetSplit, output: Output) -> Result<()> {
         parts,
     });
     let splitter = Splitter::new(Handle::current());
+    let control = Control::default();
     let name = args.name.clone();
     let split = tokio::task::spawn_blocking(move || match settings {
-        Some(settings) => splitter.run(&settings, &store, &dataset, &Control::default()),
-        None => splitter.show(&name, &store, &dataset),
+        Some(settings) => splitter.run(&settings, &store, &dataset, &control),
+        None => splitter.show(&name, &store, &dataset, &control),
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("splitting broke: {e}")))?

@@ -2,12 +2,12 @@
 
 use picofarm_catalog::{Output, Range};
 use picofarm_proto::{
-    ids::JobId,
+    ids::StageRef,
     key::task_key,
-    model::{EventKind, Finished, JobState},
+    model::{EventKind, Finished},
 };
 
-use super::{About, Core, JobEntry, SessionId};
+use super::{About, Core, SessionId, StageEntry};
 use crate::transition::RangeEvent;
 
 /// What the catalog already holds for a reported task: looked up before [`Core::finished`].
@@ -15,20 +15,17 @@ use crate::transition::RangeEvent;
 pub(crate) struct OutputHint(pub Option<[u8; 32]>);
 
 impl Core {
-    /// The job whose task a report is about: by its lease, or else by the task key.
-    pub(crate) fn job_of(&self, report: &Finished) -> Option<JobId> {
-        let fits = |entry: &JobEntry| {
-            report.index < entry.job.spec.scenes.count
-                && task_key(&self.sets[entry.set].key, report.index) == report.key
-        };
+    /// The stage whose task a report is about: by its lease, or else by the task key.
+    pub(crate) fn stage_of(&self, report: &Finished) -> Option<StageRef> {
+        let fits = |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
         if let Some(id) = self.leases.get(&report.lease.range) {
-            return fits(&self.jobs[id]).then_some(*id);
+            return fits(&self.stages[id]).then_some(*id);
         }
-        self.order
+        self.stages
             .iter()
             .rev()
-            .find(|id| fits(&self.jobs[id]))
-            .copied()
+            .find(|(_, entry)| fits(entry))
+            .map(|(id, _)| *id)
     }
 
     /// Commits a finished task, or says why not. `hint` is what the catalog holds for it.
@@ -59,10 +56,10 @@ impl Core {
         let mut manifest = [0; 32];
         hex_into(&report.manifest_sha256, &mut manifest)
             .ok_or("manifest_sha256: expected 64 hexadecimal digits")?;
-        let id = self.job_of(report).ok_or(
-            "the task key names no task of this job; the worker's renderer or settings differ from the job's",
+        let id = self.stage_of(report).ok_or(
+            "the task key names no task of an active job: it has ended, or the worker's renderer or settings differ",
         )?;
-        let set = self.jobs[&id].set;
+        let set = self.stages[&id].set;
         let known = known.or_else(|| self.fresh.get(&(set, report.index)).copied());
         let live = self
             .held_to_do(session, report.lease, report.index, now_ms)
@@ -82,7 +79,7 @@ impl Core {
                             reused: true,
                         },
                     );
-                    self.end_if_over(id, now_ms);
+                    self.perhaps_over(id, now_ms);
                 }
                 if known == manifest {
                     return Ok(());
@@ -94,11 +91,11 @@ impl Core {
                     hex_of(&known),
                     report.manifest_sha256
                 );
-                tracing::error!(job = %id, worker = name, "{message}");
+                tracing::error!(job = %id.job, worker = name, "{message}");
                 let about = About::message(message.clone())
                     .task(report.index)
                     .worker(name);
-                self.event(now_ms, id, EventKind::Alarm, about);
+                self.event(now_ms, id.job, EventKind::Alarm, about);
                 Err(message)
             }
             (Err(reason), None) => Err(reason),
@@ -108,17 +105,17 @@ impl Core {
     fn commit_new(
         &mut self,
         session: SessionId,
-        id: JobId,
+        id: StageRef,
         range: &Range,
         report: &Finished,
         manifest: [u8; 32],
         now_ms: i64,
     ) {
         let task = report.index;
-        let set = self.jobs[&id].set;
+        let set = self.stages[&id].set;
         self.fresh.insert((set, task), manifest);
         self.changes.outputs.push(Output {
-            job: id,
+            stage: id,
             task,
             manifest,
             bytes: report.bytes,
@@ -138,7 +135,7 @@ impl Core {
             .task(task)
             .worker(self.session_name(session))
             .seconds(report.seconds);
-        self.event(now_ms, id, kind, about);
+        self.event(now_ms, id.job, kind, about);
         self.mark(
             range,
             &RangeEvent::Finish {
@@ -146,36 +143,7 @@ impl Core {
                 reused: report.adopted,
             },
         );
-        self.end_if_over(id, now_ms);
-        self.settle_elsewhere(set, id, task, now_ms);
-    }
-
-    /// Other jobs that wait for the same output have it now.
-    fn settle_elsewhere(&mut self, set: usize, but: JobId, task: u64, now_ms: i64) {
-        if self.sets[set].jobs.len() < 2 {
-            return;
-        }
-        for id in self.sets[set].jobs.clone() {
-            let entry = self.jobs.get_mut(&id).expect("a set names known jobs");
-            if id == but || entry.job.state != JobState::Active {
-                continue;
-            }
-            let Some(range) = entry.stage.pending_at(task).cloned() else {
-                continue;
-            };
-            entry
-                .stage
-                .apply(
-                    &range,
-                    &RangeEvent::Settle { task },
-                    &mut Self::range_id(&mut self.make_id),
-                    &mut self.changes,
-                )
-                .expect("a pending task can be settled");
-            let about = About::message(format!("committed by job {but}")).task(task);
-            self.event(now_ms, id, EventKind::Reused, about);
-            self.end_if_over(id, now_ms);
-        }
+        self.perhaps_over(id, now_ms);
     }
 }
 

@@ -2,39 +2,39 @@
 
 use picofarm_catalog::RangeState;
 use picofarm_proto::{
-    ids::{JobId, WorkerId},
-    model::{EventKind, JobState, Lease},
+    ids::{StageRef, WorkerId},
+    model::{EventKind, Lease},
 };
 
 use super::{About, Core, Say};
 use crate::{place, transition::RangeEvent};
 
 impl Core {
-    /// Grants whatever can be granted now.
+    /// Grants whatever is in hand and can be granted now.
     pub(crate) fn dispatch(&mut self, now_ms: i64) {
+        let waiting: Vec<StageRef> = self
+            .stages
+            .iter()
+            .filter(|(_, e)| e.stage.pending_tasks() > 0 || e.free != Some(0))
+            .map(|(id, _)| *id)
+            .collect();
+        for stage in &waiting {
+            self.explain_waiting(*stage, now_ms);
+        }
         let hungry: Vec<WorkerId> = self
             .workers
             .iter()
             .filter(|(_, w)| w.credits > 0 && !w.quarantined)
             .map(|(id, _)| *id)
             .collect();
-        let waiting: Vec<JobId> = self
-            .order
-            .iter()
-            .filter(|id| {
-                let entry = &self.jobs[id];
-                entry.job.state == JobState::Active && entry.stage.counts().pending > 0
-            })
-            .copied()
-            .collect();
-        for job in &waiting {
-            self.explain_waiting(*job, now_ms);
-        }
         if hungry.is_empty() {
             return;
         }
-        let waiting: Vec<(JobId, u64)> =
-            waiting.iter().map(|job| (*job, self.able(*job))).collect();
+        let waiting: Vec<(StageRef, u64)> = waiting
+            .into_iter()
+            .filter(|stage| self.stages[stage].stage.pending_tasks() > 0)
+            .map(|stage| (stage, self.able(stage)))
+            .collect();
         // In rounds, so that the first worker does not take everything.
         let mut granted = true;
         while granted {
@@ -42,18 +42,15 @@ impl Core {
             for worker in &hungry {
                 granted |= waiting
                     .iter()
-                    .any(|(job, able)| self.grant(*job, *worker, *able, now_ms));
+                    .any(|(stage, able)| self.grant(*stage, *worker, *able, now_ms));
             }
         }
     }
 
-    /// Grants one lease of a job to a worker, if both can; `able` workers may run the job.
-    fn grant(&mut self, id: JobId, worker: WorkerId, able: u64, now_ms: i64) -> bool {
-        let entry = self.jobs.get_mut(&id).expect("the caller lists known jobs");
-        let who = self
-            .workers
-            .get_mut(&worker)
-            .expect("the caller lists connected workers");
+    /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
+    fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
+        let entry = &self.stages[&id];
+        let who = &self.workers[&worker];
         if who.credits == 0
             || who.quarantined
             || place::may_run(&entry.job.spec, &who.abilities).is_err()
@@ -64,12 +61,9 @@ impl Core {
         let Some(range) = entry.stage.front(now_ms, who.leases.is_empty()).cloned() else {
             return false;
         };
-        let count = place::lease_size(
-            self.sets[entry.set].timing.mean(),
-            entry.stage.counts().pending,
-            range.len(),
-            able,
-        );
+        let count = self.lease_size(entry, able, range.len());
+        let entry = self.stages.get_mut(&id).expect("looked up above");
+        let who = self.workers.get_mut(&worker).expect("looked up above");
         let granted = entry
             .stage
             .apply(
@@ -92,7 +86,7 @@ impl Core {
         self.leases.insert(granted.id, id);
         let lease = Lease {
             lease: granted.lease(),
-            job: id,
+            job: id.job,
             lo: granted.lo,
             hi: granted.hi,
             skip: Vec::new(),
@@ -103,13 +97,13 @@ impl Core {
         let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))
             .tasks(granted.lo, granted.hi)
             .worker(who.name.clone());
-        self.event(now_ms, id, EventKind::Leased, about);
+        self.event(now_ms, id.job, EventKind::Leased, about);
         true
     }
 
-    /// Number of connected workers that may run a job's tasks.
-    fn able(&self, id: JobId) -> u64 {
-        let spec = &self.jobs[&id].job.spec;
+    /// Number of connected workers that may run a stage's tasks.
+    fn able(&self, id: StageRef) -> u64 {
+        let spec = &self.stages[&id].job.spec;
         self.workers
             .values()
             .filter(|w| place::may_run(spec, &w.abilities).is_ok())
@@ -117,8 +111,8 @@ impl Core {
     }
 
     /// Where workers are connected but none may run a job, its history says why, once for each reason.
-    fn explain_waiting(&mut self, id: JobId, now_ms: i64) {
-        let entry = &self.jobs[&id];
+    fn explain_waiting(&mut self, id: StageRef, now_ms: i64) {
+        let entry = &self.stages[&id];
         let mut reasons = self
             .workers
             .values()
@@ -133,12 +127,12 @@ impl Core {
             return;
         }
         let name = name.clone();
-        tracing::warn!(job = %id, worker = name, "no connected worker may run this job: {reason}");
-        self.jobs.get_mut(&id).expect("looked up above").waiting = Some(reason.clone());
+        tracing::warn!(job = %id.job, worker = name, "no connected worker may run this job: {reason}");
+        self.stages.get_mut(&id).expect("looked up above").waiting = Some(reason.clone());
         let message = format!("no connected worker may run this job: {reason}");
         self.event(
             now_ms,
-            id,
+            id.job,
             EventKind::Waiting,
             About::message(message).worker(name),
         );

@@ -25,7 +25,7 @@ impl Core {
                 &name,
                 now_ms,
             );
-            self.end_if_over(range.job, now_ms);
+            self.perhaps_over(range.stage, now_ms);
         });
         self.acknowledge(session, failure.lease, failure.index, verdict);
     }
@@ -43,7 +43,7 @@ impl Core {
             let about = About::message(reason)
                 .tasks(range.lo, range.hi)
                 .worker(self.session_name(session));
-            self.event(now_ms, range.job, EventKind::Released, about);
+            self.event(now_ms, range.stage.job, EventKind::Released, about);
             self.close(&range, false);
         });
         self.acknowledge(session, lease, 0, verdict);
@@ -89,14 +89,8 @@ impl Core {
         ));
     }
 
-    /// Takes back every lease that has run out; to be called about once a second.
+    /// Takes back every lease that has run out; to be called a few times a second.
     pub(crate) fn expire(&mut self, now_ms: i64) {
-        for range in std::mem::take(&mut self.renewed) {
-            if let Some(range) = self.range(range) {
-                let range = range.clone();
-                self.changes.put(range);
-            }
-        }
         let over: Vec<Range> = self
             .leases
             .keys()
@@ -115,7 +109,7 @@ impl Core {
 
     /// The worker was lost without a goodbye: the task in hand is charged with a crash, the rest is halved.
     pub(crate) fn lost(&mut self, range: &Range, why: &str, now_ms: i64) {
-        let Some((_, lease)) = self.jobs[&range.job].stage.lease(range.lease()) else {
+        let Some((_, lease)) = self.stages[&range.stage].stage.lease(range.lease()) else {
             return;
         };
         let worker = lease.worker;
@@ -128,7 +122,7 @@ impl Core {
             self.say.push((entry.session, revoke));
         }
         let about = About::message(why).tasks(range.lo, range.hi).worker(&*name);
-        self.event(now_ms, range.job, EventKind::Expired, about);
+        self.event(now_ms, range.stage.job, EventKind::Expired, about);
         let todo = |task: &u64| to_do(range, *task);
         let mut in_hand: Vec<u64> = self
             .progress
@@ -149,7 +143,7 @@ impl Core {
         if let Some(range) = self.range(range.id).cloned() {
             self.close(&range, true);
         }
-        self.end_if_over(range.job, now_ms);
+        self.perhaps_over(range.stage, now_ms);
     }
 
     /// One task fails and leaves its lease.
@@ -162,9 +156,12 @@ impl Core {
         worker: &str,
         now_ms: i64,
     ) {
-        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
+        let entry = self
+            .stages
+            .get_mut(&range.stage)
+            .expect("a lease has a stage");
         let fresh = Exception {
-            job: range.job,
+            stage: range.stage,
             task,
             failures: 0,
             crashes: 0,
@@ -184,7 +181,7 @@ impl Core {
         if let Some(exception) = verdict.exception {
             self.changes
                 .exceptions
-                .insert((range.job, task), exception.clone());
+                .insert((range.stage, task), exception.clone());
             entry.exceptions.insert(task, exception);
         }
         self.mark(
@@ -202,7 +199,7 @@ impl Core {
             None => EventKind::Dead,
         };
         let about = About::message(message).task(task).worker(worker);
-        self.event(now_ms, range.job, kind, about);
+        self.event(now_ms, range.stage.job, kind, about);
     }
 
     /// Ends a lease; what is not done becomes pending.
@@ -210,20 +207,27 @@ impl Core {
         self.mark(range, &RangeEvent::Close { halve });
     }
 
-    /// Prolongs a lease in memory; written with the next tick.
+    /// Prolongs a lease by one period from now.
     pub(super) fn renew(&mut self, id: RangeId, now_ms: i64) {
         let until_ms = now_ms + i64::from(self.settings.lease_ms);
-        let Some(range) = self.range(id).cloned() else {
-            return;
-        };
-        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
-        entry.stage.renew(range.id, until_ms);
-        self.renewed.insert(id);
+        self.set_until(id, |_| until_ms);
+    }
+
+    /// Sets the end of a lease by a function of the present one.
+    pub(super) fn set_until(&mut self, id: RangeId, to_ms: impl FnOnce(i64) -> i64) {
+        if let Some(stage) = self.leases.get(&id)
+            && let Some(entry) = self.stages.get_mut(stage)
+        {
+            entry.stage.set_until(id, to_ms);
+        }
     }
 
     /// Lets something happen to a leased range and forgets the lease when it has ended by that.
     pub(super) fn mark(&mut self, range: &Range, event: &RangeEvent) {
-        let entry = self.jobs.get_mut(&range.job).expect("a lease has a job");
+        let entry = self
+            .stages
+            .get_mut(&range.stage)
+            .expect("a lease has a stage");
         let left = entry
             .stage
             .apply(
@@ -239,21 +243,25 @@ impl Core {
             tasks.remove(task);
         }
         if left.is_none() {
-            self.leases.remove(&range.id);
-            self.progress.remove(&range.id);
-            self.renewed.remove(&range.id);
-            for worker in self.workers.values_mut() {
-                if worker.leases.remove(&range.id) && worker.leases.is_empty() {
-                    worker.quarantined = false;
-                }
+            self.lease_over(range.id);
+        }
+    }
+
+    /// Forgets a lease.
+    pub(super) fn lease_over(&mut self, id: RangeId) {
+        self.leases.remove(&id);
+        self.progress.remove(&id);
+        for worker in self.workers.values_mut() {
+            if worker.leases.remove(&id) && worker.leases.is_empty() {
+                worker.quarantined = false;
             }
         }
     }
 
     /// A leased range.
     fn range(&self, id: RangeId) -> Option<&Range> {
-        let job = self.leases.get(&id)?;
-        self.jobs[job].stage.leased_range(id)
+        let stage = self.leases.get(&id)?;
+        self.stages[stage].stage.leased_range(id)
     }
 
     /// The range of a lease that this session's worker holds now.
@@ -266,7 +274,7 @@ impl Core {
         let (range, state) = self
             .leases
             .get(&lease.range)
-            .and_then(|job| self.jobs[job].stage.lease(lease))
+            .and_then(|stage| self.stages[stage].stage.lease(lease))
             .ok_or("the lease is no longer live: it ran out, was cancelled, or is finished")?;
         if state.worker != *worker || state.incarnation != incarnation {
             return Err("the lease is another worker's now".into());

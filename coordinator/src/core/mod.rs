@@ -1,31 +1,37 @@
-//! The coordinator's mind: all live state in memory, synchronous methods over it, no I/O. Time and ids are
+//! The coordinator's mind: what this house has in hand, synchronous methods over it, no I/O. Time and ids are
 //! passed in. Each method notes what must become durable ([`Changes`]) and what to say afterwards ([`Say`]).
+//!
+//! In hand are the active jobs, the ranges leased to connected workers (or to those that may come back), and the pending
+//! ranges claimed for them. Everything else is the catalog's.
 
 mod commit;
 mod dispatch;
 mod jobs;
 mod leases;
 mod sessions;
+mod supply;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use picofarm_catalog::{Changes, Exception, Job, NewEvent, ResultSet, Run, Snapshot, Timing};
+use picofarm_catalog::{
+    Changes, Exception, Job, JobEnd, NewEvent, ResultSet, Run, Snapshot, Timing,
+};
 use picofarm_proto::{
-    ids::{Incarnation, JobId, LeaseRef, RangeId, WorkerId},
+    ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::StageKey,
-    model::{EventKind, JobState, Lease},
+    model::{EventKind, Lease},
 };
 use uuid::Uuid;
 
 use crate::{budget::Backoff, place::Abilities, stage::Stage};
 
 pub(crate) use commit::OutputHint;
-pub(crate) use jobs::Submitted;
+pub(crate) use jobs::{Prepared, Timings, place_is_free, stands_for};
 
 /// Makes UUIDs; passed in, so that the core is deterministic.
-pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send>;
+pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send + Sync>;
 
 /// Number of a session, unique in this process.
 pub(crate) type SessionId = u64;
@@ -35,6 +41,8 @@ pub(crate) type SessionId = u64;
 pub(crate) struct Settings {
     /// Life of a lease, milliseconds.
     pub lease_ms: u32,
+    /// How long a worker whose connection broke may take to come back before its leases are others', milliseconds.
+    pub reconnect_ms: u32,
     /// Waiting times after failures.
     pub backoff: Backoff,
 }
@@ -61,11 +69,17 @@ pub(crate) enum Say {
     Replaced,
 }
 
-struct JobEntry {
+struct StageEntry {
+    /// The stage's job.
     job: Job,
     set: usize,
     stage: Stage,
+    /// Of tasks that were ever in hand.
     exceptions: BTreeMap<u64, Exception>,
+    /// Pending tasks that are nobody's, as last heard; `None` = ask.
+    free: Option<u64>,
+    /// The catalog is not asked for tasks before this time: it had none to give just now.
+    ask_at_ms: i64,
     /// Why no connected worker may run it, as last told.
     waiting: Option<String>,
 }
@@ -74,7 +88,6 @@ struct JobEntry {
 struct SetEntry {
     key: StageKey,
     timing: Timing,
-    jobs: Vec<JobId>,
 }
 
 struct WorkerEntry {
@@ -97,9 +110,8 @@ struct Progress {
 pub(crate) struct Core {
     settings: Settings,
     make_id: MakeId,
-    jobs: BTreeMap<JobId, JobEntry>,
-    /// Jobs in order of submission.
-    order: Vec<JobId>,
+    /// Stages of active jobs; ids of jobs grow with time, so this is the order of submission.
+    stages: BTreeMap<StageRef, StageEntry>,
     sets: Vec<SetEntry>,
     set_ids: HashMap<ResultSet, usize>,
     /// Connected workers.
@@ -107,12 +119,14 @@ pub(crate) struct Core {
     sessions: HashMap<SessionId, WorkerId>,
     /// Names of all workers ever seen.
     names: HashMap<WorkerId, String>,
-    /// The job of each leased range.
-    leases: BTreeMap<RangeId, JobId>,
+    /// The stage of each leased range.
+    leases: BTreeMap<RangeId, StageRef>,
     /// Tasks in hand, by lease, as last reported.
     progress: BTreeMap<RangeId, BTreeMap<u64, Progress>>,
-    /// Leases prolonged since they were last written.
-    renewed: BTreeSet<RangeId>,
+    /// Houses alive, this one too.
+    houses: u32,
+    /// Workers connected to other houses.
+    elsewhere: u32,
     /// Outputs of `changes`, by set and task.
     fresh: HashMap<(usize, u64), [u8; 32]>,
     changes: Changes,
@@ -121,7 +135,7 @@ pub(crate) struct Core {
 
 impl Core {
     /// Takes up where the catalog stands. Live leases get a fresh lease period, so that workers that reconnect
-    /// keep them. `timing` of a set is asked once for each set of an active job.
+    /// keep them. `timing` holds what is known of each result set of an active job.
     pub(crate) fn load(
         snapshot: Snapshot,
         timing: &HashMap<ResultSet, Timing>,
@@ -132,8 +146,7 @@ impl Core {
         let mut core = Self {
             settings,
             make_id,
-            jobs: BTreeMap::new(),
-            order: Vec::new(),
+            stages: BTreeMap::new(),
             sets: Vec::new(),
             set_ids: HashMap::new(),
             workers: BTreeMap::new(),
@@ -145,59 +158,55 @@ impl Core {
                 .collect(),
             leases: BTreeMap::new(),
             progress: BTreeMap::new(),
-            renewed: BTreeSet::new(),
+            houses: 1,
+            elsewhere: 0,
             fresh: HashMap::new(),
             changes: Changes::default(),
             say: Vec::new(),
         };
-        let mut ranges: BTreeMap<JobId, Vec<_>> = BTreeMap::new();
-        for range in snapshot.ranges {
-            ranges.entry(range.job).or_default().push(range);
-        }
         for job in snapshot.jobs {
-            let set = ResultSet::of(&job.spec);
-            let timing = timing.get(&set).copied().unwrap_or_default();
-            let mut changes = Changes::default();
-            let stage = Stage::new(ranges.remove(&job.id).unwrap_or_default(), &mut changes);
-            if !changes.gone.is_empty() {
-                core.changes.append(changes);
-            }
-            core.leases
-                .extend(stage.leased().map(|(range, _)| (range.id, job.id)));
-            core.adopt(job, set, timing, stage);
+            core.add_job(&job, timing);
         }
-        for exception in snapshot.exceptions {
-            if let Some(entry) = core.jobs.get_mut(&exception.job) {
-                entry.exceptions.insert(exception.task, exception);
-            }
-        }
-        core.grace(now_ms);
+        core.receive(snapshot.owned, now_ms);
         core
     }
 
-    fn adopt(&mut self, job: Job, set: ResultSet, timing: Timing, stage: Stage) {
-        let next = self.sets.len();
-        let key = set.stage_key;
-        let set = *self.set_ids.entry(set).or_insert(next);
-        if set == next {
-            self.sets.push(SetEntry {
-                key,
-                timing,
-                jobs: Vec::new(),
-            });
+    /// Whether a job is known to be active.
+    pub(crate) fn knows(&self, job: JobId) -> bool {
+        self.stages.contains_key(&StageRef { job, stage: 0 })
+    }
+
+    /// Takes note of an active job.
+    pub(crate) fn add_job(&mut self, job: &Job, timing: &HashMap<ResultSet, Timing>) {
+        for record in job.stages() {
+            let next = self.sets.len();
+            let key = record.set.stage_key;
+            let timing = timing.get(&record.set).copied().unwrap_or_default();
+            let set = *self.set_ids.entry(record.set).or_insert(next);
+            if set == next {
+                self.sets.push(SetEntry { key, timing });
+            }
+            self.stages.insert(
+                record.id,
+                StageEntry {
+                    job: job.clone(),
+                    set,
+                    stage: Stage::default(),
+                    exceptions: BTreeMap::new(),
+                    free: None,
+                    ask_at_ms: 0,
+                    waiting: None,
+                },
+            );
         }
-        self.sets[set].jobs.push(job.id);
-        self.order.push(job.id);
-        self.jobs.insert(
-            job.id,
-            JobEntry {
-                job,
-                set,
-                stage,
-                exceptions: BTreeMap::new(),
-                waiting: None,
-            },
-        );
+    }
+
+    /// Takes note of jobs that have ended.
+    pub(crate) fn ended(&mut self, ends: &[JobEnd]) {
+        for end in ends {
+            tracing::info!(job = %end.job, state = ?end.state, "job ended");
+            self.stages.retain(|id, _| id.job != end.job);
+        }
     }
 
     /// What must become durable, and what to say when it is.
@@ -209,8 +218,8 @@ impl Core {
         )
     }
 
-    /// Prolongs every lease by one lease period from now: after a restart or a stall of the coordinator itself,
-    /// for which no worker is to blame.
+    /// Prolongs every lease by one lease period from now: after a stall of the coordinator itself, for which no worker
+    /// is to blame.
     pub(crate) fn grace(&mut self, now_ms: i64) {
         for range in self.leases.keys().copied().collect::<Vec<_>>() {
             self.renew(range, now_ms);
@@ -224,7 +233,19 @@ impl Core {
             .unwrap_or_else(|| worker.to_string())
     }
 
+    /// Notes a line of history. Neighbouring tasks that a worker finished in one batch share a line.
     fn event(&mut self, at_ms: i64, job: JobId, kind: EventKind, about: About) {
+        if let (Some(last), Some(tasks)) = (self.changes.events.last_mut(), about.tasks)
+            && matches!(kind, EventKind::Committed | EventKind::Reused)
+            && (last.kind, last.job) == (kind, job)
+            && last.worker == about.worker
+            && last.message == about.message
+            && let Some(before) = last.tasks.as_mut().filter(|t| t.hi == tasks.lo)
+        {
+            before.hi = tasks.hi;
+            last.seconds += about.seconds;
+            return;
+        }
         self.changes.events.push(NewEvent {
             at_ms,
             job,
@@ -236,29 +257,12 @@ impl Core {
         });
     }
 
-    /// Ends a job whose tasks are all done or dead.
-    fn end_if_over(&mut self, id: JobId, now_ms: i64) {
-        let Some(entry) = self.jobs.get_mut(&id) else {
-            return;
-        };
-        if entry.job.state != JobState::Active || !entry.stage.ended() {
-            return;
+    /// Where nothing of a stage is in hand any more, its job may be over.
+    fn perhaps_over(&mut self, stage: StageRef, now_ms: i64) {
+        let empty = self.stages.get(&stage).is_none_or(|e| e.stage.is_empty());
+        if empty {
+            self.changes.perhaps_over.insert(stage.job, now_ms);
         }
-        let counts = entry.stage.counts();
-        entry.job.state = if counts.dead > 0 {
-            JobState::Failed
-        } else {
-            JobState::Done
-        };
-        entry.job.ended_ms = Some(now_ms);
-        self.changes
-            .job_states
-            .insert(id, (entry.job.state, entry.job.ended_ms));
-        let message = format!(
-            "{} of {} tasks done, {} dead",
-            counts.done, counts.total, counts.dead
-        );
-        self.event(now_ms, id, EventKind::Ended, About::message(message));
     }
 
     fn range_id(make_id: &mut MakeId) -> impl FnMut() -> RangeId + '_ {

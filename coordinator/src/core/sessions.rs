@@ -27,8 +27,8 @@ impl Core {
         );
         let mut mine = Vec::new();
         let mut former = Vec::new();
-        for job in self.jobs.values() {
-            for (range, lease) in job.stage.leased().filter(|(_, l)| l.worker == id) {
+        for entry in self.stages.values() {
+            for (range, lease) in entry.stage.leased().filter(|(_, l)| l.worker == id) {
                 if lease.incarnation == hello.incarnation {
                     mine.push(range.clone());
                 } else {
@@ -103,12 +103,17 @@ impl Core {
         }
     }
 
-    /// A session has ended. Leases that were not given back live on until they run out: the worker may come back.
+    /// A session has ended. Leases that were not given back live on for a moment: the worker may come back. If its
+    /// process died, its tasks shall not wait for the end of the lease.
     pub(crate) fn closed(&mut self, session: SessionId, now_ms: i64) {
         let Some(worker) = self.sessions.remove(&session) else {
             return;
         };
         if let Some(entry) = self.workers.remove(&worker) {
+            let until_ms = now_ms + i64::from(self.settings.reconnect_ms);
+            for range in &entry.leases {
+                self.set_until(*range, |until| until.min(until_ms));
+            }
             self.changes.workers.insert(
                 worker,
                 Worker {

@@ -4,7 +4,7 @@ use std::{
     pin::Pin,
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicU64, AtomicUsize, Ordering},
     },
     time::Duration,
 };
@@ -23,10 +23,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::{Link, invalid};
+use super::{Link, caller, invalid};
 use crate::{
     VERSION,
     actor::{Command, FromWorker},
+    auth::{Caller, Quotas, WorkerIds},
     core::{Say, SessionId},
 };
 
@@ -37,15 +38,42 @@ const OUTBOX: usize = 4096;
 
 pub(crate) struct FarmService {
     link: Link,
+    quotas: Quotas,
     sessions: Arc<AtomicU64>,
+    open: Arc<AtomicUsize>,
+    ids: Arc<WorkerIds>,
 }
 
 impl FarmService {
-    pub(crate) fn new(link: Link) -> Self {
+    pub(crate) fn new(link: Link, quotas: Quotas) -> Self {
         Self {
             link,
+            quotas,
             sessions: Arc::new(AtomicU64::new(1)),
+            open: Arc::default(),
+            ids: Arc::default(),
         }
+    }
+
+    /// Counts a session in, until the value is dropped.
+    fn enter(&self) -> Result<Counted, Status> {
+        let (open, most) = (Arc::clone(&self.open), self.quotas.sessions);
+        let counted = Counted(open);
+        if counted.0.fetch_add(1, Ordering::Relaxed) >= most {
+            return Err(Status::resource_exhausted(format!(
+                "{most} workers are connected, the most that --max-sessions allows"
+            )));
+        }
+        Ok(counted)
+    }
+}
+
+/// A session that counts.
+struct Counted(Arc<AtomicUsize>);
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -59,17 +87,34 @@ impl Farm for FarmService {
         &self,
         request: Request<Streaming<wire::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
+        let counted = self.enter()?;
         let session = self.sessions.fetch_add(1, Ordering::Relaxed);
         let (out, stream) = mpsc::channel(16);
-        tokio::spawn(run(self.link.clone(), session, request.into_inner(), out));
+        let (link, ids) = (self.link.clone(), Arc::clone(&self.ids));
+        let caller = caller(&request);
+        tokio::spawn(async move {
+            run(link, session, caller, ids, request.into_inner(), out).await;
+            drop(counted);
+        });
         // At once: a client may wait for this before it says hello.
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 }
 
-async fn run(link: Link, session: SessionId, mut input: Streaming<wire::SessionRequest>, out: Out) {
-    let hello = match greeting(&mut input).await {
-        Ok(hello) => hello,
+async fn run(
+    link: Link,
+    session: SessionId,
+    caller: Caller,
+    ids: Arc<WorkerIds>,
+    mut input: Streaming<wire::SessionRequest>,
+    out: Out,
+) {
+    let greeted = greeting(&mut input).await.and_then(|hello| {
+        let held = ids.take(hello.id, &caller.name)?;
+        Ok((hello, held))
+    });
+    let (hello, _held) = match greeted {
+        Ok(greeted) => greeted,
         Err(status) => {
             tracing::warn!("a worker was refused: {}", status.message());
             let _ = out.send(Err(status)).await;
@@ -85,7 +130,7 @@ async fn run(link: Link, session: SessionId, mut input: Streaming<wire::SessionR
     if send(&out, welcome).await.is_err() {
         return;
     }
-    tracing::info!(worker, session, "worker connected");
+    tracing::info!(worker, session, caller = %caller.name, "worker connected");
     let (say, mut said) = mpsc::channel(OUTBOX);
     let open = Command::Open {
         session,
@@ -98,6 +143,7 @@ async fn run(link: Link, session: SessionId, mut input: Streaming<wire::SessionR
     let end = tokio::select! {
         end = listen(&link, session, &mut input) => end,
         end = speak(&mut said, &out) => end,
+        revoked = caller.revoked() => Err(revoked),
         () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
     };
     tracing::info!(worker, session, "worker disconnected");

@@ -15,8 +15,13 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, invalid};
-use crate::{VERSION, actor::Command, plan};
+use super::{Link, caller, invalid, users::UserJobs};
+use crate::{
+    VERSION,
+    actor::Command,
+    auth::{Caller, Quotas},
+    plan,
+};
 
 /// Least time between two reports to a watcher.
 const DEBOUNCE: Duration = Duration::from_millis(250);
@@ -24,13 +29,34 @@ const DEBOUNCE: Duration = Duration::from_millis(250);
 const EVENTS: u32 = 1_000;
 const MOST_EVENTS: u32 = 10_000;
 
-pub(crate) struct JobsService(pub Link);
+pub(crate) struct JobsService {
+    link: Link,
+    quotas: Quotas,
+    users: UserJobs,
+}
 
-fn spec(wire: Option<wire::JobSpec>) -> Result<Box<JobSpec>, Status> {
-    let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
-    let spec = JobSpec::try_from(wire).map_err(invalid)?;
-    plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
-    Ok(Box::new(spec))
+impl JobsService {
+    pub(crate) fn new(link: Link, quotas: Quotas) -> Self {
+        Self {
+            link,
+            quotas,
+            users: UserJobs::default(),
+        }
+    }
+
+    fn spec(&self, wire: Option<wire::JobSpec>) -> Result<Box<JobSpec>, Status> {
+        let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
+        let spec = JobSpec::try_from(wire).map_err(invalid)?;
+        plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
+        spec.check_places().map_err(|e| invalid(e.into()))?;
+        let (tasks, most) = (spec.scenes.count, self.quotas.tasks_per_job);
+        if tasks > most {
+            return Err(Status::resource_exhausted(format!(
+                "scenes.count: {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
+            )));
+        }
+        Ok(Box::new(spec))
+    }
 }
 
 fn job_id(text: &str) -> Result<JobId, Status> {
@@ -47,7 +73,7 @@ impl Jobs for JobsService {
         Ok(Response::new(wire::GetServerInfoResponse {
             version: VERSION.into(),
             protocol: PROTOCOL,
-            workers: self.0.ask(Command::Workers).await?,
+            workers: self.link.ask(Command::Workers).await?,
         }))
     }
 
@@ -55,8 +81,8 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::PlanJobRequest>,
     ) -> Result<Response<wire::PlanJobResponse>, Status> {
-        let spec = spec(request.into_inner().spec)?;
-        let plan = self.0.ask(|reply| Command::Plan(spec, reply)).await?;
+        let spec = self.spec(request.into_inner().spec)?;
+        let plan = self.link.ask(|reply| Command::Plan(spec, reply)).await?;
         Ok(Response::new(wire::PlanJobResponse {
             plan: Some(plan.into()),
         }))
@@ -66,13 +92,20 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::SubmitJobRequest>,
     ) -> Result<Response<wire::SubmitJobResponse>, Status> {
+        let caller = caller(&request);
         let request = request.into_inner();
-        let spec = spec(request.spec)?;
+        let spec = self.spec(request.spec)?;
+        let limit = self.quotas.jobs_per_user;
+        let room = self
+            .users
+            .reserve(&self.link, &caller, limit, &spec)
+            .await?;
         let again = request.again;
         let submitted = self
-            .0
+            .link
             .ask(|reply| Command::Submit { spec, again, reply })
             .await?;
+        room.filled(submitted.job);
         Ok(Response::new(wire::SubmitJobResponse {
             job_id: submitted.job.to_string(),
             existed: submitted.existed,
@@ -84,7 +117,7 @@ impl Jobs for JobsService {
         &self,
         _: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
-        let jobs = self.0.ask(Command::List).await?;
+        let jobs = self.link.ask(Command::List).await?;
         Ok(Response::new(wire::ListJobsResponse {
             jobs: jobs.into_iter().map(Into::into).collect(),
         }))
@@ -95,7 +128,7 @@ impl Jobs for JobsService {
         request: Request<wire::GetJobRequest>,
     ) -> Result<Response<wire::GetJobResponse>, Status> {
         let id = job_id(&request.into_inner().job_id)?;
-        let job = self.0.ask(|reply| Command::Get(id, reply)).await?;
+        let job = self.link.ask(|reply| Command::Get(id, reply)).await?;
         Ok(Response::new(wire::GetJobResponse {
             job: Some(job.into()),
         }))
@@ -108,11 +141,12 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let caller = caller(&request);
         let id = job_id(&request.into_inner().job_id)?;
         // A job that does not exist is an error now, not in the stream.
-        self.0.ask(|reply| Command::Get(id, reply)).await?;
+        self.link.ask(|reply| Command::Get(id, reply)).await?;
         let (sender, stream) = mpsc::channel(4);
-        tokio::spawn(watch(self.0.clone(), id, sender));
+        tokio::spawn(watch_while_allowed(self.link.clone(), caller, id, sender));
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 
@@ -121,7 +155,7 @@ impl Jobs for JobsService {
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
         let id = job_id(&request.into_inner().job_id)?;
-        let job = self.0.ask(|reply| Command::Cancel(id, reply)).await?;
+        let job = self.link.ask(|reply| Command::Cancel(id, reply)).await?;
         Ok(Response::new(wire::CancelJobResponse {
             job: Some(job.into()),
         }))
@@ -132,7 +166,7 @@ impl Jobs for JobsService {
         request: Request<wire::RetryJobRequest>,
     ) -> Result<Response<wire::RetryJobResponse>, Status> {
         let id = job_id(&request.into_inner().job_id)?;
-        let retried = self.0.ask(|reply| Command::Retry(id, reply)).await?;
+        let retried = self.link.ask(|reply| Command::Retry(id, reply)).await?;
         Ok(Response::new(wire::RetryJobResponse { retried }))
     }
 
@@ -143,7 +177,7 @@ impl Jobs for JobsService {
         let request = request.into_inner();
         let job = job_id(&request.job_id)?;
         // A job that does not exist is an error, not an empty history.
-        self.0.ask(|reply| Command::Get(job, reply)).await?;
+        self.link.ask(|reply| Command::Get(job, reply)).await?;
         let query = EventQuery {
             job,
             after: request.after,
@@ -154,7 +188,7 @@ impl Jobs for JobsService {
             task: request.task,
         };
         let events = self
-            .0
+            .link
             .catalog
             .events(&query)
             .await
@@ -163,6 +197,20 @@ impl Jobs for JobsService {
             events: events.into_iter().map(Into::into).collect(),
         }))
     }
+}
+
+/// Watches until the caller's token is revoked.
+async fn watch_while_allowed(
+    link: Link,
+    caller: Caller,
+    id: JobId,
+    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
+) {
+    let revoked = tokio::select! {
+        () = watch(link, id, sender.clone()) => return,
+        status = caller.revoked() => status,
+    };
+    let _ = sender.send(Err(revoked)).await;
 }
 
 /// Reports at once and after each change, until the job ends or nobody listens.

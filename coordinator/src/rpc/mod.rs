@@ -2,6 +2,7 @@
 
 mod farm;
 mod jobs;
+mod users;
 
 use std::sync::Arc;
 
@@ -9,9 +10,12 @@ use picofarm_catalog::Catalog;
 use picofarm_proto::convert::ConvertError;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
-use tonic::Status;
+use tonic::{Request, Status};
 
-use crate::actor::{Command, Refusal, Reply};
+use crate::{
+    actor::{Command, Refusal, Reply},
+    auth::Caller,
+};
 
 pub(crate) use farm::FarmService;
 pub(crate) use jobs::JobsService;
@@ -48,6 +52,14 @@ impl Link {
             Err(Refusal::Catalog(why)) => Err(Status::unavailable(why)),
         }
     }
+}
+
+/// Who called.
+fn caller<T>(request: &Request<T>) -> Caller {
+    let caller = request.extensions().get::<Caller>();
+    caller
+        .expect("the guard stands before every service")
+        .clone()
 }
 
 fn invalid(error: ConvertError) -> Status {

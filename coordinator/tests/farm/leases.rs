@@ -25,8 +25,9 @@ async fn a_report_after_expiry_is_refused() {
     assert!(!slow.done(&lease, 0).await.accepted);
     assert!(other.done(&second, 0).await.accepted);
     assert_eq!(farm.until_ended(&job).await.state, JobState::Done);
-    // The output stands, and the same bytes are welcome from anyone.
-    assert!(slow.done(&lease, 0).await.accepted);
+    // The job has ended: the output stands, and nobody needs another word about it.
+    let late = slow.done(&lease, 0).await;
+    assert!(!late.accepted && late.reason.contains("ended"), "{}", late.reason);
 }
 
 #[tokio::test]

@@ -261,6 +261,46 @@ impl JobSpec {
     }
 }
 
+impl JobSpec {
+    /// Checks where a submitted job reads and writes: absolute paths or URLs, none of which climbs. (Job files may name
+    /// relative ones; submission resolves them.)
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check_places(&self) -> Result<(), SpecError> {
+        place("output.store", &self.output.store)?;
+        if let SceneKind::Files { files } = &self.scenes.kind {
+            for (i, file) in files.iter().enumerate() {
+                place(&format!("scenes.files[{i}]"), &file.path)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A place that means the same to everyone: absolute, and without a way up.
+fn place(field: &str, text: &str) -> Result<(), SpecError> {
+    let fail = |what: &str| Err(SpecError::new(field, format!("{text:?} {what}")));
+    if text.contains('\0') {
+        return fail("holds a zero byte");
+    }
+    // What a URL's percent signs stand for counts too.
+    let plain = text
+        .to_ascii_lowercase()
+        .replace("%2e", ".")
+        .replace("%2f", "/")
+        .replace("%5c", "\\");
+    if plain.split(['/', '\\']).any(|part| part == "..") {
+        return fail("has a part `..`; name the place itself");
+    }
+    if !text.contains("://") && !text.starts_with('/') {
+        return fail(
+            "is relative, which means another place to each worker; give an absolute path or a URL",
+        );
+    }
+    Ok(())
+}
+
 impl SceneSource {
     /// Most tasks in one job.
     pub const MAX_COUNT: u64 = 100_000_000;

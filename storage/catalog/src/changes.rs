@@ -2,32 +2,33 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_proto::{
-    ids::{JobId, RangeId, WorkerId},
-    model::JobState,
-};
+use picofarm_proto::ids::{JobId, RangeId, StageRef, WorkerId};
 
-use crate::record::{Exception, Job, NewEvent, Output, Range, Worker};
+use crate::record::{Exception, NewEvent, Output, Range, Worker};
 
 /// What one commit writes. For each range, exception and worker only the last word counts.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Changes {
-    /// New jobs.
-    pub jobs: Vec<Job>,
-    /// Jobs whose state changed, with the Unix time of the end in milliseconds.
-    pub job_states: BTreeMap<JobId, (JobState, Option<i64>)>,
-    /// Ranges as they are now.
+    /// Ranges that this house owns, as they are now.
     pub ranges: BTreeMap<RangeId, Range>,
+    /// Ranges that this house gives out of its hands, as they are now: done and dead ones for good, pending ones
+    /// for whoever claims them. The catalog may merge them with their neighbours.
+    pub free: BTreeMap<RangeId, Range>,
     /// Ranges that are no more.
     pub gone: BTreeSet<RangeId>,
+    /// Ids among these that were made since the last commit: the catalog does not know them. It must know all others
+    /// as this house's.
+    pub minted: BTreeSet<RangeId>,
     /// New outputs.
     pub outputs: Vec<Output>,
     /// Failed tasks as they are now.
-    pub exceptions: BTreeMap<(JobId, u64), Exception>,
+    pub exceptions: BTreeMap<(StageRef, u64), Exception>,
     /// Workers as they are now.
     pub workers: BTreeMap<WorkerId, Worker>,
     /// History, in order.
     pub events: Vec<NewEvent>,
+    /// Jobs of which this house has nothing left: if nobody else has either, they have ended.
+    pub perhaps_over: BTreeMap<JobId, i64>,
 }
 
 impl Changes {
@@ -36,31 +37,34 @@ impl Changes {
         *self == Self::default()
     }
 
-    /// Notes a range as it is now.
+    /// Notes a range of this house as it is now.
     pub fn put(&mut self, range: Range) {
         self.gone.remove(&range.id);
+        self.free.remove(&range.id);
         self.ranges.insert(range.id, range);
+    }
+
+    /// Notes a range that is nobody's from now on.
+    pub fn give(&mut self, range: Range) {
+        self.gone.remove(&range.id);
+        self.ranges.remove(&range.id);
+        self.free.insert(range.id, range);
     }
 
     /// Notes that a range is no more.
     pub fn remove(&mut self, id: RangeId) {
         self.ranges.remove(&id);
+        self.free.remove(&id);
         self.gone.insert(id);
     }
 
-    /// Adds what happened after these changes.
-    pub fn append(&mut self, later: Changes) {
-        self.jobs.extend(later.jobs);
-        self.job_states.extend(later.job_states);
-        for id in later.gone {
-            self.remove(id);
-        }
-        for range in later.ranges.into_values() {
-            self.put(range);
-        }
-        self.outputs.extend(later.outputs);
-        self.exceptions.extend(later.exceptions);
-        self.workers.extend(later.workers);
-        self.events.extend(later.events);
+    /// The ranges that the catalog must know as this house's, or else somebody has taken them.
+    pub fn known(&self) -> impl Iterator<Item = RangeId> + '_ {
+        self.ranges
+            .keys()
+            .chain(self.free.keys())
+            .chain(&self.gone)
+            .filter(|id| !self.minted.contains(id))
+            .copied()
     }
 }

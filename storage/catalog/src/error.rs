@@ -21,12 +21,11 @@ pub enum CatalogError {
     },
     /// A later program wrote it.
     #[error(
-        "catalog {} has schema version {found}, but this program knows versions up to {known}; use a newer picofarm, or another catalog file",
-        path.display()
+        "catalog {place} has schema version {found}, but this program knows versions up to {known}; use a newer picofarm, or another catalog"
     )]
     Newer {
-        /// The database file.
-        path: PathBuf,
+        /// The database.
+        place: String,
         /// Its schema version.
         found: i64,
         /// The latest schema version of this program.
@@ -55,10 +54,10 @@ pub enum CatalogError {
         path: PathBuf,
     },
     /// Not a database of ours.
-    #[error("catalog {}: {what}; choose another path or restore the file from a backup", path.display())]
+    #[error("catalog {place}: {what}; choose another one or restore it from a backup")]
     Unusable {
-        /// The database file.
-        path: PathBuf,
+        /// The database.
+        place: String,
         /// What was found.
         what: String,
     },
@@ -66,14 +65,25 @@ pub enum CatalogError {
     #[error("catalog conflict: {0}")]
     Conflict(String),
     /// Any other answer of the database.
-    #[error("catalog {}: {source}", path.display())]
+    #[error("catalog {place}: {source}")]
     Database {
-        /// The database file.
-        path: PathBuf,
+        /// The database.
+        place: String,
         /// The database's answer.
         source: sqlx::Error,
     },
-    /// The writer has stopped.
+    /// The database's server does not let us in.
+    #[error("catalog {place}: {what}")]
+    Server {
+        /// The database, without its password.
+        place: String,
+        /// What it answered, and how to mend it.
+        what: String,
+    },
+    /// This house was thought lost, and others have taken over what it owned.
+    #[error("this coordinator was out of touch with its catalog for too long; it begins anew")]
+    Fenced,
+    /// It was closed before.
     #[error("the catalog is closed")]
     Closed,
 }

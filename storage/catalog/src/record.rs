@@ -1,11 +1,14 @@
 //! The records a catalog keeps, as plain data.
 
-use std::sync::Arc;
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use picofarm_proto::{
-    ids::{Epoch, Incarnation, JobId, LeaseRef, RangeId, WorkerId},
+    ids::{Epoch, HouseId, Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::{StageKey, stage_key},
-    model::{EventKind, JobSpec, JobState},
+    model::{EventKind, JobSpec, JobState, TaskCounts},
 };
 
 /// One submission.
@@ -23,6 +26,42 @@ pub struct Job {
     pub submitted_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_ms: Option<i64>,
+}
+
+/// A stage of a job: its tasks are `0..tasks`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageRecord {
+    /// Its name.
+    pub id: StageRef,
+    /// Where its results go.
+    pub set: ResultSet,
+    /// Number of tasks.
+    pub tasks: u64,
+}
+
+impl Job {
+    /// The job's stages, in order.
+    pub fn stages(&self) -> Vec<StageRecord> {
+        vec![StageRecord {
+            id: StageRef {
+                job: self.id,
+                stage: 0,
+            },
+            set: ResultSet::of(&self.spec),
+            tasks: self.spec.scenes.count,
+        }]
+    }
+}
+
+/// A job and how far it is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JobRecord {
+    /// The job.
+    pub job: Job,
+    /// Its tasks by state, as last committed.
+    pub counts: TaskCounts,
+    /// How long its tasks took.
+    pub timing: Timing,
 }
 
 /// Where the results of a job's tasks live and what shapes them: two jobs with the same set share outputs.
@@ -61,8 +100,8 @@ pub struct Run {
 pub struct Range {
     /// Its id; with the epoch, the name of a lease.
     pub id: RangeId,
-    /// The job.
-    pub job: JobId,
+    /// The stage.
+    pub stage: StageRef,
     /// First task.
     pub lo: u64,
     /// One past the last task.
@@ -133,6 +172,17 @@ impl Range {
         false
     }
 
+    /// Whether it may become one with a neighbour in the same state that may too: never those under suspicion, or
+    /// waiting for a time.
+    pub fn merges(&self) -> bool {
+        self.crashes == 0
+            && match self.state {
+                RangeState::Pending { not_before_ms } => not_before_ms == 0,
+                RangeState::Leased(_) => false,
+                RangeState::Done { .. } | RangeState::Dead => true,
+            }
+    }
+
     /// The lease's name.
     pub fn lease(&self) -> LeaseRef {
         LeaseRef {
@@ -145,8 +195,8 @@ impl Range {
 /// A committed result.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Output {
-    /// The job under which it was committed; its result set owns the output.
-    pub job: JobId,
+    /// The stage under which it was committed; its result set owns the output.
+    pub stage: StageRef,
     /// Task index.
     pub task: u64,
     /// SHA-256 of the manifest.
@@ -164,8 +214,8 @@ pub struct Output {
 /// A task that failed at least once.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Exception {
-    /// The job.
-    pub job: JobId,
+    /// The stage.
+    pub stage: StageRef,
     /// Task index.
     pub task: u64,
     /// Failures of the task's own.
@@ -195,6 +245,30 @@ pub struct NewEvent {
     pub seconds: f64,
     /// In words.
     pub message: String,
+}
+
+impl NewEvent {
+    /// Something about a job as a whole.
+    pub fn of(job: JobId, at_ms: i64, kind: EventKind, message: String) -> Self {
+        Self {
+            at_ms,
+            job,
+            kind,
+            tasks: None,
+            worker: String::new(),
+            seconds: 0.0,
+            message,
+        }
+    }
+
+    /// The end of a job.
+    pub(crate) fn ended(job: JobId, at_ms: i64, counts: &TaskCounts) -> Self {
+        let message = format!(
+            "{} of {} tasks done, {} dead",
+            counts.done, counts.total, counts.dead
+        );
+        Self::of(job, at_ms, EventKind::Ended, message)
+    }
 }
 
 /// A worker as last seen.
@@ -239,15 +313,74 @@ pub struct EventQuery {
     pub task: Option<u64>,
 }
 
-/// All that is live.
-#[derive(Debug, Clone, Default)]
+/// What a house finds when its life begins.
+#[derive(Debug, Clone)]
 pub struct Snapshot {
-    /// Every job, in order of submission.
+    /// The house.
+    pub house: HouseId,
+    /// Every active job, in order of submission.
     pub jobs: Vec<Job>,
-    /// Every range.
-    pub ranges: Vec<Range>,
-    /// Every task that failed.
-    pub exceptions: Vec<Exception>,
+    /// What the house owns: ranges left by an earlier life of this process, and by houses that are lost.
+    pub owned: Owned,
     /// Every worker ever seen.
     pub workers: Vec<Worker>,
+}
+
+/// Ranges that came into a house's hands, with what it must know to go on with them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Owned {
+    /// The ranges, leased and pending.
+    pub ranges: Vec<Range>,
+    /// Failures of their tasks.
+    pub exceptions: Vec<Exception>,
+}
+
+/// A wish for pending tasks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Want {
+    /// Of which stage.
+    pub stage: StageRef,
+    /// How many tasks.
+    pub tasks: u64,
+    /// Only tasks that may run at this time, Unix milliseconds.
+    pub now_ms: i64,
+}
+
+/// The answer to a [`Want`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Claim {
+    /// Pending ranges that are the house's now.
+    pub owned: Owned,
+    /// Tasks of them whose outputs exist already, as maximal runs in ascending order.
+    pub existing: Vec<Run>,
+    /// Pending tasks that are nobody's still, whether they may run now or later.
+    pub left: u64,
+}
+
+/// What a house learns from time to time.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct News {
+    /// Jobs that are active.
+    pub active: BTreeSet<JobId>,
+    /// Pending tasks that are nobody's.
+    pub free: BTreeMap<StageRef, u64>,
+    /// Ranges of houses that were lost.
+    pub taken: Owned,
+    /// The leased ranges that are this house's; `None` where nobody could have taken any.
+    pub leased: Option<BTreeSet<RangeId>>,
+    /// Houses alive, this one too.
+    pub houses: u32,
+    /// Workers connected to any of them.
+    pub workers: u32,
+}
+
+/// A job that has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct JobEnd {
+    /// The job.
+    pub job: JobId,
+    /// Done or failed.
+    pub state: JobState,
+    /// Unix time, milliseconds.
+    pub at_ms: i64,
 }

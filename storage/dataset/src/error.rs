@@ -1,7 +1,8 @@
-//! What can go wrong with a data set, and the hint that goes with each trouble of the store.
+//! What can go wrong with a data set.
 
-use std::error::Error as _;
 use std::io;
+
+use crate::store::{Failure, io_hint};
 
 /// An operation on a data set that failed.
 #[derive(Debug, thiserror::Error)]
@@ -87,6 +88,14 @@ pub enum DatasetError {
         /// What was expected.
         what: String,
     },
+    /// The environment does not say how to reach the store, or says it wrongly.
+    #[error("{url}: {what}")]
+    StoreSettings {
+        /// The store.
+        url: String,
+        /// The variable, what was expected and how to mend it; no variable's value.
+        what: String,
+    },
     /// The store does not keep the promise of create-only puts.
     #[error(
         "the store at {prefix} is unsafe for several writers: {what}; use a local file system or a store with conditional puts"
@@ -98,7 +107,7 @@ pub enum DatasetError {
         what: String,
     },
     /// The store refused or failed.
-    #[error("cannot {action} {object}{}: {source}", hint.map(|h| format!(" ({h})")).unwrap_or_default())]
+    #[error("cannot {action} {object}{}: {account}", hint.map(|h| format!(" ({h})")).unwrap_or_default())]
     Store {
         /// E.g. `write`.
         action: &'static str,
@@ -106,8 +115,8 @@ pub enum DatasetError {
         object: String,
         /// How to mend it, where known.
         hint: Option<&'static str>,
-        /// The store's own account.
-        source: Box<object_store::Error>,
+        /// What happened, without secrets.
+        account: String,
     },
     /// A file operation failed.
     #[error("cannot {action} {path}{}: {source}", io_hint(source).map(|h| format!(" ({h})")).unwrap_or_default())]
@@ -142,11 +151,12 @@ impl DatasetError {
         object: impl ToString,
         source: object_store::Error,
     ) -> Self {
+        let Failure { account, hint } = Failure::of(&source);
         Self::Store {
             action,
             object: object.to_string(),
-            hint: root_io_error(&source).and_then(io_hint),
-            source: Box::new(source),
+            hint,
+            account,
         }
     }
 
@@ -163,64 +173,5 @@ impl DatasetError {
             what: what.into(),
             reason: reason.to_string(),
         }
-    }
-}
-
-/// The system's error at the end of the chain, if there is one.
-fn root_io_error(error: &object_store::Error) -> Option<&io::Error> {
-    let mut at: Option<&(dyn std::error::Error + 'static)> = error.source();
-    while let Some(e) = at {
-        if let Some(io) = e.downcast_ref::<io::Error>() {
-            return Some(io);
-        }
-        at = e.source();
-    }
-    None
-}
-
-fn io_hint(error: &io::Error) -> Option<&'static str> {
-    match error.kind() {
-        io::ErrorKind::PermissionDenied => {
-            Some("no permission: check the owner and mode of the folder")
-        }
-        io::ErrorKind::ReadOnlyFilesystem => {
-            Some("the file system is mounted read-only: choose another location")
-        }
-        io::ErrorKind::StorageFull => Some("the disk is full: free some space, then run it again"),
-        io::ErrorKind::QuotaExceeded => {
-            Some("the disk quota is used up: free some space, then run it again")
-        }
-        io::ErrorKind::NotADirectory => Some("a part of the path is a file, not a folder"),
-        io::ErrorKind::Unsupported => {
-            Some("the file system has no hard links, which create-only writes need")
-        }
-        _ => None,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_full_disk_is_told_with_the_object_and_a_hint() {
-        let nested = |kind| object_store::Error::Generic {
-            store: "LocalFileSystem",
-            source: Box::new(object_store::Error::Generic {
-                store: "inner",
-                source: Box::new(io::Error::from(kind)),
-            }),
-        };
-        let text =
-            |kind| DatasetError::store("write", "sets/a/depth/c/0/0/0", nested(kind)).to_string();
-        let full = text(io::ErrorKind::StorageFull);
-        assert!(
-            full.starts_with(
-                "cannot write sets/a/depth/c/0/0/0 (the disk is full: free some space"
-            ),
-            "{full}"
-        );
-        let read_only = text(io::ErrorKind::ReadOnlyFilesystem);
-        assert!(read_only.contains("mounted read-only"), "{read_only}");
     }
 }

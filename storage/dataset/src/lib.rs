@@ -5,6 +5,7 @@
 //! task, so whoever runs a task again writes the same bytes.
 
 mod codec;
+mod collect;
 mod counts;
 mod dataset;
 mod derive;
@@ -26,6 +27,7 @@ mod squareroot;
 mod store;
 mod verify;
 
+pub use collect::{Collection, MIN_GRACE, Orphan};
 pub use dataset::Dataset;
 pub use derive::SceneTruth;
 pub use encode::EncodedScene;
@@ -39,5 +41,5 @@ pub use render_group::{RenderArray, write_render_group};
 pub use render_read::RenderGroup;
 pub use spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
-pub use store::{local_leftovers, open_store, probe};
+pub use store::{check_location, open_store, probe};
 pub use verify::{Fault, Problem, Summary, Verification, VerifyMode};

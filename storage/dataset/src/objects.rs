@@ -1,11 +1,19 @@
 //! Single objects: create-only puts, gets and sizes, with errors that name the object.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 
 use crate::error::DatasetError;
 use crate::manifest::sha256_hex;
+use crate::store::no_bucket;
+
+/// Create-only puts of an object that is refused as existing and yet is not there.
+const ATTEMPTS: usize = 4;
+/// Between them.
+const PAUSE: Duration = Duration::from_millis(250);
 
 /// Full path of a key relative to `prefix`.
 pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
@@ -16,13 +24,24 @@ pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
 /// A path as a person would look for it: with the leading `/` for local stores, whose keys are paths from the root.
 pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
     // The store's root is told only by how it displays itself.
-    match store.to_string().strip_prefix("LocalFileSystem(file://") {
-        Some(root) => format!(
-            "{}/{path}",
-            root.trim_end_matches(')').trim_end_matches('/')
-        ),
-        None => path.to_string(),
+    let named = |kind: &str| {
+        let name = store.to_string();
+        let (_, rest) = name.split_once(kind)?;
+        Some(rest.trim_end_matches(')').to_string())
+    };
+    if let Some(root) = named("LocalFileSystem(file://") {
+        format!("{}/{path}", root.trim_end_matches('/'))
+    } else if let Some(bucket) = named("AmazonS3(") {
+        format!("s3://{bucket}/{path}")
+    } else {
+        path.to_string()
     }
+}
+
+/// The folder that a path of a local store stands for; `None` for other stores.
+pub(crate) fn folder(store: &dyn ObjectStore, path: &Path) -> Option<std::path::PathBuf> {
+    let local = store.to_string().starts_with("LocalFileSystem(file://");
+    local.then(|| shown(store, path).into())
 }
 
 /// Puts create-only. `false`: it exists already.
@@ -45,11 +64,27 @@ pub(crate) async fn create_or_match(
     path: &Path,
     bytes: Bytes,
 ) -> Result<(), DatasetError> {
-    if create(store, path, bytes.clone()).await? {
-        return Ok(());
+    let mut found = None;
+    for _ in 0..ATTEMPTS {
+        if create(store, path, bytes.clone()).await? {
+            return Ok(());
+        }
+        // Never trust the server's own checksum: read it back.
+        found = get(store, path).await?;
+        if found.is_some() {
+            break;
+        }
+        // Refused because of another request in flight (S3's 409), or collected since.
+        tokio::time::sleep(PAUSE).await;
     }
-    // Never trust the server's own checksum: read it back.
-    let stored = require(store, path).await?;
+    let Some(stored) = found else {
+        return Err(DatasetError::Store {
+            action: "write",
+            object: shown(store, path),
+            hint: None,
+            account: format!("refused {ATTEMPTS} times as existing, but it does not exist"),
+        });
+    };
     if stored == bytes {
         return Ok(());
     }
@@ -85,7 +120,7 @@ pub(crate) async fn get(
     };
     match result {
         Ok(bytes) => Ok(Some(bytes)),
-        Err(Error::NotFound { .. }) => Ok(None),
+        Err(e @ Error::NotFound { .. }) if !no_bucket(&e) => Ok(None),
         Err(e) => Err(DatasetError::store("read", shown(store, path), e)),
     }
 }
@@ -107,7 +142,7 @@ pub(crate) async fn size(
 ) -> Result<Option<u64>, DatasetError> {
     match store.head(path).await {
         Ok(meta) => Ok(Some(meta.size)),
-        Err(Error::NotFound { .. }) => Ok(None),
+        Err(e @ Error::NotFound { .. }) if !no_bucket(&e) => Ok(None),
         Err(e) => Err(DatasetError::store("look up", shown(store, path), e)),
     }
 }

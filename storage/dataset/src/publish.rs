@@ -33,7 +33,8 @@ impl Dataset {
 
     /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal
     /// bytes counts as written, so that a scene half-written by a killed worker is completed and publishing twice
-    /// succeeds.
+    /// succeeds. When it returns, each object was there at a time when the manifest already protected it from
+    /// [`Self::collect`].
     ///
     /// # Errors
     /// [`DatasetError::Conflict`] where an object exists with other bytes (nothing stored is changed);
@@ -41,16 +42,24 @@ impl Dataset {
     pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
         let EncodedScene { manifest, bytes } = scene;
         let paths = manifest.objects.iter().map(|object| self.path(&object.key));
-        let puts: Vec<_> = paths
-            .zip(bytes)
-            .map(|(path, bytes)| put(&*self.store, path, bytes))
-            .collect();
-        stream::iter(puts)
-            .buffer_unordered(CONCURRENCY)
-            .try_collect::<Vec<()>>()
-            .await?;
+        let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
+        let put = |(path, bytes)| objects::create_or_match(&*self.store, path, bytes);
+        let puts: Vec<_> = objects.iter().map(|(p, b)| put((p, b.clone()))).collect();
+        all(puts).await?;
         let path = self.path(&Manifest::key(manifest.scene));
         objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
+        // A collector may have taken an object before there was a manifest to protect it: what a killed worker had
+        // left and was found equal above, or what this process wrote before it stood still for long.
+        let again: Vec<_> = objects
+            .iter()
+            .map(|(path, bytes)| async move {
+                match objects::size(&*self.store, path).await? {
+                    Some(_) => Ok(()),
+                    None => put((path, bytes.clone())).await,
+                }
+            })
+            .collect();
+        all(again).await?;
         Ok(manifest)
     }
 
@@ -85,16 +94,18 @@ impl Dataset {
         let checks: Vec<_> = objects
             .map(|object| check_size(&*self.store, self.path(&object.key), object.size))
             .collect();
-        stream::iter(checks)
-            .buffer_unordered(CONCURRENCY)
-            .try_collect::<Vec<()>>()
-            .await?;
+        all(checks).await?;
         Ok(Some(manifest))
     }
 }
 
-async fn put(store: &dyn ObjectStore, path: Path, bytes: Bytes) -> Result<(), DatasetError> {
-    objects::create_or_match(store, &path, bytes).await
+/// Waits for all, some at a time; the first error ends it.
+async fn all(
+    requests: Vec<impl Future<Output = Result<(), DatasetError>>>,
+) -> Result<(), DatasetError> {
+    let mut results = stream::iter(requests).buffer_unordered(CONCURRENCY);
+    while results.try_next().await?.is_some() {}
+    Ok(())
 }
 
 async fn check_size(

@@ -6,6 +6,7 @@ use std::fmt;
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
+use object_store::path::Path;
 use serde_json::Value;
 
 use crate::dataset::{Dataset, METADATA};
@@ -229,20 +230,18 @@ impl Dataset {
         Ok(summary)
     }
 
+    /// The key of a path below the prefix, relative to it.
+    pub(crate) fn relative(&self, path: &Path) -> String {
+        let parts = path.parts().skip(self.prefix.parts().count());
+        let parts: Vec<String> = parts.map(|part| part.as_ref().to_string()).collect();
+        parts.join("/")
+    }
+
     /// Every key below the prefix, relative to it, with its size.
     async fn list_keys(&self) -> Result<BTreeMap<String, u64>, DatasetError> {
-        let depth = self.prefix.parts().count();
         self.store
             .list(Some(&self.prefix))
-            .map_ok(|object| {
-                let parts: Vec<String> = object
-                    .location
-                    .parts()
-                    .skip(depth)
-                    .map(|part| part.as_ref().to_string())
-                    .collect();
-                (parts.join("/"), object.size)
-            })
+            .map_ok(|object| (self.relative(&object.location), object.size))
             .try_collect()
             .await
             .map_err(|e| DatasetError::store("list", self.shown(&self.prefix), e))
@@ -375,7 +374,7 @@ impl Dataset {
     }
 
     /// The scene whose object has this key.
-    fn object_scene(&self, key: &str) -> Option<u64> {
+    pub(crate) fn object_scene(&self, key: &str) -> Option<u64> {
         let mut parts = key.split('/');
         let name = parts.next()?;
         let scene: u64 = parts.nth(1)?.parse().ok()?;
@@ -393,7 +392,7 @@ struct CheckedScene {
     found: Vec<(String, u64)>,
 }
 
-fn manifest_scene(key: &str) -> Option<u64> {
+pub(crate) fn manifest_scene(key: &str) -> Option<u64> {
     let scene = key
         .strip_prefix("manifests/")?
         .strip_suffix(".json")?

@@ -119,7 +119,7 @@ async fn an_interrupted_creation_is_completed_but_foreign_remains_are_not() {
 }
 
 #[tokio::test]
-async fn stores_are_opened_from_paths_and_file_urls_only() {
+async fn local_stores_are_opened_from_paths_and_file_urls() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a set");
     let (store, prefix) = open_store(path.to_str().unwrap()).unwrap();
@@ -130,13 +130,17 @@ async fn stores_are_opened_from_paths_and_file_urls_only() {
     let (store, prefix) = open_store(&url).unwrap();
     assert_eq!(*Dataset::open(store, prefix).await.unwrap().spec(), spec);
     for (url, words) in [
-        ("s3://bucket/a", "S3 is not supported by this version"),
+        (
+            "s3://Bucket/a",
+            "a bucket name of 3 to 63 lower-case letters",
+        ),
         ("gs://bucket/a", "the scheme gs is not supported"),
         ("file://host/a", "expected file:///absolute/path"),
         ("", "expected a path, found nothing"),
     ] {
         let error = open_store(url).unwrap_err().to_string();
         assert!(error.contains(words), "{error}");
+        assert_eq!(check_location(url).unwrap_err().to_string(), error);
     }
 }
 

@@ -3,6 +3,7 @@
 mod common;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use common::*;
 use object_store::path::Path;
@@ -148,6 +149,7 @@ fn every_operation_can_be_spawned() {
     fn spawnable<F: Future + Send>(_: impl Fn(&'static Dataset) -> F) {}
     spawnable(|d| d.verify(VerifyMode::Fast));
     spawnable(|d| d.info());
+    spawnable(|d| d.collect(Duration::ZERO, true));
     spawnable(|d| d.published(0));
     spawnable(|d| d.manifest(0));
     spawnable(|d| d.scenes_present());
@@ -198,11 +200,8 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
         assert!(matches!(error, DatasetError::Conflict { .. }), "{error}");
     }
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
-    assert!(
-        local_leftovers(folder.path().to_str().unwrap(), std::time::Duration::ZERO)
-            .unwrap()
-            .is_empty()
-    );
+    let left = dataset.collect(Duration::ZERO, false).await.unwrap();
+    assert!(left.orphans.is_empty(), "{left:?}");
 }
 
 #[tokio::test]
@@ -224,11 +223,21 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
         report.is_sound() && report.unpublished.is_empty(),
         "{report:?}"
     );
-    let leftovers = local_leftovers(location, std::time::Duration::ZERO).unwrap();
-    assert_eq!(leftovers, [torn]);
-    assert!(
-        local_leftovers(location, std::time::Duration::from_secs(3600))
-            .unwrap()
-            .is_empty()
-    );
+    let found = |grace| dataset.collect(grace, false);
+    let leftovers = found(Duration::ZERO).await.unwrap().orphans;
+    let [
+        Orphan {
+            object,
+            bytes,
+            scene: None,
+        },
+    ] = &leftovers[..]
+    else {
+        panic!("{leftovers:?}")
+    };
+    assert_eq!((object.as_str(), *bytes), (torn.to_str().unwrap(), 10));
+    assert!(found(MIN_GRACE).await.unwrap().orphans.is_empty());
+    dataset.collect(Duration::ZERO, true).await.unwrap();
+    assert!(!torn.exists());
+    assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
 }

@@ -14,12 +14,12 @@ use picofarm_proto::{
 };
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Endpoint;
 use tracing::{error, info, warn};
 use uuid::Uuid;
 
 use crate::{
-    AgentConfig, AgentError, Control, Executor, Output, Summary, TaskError,
+    AgentConfig, AgentError, Control, Executor, Output, Summary, Target, TaskError,
+    allow::StorePrefixes,
     execute::Runner,
     session::{
         self, LinkError, Session, Welcome,
@@ -60,7 +60,8 @@ pub async fn run_with(
     shutdown: CancellationToken,
 ) -> Result<Summary, AgentError> {
     config.check()?;
-    let endpoint = session::endpoint(&config.coordinator)?;
+    let target = session::target(&config.coordinator, &config.access)?;
+    let allowed = StorePrefixes::new(&config.store_prefixes)?;
     let hello = WorkerHello {
         id: config
             .worker_id
@@ -78,9 +79,10 @@ pub async fn run_with(
         coordinator = config.coordinator, "worker starts");
     let mut agent = Agent {
         desk: Desk::new(),
-        runner: Runner::start(executor, config.threads)?,
+        runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
-        endpoint,
+        target,
+        welcomed: false,
         hello,
         link: Link::Down(Instant::now()),
         away_since: None,
@@ -152,7 +154,9 @@ struct Agent {
     runner: Runner,
     /// Of the task in hand.
     control: Option<Arc<Control>>,
-    endpoint: Endpoint,
+    target: Target,
+    /// This worker has been let in before: what looks like a wrong setting may pass.
+    welcomed: bool,
     hello: WorkerHello,
     link: Link,
     away_since: Option<Instant>,
@@ -213,9 +217,10 @@ impl Agent {
             Event::Retry => {
                 let mut hello = self.hello.clone();
                 hello.held = self.desk.held();
-                self.link = Link::Opening(Box::pin(session::open(self.endpoint.clone(), hello)));
+                self.link = Link::Opening(Box::pin(session::open(self.target.clone(), hello)));
             }
             Event::Opened(Ok((welcome, session))) => {
+                self.welcomed = true;
                 match self.away_since.take() {
                     Some(since) => {
                         self.summary.reconnects += 1;
@@ -266,7 +271,8 @@ impl Agent {
     /// The connection is gone, or did not come about.
     fn lost(&mut self, now: Instant, error: LinkError) -> Result<(), AgentError> {
         let reason = match error {
-            LinkError::Refused(reason) => {
+            LinkError::Mismatch(reason) if self.welcomed => reason,
+            LinkError::Refused(reason) | LinkError::Mismatch(reason) => {
                 if let Some(control) = &self.control {
                     control.stop();
                 }

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use picofarm_proto::ids::WorkerId;
 
+use crate::{Access, AccessError};
+
 /// Settings of one worker process.
 #[derive(Debug, Clone)]
 pub struct AgentConfig {
@@ -17,6 +19,10 @@ pub struct AgentConfig {
     pub threads: usize,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,
+    /// What this worker has to show, and whom it trusts.
+    pub access: Access,
+    /// Paths or URLs that tasks' outputs and scene files must lie in; without any, they may lie anywhere.
+    pub store_prefixes: Vec<String>,
 }
 
 impl AgentConfig {
@@ -65,6 +71,9 @@ pub enum AgentError {
         /// What was expected.
         what: String,
     },
+    /// The coordinator's URL, or what is needed to reach it, cannot be used.
+    #[error("coordinator: {0}")]
+    Access(#[from] AccessError),
     /// The coordinator will not have this worker, and asking again would not help.
     #[error("the coordinator at {coordinator} refused this worker: {reason}")]
     Refused {

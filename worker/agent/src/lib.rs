@@ -4,11 +4,14 @@
 //! [`run`] is the whole worker; [`run_with`] takes another [`Executor`], which is how tests look at the
 //! session without rendering.
 
+mod access;
 mod agent;
+mod allow;
 mod config;
 pub mod execute;
 mod session;
 
+pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
 pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};

@@ -499,6 +499,12 @@ async fn an_unusable_setting_is_named() {
         let ended = picofarm_agent::run(config, Default::default()).await;
         match ended {
             Err(AgentError::Config { field: named, .. }) => assert_eq!(named, field),
+            Err(AgentError::Access(error)) => {
+                assert!(
+                    field == "coordinator" && error.to_string().contains(url),
+                    "{error}"
+                );
+            }
             other => panic!("{url}: {other:?}"),
         }
     }

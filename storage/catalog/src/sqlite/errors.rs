@@ -17,6 +17,12 @@ const IOERR_SHMSIZE: i32 = 4874;
 /// The error a person can act on.
 pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
     let path = path.to_owned();
+    if let sqlx::Error::ColumnDecode { index, source } = &error {
+        return CatalogError::Unusable {
+            place: path.display().to_string(),
+            what: format!("column {index} cannot be read ({source})"),
+        };
+    }
     let code = error
         .as_database_error()
         .and_then(|e| e.code())
@@ -29,15 +35,15 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
         Some(FULL) => CatalogError::Full { path },
         Some(READONLY) => CatalogError::ReadOnly { path },
         Some(CANTOPEN) => CatalogError::Unusable {
-            path,
+            place: path.display().to_string(),
             what: "the file cannot be opened (is it a folder, or not this user's?)".into(),
         },
         Some(NOTADB) => CatalogError::Unusable {
-            path,
+            place: path.display().to_string(),
             what: "the file is not a SQLite database".into(),
         },
         Some(CORRUPT) => CatalogError::Unusable {
-            path,
+            place: path.display().to_string(),
             what: "the database is damaged".into(),
         },
         Some(BUSY) => CatalogError::Held {
@@ -46,7 +52,7 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
         },
         Some(CONSTRAINT) => CatalogError::Conflict(error.to_string()),
         _ => CatalogError::Database {
-            path,
+            place: path.display().to_string(),
             source: error,
         },
     }

@@ -1,10 +1,9 @@
-//! The catalog in one SQLite file: one writer behind an actor with group commit, reads on their own connections.
+//! The catalog in one SQLite file, for one coordinator. All writes go through one connection, one transaction at a time:
+//! the coordinator's actor puts whatever has arrived meanwhile into the next one, so one fsync serves many messages.
+//! Reads have connections of their own.
 
-mod apply;
 mod errors;
-mod read;
-mod rows;
-mod writer;
+mod write;
 
 use std::{
     path::{Path, PathBuf},
@@ -12,20 +11,29 @@ use std::{
 };
 
 use async_trait::async_trait;
-use picofarm_proto::{ids::JobId, model::Event};
+use picofarm_proto::{
+    ids::{HouseId, JobId, StageRef, WorkerId},
+    model::Event,
+};
 use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
     migrate::{MigrateError, Migrator},
-    sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous},
+    pool::PoolConnection,
+    sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous},
 };
+use tokio::sync::Mutex;
+use uuid::Uuid;
 
 use crate::{
-    Catalog, CatalogError, Changes,
+    Catalog, CatalogError, Changes, Claim, Job, JobEnd, JobRecord, NewEvent, News, Owned, Range,
+    Snapshot, Want,
     lock::CatalogLock,
-    record::{EventQuery, ResultSet, Run, Snapshot, Timing},
+    record::{EventQuery, ResultSet, Run, Timing},
 };
 
-static MIGRATIONS: Migrator = sqlx::migrate!();
+crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
+
+static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
 /// Read-only connections. Reads are few and short.
 const READERS: u32 = 3;
@@ -33,7 +41,8 @@ const READERS: u32 = 3;
 /// A catalog in one SQLite file, for exactly one coordinator.
 pub struct SqliteCatalog {
     path: PathBuf,
-    writer: writer::Writer,
+    /// `None` once closed.
+    writer: Mutex<Option<write::Writer>>,
     readers: SqlitePool,
     // Last, so that it is dropped after the connections.
     _lock: CatalogLock,
@@ -72,14 +81,31 @@ impl SqliteCatalog {
             .map_err(failed)?;
         Ok(Self {
             path: path.to_owned(),
-            writer: writer::Writer::start(path.to_owned(), connection),
+            writer: Mutex::new(Some(write::Writer::new(connection))),
             readers,
             _lock: lock,
         })
     }
 
-    fn failed(&self) -> impl Fn(sqlx::Error) -> CatalogError + '_ {
-        |e| errors::classify(&self.path, e)
+    fn failed(&self, error: sqlx::Error) -> CatalogError {
+        errors::classify(&self.path, error)
+    }
+
+    async fn reader(&self) -> Result<PoolConnection<sqlx::Sqlite>, CatalogError> {
+        self.readers.acquire().await.map_err(|e| self.failed(e))
+    }
+
+    /// Runs `work` in one transaction.
+    async fn write<T>(
+        &self,
+        work: impl AsyncFnOnce(&mut SqliteConnection, &mut write::Keys) -> Result<T, write::WriteError>,
+    ) -> Result<T, CatalogError> {
+        let mut writer = self.writer.lock().await;
+        let writer = writer.as_mut().ok_or(CatalogError::Closed)?;
+        writer.transaction(work).await.map_err(|e| match e {
+            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            write::WriteError::Sql(e) => self.failed(e),
+        })
     }
 }
 
@@ -91,7 +117,7 @@ async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), C
         .map_err(|error| match error {
             MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
                 CatalogError::Newer {
-                    path: path.to_owned(),
+                    place: path.display().to_string(),
                     found,
                     known,
                 }
@@ -100,7 +126,7 @@ async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), C
                 errors::classify(path, e)
             }
             other => CatalogError::Unusable {
-                path: path.to_owned(),
+                place: path.display().to_string(),
                 what: format!("its schema is not this program's ({other})"),
             },
         })
@@ -109,43 +135,142 @@ async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), C
 #[async_trait]
 impl Catalog for SqliteCatalog {
     async fn load(&self) -> Result<Snapshot, CatalogError> {
-        read::load(&self.path, &self.readers).await
+        let mut c = self.reader().await?;
+        let read = async {
+            // One transaction, so that all tables are of one moment.
+            let mut tx = c.begin().await?;
+            let jobs = query::active_jobs(&mut tx).await?;
+            let ranges = write::owned(&mut tx).await?;
+            let exceptions = query::exceptions(&mut tx, &ranges).await?;
+            let workers = query::workers(&mut tx).await?;
+            tx.rollback().await?;
+            Ok(Snapshot {
+                house: HouseId::from_uuid(Uuid::now_v7()),
+                jobs,
+                owned: Owned { ranges, exceptions },
+                workers,
+            })
+        };
+        read.await.map_err(|e| self.failed(e))
     }
 
-    async fn commit(&self, changes: Changes) -> Result<(), CatalogError> {
+    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+        let mut c = self.reader().await?;
+        let read = async {
+            Ok(News {
+                active: query::active_ids(&mut c).await?,
+                free: query::free(&mut c).await?,
+                taken: Owned::default(),
+                leased: None,
+                houses: 1,
+                workers,
+            })
+        };
+        read.await.map_err(|e| self.failed(e))
+    }
+
+    async fn changed(&self) {
+        std::future::pending().await
+    }
+
+    async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError> {
+        self.write(async |c, keys| write::claim(c, keys, wants).await)
+            .await
+    }
+
+    async fn adopt(&self, _: WorkerId) -> Result<Owned, CatalogError> {
+        // Every lease is this house's already.
+        Ok(Owned::default())
+    }
+
+    async fn commit(&self, changes: Changes) -> Result<Vec<JobEnd>, CatalogError> {
         if changes.is_empty() {
-            return Ok(());
+            return Ok(Vec::new());
         }
-        self.writer.commit(changes).await
+        self.write(async |c, keys| write::changes(c, keys, &changes).await)
+            .await
+    }
+
+    async fn submit(
+        &self,
+        job: &Job,
+        ranges: &[Range],
+        events: &[NewEvent],
+    ) -> Result<bool, CatalogError> {
+        self.write(async |c, keys| write::submit(c, keys, job, ranges, events).await)
+            .await
+    }
+
+    async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError> {
+        self.write(async |c, keys| write::cancel(c, keys, job, now_ms).await)
+            .await
+    }
+
+    async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
+        self.write(async |c, keys| write::retry(c, keys, job, now_ms).await)
+            .await
+    }
+
+    async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
+        let mut c = self.reader().await?;
+        let mut found = query::jobs(&mut c, Some(id))
+            .await
+            .map_err(|e| self.failed(e))?;
+        Ok(found.pop())
+    }
+
+    async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::jobs(&mut c, None).await.map_err(|e| self.failed(e))
+    }
+
+    async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::job_with(&mut c, spec_hash)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::jobs_at(&mut c, store, dataset)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn output_runs(&self, set: &ResultSet, count: u64) -> Result<Vec<Run>, CatalogError> {
-        read::output_runs(&self.readers, set, count)
+        let mut c = self.reader().await?;
+        query::output_runs(&mut c, set, count)
             .await
-            .map_err(self.failed())
+            .map_err(|e| self.failed(e))
     }
 
     async fn manifests(
         &self,
-        tasks: &[(JobId, u64)],
+        tasks: &[(StageRef, u64)],
     ) -> Result<Vec<Option<[u8; 32]>>, CatalogError> {
-        read::manifests(&self.readers, tasks)
+        let mut c = self.reader().await?;
+        write::manifests(&mut c, tasks)
             .await
-            .map_err(self.failed())
+            .map_err(|e| self.failed(e))
     }
 
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError> {
-        read::timing(&self.readers, set)
-            .await
-            .map_err(self.failed())
+        let mut c = self.reader().await?;
+        query::timing(&mut c, set).await.map_err(|e| self.failed(e))
     }
 
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError> {
-        read::events(&self.path, &self.readers, query).await
+        let mut c = self.reader().await?;
+        query::events(&mut c, query)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn close(&self) {
         self.readers.close().await;
-        self.writer.close().await;
+        if let Some(writer) = self.writer.lock().await.take() {
+            writer.close().await;
+        }
     }
 }

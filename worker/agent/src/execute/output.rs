@@ -2,11 +2,12 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::BTreeSet,
-    sync::Mutex,
+    collections::BTreeMap,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
+use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
     probe,
@@ -19,11 +20,19 @@ use tracing::warn;
 use super::{Control, TaskError};
 use crate::session::backoff::{Backoff, random};
 
+/// A store and the prefix in it.
+type Place = (Arc<dyn ObjectStore>, Path);
+
+/// How often a task that waits for its store is asked whether it shall stop.
+const STOP_LOOK: Duration = Duration::from_millis(50);
+
 /// Stores, reached from the executor's own thread.
 pub(super) struct Stores {
     runtime: Handle,
-    /// Locations that passed the probe.
-    probed: Mutex<BTreeSet<String>>,
+    /// Opened stores that passed the probe, by location: their connections are kept from task to task.
+    probed: Mutex<BTreeMap<String, Place>>,
+    /// Opened stores that are only read, by location.
+    sources: Mutex<BTreeMap<String, Place>>,
     /// How long a rendered scene is held for a store that does not take it.
     patience: Duration,
 }
@@ -33,14 +42,16 @@ impl Stores {
         Self {
             runtime,
             probed: Mutex::default(),
+            sources: Mutex::default(),
             patience,
         }
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
-    pub(super) fn open(&self, spec: &JobSpec) -> Result<Dataset, TaskError> {
+    pub(super) fn open(&self, spec: &JobSpec, control: &Control) -> Result<Dataset, TaskError> {
         let place = &spec.output;
-        self.create_or_open(&place.store, &place.dataset, &dataset_spec(spec)?)
+        let described = dataset_spec(spec)?;
+        self.create_or_open(&place.store, &place.dataset, &described, control)
     }
 
     /// Creates or opens a data set to write to. The first use of a location proves that its store is safe.
@@ -49,44 +60,62 @@ impl Stores {
         location: &str,
         dataset: &str,
         spec: &DatasetSpec,
+        control: &Control,
     ) -> Result<Dataset, TaskError> {
-        let (store, prefix) = open_store(location).map_err(of_dataset)?;
-        let probed = |s: &Self| {
-            s.probed
-                .lock()
-                .expect("no panic while locked")
-                .contains(location)
+        let (store, prefix) = self.probed(location, control)?;
+        let prefix = prefix.join(dataset);
+        self.wait(control, Dataset::create_or_open(store, prefix, spec))
+    }
+
+    /// Opens a data set to read; creates nothing, and asks of its store nothing but reading.
+    pub(super) fn open_source(
+        &self,
+        location: &str,
+        dataset: &str,
+        control: &Control,
+    ) -> Result<Dataset, TaskError> {
+        let known = || self.sources.lock().expect("no panic while locked");
+        let place = known().get(location).cloned();
+        let (store, prefix) = match place {
+            Some(place) => place,
+            None => {
+                let place = open_store(location).map_err(of_dataset)?;
+                known().insert(location.to_owned(), place.clone());
+                place
+            }
         };
-        if !probed(self) {
-            self.runtime
-                .block_on(probe(&*store, &prefix))
-                .map_err(of_dataset)?;
-            let mut probed = self.probed.lock().expect("no panic while locked");
-            probed.insert(location.to_owned());
+        self.wait(control, Dataset::open(store, prefix.join(dataset)))
+    }
+
+    fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let known = || self.probed.lock().expect("no panic while locked");
+        if let Some(place) = known().get(location) {
+            return Ok(place.clone());
         }
-        self.wait(Dataset::create_or_open(store, prefix.join(dataset), spec))
-    }
-
-    /// Opens a data set to read; creates nothing.
-    pub(super) fn open_source(&self, location: &str, dataset: &str) -> Result<Dataset, TaskError> {
         let (store, prefix) = open_store(location).map_err(of_dataset)?;
-        self.wait(Dataset::open(store, prefix.join(dataset)))
+        self.wait(control, probe(&*store, &prefix))?;
+        known().insert(location.to_owned(), (store.clone(), prefix.clone()));
+        Ok((store, prefix))
     }
 
-    /// Waits for an operation on a data set.
+    /// Waits for the store, unless the task shall stop: a server that is away may take minutes to be given up.
     pub(super) fn wait<T>(
         &self,
-        operation: impl Future<Output = Result<T, DatasetError>>,
+        control: &Control,
+        request: impl Future<Output = Result<T, DatasetError>>,
     ) -> Result<T, TaskError> {
-        self.read(operation).map_err(of_dataset)
-    }
-
-    /// Waits for an operation whose error the caller judges.
-    pub(super) fn read<T>(
-        &self,
-        operation: impl Future<Output = Result<T, DatasetError>>,
-    ) -> Result<T, DatasetError> {
-        self.runtime.block_on(operation)
+        let stopped = async {
+            while !control.stopped() {
+                tokio::time::sleep(STOP_LOOK).await;
+            }
+        };
+        self.runtime.block_on(async {
+            tokio::select! {
+                biased;
+                result = request => result.map_err(of_dataset),
+                () = stopped => Err(TaskError::Stopped),
+            }
+        })
     }
 
     /// The manifest of scene `index` if this very task has published it.
@@ -95,15 +124,19 @@ impl Stores {
         dataset: &Dataset,
         index: u64,
         key: &TaskKey,
+        control: &Control,
     ) -> Result<Option<Manifest>, TaskError> {
-        let manifest = match self.runtime.block_on(dataset.published(index)) {
-            Ok(None) => return Ok(None),
-            Ok(Some(manifest)) => manifest,
-            Err(error @ DatasetError::Damaged { .. }) => {
-                warn!(%error, task = index, "a published scene is damaged; it is made again to mend it");
-                return Ok(None);
+        let looked = async {
+            match dataset.published(index).await {
+                Err(error @ DatasetError::Damaged { .. }) => {
+                    warn!(%error, task = index, "a published scene is damaged; it is made again to mend it");
+                    Ok(None)
+                }
+                other => other,
             }
-            Err(error) => return Err(of_dataset(error)),
+        };
+        let Some(manifest) = self.wait(control, looked)? else {
+            return Ok(None);
         };
         if manifest.provenance.task_key != key.to_string() {
             return Err(TaskError::User(format!(
@@ -127,12 +160,9 @@ impl Stores {
         let until = Instant::now() + self.patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {
-            let error = match self
-                .runtime
-                .block_on(dataset.publish_encoded(scene.clone()))
-            {
+            let error = match self.wait(control, dataset.publish_encoded(scene.clone())) {
                 Ok(manifest) => return Ok(manifest),
-                Err(error) => of_dataset(error),
+                Err(error) => error,
             };
             if !matches!(error, TaskError::Interrupted(_)) || Instant::now() >= until {
                 return Err(error);
@@ -183,7 +213,10 @@ pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
 pub(super) fn of_dataset(error: DatasetError) -> TaskError {
     let text = error.to_string();
     match error {
-        DatasetError::Store { .. } | DatasetError::Io { .. } => TaskError::Interrupted(text),
+        // Of the settings, the worker's environment is to blame: another one may have them.
+        DatasetError::Store { .. }
+        | DatasetError::StoreSettings { .. }
+        | DatasetError::Io { .. } => TaskError::Interrupted(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }

@@ -76,8 +76,8 @@ impl Executor for RenderExecutor {
                 spec.render.renderer
             )));
         }
-        let dataset = self.stores.open(spec)?;
-        if let Some(manifest) = self.stores.finished(&dataset, task.index, &key)? {
+        let dataset = self.stores.open(spec, control)?;
+        if let Some(manifest) = self.stores.finished(&dataset, task.index, &key, control)? {
             return Ok(Output {
                 manifest_sha256: manifest_sha256(&manifest),
                 bytes: manifest.total_bytes(),

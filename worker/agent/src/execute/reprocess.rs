@@ -54,9 +54,13 @@ impl Reprocessor {
     ///
     /// # Errors
     /// [`TaskError::User`] where there is no such data set.
-    pub fn source(&self, settings: &ReprocessSettings) -> Result<(Vec<u64>, u64), TaskError> {
-        let source = open_source(&self.stores, settings)?;
-        let present = self.stores.wait(source.scenes_present())?;
+    pub fn source(
+        &self,
+        settings: &ReprocessSettings,
+        control: &Control,
+    ) -> Result<(Vec<u64>, u64), TaskError> {
+        let source = open_source(&self.stores, settings, control)?;
+        let present = self.stores.wait(control, source.scenes_present())?;
         Ok((present, source.spec().scenes))
     }
 
@@ -102,9 +106,9 @@ pub(super) fn run(
         )));
     }
     let sensor = sensor(&settings.sensor)?;
-    let source = open_source(stores, settings)?;
+    let source = open_source(stores, settings, control)?;
     let spec = target_spec(source.spec(), settings, &target.profile)?;
-    let found = source_manifest(stores, &source, index)?;
+    let found = source_manifest(stores, &source, index, control)?;
     let source_key = TaskKey::parse(&found.provenance.task_key).ok_or_else(|| {
         TaskError::User(format!(
             "reprocess.source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
@@ -112,21 +116,16 @@ pub(super) fn run(
         ))
     })?;
     let key = derived_key(&reprocess_stage_key(settings, &target.profile), &source_key);
-    let dataset = stores.create_or_open(&target.store, &target.dataset, &spec)?;
-    if let Some(manifest) = stores.finished(&dataset, index, &key)? {
+    let dataset = stores.create_or_open(&target.store, &target.dataset, &spec, control)?;
+    if let Some(manifest) = stores.finished(&dataset, index, &key, control)? {
         return Ok(Output {
             manifest_sha256: manifest_sha256(&manifest),
             bytes: manifest.total_bytes(),
             adopted: true,
         });
     }
-    let proceed = |fraction| match control.at(fraction) {
-        true => Ok(()),
-        false => Err(TaskError::Stopped),
-    };
-    proceed(0.0)?;
-    let h = read(stores, &source, settings, index, &proceed)?;
-    proceed(READ)?;
+    let h = read(stores, &source, settings, index, control)?;
+    proceed(control, READ)?;
     let input = Histograms {
         transient: &h,
         two_bounce: None,
@@ -137,8 +136,8 @@ pub(super) fn run(
     let seed = u64::from_le_bytes(key.0[..8].try_into().expect("a key has 32 bytes"));
     let sensed = sensor.sense(&input, seed, 0).map_err(of_sensor)?;
     drop(h);
-    proceed(MEASURED)?;
-    let truth = stores.wait(source.read_truth(index))?;
+    proceed(control, MEASURED)?;
+    let truth = stores.wait(control, source.read_truth(index))?;
     let truth = match chosen(settings) {
         None => truth,
         Some(spots) => truth.of_spots(&spots).map_err(of_dataset)?,
@@ -163,9 +162,20 @@ pub(super) fn run(
     })
 }
 
-fn open_source(stores: &Stores, settings: &ReprocessSettings) -> Result<Dataset, TaskError> {
+fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
+    match control.at(fraction) {
+        true => Ok(()),
+        false => Err(TaskError::Stopped),
+    }
+}
+
+fn open_source(
+    stores: &Stores,
+    settings: &ReprocessSettings,
+    control: &Control,
+) -> Result<Dataset, TaskError> {
     let place = &settings.source;
-    let opened = stores.open_source(&place.store, &place.dataset);
+    let opened = stores.open_source(&place.store, &place.dataset, control);
     opened.map_err(|error| match error {
         TaskError::User(text) => TaskError::User(format!("reprocess.source: {text}")),
         other => other,
@@ -173,7 +183,12 @@ fn open_source(stores: &Stores, settings: &ReprocessSettings) -> Result<Dataset,
 }
 
 /// The source's manifest of a scene; see the head of this file for what it means where there is none.
-fn source_manifest(stores: &Stores, source: &Dataset, index: u64) -> Result<Manifest, TaskError> {
+fn source_manifest(
+    stores: &Stores,
+    source: &Dataset,
+    index: u64,
+    control: &Control,
+) -> Result<Manifest, TaskError> {
     if index >= source.spec().scenes {
         return Err(TaskError::User(format!(
             "reprocess.source: scene {index} does not exist: {} has room for {} scenes",
@@ -181,14 +196,18 @@ fn source_manifest(stores: &Stores, source: &Dataset, index: u64) -> Result<Mani
             source.spec().scenes
         )));
     }
-    stores
-        .read(source.manifest(index))
-        .map_err(|error| match error {
-            DatasetError::NotPublished { .. } => TaskError::Interrupted(format!(
-                "reprocess.source: scene {index} is not there yet ({error})"
-            )),
-            other => of_dataset(other),
-        })
+    let looked = async {
+        match source.manifest(index).await {
+            Ok(manifest) => Ok(Ok(manifest)),
+            Err(error @ DatasetError::NotPublished { .. }) => Ok(Err(error)),
+            Err(error) => Err(error),
+        }
+    };
+    stores.wait(control, looked)?.map_err(|error| {
+        TaskError::Interrupted(format!(
+            "reprocess.source: scene {index} is not there yet ({error})"
+        ))
+    })
 }
 
 /// The data set that a source becomes.
@@ -276,15 +295,16 @@ fn read(
     source: &Dataset,
     settings: &ReprocessSettings,
     index: u64,
-    proceed: &impl Fn(f32) -> Result<(), TaskError>,
+    control: &Control,
 ) -> Result<Vec<f32>, TaskError> {
     if settings.histogram != Histogram::TransientSpots {
-        return stores.wait(source.read_histogram(index, quantity(settings.histogram)));
+        let read = source.read_histogram(index, quantity(settings.histogram));
+        return stores.wait(control, read);
     }
     let mut sum = Multiplex::new(source.spec().transient_len());
     for (done, spot) in settings.spots.iter().enumerate() {
-        proceed(READ * done as f32 / settings.spots.len() as f32)?;
-        let h = stores.wait(source.read_spot(index, *spot))?;
+        proceed(control, READ * done as f32 / settings.spots.len() as f32)?;
+        let h = stores.wait(control, source.read_spot(index, *spot))?;
         sum.add(&h).map_err(of_sensor)?;
     }
     Ok(sum.finish())

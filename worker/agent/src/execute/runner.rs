@@ -10,7 +10,7 @@ use std::{
 use tokio::sync::mpsc;
 
 use super::{Control, Executor, Output, Task, TaskError};
-use crate::AgentError;
+use crate::{AgentError, allow::StorePrefixes};
 
 type Job = (Task, Arc<Control>);
 
@@ -21,8 +21,12 @@ pub(crate) struct Runner {
 }
 
 impl Runner {
-    /// Starts the thread and a pool of `threads`.
-    pub(crate) fn start(executor: Arc<dyn Executor>, threads: usize) -> Result<Self, AgentError> {
+    /// Starts the thread and a pool of `threads`. Tasks that touch what is not `allowed` fail without being run.
+    pub(crate) fn start(
+        executor: Arc<dyn Executor>,
+        threads: usize,
+        allowed: StorePrefixes,
+    ) -> Result<Self, AgentError> {
         let failed = |reason: String| AgentError::Threads { threads, reason };
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -36,6 +40,9 @@ impl Runner {
             .spawn(move || {
                 for (task, control) in inbox {
                     let result = catch_unwind(AssertUnwindSafe(|| {
+                        allowed
+                            .check(&task.spec, task.index)
+                            .map_err(TaskError::User)?;
                         pool.install(|| executor.run(&task, &control))
                     }))
                     .unwrap_or_else(|panic| Err(TaskError::Crash(said(panic.as_ref()))));

@@ -63,10 +63,16 @@ impl Splitter {
     ///
     /// # Errors
     /// [`TaskError::User`] where there is none.
-    pub fn show(&self, name: &str, store: &str, dataset: &str) -> Result<Split, TaskError> {
-        let dataset = self.stores.open_source(store, dataset)?;
-        let present = present(&self.stores, &dataset)?;
-        let found = newest(&self.stores, &dataset, name)?;
+    pub fn show(
+        &self,
+        name: &str,
+        store: &str,
+        dataset: &str,
+        control: &Control,
+    ) -> Result<Split, TaskError> {
+        let dataset = self.stores.open_source(store, dataset, control)?;
+        let present = present(&self.stores, &dataset, control)?;
+        let found = newest(&self.stores, &dataset, name, control)?;
         found
             .map(|record| found_as(record, &dataset, &present, true))
             .ok_or_else(|| {
@@ -98,13 +104,10 @@ pub(super) fn run(
 ) -> Result<Split, TaskError> {
     let user = |e: picofarm_proto::model::SpecError| TaskError::User(e.to_string());
     settings.check().map_err(user)?;
-    let dataset = stores.open_source(store, dataset)?;
-    let present = present(stores, &dataset)?;
+    let dataset = stores.open_source(store, dataset, control)?;
+    let present = present(stores, &dataset, control)?;
     for _ in 0..ATTEMPTS {
-        if control.stopped() {
-            return Err(TaskError::Stopped);
-        }
-        let next = match newest(stores, &dataset, &settings.name)? {
+        let next = match newest(stores, &dataset, &settings.name, control)? {
             None => SplitRecord::first(settings, &present).map_err(user)?,
             Some(record) => match record.extended(settings, &present).map_err(user)? {
                 None => return Ok(found_as(record, &dataset, &present, true)),
@@ -112,7 +115,8 @@ pub(super) fn run(
             },
         };
         let bytes = next.to_bytes();
-        if stores.wait(dataset.create_split(&settings.name, next.version, bytes))? {
+        let create = dataset.create_split(&settings.name, next.version, bytes);
+        if stores.wait(control, create)? {
             control.at(1.0);
             return Ok(found_as(next, &dataset, &present, false));
         }
@@ -123,20 +127,26 @@ pub(super) fn run(
     )))
 }
 
-fn present(stores: &Stores, dataset: &Dataset) -> Result<BTreeSet<u64>, TaskError> {
-    Ok(stores.wait(dataset.scenes_present())?.into_iter().collect())
+fn present(
+    stores: &Stores,
+    dataset: &Dataset,
+    control: &Control,
+) -> Result<BTreeSet<u64>, TaskError> {
+    let present = stores.wait(control, dataset.scenes_present())?;
+    Ok(present.into_iter().collect())
 }
 
 fn newest(
     stores: &Stores,
     dataset: &Dataset,
     name: &str,
+    control: &Control,
 ) -> Result<Option<SplitRecord>, TaskError> {
-    let versions = stores.wait(dataset.split_versions(name))?;
+    let versions = stores.wait(control, dataset.split_versions(name))?;
     let Some(version) = versions.last() else {
         return Ok(None);
     };
-    let bytes = stores.wait(dataset.read_split(name, *version))?;
+    let bytes = stores.wait(control, dataset.read_split(name, *version))?;
     let damaged =
         |what: String| TaskError::User(format!("{}: {what}", dataset.split_place(name, *version)));
     let record = SplitRecord::parse(&bytes).map_err(damaged)?;

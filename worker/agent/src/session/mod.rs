@@ -35,9 +35,9 @@ use picofarm_proto::{
 };
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::UnboundedReceiverStream;
-use tonic::{Code, Status, Streaming, transport::Endpoint};
+use tonic::{Code, Status, Streaming};
 
-use crate::AgentError;
+use crate::{Access, AgentError, Target, Trouble, lost_connection};
 use message::{Incoming, Outgoing};
 
 /// How long a connection, and then the welcome, may take.
@@ -52,6 +52,8 @@ const MAX_MESSAGE: usize = 256 << 20;
 pub(crate) enum LinkError {
     /// Try again later.
     Down(String),
+    /// Somebody must mend a setting here or there.
+    Mismatch(String),
     /// Trying again would not help.
     Refused(String),
 }
@@ -92,30 +94,43 @@ pub(crate) struct Session {
     from: Streaming<wire::SessionResponse>,
 }
 
-/// Checks the coordinator's URL and sets how connections to it behave.
-pub(crate) fn endpoint(url: &str) -> Result<Endpoint, AgentError> {
-    let bad = |why: String| AgentError::Config {
-        field: "coordinator",
-        what: format!("{url:?} is not a usable URL ({why}); expected e.g. http://127.0.0.1:7717"),
-    };
-    if !url.starts_with("http://") {
-        return Err(bad("it must begin with http://".into()));
-    }
-    let endpoint = Endpoint::from_shared(url.to_owned()).map_err(|e| bad(e.to_string()))?;
-    Ok(endpoint
+/// Checks the coordinator's URL and what is needed to reach it, and sets how connections to it behave.
+pub(crate) fn target(url: &str, access: &Access) -> Result<Target, AgentError> {
+    let mut target = access.target(url)?;
+    target.endpoint = target
+        .endpoint
         .connect_timeout(OPEN_TIMEOUT)
         .tcp_nodelay(true)
         .http2_keep_alive_interval(KEEPALIVE)
         .keep_alive_timeout(KEEPALIVE)
-        .keep_alive_while_idle(true))
+        .keep_alive_while_idle(true);
+    Ok(target)
+}
+
+impl From<Trouble> for LinkError {
+    fn from(trouble: Trouble) -> Self {
+        match trouble {
+            Trouble::Down(why) => Self::Down(why),
+            Trouble::Mismatch(why) => Self::Mismatch(why),
+        }
+    }
+}
+
+/// Why a call at the start of a session failed: the coordinator's words, or what is wrong with the connection.
+async fn failed(target: &Target, status: Status) -> LinkError {
+    if lost_connection(&status) {
+        target.trouble(&status).await.into()
+    } else {
+        status.into()
+    }
 }
 
 /// Connects, says hello and waits for the welcome.
 pub(crate) async fn open(
-    endpoint: Endpoint,
+    target: Target,
     hello: WorkerHello,
 ) -> Result<(Welcome, Box<Session>), LinkError> {
-    match tokio::time::timeout(OPEN_TIMEOUT, open_patiently(endpoint, hello)).await {
+    match tokio::time::timeout(OPEN_TIMEOUT, open_patiently(target, hello)).await {
         Ok(opened) => opened,
         Err(_) => Err(LinkError::Down(format!(
             "no welcome within {} s",
@@ -125,14 +140,14 @@ pub(crate) async fn open(
 }
 
 async fn open_patiently(
-    endpoint: Endpoint,
+    target: Target,
     hello: WorkerHello,
 ) -> Result<(Welcome, Box<Session>), LinkError> {
-    let channel = endpoint
-        .connect()
-        .await
-        .map_err(|e| LinkError::Down(with_causes(&e)))?;
-    let mut client = FarmClient::new(channel)
+    let channel = match target.endpoint.connect().await {
+        Ok(channel) => channel,
+        Err(error) => return Err(target.trouble(&error).await.into()),
+    };
+    let mut client = FarmClient::with_interceptor(channel, target.bearer.clone())
         .max_decoding_message_size(MAX_MESSAGE)
         .max_encoding_message_size(MAX_MESSAGE);
     let (to, requests) = mpsc::unbounded_channel();
@@ -140,11 +155,16 @@ async fn open_patiently(
         message: Some(session_request::Message::Hello(hello.into())),
     };
     to.send(first).expect("the receiver is in this function");
-    let mut from = client
-        .session(UnboundedReceiverStream::new(requests))
-        .await?
-        .into_inner();
-    let welcome = match from.message().await? {
+    let requests = UnboundedReceiverStream::new(requests);
+    let mut from = match client.session(requests).await {
+        Ok(response) => response.into_inner(),
+        Err(status) => return Err(failed(&target, status).await),
+    };
+    let first = match from.message().await {
+        Ok(message) => message,
+        Err(status) => return Err(failed(&target, status).await),
+    };
+    let welcome = match first {
         Some(wire::SessionResponse {
             message: Some(session_response::Message::Welcome(w)),
         }) if w.heartbeat_ms > 0 && w.lease_ms > w.heartbeat_ms => Welcome {
@@ -178,15 +198,4 @@ impl Session {
             None => Err(LinkError::Down("the coordinator closed the session".into())),
         }
     }
-}
-
-/// An error and its sources on one line: tonic's own text is only "transport error".
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
-        text = format!("{text}: {cause}");
-        source = cause.source();
-    }
-    text
 }

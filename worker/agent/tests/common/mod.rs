@@ -374,6 +374,8 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         worker_id: None,
         threads: 1,
         asset_dirs: Vec::new(),
+        access: Default::default(),
+        store_prefixes: Vec::new(),
     }
 }
 

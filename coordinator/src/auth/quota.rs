@@ -1,0 +1,169 @@
+//! Limits on what callers can make a coordinator hold, and on how much they can make it write into its log.
+
+use std::{
+    collections::HashMap,
+    sync::{Arc, Mutex},
+    time::{Duration, Instant},
+};
+
+use picofarm_proto::ids::WorkerId;
+use tonic::Status;
+
+/// The most of everything; what lies beyond is refused with RESOURCE_EXHAUSTED and the limit's name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Quotas {
+    /// Jobs of one caller that have not ended.
+    pub jobs_per_user: usize,
+    /// Tasks of one job.
+    pub tasks_per_job: u64,
+    /// Sessions of workers at a time.
+    pub sessions: usize,
+}
+
+impl Default for Quotas {
+    /// 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers.
+    fn default() -> Self {
+        Self {
+            jobs_per_user: 1_000,
+            tasks_per_job: 10_000_000,
+            sessions: 10_000,
+        }
+    }
+}
+
+/// A line a second, and how many were left out since the last.
+#[derive(Debug, Default)]
+pub(crate) struct Throttle(Mutex<(Option<Instant>, u64)>);
+
+impl Throttle {
+    /// How many lines went unsaid before this one, or `None` if this one shall not be said either.
+    pub(crate) fn allows(&self) -> Option<u64> {
+        let mut state = self.0.lock().expect("no panic while locked");
+        let now = Instant::now();
+        if state
+            .0
+            .is_some_and(|last| now - last < Duration::from_secs(1))
+        {
+            state.1 += 1;
+            return None;
+        }
+        state.0 = Some(now);
+        Some(std::mem::take(&mut state.1))
+    }
+}
+
+/// Whose worker ids are. An id stays its caller's while a session of it is open and for some time after, so that
+/// nobody else can take over the leases of a worker that reconnects.
+#[derive(Debug, Default)]
+pub(crate) struct WorkerIds(Mutex<HashMap<WorkerId, Owned>>);
+
+#[derive(Debug)]
+struct Owned {
+    caller: Arc<str>,
+    sessions: u32,
+    closed: Instant,
+}
+
+/// How long an id stays its caller's after its last session.
+const OWNED: Duration = Duration::from_secs(24 * 3600);
+/// Ids known at most; beyond, those that have been closed longest are forgotten.
+const IDS: usize = 65_536;
+
+impl WorkerIds {
+    /// Takes `id` for a session of `caller`, until the value is dropped.
+    ///
+    /// # Errors
+    /// PERMISSION_DENIED when it is another caller's.
+    pub(crate) fn take(self: &Arc<Self>, id: WorkerId, caller: &Arc<str>) -> Result<Held, Status> {
+        let mut ids = self.0.lock().expect("no panic while locked");
+        let now = Instant::now();
+        if let Some(owned) = ids.get(&id)
+            && owned.caller != *caller
+            && (owned.sessions > 0 || now - owned.closed < OWNED)
+        {
+            return Err(Status::permission_denied(format!(
+                "worker id {id} belongs to another caller; {caller:?} must use an id of its own"
+            )));
+        }
+        if ids.len() >= IDS && !ids.contains_key(&id) {
+            ids.retain(|_, owned| owned.sessions > 0 || now - owned.closed < OWNED);
+            let oldest = ids.iter().filter(|(_, owned)| owned.sessions == 0);
+            let oldest = oldest
+                .min_by_key(|(_, owned)| owned.closed)
+                .map(|(id, _)| *id);
+            if let Some(oldest) = oldest.filter(|_| ids.len() >= IDS) {
+                ids.remove(&oldest);
+            }
+        }
+        let owned = ids.entry(id).or_insert_with(|| Owned {
+            caller: Arc::clone(caller),
+            sessions: 0,
+            closed: now,
+        });
+        owned.caller = Arc::clone(caller);
+        owned.sessions += 1;
+        Ok(Held {
+            ids: Arc::clone(self),
+            id,
+        })
+    }
+}
+
+/// A worker id in use.
+#[derive(Debug)]
+pub(crate) struct Held {
+    ids: Arc<WorkerIds>,
+    id: WorkerId,
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        let mut ids = self.ids.0.lock().expect("no panic while locked");
+        if let Some(owned) = ids.get_mut(&self.id) {
+            owned.sessions -= 1;
+            owned.closed = Instant::now();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use uuid::Uuid;
+
+    use super::*;
+
+    #[test]
+    fn a_worker_id_stays_its_callers_after_the_session() {
+        let ids = Arc::new(WorkerIds::default());
+        let (ada, eve): (Arc<str>, Arc<str>) = ("ada".into(), "eve".into());
+        let id = WorkerId::from_uuid(Uuid::new_v4());
+        let first = ids.take(id, &ada).unwrap();
+        let second = ids.take(id, &ada).unwrap();
+        assert!(ids.take(id, &eve).is_err());
+        drop(first);
+        drop(second);
+        let refused = ids.take(id, &eve).unwrap_err();
+        assert_eq!(refused.code(), tonic::Code::PermissionDenied);
+        assert!(ids.take(id, &ada).is_ok());
+    }
+
+    #[test]
+    fn ids_that_come_and_go_do_not_pile_up() {
+        let ids = Arc::new(WorkerIds::default());
+        let ada: Arc<str> = "ada".into();
+        let stays = WorkerId::from_uuid(Uuid::new_v4());
+        let _held = ids.take(stays, &ada).unwrap();
+        for _ in 0..IDS + 10 {
+            drop(ids.take(WorkerId::from_uuid(Uuid::new_v4()), &ada).unwrap());
+        }
+        let held = ids.0.lock().unwrap();
+        assert!(held.len() <= IDS && held.contains_key(&stays));
+    }
+
+    #[test]
+    fn a_flood_of_refusals_is_one_line() {
+        let throttle = Throttle::default();
+        assert_eq!(throttle.allows(), Some(0));
+        assert_eq!(throttle.allows(), None);
+    }
+}

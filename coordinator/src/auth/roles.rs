@@ -1,0 +1,191 @@
+//! What callers may do: roles, and which of them each method needs.
+
+use std::{fmt, str::FromStr};
+
+use serde::{Deserialize, Serialize};
+
+/// A right that a caller may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Look at jobs, their history and the farm.
+    View,
+    /// Plan, submit and steer jobs; and look at them.
+    Submit,
+    /// Take leases and report results.
+    Work,
+    /// Everything.
+    Admin,
+}
+
+impl Role {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::View, Self::Submit, Self::Work, Self::Admin];
+
+    /// Its name, as in the token file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::View => "view",
+            Self::Submit => "submit",
+            Self::Work => "work",
+            Self::Admin => "admin",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Role {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|role| role.name() == text);
+        found.ok_or_else(|| format!("{text:?} is no role; there are view, submit, work and admin"))
+    }
+}
+
+/// The roles of one caller, each once, ascending.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(from = "Vec<Role>")]
+pub struct Roles(Vec<Role>);
+
+impl From<Vec<Role>> for Roles {
+    fn from(mut roles: Vec<Role>) -> Self {
+        roles.sort_unstable();
+        roles.dedup();
+        Self(roles)
+    }
+}
+
+impl Roles {
+    /// None at all.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Each of them.
+    pub fn iter(&self) -> impl Iterator<Item = Role> + '_ {
+        self.0.iter().copied()
+    }
+
+    /// Whether they suffice for what needs `needed`: the role itself, one that implies it, or any.
+    pub fn allow(&self, needed: Needs) -> bool {
+        let has = |role| self.0.contains(&role);
+        has(Role::Admin)
+            || match needed {
+                Needs::Nothing => true,
+                Needs::Role(Role::View) => has(Role::View) || has(Role::Submit),
+                Needs::Role(role) => has(role),
+            }
+    }
+}
+
+impl fmt::Display for Roles {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let names: Vec<_> = self.iter().map(Role::name).collect();
+        f.write_str(&names.join(","))
+    }
+}
+
+/// What a method needs of its caller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Needs {
+    /// That it is known.
+    Nothing,
+    /// A role, or one that implies it.
+    Role(Role),
+}
+
+/// Each method of the services with what it needs.
+pub(crate) const METHODS: &[(&str, Needs)] = &[
+    ("/picofarm.v1.Farm/Session", Needs::Role(Role::Work)),
+    ("/picofarm.v1.Jobs/GetServerInfo", Needs::Nothing),
+    ("/picofarm.v1.Jobs/PlanJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/SubmitJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/CancelJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/RetryJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/ListJobs", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/GetJob", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/WatchJob", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/ListEvents", Needs::Role(Role::View)),
+];
+
+/// What a path needs. One that is not listed is for administrators: forgetting it opens nothing.
+pub fn needs(path: &str) -> Needs {
+    let listed = METHODS.iter().find(|(method, _)| *method == path);
+    listed.map_or(Needs::Role(Role::Admin), |(_, needs)| *needs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_method_of_the_schema_is_listed_with_the_role_it_needs() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../proto");
+        let mut found = Vec::new();
+        let mut folders = vec![std::path::PathBuf::from(folder)];
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() {
+                    folders.push(path);
+                } else if path.extension().is_some_and(|e| e == "proto") {
+                    methods(&std::fs::read_to_string(path).unwrap(), &mut found);
+                }
+            }
+        }
+        let mut listed: Vec<_> = METHODS.iter().map(|(m, _)| (*m).to_owned()).collect();
+        listed.sort();
+        found.sort();
+        assert_eq!(listed, found);
+    }
+
+    fn methods(schema: &str, found: &mut Vec<String>) {
+        let (mut package, mut service) = ("", "");
+        for line in schema.lines().map(str::trim) {
+            let name = |rest: &'static str| line.strip_prefix(rest).map(|l| word(l));
+            if let Some(name) = name("package ") {
+                package = name;
+            } else if let Some(name) = name("service ") {
+                service = name;
+            } else if let Some(name) = name("rpc ") {
+                found.push(format!("/{package}.{service}/{name}"));
+            }
+        }
+    }
+
+    fn word(text: &str) -> &str {
+        let end = text.find(|c: char| !(c.is_alphanumeric() || c == '.' || c == '_'));
+        &text[..end.unwrap_or(text.len())]
+    }
+
+    #[test]
+    fn roles_imply_what_they_should_and_nothing_more() {
+        let may = |roles: &[Role], role| Roles::from(roles.to_vec()).allow(Needs::Role(role));
+        for role in Role::ALL {
+            assert!(may(&[role], role));
+            assert!(may(&[Role::Admin], role));
+            assert!(!may(&[], role));
+            assert!(Roles::from(vec![role]).allow(Needs::Nothing));
+        }
+        assert!(may(&[Role::Submit], Role::View));
+        for (has, wants) in [
+            (Role::View, Role::Submit),
+            (Role::Submit, Role::Work),
+            (Role::Work, Role::View),
+            (Role::Work, Role::Submit),
+            (Role::Submit, Role::Admin),
+        ] {
+            assert!(!may(&[has], wants), "{has} must not do for {wants}");
+        }
+        assert_eq!(
+            needs("/picofarm.v1.Jobs/DropEverything"),
+            Needs::Role(Role::Admin)
+        );
+    }
+}

@@ -1,0 +1,329 @@
+//! The token file: who there is, with what roles, and the SHA-256 of each one's token. Tokens themselves are shown
+//! once, when they are made, and kept nowhere.
+
+use std::{
+    io::Write,
+    path::{Path, PathBuf},
+};
+
+use picofarm_proto::credentials::{CredentialError, Described, Secret, private};
+use rustls::crypto::aws_lc_rs;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use subtle::ConstantTimeEq;
+
+use super::roles::Roles;
+
+/// Tokens begin with this, so that leaked ones are found by a search.
+pub const TOKEN_PREFIX: &str = "pf-";
+
+/// Why the token file cannot be used or changed.
+#[derive(Debug, thiserror::Error)]
+pub enum TokenError {
+    /// It cannot be read, or everyone has access to it.
+    #[error(transparent)]
+    File(#[from] CredentialError),
+    /// It is not what it should be.
+    #[error("{}: {what}", path.display())]
+    Invalid {
+        /// The file.
+        path: PathBuf,
+        /// What was expected.
+        what: String,
+    },
+    /// It cannot be written.
+    #[error("{}: {source}; check that this user may write there", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's answer.
+        source: std::io::Error,
+    },
+}
+
+/// One caller of the token file: known by a token, or by the name in a client certificate.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Who: jobs and workers carry this name.
+    pub name: String,
+    /// What it may do.
+    pub roles: Roles,
+    /// SHA-256 of the token, hexadecimal.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<String>,
+    /// Common name or alternative name of a client certificate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub certificate: Option<String>,
+}
+
+/// The token file's content.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tokens {
+    #[serde(default, rename = "caller", skip_serializing_if = "Vec::is_empty")]
+    entries: Vec<Entry>,
+}
+
+const HEAD: &str = "\
+# Who may use this farm. `picofarm token create`, `list` and `revoke` edit this file; a running coordinator notices.
+# Roles: view, submit, work, admin. sha256 is that of the token, which is kept nowhere.
+# In place of sha256, certificate = \"NAME\" knows a client certificate by its common name or an alternative name.
+
+";
+
+impl Tokens {
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// [`TokenError`]: it cannot be read, is open to everyone, or an entry makes no sense.
+    pub fn read(path: &Path) -> Result<Self, TokenError> {
+        private(path)?;
+        let text = std::fs::read_to_string(path).map_err(|source| CredentialError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::parse(&text).map_err(|what| TokenError::Invalid {
+            path: path.to_owned(),
+            what,
+        })
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        // The parser's own words quote the file's lines, which hold no secret.
+        let tokens: Self = toml::from_str(text).map_err(|e| e.to_string().trim_end().to_owned())?;
+        for (i, entry) in tokens.entries.iter().enumerate() {
+            let at = format!("caller {:?}", entry.name);
+            plain_name(&entry.name)?;
+            if tokens.entries[..i].iter().any(|e| e.name == entry.name) {
+                return Err(format!("{at} is there twice; give each its own name"));
+            }
+            if entry.roles.is_empty() {
+                return Err(format!(
+                    "{at} has no roles; give it view, submit, work or admin"
+                ));
+            }
+            let digest = |text: &String| hex::decode(text).is_ok_and(|bytes| bytes.len() == 32);
+            match (&entry.sha256, &entry.certificate) {
+                (Some(sha256), None) if digest(sha256) => {}
+                (Some(_), None) => {
+                    return Err(format!(
+                        "{at}: sha256 must be 64 hexadecimal digits: the SHA-256 of the token, not the token"
+                    ));
+                }
+                (None, Some(name)) if !name.is_empty() => {}
+                _ => return Err(format!("{at} needs either sha256 or certificate")),
+            }
+        }
+        Ok(tokens)
+    }
+
+    /// All callers.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// Whose token this is. Takes the same time for every token.
+    pub fn by_token(&self, token: &str) -> Option<&Entry> {
+        let digest = Sha256::digest(token);
+        let mut found = None;
+        for entry in &self.entries {
+            let Some(sha256) = &entry.sha256 else {
+                continue;
+            };
+            let known = hex::decode(sha256).expect("checked when it was read");
+            if bool::from(known.ct_eq(&digest)) {
+                found = Some(entry);
+            }
+        }
+        found
+    }
+
+    /// Whose client certificate this is.
+    pub fn by_certificate(&self, certificate: &Described) -> Option<&Entry> {
+        self.entries.iter().find(|entry| {
+            let name = entry.certificate.as_deref();
+            name.is_some_and(|name| certificate.is(name))
+        })
+    }
+
+    /// Makes a token for a new caller and adds it.
+    ///
+    /// # Errors
+    /// The name is taken or not plain, or there are no roles; in words.
+    pub fn create(&mut self, name: &str, roles: Roles) -> Result<Secret, String> {
+        plain_name(name)?;
+        if self.entries.iter().any(|e| e.name == name) {
+            return Err(format!(
+                "there is a caller {name:?} already; revoke it first, or choose another name"
+            ));
+        }
+        if roles.is_empty() {
+            return Err("a token needs at least one role".into());
+        }
+        let mut random = [0; 32];
+        aws_lc_rs::default_provider()
+            .secure_random
+            .fill(&mut random)
+            .map_err(|_| "the system gives no random numbers")?;
+        let token = format!("{TOKEN_PREFIX}{}", hex::encode(random));
+        self.entries.push(Entry {
+            name: name.to_owned(),
+            roles,
+            sha256: Some(hex::encode(Sha256::digest(&token))),
+            certificate: None,
+        });
+        Ok(Secret::new(token))
+    }
+
+    /// Removes a caller; `false` if there is none of this name.
+    pub fn revoke(&mut self, name: &str) -> bool {
+        let before = self.entries.len();
+        self.entries.retain(|e| e.name != name);
+        self.entries.len() < before
+    }
+
+    /// Writes the file in one step, for its owner and group only.
+    ///
+    /// # Errors
+    /// [`TokenError::Write`].
+    pub fn write(&self, path: &Path) -> Result<(), TokenError> {
+        use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+        let failed = |source| TokenError::Write {
+            path: path.to_owned(),
+            source,
+        };
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty());
+        if let Some(folder) = folder {
+            std::fs::create_dir_all(folder).map_err(failed)?;
+        }
+        let mode = std::fs::metadata(path).map_or(0o600, |m| m.permissions().mode() & 0o770);
+        let mut temporary = path.as_os_str().to_owned();
+        temporary.push(format!(".{}", uuid::Uuid::new_v4()));
+        let text = toml::to_string(self).expect("entries are plain data");
+        let written = std::fs::OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .mode(mode)
+            .open(&temporary)
+            .and_then(|mut file| {
+                file.write_all(HEAD.as_bytes())?;
+                file.write_all(text.as_bytes())?;
+                file.sync_all()
+            })
+            .and_then(|()| std::fs::rename(&temporary, path));
+        written.map_err(|e| {
+            // What is left of it is of no use; the error that matters is the first.
+            let _ = std::fs::remove_file(&temporary);
+            failed(e)
+        })
+    }
+}
+
+/// Names go into logs, job lists and label values.
+fn plain_name(name: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.@".contains(c);
+    if name.is_empty() || name.len() > 64 || !name.chars().all(plain) {
+        return Err(format!(
+            "{name:?} is no name: expected up to 64 letters, digits, '-', '_', '.' and '@'"
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{super::roles::Role, *};
+
+    #[test]
+    fn a_token_made_is_known_again_and_revoked_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("deep/tokens.toml");
+        let mut tokens = Tokens::default();
+        let ada = tokens
+            .create("ada", vec![Role::Work, Role::Submit].into())
+            .unwrap();
+        let bob = tokens.create("bob", vec![Role::View].into()).unwrap();
+        assert!(
+            tokens
+                .create("ada", vec![Role::View].into())
+                .unwrap_err()
+                .contains("already")
+        );
+        assert!(
+            tokens
+                .create("a b", vec![Role::View].into())
+                .unwrap_err()
+                .contains("no name")
+        );
+        tokens.write(&path).unwrap();
+
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains(ada.expose()) && !text.contains(&ada.expose()[3..]));
+        let mut back = Tokens::read(&path).unwrap();
+        assert_eq!(back, tokens);
+        let entry = back.by_token(ada.expose()).unwrap();
+        assert_eq!(
+            (entry.name.as_str(), entry.roles.to_string()),
+            ("ada", "submit,work".into())
+        );
+        assert!(back.by_token("").is_none() && back.by_token("pf-00").is_none());
+        assert!(back.revoke("ada") && !back.revoke("ada"));
+        assert!(back.by_token(ada.expose()).is_none());
+        assert_eq!(back.by_token(bob.expose()).unwrap().name, "bob");
+    }
+
+    #[test]
+    fn a_token_file_open_to_everyone_is_refused() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens.toml");
+        Tokens::default().write(&path).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
+        let said = Tokens::read(&path).unwrap_err().to_string();
+        assert!(
+            said.contains("tokens.toml") && said.contains("chmod o-rwx"),
+            "{said}"
+        );
+    }
+
+    #[test]
+    fn entries_that_make_no_sense_are_named() {
+        let digest = "00".repeat(32);
+        for (text, says) in [
+            (
+                "name = \"a\"\nroles = [\"work\"]\n".to_owned(),
+                "either sha256 or certificate",
+            ),
+            (
+                format!("name = \"a\"\nroles = []\nsha256 = \"{digest}\"\n"),
+                "no roles",
+            ),
+            (
+                "name = \"a\"\nroles = [\"work\"]\nsha256 = \"pf-12\"\n".to_owned(),
+                "not the token",
+            ),
+            (
+                format!("name = \"a b\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\n"),
+                "no name",
+            ),
+            (
+                format!("name = \"a\"\nroles = [\"boss\"]\nsha256 = \"{digest}\"\n"),
+                "boss",
+            ),
+            (
+                format!("name = \"a\"\nrole = [\"work\"]\nsha256 = \"{digest}\"\n"),
+                "role",
+            ),
+        ] {
+            let said = Tokens::parse(&format!("[[caller]]\n{text}")).unwrap_err();
+            assert!(said.contains(says), "{said}");
+        }
+        let one = format!("[[caller]]\nname = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\n");
+        assert!(
+            Tokens::parse(&format!("{one}{one}"))
+                .unwrap_err()
+                .contains("twice")
+        );
+    }
+}

@@ -1,0 +1,186 @@
+//! Between the catalog and the workers: claiming pending tasks, giving back what nobody here wants, and what is heard
+//! of other houses.
+
+use picofarm_catalog::{Changes, Claim, News, Owned, RangeState, Want};
+use picofarm_proto::{
+    ids::{JobId, StageRef},
+    model::EventKind,
+};
+
+use super::{About, Core};
+use crate::{place, transition::RangeEvent};
+
+/// Leases claimed for each one that is wanted now, so that short tasks do not cost a transaction each.
+const AHEAD: u64 = 2;
+/// How long not to ask again after an empty answer.
+const ASK_AGAIN_MS: i64 = 100;
+
+impl Core {
+    /// The pending tasks that connected workers could run now and that are not in hand.
+    pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
+        let mut wants = Vec::new();
+        for (id, entry) in &self.stages {
+            if entry.free == Some(0) || entry.ask_at_ms > now_ms {
+                continue;
+            }
+            let may_run = |w: &&super::WorkerEntry| place::may_run(&entry.job.spec, &w.abilities).is_ok();
+            let able = self.workers.values().filter(may_run).count() as u64;
+            let credits: u64 = self
+                .workers
+                .values()
+                .filter(may_run)
+                .filter(|w| !w.quarantined)
+                .map(|w| u64::from(w.credits))
+                .sum();
+            if credits == 0 {
+                continue;
+            }
+            let have = entry.stage.pending_tasks();
+            let size = self.lease_size(entry, able, u64::MAX);
+            if have < credits * size || entry.stage.front(now_ms, true).is_none() {
+                wants.push(Want {
+                    stage: *id,
+                    tasks: AHEAD * credits * size,
+                    now_ms,
+                });
+            }
+            // Others get their turn when this one has nothing left.
+            if entry.free.is_none_or(|free| free + have >= credits * size) {
+                break;
+            }
+        }
+        wants
+    }
+
+    /// Tasks of the next lease of a stage, at most `in_range`.
+    pub(super) fn lease_size(&self, entry: &super::StageEntry, able: u64, in_range: u64) -> u64 {
+        // As long as it is not known how much there is, there is enough.
+        let free = entry.free.unwrap_or(u64::MAX / 2);
+        place::lease_size(
+            self.sets[entry.set].timing.mean(),
+            entry.stage.pending_tasks().saturating_add(free),
+            in_range,
+            able * u64::from(self.houses),
+        )
+    }
+
+    /// The answer to a wish.
+    pub(crate) fn supplied(&mut self, stage: StageRef, claim: Claim, now_ms: i64) {
+        let Some(entry) = self.stages.get_mut(&stage) else {
+            return;
+        };
+        entry.free = Some(claim.left);
+        if claim.owned.ranges.is_empty() {
+            entry.ask_at_ms = now_ms + ASK_AGAIN_MS;
+        }
+        self.receive(claim.owned, now_ms);
+        for run in claim.existing {
+            let entry = self.stages.get_mut(&stage).expect("looked up above");
+            // Runs end at the ends of claimed ranges: each lies in one of them.
+            let Some(range) = entry.stage.pending_at(run.lo).cloned() else {
+                continue;
+            };
+            entry
+                .stage
+                .apply(
+                    &range,
+                    &RangeEvent::Settle { run },
+                    &mut Self::range_id(&mut self.make_id),
+                    &mut self.changes,
+                )
+                .expect("pending tasks can be settled");
+            let about = About::message("the outputs exist already").tasks(run.lo, run.hi);
+            self.event(now_ms, stage.job, EventKind::Reused, about);
+            self.perhaps_over(stage, now_ms);
+        }
+    }
+
+    /// Takes ranges in hand that are this house's in the catalog. Leases begin a new period.
+    pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
+        for exception in owned.exceptions {
+            if let Some(entry) = self.stages.get_mut(&exception.stage) {
+                entry.exceptions.insert(exception.task, exception);
+            }
+        }
+        for range in owned.ranges {
+            let id = range.id;
+            match self.stages.get_mut(&range.stage) {
+                Some(entry) => {
+                    if matches!(range.state, RangeState::Leased(_)) {
+                        self.leases.insert(id, range.stage);
+                    }
+                    entry.stage.receive(range, &mut self.changes);
+                    self.renew(id, now_ms);
+                }
+                // Of a job that is no longer active: it goes back as it would have when the job ended.
+                None => give_back(&range, &mut self.changes),
+            }
+        }
+    }
+
+    /// Gives back the pending tasks that no worker took, so that other houses may.
+    pub(crate) fn give_back(&mut self) {
+        for entry in self.stages.values_mut() {
+            let before = self.changes.free.len();
+            entry.stage.give_pending(&mut self.changes);
+            if self.changes.free.len() > before {
+                entry.free = None;
+            }
+        }
+    }
+
+    /// What the catalog tells from time to time. Returns the active jobs that are not known yet.
+    pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
+        self.houses = news.houses.max(1);
+        self.elsewhere = news.workers.saturating_sub(self.connected());
+        let over: Vec<JobId> = self
+            .stages
+            .keys()
+            .map(|stage| stage.job)
+            .filter(|job| !news.active.contains(job))
+            .collect();
+        for job in over {
+            self.drop_job(job, "the job was stopped");
+        }
+        for (id, entry) in &mut self.stages {
+            entry.free = Some(news.free.get(id).copied().unwrap_or(0));
+        }
+        if let Some(leased) = &news.leased {
+            let lost: Vec<_> = self
+                .leases
+                .iter()
+                .filter(|(range, _)| !leased.contains(range))
+                .map(|(range, stage)| (*range, *stage))
+                .collect();
+            for (range, stage) in lost {
+                tracing::info!(%range, "a worker has taken this lease along to another coordinator");
+                if let Some(entry) = self.stages.get_mut(&stage) {
+                    entry.stage.forget(range);
+                }
+                self.lease_over(range);
+            }
+        }
+        self.receive(news.taken, now_ms);
+        let unknown = news.active.into_iter().filter(|job| !self.knows(*job));
+        unknown.collect()
+    }
+}
+
+/// The pieces of a range whose job is not active, as the catalog keeps them.
+fn give_back(range: &picofarm_catalog::Range, changes: &mut Changes) {
+    let mut minted = Vec::new();
+    let pieces = match range.state {
+        RangeState::Leased(_) => crate::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
+            let id = picofarm_proto::ids::RangeId::from_uuid(uuid::Uuid::now_v7());
+            minted.push(id);
+            id
+        })
+        .expect("a lease can be closed"),
+        _ => vec![range.clone()],
+    };
+    changes.remove(range.id);
+    changes.minted.extend(minted);
+    for piece in pieces {
+        changes.give(piece);
+    }
+}

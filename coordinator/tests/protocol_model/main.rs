@@ -1,0 +1,233 @@
+//! The commit protocol of tasks, leases, houses (coordinators over one database) and the collector of orphaned
+//! objects, checked exhaustively within bounds: every interleaving of two coordinators, two workers and a collector
+//! over one database and one object store.
+//!
+//! * `rules.rs`: what the protocol checks, and where in the product; the bounds.
+//! * `state.rs`: the state. `houses.rs`, `workers.rs`: who does what. `model.rs`: the actions, the laws.
+//! * `reach.rs`: from every state the job's end can be reached.
+//!
+//! How faults are modelled. *Stopped* processes take no step for as long as one likes while leases and house rows run
+//! out around them; nothing in the model keeps a process from going on with what it knew. *Killed* ones lose what they
+//! knew and come back under a new name. *Messages* stay in the network for ever once sent: they may arrive late, out of
+//! order, repeatedly, at either house, or never, which is how a lost one looks. A house decides by its memory and
+//! writes by one transaction; as its memory is its own, deciding and writing are one step even if time passes between
+//! them. Time has no place here: whatever ends by a clock may end at any moment.
+//!
+//! Faults of coordinators strike process 0 only, and the first lease goes to worker 0: the others are alike.
+
+mod houses;
+mod model;
+mod reach;
+mod rules;
+mod state;
+mod workers;
+
+use stateright::{Checker, HasDiscoveries, Model};
+
+use model::{DEAD_EPOCH, FENCED, LAWS, LEASED_AGAIN, ONCE, Protocol, ROBBED, THERE};
+use rules::{Bounds, Rules};
+
+/// One task; a worker's kill, a stopped coordinator and a run of the collector, together.
+const STOPPED_HOUSE: Bounds = Bounds {
+    tasks: 1,
+    epochs: 2,
+    worker_kills: 1,
+    house_kills: 0,
+    house_stops: 1,
+    collections: 1,
+};
+
+/// The coordinator is killed instead.
+const KILLED_HOUSE: Bounds = Bounds {
+    house_kills: 1,
+    house_stops: 0,
+    ..STOPPED_HOUSE
+};
+
+/// Three epochs; nothing is killed, workers and collector may be stopped, and the collector comes twice.
+const THREE_EPOCHS: Bounds = Bounds {
+    epochs: 3,
+    worker_kills: 0,
+    house_stops: 0,
+    collections: 2,
+    ..STOPPED_HOUSE
+};
+
+/// A range of two tasks, so that a lease may be left half done; processes are only stopped.
+const TWO_TASKS: Bounds = Bounds {
+    tasks: 2,
+    worker_kills: 0,
+    house_stops: 0,
+    ..STOPPED_HOUSE
+};
+
+/// Every law holds, and the model is not empty: each of its `sometimes` happens.
+fn assert_holds(bounds: Bounds) {
+    let checker = Protocol {
+        rules: Rules::ALL,
+        bounds,
+    }
+    .checker()
+    .spawn_bfs()
+    .join();
+    println!(
+        "{} states, {} steps, {} deep",
+        checker.unique_state_count(),
+        checker.state_count(),
+        checker.max_depth()
+    );
+    for (law, _) in LAWS {
+        checker.assert_no_discovery(law);
+    }
+    for possible in [model::ENDS_LATE, model::COLLECTED, model::ZOMBIE] {
+        checker.assert_any_discovery(possible);
+    }
+}
+
+/// Each of these laws breaks; a shortest trace of each goes to standard output.
+fn assert_breaks(rules: Rules, laws: &[&'static str]) {
+    let checker = Protocol {
+        rules,
+        bounds: STOPPED_HOUSE,
+    }
+    .checker()
+    .finish_when(HasDiscoveries::AllOf(laws.iter().copied().collect()))
+    .spawn_bfs()
+    .join();
+    println!("{} states", checker.unique_state_count());
+    for law in laws {
+        println!("broken: {law}");
+        for action in checker.assert_any_discovery(law).into_actions() {
+            println!("    {action:?}");
+        }
+    }
+}
+
+/// No law breaks but this one, in all of the state space.
+fn assert_breaks_only(rules: Rules, law: &'static str) {
+    assert_breaks(rules, &[law]);
+    let bounds = STOPPED_HOUSE;
+    let checker = Protocol { rules, bounds }.checker().spawn_bfs().join();
+    for (other, _) in LAWS.into_iter().filter(|(other, _)| *other != law) {
+        checker.assert_no_discovery(other);
+    }
+}
+
+#[test]
+fn laws_hold_when_a_coordinator_is_stopped_past_its_lease() {
+    assert_holds(STOPPED_HOUSE);
+}
+
+#[test]
+fn laws_hold_when_a_coordinator_is_killed() {
+    assert_holds(KILLED_HOUSE);
+}
+
+#[test]
+fn laws_hold_over_three_epochs_and_two_collections() {
+    assert_holds(THREE_EPOCHS);
+}
+
+#[test]
+fn laws_hold_for_a_lease_of_two_tasks() {
+    assert_holds(TWO_TASKS);
+}
+
+#[test]
+fn the_job_can_end_from_every_state() {
+    for bounds in [STOPPED_HOUSE, KILLED_HOUSE] {
+        let model = Protocol {
+            rules: Rules::ALL,
+            bounds,
+        };
+        let (stranded, states) = reach::stranded(&model, |state| model.ended(state));
+        println!("{states} states");
+        assert!(
+            stranded.is_empty(),
+            "{} of {states}, first {:#?}",
+            stranded.len(),
+            stranded[0]
+        );
+    }
+}
+
+#[test]
+fn without_the_fence_a_house_that_was_given_up_writes() {
+    let rules = Rules {
+        house_is_fenced: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[FENCED]);
+}
+
+#[test]
+fn without_the_owner_check_two_houses_commit_one_task() {
+    let rules = Rules {
+        writes_check_owner: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[ONCE, DEAD_EPOCH, LEASED_AGAIN]);
+}
+
+#[test]
+fn without_the_lease_check_a_zombie_commits() {
+    let rules = Rules {
+        commit_checks_lease: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[DEAD_EPOCH]);
+}
+
+#[test]
+fn a_lease_adopted_without_its_epoch_lets_a_zombie_commit() {
+    let rules = Rules {
+        lease_adoption_is_conditional: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[DEAD_EPOCH]);
+}
+
+#[test]
+fn a_report_before_the_upload_commits_nothing_real() {
+    let rules = Rules {
+        store_precedes_report: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[THERE]);
+}
+
+#[test]
+fn a_manifest_reused_without_its_objects_commits_nothing_real() {
+    let rules = Rules {
+        reuse_checks_objects: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[THERE]);
+}
+
+#[test]
+fn a_collector_that_does_not_hold_the_range_deletes_what_is_committed() {
+    let rules = Rules {
+        collector_holds_range: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[THERE]);
+}
+
+#[test]
+fn a_collector_whose_hold_runs_out_deletes_what_is_committed() {
+    let rules = Rules {
+        hold_outlasts_lease: false,
+        ..Rules::ALL
+    };
+    assert_breaks(rules, &[THERE]);
+}
+
+#[test]
+fn a_takeover_before_the_expiry_robs_a_living_house_but_loses_nothing() {
+    let rules = Rules {
+        takeover_waits_for_expiry: false,
+        ..Rules::ALL
+    };
+    assert_breaks_only(rules, ROBBED);
+}

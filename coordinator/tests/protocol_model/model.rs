@@ -1,0 +1,235 @@
+//! The protocol as a transition system: who may do what, and which laws must hold. An action whose guard does not
+//! hold is no step.
+
+use stateright::{Model, Property};
+
+use crate::{
+    rules::{Bounds, Rules},
+    state::{Collector, Commit, HouseId, HouseRow, Message, State, Tasks},
+};
+
+pub const ONCE: &str = "each task is committed at most once";
+pub const THERE: &str = "what the catalog names is in the store";
+pub const FENCED: &str = "a fenced house writes nothing";
+pub const DEAD_EPOCH: &str = "no report of a dead epoch is accepted";
+pub const TWO_HOUSES: &str = "no two houses accept the same task of one epoch";
+pub const LEASED_AGAIN: &str = "a committed task is never leased again";
+pub const ROBBED: &str = "a living house keeps its range";
+pub const ENDS_LATE: &str = "the job can end in its last epoch";
+pub const COLLECTED: &str = "objects can be collected";
+pub const ZOMBIE: &str = "a stopped worker can leave a manifest whose objects were collected";
+
+/// A condition on a state.
+type Law = fn(&Protocol, &State) -> bool;
+
+/// What must hold in every state.
+pub const LAWS: [(&str, Law); 7] = [
+    (ONCE, |_, s| {
+        let commits = &s.history.commits;
+        (1..commits.len()).all(|n| commits[..n].iter().all(|c| c.task != commits[n].task))
+    }),
+    (THERE, |_, s| {
+        let stored = s.store.objects.and(s.store.manifests);
+        s.database.outputs.without(stored).is_empty()
+    }),
+    (FENCED, |_, s| !s.history.fenced_write),
+    (DEAD_EPOCH, |_, s| {
+        s.history.commits.iter().all(|c| c.lease_was_live)
+    }),
+    (TWO_HOUSES, |_, s| {
+        let commits = &s.history.commits;
+        let one = |a: &Commit, b: &Commit| (a.epoch, a.task) != (b.epoch, b.task) || a.by == b.by;
+        commits.iter().all(|a| commits.iter().all(|b| one(a, b)))
+    }),
+    (LEASED_AGAIN, |_, s| !s.history.leased_again),
+    (ROBBED, |_, s| !s.history.robbed),
+];
+
+/// One step of one process, or one fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Action {
+    House(u8, HouseStep),
+    Worker(u8, WorkerStep),
+    Collector(CollectorStep),
+    /// A house's row runs out: of one that is dead at any time, of one that runs if it is stopped so long.
+    Expire(HouseId),
+}
+
+/// What a house does, each with one transaction or none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HouseStep {
+    /// It takes a pending range that nobody owns.
+    Claim,
+    /// It gives a pending range back.
+    Release,
+    /// It leases the range to a worker.
+    Grant(u8),
+    /// It ends a lease: heartbeats are missing, or the worker gave it back.
+    Close,
+    /// It accepts a report (`Message::Done`).
+    Commit(Message),
+    /// A worker connects and names its lease; the house becomes the owner of its range.
+    Adopt(u8),
+    /// It deletes another house's row and becomes the owner of what that one had.
+    TakeOver(HouseId),
+    /// As `TakeOver`, of a collector whose lease has run out.
+    TakeOverCollector,
+    /// A write was refused: it forgets everything, and comes back as a new house if its row is no longer live.
+    Reload,
+    /// It is killed and started again.
+    Restart,
+}
+
+/// What a worker does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WorkerStep {
+    /// A lease arrives (`Message::Grant`).
+    Receive(Message),
+    /// It looks for a manifest of the task in hand.
+    Look,
+    /// It checks that the objects of the manifest exist.
+    Check,
+    /// It has rendered the task and stores the object, create-only.
+    PutObject,
+    /// It stores the manifest, create-only.
+    PutManifest,
+    /// It reports the task in hand though nothing is stored yet. No worker of the product does.
+    ReportEarly,
+    /// It reports a finished task, for the first time or again.
+    Report(u8),
+    /// It is done with its lease: everything acknowledged, refused, revoked, or lost from sight.
+    Forget,
+    /// It is killed and started again.
+    Restart,
+}
+
+/// What the collector does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CollectorStep {
+    /// It takes a pending range that nobody owns.
+    Claim,
+    /// It looks for objects without a manifest.
+    Look,
+    /// It deletes the object of one task; after the last one it gives the range back.
+    Delete,
+    /// It is killed: its database session ends, and with it its hold.
+    Restart,
+}
+
+/// The model: the rules in force and its size.
+#[derive(Debug, Clone, Copy)]
+pub struct Protocol {
+    pub rules: Rules,
+    pub bounds: Bounds,
+}
+
+impl Protocol {
+    pub fn tasks(&self) -> Tasks {
+        Tasks::first(self.bounds.tasks)
+    }
+
+    /// Whether the last epoch is granted: faults that would ask for a further one are out of bounds.
+    pub fn last_epoch(&self, state: &State) -> bool {
+        state.database.range.epoch == self.bounds.epochs
+    }
+}
+
+impl Model for Protocol {
+    type State = State;
+    type Action = Action;
+
+    fn init_states(&self) -> Vec<State> {
+        vec![State::initial()]
+    }
+
+    fn actions(&self, state: &State, actions: &mut Vec<Action>) {
+        // What follows a broken law is of no interest.
+        if !LAWS.iter().all(|(_, law)| law(self, state)) {
+            return;
+        }
+        for process in [0, 1] {
+            let mut house = |step| actions.push(Action::House(process, step));
+            house(HouseStep::Claim);
+            house(HouseStep::Release);
+            house(HouseStep::Grant(0));
+            house(HouseStep::Grant(1));
+            house(HouseStep::Adopt(0));
+            house(HouseStep::Adopt(1));
+            house(HouseStep::Close);
+            house(HouseStep::TakeOverCollector);
+            house(HouseStep::Reload);
+            house(HouseStep::Restart);
+            for message in &state.network {
+                house(HouseStep::Commit(*message));
+            }
+            for id in state.database.houses.keys() {
+                house(HouseStep::TakeOver(*id));
+            }
+        }
+        for worker in [0, 1] {
+            let mut worker = |step| actions.push(Action::Worker(worker, step));
+            worker(WorkerStep::Look);
+            worker(WorkerStep::Check);
+            worker(WorkerStep::PutObject);
+            worker(WorkerStep::PutManifest);
+            worker(WorkerStep::ReportEarly);
+            worker(WorkerStep::Forget);
+            worker(WorkerStep::Restart);
+            for task in self.tasks().iter() {
+                worker(WorkerStep::Report(task));
+            }
+            for message in &state.network {
+                worker(WorkerStep::Receive(*message));
+            }
+        }
+        actions.push(Action::Collector(CollectorStep::Claim));
+        actions.push(Action::Collector(CollectorStep::Look));
+        actions.push(Action::Collector(CollectorStep::Delete));
+        actions.push(Action::Collector(CollectorStep::Restart));
+        actions.extend(state.database.houses.keys().copied().map(Action::Expire));
+    }
+
+    fn next_state(&self, last: &State, action: Action) -> Option<State> {
+        let mut next = last.clone();
+        match action {
+            Action::House(process, step) => self.house(&mut next, process, step),
+            Action::Worker(worker, step) => self.worker(&mut next, worker, step),
+            Action::Collector(step) => self.collector(&mut next, step),
+            Action::Expire(id) => self.expire(&mut next, id),
+        }?;
+        (next != *last).then_some(next)
+    }
+
+    fn properties(&self) -> Vec<Property<Self>> {
+        let laws = LAWS.map(|(name, law)| Property::always(name, law));
+        let mut properties = Vec::from(laws);
+        properties.push(Property::sometimes(ENDS_LATE, |m: &Self, s: &State| {
+            m.ended(s) && m.last_epoch(s)
+        }));
+        properties.push(Property::sometimes(COLLECTED, |_, s: &State| {
+            s.faults.collections > 0 && s.collector == Collector::Idle && s.store.objects.is_empty()
+        }));
+        properties.push(Property::sometimes(ZOMBIE, |_, s: &State| {
+            !s.store.manifests.without(s.store.objects).is_empty()
+        }));
+        properties
+    }
+}
+
+impl Protocol {
+    /// Every task is committed.
+    pub fn ended(&self, state: &State) -> bool {
+        state.database.outputs == self.tasks() && state.database.range.done == self.tasks()
+    }
+
+    fn expire(&self, state: &mut State, id: HouseId) -> Option<()> {
+        if state.runs(id) {
+            (id.process == 0 && state.faults.house_stops < self.bounds.house_stops).then_some(())?;
+            state.faults.house_stops += 1;
+        }
+        let row = state.database.houses.get_mut(&id)?;
+        (*row == HouseRow::Live).then_some(())?;
+        *row = HouseRow::Expired;
+        Some(())
+    }
+}

@@ -1,0 +1,277 @@
+//! Certificates, keys and secrets on disk, read the same way by both sides: every error names the file and how to
+//! mend it, and no secret can reach a log.
+
+use std::{
+    fmt, io,
+    path::{Path, PathBuf},
+    time::{SystemTime, UNIX_EPOCH},
+};
+
+use rustls::{
+    crypto::aws_lc_rs,
+    pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
+    sign::CertifiedKey,
+};
+use x509_parser::{
+    extensions::GeneralName,
+    prelude::{FromDer, X509Certificate},
+};
+
+/// A secret text. Shown by neither `Debug` nor `Display`; [`Secret::expose`] is the only way to it.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(String);
+
+impl Secret {
+    /// Wraps a secret.
+    pub fn new(text: impl Into<String>) -> Self {
+        Self(text.into())
+    }
+
+    /// The secret itself, for the one place that needs it.
+    pub fn expose(&self) -> &str {
+        &self.0
+    }
+
+    /// The first line of a file that others have no access to.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or is open to everyone on the machine.
+    pub fn read(path: &Path) -> Result<Self, CredentialError> {
+        private(path)?;
+        let text = std::fs::read_to_string(path).map_err(|e| CredentialError::read(path, e))?;
+        let line = text.lines().next().unwrap_or_default().trim();
+        if line.is_empty() {
+            return Err(CredentialError::unusable(
+                path,
+                "is empty; expected one line with the secret",
+            ));
+        }
+        Ok(Self(line.to_owned()))
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Secret(…)")
+    }
+}
+
+impl fmt::Display for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("…")
+    }
+}
+
+/// A file with credentials that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CredentialError {
+    /// The file cannot be read.
+    #[error("{}: {source}; check the path and that this user may read it", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's answer.
+        source: io::Error,
+    },
+    /// Everyone on the machine has access to it.
+    #[error(
+        "{}: others than its owner and group have access to it (mode {mode:03o}); run `chmod o-rwx {}`",
+        path.display(), path.display()
+    )]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// Its content is not what it should be.
+    #[error("{}: {what}", path.display())]
+    Unusable {
+        /// The file.
+        path: PathBuf,
+        /// What was expected.
+        what: String,
+    },
+}
+
+impl CredentialError {
+    fn read(path: &Path, source: io::Error) -> Self {
+        Self::Read {
+            path: path.to_owned(),
+            source,
+        }
+    }
+
+    fn unusable(path: &Path, what: impl Into<String>) -> Self {
+        Self::Unusable {
+            path: path.to_owned(),
+            what: what.into(),
+        }
+    }
+}
+
+/// Refuses a file that everyone on the machine may read or write.
+///
+/// # Errors
+/// [`CredentialError::Open`], or the file is not there.
+pub fn private(path: &Path) -> Result<(), CredentialError> {
+    use std::os::unix::fs::PermissionsExt;
+    let metadata = std::fs::metadata(path).map_err(|e| CredentialError::read(path, e))?;
+    let mode = metadata.permissions().mode() & 0o777;
+    if metadata.is_file() && mode & 0o007 != 0 {
+        return Err(CredentialError::Open {
+            path: path.to_owned(),
+            mode,
+        });
+    }
+    Ok(())
+}
+
+/// The certificates of a PEM file, and its bytes.
+///
+/// # Errors
+/// The file cannot be read, or holds no certificate.
+pub fn certificates(
+    path: &Path,
+) -> Result<(Vec<CertificateDer<'static>>, Vec<u8>), CredentialError> {
+    let bytes = std::fs::read(path).map_err(|e| CredentialError::read(path, e))?;
+    let parsed: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
+    let found = parsed.map_err(|e| {
+        CredentialError::unusable(
+            path,
+            format!("is no PEM file ({e}); {EXPECTED_CERTIFICATE}"),
+        )
+    })?;
+    for der in &found {
+        Described::of(der).map_err(|what| {
+            CredentialError::unusable(path, format!("holds a certificate that {what}"))
+        })?;
+    }
+    if found.is_empty() {
+        return Err(CredentialError::unusable(
+            path,
+            format!("holds no certificate; {EXPECTED_CERTIFICATE}"),
+        ));
+    }
+    Ok((found, bytes))
+}
+
+const EXPECTED_CERTIFICATE: &str = "expected PEM with -----BEGIN CERTIFICATE-----";
+
+/// A certificate chain with its private key, as PEM.
+#[derive(Clone)]
+pub struct Pair {
+    /// The chain, the own certificate first.
+    pub certificate: Vec<u8>,
+    /// The private key.
+    pub key: Vec<u8>,
+    /// Who it is of.
+    pub described: Described,
+}
+
+impl fmt::Debug for Pair {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Pair").field(&self.described).finish()
+    }
+}
+
+impl Pair {
+    /// Reads a certificate chain and its key, and checks that they belong together.
+    ///
+    /// # Errors
+    /// A file cannot be read or is not PEM, the key is open to everyone, or is of another certificate.
+    pub fn read(certificate: &Path, key: &Path) -> Result<Self, CredentialError> {
+        let (chain, certificate_pem) = certificates(certificate)?;
+        private(key)?;
+        let key_pem = std::fs::read(key).map_err(|e| CredentialError::read(key, e))?;
+        let secret = PrivateKeyDer::from_pem_slice(&key_pem).map_err(|_| {
+            // What the parser says could quote the file.
+            CredentialError::unusable(
+                key,
+                "holds no private key; expected PEM with -----BEGIN PRIVATE KEY-----",
+            )
+        })?;
+        let described = Described::of(&chain[0]).expect("it was described when it was read");
+        let matched = CertifiedKey::from_der(chain, secret, &aws_lc_rs::default_provider());
+        matched.map_err(|e| {
+            let what = match e {
+                rustls::Error::InconsistentKeys(_) => format!(
+                    "the key does not match the certificate {}; give the key that this certificate was made with",
+                    certificate.display()
+                ),
+                other => format!("the key cannot be used ({other}); make one with e.g. ECDSA P-256"),
+            };
+            CredentialError::unusable(key, what)
+        })?;
+        Ok(Self {
+            certificate: certificate_pem,
+            key: key_pem,
+            described,
+        })
+    }
+}
+
+/// What a certificate says of its owner.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Described {
+    /// Its common name, where it has one.
+    pub common_name: Option<String>,
+    /// Its alternative names: DNS names, and URIs such as SPIFFE ids.
+    pub names: Vec<String>,
+    /// Valid from, seconds since 1970.
+    pub not_before: i64,
+    /// Valid until, seconds since 1970.
+    pub not_after: i64,
+}
+
+impl Described {
+    /// Reads a certificate.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words that follow "a certificate that".
+    pub fn of(der: &[u8]) -> Result<Self, String> {
+        let (_, parsed) = X509Certificate::from_der(der)
+            .map_err(|e| format!("cannot be read ({e}); make it again"))?;
+        let common_name = parsed
+            .subject()
+            .iter_common_name()
+            .next()
+            .and_then(|name| name.as_str().ok())
+            .map(str::to_owned);
+        let names = match parsed.subject_alternative_name() {
+            Ok(Some(names)) => names.value.general_names.iter().filter_map(named).collect(),
+            _ => Vec::new(),
+        };
+        Ok(Self {
+            common_name,
+            names,
+            not_before: parsed.validity().not_before.timestamp(),
+            not_after: parsed.validity().not_after.timestamp(),
+        })
+    }
+
+    /// Whether the certificate is called `name`.
+    pub fn is(&self, name: &str) -> bool {
+        self.common_name.as_deref() == Some(name) || self.names.iter().any(|n| n == name)
+    }
+
+    /// Why the certificate is of no use now, if so.
+    pub fn out_of_date(&self) -> Option<&'static str> {
+        let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
+        let now = since_1970.map_or(0, |d| i64::try_from(d.as_secs()).unwrap_or(i64::MAX));
+        if now > self.not_after {
+            Some("has expired; make a new one")
+        } else if now < self.not_before {
+            Some("is not valid yet; check this machine's clock")
+        } else {
+            None
+        }
+    }
+}
+
+fn named(name: &GeneralName<'_>) -> Option<String> {
+    match name {
+        GeneralName::DNSName(name) | GeneralName::URI(name) => Some((*name).to_owned()),
+        _ => None,
+    }
+}

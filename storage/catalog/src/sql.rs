@@ -1,0 +1,520 @@
+//! What SQLite and Postgres have in common: the codes in columns, and the queries, whose text both understand. The
+//! queries are a macro over the database's types because sqlx has no common type for a connection.
+
+use picofarm_proto::model::{EventKind, JobState};
+
+use crate::record::Mark;
+
+/// A column that holds what no version of this program wrote.
+pub(crate) fn bad(column: &'static str, what: impl std::fmt::Display) -> sqlx::Error {
+    sqlx::Error::ColumnDecode {
+        index: column.into(),
+        source: what.to_string().into(),
+    }
+}
+
+/// The databases' integers are signed; ours never reach the sign bit.
+pub(crate) fn int(value: u64) -> i64 {
+    i64::try_from(value).expect("counts, indices and sizes are below 2^63")
+}
+
+const JOB_STATES: [JobState; 4] = [
+    JobState::Active,
+    JobState::Done,
+    JobState::Failed,
+    JobState::Cancelled,
+];
+
+pub(crate) fn job_state_code(state: JobState) -> i64 {
+    code(&JOB_STATES, state)
+}
+
+pub(crate) fn job_state(code: i64) -> Result<JobState, sqlx::Error> {
+    usize::try_from(code)
+        .ok()
+        .and_then(|i| JOB_STATES.get(i).copied())
+        .ok_or_else(|| bad("state", code))
+}
+
+const EVENT_KINDS: [EventKind; 13] = [
+    EventKind::Submitted,
+    EventKind::Leased,
+    EventKind::Committed,
+    EventKind::Reused,
+    EventKind::Failed,
+    EventKind::Dead,
+    EventKind::Expired,
+    EventKind::Released,
+    EventKind::Cancelled,
+    EventKind::Retried,
+    EventKind::Ended,
+    EventKind::Waiting,
+    EventKind::Alarm,
+];
+
+pub(crate) fn event_kind_code(kind: EventKind) -> i64 {
+    code(&EVENT_KINDS, kind)
+}
+
+fn code<T: Copy + PartialEq>(all: &[T], one: T) -> i64 {
+    all.iter()
+        .position(|x| *x == one)
+        .expect("every one is listed") as i64
+}
+
+pub(crate) fn event_kind(code: i64) -> Result<EventKind, sqlx::Error> {
+    usize::try_from(code)
+        .ok()
+        .and_then(|i| EVENT_KINDS.get(i).copied())
+        .ok_or_else(|| bad("kind", code))
+}
+
+pub(crate) const PENDING: i64 = 0;
+pub(crate) const LEASED: i64 = 1;
+pub(crate) const DONE: i64 = 2;
+pub(crate) const DONE_REUSED: i64 = 3;
+pub(crate) const DEAD: i64 = 4;
+
+pub(crate) fn mark(byte: u8) -> Result<Mark, sqlx::Error> {
+    Ok(match byte {
+        0 => Mark::Todo,
+        1 => Mark::Done,
+        2 => Mark::Reused,
+        3 => Mark::Left,
+        other => return Err(bad("marks", other)),
+    })
+}
+
+/// A range's columns but id, stage, lo, hi, epoch and crashes.
+pub(crate) struct StateColumns {
+    pub state: i64,
+    pub not_before_ms: Option<i64>,
+    pub worker: Option<uuid::Uuid>,
+    pub incarnation: Option<uuid::Uuid>,
+    pub lease_until_ms: Option<i64>,
+    pub marks: Option<Vec<u8>>,
+}
+
+impl From<&crate::RangeState> for StateColumns {
+    fn from(state: &crate::RangeState) -> Self {
+        use crate::RangeState;
+        let empty = Self {
+            state: PENDING,
+            not_before_ms: None,
+            worker: None,
+            incarnation: None,
+            lease_until_ms: None,
+            marks: None,
+        };
+        match state {
+            RangeState::Pending { not_before_ms } => Self {
+                not_before_ms: Some(*not_before_ms),
+                ..empty
+            },
+            RangeState::Leased(lease) => Self {
+                state: LEASED,
+                worker: Some(lease.worker.uuid()),
+                incarnation: Some(lease.incarnation.uuid()),
+                lease_until_ms: Some(lease.until_ms),
+                marks: Some(lease.marks.iter().map(|m| *m as u8).collect()),
+                ..empty
+            },
+            RangeState::Done { reused } => Self {
+                state: if *reused { DONE_REUSED } else { DONE },
+                ..empty
+            },
+            RangeState::Dead => Self {
+                state: DEAD,
+                ..empty
+            },
+        }
+    }
+}
+
+/// Checks that outputs that could not be written are there with the same manifests.
+///
+/// # Errors
+/// What differs, in words.
+pub(crate) fn equal_manifests(
+    outputs: &[crate::Output],
+    there: &[Option<[u8; 32]>],
+) -> Result<(), String> {
+    for (output, there) in outputs.iter().zip(there) {
+        if *there != Some(output.manifest) {
+            return Err(format!(
+                "task {} of stage {} has another result already",
+                output.task, output.stage
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The words for a job that cannot become active again.
+pub(crate) const LATER_JOB: &str = "another job with the same spec is active or done";
+
+/// The queries, for one database: `queries!(SqliteConnection, SqliteRow)` makes a module `query`.
+macro_rules! queries {
+    ($connection:ty, $row:ty) => {
+        pub(crate) mod query {
+            use std::{
+                collections::{BTreeMap, BTreeSet},
+                sync::Arc,
+            };
+
+            use picofarm_proto::{
+                ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
+                model::{Event, JobSpec, TaskCounts},
+            };
+            use sqlx::Row;
+            use uuid::Uuid;
+
+            use crate::{
+                record::{
+                    EventQuery, Exception, Job, JobRecord, LeaseState, Mark, Range, RangeState, ResultSet, Run,
+                    Timing, Worker,
+                },
+                sql::{self, bad, int},
+            };
+
+            type Connection = $connection;
+            type DbRow = $row;
+            type Result<T> = std::result::Result<T, sqlx::Error>;
+
+            fn uint(row: &DbRow, column: &'static str) -> Result<u64> {
+                u64::try_from(row.try_get::<i64, _>(column)?).map_err(|e| bad(column, e))
+            }
+
+            fn small(row: &DbRow, column: &'static str) -> Result<u32> {
+                u32::try_from(row.try_get::<i64, _>(column)?).map_err(|e| bad(column, e))
+            }
+
+            fn stage_of(row: &DbRow) -> Result<StageRef> {
+                Ok(StageRef {
+                    job: JobId::from_uuid(row.try_get("job_id")?),
+                    stage: small(row, "ordinal")?,
+                })
+            }
+
+            /// A row of `task_range` with its stage's `job_id` and `ordinal`.
+            pub(crate) fn range(row: &DbRow) -> Result<Range> {
+                let state = match row.try_get::<i64, _>("state")? {
+                    sql::PENDING => RangeState::Pending {
+                        not_before_ms: row.try_get("not_before_ms")?,
+                    },
+                    sql::LEASED => RangeState::Leased(LeaseState {
+                        worker: WorkerId::from_uuid(row.try_get("worker")?),
+                        incarnation: Incarnation::from_uuid(row.try_get("incarnation")?),
+                        until_ms: row.try_get("lease_until_ms")?,
+                        marks: marks(row)?,
+                    }),
+                    sql::DONE => RangeState::Done { reused: false },
+                    sql::DONE_REUSED => RangeState::Done { reused: true },
+                    sql::DEAD => RangeState::Dead,
+                    other => return Err(bad("state", other)),
+                };
+                Ok(Range {
+                    id: RangeId::from_uuid(row.try_get("id")?),
+                    stage: stage_of(row)?,
+                    lo: uint(row, "lo")?,
+                    hi: uint(row, "hi")?,
+                    epoch: Epoch(uint(row, "epoch")?),
+                    crashes: small(row, "crashes")?,
+                    state,
+                })
+            }
+
+            fn marks(row: &DbRow) -> Result<Vec<Mark>> {
+                let bytes: Vec<u8> = row.try_get("marks")?;
+                bytes.into_iter().map(sql::mark).collect()
+            }
+
+            fn job(row: &DbRow) -> Result<Job> {
+                let spec: JobSpec =
+                    serde_json::from_str(row.try_get("spec")?).map_err(|e| bad("spec", e))?;
+                Ok(Job {
+                    id: JobId::from_uuid(row.try_get("id")?),
+                    spec_hash: row.try_get("spec_hash")?,
+                    spec: Arc::new(spec),
+                    state: sql::job_state(row.try_get("state")?)?,
+                    submitted_ms: row.try_get("submitted_ms")?,
+                    ended_ms: row.try_get("ended_ms")?,
+                })
+            }
+
+            pub(crate) async fn active_jobs(c: &mut Connection) -> Result<Vec<Job>> {
+                let rows = sqlx::query("SELECT * FROM job WHERE state = 0 ORDER BY key")
+                    .fetch_all(c)
+                    .await?;
+                rows.iter().map(job).collect()
+            }
+
+            pub(crate) async fn active_ids(c: &mut Connection) -> Result<BTreeSet<JobId>> {
+                let rows = sqlx::query("SELECT id FROM job WHERE state = 0")
+                    .fetch_all(c)
+                    .await?;
+                rows.iter()
+                    .map(|row| Ok(JobId::from_uuid(row.try_get("id")?)))
+                    .collect()
+            }
+
+            /// Pending tasks of active jobs that are nobody's.
+            pub(crate) async fn free(c: &mut Connection) -> Result<BTreeMap<StageRef, u64>> {
+                let rows = sqlx::query(
+                    "SELECT job.id AS job_id, stage.ordinal, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+                     JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+                     WHERE task_range.state = 0 AND owner IS NULL AND job.state = 0 GROUP BY job.id, stage.ordinal",
+                )
+                .fetch_all(c)
+                .await?;
+                rows.iter()
+                    .map(|row| Ok((stage_of(row)?, uint(row, "tasks")?)))
+                    .collect()
+            }
+
+            pub(crate) async fn workers(c: &mut Connection) -> Result<Vec<Worker>> {
+                let rows = sqlx::query("SELECT * FROM worker ORDER BY id")
+                    .fetch_all(c)
+                    .await?;
+                rows.iter()
+                    .map(|row| {
+                        Ok(Worker {
+                            id: WorkerId::from_uuid(row.try_get("id")?),
+                            incarnation: Incarnation::from_uuid(row.try_get("incarnation")?),
+                            name: row.try_get("name")?,
+                            last_seen_ms: row.try_get("last_seen_ms")?,
+                        })
+                    })
+                    .collect()
+            }
+
+            /// Failures of the tasks in these ranges.
+            pub(crate) async fn exceptions(c: &mut Connection, ranges: &[Range]) -> Result<Vec<Exception>> {
+                let mut found = Vec::new();
+                for range in ranges {
+                    let rows = sqlx::query(
+                        "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
+                         JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
+                         WHERE job.id = $1 AND stage.ordinal = $2 AND task >= $3 AND task < $4 ORDER BY task",
+                    )
+                    .bind(range.stage.job.uuid())
+                    .bind(i64::from(range.stage.stage))
+                    .bind(int(range.lo))
+                    .bind(int(range.hi))
+                    .fetch_all(&mut *c)
+                    .await?;
+                    for row in &rows {
+                        found.push(Exception {
+                            stage: stage_of(row)?,
+                            task: uint(row, "task")?,
+                            failures: small(row, "failures")?,
+                            crashes: small(row, "crashes")?,
+                            dead: row.try_get("dead")?,
+                            last_error: row.try_get("last_error")?,
+                        });
+                    }
+                }
+                Ok(found)
+            }
+
+            /// Runs of tasks in `lo..hi` whose outputs exist, by gaps and islands: within a run, task minus its rank
+            /// is constant.
+            pub(crate) async fn runs_of_stage(c: &mut Connection, stage: StageRef, lo: u64, hi: u64) -> Result<Vec<Run>> {
+                let rows = sqlx::query(
+                    "SELECT min(task) AS lo, max(task) + 1 AS hi FROM ( \
+                       SELECT task, task - row_number() OVER (ORDER BY task) AS island FROM output WHERE result_set = \
+                       (SELECT result_set FROM stage JOIN job ON job.key = stage.job WHERE job.id = $1 AND ordinal = $2) \
+                       AND task >= $3 AND task < $4) AS islands GROUP BY island ORDER BY lo",
+                )
+                .bind(stage.job.uuid())
+                .bind(i64::from(stage.stage))
+                .bind(int(lo))
+                .bind(int(hi))
+                .fetch_all(c)
+                .await?;
+                rows.iter().map(run).collect()
+            }
+
+            pub(crate) async fn output_runs(c: &mut Connection, set: &ResultSet, count: u64) -> Result<Vec<Run>> {
+                let rows = sqlx::query(
+                    "SELECT min(task) AS lo, max(task) + 1 AS hi FROM ( \
+                       SELECT task, task - row_number() OVER (ORDER BY task) AS island FROM output WHERE result_set = \
+                       (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3) \
+                       AND task < $4) AS islands GROUP BY island ORDER BY lo",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .bind(int(count))
+                .fetch_all(c)
+                .await?;
+                rows.iter().map(run).collect()
+            }
+
+            fn run(row: &DbRow) -> Result<Run> {
+                Ok(Run {
+                    lo: uint(row, "lo")?,
+                    hi: uint(row, "hi")?,
+                })
+            }
+
+            pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
+                let row = sqlx::query(
+                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds \
+                     FROM output WHERE NOT adopted AND result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3)",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .fetch_one(c)
+                .await?;
+                timing_of(&row)
+            }
+
+            fn timing_of(row: &DbRow) -> Result<Timing> {
+                Ok(Timing {
+                    tasks: uint(row, "timed")?,
+                    seconds: row.try_get("seconds")?,
+                })
+            }
+
+            /// Jobs with their counts: all, or one.
+            pub(crate) async fn jobs(c: &mut Connection, one: Option<JobId>) -> Result<Vec<JobRecord>> {
+                let id: Option<Uuid> = one.map(JobId::uuid);
+                let rows = match id {
+                    Some(id) => sqlx::query("SELECT * FROM job WHERE id = $1").bind(id),
+                    None => sqlx::query("SELECT * FROM job ORDER BY key"),
+                }
+                .fetch_all(&mut *c)
+                .await?;
+                let mut records = Vec::with_capacity(rows.len());
+                for row in &rows {
+                    // The counts of a job that has ended are final.
+                    let counts = match row.try_get::<Option<i64>, _>("tasks")? {
+                        Some(_) => TaskCounts {
+                            total: uint(row, "tasks")?,
+                            done: uint(row, "done")?,
+                            reused: uint(row, "reused")?,
+                            leased: 0,
+                            pending: 0,
+                            dead: uint(row, "dead")?,
+                        },
+                        None => counts(c, row.try_get("key")?).await?,
+                    };
+                    records.push(JobRecord {
+                        job: job(row)?,
+                        counts,
+                        timing: timing_of(row)?,
+                    });
+                }
+                Ok(records)
+            }
+
+            /// Tasks of a job by state.
+            pub(crate) async fn counts(c: &mut Connection, key: i64) -> Result<TaskCounts> {
+                let mut counts = TaskCounts::default();
+                let rows = sqlx::query(
+                    "SELECT task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+                     JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage.job = $1 AND task_range.state <> 1 GROUP BY task_range.state",
+                )
+                .bind(key)
+                .fetch_all(&mut *c)
+                .await?;
+                for row in &rows {
+                    let n = uint(row, "tasks")?;
+                    match row.try_get::<i64, _>("state")? {
+                        sql::PENDING => counts.pending += n,
+                        sql::DONE => counts.done += n,
+                        sql::DONE_REUSED => {
+                            counts.done += n;
+                            counts.reused += n;
+                        }
+                        sql::DEAD => counts.dead += n,
+                        other => return Err(bad("state", other)),
+                    }
+                }
+                let rows = sqlx::query(
+                    "SELECT marks FROM task_range JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage.job = $1 AND task_range.state = 1",
+                )
+                .bind(key)
+                .fetch_all(&mut *c)
+                .await?;
+                for row in &rows {
+                    for mark in marks(row)? {
+                        match mark {
+                            Mark::Todo => counts.leased += 1,
+                            Mark::Done => counts.done += 1,
+                            Mark::Reused => {
+                                counts.done += 1;
+                                counts.reused += 1;
+                            }
+                            Mark::Left => {}
+                        }
+                    }
+                }
+                counts.total = counts.done + counts.leased + counts.pending + counts.dead;
+                Ok(counts)
+            }
+
+            pub(crate) async fn job_with(c: &mut Connection, spec_hash: &str) -> Result<Option<Job>> {
+                let row = sqlx::query("SELECT * FROM job WHERE spec_hash = $1 ORDER BY key DESC LIMIT 1")
+                    .bind(spec_hash)
+                    .fetch_optional(c)
+                    .await?;
+                row.as_ref().map(job).transpose()
+            }
+
+            pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
+                let rows = sqlx::query(
+                    "SELECT * FROM job WHERE key IN (SELECT stage.job FROM stage \
+                       JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2) \
+                     AND (state = 0 OR done > 0 OR EXISTS (SELECT 1 FROM task_range \
+                       JOIN stage ON stage.key = task_range.stage WHERE stage.job = job.key AND task_range.state IN (2, 3))) \
+                     ORDER BY key DESC",
+                )
+                .bind(store)
+                .bind(dataset)
+                .fetch_all(c)
+                .await?;
+                rows.iter().map(job).collect()
+            }
+
+            pub(crate) async fn events(c: &mut Connection, query: &EventQuery) -> Result<Vec<Event>> {
+                let rows = sqlx::query(
+                    "SELECT sequence, at_ms, kind, lo, hi, worker, seconds, message FROM event \
+                     WHERE job = (SELECT key FROM job WHERE id = $1) AND sequence > $2 \
+                     AND (CAST($3 AS BIGINT) IS NULL OR (lo <= $3 AND $3 < hi)) ORDER BY sequence LIMIT $4",
+                )
+                .bind(query.job.uuid())
+                .bind(i64::try_from(query.after).unwrap_or(i64::MAX))
+                .bind(query.task.map(|t| i64::try_from(t).unwrap_or(i64::MAX)))
+                .bind(i64::from(query.limit))
+                .fetch_all(c)
+                .await?;
+                rows.iter()
+                    .map(|row| {
+                        let (lo, hi): (Option<i64>, Option<i64>) = (row.try_get("lo")?, row.try_get("hi")?);
+                        let single = lo.filter(|lo| hi == Some(lo + 1));
+                        Ok(Event {
+                            sequence: uint(row, "sequence")?,
+                            at_ms: row.try_get("at_ms")?,
+                            job: query.job,
+                            kind: sql::event_kind(row.try_get("kind")?)?,
+                            task: single
+                                .map(|t| u64::try_from(t).map_err(|e| bad("lo", e)))
+                                .transpose()?,
+                            worker: row.try_get("worker")?,
+                            message: row.try_get("message")?,
+                            seconds: row.try_get("seconds")?,
+                        })
+                    })
+                    .collect()
+            }
+        }
+    };
+}
+
+pub(crate) use queries;

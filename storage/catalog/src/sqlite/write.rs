@@ -1,0 +1,559 @@
+//! Everything that writes, each in one transaction.
+
+use std::collections::HashMap;
+
+use picofarm_proto::{
+    ids::{JobId, RangeId, StageRef},
+    model::{EventKind, JobState},
+};
+use sqlx::{Connection, QueryBuilder, Row, Sqlite, SqliteConnection};
+use uuid::Uuid;
+
+use super::query;
+use crate::{
+    Changes, Claim, Job, JobEnd, NewEvent, Output, Owned, Range, Want,
+    record::RangeState,
+    sql::{self, StateColumns, int},
+};
+
+/// Rows in one statement; SQLite takes 32,766 parameters and no row here has more than 13.
+const ROWS: usize = 1000;
+/// Pending ranges looked at for one wish.
+const LOOK_AT: i64 = 256;
+
+pub(super) enum WriteError {
+    Conflict(String),
+    Sql(sqlx::Error),
+}
+
+impl From<sqlx::Error> for WriteError {
+    fn from(e: sqlx::Error) -> Self {
+        Self::Sql(e)
+    }
+}
+
+type Result<T> = std::result::Result<T, WriteError>;
+
+/// The connection that writes.
+pub(super) struct Writer {
+    connection: SqliteConnection,
+    keys: Keys,
+}
+
+impl Writer {
+    pub(super) fn new(connection: SqliteConnection) -> Self {
+        Self {
+            connection,
+            keys: Keys::default(),
+        }
+    }
+
+    pub(super) async fn transaction<T>(
+        &mut self,
+        work: impl AsyncFnOnce(&mut SqliteConnection, &mut Keys) -> Result<T>,
+    ) -> Result<T> {
+        let mut tx = self.connection.begin_with("BEGIN IMMEDIATE").await?;
+        // Dropping the transaction undoes it.
+        let done = work(&mut tx, &mut self.keys).await?;
+        tx.commit().await?;
+        Ok(done)
+    }
+
+    pub(super) async fn close(self) {
+        if let Err(error) = self.connection.close().await {
+            tracing::warn!(%error, "closing the catalog");
+        }
+    }
+}
+
+/// Integer keys of stages, remembered: they never change.
+#[derive(Default)]
+pub(super) struct Keys(HashMap<StageRef, StageKeys>);
+
+#[derive(Clone, Copy)]
+struct StageKeys {
+    stage: i64,
+    job: i64,
+    result_set: i64,
+}
+
+impl Keys {
+    async fn of(&mut self, c: &mut SqliteConnection, stage: StageRef) -> Result<StageKeys> {
+        if let Some(keys) = self.0.get(&stage) {
+            return Ok(*keys);
+        }
+        let found: Option<(i64, i64, i64)> = sqlx::query_as(
+            "SELECT stage.key, stage.job, stage.result_set FROM stage JOIN job ON job.key = stage.job \
+             WHERE job.id = ? AND ordinal = ?",
+        )
+        .bind(stage.job.uuid())
+        .bind(i64::from(stage.stage))
+        .fetch_optional(c)
+        .await?;
+        let (key, job, result_set) =
+            found.ok_or_else(|| WriteError::Conflict(format!("there is no stage {stage}")))?;
+        let keys = StageKeys {
+            stage: key,
+            job,
+            result_set,
+        };
+        self.0.insert(stage, keys);
+        Ok(keys)
+    }
+
+    async fn job(&mut self, c: &mut SqliteConnection, job: JobId) -> Result<i64> {
+        Ok(self.of(c, StageRef { job, stage: 0 }).await?.job)
+    }
+}
+
+/// The ranges in this house's hands.
+pub(super) async fn owned(c: &mut SqliteConnection) -> std::result::Result<Vec<Range>, sqlx::Error> {
+    let rows = sqlx::query(
+        "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
+         JOIN job ON job.key = stage.job WHERE owner IS NOT NULL ORDER BY task_range.stage, lo",
+    )
+    .fetch_all(c)
+    .await?;
+    rows.iter().map(query::range).collect()
+}
+
+pub(super) async fn claim(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    wants: &[Want],
+) -> Result<Vec<Claim>> {
+    let mut claims = Vec::with_capacity(wants.len());
+    for want in wants {
+        let key = keys.of(c, want.stage).await?.stage;
+        let rows = sqlx::query(
+            "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
+             JOIN job ON job.key = stage.job WHERE stage = ? AND task_range.state = 0 AND owner IS NULL \
+             AND not_before_ms <= ? AND job.state = 0 ORDER BY not_before_ms, lo LIMIT ?",
+        )
+        .bind(key)
+        .bind(want.now_ms)
+        .bind(LOOK_AT)
+        .fetch_all(&mut *c)
+        .await?;
+        let mut ranges = Vec::new();
+        let mut missing = want.tasks;
+        for row in &rows {
+            if missing == 0 {
+                break;
+            }
+            let mut range = query::range(row)?;
+            if range.len() <= missing {
+                sqlx::query("UPDATE task_range SET owner = 1 WHERE id = ?")
+                    .bind(range.id.uuid())
+                    .execute(&mut *c)
+                    .await?;
+            } else {
+                let cut = range.lo + missing;
+                sqlx::query("UPDATE task_range SET lo = ? WHERE id = ?")
+                    .bind(int(cut))
+                    .bind(range.id.uuid())
+                    .execute(&mut *c)
+                    .await?;
+                range.id = RangeId::from_uuid(Uuid::now_v7());
+                range.hi = cut;
+                insert_ranges(c, &[(key, &range)], true).await?;
+            }
+            missing -= range.len();
+            ranges.push(range);
+        }
+        let mut existing = Vec::new();
+        for range in &ranges {
+            existing.extend(query::runs_of_stage(c, want.stage, range.lo, range.hi).await?);
+        }
+        existing.sort_unstable_by_key(|run| run.lo);
+        let left: Option<i64> = sqlx::query_scalar(
+            "SELECT sum(hi - lo) FROM task_range WHERE stage = ? AND state = 0 AND owner IS NULL",
+        )
+        .bind(key)
+        .fetch_one(&mut *c)
+        .await?;
+        claims.push(Claim {
+            owned: Owned {
+                exceptions: query::exceptions(c, &ranges).await?,
+                ranges,
+            },
+            existing,
+            left: left.unwrap_or(0).unsigned_abs(),
+        });
+    }
+    Ok(claims)
+}
+
+pub(super) async fn changes(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    changes: &Changes,
+) -> Result<Vec<JobEnd>> {
+    replace_known(c, changes).await?;
+    let mut rows = Vec::with_capacity(changes.ranges.len());
+    for range in changes.ranges.values() {
+        rows.push((keys.of(c, range.stage).await?.stage, range));
+    }
+    insert_ranges(c, &rows, true).await?;
+    for range in changes.free.values() {
+        let key = keys.of(c, range.stage).await?.stage;
+        give(c, key, range).await?;
+    }
+    insert_outputs(c, keys, &changes.outputs).await?;
+    for exception in changes.exceptions.values() {
+        let stage = keys.of(c, exception.stage).await?.stage;
+        sqlx::query(
+            "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES (?, ?, ?, ?, ?, ?) \
+             ON CONFLICT DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
+             dead = excluded.dead, last_error = excluded.last_error",
+        )
+        .bind(stage)
+        .bind(int(exception.task))
+        .bind(exception.failures)
+        .bind(exception.crashes)
+        .bind(exception.dead)
+        .bind(&exception.last_error)
+        .execute(&mut *c)
+        .await?;
+    }
+    for worker in changes.workers.values() {
+        sqlx::query(
+            "INSERT INTO worker (id, incarnation, name, last_seen_ms) VALUES (?, ?, ?, ?) \
+             ON CONFLICT DO UPDATE SET incarnation = excluded.incarnation, name = excluded.name, \
+             last_seen_ms = excluded.last_seen_ms",
+        )
+        .bind(worker.id.uuid())
+        .bind(worker.incarnation.uuid())
+        .bind(&worker.name)
+        .bind(worker.last_seen_ms)
+        .execute(&mut *c)
+        .await?;
+    }
+    insert_events(c, keys, &changes.events).await?;
+    let mut ended = Vec::new();
+    for (job, at_ms) in &changes.perhaps_over {
+        ended.extend(end_if_over(c, keys, *job, *at_ms).await?);
+    }
+    Ok(ended)
+}
+
+/// Removes the former state of every range that changes, having checked that it is there.
+async fn replace_known(c: &mut SqliteConnection, changes: &Changes) -> Result<()> {
+    let known: Vec<RangeId> = changes.known().collect();
+    for chunk in known.chunks(ROWS) {
+        let mut delete = QueryBuilder::<Sqlite>::new(
+            "DELETE FROM task_range WHERE owner IS NOT NULL AND id IN (",
+        );
+        let mut ids = delete.separated(", ");
+        for id in chunk {
+            ids.push_bind(id.uuid());
+        }
+        delete.push(")");
+        let found = delete.build().execute(&mut *c).await?.rows_affected();
+        if found != chunk.len() as u64 {
+            return Err(WriteError::Conflict(format!(
+                "{found} of {} ranges are as this coordinator knows them",
+                chunk.len()
+            )));
+        }
+    }
+    Ok(())
+}
+
+async fn insert_ranges(c: &mut SqliteConnection, rows: &[(i64, &Range)], mine: bool) -> Result<()> {
+    for chunk in rows.chunks(ROWS) {
+        let mut insert = QueryBuilder::<Sqlite>::new(
+            "INSERT INTO task_range (id, stage, lo, hi, epoch, crashes, state, owner, not_before_ms, worker, \
+             incarnation, lease_until_ms, marks) ",
+        );
+        insert.push_values(chunk, |mut row, (key, range)| {
+            let columns = StateColumns::from(&range.state);
+            row.push_bind(range.id.uuid())
+                .push_bind(*key)
+                .push_bind(int(range.lo))
+                .push_bind(int(range.hi))
+                .push_bind(int(range.epoch.0))
+                .push_bind(i64::from(range.crashes))
+                .push_bind(columns.state)
+                .push_bind(mine.then_some(1i64))
+                .push_bind(columns.not_before_ms)
+                .push_bind(columns.worker)
+                .push_bind(columns.incarnation)
+                .push_bind(columns.lease_until_ms)
+                .push_bind(columns.marks);
+        });
+        insert.build().execute(&mut *c).await?;
+    }
+    Ok(())
+}
+
+/// Writes a range of nobody's, merged with its neighbours in the same state.
+async fn give(c: &mut SqliteConnection, key: i64, range: &Range) -> Result<()> {
+    let mut range = range.clone();
+    let columns = StateColumns::from(&range.state);
+    if range.merges() {
+        let rows = sqlx::query(
+            "DELETE FROM task_range WHERE stage = ?1 AND state = ?2 AND (hi = ?3 OR lo = ?4) AND owner IS NULL \
+             AND crashes = 0 AND coalesce(not_before_ms, 0) = 0 RETURNING lo, hi, epoch",
+        )
+        .bind(key)
+        .bind(columns.state)
+        .bind(int(range.lo))
+        .bind(int(range.hi))
+        .fetch_all(&mut *c)
+        .await?;
+        for row in rows {
+            let number = |column| row.try_get::<i64, _>(column).map(i64::unsigned_abs);
+            range.lo = range.lo.min(number("lo")?);
+            range.hi = range.hi.max(number("hi")?);
+            range.epoch.0 = range.epoch.0.max(number("epoch")?);
+        }
+    }
+    insert_ranges(c, &[(key, &range)], false).await
+}
+
+async fn insert_outputs(c: &mut SqliteConnection, keys: &mut Keys, outputs: &[Output]) -> Result<()> {
+    for chunk in outputs.chunks(ROWS) {
+        let mut sets = Vec::with_capacity(chunk.len());
+        for output in chunk {
+            sets.push(keys.of(c, output.stage).await?.result_set);
+        }
+        let mut insert = QueryBuilder::<Sqlite>::new(
+            "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) ",
+        );
+        insert.push_values(chunk.iter().zip(sets), |mut row, (output, set)| {
+            row.push_bind(set)
+                .push_bind(int(output.task))
+                .push_bind(output.manifest.to_vec())
+                .push_bind(int(output.bytes))
+                .push_bind(output.seconds)
+                .push_bind(int(output.epoch.0))
+                .push_bind(output.adopted);
+        });
+        insert.push(" ON CONFLICT DO NOTHING");
+        let written = insert.build().execute(&mut *c).await?.rows_affected();
+        if written == chunk.len() as u64 {
+            continue;
+        }
+        let tasks: Vec<_> = chunk.iter().map(|o| (o.stage, o.task)).collect();
+        let there = manifests(c, &tasks).await?;
+        sql::equal_manifests(chunk, &there).map_err(WriteError::Conflict)?;
+    }
+    Ok(())
+}
+
+/// The manifests of many tasks: one short query each, which costs SQLite little.
+pub(super) async fn manifests(
+    c: &mut SqliteConnection,
+    tasks: &[(StageRef, u64)],
+) -> std::result::Result<Vec<Option<[u8; 32]>>, sqlx::Error> {
+    let mut found = Vec::with_capacity(tasks.len());
+    for (stage, task) in tasks {
+        let manifest: Option<Vec<u8>> = sqlx::query_scalar(
+            "SELECT manifest FROM output WHERE task = $1 AND result_set = (SELECT result_set FROM stage \
+             JOIN job ON job.key = stage.job WHERE job.id = $2 AND ordinal = $3)",
+        )
+        .bind(int(*task))
+        .bind(stage.job.uuid())
+        .bind(i64::from(stage.stage))
+        .fetch_optional(&mut *c)
+        .await?;
+        let manifest = manifest.map(|m| m.try_into().map_err(|_| sql::bad("manifest", "not 32 bytes long")));
+        found.push(manifest.transpose()?);
+    }
+    Ok(found)
+}
+
+async fn insert_events(c: &mut SqliteConnection, keys: &mut Keys, events: &[NewEvent]) -> Result<()> {
+    for chunk in events.chunks(ROWS) {
+        let mut jobs = Vec::with_capacity(chunk.len());
+        for event in chunk {
+            jobs.push(keys.job(c, event.job).await?);
+        }
+        let mut insert = QueryBuilder::<Sqlite>::new(
+            "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message) ",
+        );
+        insert.push_values(chunk.iter().zip(jobs), |mut row, (event, job)| {
+            row.push_bind(event.at_ms)
+                .push_bind(job)
+                .push_bind(sql::event_kind_code(event.kind))
+                .push_bind(event.tasks.map(|t| int(t.lo)))
+                .push_bind(event.tasks.map(|t| int(t.hi)))
+                .push_bind(event.worker.clone())
+                .push_bind(event.seconds)
+                .push_bind(event.message.clone());
+        });
+        insert.build().execute(&mut *c).await?;
+    }
+    Ok(())
+}
+
+/// Ends an active job of which nothing is pending or leased.
+async fn end_if_over(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    id: JobId,
+    at_ms: i64,
+) -> Result<Option<JobEnd>> {
+    let key = keys.job(c, id).await?;
+    let active: Option<i64> = sqlx::query_scalar("SELECT 1 FROM job WHERE key = ? AND state = 0")
+        .bind(key)
+        .fetch_optional(&mut *c)
+        .await?;
+    let open: Option<i64> = sqlx::query_scalar(
+        "SELECT 1 FROM task_range JOIN stage ON stage.key = task_range.stage \
+         WHERE stage.job = ? AND state IN (0, 1) LIMIT 1",
+    )
+    .bind(key)
+    .fetch_optional(&mut *c)
+    .await?;
+    if active.is_none() || open.is_some() {
+        return Ok(None);
+    }
+    let counts = query::counts(c, key).await?;
+    let state = if counts.dead > 0 {
+        JobState::Failed
+    } else {
+        JobState::Done
+    };
+    sqlx::query(
+        "UPDATE job SET state = ?2, ended_ms = ?3, tasks = ?4, done = ?5, reused = ?6, dead = ?7, \
+         (timed, seconds) = (SELECT count(*), coalesce(sum(seconds), 0.0) FROM output \
+           WHERE NOT adopted AND result_set IN (SELECT result_set FROM stage WHERE job = ?1)) WHERE key = ?1",
+    )
+    .bind(key)
+    .bind(sql::job_state_code(state))
+    .bind(at_ms)
+    .bind(int(counts.total))
+    .bind(int(counts.done))
+    .bind(int(counts.reused))
+    .bind(int(counts.dead))
+    .execute(&mut *c)
+    .await?;
+    insert_events(c, keys, &[NewEvent::ended(id, at_ms, &counts)]).await?;
+    Ok(Some(JobEnd {
+        job: id,
+        state,
+        at_ms,
+    }))
+}
+
+pub(super) async fn submit(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    job: &Job,
+    ranges: &[Range],
+    events: &[NewEvent],
+) -> Result<bool> {
+    let spec = serde_json::to_string(&*job.spec).expect("a spec is plain data");
+    let key: Option<i64> = sqlx::query_scalar(
+        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms) VALUES (?, ?, ?, 0, ?) \
+         ON CONFLICT DO NOTHING RETURNING key",
+    )
+    .bind(job.id.uuid())
+    .bind(&job.spec_hash)
+    .bind(spec)
+    .bind(job.submitted_ms)
+    .fetch_optional(&mut *c)
+    .await?;
+    let Some(key) = key else {
+        return Ok(false);
+    };
+    let mut stages = HashMap::new();
+    for stage in job.stages() {
+        let set = &stage.set;
+        sqlx::query("INSERT INTO result_set (store, dataset, stage_key) VALUES (?, ?, ?) ON CONFLICT DO NOTHING")
+            .bind(&set.store)
+            .bind(&set.dataset)
+            .bind(&set.stage_key.0[..])
+            .execute(&mut *c)
+            .await?;
+        let stage_key: i64 = sqlx::query_scalar(
+            "INSERT INTO stage (job, ordinal, result_set, tasks) SELECT ?, ?, key, ? FROM result_set \
+             WHERE store = ? AND dataset = ? AND stage_key = ? RETURNING key",
+        )
+        .bind(key)
+        .bind(i64::from(stage.id.stage))
+        .bind(int(stage.tasks))
+        .bind(&set.store)
+        .bind(&set.dataset)
+        .bind(&set.stage_key.0[..])
+        .fetch_one(&mut *c)
+        .await?;
+        stages.insert(stage.id, stage_key);
+    }
+    let rows: Vec<_> = ranges.iter().map(|r| (stages[&r.stage], r)).collect();
+    insert_ranges(c, &rows, false).await?;
+    insert_events(c, keys, events).await?;
+    end_if_over(c, keys, job.id, job.submitted_ms).await?;
+    Ok(true)
+}
+
+pub(super) async fn cancel(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    job: JobId,
+    now_ms: i64,
+) -> Result<bool> {
+    let key = keys.job(c, job).await?;
+    let cancelled =
+        sqlx::query("UPDATE job SET state = ?, ended_ms = ? WHERE key = ? AND state = 0")
+            .bind(sql::job_state_code(JobState::Cancelled))
+            .bind(now_ms)
+            .bind(key)
+            .execute(&mut *c)
+            .await?
+            .rows_affected()
+            > 0;
+    if cancelled {
+        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, String::new());
+        insert_events(c, keys, &[event]).await?;
+    }
+    Ok(cancelled)
+}
+
+pub(super) async fn retry(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    job: JobId,
+    now_ms: i64,
+) -> Result<u64> {
+    let key = keys.job(c, job).await?;
+    let rows = sqlx::query(
+        "DELETE FROM task_range WHERE state = 4 AND stage IN (SELECT key FROM stage WHERE job = ?) RETURNING \
+         *, (SELECT id FROM job WHERE key = ?1) AS job_id, \
+         (SELECT ordinal FROM stage WHERE stage.key = task_range.stage) AS ordinal",
+    )
+    .bind(key)
+    .fetch_all(&mut *c)
+    .await?;
+    let mut retried = 0;
+    for row in &rows {
+        let mut range = query::range(row)?;
+        retried += range.len();
+        range.crashes = 0;
+        range.state = RangeState::Pending { not_before_ms: 0 };
+        let stage = keys.of(c, range.stage).await?.stage;
+        give(c, stage, &range).await?;
+        sqlx::query("DELETE FROM exception WHERE stage = ? AND task >= ? AND task < ?")
+            .bind(stage)
+            .bind(int(range.lo))
+            .bind(int(range.hi))
+            .execute(&mut *c)
+            .await?;
+    }
+    if retried > 0 {
+        sqlx::query("UPDATE job SET state = 0, ended_ms = NULL, tasks = NULL WHERE key = ?")
+            .bind(key)
+            .execute(&mut *c)
+            .await
+            .map_err(|e| match e.as_database_error() {
+                Some(e) if e.is_unique_violation() => WriteError::Conflict(sql::LATER_JOB.into()),
+                _ => WriteError::Sql(e),
+            })?;
+        let message = format!("{retried} dead tasks are pending again");
+        let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
+        insert_events(c, keys, &[event]).await?;
+    }
+    Ok(retried)
+}

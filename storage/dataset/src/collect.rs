@@ -1,0 +1,273 @@
+//! Collection: finding and deleting what belongs to no published scene.
+//!
+//! A killed worker leaves objects without a manifest. They are not rubbish by themselves: whoever renders the scene
+//! next finds them equal and publishes them. So only old ones are deleted, and a published scene never loses an
+//! object, whenever its manifest appears:
+//!
+//! - objects are listed first, manifests after them, and the scene's manifest is looked for once more right before the
+//!   deletion of an object;
+//! - the publisher looks after its objects once more when its manifest stands ([`Dataset::publish_encoded`]);
+//! - the collector looks for the manifest once more when an object is gone, and puts it back if there is one.
+//!
+//! So a deletion before the manifest is noticed by the publisher, one after it by the collector. What remains is a
+//! collector killed or cut off in the instant between a deletion and its last look, which had found no manifest an instant before;
+//! then `verify` names the object, and publishing the scene again restores it.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt, stream};
+use object_store::path::Path;
+use object_store::{Error, ObjectMeta, ObjectStoreExt};
+
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::manifest::Manifest;
+use crate::objects;
+use crate::store::{PROBE, leftovers, probe_leftovers};
+use crate::verify::manifest_scene;
+
+/// The shortest grace period where workers may be writing: longer than publishing a scene ever takes.
+pub const MIN_GRACE: Duration = Duration::from_secs(3600);
+
+/// Deletions in flight. Each holds its object in memory.
+const CONCURRENCY: usize = 4;
+
+/// Something that belongs to no published scene.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Orphan {
+    /// Full key (its path, in a local store).
+    pub object: String,
+    /// Its size.
+    pub bytes: u64,
+    /// The scene it would belong to; `None` for what a killed probe or a killed local write left.
+    pub scene: Option<u64>,
+}
+
+/// What [`Dataset::collect`] found.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Collection {
+    /// Orphans past the grace period, ordered by key; deleted, if that was asked for.
+    pub orphans: Vec<Orphan>,
+    /// Objects without a manifest that were left alone because they are younger.
+    pub young: u64,
+    /// Orphans that were left alone because their scene was published in the meantime.
+    pub published: u64,
+}
+
+impl Collection {
+    /// Bytes of the orphans.
+    pub fn bytes(&self) -> u64 {
+        self.orphans.iter().map(|o| o.bytes).sum()
+    }
+}
+
+/// A candidate.
+enum Found {
+    Object(ObjectMeta, Option<u64>),
+    /// An unfinished file of a local store.
+    File(PathBuf, u64),
+}
+
+impl Dataset {
+    /// Finds what belongs to no published scene and was last written `grace` ago or earlier: objects of scenes without
+    /// a manifest, and what killed probes and killed local writes left. Deletes it if `delete` says so. Never touches
+    /// an object that a manifest names, or that it does not know. With less than [`MIN_GRACE`] no worker may be writing
+    /// to this data set.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`], [`DatasetError::Io`]. What was deleted until then stays deleted; collect again.
+    pub async fn collect(&self, grace: Duration, delete: bool) -> Result<Collection, DatasetError> {
+        let now = match delete {
+            true => self.store_time().await?,
+            false => SystemTime::now(),
+        };
+        let limit = now.checked_sub(grace).unwrap_or(SystemTime::UNIX_EPOCH);
+        let mut report = Collection::default();
+        let mut found = self.unpublished(limit, &mut report).await?;
+        found.extend(self.leavings(limit, grace).await?);
+        let removals: Vec<_> = found
+            .into_iter()
+            .map(|found| self.collect_one(found, limit, delete))
+            .collect();
+        let mut removed = stream::iter(removals).buffer_unordered(CONCURRENCY);
+        while let Some(orphan) = removed.try_next().await? {
+            match orphan {
+                Some(orphan) => report.orphans.push(orphan),
+                None => report.published += 1,
+            }
+        }
+        report.orphans.sort_by(|a, b| a.object.cmp(&b.object));
+        Ok(report)
+    }
+
+    /// Objects of scenes without a manifest, written before `limit`. Counts the younger ones.
+    async fn unpublished(
+        &self,
+        limit: SystemTime,
+        report: &mut Collection,
+    ) -> Result<Vec<Found>, DatasetError> {
+        let failed = |e| DatasetError::store("list", self.shown(&self.prefix), e);
+        // The objects first: a scene published since is among the manifests then.
+        let mut objects: Vec<(u64, ObjectMeta)> = Vec::new();
+        let mut listing = self.store.list(Some(&self.prefix));
+        let mut seen = BTreeSet::new();
+        while let Some(object) = listing.try_next().await.map_err(failed)? {
+            let key = self.relative(&object.location);
+            if let Some(scene) = manifest_scene(&key) {
+                seen.insert(scene);
+            } else if let Some(scene) = self.object_scene(&key) {
+                objects.push((scene, object));
+            }
+        }
+        drop(listing);
+        // Most are published and need not be kept until then.
+        objects.retain(|(scene, _)| !seen.contains(scene));
+        if objects.is_empty() {
+            return Ok(Vec::new());
+        }
+        let published: BTreeSet<u64> = self.scenes_present().await?.into_iter().collect();
+        objects.retain(|(scene, _)| !published.contains(scene));
+        let all = objects.len();
+        objects.retain(|(_, object)| SystemTime::from(object.last_modified) <= limit);
+        report.young = (all - objects.len()) as u64;
+        Ok(objects
+            .into_iter()
+            .map(|(scene, object)| Found::Object(object, Some(scene)))
+            .collect())
+    }
+
+    /// What killed probes left beside the data set, and killed local writes in it.
+    async fn leavings(
+        &self,
+        limit: SystemTime,
+        grace: Duration,
+    ) -> Result<Vec<Found>, DatasetError> {
+        let Some(parent) = self.parent() else {
+            return Ok(Vec::new());
+        };
+        let listed = self.store.list_with_delimiter(Some(&parent)).await;
+        let listed = listed.map_err(|e| DatasetError::store("list", self.shown(&parent), e))?;
+        let is_probe = |object: &ObjectMeta| {
+            let name = object.location.filename().unwrap_or_default();
+            name.starts_with(PROBE) && SystemTime::from(object.last_modified) <= limit
+        };
+        let probes = listed.objects.into_iter().filter(is_probe);
+        let mut found: Vec<_> = probes.map(|object| Found::Object(object, None)).collect();
+        let folder = |path| objects::folder(&*self.store, path);
+        if let (Some(here), Some(beside)) = (folder(&self.prefix), folder(&parent)) {
+            let files = leftovers(&here, grace)?;
+            let files = files.into_iter().chain(probe_leftovers(&beside, grace)?);
+            found.extend(files.map(|(path, bytes)| Found::File(path, bytes)));
+        }
+        Ok(found)
+    }
+
+    /// The prefix that the data set lies in, where stores are probed; `None` if it is the root of its store.
+    fn parent(&self) -> Option<Path> {
+        let parts: Vec<_> = self.prefix.parts().collect();
+        let (_, parent) = parts.split_last()?;
+        Some(parent.iter().cloned().collect())
+    }
+
+    /// Deletes an orphan, if it still is one; `None` if it is not.
+    async fn collect_one(
+        &self,
+        found: Found,
+        limit: SystemTime,
+        delete: bool,
+    ) -> Result<Option<Orphan>, DatasetError> {
+        let (object, scene) = match found {
+            Found::File(path, bytes) => {
+                if delete {
+                    match std::fs::remove_file(&path) {
+                        Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                            return Err(DatasetError::io("delete", &path, e));
+                        }
+                        _ => {}
+                    }
+                }
+                return Ok(Some(Orphan {
+                    object: path.display().to_string(),
+                    bytes,
+                    scene: None,
+                }));
+            }
+            Found::Object(object, scene) => (object, scene),
+        };
+        let path = &object.location;
+        if delete && !self.delete_orphan(path, scene, limit).await? {
+            return Ok(None);
+        }
+        Ok(Some(Orphan {
+            object: self.shown(path),
+            bytes: object.size,
+            scene,
+        }))
+    }
+
+    /// `false` if a manifest protects it, or it was written anew.
+    async fn delete_orphan(
+        &self,
+        path: &Path,
+        scene: Option<u64>,
+        limit: SystemTime,
+    ) -> Result<bool, DatasetError> {
+        let Some(bytes) = self.still_old(path, limit).await? else {
+            return Ok(false);
+        };
+        if self.is_published(scene).await? {
+            return Ok(false);
+        }
+        match self.store.delete(path).await {
+            Ok(()) | Err(Error::NotFound { .. }) => {}
+            Err(e) => return Err(DatasetError::store("delete", self.shown(path), e)),
+        }
+        if self.is_published(scene).await? {
+            objects::create_or_match(&*self.store, path, bytes).await?;
+            return Ok(false);
+        }
+        Ok(true)
+    }
+
+    /// The bytes of an object that was not written again since it was listed.
+    async fn still_old(
+        &self,
+        path: &Path,
+        limit: SystemTime,
+    ) -> Result<Option<Bytes>, DatasetError> {
+        let failed = |e| DatasetError::store("read", self.shown(path), e);
+        let result = match self.store.get(path).await {
+            Ok(result) => result,
+            Err(Error::NotFound { .. }) => return Ok(None),
+            Err(e) => return Err(failed(e)),
+        };
+        if SystemTime::from(result.meta.last_modified) > limit {
+            return Ok(None);
+        }
+        result.bytes().await.map(Some).map_err(failed)
+    }
+
+    async fn is_published(&self, scene: Option<u64>) -> Result<bool, DatasetError> {
+        let Some(scene) = scene else {
+            return Ok(false);
+        };
+        let manifest = self.path(&Manifest::key(scene));
+        Ok(objects::size(&*self.store, &manifest).await?.is_some())
+    }
+
+    /// The time by the clock that stamps this store's objects, which need not agree with ours.
+    async fn store_time(&self) -> Result<SystemTime, DatasetError> {
+        let name = format!("{PROBE}{}-time", uuid::Uuid::new_v4());
+        let parent = self.parent().unwrap_or_default();
+        let path = parent.join(name);
+        objects::create(&*self.store, &path, Bytes::from_static(b"what time is it?")).await?;
+        let meta = self.store.head(&path).await;
+        let deleted = self.store.delete(&path).await;
+        let meta = meta.map_err(|e| DatasetError::store("look up", self.shown(&path), e))?;
+        deleted.map_err(|e| DatasetError::store("delete", self.shown(&path), e))?;
+        Ok(meta.last_modified.into())
+    }
+}

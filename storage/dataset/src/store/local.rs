@@ -1,0 +1,115 @@
+//! Stores in a local folder: their paths, and the unfinished files that killed writers leave in them.
+
+use std::fs::Metadata;
+use std::io::ErrorKind;
+use std::path::{Path as Folder, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use object_store::path::Path;
+
+use super::probe::PROBE;
+use crate::error::DatasetError;
+
+/// The path of a local location.
+pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
+    let unsupported = |what: &str| DatasetError::UnsupportedStore {
+        url: url_or_path.to_string(),
+        what: what.to_string(),
+    };
+    let path = match url_or_path.split_once("://") {
+        None => PathBuf::from(url_or_path),
+        Some(("file", rest)) if rest.starts_with('/') => {
+            let decoded = Path::from_url_path(rest)
+                .map_err(|e| unsupported(&format!("not a usable file URL: {e}")))?;
+            PathBuf::from(format!("/{decoded}"))
+        }
+        Some(("file", _)) => {
+            return Err(unsupported(
+                "expected file:///absolute/path, with three slashes",
+            ));
+        }
+        Some((scheme, _)) => {
+            return Err(unsupported(&format!(
+                "the scheme {scheme} is not supported; use a local path, a file:// URL or s3://bucket/prefix"
+            )));
+        }
+    };
+    if path.as_os_str().is_empty() {
+        return Err(unsupported("expected a path, found nothing"));
+    }
+    std::path::absolute(&path).map_err(|e| DatasetError::io("resolve", &path, e))
+}
+
+/// The unfinished files that killed writers left in a local data set, of at least the given age, with their sizes. A
+/// put to a local store writes `name#1` beside the object and links it when complete, so a kill leaves such a file; it
+/// is invisible to the store, disturbs nobody and only takes up space. Give an age longer than any put takes.
+///
+/// # Errors
+/// [`DatasetError::Io`].
+pub(crate) fn leftovers(
+    folder: &Folder,
+    min_age: Duration,
+) -> Result<Vec<(PathBuf, u64)>, DatasetError> {
+    let mut folders = vec![folder.to_owned()];
+    let mut found = Vec::new();
+    while let Some(folder) = folders.pop() {
+        for (path, meta) in entries(&folder)? {
+            if meta.is_dir() {
+                folders.push(path);
+            } else if is_staged(&path) && is_old(&meta, min_age) {
+                found.push((path, meta.len()));
+            }
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// The same for what killed probes left of their own in the store's folder itself: `.probe-…#1`.
+///
+/// # Errors
+/// [`DatasetError::Io`].
+pub(crate) fn probe_leftovers(
+    folder: &Folder,
+    min_age: Duration,
+) -> Result<Vec<(PathBuf, u64)>, DatasetError> {
+    let mut found: Vec<_> = entries(folder)?
+        .into_iter()
+        .filter(|(path, meta)| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            meta.is_file() && name.starts_with(PROBE) && is_staged(path) && is_old(meta, min_age)
+        })
+        .map(|(path, meta)| (path, meta.len()))
+        .collect();
+    found.sort();
+    Ok(found)
+}
+
+fn entries(folder: &Folder) -> Result<Vec<(PathBuf, Metadata)>, DatasetError> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(|e| DatasetError::io("list", folder, e))? {
+        let entry = entry.map_err(|e| DatasetError::io("list", folder, e))?;
+        let path = entry.path();
+        match entry.metadata() {
+            Ok(meta) => found.push((path, meta)),
+            // Finished while we looked.
+            Err(e) if e.kind() == ErrorKind::NotFound => {}
+            Err(e) => return Err(DatasetError::io("look up", &path, e)),
+        }
+    }
+    Ok(found)
+}
+
+fn is_staged(path: &Folder) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let number = name.rsplit_once('#').map(|(_, number)| number);
+    number.is_some_and(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))
+}
+
+fn is_old(meta: &Metadata, min_age: Duration) -> bool {
+    let age = meta
+        .modified()
+        .ok()
+        .and_then(|at| SystemTime::now().duration_since(at).ok());
+    age.is_some_and(|age| age >= min_age)
+}
