@@ -7,6 +7,7 @@ mod render;
 use std::{net::SocketAddr, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use picofarm_coordinator::CatalogPlace;
 
 pub use data::{DatasetExport, DatasetReprocess, DatasetSplit, SensorArgs};
 pub use guard::{Guard, Token};
@@ -42,7 +43,7 @@ pub struct Global {
     /// Settings file [default: picofarm.toml here, else in the user's configuration folder]
     #[arg(long, global = true, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// URL of the coordinator [env: PICOFARM_COORDINATOR]
+    /// URL of the coordinator; of several on one catalog, with commas between [env: PICOFARM_COORDINATOR]
     #[arg(long, global = true, value_name = "URL")]
     pub coordinator: Option<String>,
     /// Folder with furniture assets [env: PICOFARM_ASSETS]
@@ -149,13 +150,15 @@ pub struct Up {
 
 #[derive(Args)]
 pub struct Coordinator {
-    /// The catalog, a SQLite file
+    /// The catalog: a SQLite file, for one coordinator, or the URL of a Postgres database, for several
     #[arg(
         long,
         default_value = "picofarm-data/catalog.sqlite",
-        value_name = "FILE"
+        value_name = "FILE|URL",
+        env = "PICOFARM_CATALOG",
+        hide_env_values = true
     )]
-    pub catalog: PathBuf,
+    pub catalog: CatalogPlace,
     /// Address to listen on (port 0 = any free port; the address is printed)
     #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
     pub listen: SocketAddr,
@@ -377,6 +380,39 @@ pub enum GeneratorArg {
 pub enum Bench {
     /// Measure the renderer: CPU time against the true error, beside a converged render of the same scene
     Render(BenchRender),
+    /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and fleets of simulated workers
+    Queue(BenchQueue),
+}
+
+#[derive(Args)]
+pub struct BenchQueue {
+    /// The catalog: a SQLite file or the URL of a Postgres database [default: a new SQLite file that is removed after]
+    #[arg(long, value_name = "FILE|URL", env = "PICOFARM_CATALOG", hide_env_values = true)]
+    pub catalog: Option<CatalogPlace>,
+    /// Simulated workers of the no-op tasks
+    #[arg(long, default_value_t = 8)]
+    pub workers: usize,
+    /// No-op tasks to run end to end; 0 leaves this part out
+    #[arg(long, default_value_t = 200_000)]
+    pub tasks: u64,
+    /// Sizes of jobs to submit
+    #[arg(long, value_delimiter = ',', value_name = "N,…", default_value = "97432,1000000")]
+    pub submit: Vec<u64>,
+    /// Sizes of fleets to simulate with tasks of a fixed length, e.g. 10,100,1000,4000
+    #[arg(long, value_delimiter = ',', value_name = "N,…")]
+    pub fleet: Vec<usize>,
+    /// Length of a fleet's tasks in seconds
+    #[arg(long, default_value_t = 30.0, value_name = "S")]
+    pub task_s: f64,
+    /// Tasks a worker of a fleet
+    #[arg(long, default_value_t = 3)]
+    pub rounds: u64,
+    /// Kill the coordinator in the middle of a fleet's run and start another: all workers come back at once
+    #[arg(long)]
+    pub restart: bool,
+    /// Lease time to live in seconds
+    #[arg(long, default_value_t = 60.0, value_name = "S")]
+    pub lease_s: f64,
 }
 
 #[derive(Args)]

@@ -17,7 +17,9 @@ use crate::error::{CliError, Code, Result};
 #[derive(Clone)]
 pub struct Client {
     jobs: JobsClient<InterceptedService<Channel, Bearer>>,
+    /// The coordinator in use, and all there are.
     url: String,
+    urls: String,
     access: Access,
 }
 
@@ -55,8 +57,25 @@ fn required<T>(value: Option<T>, field: &'static str) -> Result<T> {
 }
 
 impl Client {
-    /// Connects, within five seconds.
-    pub async fn connect(url: &str, access: &Access) -> Result<Self> {
+    /// Connects to the first coordinator that answers, of a list of URLs with commas between them; each gets five
+    /// seconds.
+    pub async fn connect(urls: &str, access: &Access) -> Result<Self> {
+        let mut first = None;
+        for url in urls.split(',') {
+            match Self::connect_to(url.trim(), access).await {
+                Ok(client) => {
+                    return Ok(Self {
+                        urls: urls.to_owned(),
+                        ..client
+                    });
+                }
+                Err(error) => first = first.or(Some(error)),
+            }
+        }
+        Err(first.expect("a text has at least one part between commas"))
+    }
+
+    async fn connect_to(url: &str, access: &Access) -> Result<Self> {
         let target = access
             .target(url)
             .map_err(|e| CliError::input(format!("coordinator: {e}")))?;
@@ -74,6 +93,7 @@ impl Client {
         let mut client = Self {
             jobs,
             url: url.to_owned(),
+            urls: url.to_owned(),
             access: access.clone(),
         };
         if url.starts_with("https") {
@@ -93,7 +113,7 @@ impl Client {
 
     /// Connects again.
     pub async fn reconnect(&self) -> Result<Self> {
-        Self::connect(&self.url, &self.access).await
+        Self::connect(&self.urls, &self.access).await
     }
 
     pub fn url(&self) -> &str {

@@ -223,7 +223,11 @@ pub fn describe(s: &JobStatus) -> String {
 }
 
 fn describe_event(e: &Event) -> String {
-    let task = e.task.map(|t| format!("task {t} ")).unwrap_or_default();
+    let task = match (e.task, e.lo, e.hi) {
+        (Some(task), ..) => format!("task {task} "),
+        (None, Some(lo), Some(hi)) => format!("tasks {lo}..{hi} "),
+        _ => String::new(),
+    };
     let worker = if e.worker.is_empty() {
         String::new()
     } else {

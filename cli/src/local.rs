@@ -41,7 +41,7 @@ impl Local {
         } else {
             settings.access()?
         };
-        let coordinator = roles::Coordinator::start(catalog, listen, LEASE, guarded).await?;
+        let coordinator = roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded).await?;
         let url = coordinator.url();
         let mut local = Self {
             url: url.clone(),

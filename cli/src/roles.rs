@@ -1,10 +1,10 @@
 //! `picofarm coordinator` and `picofarm worker`: one role in one process.
 
-use std::{net::SocketAddr, path::Path, time::Duration};
+use std::{net::SocketAddr, time::Duration};
 
 use picofarm_agent::{AgentConfig, AgentError};
 use picofarm_coordinator::{
-    CoordinatorConfig, CoordinatorError, Running,
+    CatalogPlace, CoordinatorConfig, CoordinatorError, Running,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
@@ -130,12 +130,12 @@ impl Coordinator {
     /// # Errors
     /// The catalog is in use, unreadable or of a newer version, or the address is taken.
     pub async fn start(
-        catalog: &Path,
+        catalog: CatalogPlace,
         listen: SocketAddr,
         lease: Duration,
         guarded: Guarded,
     ) -> Result<Self> {
-        let mut config = CoordinatorConfig::new(catalog.to_owned(), listen);
+        let mut config = CoordinatorConfig::new(catalog, listen);
         config.lease_ms = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
         config.heartbeat_ms = (config.lease_ms / 6).max(1);
         config.tick = config.tick.min(lease / 6);
@@ -198,11 +198,11 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
     let coordinator =
-        Coordinator::start(&args.catalog, args.listen, lease, Guarded::of(&args.guard)).await?;
+        Coordinator::start(args.catalog.clone(), args.listen, lease, Guarded::of(&args.guard)).await?;
     let url = coordinator.url();
     output.result(
-        &json!({"coordinator": url, "catalog": args.catalog}),
-        || format!("coordinator at {url} on {}", args.catalog.display()),
+        &json!({"coordinator": url, "catalog": args.catalog.to_string()}),
+        || format!("coordinator at {url} on {}", args.catalog),
     );
     stop.cancelled().await;
     coordinator.stop().await

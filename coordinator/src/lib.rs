@@ -16,6 +16,7 @@ pub mod stage;
 pub mod transition;
 
 pub use budget::Backoff;
+pub use picofarm_catalog::CatalogPlace;
 pub use clock::Clock;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 

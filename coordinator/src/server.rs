@@ -1,8 +1,8 @@
 //! Starting and stopping a coordinator.
 
-use std::{io, net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
+use std::{io, net::SocketAddr, sync::Arc, time::Duration};
 
-use picofarm_catalog::{Catalog, CatalogError, SqliteCatalog};
+use picofarm_catalog::{CatalogError, CatalogPlace};
 use picofarm_proto::credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
 use tokio::{
@@ -36,8 +36,8 @@ const KEEPALIVE: Duration = Duration::from_secs(20);
 /// How a coordinator runs.
 #[derive(Debug, Clone)]
 pub struct CoordinatorConfig {
-    /// The SQLite file; its folder is created.
-    pub catalog: PathBuf,
+    /// The catalog; what is missing is created.
+    pub catalog: CatalogPlace,
     /// Where to listen; port 0 = any free port.
     pub listen: SocketAddr,
     /// Life of a lease without a heartbeat, milliseconds (default 60,000).
@@ -60,9 +60,9 @@ pub struct CoordinatorConfig {
 
 impl CoordinatorConfig {
     /// The defaults, for this catalog and address.
-    pub fn new(catalog: PathBuf, listen: SocketAddr) -> Self {
+    pub fn new(catalog: impl Into<CatalogPlace>, listen: SocketAddr) -> Self {
         Self {
-            catalog,
+            catalog: catalog.into(),
             listen,
             lease_ms: 60_000,
             heartbeat_ms: 10_000,
@@ -163,7 +163,7 @@ pub async fn serve(
     let listener = TcpListener::bind(config.listen).await.map_err(failed)?;
     let address = listener.local_addr().map_err(failed)?;
     let holder = format!("process {}, listening on {address}", std::process::id());
-    let catalog: Arc<dyn Catalog> = Arc::new(SqliteCatalog::open(&config.catalog, &holder).await?);
+    let catalog = config.catalog.open(&holder).await?;
 
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
@@ -218,6 +218,6 @@ pub async fn serve(
         actor.await.expect("the actor catches panics");
         Ok(served?)
     });
-    tracing::info!(%address, catalog = %config.catalog.display(), "coordinator listens");
+    tracing::info!(%address, catalog = %config.catalog, "coordinator listens");
     Ok(Running { address, task })
 }

@@ -6,10 +6,13 @@
 
 pub mod binary;
 pub mod cli;
+pub mod cluster;
 pub mod farm;
 pub mod job;
 pub mod mount;
+pub mod postgres;
 pub mod process;
+pub mod proxy;
 pub mod rng;
 pub mod s3;
 pub mod scratch;
@@ -18,6 +21,7 @@ pub mod store;
 pub mod wait;
 
 pub use cli::{Cli, Ended};
+pub use cluster::Cluster;
 pub use farm::Farm;
 pub use job::Job;
 pub use process::{Process, Signal};

@@ -1,4 +1,4 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is.
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears.
 
 mod axes;
 mod curve;
@@ -7,6 +7,7 @@ mod ladder;
 mod measure;
 mod peer;
 mod plot;
+mod queue;
 mod report;
 mod scaling;
 mod scenes;
@@ -24,9 +25,12 @@ use crate::{
 };
 
 pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
-    let Command::Render(args) = command;
-    check(&args)?;
     let stop = signals::stop_on_signal()?;
+    let args = match command {
+        Command::Queue(args) => return queue::run(args, output, &stop).await,
+        Command::Render(args) => args,
+    };
+    check(&args)?;
     let assets = settings.assets.clone();
     tokio::task::spawn_blocking(move || render(&args, &assets, output, &stop))
         .await

@@ -135,6 +135,10 @@ pub struct Event {
     pub kind: EventKind,
     /// Task, where it concerns one.
     pub task: Option<u64>,
+    /// First of the tasks it concerns, where it concerns any.
+    pub lo: Option<u64>,
+    /// One past the last of them.
+    pub hi: Option<u64>,
     /// Worker's name, where one is concerned.
     pub worker: String,
     /// In words.

@@ -16,7 +16,9 @@
 mod changes;
 mod error;
 mod lock;
+mod place;
 mod postgres;
+mod raw;
 mod record;
 mod sql;
 mod sqlite;
@@ -31,6 +33,7 @@ use picofarm_proto::{
 
 pub use changes::Changes;
 pub use error::CatalogError;
+pub use place::CatalogPlace;
 pub use postgres::PostgresCatalog;
 pub use record::{
     Claim, EventQuery, Exception, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent, News, Output,

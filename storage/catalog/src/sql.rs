@@ -496,16 +496,19 @@ macro_rules! queries {
                 .await?;
                 rows.iter()
                     .map(|row| {
-                        let (lo, hi): (Option<i64>, Option<i64>) = (row.try_get("lo")?, row.try_get("hi")?);
-                        let single = lo.filter(|lo| hi == Some(lo + 1));
+                        let task = |column| {
+                            let task: Option<i64> = row.try_get(column)?;
+                            task.map(|t| u64::try_from(t).map_err(|e| bad(column, e))).transpose()
+                        };
+                        let (lo, hi) = (task("lo")?, task("hi")?);
                         Ok(Event {
                             sequence: uint(row, "sequence")?,
                             at_ms: row.try_get("at_ms")?,
                             job: query.job,
                             kind: sql::event_kind(row.try_get("kind")?)?,
-                            task: single
-                                .map(|t| u64::try_from(t).map_err(|e| bad("lo", e)))
-                                .transpose()?,
+                            task: lo.filter(|lo| hi == Some(lo + 1)),
+                            lo,
+                            hi,
                             worker: row.try_get("worker")?,
                             message: row.try_get("message")?,
                             seconds: row.try_get("seconds")?,

@@ -37,6 +37,9 @@ const STOP_WITHIN: Duration = Duration::from_secs(10);
 const GOODBYE_WITHIN: Duration = Duration::from_secs(3);
 /// A session that lasted this long was a good one: the next reconnect begins with a short wait.
 const GOOD_SESSION: Duration = Duration::from_secs(10);
+/// How long at most before the next coordinator of the list is tried: the workers of one that is lost shall not all
+/// come to the other in the same moment.
+const NEXT_COORDINATOR: Duration = Duration::from_millis(300);
 const SHUTDOWN: &str = "the worker is shutting down";
 
 /// Runs a worker that renders, until `shutdown` or a refusal.
@@ -60,7 +63,7 @@ pub async fn run_with(
     shutdown: CancellationToken,
 ) -> Result<Summary, AgentError> {
     config.check()?;
-    let target = session::target(&config.coordinator, &config.access)?;
+    let targets = session::targets(&config.coordinator, &config.access)?;
     let allowed = StorePrefixes::new(&config.store_prefixes)?;
     let hello = WorkerHello {
         id: config
@@ -81,7 +84,8 @@ pub async fn run_with(
         desk: Desk::new(),
         runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
-        target,
+        targets,
+        at: 0,
         welcomed: false,
         hello,
         link: Link::Down(Instant::now()),
@@ -154,7 +158,10 @@ struct Agent {
     runner: Runner,
     /// Of the task in hand.
     control: Option<Arc<Control>>,
-    target: Target,
+    /// The coordinators to choose from.
+    targets: Vec<Target>,
+    /// Which of them is in use or to be tried next.
+    at: usize,
     /// This worker has been let in before: what looks like a wrong setting may pass.
     welcomed: bool,
     hello: WorkerHello,
@@ -184,6 +191,10 @@ impl Agent {
                 () = shutdown.cancelled(), if self.leaving.is_none() => self.begin_leaving(),
             }
         }
+    }
+
+    fn target(&self) -> &Target {
+        &self.targets[self.at]
     }
 
     /// Starts the next task if the hand is free, and sends what is to be said.
@@ -217,7 +228,7 @@ impl Agent {
             Event::Retry => {
                 let mut hello = self.hello.clone();
                 hello.held = self.desk.held();
-                self.link = Link::Opening(Box::pin(session::open(self.target.clone(), hello)));
+                self.link = Link::Opening(Box::pin(session::open(self.target().clone(), hello)));
             }
             Event::Opened(Ok((welcome, session))) => {
                 self.welcomed = true;
@@ -286,7 +297,12 @@ impl Agent {
         if matches!(self.link, Link::Up { since, .. } if now - since > GOOD_SESSION) {
             self.retry.reset();
         }
-        let wait = self.retry.next(random());
+        // The next coordinator of the list at once; the first again only after a wait.
+        self.at = (self.at + 1) % self.targets.len();
+        let wait = match self.at {
+            0 => self.retry.next(random()),
+            _ => NEXT_COORDINATOR.mul_f64(random()),
+        };
         if self.away_since.is_none() {
             warn!(
                 reason,

@@ -9,7 +9,8 @@ use crate::{Access, AccessError};
 /// Settings of one worker process.
 #[derive(Debug, Clone)]
 pub struct AgentConfig {
-    /// URL of the coordinator, e.g. `http://127.0.0.1:7717`.
+    /// URL of the coordinator, e.g. `http://127.0.0.1:7717`; of several on one catalog, with commas between them. The
+    /// worker goes to the next one when it loses one.
     pub coordinator: String,
     /// Name, for people: host and process.
     pub name: String,

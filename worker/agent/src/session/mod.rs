@@ -94,8 +94,15 @@ pub(crate) struct Session {
     from: Streaming<wire::SessionResponse>,
 }
 
-/// Checks the coordinator's URL and what is needed to reach it, and sets how connections to it behave.
-pub(crate) fn target(url: &str, access: &Access) -> Result<Target, AgentError> {
+/// The coordinators of a list of URLs with commas between them.
+pub(crate) fn targets(urls: &str, access: &Access) -> Result<Vec<Target>, AgentError> {
+    urls.split(',')
+        .map(|url| target(url.trim(), access))
+        .collect()
+}
+
+/// Checks a coordinator's URL and what is needed to reach it, and sets how connections to it behave.
+fn target(url: &str, access: &Access) -> Result<Target, AgentError> {
     let mut target = access.target(url)?;
     target.endpoint = target
         .endpoint

@@ -1,0 +1,190 @@
+//! A farm as it runs in earnest: several coordinators on one Postgres, workers that reach them through proxies, and any
+//! of them may fail at any time.
+
+use std::net::SocketAddr;
+
+use serde_json::Value;
+
+use crate::{
+    cli::Cli,
+    job::Job,
+    postgres::Postgres,
+    process::Process,
+    proxy::Proxy,
+    scratch::Scratch,
+    wait::until,
+};
+
+/// One of several coordinators.
+pub struct House {
+    process: Option<Process>,
+    address: SocketAddr,
+    /// Before it; outlives its process.
+    pub proxy: Proxy,
+}
+
+/// Coordinators, their database and what reaches them.
+pub struct Cluster {
+    /// The coordinators.
+    pub houses: Vec<House>,
+    cli: Cli,
+    lease_s: f64,
+    /// The database.
+    pub postgres: Postgres,
+    /// Its folder.
+    pub scratch: Scratch,
+}
+
+impl Cluster {
+    /// Coordinators with leases of `lease_s` seconds; `None`, having said so, where there is no Postgres.
+    pub fn start(name: &str, coordinators: usize, lease_s: f64) -> Option<Self> {
+        Self::reaching(name, coordinators, lease_s, |cli| cli)
+    }
+
+    /// The same, whose processes and commands come with further settings.
+    pub fn reaching(
+        name: &str,
+        coordinators: usize,
+        lease_s: f64,
+        with: impl FnOnce(Cli) -> Cli,
+    ) -> Option<Self> {
+        let postgres = Postgres::start(name)?;
+        let scratch = Scratch::new(name);
+        let mut cluster = Self {
+            houses: Vec::new(),
+            cli: with(Cli::new(scratch.path())),
+            lease_s,
+            postgres,
+            scratch,
+        };
+        for _ in 0..coordinators {
+            let (process, address) = cluster.launch("127.0.0.1:0");
+            cluster.houses.push(House {
+                process: Some(process),
+                address,
+                proxy: Proxy::before(address),
+            });
+        }
+        Some(cluster)
+    }
+
+    fn launch(&self, listen: &str) -> (Process, SocketAddr) {
+        let lease = self.lease_s.to_string();
+        let args = ["coordinator", "--allow-insecure", "--json", "--log", "info"];
+        let args = [&args[..], &["--listen", listen, "--lease-s", &lease]].concat();
+        let cli = self
+            .cli
+            .clone()
+            .with("PICOFARM_CATALOG", &self.postgres.url);
+        let mut process = cli.start("coordinator", &args);
+        let line = process.first_line();
+        let document: Value = serde_json::from_str(&line).expect("the first line is JSON");
+        let url = document["coordinator"]
+            .as_str()
+            .expect("it names its address");
+        let address = url
+            .trim_start_matches("http://")
+            .parse()
+            .expect("an address");
+        (process, address)
+    }
+
+    /// A coordinator's process.
+    ///
+    /// # Panics
+    /// When it was killed.
+    pub fn house(&mut self, i: usize) -> &mut Process {
+        self.houses[i].process.as_mut().expect("it runs")
+    }
+
+    /// Ends a coordinator as `kill -9` does.
+    ///
+    /// # Panics
+    /// When it does not run.
+    pub fn kill_house(&mut self, i: usize) {
+        self.houses[i].process.take().expect("it runs").kill();
+    }
+
+    /// Starts a killed coordinator where it was.
+    pub fn start_house(&mut self, i: usize) {
+        let listen = self.houses[i].address.to_string();
+        let (process, _) = self.launch(&listen);
+        self.houses[i].process = Some(process);
+    }
+
+    /// The coordinators, as a worker's list that begins with the `first`.
+    pub fn urls(&self, first: usize) -> String {
+        let n = self.houses.len();
+        let url = |i: usize| self.houses[(first + i) % n].proxy.url();
+        (0..n).map(url).collect::<Vec<_>>().join(",")
+    }
+
+    /// Starts a worker with one thread that goes to the `first` coordinator before the others.
+    pub fn worker(&self, name: &str, first: usize) -> Process {
+        let args = ["worker", "--log", "info", "--name", name, "--threads", "1"];
+        let urls = self.urls(first);
+        self.cli
+            .start(name, &[&args[..], &["--coordinator", &urls]].concat())
+    }
+
+    /// Commands that go to whichever coordinator answers, past the proxies.
+    pub fn cli(&self) -> Cli {
+        let urls: Vec<_> = self
+            .houses
+            .iter()
+            .map(|h| format!("http://{}", h.address))
+            .collect();
+        self.cli.clone().with("PICOFARM_COORDINATOR", &urls.join(","))
+    }
+
+    /// The JSON answer of a command, asked again while no coordinator can answer.
+    pub fn json(&self, args: &[&str]) -> Value {
+        until(&format!("an answer to {args:?}"), || {
+            let ended = self.cli().run(&[args, &["--json"]].concat());
+            match ended.code {
+                Some(0) => Some(ended.json()),
+                Some(4) => None,
+                _ => panic!("{args:?}: {}", ended.stderr),
+            }
+        })
+    }
+
+    /// Submits a job: its id.
+    ///
+    /// # Panics
+    /// When it is refused.
+    pub fn submit(&self, job: &Job) -> String {
+        let file = self.scratch.join(&format!("{}.toml", job.name));
+        job.write(&file);
+        let answer = self.json(&["job", "submit", &file.display().to_string()]);
+        answer["job"]
+            .as_str()
+            .expect("a submission answers with a job")
+            .to_owned()
+    }
+
+    /// `job status`.
+    pub fn status(&self, job: &str) -> Value {
+        self.json(&["job", "status", job])
+    }
+
+    /// Waits until the job ends: its last status.
+    ///
+    /// # Panics
+    /// When it does not end.
+    pub fn until_ended(&self, job: &str) -> Value {
+        until(&format!("the end of job {job}"), || {
+            let status = self.status(job);
+            (status["state"] != "active").then_some(status)
+        })
+    }
+
+    /// The whole history.
+    ///
+    /// # Panics
+    /// When it is no list.
+    pub fn events(&self, job: &str) -> Vec<Value> {
+        let answer = self.json(&["job", "logs", job, "--last", "1000000"]);
+        answer.as_array().expect("a history is a list").clone()
+    }
+}
