@@ -83,8 +83,8 @@ proptest! {
         let at_once = one.extended(&asked, &all).unwrap().unwrap_or(one);
         prop_assert_eq!(at_once.sides, last.sides);
         // An empty side stays empty.
-        for side in 0..3 {
-            prop_assert!(counts[side] > 0 || last.counts[side] == 0);
+        for (asked, found) in counts.iter().zip(last.counts) {
+            prop_assert!(*asked > 0 || found == 0);
         }
     }
 
@@ -95,8 +95,7 @@ proptest! {
         let one = SplitRecord::first(&asked, &first(n)).unwrap();
         let m = 6000;
         let grown = one.extended(&asked, &first(n + m)).unwrap().unwrap();
-        for side in 0..3 {
-            let p = shares[side];
+        for (side, p) in shares.into_iter().enumerate() {
             let new = (grown.counts[side] - one.counts[side]) as f64 / m as f64;
             let sigma = (p * (1.0 - p) * (1.0 / m as f64 + 1.0 / n as f64)).sqrt();
             prop_assert!((new - p).abs() < 6.0 * sigma + 1.0 / n as f64, "{new} is not {p}");
