@@ -252,7 +252,7 @@ pub enum Job {
     },
 }
 
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Debug, Clone, Copy, ValueEnum)]
 pub enum SceneKindArg {
     Furnished,
     Primitive,
