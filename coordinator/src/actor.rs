@@ -2,7 +2,7 @@
 //! makes the outcome durable in one commit, and only then answers: whatever waits meanwhile forms the next commit.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, hash_map::Entry},
     panic::AssertUnwindSafe,
     sync::Arc,
     time::{Duration, Instant},
@@ -140,9 +140,9 @@ impl Actor {
         let snapshot = self.catalog.load().await?;
         let mut timings = Timings::new();
         for stage in snapshot.jobs.iter().flat_map(Job::stages) {
-            if !timings.contains_key(&stage.set) {
-                let seconds = self.catalog.timing(&stage.set).await?;
-                timings.insert(stage.set, seconds);
+            if let Entry::Vacant(entry) = timings.entry(stage.set) {
+                let seconds = self.catalog.timing(entry.key()).await?;
+                entry.insert(seconds);
             }
         }
         tracing::debug!(house = %snapshot.house, jobs = snapshot.jobs.len(),
