@@ -121,11 +121,9 @@ stop)
     scancel --user=root 2>/dev/null || true
     until_true 15 no_jobs || true
   fi
-  for file in "$dir"/pids/n* "$dir"/pids/slurmctld "$dir"/pids/munged; do
-    if [ -s "$file" ] && pid=$(cat "$file") && kill "$pid" 2>/dev/null; then
-      until_true 10 gone "$pid" || kill -9 "$pid" || true
-    fi
-  done
+  mapfile -t daemons < <(cat "$dir"/pids/* 2>/dev/null)
+  for pid in "${daemons[@]}"; do kill "$pid" 2>/dev/null || true; done
+  for pid in "${daemons[@]}"; do until_true 10 gone "$pid" || kill -9 "$pid" || true; done
   for pid in $(ours slurmstepd '') $(ours picofarm ''); do kill -9 "$pid" 2>/dev/null || true; done
   ;;
 *)
