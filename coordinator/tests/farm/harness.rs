@@ -1,7 +1,6 @@
 //! A coordinator with a clock of its own, a client, and a worker that does what the test says.
 
 use std::{
-    path::PathBuf,
     sync::{
         Arc,
         atomic::{AtomicI64, Ordering},
