@@ -542,7 +542,10 @@ async fn a_worker_takes_its_leases_along_and_the_former_house_learns_of_it() {
     changes.put(lease.clone());
     a.commit(changes).await.unwrap();
     assert!(a.beat(1).await.unwrap().leased.unwrap().contains(&lease.id));
-    assert_eq!(b.adopt(worker().id).await.unwrap().ranges, [lease.clone()]);
+    assert_eq!(
+        b.adopt(worker().id).await.unwrap().ranges,
+        std::slice::from_ref(&lease)
+    );
     assert_eq!(
         b.adopt(worker().id).await.unwrap().ranges,
         [],
