@@ -434,6 +434,7 @@ promises! {
     given_up_tasks_can_be_tried_again
     the_same_spec_is_recorded_once
     history_is_read_in_pages_and_by_task
+    what_holds_tasks_up_and_what_became_of_one_can_be_asked
     every_kind_of_spec_is_read_back_as_written
 }
 
