@@ -190,7 +190,7 @@ pub async fn serve(
             backoff: config.backoff,
         },
         tick: config.tick,
-        clock: config.clock,
+        clock: config.clock.clone(),
         revision,
         metrics: Arc::clone(&metrics),
         pulse: Arc::clone(&pulse),
@@ -202,7 +202,7 @@ pub async fn serve(
         catalog,
         stop: shutdown.clone(),
         name: holder.into(),
-        clock: config.clock.clone(),
+        clock: config.clock,
         lease_ms: config.lease_ms,
         heartbeat_ms: config.heartbeat_ms,
     };
