@@ -40,7 +40,11 @@ impl Postgres {
         Some(server)
     }
 
-    fn up(&mut self) {
+    /// Starts it again.
+    ///
+    /// # Panics
+    /// When it does not start.
+    pub fn up(&mut self) {
         let started = script(&["start", &self.dir.display().to_string()]);
         let error = String::from_utf8_lossy(&started.stderr);
         assert!(started.status.success(), "{error}");
@@ -49,12 +53,17 @@ impl Postgres {
             .clone_into(&mut self.url);
     }
 
+    /// Ends it without a word to anyone.
+    pub fn down(&self) {
+        script(&["stop", &self.dir.display().to_string(), "immediate"]);
+    }
+
     /// Ends it without a word to anyone and starts it again: it recovers what was committed.
     ///
     /// # Panics
     /// When it does not come back.
     pub fn crash(&mut self) {
-        script(&["stop", &self.dir.display().to_string(), "immediate"]);
+        self.down();
         self.up();
     }
 }

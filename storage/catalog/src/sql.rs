@@ -565,7 +565,7 @@ macro_rules! queries {
                     .bind(int(task))
                     .fetch_optional(c)
                     .await?;
-                let output = row.map(|row| {
+                let output = row.map(|row| -> Result<Output> {
                     let manifest: Vec<u8> = row.try_get("manifest")?;
                     Ok(Output {
                         stage,
