@@ -1,7 +1,6 @@
 //! A coordinator with a clock of its own, a client, and a worker that does what the test says.
 
 use std::{
-    path::PathBuf,
     sync::{
         Arc,
         atomic::{AtomicI64, Ordering},
@@ -139,6 +138,7 @@ impl Farm {
             after: 0,
             limit: 0,
             task,
+            newest: false,
         };
         let response = self.jobs.list_events(request).await.unwrap();
         response.into_inner().events
@@ -345,6 +345,6 @@ impl Worker {
     }
 }
 
-pub fn catalog_of(farm: &Farm) -> PathBuf {
+pub fn catalog_of(farm: &Farm) -> picofarm_coordinator::CatalogPlace {
     farm.config.catalog.clone()
 }

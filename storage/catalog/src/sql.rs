@@ -157,7 +157,7 @@ pub(crate) const LATER_JOB: &str = "another job with the same spec is active or 
 macro_rules! history {
     ($job:literal, $order:literal) => {
         concat!(
-            "SELECT sequence, at_ms, kind, lo, hi, worker, seconds, message, job.id AS job_id FROM event \
+            "SELECT event.*, job.id AS job_id FROM event \
              JOIN job ON job.key = event.job WHERE sequence > $1 AND ",
             $job,
             " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) ",
