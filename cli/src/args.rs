@@ -284,7 +284,7 @@ pub enum Job {
     },
 }
 
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Debug, Clone, Copy, ValueEnum)]
 pub enum SceneKindArg {
     Furnished,
     Primitive,

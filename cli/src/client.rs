@@ -42,7 +42,13 @@ fn refused(status: &Status) -> CliError {
         | Grpc::PermissionDenied => Code::Coordinator,
         _ => Code::Failed,
     };
-    CliError::new(code, status.message())
+    CliError {
+        denied: matches!(
+            status.code(),
+            Grpc::Unauthenticated | Grpc::PermissionDenied
+        ),
+        ..CliError::new(code, status.message())
+    }
 }
 
 fn unreadable(e: ConvertError) -> CliError {
@@ -97,17 +103,16 @@ impl Client {
             urls: url.to_owned(),
             access: access.clone(),
         };
-        if url.starts_with("https") {
-            // A client certificate is refused only after the handshake: the first call tells.
-            let asked = client
-                .jobs
-                .get_server_info(wire::GetServerInfoRequest {})
-                .await;
-            if let Err(status) = asked
-                && lost_connection(&status)
-            {
-                return Err(no_connection(&target, url, &status).await);
-            }
+        // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only when it is spoken:
+        // the first call tells.
+        let asked = client
+            .jobs
+            .get_server_info(wire::GetServerInfoRequest {})
+            .await;
+        if let Err(status) = asked
+            && lost_connection(&status)
+        {
+            return Err(no_connection(&target, url, &status).await);
         }
         Ok(client)
     }

@@ -21,6 +21,8 @@ pub struct CliError {
     pub code: Code,
     pub message: String,
     pub hint: Option<String>,
+    /// Asking again would not help: whoever was asked does not let this caller in.
+    pub denied: bool,
 }
 
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
@@ -31,6 +33,7 @@ impl CliError {
             code,
             message: message.to_string(),
             hint: None,
+            denied: false,
         }
     }
 

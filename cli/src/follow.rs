@@ -47,7 +47,7 @@ pub async fn follow(
                 return Ok(status);
             }
             Ok(None) => None,
-            Err(e) if e.code == Code::Coordinator => Some(e),
+            Err(e) if e.code == Code::Coordinator && !e.denied => Some(e),
             Err(e) => return Err(e),
         };
         let since = *away.get_or_insert_with(Instant::now);

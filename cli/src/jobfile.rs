@@ -1,7 +1,7 @@
 //! Job files: the commented template, reading, and resolving what a submission must pin (furniture,
 //! scene files' content, renderer version, absolute store).
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use picofarm_proto::model::{JobSpec, SceneKind};
 
@@ -125,12 +125,25 @@ pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSp
             }
         }
     }
+    spec.check_places()?;
     Ok(spec)
 }
 
+/// The place that `path` means in `base`, without `.` and `..`.
 fn absolute(base: &Path, path: &str) -> Result<PathBuf> {
-    std::path::absolute(base.join(path))
-        .map_err(|e| CliError::new(Code::Input, format!("{path}: {e}")))
+    let whole = std::path::absolute(base.join(path))
+        .map_err(|e| CliError::new(Code::Input, format!("{path:?}: {e}")))?;
+    let mut plain = PathBuf::new();
+    for part in whole.components() {
+        if part == Component::ParentDir {
+            // The folder above a link's target is not the one above the link.
+            plain = plain.canonicalize().unwrap_or(plain);
+            plain.pop();
+        } else {
+            plain.push(part);
+        }
+    }
+    Ok(plain)
 }
 
 #[cfg(test)]
@@ -233,5 +246,99 @@ mod tests {
             error.message
         );
         assert_eq!(error.code, Code::Input);
+    }
+
+    mod hostile {
+        use proptest::prelude::*;
+
+        use super::*;
+
+        /// How many cases; `PICOFARM_FUZZ=n` runs n times as many.
+        fn cases() -> u32 {
+            let times = std::env::var("PICOFARM_FUZZ").map_or(1, |n| n.parse().expect("a number"));
+            300 * times
+        }
+
+        fn kind() -> impl Strategy<Value = SceneKindArg> {
+            prop_oneof![
+                Just(SceneKindArg::Furnished),
+                Just(SceneKindArg::Primitive),
+                Just(SceneKindArg::Files)
+            ]
+        }
+
+        /// A value where a field's was, or text where any was.
+        fn spoilt() -> impl Strategy<Value = String> {
+            let value = prop_oneof![
+                Just("-1".to_owned()),
+                Just("1e400".to_owned()),
+                Just("nan".to_owned()),
+                Just("9223372036854775807".to_owned()),
+                Just("[[]]".to_owned()),
+                Just("{ a = { b = [1, {}] } }".to_owned()),
+                Just("\"../../../etc\"".to_owned()),
+                any::<f64>().prop_map(|x| format!("{x:?}")),
+                any::<String>().prop_map(|text| format!("{text:?}")),
+            ];
+            let line =
+                (kind(), any::<prop::sample::Index>(), value).prop_map(|(kind, at, value)| {
+                    let text = template(kind);
+                    let mut lines: Vec<_> = text.lines().map(str::to_owned).collect();
+                    let at = at.index(lines.len());
+                    if let Some((name, _)) = lines[at].clone().split_once('=') {
+                        lines[at] = format!("{name}= {value}");
+                    }
+                    lines.join("\n")
+                });
+            let bytes = (
+                kind(),
+                prop::collection::vec((any::<prop::sample::Index>(), any::<char>()), 1..6),
+            )
+                .prop_map(|(kind, changes)| {
+                    let mut text: Vec<char> = template(kind).chars().collect();
+                    for (at, char) in changes {
+                        let at = at.index(text.len());
+                        text[at] = char;
+                    }
+                    text.into_iter().collect()
+                });
+            prop_oneof![3 => line, 2 => bytes, 1 => any::<String>()]
+        }
+
+        proptest! {
+            #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
+
+            #[test]
+            fn any_text_is_a_job_or_an_error_that_names_the_file(text in spoilt()) {
+                let dir = tempfile::tempdir().unwrap();
+                match read(&written(dir.path(), &text), dir.path()) {
+                    Ok(spec) => {
+                        spec.check().unwrap();
+                        spec.check_places().unwrap();
+                    }
+                    Err(error) => prop_assert!(error.message.contains("job.toml"), "{}", error.message),
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_store_beside_the_job_file_is_resolved_and_a_url_that_climbs_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |store: &str| {
+            let text = template(SceneKindArg::Primitive).replace("\"picofarm-data/store\"", store);
+            read(&written(dir.path(), &text), dir.path())
+        };
+        let above = at("\"../store\"").unwrap().output.store;
+        let parent = dir
+            .path()
+            .canonicalize()
+            .unwrap()
+            .parent()
+            .unwrap()
+            .join("store");
+        assert_eq!(Path::new(&above), parent);
+        let error = at("\"file:///data/../etc\"").unwrap_err();
+        assert!(error.message.contains("output.store"), "{}", error.message);
     }
 }

@@ -150,7 +150,7 @@ mod tests {
     fn methods(schema: &str, found: &mut Vec<String>) {
         let (mut package, mut service) = ("", "");
         for line in schema.lines().map(str::trim) {
-            let name = |rest: &'static str| line.strip_prefix(rest).map(|l| word(l));
+            let name = |rest: &'static str| line.strip_prefix(rest).map(word);
             if let Some(name) = name("package ") {
                 package = name;
             } else if let Some(name) = name("service ") {

@@ -65,7 +65,7 @@ async fn opened(store: Tricky) -> Dataset {
 
 fn runtime() -> tokio::runtime::Runtime {
     let mut builder = tokio::runtime::Builder::new_current_thread();
-    builder.enable_all().start_paused(true).build().unwrap()
+    builder.enable_all().build().unwrap()
 }
 
 proptest! {

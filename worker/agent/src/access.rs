@@ -10,7 +10,10 @@ use std::{
 
 use http::Uri;
 use picofarm_proto::credentials::{CredentialError, Pair, Secret, certificates};
-use rustls::{AlertDescription, CertificateError};
+use rustls::{
+    AlertDescription, CertificateError, ClientConfig, RootCertStore,
+    pki_types::{PrivateKeyDer, ServerName, pem::PemObject},
+};
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpStream,
@@ -64,7 +67,7 @@ pub struct Target {
     /// Shows the token with each call.
     pub bearer: Bearer,
     uri: Uri,
-    ca: Option<PathBuf>,
+    access: Access,
 }
 
 /// Adds the token to requests.
@@ -121,7 +124,7 @@ impl Access {
             endpoint,
             bearer: self.bearer()?,
             uri,
-            ca: self.ca.clone(),
+            access: self.clone(),
         })
     }
 
@@ -158,6 +161,31 @@ impl Access {
         Ok(tls)
     }
 
+    /// The same as [`Access::tls`] for a look at the handshake itself.
+    fn rustls(&self) -> Option<ClientConfig> {
+        let mut roots = RootCertStore::empty();
+        roots.add_parsable_certificates(match &self.ca {
+            Some(path) => certificates(path).ok()?.0,
+            None => rustls_native_certs::load_native_certs().certs,
+        });
+        let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+        let builder = ClientConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .ok()?
+            .with_root_certificates(roots);
+        let mut config = match (&self.certificate, &self.key) {
+            (Some(certificate), Some(key)) => {
+                let key = PrivateKeyDer::from_pem_file(key).ok()?;
+                builder
+                    .with_client_auth_cert(certificates(certificate).ok()?.0, key)
+                    .ok()?
+            }
+            _ => builder.with_no_client_auth(),
+        };
+        config.alpn_protocols.push(b"h2".to_vec());
+        Some(config)
+    }
+
     fn bearer(&self) -> Result<Bearer, AccessError> {
         let Some(token) = &self.token else {
             return Ok(Bearer::default());
@@ -179,6 +207,9 @@ fn loopback(host: &str) -> bool {
     host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback())
 }
 
+/// How long looking for what is wrong may take.
+const PROBE: Duration = Duration::from_secs(3);
+
 /// Why a connection did not come about.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Trouble {
@@ -190,9 +221,18 @@ pub enum Trouble {
 
 impl Target {
     /// What went wrong with a connection or a call, as far as it can be told.
-    pub async fn trouble(&self, error: &(dyn std::error::Error + 'static)) -> Trouble {
-        if let Some(text) = self.tls_trouble(error) {
-            return Trouble::Mismatch(text);
+    pub async fn trouble(
+        &self,
+        error: &(dyn std::error::Error + Send + Sync + 'static),
+    ) -> Trouble {
+        if let Some(error) = rustls_error(error) {
+            return Trouble::Mismatch(self.tls_trouble(error));
+        }
+        // A client certificate is refused after the handshake, and its alert is lost in the connection's background.
+        if self.uri.scheme_str() == Some("https")
+            && let Some(error) = self.handshake_error().await
+        {
+            return Trouble::Mismatch(self.tls_trouble(&error));
         }
         if self.uri.scheme_str() == Some("http") && self.speaks_tls().await {
             return Trouble::Mismatch(format!(
@@ -203,14 +243,14 @@ impl Target {
         Trouble::Down(causes(error))
     }
 
-    fn tls_trouble(&self, error: &(dyn std::error::Error + 'static)) -> Option<String> {
+    fn tls_trouble(&self, error: &rustls::Error) -> String {
         let uri = &self.uri;
         let host = uri.host().unwrap_or_default();
-        let by = match &self.ca {
+        let by = match &self.access.ca {
             Some(file) => format!("the authorities in {}", file.display()),
             None => "the authorities of this system".to_owned(),
         };
-        Some(match rustls_error(error)? {
+        match error {
             rustls::Error::InvalidMessage(_) => {
                 format!(
                     "{uri} does not speak TLS: use http://, or start the coordinator with --tls-cert and --tls-key"
@@ -260,21 +300,38 @@ impl Target {
                 other => format!("{uri} refused the TLS connection: {other:?}"),
             },
             other => format!("no TLS connection with {uri}: {other}"),
-        })
+        }
+    }
+
+    /// What rustls says of a handshake and the first answer after it; `None` if it is content or nothing answers.
+    async fn handshake_error(&self) -> Option<rustls::Error> {
+        let ask = async {
+            let config = self.access.rustls()?;
+            let host = self.uri.host()?.trim_matches(['[', ']']);
+            let name = ServerName::try_from(host).ok()?.to_owned();
+            let stream = self.connect(443).await?;
+            let connector = tokio_rustls::TlsConnector::from(Arc::new(config));
+            let answer = match connector.connect(name, stream).await {
+                Ok(mut stream) => stream.read(&mut [0]).await.map(drop),
+                Err(error) => Err(error),
+            };
+            rustls_error(&answer.err()?).cloned()
+        };
+        tokio::time::timeout(PROBE, ask).await.ok().flatten()
+    }
+
+    async fn connect(&self, port: u16) -> Option<TcpStream> {
+        let host = self.uri.host()?.trim_matches(['[', ']']);
+        let port = self.uri.port_u16().unwrap_or(port);
+        let addresses = tokio::net::lookup_host((host, port)).await.ok()?;
+        let addresses: Vec<SocketAddr> = addresses.collect();
+        TcpStream::connect(&addresses[..]).await.ok()
     }
 
     /// Whether a plain HTTP/2 greeting is answered as only TLS does: with an alert.
     async fn speaks_tls(&self) -> bool {
         let ask = async {
-            let host = self
-                .uri
-                .host()?
-                .trim_start_matches('[')
-                .trim_end_matches(']');
-            let port = self.uri.port_u16().unwrap_or(80);
-            let addresses = tokio::net::lookup_host((host, port)).await.ok()?;
-            let addresses: Vec<SocketAddr> = addresses.collect();
-            let mut stream = TcpStream::connect(&addresses[..]).await.ok()?;
+            let mut stream = self.connect(80).await?;
             stream
                 .write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
                 .await
@@ -283,7 +340,7 @@ impl Target {
             stream.read_exact(&mut answer).await.ok()?;
             Some(answer)
         };
-        let answer = tokio::time::timeout(Duration::from_secs(3), ask).await;
+        let answer = tokio::time::timeout(PROBE, ask).await;
         // Record type alert (or handshake), TLS major version.
         matches!(answer, Ok(Some([0x15 | 0x16, 0x03])))
     }

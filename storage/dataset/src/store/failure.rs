@@ -126,8 +126,10 @@ impl Request {
                 "the server is full: free some space, then run it again"
             }
             (_, Some(401)) => "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+            // Some servers say so too of a bucket that does not exist.
             (_, Some(403)) => {
-                "no permission: AWS_ACCESS_KEY_ID needs leave to read, write, list and delete in this bucket"
+                "no permission: AWS_ACCESS_KEY_ID needs leave to read, write, list and delete in this bucket; does the \
+                 bucket exist?"
             }
             (_, Some(429 | 500..=599)) => "the server is in trouble: try again later",
             (None, _) => "this is not how S3 answers: check AWS_ENDPOINT_URL and AWS_REGION",

@@ -1,0 +1,368 @@
+//! Whatever arrives on the wire, a coordinator neither panics nor grows, and goes on serving those who behave.
+//! `PICOFARM_FUZZ=n` runs n times as many cases.
+
+use std::{
+    sync::atomic::{AtomicUsize, Ordering},
+    time::Duration,
+};
+
+use picofarm_coordinator::{CoordinatorConfig, Running, VERSION, serve};
+use picofarm_proto::{
+    PROTOCOL,
+    model::JobSpec,
+    wire::{
+        self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
+        session_response::Message as Heard,
+    },
+};
+use proptest::{
+    collection::vec,
+    prelude::*,
+    strategy::ValueTree,
+    test_runner::{Config, TestRunner},
+};
+use prost::Message;
+use tokio_stream::StreamExt;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+use uuid::Uuid;
+
+/// Panics of any thread, those that somebody catches too.
+static PANICS: AtomicUsize = AtomicUsize::new(0);
+
+/// How many cases, given how many take a few seconds.
+fn cases(short: u32) -> u32 {
+    let times = std::env::var("PICOFARM_FUZZ").map_or(1, |n| n.parse().expect("a number"));
+    short * times
+}
+
+struct Server {
+    _folder: tempfile::TempDir,
+    _running: Running,
+    channel: Channel,
+}
+
+impl Server {
+    async fn start() -> Self {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            PANICS.fetch_add(1, Ordering::SeqCst);
+            before(panic);
+        }));
+        let folder = tempfile::tempdir().unwrap();
+        let listen = "127.0.0.1:0".parse().unwrap();
+        let config = CoordinatorConfig::new(folder.path().join("catalog.db"), listen);
+        let running = serve(config, CancellationToken::new()).await.unwrap();
+        let url = format!("http://{}", running.address);
+        Self {
+            _folder: folder,
+            _running: running,
+            channel: Channel::from_shared(url).unwrap().connect().await.unwrap(),
+        }
+    }
+
+    fn jobs(&self) -> JobsClient<Channel> {
+        JobsClient::new(self.channel.clone())
+    }
+
+    /// One session that says all this; it ends when the coordinator ends it, or has heard enough.
+    async fn session(&self, said: Vec<wire::SessionRequest>) {
+        let mut client = FarmClient::new(self.channel.clone());
+        let said = tokio_stream::iter(said);
+        if let Ok(answer) = client.session(said).await {
+            let mut heard = answer.into_inner();
+            let enough = Duration::from_secs(10);
+            while let Ok(Ok(Some(_))) = tokio::time::timeout(enough, heard.message()).await {}
+        }
+    }
+
+    /// A job from its submission to its end, by a worker that behaves.
+    async fn serves(&self) {
+        let mut jobs = self.jobs();
+        let mut spec = good();
+        spec.name = Uuid::new_v4().to_string();
+        spec.output.dataset = spec.name.clone();
+        let request = wire::SubmitJobRequest {
+            spec: Some(spec.into()),
+            again: false,
+        };
+        let job = jobs.submit_job(request).await.unwrap().into_inner().job_id;
+        let hello = hello(Uuid::new_v4().to_string());
+        let (say, said) = tokio::sync::mpsc::channel(8);
+        for message in [Say::Hello(hello), Say::Credit(wire::Credit { leases: 1 })] {
+            say.send(request_of(message)).await.unwrap();
+        }
+        let said = tokio_stream::wrappers::ReceiverStream::new(said);
+        let mut client = FarmClient::new(self.channel.clone());
+        let mut heard = client.session(said).await.unwrap().into_inner();
+        let lease = loop {
+            let message = tokio::time::timeout(Duration::from_secs(20), heard.next()).await;
+            let message = message.expect("a lease in time").unwrap().unwrap();
+            if let Some(Heard::Lease(lease)) = message.message {
+                break lease;
+            }
+        };
+        assert_eq!(lease.job_id, job);
+        let cancel = wire::CancelJobRequest { job_id: job };
+        jobs.cancel_job(cancel).await.unwrap();
+    }
+
+    /// Jobs known, and workers connected.
+    async fn held(&self) -> (usize, u32) {
+        let mut jobs = self.jobs();
+        let list = jobs.list_jobs(wire::ListJobsRequest {}).await.unwrap();
+        let info = jobs
+            .get_server_info(wire::GetServerInfoRequest {})
+            .await
+            .unwrap();
+        (list.into_inner().jobs.len(), info.into_inner().workers)
+    }
+
+    async fn settles_at(&self, held: (usize, u32)) {
+        for _ in 0..2_000 {
+            if self.held().await == held {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        assert_eq!(self.held().await, held);
+    }
+}
+
+fn request_of(message: Say) -> wire::SessionRequest {
+    wire::SessionRequest {
+        message: Some(message),
+    }
+}
+
+/// A job that is accepted.
+fn good() -> JobSpec {
+    serde_json::from_str(
+        r#"{"name": "good", "scenes": {"kind": "primitive", "count": 3},
+            "render": {"renderer": "r1"},
+            "output": {"store": "file:///nowhere", "dataset": "d", "profile": "sqrt-u16"}}"#,
+    )
+    .unwrap()
+}
+
+fn hello(id: String) -> wire::Hello {
+    wire::Hello {
+        worker_id: id,
+        incarnation: Uuid::new_v4().to_string(),
+        name: "ada".into(),
+        version: VERSION.into(),
+        protocol: PROTOCOL,
+        cores: 1,
+        held: Vec::new(),
+        renderer: "r1".into(),
+        assets: Vec::new(),
+    }
+}
+
+// What is on the wire at random. Ids come from few values, so that messages meet one another.
+
+fn id() -> impl Strategy<Value = String> {
+    prop_oneof![
+        6 => (0..4u128).prop_map(|n| Uuid::from_u128(n).to_string()),
+        1 => Just(String::new()),
+        1 => any::<u128>().prop_map(|n| Uuid::from_u128(n).to_string()),
+        1 => ".{0,40}",
+    ]
+}
+
+fn number() -> impl Strategy<Value = u64> {
+    prop_oneof![
+        Just(0),
+        0..5u64,
+        Just(u64::MAX),
+        Just(u64::MAX - 1),
+        any::<u64>()
+    ]
+}
+
+fn small() -> impl Strategy<Value = u32> {
+    prop_oneof![Just(0), 0..5u32, Just(u32::MAX), any::<u32>()]
+}
+
+fn lease() -> impl Strategy<Value = Option<wire::LeaseRef>> {
+    let lease = (id(), number()).prop_map(|(range_id, epoch)| wire::LeaseRef { range_id, epoch });
+    prop_oneof![1 => Just(None), 9 => lease.prop_map(Some)]
+}
+
+fn leases() -> impl Strategy<Value = Vec<wire::LeaseRef>> {
+    vec(lease(), 0..6).prop_map(|all| all.into_iter().flatten().collect())
+}
+
+fn say() -> impl Strategy<Value = wire::SessionRequest> {
+    let hello = (id(), id(), leases()).prop_map(|(worker, incarnation, held)| {
+        let mut hello = hello(worker);
+        hello.incarnation = incarnation;
+        hello.held = held;
+        Say::Hello(hello)
+    });
+    let progress =
+        (lease(), number(), any::<f32>()).prop_map(|(lease, index, fraction)| wire::TaskProgress {
+            lease,
+            index,
+            fraction,
+        });
+    let beat = (leases(), vec(progress, 0..4))
+        .prop_map(|(leases, progress)| Say::Heartbeat(wire::Heartbeat { leases, progress }));
+    let done = (
+        lease(),
+        number(),
+        "[0-9a-f]{0,64}",
+        number(),
+        any::<f64>(),
+        any::<bool>(),
+    )
+        .prop_map(|(lease, index, hex, bytes, seconds, adopted)| {
+            Say::Done(wire::TaskDone {
+                lease,
+                index,
+                task_key: format!("{hex:0>64}"),
+                manifest_sha256: hex,
+                bytes,
+                seconds,
+                adopted,
+            })
+        });
+    let failed =
+        (lease(), number(), -1..6i32, ".{0,60}").prop_map(|(lease, index, kind, message)| {
+            Say::Failed(wire::TaskFailed {
+                lease,
+                index,
+                kind,
+                message,
+            })
+        });
+    let release = (lease(), ".{0,20}")
+        .prop_map(|(lease, reason)| Say::Release(wire::Release { lease, reason }));
+    let credit = small().prop_map(|leases| Say::Credit(wire::Credit { leases }));
+    prop_oneof![hello, beat, done, failed, release, credit].prop_map(request_of)
+}
+
+/// The wire form of a job with some bytes changed, where that still is a message.
+fn spoilt_spec() -> impl Strategy<Value = Option<wire::JobSpec>> {
+    vec((any::<prop::sample::Index>(), any::<u8>()), 1..5).prop_map(|changes| {
+        let mut bytes = wire::JobSpec::from(good()).encode_to_vec();
+        for (at, byte) in changes {
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+        }
+        wire::JobSpec::decode(&bytes[..]).ok()
+    })
+}
+
+/// Draws values one after the other: proptest's own loop knows no asynchronous tests.
+struct Draws(TestRunner);
+
+impl Draws {
+    fn new() -> Self {
+        Self(TestRunner::new(Config::default()))
+    }
+
+    fn next<T>(&mut self, strategy: &impl Strategy<Value = T>) -> T {
+        strategy.new_tree(&mut self.0).unwrap().current()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
+    let server = Server::start().await;
+    let mut draws = Draws::new();
+    server.serves().await;
+
+    for case in 0..cases(150) {
+        // A session of random messages, most of which begin as they should.
+        let mut said = draws.next(&vec(say(), 0..40));
+        if case % 4 != 0 {
+            let id = Uuid::from_u128(u128::from(case % 4)).to_string();
+            said.insert(0, request_of(Say::Hello(hello(id))));
+        }
+        tokio::time::timeout(Duration::from_secs(30), server.session(said))
+            .await
+            .expect("the session ends");
+    }
+    server.settles_at((1, 0)).await;
+
+    let mut jobs = server.jobs();
+    let mut accepted = 1;
+    for _ in 0..cases(150) {
+        let spec = draws.next(&spoilt_spec());
+        let again = draws.next(&any::<bool>());
+        let plan = wire::PlanJobRequest { spec: spec.clone() };
+        let planned = jobs.plan_job(plan).await.is_ok();
+        let submit = wire::SubmitJobRequest { spec, again };
+        if let Ok(answer) = jobs.submit_job(submit).await {
+            let answer = answer.into_inner();
+            assert!(planned, "what can be submitted can be planned");
+            accepted += usize::from(!answer.existed);
+            let cancel = wire::CancelJobRequest {
+                job_id: answer.job_id,
+            };
+            jobs.cancel_job(cancel).await.unwrap();
+        }
+        let id = draws.next(&id());
+        let query = wire::ListEventsRequest {
+            job_id: id.clone(),
+            after: draws.next(&number()),
+            limit: draws.next(&small()),
+            task: Some(draws.next(&number())),
+        };
+        // Any answer will do; that there is one is the point.
+        let _ = jobs.list_events(query).await;
+        let _ = jobs
+            .get_job(wire::GetJobRequest { job_id: id.clone() })
+            .await;
+        let _ = jobs
+            .cancel_job(wire::CancelJobRequest { job_id: id.clone() })
+            .await;
+        let _ = jobs
+            .retry_job(wire::RetryJobRequest { job_id: id.clone() })
+            .await;
+        let _ = jobs.watch_job(wire::WatchJobRequest { job_id: id }).await;
+    }
+    server.settles_at((accepted, 0)).await;
+    server.serves().await;
+    assert_eq!(PANICS.load(Ordering::SeqCst), 0, "somebody panicked");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn messages_beyond_their_limit_are_refused_by_name_and_leave_nothing_behind() {
+    let server = Server::start().await;
+    let huge = wire::LeaseRef {
+        range_id: "x".repeat(1000),
+        epoch: 1,
+    };
+    let mut first = hello(Uuid::new_v4().to_string());
+    first.held = vec![huge; 2000];
+    let mut client = FarmClient::new(server.channel.clone());
+    let said = tokio_stream::iter([request_of(Say::Hello(first))]);
+    let mut heard = client.session(said).await.unwrap().into_inner();
+    let refused = heard.message().await.unwrap_err();
+    assert_eq!(refused.code(), tonic::Code::OutOfRange, "{refused:?}");
+
+    let mut spec = good();
+    spec.scenes.count = 50_000_000;
+    let submit = wire::SubmitJobRequest {
+        spec: Some(spec.into()),
+        again: false,
+    };
+    let refused = server.jobs().submit_job(submit).await.unwrap_err();
+    assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
+    assert!(
+        refused.message().contains("--max-tasks-per-job"),
+        "{refused:?}"
+    );
+
+    let mut climbing = good();
+    climbing.output.store = "file:///data/%2E./etc".into();
+    let plan = wire::PlanJobRequest {
+        spec: Some(climbing.into()),
+    };
+    let refused = server.jobs().plan_job(plan).await.unwrap_err();
+    assert!(refused.message().contains("output.store"), "{refused:?}");
+    server.settles_at((0, 0)).await;
+    server.serves().await;
+}

@@ -1,0 +1,353 @@
+//! Who gets in: real processes with certificates and tokens, right and wrong ones, and what each is told.
+
+use std::{fs, os::unix::fs::PermissionsExt, path::Path};
+
+use picofarm_tests::{Cli, Job, Process, Scratch, store, wait::until};
+use rcgen::{
+    BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair, date_time_ymd,
+};
+
+type Authority = CertifiedIssuer<'static, KeyPair>;
+
+fn private(path: &Path, text: &str) {
+    fs::write(path, text).unwrap();
+    fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();
+}
+
+/// A certificate authority; its certificate goes to `NAME.pem`.
+fn authority(scratch: &Scratch, name: &str) -> Authority {
+    let mut params = CertificateParams::new(Vec::new()).unwrap();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    params.distinguished_name.push(DnType::CommonName, name);
+    let issuer = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
+    fs::write(scratch.join(&format!("{name}.pem")), issuer.pem()).unwrap();
+    issuer
+}
+
+/// A certificate for `host` with the common name `name`, in `NAME.pem` and `NAME.key`.
+fn certificate(scratch: &Scratch, by: &Authority, name: &str, host: &str, until: i32) {
+    let mut params = CertificateParams::new(vec![host.to_owned()]).unwrap();
+    params.distinguished_name.push(DnType::CommonName, name);
+    params.not_before = date_time_ymd(2000, 1, 1);
+    params.not_after = date_time_ymd(until, 1, 1);
+    let key = KeyPair::generate().unwrap();
+    let signed = params.signed_by(&key, by).unwrap();
+    fs::write(scratch.join(&format!("{name}.pem")), signed.pem()).unwrap();
+    private(&scratch.join(&format!("{name}.key")), &key.serialize_pem());
+}
+
+/// Starts a coordinator and waits for its URL.
+fn coordinator(cli: &Cli, options: &[&str]) -> (Process, String) {
+    let args = [
+        "coordinator",
+        "--json",
+        "--catalog",
+        "catalog.sqlite",
+        "--listen",
+        "127.0.0.1:0",
+    ];
+    let mut process = cli.start("coordinator", &[&args[..], options].concat());
+    let document: serde_json::Value = serde_json::from_str(&process.first_line()).unwrap();
+    let url = document["coordinator"].as_str().unwrap().to_owned();
+    (process, url)
+}
+
+fn token(cli: &Cli, name: &str, roles: &str) -> String {
+    let args = [
+        "token",
+        "create",
+        "--tokens",
+        "tokens.toml",
+        "--name",
+        name,
+        "--role",
+        roles,
+    ];
+    let made = cli.json(&args);
+    made["token"].as_str().unwrap().to_owned()
+}
+
+#[test]
+fn the_right_certificate_and_token_are_let_in_and_all_others_are_told_why_not() {
+    let scratch = Scratch::new("security");
+    let cli = Cli::new(scratch.path());
+    let ours = authority(&scratch, "ours");
+    authority(&scratch, "theirs");
+    certificate(&scratch, &ours, "server", "localhost", 4000);
+    let worker = token(&cli, "worker", "work");
+    let ada = token(&cli, "ada", "submit");
+    let eve = token(&cli, "eve", "view");
+    let tls = [
+        "--tls-cert",
+        "server.pem",
+        "--tls-key",
+        "server.key",
+        "--tokens",
+        "tokens.toml",
+    ];
+    let trace = [&tls[..], &["--log", "trace"]].concat();
+    let (mut process, url) = coordinator(&cli, &trace);
+    assert!(url.starts_with("https://localhost:"), "{url}");
+    let port = url.rsplit(':').next().unwrap().to_owned();
+    let at = |cli: &Cli, url: &str| cli.clone().with("PICOFARM_COORDINATOR", url);
+    let trusting = at(&cli, &url).with("PICOFARM_CA", "ours.pem");
+    let with = |token: &str| trusting.clone().with("PICOFARM_TOKEN", token);
+
+    // Tokens.
+    let list = ["job", "list"];
+    with(&ada).run(&list).ok();
+    with(&eve).run(&list).ok();
+    trusting
+        .run(&list)
+        .fails(4, &["wants a token", "PICOFARM_TOKEN"]);
+    with("pf-wrong")
+        .run(&list)
+        .fails(4, &["not known", "revoked"]);
+    with(&worker)
+        .run(&list)
+        .fails(4, &["\"worker\"", "needs the role view", "has work"]);
+    let job = Job::quick(&scratch.join("store"), 1);
+    job.write(&scratch.join("job.toml"));
+    let submit = ["job", "submit", "job.toml"];
+    with(&eve)
+        .run(&submit)
+        .fails(4, &["\"eve\"", "needs the role submit", "has view"]);
+    private(&scratch.join("ada.token"), &format!("{ada}\n"));
+    let from_file = [&list[..], &["--token-file", "ada.token"]].concat();
+    trusting.run(&from_file).ok();
+    fs::set_permissions(scratch.join("ada.token"), fs::Permissions::from_mode(0o644)).unwrap();
+    trusting
+        .run(&from_file)
+        .fails(3, &["ada.token", "chmod o-rwx"]);
+
+    // Certificates.
+    at(&cli, &url)
+        .with("PICOFARM_CA", "theirs.pem")
+        .run(&list)
+        .fails(4, &["not signed by", "theirs.pem", "--ca"]);
+    at(&cli, &url)
+        .with("PICOFARM_CA", "nowhere.pem")
+        .run(&list)
+        .fails(3, &["nowhere.pem"]);
+    at(&cli, &url)
+        .with("PICOFARM_CA", "server.key")
+        .run(&list)
+        .fails(3, &["server.key", "BEGIN CERTIFICATE"]);
+    at(&trusting, &format!("https://127.0.0.1:{port}"))
+        .run(&list)
+        .fails(4, &["is not for \"127.0.0.1\""]);
+    at(&trusting, &format!("http://127.0.0.1:{port}"))
+        .run(&list)
+        .fails(4, &["speaks TLS", "https://"]);
+    at(&trusting, "http://farm.example:1")
+        .with("PICOFARM_TOKEN", &ada)
+        .run(&list)
+        .fails(3, &["in the clear"]);
+
+    // A worker without the role, one with it, and what it does.
+    let work = ["worker", "--threads", "1", "--log", "trace", "--name"];
+    with(&ada)
+        .run(&[&work[..], &["ada"]].concat())
+        .fails(4, &["needs the role work"]);
+    trusting
+        .run(&[&work[..], &["nobody"]].concat())
+        .fails(4, &["wants a token"]);
+    let works = with(&worker).start("worker", &[&work[..], &["w"]].concat());
+    with(&ada).run(&[&submit[..], &["--watch"]].concat()).ok();
+    assert_eq!(store::finished(&job.place()), [0]);
+
+    // Revoked.
+    cli.run(&["token", "revoke", "--tokens", "tokens.toml", "worker"])
+        .ok();
+    works.end().fails(4, &["\"worker\" was revoked"]);
+    cli.run(&["token", "revoke", "--tokens", "tokens.toml", "ada"])
+        .ok();
+    until("ada's end", || {
+        let refused = with(&ada).run(&list);
+        (refused.code == Some(4)).then_some(())
+    });
+    with(&eve).run(&list).ok();
+    assert!(process.runs());
+    drop(process);
+
+    for entry in fs::read_dir(scratch.path()).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|e| e == "stderr") {
+            let log = fs::read_to_string(&path).unwrap();
+            for token in [&ada, &eve, &worker] {
+                assert!(
+                    !log.contains(&token[3..]),
+                    "{} holds a token",
+                    path.display()
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn mutual_tls_lets_in_whom_the_authority_signed() {
+    let scratch = Scratch::new("mutual-tls");
+    let cli = Cli::new(scratch.path());
+    let ours = authority(&scratch, "ours");
+    let theirs = authority(&scratch, "theirs");
+    certificate(&scratch, &ours, "server", "localhost", 4000);
+    certificate(&scratch, &ours, "ada", "ada.example", 4000);
+    certificate(&scratch, &theirs, "eve", "eve.example", 4000);
+    certificate(&scratch, &ours, "old", "old.example", 2001);
+    let tls = [
+        "--tls-cert",
+        "server.pem",
+        "--tls-key",
+        "server.key",
+        "--client-ca",
+        "ours.pem",
+    ];
+    let (_process, url) = coordinator(&cli, &tls);
+    let trusting = cli
+        .clone()
+        .with("PICOFARM_COORDINATOR", &url)
+        .with("PICOFARM_CA", "ours.pem");
+    let as_of = |name: &str| {
+        let (cert, key) = (format!("{name}.pem"), format!("{name}.key"));
+        trusting
+            .clone()
+            .with("PICOFARM_CERT", &cert)
+            .with("PICOFARM_KEY", &key)
+    };
+    let list = ["job", "list"];
+    as_of("ada").run(&list).ok();
+    trusting
+        .run(&list)
+        .fails(4, &["wants a client certificate", "--cert"]);
+    as_of("eve")
+        .run(&list)
+        .fails(4, &["does not know the authority", "--client-ca"]);
+    as_of("old")
+        .run(&list)
+        .fails(3, &["old.pem", "has expired"]);
+    let mixed = trusting
+        .clone()
+        .with("PICOFARM_CERT", "ada.pem")
+        .with("PICOFARM_KEY", "eve.key");
+    mixed
+        .run(&list)
+        .fails(3, &["eve.key", "does not match", "ada.pem"]);
+    trusting
+        .clone()
+        .with("PICOFARM_CERT", "ada.pem")
+        .run(&list)
+        .fails(3, &["--cert needs --key"]);
+
+    let job = Job::quick(&scratch.join("store"), 2);
+    job.write(&scratch.join("job.toml"));
+    let _worker = as_of("ada").start("worker", &["worker", "--threads", "1"]);
+    as_of("ada")
+        .run(&["job", "submit", "job.toml", "--watch"])
+        .ok();
+    assert_eq!(store::finished(&job.place()), [0, 1]);
+}
+
+#[test]
+fn a_coordinator_with_unusable_files_says_which() {
+    let scratch = Scratch::new("security-files");
+    let cli = Cli::new(scratch.path());
+    let ours = authority(&scratch, "ours");
+    certificate(&scratch, &ours, "server", "localhost", 4000);
+    certificate(&scratch, &ours, "other", "localhost", 4000);
+    certificate(&scratch, &ours, "old", "localhost", 2001);
+    fs::write(scratch.join("broken.toml"), "[[caller]]\nname = 3\n").unwrap();
+    fs::set_permissions(
+        scratch.join("broken.toml"),
+        fs::Permissions::from_mode(0o600),
+    )
+    .unwrap();
+    let start = ["coordinator", "--allow-insecure", "--listen", "127.0.0.1:0"];
+    let run = |options: &[&str]| cli.run(&[&start[..], options].concat());
+    let tls = |cert, key| run(&["--tls-cert", cert, "--tls-key", key]);
+    tls("nowhere.pem", "server.key").fails(3, &["nowhere.pem"]);
+    tls("server.key", "server.key").fails(3, &["server.key", "BEGIN CERTIFICATE"]);
+    tls("server.pem", "server.pem").fails(3, &["server.pem"]);
+    tls("server.pem", "other.key").fails(3, &["other.key", "does not match", "server.pem"]);
+    run(&["--tls-cert", "server.pem"]).fails(2, &["--tls-key"]);
+    run(&["--tokens", "nowhere.toml"]).fails(3, &["nowhere.toml"]);
+    run(&["--tokens", "broken.toml"]).fails(3, &["broken.toml", "name"]);
+
+    // An expired certificate is the clients' to refuse, and a plain port is told from one with TLS.
+    let old = [
+        "--allow-insecure",
+        "--tls-cert",
+        "old.pem",
+        "--tls-key",
+        "old.key",
+    ];
+    let (process, url) = coordinator(&cli, &old);
+    let trusting = cli.clone().with("PICOFARM_CA", "ours.pem");
+    trusting
+        .clone()
+        .with("PICOFARM_COORDINATOR", &url)
+        .run(&["job", "list"])
+        .fails(4, &["has expired"]);
+    drop(process);
+    let (_process, url) = coordinator(&cli, &["--allow-insecure"]);
+    let secure = url.replace("http://", "https://");
+    trusting
+        .with("PICOFARM_COORDINATOR", &secure)
+        .run(&["job", "list"])
+        .fails(4, &["does not speak TLS", "http://"]);
+}
+
+#[test]
+fn a_worker_touches_only_its_store_prefixes() {
+    let farm = picofarm_tests::Farm::start("store-prefix");
+    let elsewhere = farm.scratch.join("elsewhere").display().to_string();
+    let job = Job {
+        max_failures: 1,
+        ..Job::quick(&farm.store(), 1)
+    };
+    let id = farm.submit(&job);
+    let args = ["worker", "--threads", "1", "--store-prefix", &elsewhere];
+    let _worker = farm.cli().start("worker", &args);
+    assert_eq!(farm.until_ended(&id)["state"], "failed");
+    let dead = farm.events_of(&id, "dead");
+    let message = dead[0]["message"].as_str().unwrap();
+    assert!(
+        message.contains("output.store") && message.contains("--store-prefix"),
+        "{message}"
+    );
+    assert!(!farm.store().exists());
+}
+
+#[test]
+fn limits_are_named_when_they_are_reached() {
+    let scratch = Scratch::new("limits");
+    let cli = Cli::new(scratch.path());
+    let limits = [
+        "--allow-insecure",
+        "--max-jobs-per-user",
+        "1",
+        "--max-tasks-per-job",
+        "5",
+    ];
+    let (_process, url) = coordinator(&cli, &limits);
+    let cli = cli.with("PICOFARM_COORDINATOR", &url);
+    let submit = |name: &str, count| {
+        let job = Job {
+            dataset: name.into(),
+            ..Job::quick(&scratch.join("store"), count)
+        };
+        job.write(&scratch.join("job.toml"));
+        cli.run(&["job", "submit", "job.toml", "--json"])
+    };
+    submit("big", 6).fails(7, &["6 tasks", "--max-tasks-per-job"]);
+    let first = submit("one", 5).ok().json();
+    submit("two", 5).fails(7, &["--max-jobs-per-user"]);
+    assert_eq!(
+        submit("one", 5).ok().json()["job"],
+        first["job"],
+        "it is there already"
+    );
+    cli.run(&["job", "cancel", first["job"].as_str().unwrap()])
+        .ok();
+    submit("two", 5).ok();
+}
