@@ -48,7 +48,12 @@ pub fn describe(explained: &Explained) -> String {
             duration(output.seconds)
         );
         if let Some(made) = &output.made {
-            text += &format!("  committed {} by {} under job {}\n", clock(made.at_ms), made.worker, made.job);
+            text += &format!(
+                "  committed {} by {} under job {}\n",
+                clock(made.at_ms),
+                made.worker,
+                made.job
+            );
         }
     }
     if !task.events.is_empty() {
@@ -72,11 +77,20 @@ pub async fn workers(settings: &Settings, output: Output) -> Result<()> {
 }
 
 fn describe_workers(all: &Workers) -> String {
-    let mut text = format!("coordinator ({}): {} connected\n", all.coordinator, all.workers.len());
+    let mut text = format!(
+        "coordinator ({}): {} connected\n",
+        all.coordinator,
+        all.workers.len()
+    );
     if !all.workers.is_empty() {
-        let header = ["worker", "version", "cores", "leases", "tasks", "since", ""].map(String::from);
+        let header =
+            ["worker", "version", "cores", "leases", "tasks", "since", ""].map(String::from);
         let rows = all.workers.iter().map(|w| {
-            let note = if w.quarantined { "on probation: its range crashed others" } else { "" };
+            let note = if w.quarantined {
+                "on probation: its range crashed others"
+            } else {
+                ""
+            };
             vec![
                 w.name.clone(),
                 w.version.clone(),
@@ -87,7 +101,11 @@ fn describe_workers(all: &Workers) -> String {
                 note.to_owned(),
             ]
         });
-        text += &table(&std::iter::once(header.to_vec()).chain(rows).collect::<Vec<_>>());
+        text += &table(
+            &std::iter::once(header.to_vec())
+                .chain(rows)
+                .collect::<Vec<_>>(),
+        );
     }
     if all.coordinators > 1 {
         text += &format!(

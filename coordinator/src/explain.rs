@@ -3,7 +3,10 @@
 use picofarm_catalog::{Exception, Holdups, RangeState, TaskRecord};
 use picofarm_proto::{
     ids::JobId,
-    model::{Event, EventKind, JobState, Limits, Made, Reason, TaskCounts, TaskExplanation, TaskOutput, TaskState},
+    model::{
+        Event, EventKind, JobState, Limits, Made, Reason, TaskCounts, TaskExplanation, TaskOutput,
+        TaskState,
+    },
 };
 
 /// A connected worker with regard to a job.
@@ -149,7 +152,11 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
         let last = last_error(failed.iter().filter(|e| !e.dead));
         let words = format!(
             "{} after a failure before the next attempt{soon}{last}",
-            if *waiting == 1 { "1 task waits".into() } else { format!("{waiting} tasks wait") }
+            if *waiting == 1 {
+                "1 task waits".into()
+            } else {
+                format!("{waiting} tasks wait")
+            }
         );
         reasons.push(Reason {
             until_ms: *next_ms,
@@ -163,17 +170,30 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     let tasks = n(ready, "task");
     let others = match facts.elsewhere {
         0 => String::new(),
-        count => format!("; {} connected to other coordinators, which this one cannot ask", are(count)),
+        count => format!(
+            "; {} connected to other coordinators, which this one cannot ask",
+            are(count)
+        ),
     };
     if facts.candidates.is_empty() {
         let words = match facts.elsewhere {
-            0 => format!("no worker is connected, and {tasks} could run: start one with `picofarm worker`"),
+            0 => format!(
+                "no worker is connected, and {tasks} could run: start one with `picofarm worker`"
+            ),
             _ => format!("no worker is connected here for {tasks}{others}"),
         };
-        let code = if facts.elsewhere == 0 { "no_workers" } else { "elsewhere" };
+        let code = if facts.elsewhere == 0 {
+            "no_workers"
+        } else {
+            "elsewhere"
+        };
         return reason(code, ready, words);
     }
-    let able: Vec<_> = facts.candidates.iter().filter(|c| c.may_run.is_ok()).collect();
+    let able: Vec<_> = facts
+        .candidates
+        .iter()
+        .filter(|c| c.may_run.is_ok())
+        .collect();
     if able.is_empty() {
         let mut whys: Vec<(&str, &str)> = facts
             .candidates
@@ -182,13 +202,26 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
             .collect();
         whys.sort_unstable();
         whys.dedup_by_key(|(why, _)| *why);
-        let whys: Vec<String> = whys.iter().map(|(why, name)| format!("{why} ({name})")).collect();
-        let words = format!("no connected worker may run {tasks}: {}{others}", whys.join("; "));
+        let whys: Vec<String> = whys
+            .iter()
+            .map(|(why, name)| format!("{why} ({name})"))
+            .collect();
+        let words = format!(
+            "no connected worker may run {tasks}: {}{others}",
+            whys.join("; ")
+        );
         return reason("unable", ready, words);
     }
     let idle = able.iter().filter(|c| c.idle && !c.quarantined).count();
     if idle > 0 {
-        let words = format!("{tasks} about to be leased: {} for work", if idle == 1 { "1 worker asks".into() } else { format!("{idle} workers ask") });
+        let words = format!(
+            "{tasks} about to be leased: {} for work",
+            if idle == 1 {
+                "1 worker asks".into()
+            } else {
+                format!("{idle} workers ask")
+            }
+        );
         return reason("starting", ready, words);
     }
     if let Some(first) = facts.ahead.first() {
@@ -206,14 +239,22 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     };
     let words = format!(
         "{tasks} behind others: {} that may run them {} busy{probation}{others}",
-        if able.len() == 1 { "the one worker".into() } else { format!("all {} workers", able.len()) },
+        if able.len() == 1 {
+            "the one worker".into()
+        } else {
+            format!("all {} workers", able.len())
+        },
         if able.len() == 1 { "is" } else { "are" },
     );
     reason("busy", ready, words)
 }
 
 fn are(count: u32) -> String {
-    if count == 1 { "1 worker is".into() } else { format!("{count} workers are") }
+    if count == 1 {
+        "1 worker is".into()
+    } else {
+        format!("{count} workers are")
+    }
 }
 
 /// What became of a task and why.
@@ -280,7 +321,11 @@ fn leased(facts: &TaskFacts) -> String {
             f64::from(*fraction) * 100.0
         );
     }
-    let granted = facts.events.iter().rev().find(|e| e.kind == EventKind::Leased);
+    let granted = facts
+        .events
+        .iter()
+        .rev()
+        .find(|e| e.kind == EventKind::Leased);
     match granted {
         Some(event) => format!(
             "leased to {} for {}, which has not reported on it yet: it works on others of the same lease, or has only begun",
@@ -295,9 +340,15 @@ fn done(facts: &TaskFacts, output: Option<&TaskOutput>) -> String {
     let Some(output) = output else {
         return "done".to_owned();
     };
-    let how = if output.adopted { "found in the store" } else { "computed" };
+    let how = if output.adopted {
+        "found in the store"
+    } else {
+        "computed"
+    };
     match &output.made {
-        Some(made) if made.job == facts.job => format!("done: {how} by {} under this job", made.worker),
+        Some(made) if made.job == facts.job => {
+            format!("done: {how} by {} under this job", made.worker)
+        }
         Some(made) => format!(
             "reused: {how} by {} under job {} ({})",
             made.worker, made.job, made.job_name
@@ -362,7 +413,10 @@ fn reruns(events: &[Event]) -> Vec<String> {
             EventKind::Expired => format!("{} was lost with it: {}", event.worker, event.message),
             EventKind::Released => format!("{} gave it back: {}", event.worker, event.message),
             EventKind::Failed => format!("it failed on {}: {}", event.worker, event.message),
-            EventKind::Dead => format!("it was given up on {}: {}, and then tried again", event.worker, event.message),
+            EventKind::Dead => format!(
+                "it was given up on {}: {}, and then tried again",
+                event.worker, event.message
+            ),
             EventKind::Retried => "its job was retried".to_owned(),
             _ => continue,
         };

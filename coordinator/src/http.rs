@@ -86,7 +86,9 @@ impl Pulse {
         }
         let what = match state.beaten.map(|at| at.elapsed()) {
             None => "the catalog has not answered yet".into(),
-            Some(age) if age > READY => format!("the catalog has not answered for {} s", age.as_secs()),
+            Some(age) if age > READY => {
+                format!("the catalog has not answered for {} s", age.as_secs())
+            }
             Some(_) => return Ok(()),
         };
         Err(Unready { what, detail: None })
@@ -150,7 +152,11 @@ impl Answer {
     }
 
     fn bytes(&self, with_body: bool) -> Vec<u8> {
-        let allow = if self.status.starts_with("405") { "Allow: GET, HEAD\r\n" } else { "" };
+        let allow = if self.status.starts_with("405") {
+            "Allow: GET, HEAD\r\n"
+        } else {
+            ""
+        };
         let head = format!(
             "HTTP/1.1 {}\r\nContent-Type: text/plain; version=0.0.4; charset=utf-8\r\nContent-Length: {}\r\n\
              Cache-Control: no-store\r\n{allow}Connection: close\r\n\r\n",
@@ -170,10 +176,15 @@ fn request_line(head: &str) -> Result<(&str, &str), Answer> {
     let line = head.lines().next().unwrap_or_default();
     let mut words = line.split(' ');
     match (words.next(), words.next(), words.next(), words.next()) {
-        (Some(method), Some(target), Some("HTTP/1.1" | "HTTP/1.0"), None) if target.starts_with('/') => {
+        (Some(method), Some(target), Some("HTTP/1.1" | "HTTP/1.0"), None)
+            if target.starts_with('/') =>
+        {
             Ok((method, target.split('?').next().unwrap_or(target)))
         }
-        _ => Err(Answer::new("400 Bad Request", "expected GET /PATH HTTP/1.1\n")),
+        _ => Err(Answer::new(
+            "400 Bad Request",
+            "expected GET /PATH HTTP/1.1\n",
+        )),
     }
 }
 
@@ -184,7 +195,10 @@ async fn head(stream: &mut (impl AsyncRead + Unpin)) -> Result<String, Answer> {
         let mut piece = [0; 1024];
         while !read.windows(4).any(|end| end == b"\r\n\r\n") {
             if read.len() > HEAD {
-                return Err(Answer::new("431 Request Header Fields Too Large", "the request is too long\n"));
+                return Err(Answer::new(
+                    "431 Request Header Fields Too Large",
+                    "the request is too long\n",
+                ));
             }
             match stream.read(&mut piece).await {
                 Ok(n) if n > 0 => read.extend_from_slice(&piece[..n]),
@@ -224,7 +238,10 @@ impl Pages {
                 let ready = self.pulse.ready().is_ok();
                 Answer::new("200 OK", self.metrics.page(self.gauges().await, ready))
             }
-            _ => Answer::new("404 Not Found", "there are /healthz, /readyz and /metrics\n"),
+            _ => Answer::new(
+                "404 Not Found",
+                "there are /healthz, /readyz and /metrics\n",
+            ),
         }
     }
 
@@ -235,7 +252,10 @@ impl Pages {
             Ok(_) => Answer::new("200 OK", "ok\n"),
             Err(_) if self.pulse.mends() => Answer::new("200 OK", "ok, waiting for the catalog\n"),
             Err(_) => {
-                let words = format!("the coordinator has not answered for {} s\n", ALIVE.as_secs());
+                let words = format!(
+                    "the coordinator has not answered for {} s\n",
+                    ALIVE.as_secs()
+                );
                 Answer::new("503 Service Unavailable", words)
             }
         }
@@ -296,12 +316,21 @@ mod tests {
     #[test]
     fn readiness_follows_the_catalog() {
         let pulse = Pulse::default();
-        assert!(pulse.ready().unwrap_err().to_string().contains("not answered yet"));
+        assert!(
+            pulse
+                .ready()
+                .unwrap_err()
+                .to_string()
+                .contains("not answered yet")
+        );
         pulse.beat();
         assert_eq!(pulse.ready(), Ok(()));
         pulse.trouble("no route to db.example");
         let why = pulse.ready().unwrap_err();
-        assert!(!why.to_string().contains("db.example"), "hosts are for this machine alone");
+        assert!(
+            !why.to_string().contains("db.example"),
+            "hosts are for this machine alone"
+        );
         assert_eq!(why.detail.as_deref(), Some("no route to db.example"));
         assert!(pulse.mends());
         pulse.beat();
@@ -317,9 +346,17 @@ mod tests {
             let head = head(&mut text.as_bytes()).await?;
             request_line(&head).map(|(m, p)| (m.to_owned(), p.to_owned()))
         };
-        let good = line("GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n").await.unwrap();
+        let good = line("GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n")
+            .await
+            .unwrap();
         assert_eq!(good, ("GET".into(), "/metrics".into()));
-        for bad in ["GET /metrics", "GET\r\n\r\n", "\r\n\r\n", "GET x HTTP/1.1\r\n\r\n", "GET / HTTP/2\r\n\r\n"] {
+        for bad in [
+            "GET /metrics",
+            "GET\r\n\r\n",
+            "\r\n\r\n",
+            "GET x HTTP/1.1\r\n\r\n",
+            "GET / HTTP/2\r\n\r\n",
+        ] {
             let answer = line(bad).await.unwrap_err();
             assert_eq!(answer.status, "400 Bad Request", "{bad:?}");
         }
@@ -332,7 +369,10 @@ mod tests {
     fn an_answer_to_head_has_no_body() {
         let answer = Answer::new("200 OK", "ready\n");
         let bytes = String::from_utf8(answer.bytes(false)).unwrap();
-        assert!(bytes.contains("Content-Length: 6\r\n") && bytes.ends_with("\r\n\r\n"), "{bytes}");
+        assert!(
+            bytes.contains("Content-Length: 6\r\n") && bytes.ends_with("\r\n\r\n"),
+            "{bytes}"
+        );
         let bytes = String::from_utf8(answer.bytes(true)).unwrap();
         assert!(bytes.ends_with("\r\n\r\nready\n"), "{bytes}");
     }

@@ -139,7 +139,15 @@ impl Tally {
                 self.seconds.push(output.seconds);
             }
         }
-        let refused = |(_, say): &&(SessionId, Say)| matches!(say, Say::Acknowledge { accepted: false, .. });
+        let refused = |(_, say): &&(SessionId, Say)| {
+            matches!(
+                say,
+                Say::Acknowledge {
+                    accepted: false,
+                    ..
+                }
+            )
+        };
         self.refused += say.iter().filter(refused).count() as u64;
     }
 }
@@ -197,9 +205,18 @@ impl Metrics {
     /// The text that Prometheus reads. `gauges` is missing where the catalog cannot be read.
     pub(crate) fn page(&self, gauges: Option<Gauges>, ready: bool) -> String {
         let mut page = Page(String::with_capacity(16 << 10));
-        page.family("build_info", "gauge", "Version of this coordinator; always 1.");
+        page.family(
+            "build_info",
+            "gauge",
+            "Version of this coordinator; always 1.",
+        );
         page.sample("build_info", &[("version", VERSION)], 1);
-        page.one("ready", "gauge", "Whether the catalog answers (1) or not (0), as /readyz says.", u8::from(ready));
+        page.one(
+            "ready",
+            "gauge",
+            "Whether the catalog answers (1) or not (0), as /readyz says.",
+            u8::from(ready),
+        );
         if let Some(gauges) = gauges {
             page.gauges(&gauges);
         }
@@ -209,7 +226,12 @@ impl Metrics {
     }
 
     fn counters(&self, page: &mut Page) {
-        page.one("leases_granted_total", "counter", "Leases granted to workers.", self.granted.load(Relaxed));
+        page.one(
+            "leases_granted_total",
+            "counter",
+            "Leases granted to workers.",
+            self.granted.load(Relaxed),
+        );
         page.one(
             "leases_expired_total",
             "counter",
@@ -232,8 +254,17 @@ impl Metrics {
         );
         page.sample(name, &[("kind", "user")], self.user.load(Relaxed));
         page.sample(name, &[("kind", "crash")], self.crash.load(Relaxed));
-        page.sample(name, &[("kind", "interrupted")], self.interrupted.load(Relaxed));
-        page.one("tasks_dead_total", "counter", "Tasks given up.", self.dead.load(Relaxed));
+        page.sample(
+            name,
+            &[("kind", "interrupted")],
+            self.interrupted.load(Relaxed),
+        );
+        page.one(
+            "tasks_dead_total",
+            "counter",
+            "Tasks given up.",
+            self.dead.load(Relaxed),
+        );
         page.one(
             "reports_refused_total",
             "counter",
@@ -243,15 +274,33 @@ impl Metrics {
     }
 
     fn histograms(&self, page: &mut Page) {
-        page.family("catalog_commit_seconds", "histogram", "Time of a commit to the catalog.");
+        page.family(
+            "catalog_commit_seconds",
+            "histogram",
+            "Time of a commit to the catalog.",
+        );
         page.histogram("catalog_commit_seconds", None, &self.commit);
-        page.family("batch_messages", "histogram", "Messages handled in one commit.");
+        page.family(
+            "batch_messages",
+            "histogram",
+            "Messages handled in one commit.",
+        );
         page.histogram("batch_messages", None, &self.batch);
-        page.family("task_seconds", "histogram", "Time of a computed task on its worker.");
+        page.family(
+            "task_seconds",
+            "histogram",
+            "Time of a computed task on its worker.",
+        );
         page.histogram("task_seconds", None, &self.task);
         let name = "grpc_request_seconds";
-        page.family(name, "histogram", "Time to the answer of a gRPC call, of a stream to its beginning.");
-        let methods = METHODS.iter().map(|(path, _)| path.trim_start_matches("/picofarm.v1."));
+        page.family(
+            name,
+            "histogram",
+            "Time to the answer of a gRPC call, of a stream to its beginning.",
+        );
+        let methods = METHODS
+            .iter()
+            .map(|(path, _)| path.trim_start_matches("/picofarm.v1."));
         for (method, calls) in methods.chain(["other"]).zip(&self.calls) {
             page.histogram(name, Some(("method", method)), calls);
         }
@@ -263,13 +312,20 @@ struct Page(String);
 
 impl Page {
     fn family(&mut self, name: &str, kind: &str, help: &str) {
-        let _ = writeln!(self.0, "# HELP picofarm_{name} {help}\n# TYPE picofarm_{name} {kind}");
+        let _ = writeln!(
+            self.0,
+            "# HELP picofarm_{name} {help}\n# TYPE picofarm_{name} {kind}"
+        );
     }
 
     fn sample(&mut self, name: &str, labels: &[(&str, &str)], value: impl Display) {
         let _ = write!(self.0, "picofarm_{name}");
         for (i, (label, text)) in labels.iter().enumerate() {
-            let _ = write!(self.0, "{}{label}=\"{text}\"", if i == 0 { '{' } else { ',' });
+            let _ = write!(
+                self.0,
+                "{}{label}=\"{text}\"",
+                if i == 0 { '{' } else { ',' }
+            );
         }
         let end = if labels.is_empty() { "" } else { "}" };
         let _ = writeln!(self.0, "{end} {value}");
@@ -295,10 +351,30 @@ impl Page {
         ] {
             self.sample("tasks", &[("state", state)], count);
         }
-        self.one("tasks_pending", "gauge", "Tasks that wait for workers: what to scale workers by. Of the whole farm.", tasks.pending);
-        self.one("jobs_active", "gauge", "Jobs that have not ended. Of the whole farm.", jobs);
-        self.one("workers", "gauge", "Workers connected to this coordinator.", gauges.workers);
-        self.one("houses", "gauge", "Coordinators of the catalog that are alive. Of the whole farm.", gauges.houses);
+        self.one(
+            "tasks_pending",
+            "gauge",
+            "Tasks that wait for workers: what to scale workers by. Of the whole farm.",
+            tasks.pending,
+        );
+        self.one(
+            "jobs_active",
+            "gauge",
+            "Jobs that have not ended. Of the whole farm.",
+            jobs,
+        );
+        self.one(
+            "workers",
+            "gauge",
+            "Workers connected to this coordinator.",
+            gauges.workers,
+        );
+        self.one(
+            "houses",
+            "gauge",
+            "Coordinators of the catalog that are alive. Of the whole farm.",
+            gauges.houses,
+        );
     }
 
     fn histogram(&mut self, name: &str, label: Option<(&str, &str)>, histogram: &Histogram) {
@@ -306,7 +382,10 @@ impl Page {
         let mut count = 0;
         for (at, counted) in histogram.counts.iter().enumerate() {
             count += counted.load(Relaxed);
-            let bound = histogram.bounds.get(at).map_or_else(|| "+Inf".to_owned(), f64::to_string);
+            let bound = histogram
+                .bounds
+                .get(at)
+                .map_or_else(|| "+Inf".to_owned(), f64::to_string);
             let labels = [&labels[..], &[("le", &*bound)]].concat();
             self.sample(&format!("{name}_bucket"), &labels, count);
         }

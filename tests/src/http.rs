@@ -27,6 +27,8 @@ pub fn get(url: &str) -> Option<(u16, String)> {
 
 /// The value of a sample on a page of metrics, its labels as they are written there.
 pub fn sample(page: &str, name: &str) -> Option<f64> {
-    let line = page.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '))?;
+    let line = page
+        .lines()
+        .find_map(|line| line.strip_prefix(name)?.strip_prefix(' '))?;
     line.parse().ok()
 }

@@ -53,9 +53,9 @@ impl Postgres {
             .clone_into(&mut self.url);
     }
 
-    /// Ends it without a word to anyone.
+    /// Ends it in order: connections break, what was committed stays.
     pub fn down(&self) {
-        script(&["stop", &self.dir.display().to_string(), "immediate"]);
+        script(&["stop", &self.dir.display().to_string()]);
     }
 
     /// Ends it without a word to anyone and starts it again: it recovers what was committed.
@@ -63,7 +63,7 @@ impl Postgres {
     /// # Panics
     /// When it does not come back.
     pub fn crash(&mut self) {
-        self.down();
+        script(&["stop", &self.dir.display().to_string(), "immediate"]);
         self.up();
     }
 }

@@ -11,21 +11,38 @@ use serde_json::Value;
 /// A coordinator with an HTTP endpoint, and the addresses of both.
 fn coordinator(cli: &Cli) -> (Process, String, String) {
     let args = ["coordinator", "--allow-insecure", "--json", "--log", "info"];
-    let more = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--lease-s", "300"];
+    let more = [
+        "--listen",
+        "127.0.0.1:0",
+        "--http",
+        "127.0.0.1:0",
+        "--lease-s",
+        "300",
+    ];
     let mut process = cli.start("coordinator", &[&args[..], &more].concat());
     let line: Value = serde_json::from_str(&process.first_line()).expect("the first line is JSON");
-    let address = |name: &str| line[name].as_str().expect("it names its addresses").to_owned();
+    let address = |name: &str| {
+        line[name]
+            .as_str()
+            .expect("it names its addresses")
+            .to_owned()
+    };
     let (url, http) = (address("coordinator"), address("http"));
     (process, url, http)
 }
 
 fn worker(cli: &Cli, name: &str) -> Process {
-    cli.start(name, &["worker", "--log", "info", "--name", name, "--threads", "1"])
+    cli.start(
+        name,
+        &["worker", "--log", "info", "--name", name, "--threads", "1"],
+    )
 }
 
 fn until_code(url: &str, code: u16) -> String {
     until(&format!("{url} to answer {code}"), || {
-        get(url).filter(|(found, _)| *found == code).map(|(_, body)| body)
+        get(url)
+            .filter(|(found, _)| *found == code)
+            .map(|(_, body)| body)
     })
 }
 
@@ -43,7 +60,10 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
     let file = scratch.join("job.toml");
     job.write(&file);
     let submitted = cli.json(&["job", "submit", &file.display().to_string()]);
-    let id = submitted["job"].as_str().expect("a job has an id").to_owned();
+    let id = submitted["job"]
+        .as_str()
+        .expect("a job has an id")
+        .to_owned();
 
     // Nobody works yet: the metrics ask for workers, and the job says so.
     let page = until("the tasks to be counted", || {
@@ -56,7 +76,8 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
     assert_eq!(why["reasons"][0]["code"], "no_workers", "{why}");
     assert_eq!(why["task"]["state"], "pending", "{why}");
     assert_eq!(cli.json(&["workers"])["workers"], Value::Array(vec![]));
-    cli.run(&["job", "explain", &id, "--task", "99"]).fails(3, &["has no task 99"]);
+    cli.run(&["job", "explain", &id, "--task", "99"])
+        .fails(3, &["has no task 99"]);
 
     // The history is shown as it grows, until the job ends.
     let follower = cli.start("follower", &["job", "logs", &id, "--follow", "--json"]);
@@ -78,13 +99,20 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
         ("picofarm_task_seconds_count", 4.0),
         ("picofarm_reports_refused_total", 0.0),
         ("picofarm_task_failures_total{kind=\"user\"}", 0.0),
-        ("picofarm_grpc_request_seconds_count{method=\"Jobs/SubmitJob\"}", 1.0),
+        (
+            "picofarm_grpc_request_seconds_count{method=\"Jobs/SubmitJob\"}",
+            1.0,
+        ),
         ("picofarm_ready", 1.0),
     ] {
         assert_eq!(sample(&page, name), Some(value), "{name} in {page}");
     }
     let leased = count("leased") as f64;
-    assert_eq!(sample(&page, "picofarm_leases_granted_total"), Some(leased), "{page}");
+    assert_eq!(
+        sample(&page, "picofarm_leases_granted_total"),
+        Some(leased),
+        "{page}"
+    );
 
     let workers = cli.json(&["workers"]);
     assert_eq!(workers["workers"][0]["name"], "one", "{workers}");
@@ -94,7 +122,9 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
 
     // The other follower goes on until Ctrl-C.
     assert!(forever.runs());
-    until("the end to be shown", || forever.stdout().contains("ended").then_some(()));
+    until("the end to be shown", || {
+        forever.stdout().contains("ended").then_some(())
+    });
     forever.signal(Signal::Interrupt);
     forever.end().code(130);
     drop(one);

@@ -66,7 +66,8 @@ impl Core {
         ranges
             .map(|range| match &range.state {
                 picofarm_catalog::RangeState::Leased(lease) => {
-                    let todo = |mark: &&picofarm_catalog::Mark| **mark == picofarm_catalog::Mark::Todo;
+                    let todo =
+                        |mark: &&picofarm_catalog::Mark| **mark == picofarm_catalog::Mark::Todo;
                     lease.marks.iter().filter(todo).count() as u64
                 }
                 _ => 0,
@@ -93,7 +94,8 @@ impl Core {
                 quarantined: worker.quarantined,
             })
             .collect();
-        let waits = |e: &StageEntry| e.stage.pending_tasks() > 0 || e.free.is_none_or(|free| free > 0);
+        let waits =
+            |e: &StageEntry| e.stage.pending_tasks() > 0 || e.free.is_none_or(|free| free > 0);
         let able = |e: &StageEntry| {
             self.workers.values().any(|w| {
                 place::may_run(&entry.job.spec, &w.abilities).is_ok()
@@ -118,7 +120,11 @@ impl Core {
     fn runs(&self, entry: &StageEntry, task: u64) -> Option<(String, f32, i64)> {
         entry.stage.leased().find_map(|(range, lease)| {
             let progress = self.progress.get(&range.id)?.get(&task)?;
-            Some((self.name_of(lease.worker), progress.fraction, progress.since_ms))
+            Some((
+                self.name_of(lease.worker),
+                progress.fraction,
+                progress.since_ms,
+            ))
         })
     }
 

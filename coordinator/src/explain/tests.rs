@@ -73,7 +73,10 @@ fn a_waiting_job_says_what_it_waits_for() {
     };
     let (code, words) = first(&none);
     assert_eq!(code, "no_workers");
-    assert!(words.contains("10 tasks") && words.contains("picofarm worker"), "{words}");
+    assert!(
+        words.contains("10 tasks") && words.contains("picofarm worker"),
+        "{words}"
+    );
 
     let elsewhere = JobFacts {
         elsewhere: 3,
@@ -81,7 +84,10 @@ fn a_waiting_job_says_what_it_waits_for() {
     };
     let (code, words) = first(&elsewhere);
     assert_eq!(code, "elsewhere");
-    assert!(words.contains("3 workers are connected to other coordinators"), "{words}");
+    assert!(
+        words.contains("3 workers are connected to other coordinators"),
+        "{words}"
+    );
 
     let refused = |name: &str| Candidate {
         may_run: Err("the job needs renderer \"2\", the worker has \"1\"".into()),
@@ -93,11 +99,18 @@ fn a_waiting_job_says_what_it_waits_for() {
     };
     let (code, words) = first(&unable);
     assert_eq!(code, "unable");
-    assert_eq!(words.matches("needs renderer").count(), 1, "each reason once: {words}");
+    assert_eq!(
+        words.matches("needs renderer").count(),
+        1,
+        "each reason once: {words}"
+    );
 
     let (code, words) = first(&facts());
     assert_eq!(code, "busy");
-    assert!(words.contains("the one worker that may run them is busy"), "{words}");
+    assert!(
+        words.contains("the one worker that may run them is busy"),
+        "{words}"
+    );
 
     let behind = JobFacts {
         ahead: vec![id(3), id(4)],
@@ -105,7 +118,10 @@ fn a_waiting_job_says_what_it_waits_for() {
     };
     let (code, words) = first(&behind);
     assert_eq!(code, "behind");
-    assert!(words.contains(&id(3).to_string()) && words.contains("1 job"), "{words}");
+    assert!(
+        words.contains(&id(3).to_string()) && words.contains("1 job"),
+        "{words}"
+    );
 
     let starting = JobFacts {
         candidates: vec![Candidate {
@@ -132,7 +148,10 @@ fn a_task_that_failed_says_when_it_goes_on_and_what_went_wrong() {
     assert_eq!(reasons[0].code, "after_failure");
     assert_eq!(reasons[0].until_ms, Some(NOW + 12_500));
     let words = &reasons[0].words;
-    assert!(words.contains("another 12 s") && words.contains("task 4: no light"), "{words}");
+    assert!(
+        words.contains("another 12 s") && words.contains("task 4: no light"),
+        "{words}"
+    );
 }
 
 #[test]
@@ -154,13 +173,13 @@ fn every_state_of_a_job_has_an_answer() {
     };
     let (code, words) = first(&ended);
     assert_eq!(code, "dead");
-    assert!(words.contains("job retry") && words.contains("no light"), "{words}");
+    assert!(
+        words.contains("job retry") && words.contains("no light"),
+        "{words}"
+    );
     let cancelled = JobFacts {
         state: JobState::Cancelled,
-        counts: TaskCounts {
-            dead: 0,
-            ..counts
-        },
+        counts: TaskCounts { dead: 0, ..counts },
         ..ended.clone()
     };
     let (code, words) = first(&cancelled);
@@ -283,7 +302,11 @@ fn a_finished_task_says_who_made_it() {
     assert!(unknown.words.contains("does not tell"), "{}", unknown.words);
     facts.elsewhere = Some((id(3), "first".into(), event(EventKind::Committed, "a", "")));
     let reused = task(facts.clone());
-    assert!(reused.words.contains("under job") && reused.words.contains("(first)"), "{}", reused.words);
+    assert!(
+        reused.words.contains("under job") && reused.words.contains("(first)"),
+        "{}",
+        reused.words
+    );
     facts.events = vec![event(EventKind::Committed, "b", "")];
     let own = task(facts);
     assert_eq!(own.words, "done: computed by b under this job");
@@ -298,11 +321,19 @@ fn a_task_that_waits_or_was_given_up_says_why() {
     facts.record.exception = Some(failed(4, false));
     let told = task(facts.clone());
     assert_eq!(told.state, TaskState::Pending);
-    assert!(told.words.contains("another 8 s") && told.words.contains("no light"), "{}", told.words);
+    assert!(
+        told.words.contains("another 8 s") && told.words.contains("no light"),
+        "{}",
+        told.words
+    );
     facts.record.range = Some(range(RangeState::Dead));
     let told = task(facts.clone());
     assert_eq!(told.state, TaskState::Dead);
-    assert!(told.words.contains("2 of 3 failures") && told.words.contains("job retry"), "{}", told.words);
+    assert!(
+        told.words.contains("2 of 3 failures") && told.words.contains("job retry"),
+        "{}",
+        told.words
+    );
     facts.record.range = None;
     assert_eq!(task(facts).state, TaskState::Gone);
 }

@@ -23,8 +23,13 @@ fn every_line_is_a_sample_of_the_family_before_it() {
         } else if !line.starts_with('#') {
             let (name, value) = line.rsplit_once(' ').unwrap();
             let name = name.split('{').next().unwrap();
-            let suffix = name.strip_prefix(&family).unwrap_or_else(|| panic!("{line}: not of {family}"));
-            assert!(["", "_bucket", "_sum", "_count"].contains(&suffix), "{line}");
+            let suffix = name
+                .strip_prefix(&family)
+                .unwrap_or_else(|| panic!("{line}: not of {family}"));
+            assert!(
+                ["", "_bucket", "_sum", "_count"].contains(&suffix),
+                "{line}"
+            );
             value.parse::<f64>().unwrap();
         }
     }
@@ -104,7 +109,15 @@ fn what_fails_without_a_report_was_lost_with_its_worker() {
     };
     let acknowledge = |accepted| {
         let reason = String::new();
-        (1, Say::Acknowledge { lease, index: 0, accepted, reason })
+        (
+            1,
+            Say::Acknowledge {
+                lease,
+                index: 0,
+                accepted,
+                reason,
+            },
+        )
     };
     let mut tally = Tally::default();
     tally.failed(FailureKind::User);

@@ -101,12 +101,20 @@ async fn history(link: &Link, job: JobId, task: u64) -> Result<Vec<Event>, Statu
 }
 
 /// The job with the same results under which a task was handed in, and the line that says so.
-async fn maker(link: &Link, job: JobId, task: u64) -> Result<Option<(JobId, String, Event)>, Status> {
+async fn maker(
+    link: &Link,
+    job: JobId,
+    task: u64,
+) -> Result<Option<(JobId, String, Event)>, Status> {
     let Some(record) = link.catalog.job(job).await.map_err(failed)? else {
         return Ok(None);
     };
     let set = ResultSet::of(&record.job.spec);
-    let others = link.catalog.jobs_at(&set.store, &set.dataset).await.map_err(failed)?;
+    let others = link
+        .catalog
+        .jobs_at(&set.store, &set.dataset)
+        .await
+        .map_err(failed)?;
     let shares = |other: &Job| other.id != job && ResultSet::of(&other.spec) == set;
     for other in others.iter().filter(|o| shares(o)).take(OTHERS) {
         let events = history(link, other.id, task).await?;
