@@ -1,5 +1,6 @@
 //! The command line: one definition feeds the parser, the help, and the completions.
 
+mod data;
 mod guard;
 mod render;
 
@@ -8,6 +9,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
+pub use data::{DatasetExport, DatasetReprocess, DatasetSplit, SensorArgs};
 pub use guard::{Guard, Token};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
@@ -88,7 +90,7 @@ pub enum Command {
         #[arg(long, default_value_t = 100, value_name = "N")]
         last: u32,
     },
-    /// Look at data sets and check them
+    /// Look at data sets, check them, and make others of them
     #[command(subcommand)]
     Dataset(Dataset),
     /// Make, inspect and render single scenes
@@ -331,6 +333,12 @@ pub enum Dataset {
         #[arg(long, default_value_t = 8)]
         rows: usize,
     },
+    /// Measure every scene with a sensor into another data set, without rendering; again to resume
+    Reprocess(DatasetReprocess),
+    /// Pack a data set, or a part of it, into few files for sharing; again to resume
+    Export(DatasetExport),
+    /// Say which scenes are for training, validation and test; again to take in scenes added since
+    Split(DatasetSplit),
 }
 
 #[derive(Subcommand)]
@@ -413,7 +421,12 @@ pub enum Bench {
 #[derive(Args)]
 pub struct BenchQueue {
     /// The catalog: a SQLite file or the URL of a Postgres database [default: a new SQLite file that is removed after]
-    #[arg(long, value_name = "FILE|URL", env = "PICOFARM_CATALOG", hide_env_values = true)]
+    #[arg(
+        long,
+        value_name = "FILE|URL",
+        env = "PICOFARM_CATALOG",
+        hide_env_values = true
+    )]
     pub catalog: Option<CatalogPlace>,
     /// Simulated workers of the no-op tasks
     #[arg(long, default_value_t = 8)]
@@ -422,7 +435,12 @@ pub struct BenchQueue {
     #[arg(long, default_value_t = 200_000)]
     pub tasks: u64,
     /// Sizes of jobs to submit
-    #[arg(long, value_delimiter = ',', value_name = "N,…", default_value = "97432,1000000")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "N,…",
+        default_value = "97432,1000000"
+    )]
     pub submit: Vec<u64>,
     /// Sizes of fleets to simulate with tasks of a fixed length, e.g. 10,100,1000,4000
     #[arg(long, value_delimiter = ',', value_name = "N,…")]
@@ -448,36 +466,8 @@ pub struct SceneSense {
     /// Folder for the new Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Sensor settings (TOML); the options below go before them
-    #[arg(long, value_name = "FILE")]
-    pub sensor: Option<PathBuf>,
-    /// Photons in the two-bounce peak of the median pixel: a number, or a range to draw it from [default: 10..400]
-    #[arg(long, value_name = "LOW..HIGH")]
-    pub peak_photons: Option<String>,
-    /// Photons for a unit of the transient, instead of a peak
-    #[arg(long, value_name = "N", conflicts_with = "peak_photons")]
-    pub photons_per_unit: Option<f64>,
-    /// Pulse: fwhm:PS (Gaussian rise, exponential tail) or none; measured pulses go into --sensor [default: fwhm:128]
-    #[arg(long, value_name = "PULSE")]
-    pub pulse: Option<String>,
-    /// Timing jitter, full width at half maximum in picoseconds [default: 50]
-    #[arg(long, value_name = "PS")]
-    pub jitter_ps: Option<f64>,
-    /// Jitter as in the published code: the pulse is shifted by floor(N(0, 2.654)) bins, once a scene
-    #[arg(long, conflicts_with = "jitter_ps")]
-    pub jitter_sb3d: bool,
-    /// Ambient and dark counts, photons a bin (before --rebin) [default: 0]
-    #[arg(long, value_name = "RATE")]
-    pub dark: Option<f64>,
-    /// Sum this many adjacent bins [default: 1]
-    #[arg(long, value_name = "BINS")]
-    pub rebin: Option<u32>,
-    /// Write the expected photons instead of drawing counts
-    #[arg(long)]
-    pub no_poisson: bool,
-    /// Pile-up: at most one photon a pixel and pulse is seen, of so many pulses [default: all photons are]
-    #[arg(long, value_name = "pulses:N")]
-    pub dead_time: Option<String>,
+    #[command(flatten)]
+    pub sensor: SensorArgs,
     /// Seed of the random numbers
     #[arg(long, default_value_t = 0)]
     pub seed: u64,

@@ -1,7 +1,12 @@
 //! `picofarm dataset …`: what a data set holds, whether it is whole, and what it looks like.
 
+pub mod export;
+pub mod reprocess;
+pub mod split;
+
 use std::path::{Path, PathBuf};
 
+use picofarm_agent::TaskError;
 use picofarm_dataset::{
     Collection, Dataset, DatasetError, MIN_GRACE, Summary, Verification, VerifyMode, open_store,
 };
@@ -12,6 +17,7 @@ use crate::{
     error::{CliError, Code, Result, io},
     output::{Output, bytes},
     picture::{View, flight, sheet},
+    signals,
 };
 
 pub async fn run(command: Command, output: Output) -> Result<()> {
@@ -37,6 +43,9 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             });
             Ok(())
         }
+        Command::Reprocess(args) => reprocess::run(args, output).await,
+        Command::Export(args) => export::run(args, output).await,
+        Command::Split(args) => split::run(args, output).await,
         Command::Collect {
             dataset,
             older_than,
@@ -177,6 +186,46 @@ fn further(info: &Summary) -> String {
         );
     }
     text
+}
+
+/// The store and the folder in it of a data set's place.
+fn store_and_folder(place: &str) -> Result<(String, String)> {
+    let trimmed = place.trim_end_matches('/');
+    let parts = match trimmed.rsplit_once('/') {
+        Some(("", folder)) => Some(("/", folder)),
+        Some((store, folder)) if !store.ends_with('/') => Some((store, folder)),
+        Some(_) => None,
+        None => Some((".", trimmed)),
+    };
+    match parts {
+        Some((store, folder)) if !folder.is_empty() && folder != "." && folder != ".." => {
+            Ok((store.to_owned(), folder.to_owned()))
+        }
+        _ => Err(CliError::input(format!(
+            "{place:?}: expected the place of a data set: STORE/DATASET"
+        ))),
+    }
+}
+
+/// What the failure of a task means for a command that runs it here.
+fn task_failed(error: TaskError) -> CliError {
+    let (code, hint) = match &error {
+        TaskError::User(_) => (Code::Input, None),
+        TaskError::Crash(_) => (Code::Failed, None),
+        TaskError::Interrupted(_) => (
+            Code::Resource,
+            Some("run the same command again; finished work is kept"),
+        ),
+        TaskError::Stopped => {
+            let hint = "run the same command again to go on; finished work is kept";
+            return signals::interrupted(hint);
+        }
+    };
+    let failed = CliError::new(code, error);
+    match hint {
+        Some(hint) => failed.hint(hint),
+        None => failed,
+    }
 }
 
 async fn open(place: &str) -> Result<Dataset> {

@@ -44,7 +44,9 @@ impl Local {
         } else {
             settings.access()?
         };
-        let coordinator = roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded, http).await?;
+        let coordinator =
+            roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded, http)
+                .await?;
         let (url, http) = (coordinator.url(), coordinator.http());
         let mut local = Self {
             url: url.clone(),

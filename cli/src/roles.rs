@@ -205,13 +205,21 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
     let guarded = Guarded::of(&args.guard);
-    let coordinator =
-        Coordinator::start(args.catalog.clone(), args.listen, lease, guarded, args.http.http).await?;
+    let coordinator = Coordinator::start(
+        args.catalog.clone(),
+        args.listen,
+        lease,
+        guarded,
+        args.http.http,
+    )
+    .await?;
     let (url, http) = (coordinator.url(), coordinator.http());
     output.result(
         &json!({"coordinator": url, "catalog": args.catalog.to_string(), "http": http}),
         || {
-            let metrics = http.as_ref().map_or_else(String::new, |at| format!(", metrics at {at}/metrics"));
+            let metrics = http
+                .as_ref()
+                .map_or_else(String::new, |at| format!(", metrics at {at}/metrics"));
             format!("coordinator at {url} on {}{metrics}", args.catalog)
         },
     );

@@ -1,6 +1,6 @@
 //! `picofarm scene sense`: a rendered scene as a sensor sees it.
 
-mod options;
+pub mod options;
 
 use std::{path::Path, time::Instant};
 
@@ -19,7 +19,7 @@ use crate::{
 };
 
 pub async fn run(args: SceneSense, output: Output) -> Result<()> {
-    let sensor = options::settings(&args)?;
+    let sensor = options::settings(&args.sensor)?;
     render::free_folder(&args.out)?;
     let threads = args.threads.unwrap_or_else(roles::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
@@ -251,21 +251,16 @@ fn write(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::args::SensorArgs;
 
     fn args(folder: &Path, out: &str) -> SceneSense {
         SceneSense {
             render: folder.join("render"),
             out: folder.join(out),
-            sensor: None,
-            peak_photons: None,
-            photons_per_unit: None,
-            pulse: None,
-            jitter_ps: None,
-            jitter_sb3d: false,
-            dark: None,
-            rebin: Some(4),
-            no_poisson: false,
-            dead_time: None,
+            sensor: SensorArgs {
+                rebin: Some(4),
+                ..SensorArgs::default()
+            },
             seed: 7,
             scene: 0,
             threads: Some(1),
@@ -273,7 +268,7 @@ mod tests {
     }
 
     fn measure(args: &SceneSense) -> Result<Report> {
-        sense(args, &options::settings(args)?)
+        sense(args, &options::settings(&args.sensor)?)
     }
 
     /// A render group of 3×2 pixels and 50 bins of 8 ps, as `scene render --split` writes it.
@@ -307,10 +302,14 @@ mod tests {
     fn counts_and_rates_are_written_with_all_that_made_them() {
         let folder = tempfile::tempdir().unwrap();
         rendered(folder.path());
-        let counts = measure(&SceneSense {
-            peak_photons: Some("100".into()),
-            ..args(folder.path(), "counts")
-        })
+        let with = |out: &str, change: fn(&mut SensorArgs)| {
+            let mut args = args(folder.path(), out);
+            change(&mut args.sensor);
+            args
+        };
+        let counts = measure(&with("counts", |s| {
+            s.peak_photons = Some("100".into());
+        }))
         .unwrap();
         assert_eq!(counts.facts["data_type"], "uint16");
         assert_eq!(counts.facts["scale_from"], "two");
@@ -334,23 +333,16 @@ mod tests {
         assert_eq!(a["dropped"]["bins"], 2);
         let sensor: Sensor = serde_json::from_value(a["sensor"].clone()).unwrap();
         assert_eq!(sensor.scale, Scale::Peak { photons: 100.0 });
-        let rate = measure(&SceneSense {
-            no_poisson: true,
-            photons_per_unit: Some(a["scale"].as_f64().unwrap()),
-            ..args(folder.path(), "rate")
-        })
-        .unwrap();
+        let mut expected = with("rate", |s| s.no_poisson = true);
+        expected.sensor.photons_per_unit = a["scale"].as_f64();
+        let rate = measure(&expected).unwrap();
         assert_eq!(rate.facts["data_type"], "float32");
         let group = RenderGroup::open(&folder.path().join("rate")).unwrap();
         let (_, rate) = group.read::<f32>("rate").unwrap();
         let expected: f64 = rate.iter().map(|r| f64::from(*r)).sum();
         assert!((sum - expected).abs() < 5.0 * expected.sqrt());
         // Bright counts need 32 bits.
-        let bright = measure(&SceneSense {
-            photons_per_unit: Some(1e8),
-            ..args(folder.path(), "bright")
-        })
-        .unwrap();
+        let bright = measure(&with("bright", |s| s.photons_per_unit = Some(1e8))).unwrap();
         assert_eq!(bright.facts["data_type"], "uint32");
     }
 
@@ -383,15 +375,14 @@ mod tests {
             code == Code::Input && message.contains("absent"),
             "{message}"
         );
-        let (_, message) = fails(SceneSense {
-            rebin: Some(51),
-            ..args(folder.path(), "out")
-        });
+        let with = |change: fn(&mut SensorArgs)| {
+            let mut args = args(folder.path(), "out");
+            change(&mut args.sensor);
+            args
+        };
+        let (_, message) = fails(with(|s| s.rebin = Some(51)));
         assert!(message.contains("rebin: expected 1 to 50"), "{message}");
-        let (_, message) = fails(SceneSense {
-            dark: Some(-1.0),
-            ..args(folder.path(), "out")
-        });
+        let (_, message) = fails(with(|s| s.dark = Some(-1.0)));
         assert!(message.contains("sensor.dark_per_bin"), "{message}");
         let chunk = folder.path().join("render/transient/c/0/0/0");
         let mut bytes = std::fs::read(&chunk).unwrap();

@@ -2,7 +2,7 @@
 //! makes the outcome durable in one commit, and only then answers: whatever waits meanwhile forms the next commit.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, hash_map::Entry},
     panic::AssertUnwindSafe,
     sync::Arc,
     time::{Duration, Instant},
@@ -14,7 +14,8 @@ use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     key::spec_hash,
     model::{
-        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress, WorkerHello,
+        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress,
+        WorkerHello,
     },
 };
 use tokio::{
@@ -26,7 +27,10 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, JobLook, Look, OutputHint, Prepared, Say, SessionId, Settings, Timings, place_is_free, stands_for},
+    core::{
+        Core, JobLook, Look, OutputHint, Prepared, Say, SessionId, Settings, Timings,
+        place_is_free, stands_for,
+    },
     http::Pulse,
     metrics::{Metrics, Tally},
     plan,
@@ -146,9 +150,9 @@ impl Actor {
         let snapshot = self.catalog.load().await?;
         let mut timings = Timings::new();
         for stage in snapshot.jobs.iter().flat_map(Job::stages) {
-            if !timings.contains_key(&stage.set) {
-                let seconds = self.catalog.timing(&stage.set).await?;
-                timings.insert(stage.set, seconds);
+            if let Entry::Vacant(entry) = timings.entry(stage.set) {
+                let seconds = self.catalog.timing(entry.key()).await?;
+                entry.insert(seconds);
             }
         }
         tracing::debug!(house = %snapshot.house, jobs = snapshot.jobs.len(),
@@ -449,7 +453,9 @@ impl Life<'_> {
             // Another coordinator was first.
             return Ok(match catalog.job_with(&job.spec_hash).await? {
                 Some(first) => return existed(first.id, plan),
-                None => Err(Refusal::NotNow("the same job is being submitted by someone else; try again".into())),
+                None => Err(Refusal::NotNow(
+                    "the same job is being submitted by someone else; try again".into(),
+                )),
             });
         }
         // A job without anything to run has ended by now.

@@ -240,7 +240,7 @@ proptest! {
 fn known_task_times_give_about_a_minute_of_work() {
     assert_eq!(lease_size(Some(9.0), 100_000, 100_000, 10), 5);
     assert_eq!(lease_size(Some(400.0), 100_000, 100_000, 10), 1);
-    assert_eq!(lease_size(Some(0.01), 100_000, 100_000, 10), 4096);
+    assert_eq!(lease_size(Some(0.01), 100_000, 100_000, 10), 1024);
     assert_eq!(lease_size(Some(0.01), 40, 40, 10), 2);
 }
 

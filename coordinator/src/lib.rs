@@ -20,8 +20,8 @@ mod timed;
 pub mod transition;
 
 pub use budget::Backoff;
-pub use picofarm_catalog::CatalogPlace;
 pub use clock::Clock;
+pub use picofarm_catalog::CatalogPlace;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 
 /// Version of this program; workers must have the same.

@@ -9,7 +9,7 @@ pub const PARAMETRIC: &str = "parametric-1";
 /// is lost with a worker.
 const LEASE_SECONDS: f64 = 45.0;
 /// Most tasks in one lease; its marks are written at each commit.
-const MOST: u64 = 4096;
+const MOST: u64 = 1024;
 /// A lease takes at most this part of an even share of what is left, so that all workers end together.
 const SHARE: u64 = 2;
 

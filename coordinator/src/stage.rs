@@ -44,11 +44,7 @@ impl Stage {
             .map(|(_, b)| b)
             .filter(|b| b.hi == range.lo && b.merges())
             .cloned();
-        let after = self
-            .pending
-            .get(&range.hi)
-            .filter(|a| a.merges())
-            .cloned();
+        let after = self.pending.get(&range.hi).filter(|a| a.merges()).cloned();
         let neighbours = before.into_iter().chain(after);
         let mut joined = false;
         for neighbour in neighbours {

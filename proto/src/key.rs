@@ -5,7 +5,10 @@ use std::fmt;
 
 use sha2::{Digest, Sha256};
 
-use crate::model::{JobSpec, SceneKind};
+use crate::{
+    model::{JobSpec, ReprocessSettings, SceneKind},
+    split::SplitSettings,
+};
 
 /// Hash of the canonical description of a stage's tasks, without their number, name or budgets.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -74,6 +77,42 @@ pub fn task_key(stage: &StageKey, index: u64) -> TaskKey {
     hash.update(stage.0);
     hash.update(index.to_le_bytes());
     TaskKey(hash.finalize().into())
+}
+
+/// The stage key of a reprocess stage: everything but the places of source and target, which follow from the keys of
+/// the source's scenes ([`derived_key`]).
+pub fn reprocess_stage_key(settings: &ReprocessSettings, profile: &str) -> StageKey {
+    let description = serde_json::json!({
+        "task": "reprocess",
+        "histogram": settings.histogram,
+        "spots": settings.spots,
+        "sensor": serde_json::to_value(&settings.sensor).expect("settings are plain data"),
+        "drop_left_over": settings.drop_left_over,
+        "seed": settings.seed,
+        "version": settings.version,
+        "profile": profile,
+    });
+    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// The key of a task that makes one scene of another: the stage, and the key of the task that made the source.
+pub fn derived_key(stage: &StageKey, source: &TaskKey) -> TaskKey {
+    let mut hash = Sha256::new();
+    hash.update(b"derived");
+    hash.update(stage.0);
+    hash.update(source.0);
+    TaskKey(hash.finalize().into())
+}
+
+/// The key of the one task of a split stage over the first `scenes` scenes of what `source` makes.
+pub fn split_key(settings: &SplitSettings, source: &StageKey, scenes: u64) -> TaskKey {
+    let description = serde_json::json!({
+        "task": "split",
+        "settings": serde_json::to_value(settings).expect("settings are plain data"),
+        "source": source.to_string(),
+        "scenes": scenes,
+    });
+    TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
 /// The seed of scene `index`: the first eight bytes of SHA-256("scene", seed, index).

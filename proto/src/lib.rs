@@ -6,6 +6,7 @@ pub mod credentials;
 pub mod ids;
 pub mod key;
 pub mod model;
+pub mod split;
 
 /// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
 #[expect(missing_docs, reason = "generated from the schema, which documents it")]

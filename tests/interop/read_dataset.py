@@ -52,7 +52,7 @@ def main(dataset, scene, folder, render):
     h = names["h"]
     manifest = json.loads((pathlib.Path(dataset) / "manifests" / f"{scene}.json").read_text())
     h = np.array(h)
-    if spec["profile"]["name"] == "sqrt-u16":
+    if spec["profile"]["name"] != "plain-f32":
         saturated = np.flatnonzero(group["transient"][scene].ravel() == 65535)
         same("saturated bins", saturated, np.array([at for at, _ in manifest["overflow"]], dtype=saturated.dtype))
     for at, value in manifest["overflow"]:

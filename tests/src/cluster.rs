@@ -6,12 +6,7 @@ use std::net::SocketAddr;
 use serde_json::Value;
 
 use crate::{
-    cli::Cli,
-    job::Job,
-    postgres::Postgres,
-    process::Process,
-    proxy::Proxy,
-    scratch::Scratch,
+    cli::Cli, job::Job, postgres::Postgres, process::Process, proxy::Proxy, scratch::Scratch,
     wait::until,
 };
 
@@ -134,7 +129,9 @@ impl Cluster {
             .iter()
             .map(|h| format!("http://{}", h.address))
             .collect();
-        self.cli.clone().with("PICOFARM_COORDINATOR", &urls.join(","))
+        self.cli
+            .clone()
+            .with("PICOFARM_COORDINATOR", &urls.join(","))
     }
 
     /// The JSON answer of a command, asked again while no coordinator can answer.

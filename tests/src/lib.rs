@@ -18,6 +18,7 @@ pub mod rng;
 pub mod s3;
 pub mod scratch;
 pub mod shapes;
+pub mod slurm;
 pub mod store;
 pub mod wait;
 
@@ -27,3 +28,4 @@ pub use farm::Farm;
 pub use job::Job;
 pub use process::{Process, Signal};
 pub use scratch::Scratch;
+pub use slurm::Slurm;

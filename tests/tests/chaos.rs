@@ -18,7 +18,9 @@ const WORKERS: usize = 6;
 const ROUNDS: u64 = 10;
 
 fn rounds() -> u64 {
-    std::env::var("PICOFARM_CHAOS").map_or(ROUNDS, |n| n.parse().expect("PICOFARM_CHAOS is a number of rounds"))
+    std::env::var("PICOFARM_CHAOS").map_or(ROUNDS, |n| {
+        n.parse().expect("PICOFARM_CHAOS is a number of rounds")
+    })
 }
 
 fn millis(rng: &mut Rng, most: u64) -> Duration {
@@ -114,7 +116,10 @@ fn done_once(cluster: &Cluster, id: &str, total: u64) {
             }
         }
     }
-    assert!(times.iter().all(|n| *n == 1), "committed once each: {times:?}");
+    assert!(
+        times.iter().all(|n| *n == 1),
+        "committed once each: {times:?}"
+    );
 }
 
 #[test]
@@ -144,7 +149,8 @@ fn with_objects_on_s3_too() {
     let Some(mut server) = s3::Server::start("chaos-s3") else {
         return;
     };
-    let Some(mut cluster) = Cluster::reaching("chaos-s3", 2, LEASE_S, |cli| server.with(cli)) else {
+    let Some(mut cluster) = Cluster::reaching("chaos-s3", 2, LEASE_S, |cli| server.with(cli))
+    else {
         return;
     };
     let mut rng = Rng::new(6);
@@ -171,7 +177,9 @@ fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() 
     };
     let job = Job::slow(&cluster.scratch.join("store"), 8);
     let id = cluster.submit(&job);
-    let mut workers: Vec<_> = (0..2).map(|i| cluster.worker(&format!("w{i}"), 0)).collect();
+    let mut workers: Vec<_> = (0..2)
+        .map(|i| cluster.worker(&format!("w{i}"), 0))
+        .collect();
     for worker in &mut workers {
         worker.until_says("task starts");
     }

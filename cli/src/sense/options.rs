@@ -3,12 +3,12 @@
 use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale, Sensor};
 
 use crate::{
-    args::SceneSense,
+    args::SensorArgs,
     error::{CliError, Result, io},
 };
 
 /// The settings file with the options on top.
-pub fn settings(args: &SceneSense) -> Result<Sensor> {
+pub fn settings(args: &SensorArgs) -> Result<Sensor> {
     let mut sensor = match &args.sensor {
         None => Sensor::default(),
         Some(path) => {

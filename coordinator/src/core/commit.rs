@@ -17,7 +17,8 @@ pub(crate) struct OutputHint(pub Option<[u8; 32]>);
 impl Core {
     /// The stage whose task a report is about: by its lease, or else by the task key.
     pub(crate) fn stage_of(&self, report: &Finished) -> Option<StageRef> {
-        let fits = |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
+        let fits =
+            |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
         if let Some(id) = self.leases.get(&report.lease.range) {
             return fits(&self.stages[id]).then_some(*id);
         }

@@ -23,7 +23,8 @@ impl Core {
             if entry.free == Some(0) || entry.ask_at_ms > now_ms {
                 continue;
             }
-            let may_run = |w: &&super::WorkerEntry| place::may_run(&entry.job.spec, &w.abilities).is_ok();
+            let may_run =
+                |w: &&super::WorkerEntry| place::may_run(&entry.job.spec, &w.abilities).is_ok();
             let able = self.workers.values().filter(may_run).count() as u64;
             let credits: u64 = self
                 .workers
@@ -170,12 +171,14 @@ impl Core {
 fn give_back(range: &picofarm_catalog::Range, changes: &mut Changes) {
     let mut minted = Vec::new();
     let pieces = match range.state {
-        RangeState::Leased(_) => crate::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
-            let id = picofarm_proto::ids::RangeId::from_uuid(uuid::Uuid::now_v7());
-            minted.push(id);
-            id
-        })
-        .expect("a lease can be closed"),
+        RangeState::Leased(_) => {
+            crate::transition::next(range, &RangeEvent::Close { halve: false }, &mut || {
+                let id = picofarm_proto::ids::RangeId::from_uuid(uuid::Uuid::now_v7());
+                minted.push(id);
+                id
+            })
+            .expect("a lease can be closed")
+        }
         _ => vec![range.clone()],
     };
     changes.remove(range.id);

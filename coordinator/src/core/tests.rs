@@ -7,7 +7,9 @@ use std::{
     sync::Arc,
 };
 
-use picofarm_catalog::{Catalog, CatalogError, Job, PostgresCatalog, ResultSet, SqliteCatalog, testing};
+use picofarm_catalog::{
+    Catalog, CatalogError, Job, PostgresCatalog, ResultSet, SqliteCatalog, testing,
+};
 use picofarm_proto::{
     PROTOCOL,
     ids::{HouseId, Incarnation, JobId, WorkerId},
@@ -176,11 +178,16 @@ impl World {
         self.flush(h).await;
         let spec = spec(count);
         let catalog = self.houses[h].catalog.clone();
-        let latest = catalog.job_with(&picofarm_proto::key::spec_hash(&spec)).await;
+        let latest = catalog
+            .job_with(&picofarm_proto::key::spec_hash(&spec))
+            .await;
         if super::stands_for(latest.unwrap(), true).is_some() {
             return;
         }
-        let runs = catalog.output_runs(&ResultSet::of(&spec), count).await.unwrap();
+        let runs = catalog
+            .output_runs(&ResultSet::of(&spec), count)
+            .await
+            .unwrap();
         let prepared = self.houses[h].core.prepare(spec, &runs, self.now);
         let recorded = catalog
             .submit(&prepared.job, &prepared.ranges, &prepared.events)
@@ -296,11 +303,7 @@ impl World {
     fn lease_of(&self, w: u8, l: u8) -> Option<(usize, u64, Lease)> {
         let worker = &self.workers[usize::from(w)];
         let (house, session) = worker.session?;
-        Some((
-            house,
-            session,
-            worker.leases.get(usize::from(l))?.clone(),
-        ))
+        Some((house, session, worker.leases.get(usize::from(l))?.clone()))
     }
 
     fn house(&self, h: u8) -> usize {
@@ -341,7 +344,9 @@ impl World {
                 let worker = &self.workers[usize::from(*w)];
                 if let Some((h, session)) = worker.session {
                     let leases: Vec<_> = worker.leases.iter().map(|l| l.lease).collect();
-                    self.houses[h].core.heartbeat(session, &leases, &[], self.now);
+                    self.houses[h]
+                        .core
+                        .heartbeat(session, &leases, &[], self.now);
                 }
             }
             Op::Drop(w, dies) => {

@@ -38,7 +38,10 @@ pub(crate) struct Link {
 
 impl Link {
     /// Asks the actor and waits for its answer.
-    pub(crate) async fn ask<T>(&self, command: impl FnOnce(Reply<T>) -> Command) -> Result<T, Status> {
+    pub(crate) async fn ask<T>(
+        &self,
+        command: impl FnOnce(Reply<T>) -> Command,
+    ) -> Result<T, Status> {
         let (reply, answer) = oneshot::channel();
         let gone = || {
             Status::unavailable("the coordinator is stopping or cannot use its catalog; try again")

@@ -9,7 +9,7 @@ use std::{
 };
 
 use picofarm_coordinator::{
-    Backoff, Clock, CoordinatorConfig, CoordinatorError, Running, VERSION, serve,
+    Backoff, CatalogPlace, Clock, CoordinatorConfig, CoordinatorError, Running, VERSION, serve,
 };
 use picofarm_proto::{
     PROTOCOL,
@@ -345,6 +345,6 @@ impl Worker {
     }
 }
 
-pub fn catalog_of(farm: &Farm) -> picofarm_coordinator::CatalogPlace {
+pub fn catalog_of(farm: &Farm) -> CatalogPlace {
     farm.config.catalog.clone()
 }

@@ -27,7 +27,11 @@ async fn a_report_after_expiry_is_refused() {
     assert_eq!(farm.until_ended(&job).await.state, JobState::Done);
     // The job has ended: the output stands, and nobody needs another word about it.
     let late = slow.done(&lease, 0).await;
-    assert!(!late.accepted && late.reason.contains("ended"), "{}", late.reason);
+    assert!(
+        !late.accepted && late.reason.contains("ended"),
+        "{}",
+        late.reason
+    );
 }
 
 #[tokio::test]

@@ -5,16 +5,18 @@
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rules {
     /// A write transaction first locks its house's row; a house whose row has run out or is gone writes nothing and
-    /// comes back as a new house. Enforced by the catalog (`storage/catalog`), as each transaction's first statement.
+    /// comes back as a new house. Enforced by `storage/catalog/src/postgres/house.rs` (`fence`), which every writing
+    /// transaction calls first.
     pub house_is_fenced: bool,
-    /// A range is written only by the house that owns it. Enforced by the catalog: every update of a range asks for
-    /// `owner = me`, and one that finds another owner fails the whole transaction.
+    /// A range is written only by the house that owns it. Enforced by `storage/catalog/src/postgres/write.rs`
+    /// (`replace_known`): one range of another owner fails the whole transaction.
     pub writes_check_owner: bool,
     /// A house becomes the owner of a lease that a worker names in its hello only if the range still has that epoch,
-    /// that worker and that incarnation. Enforced by the catalog, in the condition of the one update.
+    /// that worker and that incarnation. The product takes over all leases of that worker as the catalog has them
+    /// (`house.rs`, `adopt`) and ends at once those that the hello does not name (`coordinator/src/core/sessions.rs`).
     pub lease_adoption_is_conditional: bool,
     /// The ranges of a house fall to another one only after its row has run out by the database's clock. Enforced by
-    /// the catalog, in the condition of the delete that begins a takeover.
+    /// `house.rs` (`take_lost`).
     pub takeover_waits_for_expiry: bool,
     /// A report is accepted only for the live lease: epoch, worker and incarnation match, the task is still to do.
     /// Enforced by `coordinator/src/core/leases.rs` (`held_to_do`), called by `core/commit.rs`.
@@ -26,7 +28,9 @@ pub struct Rules {
     /// Enforced by `storage/dataset/src/publish.rs` (`published`).
     pub reuse_checks_objects: bool,
     /// The collector takes a range that nobody owns and that is not leased, before it looks for a manifest, and keeps
-    /// others off it until its last delete is answered. Enforced by the catalog.
+    /// others off it until its last delete is answered. Not so in the product: `dataset collect` leaves alone what is
+    /// younger than a day, looks again after it deleted, and publishers look again after their manifest
+    /// (`storage/dataset/src/collect.rs`).
     pub collector_holds_range: bool,
     /// The collector's hold does not run out like a house's lease: it ends when the collector gives the range back or
     /// its process is dead (its database session has ended). A delete in an object store cannot be fenced, so nobody

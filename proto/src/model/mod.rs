@@ -3,6 +3,8 @@
 pub mod explain;
 pub mod job;
 pub mod lease;
+pub mod reprocess;
+pub mod sensor;
 pub mod status;
 mod text;
 
@@ -12,5 +14,7 @@ pub use job::{
     SceneSource, SpecError,
 };
 pub use lease::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
+pub use reprocess::{Histogram, ReprocessSettings, SourceSettings};
+pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};
 pub use status::{Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, TaskCounts};
 pub use text::parse_share;

@@ -36,8 +36,9 @@ pub use error::CatalogError;
 pub use place::CatalogPlace;
 pub use postgres::PostgresCatalog;
 pub use record::{
-    Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent, News, Output,
-    Owned, Range, RangeState, ResultSet, Run, Snapshot, StageRecord, TaskRecord, Timing, Want, Worker,
+    Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,
+    News, Output, Owned, Range, RangeState, ResultSet, Run, Snapshot, StageRecord, TaskRecord,
+    Timing, Want, Worker,
 };
 pub use sqlite::SqliteCatalog;
 

@@ -81,8 +81,14 @@ mod tests {
     #[test]
     fn a_url_is_shown_without_its_password() {
         for (url, shown) in [
-            ("postgres://me:secret@db.example:5432/farm?sslmode=require", "postgres://me@db.example:5432/farm"),
-            ("postgres:///farm?host=/run&password=secret", "postgres:///farm"),
+            (
+                "postgres://me:secret@db.example:5432/farm?sslmode=require",
+                "postgres://me@db.example:5432/farm",
+            ),
+            (
+                "postgres:///farm?host=/run&password=secret",
+                "postgres:///farm",
+            ),
             ("postgres://host", "postgres://host"),
         ] {
             let place: CatalogPlace = url.parse().unwrap();

@@ -46,7 +46,11 @@ impl CatalogPlace {
     }
 }
 
-async fn sqlite(options: SqliteConnectOptions, batch: usize, time: Duration) -> Result<f64, sqlx::Error> {
+async fn sqlite(
+    options: SqliteConnectOptions,
+    batch: usize,
+    time: Duration,
+) -> Result<f64, sqlx::Error> {
     let mut c = SqliteConnection::connect_with(&options).await?;
     sqlx::query(sqlx::AssertSqlSafe(TABLE.replace("{bytes}", "BLOB")))
         .execute(&mut c)

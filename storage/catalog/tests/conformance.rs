@@ -100,7 +100,13 @@ async fn submitted(catalog: &dyn Catalog, ranges: &[Range]) {
 
 /// Claims everything there is.
 async fn claim_all(catalog: &dyn Catalog) -> Vec<Range> {
-    catalog.claim(&[want(99)]).await.unwrap().remove(0).owned.ranges
+    catalog
+        .claim(&[want(99)])
+        .await
+        .unwrap()
+        .remove(0)
+        .owned
+        .ranges
 }
 
 async fn what_is_written_is_read_again_by_the_next_life(catalog: &dyn Catalog) {
@@ -140,7 +146,10 @@ async fn what_is_written_is_read_again_by_the_next_life(catalog: &dyn Catalog) {
     assert_eq!(found.unwrap(), [Some([5; 32]), None]);
     let record = catalog.job(job().id).await.unwrap().unwrap();
     let c = record.counts;
-    assert_eq!((c.total, c.done, c.reused, c.leased, c.pending), (8, 2, 1, 1, 5));
+    assert_eq!(
+        (c.total, c.done, c.reused, c.leased, c.pending),
+        (8, 2, 1, 1, 5)
+    );
 }
 
 async fn a_claim_takes_what_it_names_from_the_front_and_says_what_is_left(catalog: &dyn Catalog) {
@@ -156,7 +165,11 @@ async fn a_claim_takes_what_it_names_from_the_front_and_says_what_is_left(catalo
     assert_eq!(spans, [(0, 2), (2, 5)]);
     assert_eq!(claim.existing, [Run { lo: 1, hi: 2 }, Run { lo: 3, hi: 4 }]);
     assert_eq!(claim.left, 4);
-    let spans: Vec<_> = claim_all(catalog).await.iter().map(|r| (r.lo, r.hi)).collect();
+    let spans: Vec<_> = claim_all(catalog)
+        .await
+        .iter()
+        .map(|r| (r.lo, r.hi))
+        .collect();
     assert_eq!(spans, [(5, 8)], "what may not run yet is not given");
     assert_eq!(catalog.beat(0).await.unwrap().free[&stage()], 1);
 }
@@ -188,12 +201,21 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
     catalog.commit(first).await.unwrap();
     // Another manifest for a task that has one.
     let mut other = Changes {
-        outputs: vec![output(1), Output { manifest: [9; 32], ..output(0) }],
+        outputs: vec![
+            output(1),
+            Output {
+                manifest: [9; 32],
+                ..output(0)
+            },
+        ],
         ..Changes::default()
     };
     other.put(leased(mine.clone(), &[Mark::Todo; 9]));
     let refused = catalog.commit(other).await;
-    assert!(matches!(refused, Err(CatalogError::Conflict(_))), "{refused:?}");
+    assert!(
+        matches!(refused, Err(CatalogError::Conflict(_))),
+        "{refused:?}"
+    );
     // A range that the catalog does not know as ours.
     let mut stale = Changes {
         outputs: vec![output(2)],
@@ -201,7 +223,10 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
     };
     stale.give(range(77, 0, 9, RangeState::Dead));
     let refused = catalog.commit(stale).await;
-    assert!(matches!(refused, Err(CatalogError::Conflict(_))), "{refused:?}");
+    assert!(
+        matches!(refused, Err(CatalogError::Conflict(_))),
+        "{refused:?}"
+    );
     assert_eq!(catalog.load().await.unwrap().owned.ranges, [mine]);
     let runs = catalog.output_runs(&ResultSet::of(&job().spec), 9).await;
     assert_eq!(runs.unwrap(), [Run { lo: 0, hi: 1 }]);
@@ -219,43 +244,85 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
     let id = job().id;
     let mut changes = Changes::default();
     changes.perhaps_over.insert(id, 50);
-    assert_eq!(catalog.commit(changes.clone()).await.unwrap(), [], "tasks are pending");
+    assert_eq!(
+        catalog.commit(changes.clone()).await.unwrap(),
+        [],
+        "tasks are pending"
+    );
     let dead = range(2, 8, 9, RangeState::Dead);
     changes.minted.insert(dead.id);
     changes.give(dead);
-    changes.give(Range { hi: 8, state: RangeState::Done { reused: false }, ..mine });
+    changes.give(Range {
+        hi: 8,
+        state: RangeState::Done { reused: false },
+        ..mine
+    });
     let ended = catalog.commit(changes).await.unwrap();
-    assert_eq!((ended[0].job, ended[0].state, ended[0].at_ms), (id, JobState::Failed, 50));
+    assert_eq!(
+        (ended[0].job, ended[0].state, ended[0].at_ms),
+        (id, JobState::Failed, 50)
+    );
     assert!(catalog.beat(0).await.unwrap().active.is_empty());
     let record = catalog.job(id).await.unwrap().unwrap();
-    assert_eq!((record.counts.total, record.counts.done, record.counts.dead), (9, 8, 1));
+    assert_eq!(
+        (record.counts.total, record.counts.done, record.counts.dead),
+        (9, 8, 1)
+    );
     assert_eq!(record.job.ended_ms, Some(50));
     // The same job may be submitted again; then the first cannot come back.
-    let twin = Job { id: JobId::from_uuid(Uuid::from_u128(2)), ..job() };
+    let twin = Job {
+        id: JobId::from_uuid(Uuid::from_u128(2)),
+        ..job()
+    };
     assert!(catalog.submit(&twin, &[], &[]).await.unwrap());
     let refused = catalog.retry(id, 60).await;
-    assert!(matches!(refused, Err(CatalogError::Conflict(_))), "{refused:?}");
+    assert!(
+        matches!(refused, Err(CatalogError::Conflict(_))),
+        "{refused:?}"
+    );
 }
 
 async fn given_up_tasks_can_be_tried_again(catalog: &dyn Catalog) {
-    submitted(catalog, &[range(1, 0, 2, RangeState::Dead), range(2, 2, 9, RangeState::Done { reused: true })]).await;
+    submitted(
+        catalog,
+        &[
+            range(1, 0, 2, RangeState::Dead),
+            range(2, 2, 9, RangeState::Done { reused: true }),
+        ],
+    )
+    .await;
     let id = job().id;
     let state = async || catalog.job(id).await.unwrap().unwrap().job.state;
     assert_eq!(state().await, JobState::Failed, "nothing is to be run");
     assert_eq!(catalog.retry(id, 60).await.unwrap(), 2);
     assert_eq!(state().await, JobState::Active);
-    let spans: Vec<_> = claim_all(catalog).await.iter().map(|r| (r.lo, r.hi)).collect();
+    let spans: Vec<_> = claim_all(catalog)
+        .await
+        .iter()
+        .map(|r| (r.lo, r.hi))
+        .collect();
     assert_eq!(spans, [(0, 2)]);
     assert!(catalog.cancel(id, 70).await.unwrap());
     assert!(!catalog.cancel(id, 71).await.unwrap(), "once");
     assert_eq!(state().await, JobState::Cancelled);
-    assert!(claim_all(catalog).await.is_empty(), "nothing of a cancelled job is given");
+    assert!(
+        claim_all(catalog).await.is_empty(),
+        "nothing of a cancelled job is given"
+    );
 }
 
 async fn the_same_spec_is_recorded_once(catalog: &dyn Catalog) {
     submitted(catalog, &[pending(1, 0, 9)]).await;
-    let twin = Job { id: JobId::from_uuid(Uuid::from_u128(2)), ..job() };
-    assert!(!catalog.submit(&twin, &[pending(2, 0, 9)], &[]).await.unwrap());
+    let twin = Job {
+        id: JobId::from_uuid(Uuid::from_u128(2)),
+        ..job()
+    };
+    assert!(
+        !catalog
+            .submit(&twin, &[pending(2, 0, 9)], &[])
+            .await
+            .unwrap()
+    );
     assert_eq!(catalog.jobs().await.unwrap().len(), 1);
     assert_eq!(catalog.job_with("h").await.unwrap(), Some(job()));
     assert_eq!(catalog.job_with("x").await.unwrap(), None);
@@ -270,7 +337,10 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     };
     catalog.load().await.unwrap();
     let submitted = [event(EventKind::Submitted, None)];
-    catalog.submit(&job(), &[pending(1, 0, 9)], &submitted).await.unwrap();
+    catalog
+        .submit(&job(), &[pending(1, 0, 9)], &submitted)
+        .await
+        .unwrap();
     let changes = Changes {
         events: vec![
             event(EventKind::Leased, Some(Run { lo: 0, hi: 3 })),
@@ -295,7 +365,10 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     query.after = 0;
     query.task = Some(2);
     let events = catalog.events(&query).await.unwrap();
-    let kinds: Vec<_> = events.iter().map(|e| (e.kind, e.task, e.lo, e.hi)).collect();
+    let kinds: Vec<_> = events
+        .iter()
+        .map(|e| (e.kind, e.task, e.lo, e.hi))
+        .collect();
     assert_eq!(
         kinds,
         [
@@ -320,17 +393,26 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
 async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn Catalog) {
     catalog.load().await.unwrap();
     let later = range(3, 8, 9, RangeState::Pending { not_before_ms: 700 });
-    let lease = leased(range(1, 0, 3, RangeState::Dead), &[Mark::Todo, Mark::Left, Mark::Done]);
+    let lease = leased(
+        range(1, 0, 3, RangeState::Dead),
+        &[Mark::Todo, Mark::Left, Mark::Done],
+    );
     let ranges = [pending(1, 0, 3), pending(2, 3, 8), pending(3, 8, 9)];
     catalog.submit(&job(), &ranges, &[]).await.unwrap();
-    let want = Want { stage: stage(), tasks: 9, now_ms: 0 };
+    let want = Want {
+        stage: stage(),
+        tasks: 9,
+        now_ms: 0,
+    };
     catalog.claim(&[want]).await.unwrap();
     let mut changes = Changes::default();
     changes.put(lease.clone());
     changes.put(later.clone());
     changes.give(pending(2, 3, 8));
     changes.put(pending(9, 1, 2));
-    changes.minted.insert(RangeId::from_uuid(Uuid::from_u128(9)));
+    changes
+        .minted
+        .insert(RangeId::from_uuid(Uuid::from_u128(9)));
     for (task, crashes) in [(1, 1), (8, 2)] {
         let exception = Exception {
             stage: stage(),
@@ -355,15 +437,25 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
     catalog.commit(changes).await.unwrap();
 
     let holdups = catalog.holdups(job().id, 600).await.unwrap();
-    assert_eq!((holdups.ready, holdups.waiting, holdups.next_ms), (6, 1, Some(700)));
+    assert_eq!(
+        (holdups.ready, holdups.waiting, holdups.next_ms),
+        (6, 1, Some(700))
+    );
     let failed: Vec<_> = holdups.failed.iter().map(|e| e.task).collect();
     assert_eq!(failed, [8, 1]);
     let holdups = catalog.holdups(job().id, 700).await.unwrap();
-    assert_eq!((holdups.ready, holdups.waiting, holdups.next_ms), (7, 0, None));
+    assert_eq!(
+        (holdups.ready, holdups.waiting, holdups.next_ms),
+        (7, 0, None)
+    );
 
     let task = async |task| catalog.task(stage(), task).await.unwrap();
     let left = task(1).await;
-    assert_eq!(left.range, Some(pending(9, 1, 2)), "what left a lease is found where it is");
+    assert_eq!(
+        left.range,
+        Some(pending(9, 1, 2)),
+        "what left a lease is found where it is"
+    );
     assert_eq!(left.exception.map(|e| e.crashes), Some(1));
     let done = task(2).await;
     assert_eq!((done.range, done.output), (Some(lease), Some(output)));
@@ -390,7 +482,10 @@ async fn every_kind_of_spec_is_read_back_as_written(catalog: &dyn Catalog) {
             ..job()
         };
         let range = Range {
-            stage: StageRef { job: job.id, stage: 0 },
+            stage: StageRef {
+                job: job.id,
+                stage: 0,
+            },
             ..pending(i as u128, 0, 1)
         };
         assert!(catalog.submit(&job, &[range], &[]).await.unwrap());
@@ -454,7 +549,10 @@ async fn a_catalog_survives_its_process() {
 /// Two houses on a database, and its URL.
 async fn two() -> Option<(PostgresCatalog, PostgresCatalog, String)> {
     let url = testing::postgres().await?;
-    let (a, b) = tokio::join!(PostgresCatalog::open(&url, "a"), PostgresCatalog::open(&url, "b"));
+    let (a, b) = tokio::join!(
+        PostgresCatalog::open(&url, "a"),
+        PostgresCatalog::open(&url, "b")
+    );
     let (a, b) = (a.unwrap(), b.unwrap());
     submitted(&a, &[pending(1, 0, 4), pending(2, 5, 9)]).await;
     b.load().await.unwrap();
@@ -480,7 +578,9 @@ async fn two_houses_never_claim_the_same_task() {
 
 #[tokio::test]
 async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
-    let Some((a, b, url)) = two().await else { return };
+    let Some((a, b, url)) = two().await else {
+        return;
+    };
     let mine = claim_all(&a).await;
     let house = a.load().await.unwrap().house;
     testing::lose_house(&url, house).await;
@@ -488,16 +588,36 @@ async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
         outputs: vec![output(0)],
         ..Changes::default()
     };
-    late.put(leased(mine[0].clone(), &[Mark::Done, Mark::Todo, Mark::Todo, Mark::Todo]));
-    assert!(matches!(a.commit(late.clone()).await, Err(CatalogError::Fenced)));
+    late.put(leased(
+        mine[0].clone(),
+        &[Mark::Done, Mark::Todo, Mark::Todo, Mark::Todo],
+    ));
+    assert!(matches!(
+        a.commit(late.clone()).await,
+        Err(CatalogError::Fenced)
+    ));
     assert_eq!(b.beat(0).await.unwrap().taken.ranges.len(), 2);
-    assert!(matches!(a.commit(late.clone()).await, Err(CatalogError::Fenced)));
+    assert!(matches!(
+        a.commit(late.clone()).await,
+        Err(CatalogError::Fenced)
+    ));
     assert!(matches!(a.beat(0).await, Err(CatalogError::Fenced)));
-    assert!(matches!(a.claim(&[want(1)]).await, Err(CatalogError::Fenced)));
+    assert!(matches!(
+        a.claim(&[want(1)]).await,
+        Err(CatalogError::Fenced)
+    ));
     // In its next life it has nothing, and what it remembers is refused.
     assert_eq!(a.load().await.unwrap().owned.ranges, []);
-    assert!(matches!(a.commit(late).await, Err(CatalogError::Conflict(_))));
-    assert!(b.output_runs(&ResultSet::of(&job().spec), 9).await.unwrap().is_empty());
+    assert!(matches!(
+        a.commit(late).await,
+        Err(CatalogError::Conflict(_))
+    ));
+    assert!(
+        b.output_runs(&ResultSet::of(&job().spec), 9)
+            .await
+            .unwrap()
+            .is_empty()
+    );
 }
 
 #[tokio::test]
@@ -510,11 +630,18 @@ async fn a_worker_takes_its_leases_along_and_the_former_house_learns_of_it() {
     a.commit(changes).await.unwrap();
     assert!(a.beat(1).await.unwrap().leased.unwrap().contains(&lease.id));
     assert_eq!(b.adopt(worker().id).await.unwrap().ranges, [lease.clone()]);
-    assert_eq!(b.adopt(worker().id).await.unwrap().ranges, [], "it is there already");
+    assert_eq!(
+        b.adopt(worker().id).await.unwrap().ranges,
+        [],
+        "it is there already"
+    );
     assert!(a.beat(1).await.unwrap().leased.unwrap().is_empty());
     let mut late = Changes::default();
     late.put(leased(lease, &[Mark::Done; 4]));
-    assert!(matches!(a.commit(late).await, Err(CatalogError::Conflict(_))));
+    assert!(matches!(
+        a.commit(late).await,
+        Err(CatalogError::Conflict(_))
+    ));
 }
 
 #[tokio::test]
@@ -526,21 +653,38 @@ async fn a_house_that_leaves_in_order_gives_back_what_nobody_runs() {
     a.commit(changes).await.unwrap();
     a.close().await;
     assert_eq!(claim_all(&b).await.len(), 1, "the pending one");
-    assert_eq!(b.beat(0).await.unwrap().taken.ranges.len(), 1, "the leased one");
+    assert_eq!(
+        b.beat(0).await.unwrap().taken.ranges.len(),
+        1,
+        "the leased one"
+    );
 }
 
 #[tokio::test]
 async fn of_two_houses_that_finish_at_once_the_second_ends_the_job() {
     let Some((a, b, _)) = two().await else { return };
-    let first = a.claim(&[want(4)]).await.unwrap().remove(0).owned.ranges.remove(0);
+    let first = a
+        .claim(&[want(4)])
+        .await
+        .unwrap()
+        .remove(0)
+        .owned
+        .ranges
+        .remove(0);
     let second = claim_all(&b).await.remove(0);
     let done = |range: Range| {
         let mut changes = Changes::default();
         changes.perhaps_over.insert(job().id, 50);
-        changes.give(Range { state: RangeState::Done { reused: false }, ..range });
+        changes.give(Range {
+            state: RangeState::Done { reused: false },
+            ..range
+        });
         changes
     };
     let (x, y) = tokio::join!(a.commit(done(first)), b.commit(done(second)));
     assert_eq!(x.unwrap().len() + y.unwrap().len(), 1);
-    assert_eq!(a.job(job().id).await.unwrap().unwrap().job.state, JobState::Done);
+    assert_eq!(
+        a.job(job().id).await.unwrap().unwrap().job.state,
+        JobState::Done
+    );
 }

@@ -223,6 +223,16 @@ pub(crate) fn root_metadata(spec: &DatasetSpec) -> Value {
                 spec.spots
             ),
         ]),
+        Profile::CountsU16 => json!([
+            "ds = xarray.open_zarr(location)  # i is the scene's index",
+            "counts = ds['transient'][i].values  # photons",
+            "h = counts.astype('float32') / ds['scale'][i].values  # radiance; NaN where the scene is missing",
+            "# bins with code 65535 are saturated: their exact h stand in manifests/<i>.json, 'overflow'",
+            format!(
+                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
+                spec.spots
+            ),
+        ]),
         Profile::PlainF32 => json!([
             "ds = xarray.open_zarr(location)  # i is the scene's index",
             "h = ds['transient'][i].values  # radiance",

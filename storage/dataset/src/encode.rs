@@ -7,13 +7,14 @@ use bytes::Bytes;
 use rayon::prelude::*;
 
 use crate::codec::ChunkCodec;
+use crate::counts;
 use crate::dataset::ArrayCodec;
 use crate::error::DatasetError;
 use crate::layout::{Layout, Quantity};
 use crate::manifest::{
     ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
 };
-use crate::record::{Provenance, SceneRecord};
+use crate::record::{Provenance, SceneRecord, SubsetRecord};
 use crate::shard;
 use crate::spec::{DatasetSpec, Profile};
 use crate::squareroot::{ErrorSums, SATURATED, SquareRoot};
@@ -38,6 +39,32 @@ pub(crate) fn encode_scene(
     provenance: &Provenance,
 ) -> Result<EncodedScene, DatasetError> {
     record.check(spec)?;
+    let content = Content {
+        transient: record.transient,
+        subsets: record.subsets,
+        scale: record.scale,
+    };
+    assemble(spec, arrays, scene, &content, provenance, |quantity| {
+        Ok(small_array(spec, quantity, record))
+    })
+}
+
+/// A scene's histograms.
+pub(crate) struct Content<'a> {
+    pub transient: &'a [f32],
+    pub subsets: &'a [SubsetRecord<'a>],
+    pub scale: f32,
+}
+
+/// Codes the histograms, and the native-endian bytes that `small` gives for each other quantity.
+pub(crate) fn assemble(
+    spec: &DatasetSpec,
+    arrays: &[ArrayCodec],
+    scene: u64,
+    content: &Content<'_>,
+    provenance: &Provenance,
+    small: impl Fn(Quantity) -> Result<Vec<u8>, DatasetError>,
+) -> Result<EncodedScene, DatasetError> {
     let mut coded = None;
     let mut subsets = BTreeMap::new();
     let mut objects = Vec::with_capacity(arrays.len());
@@ -45,15 +72,15 @@ pub(crate) fn encode_scene(
     for array in arrays {
         let object = match array.layout.quantity {
             Quantity::Transient => {
-                let planes = [record.transient];
-                let transient = encode_transient(spec, array, &planes, record.scale)?;
+                let planes = [content.transient];
+                let transient = encode_transient(spec, array, &planes, content.scale)?;
                 coded = Some((transient.error, transient.overflow));
                 transient.shard
             }
             quantity if quantity.is_transient() => {
-                let subset = record.subsets.iter().find(|s| s.quantity == quantity);
+                let subset = content.subsets.iter().find(|s| s.quantity == quantity);
                 let planes = &subset.expect("checked with the record").planes;
-                let transient = encode_transient(spec, array, planes, record.scale)?;
+                let transient = encode_transient(spec, array, planes, content.scale)?;
                 let coding = SubsetCoding {
                     error: transient.error.finish(),
                     overflow: transient.overflow,
@@ -61,7 +88,7 @@ pub(crate) fn encode_scene(
                 subsets.insert(quantity.name().to_string(), coding);
                 transient.shard
             }
-            quantity => array.codec.encode(&small_array(spec, quantity, record))?,
+            quantity => array.codec.encode(&small(quantity)?)?,
         };
         objects.push(ObjectEntry {
             key: array.layout.key(scene),
@@ -76,7 +103,7 @@ pub(crate) fn encode_scene(
         scene,
         profile: spec.profile,
         encoder: ENCODER_VERSION.into(),
-        scale: record.scale,
+        scale: content.scale,
         error: error.finish(),
         provenance: provenance.clone(),
         overflow,
@@ -185,6 +212,22 @@ fn encode_tile(
             }
             codec.encode(bytemuck::cast_slice(&q))?
         }
+        Profile::CountsU16 => {
+            let mut q = vec![0u16; tiles.tile_len()];
+            for run in tiles.runs(tile) {
+                let h = source.run(&run);
+                let q = &mut q[run.tile..run.tile + run.len];
+                match counts::encode_run(source.scale, h, q, &mut error) {
+                    Ok(false) => {}
+                    Ok(true) => {
+                        let saturated = q.iter().enumerate().filter(|(_, q)| **q == SATURATED);
+                        overflow.extend(saturated.map(|(i, _)| ((run.image + i) as u64, h[i])));
+                    }
+                    Err(at) => return Err(invalid_count(source, h[at], run.image + at)),
+                }
+            }
+            codec.encode(bytemuck::cast_slice(&q))?
+        }
         Profile::PlainF32 => {
             let mut values = vec![0f32; tiles.tile_len()];
             for run in tiles.runs(tile) {
@@ -212,6 +255,19 @@ fn invalid_value(name: &str, h: &[f32], start: usize) -> DatasetError {
     DatasetError::invalid(
         format!("record.{name}[{}]", start + at),
         format!("expected a finite value of at least 0, found {}", h[at]),
+    )
+}
+
+fn invalid_count(source: &Source<'_>, h: f32, at: usize) -> DatasetError {
+    if !(0.0..=f32::MAX).contains(&h) {
+        return invalid_value(source.name, &[h], at);
+    }
+    DatasetError::invalid(
+        format!("record.{}[{at}]", source.name),
+        format!(
+            "expected a whole number of photons, found {}; counts-u16 holds counts, other values need sqrt-u16 or plain-f32",
+            h * source.scale
+        ),
     )
 }
 
@@ -326,15 +382,7 @@ fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>)
         | Quantity::Transient4
         | Quantity::Transient25
         | Quantity::TransientSpots => unreachable!("transients are coded by tiles"),
-        Quantity::Intensity => {
-            let bins = spec.gate.bins as usize;
-            let sums: Vec<f32> = record
-                .transient
-                .par_chunks(bins)
-                .map(|h| h.iter().map(|h| f64::from(*h)).sum::<f64>() as f32)
-                .collect();
-            bytemuck::cast_slice(&sums).to_vec()
-        }
+        Quantity::Intensity => intensity(record.transient, spec.gate.bins),
         Quantity::Depth => bytemuck::cast_slice(record.depth).to_vec(),
         Quantity::Range => bytemuck::cast_slice(record.range).to_vec(),
         Quantity::Normal => {
@@ -370,6 +418,15 @@ fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>)
         Quantity::Laser => bytemuck::cast_slice(&record.laser).to_vec(),
         Quantity::Scale => record.scale.to_ne_bytes().to_vec(),
     }
+}
+
+/// Native-endian bytes of Σ_b h.
+pub(crate) fn intensity(transient: &[f32], bins: u32) -> Vec<u8> {
+    let sums: Vec<f32> = transient
+        .par_chunks(bins as usize)
+        .map(|h| h.iter().map(|h| f64::from(*h)).sum::<f64>() as f32)
+        .collect();
+    bytemuck::cast_slice(&sums).to_vec()
 }
 
 /// Linear value, clamped to [0, 1], to 8-bit sRGB (IEC 61966-2-1).

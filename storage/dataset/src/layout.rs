@@ -306,6 +306,17 @@ impl Quantity {
                     "saturated": format!("exact values stand in manifests/<scene>.json, '{saturated}'"),
                 }),
             ),
+            Profile::CountsU16 => (
+                Element::U16,
+                json!({
+                    "long_name": format!("photon counts{of}"),
+                    "units": "photons",
+                    "decode": "h = counts / scale in float32",
+                    "decoded_units": "1/(m2 sr), radiance per unit pulse energy in each bin",
+                    "saturated_code": crate::squareroot::SATURATED,
+                    "saturated": format!("exact values of h stand in manifests/<scene>.json, '{saturated}'"),
+                }),
+            ),
             Profile::PlainF32 => (
                 Element::F32,
                 json!({

@@ -6,9 +6,12 @@
 
 mod codec;
 mod collect;
+mod counts;
 mod dataset;
+mod derive;
 mod encode;
 mod error;
+mod export;
 mod layout;
 mod manifest;
 mod objects;
@@ -19,14 +22,17 @@ mod render_group;
 mod render_read;
 mod shard;
 mod spec;
+mod splits;
 mod squareroot;
 mod store;
 mod verify;
 
 pub use collect::{Collection, MIN_GRACE, Orphan};
 pub use dataset::Dataset;
+pub use derive::SceneTruth;
 pub use encode::EncodedScene;
 pub use error::DatasetError;
+pub use export::{Export, Exported};
 pub use layout::{INNER_SIDE, Quantity};
 pub use manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding};
 pub use read::Stored;

@@ -8,6 +8,7 @@ use futures::TryStreamExt;
 use object_store::{ObjectStore, ObjectStoreExt};
 use rayon::prelude::*;
 
+use crate::counts;
 use crate::dataset::{ArrayCodec, Dataset};
 use crate::encode::Tiles;
 use crate::error::DatasetError;
@@ -137,23 +138,55 @@ impl Dataset {
             columns.start as usize..columns.end as usize,
         ];
         let manifest = self.manifest(scene).await?;
-        let tiles = Tiles::new(&self.spec, &self.array(Quantity::Transient).layout);
+        self.read_window(&manifest, self.array(Quantity::Transient), window)
+            .await
+    }
+
+    /// h of one spot alone, from `transient_spots`: `[row][column][bin]`. Fetches and decodes nothing of the other spots.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the data set has no such transient or no such spot; those of
+    /// [`Self::read_transient`].
+    pub async fn read_spot(&self, scene: u64, spot: u32) -> Result<Vec<f32>, DatasetError> {
+        let array = self.array_of(Quantity::TransientSpots)?;
+        if spot >= self.spec.spots {
+            let what = format!(
+                "the data set has {} spots, counted from 0; found {spot}",
+                self.spec.spots
+            );
+            return Err(DatasetError::invalid("spot", what));
+        }
+        let (height, width) = (self.spec.height as usize, self.spec.width as usize);
+        let top = spot as usize * height;
+        let manifest = self.manifest(scene).await?;
+        self.read_window(&manifest, array, [top..top + height, 0..width])
+            .await
+    }
+
+    /// A window of an array's rows, counted through all of its planes, and columns.
+    async fn read_window(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        window: [Range<usize>; 2],
+    ) -> Result<Vec<f32>, DatasetError> {
+        let tiles = Tiles::new(&self.spec, &array.layout);
         let wanted: Vec<usize> = (0..tiles.count())
             .filter(|tile| tiles.touches(*tile, &window[0], &window[1]))
             .collect();
-        let chunks = self.fetch_tiles(&manifest, &tiles, &wanted).await?;
-        let array = self.array(Quantity::Transient);
-        self.decode_window(&manifest, array, &tiles, chunks, window)
+        let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
+        self.decode_window(manifest, array, &tiles, chunks, window)
     }
 
     /// The coded bytes of the wanted tiles; `None` = all fill value.
     async fn fetch_tiles(
         &self,
         manifest: &Manifest,
+        array: &ArrayCodec,
         tiles: &Tiles,
         wanted: &[usize],
     ) -> Result<Vec<(usize, Option<Bytes>)>, DatasetError> {
-        let key = self.array(Quantity::Transient).layout.key(manifest.scene);
+        let key = array.layout.key(manifest.scene);
         let path = self.path(&key);
         let damaged = |what: String| DatasetError::Damaged {
             object: self.shown(&path),
@@ -301,6 +334,10 @@ impl Dataset {
                     Profile::SqrtU16 { delta } => {
                         let q = values::<u16>(&raw[source * 2..][..len * 2]);
                         saturated |= SquareRoot::new(delta, scale).decode_run(&q, target);
+                    }
+                    Profile::CountsU16 => {
+                        let q = values::<u16>(&raw[source * 2..][..len * 2]);
+                        saturated |= counts::decode_run(scale, &q, target);
                     }
                     Profile::PlainF32 => {
                         target.copy_from_slice(&values::<f32>(&raw[source * 4..][..len * 4]));

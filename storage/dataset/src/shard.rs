@@ -6,6 +6,8 @@
 
 use std::ops::Range;
 
+use bytes::Bytes;
+
 use crate::codec::ChunkCodec;
 use crate::error::DatasetError;
 
@@ -19,14 +21,31 @@ pub(crate) fn index_len(chunks: usize) -> usize {
 
 /// Puts coded inner chunks, in row-major order, and the index together.
 pub(crate) fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, DatasetError> {
-    let payload: usize = chunks.iter().map(Vec::len).sum();
-    let mut shard = Vec::with_capacity(payload + index_len(chunks.len()));
-    let mut index: Vec<u64> = Vec::with_capacity(chunks.len() * 2);
+    put_together(chunks.iter().map(|chunk| Some(&chunk[..])))
+}
+
+/// The same where some chunks are all fill value.
+pub(crate) fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, DatasetError> {
+    put_together(chunks.iter().map(|chunk| chunk.as_deref()))
+}
+
+fn put_together<'a>(
+    chunks: impl ExactSizeIterator<Item = Option<&'a [u8]>> + Clone,
+) -> Result<Vec<u8>, DatasetError> {
+    let payload: usize = chunks.clone().flatten().map(<[u8]>::len).sum();
+    let count = chunks.len();
+    let mut shard = Vec::with_capacity(payload + index_len(count));
+    let mut index: Vec<u64> = Vec::with_capacity(count * 2);
     for chunk in chunks {
-        index.extend([shard.len() as u64, chunk.len() as u64]);
-        shard.extend_from_slice(chunk);
+        match chunk {
+            Some(chunk) => {
+                index.extend([shard.len() as u64, chunk.len() as u64]);
+                shard.extend_from_slice(chunk);
+            }
+            None => index.extend([u64::MAX; 2]),
+        }
     }
-    shard.extend(ChunkCodec::index(chunks.len()).encode(bytemuck::cast_slice(&index))?);
+    shard.extend(ChunkCodec::index(count).encode(bytemuck::cast_slice(&index))?);
     Ok(shard)
 }
 

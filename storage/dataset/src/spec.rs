@@ -28,6 +28,9 @@ pub enum Profile {
     },
     /// 32-bit floats, lossless.
     PlainF32,
+    /// Whole photon counts in u16, lossless: N = h·scale, which must be whole; decoded as h = N/scale. What a sensor
+    /// with photon noise gives.
+    CountsU16,
 }
 
 impl Default for Profile {
@@ -125,8 +128,9 @@ impl Profile {
         match name {
             "sqrt-u16" => Ok(Self::default()),
             "plain-f32" => Ok(Self::PlainF32),
+            "counts-u16" => Ok(Self::CountsU16),
             other => Err(format!(
-                "{other:?} is not one of \"sqrt-u16\", \"plain-f32\""
+                "{other:?} is not one of \"sqrt-u16\", \"plain-f32\", \"counts-u16\""
             )),
         }
     }
@@ -137,6 +141,7 @@ impl std::fmt::Display for Profile {
         match self {
             Self::SqrtU16 { delta } => write!(f, "sqrt-u16 with delta {delta}"),
             Self::PlainF32 => write!(f, "plain-f32"),
+            Self::CountsU16 => write!(f, "counts-u16"),
         }
     }
 }

@@ -118,6 +118,11 @@ pub(crate) struct ErrorSums {
 }
 
 impl ErrorSums {
+    /// `count` values without error.
+    pub fn add_exact(&mut self, count: usize) {
+        self.count += count as u64;
+    }
+
     pub fn add(&mut self, other: &Self) {
         self.squares += other.squares;
         self.worst = self.worst.max(other.worst);

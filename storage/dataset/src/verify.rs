@@ -14,6 +14,7 @@ use crate::error::DatasetError;
 use crate::manifest::{Manifest, sha256_hex};
 use crate::objects;
 use crate::spec::DatasetSpec;
+use crate::splits;
 
 /// Requests in flight.
 const CONCURRENCY: usize = 16;
@@ -143,6 +144,7 @@ impl Dataset {
             problems: Vec::new(),
             unpublished: Vec::new(),
         };
+        listed.retain(|key, _| !splits::is_split(key));
         self.verify_metadata(&mut listed, &mut report).await?;
         let mut scenes = Vec::new();
         listed.retain(|key, _| match manifest_scene(key) {

@@ -16,3 +16,4 @@ pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
 pub use execute::{check_memory, render_bytes, renderer_version, strategy, strategy_names};
+pub use execute::{reprocess, split};

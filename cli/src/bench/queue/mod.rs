@@ -6,7 +6,10 @@ mod server;
 mod stats;
 mod worker;
 
-use std::{sync::Arc, time::{Duration, Instant}};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use picofarm_coordinator::CatalogPlace;
 use picofarm_proto::model::{JobSpec, JobState};
@@ -135,7 +138,8 @@ impl Bench<'_> {
         client.submit(spec(tasks), false).await?;
         let seconds = start.elapsed().as_secs_f64();
         let coordinator_peak_bytes = server.usage()?.peak_bytes;
-        self.output.say(format!("submitted {tasks} tasks in {seconds:.3} s"));
+        self.output
+            .say(format!("submitted {tasks} tasks in {seconds:.3} s"));
         Ok(Submit {
             tasks,
             seconds,
@@ -159,7 +163,11 @@ impl Bench<'_> {
         drop(server);
         raw.extend(raw::measure(&self.place).await?);
         let tasks_per_second = self.args.tasks as f64 / seconds;
-        let limits: Vec<f64> = raw.iter().filter(|r| r.batch == 1000).map(|r| r.rows_per_second).collect();
+        let limits: Vec<f64> = raw
+            .iter()
+            .filter(|r| r.batch == 1000)
+            .map(|r| r.rows_per_second)
+            .collect();
         let limit = limits.iter().sum::<f64>() / limits.len().max(1) as f64;
         self.output.say(format!("{tasks_per_second:.0} tasks/s"));
         Ok(Throughput {
@@ -231,7 +239,10 @@ impl Bench<'_> {
                 JobState::Done => return Ok(()),
                 JobState::Active => {}
                 state => {
-                    return Err(CliError::new(Code::Failed, format!("the bench's job ended {state:?}")));
+                    return Err(CliError::new(
+                        Code::Failed,
+                        format!("the bench's job ended {state:?}"),
+                    ));
                 }
             }
             fleet.check()?;
@@ -288,7 +299,9 @@ impl Running {
     async fn stop(mut self) -> Result<Arc<Stats>> {
         self.stop.cancel();
         while let Some(ended) = self.workers.join_next().await {
-            ended.map_err(|e| CliError::new(Code::Failed, format!("a simulated worker broke: {e}")))?;
+            ended.map_err(|e| {
+                CliError::new(Code::Failed, format!("a simulated worker broke: {e}"))
+            })?;
         }
         self.check()?;
         Ok(self.stats)
@@ -309,15 +322,29 @@ fn describe(report: &Report) -> String {
     let mut text = format!("catalog {}\n", report.catalog);
     let row = |cells: &[String]| cells.to_vec();
     if !report.submit.is_empty() {
-        let mut rows = vec![row(&["submit, tasks".into(), "s".into(), "coordinator's peak".into()])];
+        let mut rows = vec![row(&[
+            "submit, tasks".into(),
+            "s".into(),
+            "coordinator's peak".into(),
+        ])];
         for s in &report.submit {
-            rows.push(row(&[s.tasks.to_string(), format!("{:.3}", s.seconds), bytes(s.coordinator_peak_bytes)]));
+            rows.push(row(&[
+                s.tasks.to_string(),
+                format!("{:.3}", s.seconds),
+                bytes(s.coordinator_peak_bytes),
+            ]));
         }
         text += &format!("\n{}", table(&rows));
     }
     if let Some(t) = &report.throughput {
-        let mut rows = vec![row(&["no-op tasks".into(), format!("{} with {} workers", t.tasks, t.workers)])];
-        rows.push(row(&["tasks/s, durable".into(), format!("{:.0}", t.tasks_per_second)]));
+        let mut rows = vec![row(&[
+            "no-op tasks".into(),
+            format!("{} with {} workers", t.tasks, t.workers),
+        ])];
+        rows.push(row(&[
+            "tasks/s, durable".into(),
+            format!("{:.0}", t.tasks_per_second),
+        ]));
         for raw in &t.raw {
             rows.push(row(&[
                 format!("raw rows/s, {} a transaction", raw.batch),
@@ -325,18 +352,35 @@ fn describe(report: &Report) -> String {
             ]));
         }
         if let Some(share) = t.of_raw {
-            rows.push(row(&["of the raw limit (1000 a transaction)".into(), format!("{share:.2}")]));
+            rows.push(row(&[
+                "of the raw limit (1000 a transaction)".into(),
+                format!("{share:.2}"),
+            ]));
         }
         rows.push(row(&[
             "coordinator's CPU, a task".into(),
             format!("{:.1} µs", t.coordinator_cpu_s / t.tasks as f64 * 1e6),
         ]));
-        rows.push(row(&["coordinator's peak".into(), bytes(t.coordinator_peak_bytes)]));
+        rows.push(row(&[
+            "coordinator's peak".into(),
+            bytes(t.coordinator_peak_bytes),
+        ]));
         text += &format!("\n{}", table(&rows));
     }
     if !report.fleets.is_empty() {
-        let head = ["workers", "tasks", "wall s", "efficiency", "lease p50/p99 ms", "heartbeat p50/p99 ms",
-            "reconnects", "refused", "revoked", "coordinator's load", "peak"];
+        let head = [
+            "workers",
+            "tasks",
+            "wall s",
+            "efficiency",
+            "lease p50/p99 ms",
+            "heartbeat p50/p99 ms",
+            "reconnects",
+            "refused",
+            "revoked",
+            "coordinator's load",
+            "peak",
+        ];
         let mut rows = vec![head.map(String::from).to_vec()];
         for f in &report.fleets {
             rows.push(row(&[

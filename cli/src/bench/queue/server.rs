@@ -67,7 +67,10 @@ impl Server {
         let id = self.child.id();
         let read = |file: &str| {
             std::fs::read_to_string(format!("/proc/{id}/{file}")).map_err(|e| {
-                CliError::new(Code::Resource, format!("/proc/{id}/{file}: {e}; this bench needs Linux"))
+                CliError::new(
+                    Code::Resource,
+                    format!("/proc/{id}/{file}: {e}; this bench needs Linux"),
+                )
             })
         };
         let stat = read("stat")?;
@@ -77,7 +80,12 @@ impl Server {
             .map_or("", |(_, rest)| rest)
             .split_whitespace()
             .collect();
-        let ticks = |at: usize| fields.get(at).and_then(|t| t.parse::<f64>().ok()).unwrap_or(0.0);
+        let ticks = |at: usize| {
+            fields
+                .get(at)
+                .and_then(|t| t.parse::<f64>().ok())
+                .unwrap_or(0.0)
+        };
         let status = read("status")?;
         let peak = status
             .lines()
@@ -104,14 +112,21 @@ impl Drop for Server {
 }
 
 fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, String)> {
-    let failed = |e: std::io::Error| CliError::new(Code::Resource, format!("starting a coordinator: {e}"));
+    let failed =
+        |e: std::io::Error| CliError::new(Code::Resource, format!("starting a coordinator: {e}"));
     let program = std::env::current_exe().map_err(failed)?;
     let url = match place {
         CatalogPlace::Sqlite(path) => path.display().to_string(),
         CatalogPlace::Postgres(url) => url.clone(),
     };
     let mut child = Command::new(program)
-        .args(["coordinator", "--json", "--allow-insecure", "--listen", listen])
+        .args([
+            "coordinator",
+            "--json",
+            "--allow-insecure",
+            "--listen",
+            listen,
+        ])
         .args(["--lease-s", &lease_s.to_string(), "--log", "warn"])
         // Not an argument: it may hold a password.
         .env("PICOFARM_CATALOG", url)
@@ -127,7 +142,10 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
         None => {
             let _ = child.kill();
             let _ = child.wait();
-            Err(CliError::new(Code::Resource, "the coordinator did not start; its own words stand above"))
+            Err(CliError::new(
+                Code::Resource,
+                "the coordinator did not start; its own words stand above",
+            ))
         }
     }
 }

@@ -41,7 +41,9 @@ fn latency(mut seconds: Vec<f64>) -> Latency {
     seconds.sort_by(f64::total_cmp);
     let at = |share: f64| {
         let last = seconds.len().saturating_sub(1) as f64;
-        seconds.get((last * share).round() as usize).map_or(0.0, |s| s * 1e3)
+        seconds
+            .get((last * share).round() as usize)
+            .map_or(0.0, |s| s * 1e3)
     };
     Latency {
         p50_ms: at(0.5),

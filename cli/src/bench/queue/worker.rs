@@ -13,7 +13,8 @@ use picofarm_proto::{
     key::{StageKey, stage_key, task_key},
     model::{Finished, Lease, WorkerHello},
     wire::{
-        self, farm_client::FarmClient, session_request::Message as Say, session_response::Message as Heard,
+        self, farm_client::FarmClient, session_request::Message as Say,
+        session_response::Message as Heard,
     },
 };
 use tokio::sync::mpsc;
@@ -117,7 +118,9 @@ impl Simulated {
             Err(status) => return End::Refused(status.message().to_owned()),
         };
         let welcome = match from.message().await {
-            Ok(Some(wire::SessionResponse { message: Some(Heard::Welcome(w)) })) => w,
+            Ok(Some(wire::SessionResponse {
+                message: Some(Heard::Welcome(w)),
+            })) => w,
             Ok(_) | Err(_) => return End::Lost,
         };
         self.stats.welcomed(again);
@@ -129,7 +132,9 @@ impl Simulated {
         let mut beat = tokio::time::interval(Duration::from_millis(welcome.heartbeat_ms.into()));
         let mut beats = VecDeque::new();
         loop {
-            let done_at = self.done_at.unwrap_or_else(|| Instant::now() + Duration::from_secs(3600));
+            let done_at = self
+                .done_at
+                .unwrap_or_else(|| Instant::now() + Duration::from_secs(3600));
             tokio::select! {
                 heard = from.message() => match heard {
                     Ok(Some(wire::SessionResponse { message: Some(message) })) => {

@@ -69,11 +69,15 @@ pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
         Some("42501") => server(format!(
             "{said}; the user must own the database, or be granted CREATE on its schema"
         )),
-        Some("53300") => server(format!("{said}; raise max_connections, or run fewer programs on it")),
+        Some("53300") => server(format!(
+            "{said}; raise max_connections, or run fewer programs on it"
+        )),
         Some("53100") => server(format!(
             "the server's disk is full ({said}); free some space: no finished work is lost"
         )),
-        Some("57P01" | "57P02" | "57P03") => server(format!("{said}; the server is stopping or starting")),
+        Some("57P01" | "57P02" | "57P03") => {
+            server(format!("{said}; the server is stopping or starting"))
+        }
         Some("23505" | "23503" | "23514" | "40001" | "40P01") => {
             CatalogError::Conflict(format!("{said} ({})", code.unwrap_or_default()))
         }

@@ -6,6 +6,8 @@
 //! and asks once a second anyway.
 
 mod errors;
+mod house;
+mod jobs;
 mod write;
 
 use std::{
@@ -125,7 +127,7 @@ impl PostgresCatalog {
         let result = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            write::fence(&mut tx, house).await?;
+            house::fence(&mut tx, house).await?;
             let mut desk = write::Desk {
                 c: &mut tx,
                 house: house.uuid(),
@@ -197,8 +199,8 @@ impl Catalog for PostgresCatalog {
         let snapshot = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            write::found(&mut tx, house, former, &self.name, HOUSE_SECONDS).await?;
-            let ranges = write::take_lost(&mut tx, house).await?;
+            house::found(&mut tx, house, former, &self.name, HOUSE_SECONDS).await?;
+            let ranges = house::take_lost(&mut tx, house).await?;
             let snapshot = Snapshot {
                 house,
                 jobs: query::active_jobs(&mut tx).await?,
@@ -221,11 +223,11 @@ impl Catalog for PostgresCatalog {
         let news = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            if !write::renew(&mut tx, house, workers, HOUSE_SECONDS).await? {
+            if !house::renew(&mut tx, house, workers, HOUSE_SECONDS).await? {
                 return Ok(None);
             }
-            let taken = write::take_lost(&mut tx, house).await?;
-            let (houses, workers) = write::count_houses(&mut tx).await?;
+            let taken = house::take_lost(&mut tx, house).await?;
+            let (houses, workers) = house::count_houses(&mut tx).await?;
             let news = News {
                 active: query::active_ids(&mut tx).await?,
                 free: query::free(&mut tx).await?,
@@ -233,7 +235,7 @@ impl Catalog for PostgresCatalog {
                     exceptions: query::exceptions(&mut tx, &taken).await?,
                     ranges: taken,
                 },
-                leased: Some(write::leased(&mut tx, house).await?),
+                leased: Some(house::leased(&mut tx, house).await?),
                 houses,
                 workers,
             };
@@ -267,7 +269,7 @@ impl Catalog for PostgresCatalog {
 
     async fn adopt(&self, worker: WorkerId) -> Result<Owned, CatalogError> {
         self.write(async |desk| {
-            let ranges = write::adopt(desk, worker).await?;
+            let ranges = house::adopt(desk, worker).await?;
             Ok(Owned {
                 exceptions: query::exceptions(desk.c, &ranges).await?,
                 ranges,
@@ -297,7 +299,7 @@ impl Catalog for PostgresCatalog {
         events: &[NewEvent],
     ) -> Result<bool, CatalogError> {
         let new = self
-            .write(async |desk| write::submit(desk, job, ranges, events).await)
+            .write(async |desk| jobs::submit(desk, job, ranges, events).await)
             .await?;
         self.hint().await;
         Ok(new)
@@ -305,7 +307,7 @@ impl Catalog for PostgresCatalog {
 
     async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError> {
         let cancelled = self
-            .write(async |desk| write::cancel(desk, job, now_ms).await)
+            .write(async |desk| jobs::cancel(desk, job, now_ms).await)
             .await?;
         self.hint().await;
         Ok(cancelled)
@@ -313,7 +315,7 @@ impl Catalog for PostgresCatalog {
 
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
         let retried = self
-            .write(async |desk| write::retry(desk, job, now_ms).await)
+            .write(async |desk| jobs::retry(desk, job, now_ms).await)
             .await?;
         self.hint().await;
         Ok(retried)
@@ -397,7 +399,7 @@ impl Catalog for PostgresCatalog {
         if let Some(house) = house {
             // What is not given back now, others find when the house is lost.
             if let Ok(mut c) = self.pool.acquire().await
-                && let Err(error) = write::leave(&mut c, house).await
+                && let Err(error) = house::leave(&mut c, house).await
             {
                 tracing::debug!(%error, "the house was not given up in order");
             }

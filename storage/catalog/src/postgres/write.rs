@@ -1,26 +1,21 @@
-//! Everything that writes. What a house writes it writes at its [`Desk`], behind the [`fence`]; rows go in bulk, as
-//! arrays.
+//! What a house writes of ranges, outputs and history: at its [`Desk`], behind the fence; rows go in bulk, as arrays.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 
-use picofarm_proto::{
-    ids::{HouseId, JobId, RangeId, StageRef, WorkerId},
-    model::{EventKind, JobState},
-};
+use picofarm_proto::ids::{JobId, RangeId, StageRef};
 use sqlx::{PgConnection, Row, postgres::PgRow};
 use uuid::Uuid;
 
-use super::query;
+use super::{jobs, query};
 use crate::{
-    Changes, Claim, Exception, Job, JobEnd, NewEvent, Output, Owned, Range, Want,
-    record::RangeState,
+    Changes, Claim, Exception, JobEnd, NewEvent, Output, Owned, Range, Want,
     sql::{self, StateColumns, int},
 };
 
 /// Pending ranges looked at for one wish.
 const LOOK_AT: i64 = 256;
 /// A range with the names of its job and stage.
-const RANGE: &str = "task_range.*, (SELECT id FROM job JOIN stage ON stage.job = job.key WHERE stage.key = task_range.stage) AS job_id, \
+pub(super) const RANGE: &str = "task_range.*, (SELECT id FROM job JOIN stage ON stage.job = job.key WHERE stage.key = task_range.stage) AS job_id, \
                      (SELECT ordinal FROM stage WHERE stage.key = task_range.stage) AS ordinal";
 
 pub(super) enum WriteError {
@@ -35,18 +30,18 @@ impl From<sqlx::Error> for WriteError {
     }
 }
 
-type Result<T> = std::result::Result<T, WriteError>;
-type Sql<T> = std::result::Result<T, sqlx::Error>;
+pub(super) type Result<T> = std::result::Result<T, WriteError>;
+pub(super) type Sql<T> = std::result::Result<T, sqlx::Error>;
 
 /// Integer keys of stages, remembered: they never change.
 #[derive(Default)]
 pub(super) struct Keys(HashMap<StageRef, StageKeys>);
 
 #[derive(Clone, Copy)]
-struct StageKeys {
-    stage: i64,
-    job: i64,
-    result_set: i64,
+pub(super) struct StageKeys {
+    pub stage: i64,
+    pub job: i64,
+    pub result_set: i64,
 }
 
 /// Where a house writes: inside a transaction that has passed the fence.
@@ -57,7 +52,7 @@ pub(super) struct Desk<'a> {
 }
 
 impl Desk<'_> {
-    async fn keys(&mut self, stage: StageRef) -> Result<StageKeys> {
+    pub(super) async fn keys(&mut self, stage: StageRef) -> Result<StageKeys> {
         if let Some(keys) = self.keys.0.get(&stage) {
             return Ok(*keys);
         }
@@ -80,133 +75,12 @@ impl Desk<'_> {
         Ok(keys)
     }
 
-    async fn job(&mut self, job: JobId) -> Result<i64> {
+    pub(super) async fn job(&mut self, job: JobId) -> Result<i64> {
         Ok(self.keys(StageRef { job, stage: 0 }).await?.job)
     }
 }
 
-/// Holds the house's row until the transaction ends: it is alive, and cannot be found lost meanwhile.
-pub(super) async fn fence(c: &mut PgConnection, house: HouseId) -> Result<()> {
-    let alive: Option<i32> = sqlx::query_scalar(
-        "SELECT 1 FROM house WHERE id = $1 AND until > clock_timestamp() FOR KEY SHARE",
-    )
-    .bind(house.uuid())
-    .fetch_optional(c)
-    .await?;
-    alive.map(|_| ()).ok_or(WriteError::Fenced)
-}
-
-/// Founds a house, which inherits from a former life of the same process.
-pub(super) async fn found(
-    c: &mut PgConnection,
-    house: HouseId,
-    former: Option<HouseId>,
-    name: &str,
-    seconds: f64,
-) -> Sql<()> {
-    sqlx::query(
-        "INSERT INTO house (id, name, workers, until) \
-         VALUES ($1, $2, 0, clock_timestamp() + make_interval(secs => $3))",
-    )
-    .bind(house.uuid())
-    .bind(name)
-    .bind(seconds)
-    .execute(&mut *c)
-    .await?;
-    if let Some(former) = former {
-        sqlx::query("DELETE FROM house WHERE id = $1")
-            .bind(former.uuid())
-            .execute(c)
-            .await?;
-    }
-    Ok(())
-}
-
-/// Prolongs the house's time; `false` where it is over.
-pub(super) async fn renew(
-    c: &mut PgConnection,
-    house: HouseId,
-    workers: u32,
-    seconds: f64,
-) -> Sql<bool> {
-    let renewed = sqlx::query(
-        "UPDATE house SET until = clock_timestamp() + make_interval(secs => $3), workers = $2 \
-         WHERE id = $1 AND until > clock_timestamp()",
-    )
-    .bind(house.uuid())
-    .bind(i64::from(workers))
-    .bind(seconds)
-    .execute(c)
-    .await?;
-    Ok(renewed.rows_affected() == 1)
-}
-
-/// Takes over the ranges of houses whose time is over, or that are no more. A house that writes just now holds its row,
-/// so this waits for it and then sees what it wrote.
-pub(super) async fn take_lost(c: &mut PgConnection, house: HouseId) -> Sql<Vec<Range>> {
-    sqlx::query("DELETE FROM house WHERE until < clock_timestamp()")
-        .execute(&mut *c)
-        .await?;
-    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
-        "UPDATE task_range SET owner = $1 WHERE owner IS NOT NULL \
-         AND NOT EXISTS (SELECT 1 FROM house WHERE house.id = owner) RETURNING {RANGE}"
-    )))
-    .bind(house.uuid())
-    .fetch_all(c)
-    .await?;
-    ranges(&rows)
-}
-
-/// Houses alive and their workers.
-pub(super) async fn count_houses(c: &mut PgConnection) -> Sql<(u32, u32)> {
-    let row = sqlx::query(
-        "SELECT count(*) AS houses, CAST(coalesce(sum(workers), 0) AS BIGINT) AS workers FROM house \
-         WHERE until > clock_timestamp()",
-    )
-    .fetch_one(c)
-    .await?;
-    let number = |column| {
-        row.try_get::<i64, _>(column)
-            .map(|n| u32::try_from(n).unwrap_or(u32::MAX))
-    };
-    Ok((number("houses")?, number("workers")?))
-}
-
-/// The leased ranges that are this house's.
-pub(super) async fn leased(c: &mut PgConnection, house: HouseId) -> Sql<BTreeSet<RangeId>> {
-    let ids: Vec<Uuid> =
-        sqlx::query_scalar("SELECT id FROM task_range WHERE owner = $1 AND state = 1")
-            .bind(house.uuid())
-            .fetch_all(c)
-            .await?;
-    Ok(ids.into_iter().map(RangeId::from_uuid).collect())
-}
-
-/// Gives everything up that is not leased, and the house. Its leases find a new one.
-pub(super) async fn leave(c: &mut PgConnection, house: HouseId) -> Sql<()> {
-    sqlx::query("UPDATE task_range SET owner = NULL WHERE owner = $1 AND state = 0")
-        .bind(house.uuid())
-        .execute(&mut *c)
-        .await?;
-    sqlx::query("DELETE FROM house WHERE id = $1")
-        .bind(house.uuid())
-        .execute(c)
-        .await?;
-    Ok(())
-}
-
-pub(super) async fn adopt(desk: &mut Desk<'_>, worker: WorkerId) -> Result<Vec<Range>> {
-    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
-        "UPDATE task_range SET owner = $1 WHERE worker = $2 AND state = 1 AND owner <> $1 RETURNING {RANGE}"
-    )))
-    .bind(desk.house)
-    .bind(worker.uuid())
-    .fetch_all(&mut *desk.c)
-    .await?;
-    Ok(ranges(&rows)?)
-}
-
-fn ranges(rows: &[PgRow]) -> Sql<Vec<Range>> {
+pub(super) fn ranges(rows: &[PgRow]) -> Sql<Vec<Range>> {
     rows.iter().map(query::range).collect()
 }
 
@@ -308,7 +182,7 @@ pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Ve
     insert_events(desk, &changes.events).await?;
     let mut ended = Vec::new();
     for (job, at_ms) in &changes.perhaps_over {
-        ended.extend(end_if_over(desk, *job, *at_ms).await?);
+        ended.extend(jobs::end_if_over(desk, *job, *at_ms).await?);
     }
     Ok(ended)
 }
@@ -352,7 +226,11 @@ async fn replace_known(desk: &mut Desk<'_>, changes: &Changes) -> Result<()> {
     Ok(())
 }
 
-async fn insert_ranges(desk: &mut Desk<'_>, rows: &[(i64, &Range)], mine: bool) -> Result<()> {
+pub(super) async fn insert_ranges(
+    desk: &mut Desk<'_>,
+    rows: &[(i64, &Range)],
+    mine: bool,
+) -> Result<()> {
     if rows.is_empty() {
         return Ok(());
     }
@@ -388,7 +266,7 @@ async fn insert_ranges(desk: &mut Desk<'_>, rows: &[(i64, &Range)], mine: bool) 
 
 /// Writes a range of nobody's, merged with its neighbours in the same state, as far as no other house has them in its
 /// hands just now.
-async fn give(desk: &mut Desk<'_>, key: i64, range: &Range) -> Result<()> {
+pub(super) async fn give(desk: &mut Desk<'_>, key: i64, range: &Range) -> Result<()> {
     let mut range = range.clone();
     let columns = StateColumns::from(&range.state);
     if range.merges() {
@@ -481,7 +359,7 @@ pub(super) async fn manifests(
     Ok(tasks.iter().map(|t| found.get(t).copied()).collect())
 }
 
-async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
+pub(super) async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
     if events.is_empty() {
         return Ok(());
     }
@@ -489,7 +367,8 @@ async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
     for event in events {
         jobs.push(desk.job(event.job).await?);
     }
-    let text = |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
+    let text =
+        |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
     sqlx::query(
         "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message) \
          SELECT * FROM UNNEST($1::BIGINT[], $2::BIGINT[], $3::BIGINT[], $4::BIGINT[], $5::BIGINT[], $6::TEXT[], \
@@ -527,167 +406,4 @@ async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
     .execute(&mut *desk.c)
     .await?;
     Ok(())
-}
-
-/// Ends an active job of which nothing is pending or leased. Its row is locked first: of two houses that finish their
-/// last tasks at once, the second sees what the first wrote.
-async fn end_if_over(desk: &mut Desk<'_>, id: JobId, at_ms: i64) -> Result<Option<JobEnd>> {
-    let key = desk.job(id).await?;
-    let active: Option<i32> =
-        sqlx::query_scalar("SELECT 1 FROM job WHERE key = $1 AND state = 0 FOR UPDATE")
-            .bind(key)
-            .fetch_optional(&mut *desk.c)
-            .await?;
-    if active.is_none() {
-        return Ok(None);
-    }
-    let open: Option<i32> = sqlx::query_scalar(
-        "SELECT 1 FROM task_range JOIN stage ON stage.key = task_range.stage \
-         WHERE stage.job = $1 AND state IN (0, 1) LIMIT 1",
-    )
-    .bind(key)
-    .fetch_optional(&mut *desk.c)
-    .await?;
-    if open.is_some() {
-        return Ok(None);
-    }
-    let counts = query::counts(desk.c, key).await?;
-    let state = if counts.dead > 0 {
-        JobState::Failed
-    } else {
-        JobState::Done
-    };
-    sqlx::query(
-        "UPDATE job SET state = $2, ended_ms = $3, tasks = $4, done = $5, reused = $6, dead = $7, \
-         (timed, seconds) = (SELECT count(*), coalesce(sum(seconds), 0) FROM output \
-           WHERE NOT adopted AND result_set IN (SELECT result_set FROM stage WHERE job = $1)) WHERE key = $1",
-    )
-    .bind(key)
-    .bind(sql::job_state_code(state))
-    .bind(at_ms)
-    .bind(int(counts.total))
-    .bind(int(counts.done))
-    .bind(int(counts.reused))
-    .bind(int(counts.dead))
-    .execute(&mut *desk.c)
-    .await?;
-    insert_events(desk, &[NewEvent::ended(id, at_ms, &counts)]).await?;
-    Ok(Some(JobEnd {
-        job: id,
-        state,
-        at_ms,
-    }))
-}
-
-pub(super) async fn submit(
-    desk: &mut Desk<'_>,
-    job: &Job,
-    ranges: &[Range],
-    events: &[NewEvent],
-) -> Result<bool> {
-    let spec = serde_json::to_string(&*job.spec).expect("a spec is plain data");
-    let key: Option<i64> = sqlx::query_scalar(
-        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms) VALUES ($1, $2, $3, 0, $4) \
-         ON CONFLICT DO NOTHING RETURNING key",
-    )
-    .bind(job.id.uuid())
-    .bind(&job.spec_hash)
-    .bind(spec)
-    .bind(job.submitted_ms)
-    .fetch_optional(&mut *desk.c)
-    .await?;
-    let Some(key) = key else {
-        return Ok(false);
-    };
-    let mut stages = HashMap::new();
-    for stage in job.stages() {
-        let set = &stage.set;
-        sqlx::query(
-            "INSERT INTO result_set (store, dataset, stage_key) VALUES ($1, $2, $3) ON CONFLICT DO NOTHING",
-        )
-        .bind(&set.store)
-        .bind(&set.dataset)
-        .bind(&set.stage_key.0[..])
-        .execute(&mut *desk.c)
-        .await?;
-        let stage_key: i64 = sqlx::query_scalar(
-            "INSERT INTO stage (job, ordinal, result_set, tasks) SELECT $1, $2, key, $3 FROM result_set \
-             WHERE store = $4 AND dataset = $5 AND stage_key = $6 RETURNING key",
-        )
-        .bind(key)
-        .bind(i64::from(stage.id.stage))
-        .bind(int(stage.tasks))
-        .bind(&set.store)
-        .bind(&set.dataset)
-        .bind(&set.stage_key.0[..])
-        .fetch_one(&mut *desk.c)
-        .await?;
-        stages.insert(stage.id, stage_key);
-    }
-    let rows: Vec<_> = ranges.iter().map(|r| (stages[&r.stage], r)).collect();
-    insert_ranges(desk, &rows, false).await?;
-    insert_events(desk, events).await?;
-    end_if_over(desk, job.id, job.submitted_ms).await?;
-    Ok(true)
-}
-
-pub(super) async fn cancel(desk: &mut Desk<'_>, job: JobId, now_ms: i64) -> Result<bool> {
-    let key = desk.job(job).await?;
-    let cancelled =
-        sqlx::query("UPDATE job SET state = $1, ended_ms = $2 WHERE key = $3 AND state = 0")
-            .bind(sql::job_state_code(JobState::Cancelled))
-            .bind(now_ms)
-            .bind(key)
-            .execute(&mut *desk.c)
-            .await?
-            .rows_affected()
-            > 0;
-    if cancelled {
-        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, String::new());
-        insert_events(desk, &[event]).await?;
-    }
-    Ok(cancelled)
-}
-
-pub(super) async fn retry(desk: &mut Desk<'_>, job: JobId, now_ms: i64) -> Result<u64> {
-    let key = desk.job(job).await?;
-    // The job's row first, as whoever ends it does.
-    sqlx::query("SELECT 1 FROM job WHERE key = $1 FOR UPDATE")
-        .bind(key)
-        .execute(&mut *desk.c)
-        .await?;
-    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
-        "DELETE FROM task_range WHERE state = 4 AND stage IN (SELECT key FROM stage WHERE job = $1) RETURNING {RANGE}"
-    )))
-    .bind(key)
-    .fetch_all(&mut *desk.c)
-    .await?;
-    let mut retried = 0;
-    for mut range in ranges(&rows)? {
-        retried += range.len();
-        range.crashes = 0;
-        range.state = RangeState::Pending { not_before_ms: 0 };
-        let stage = desk.keys(range.stage).await?.stage;
-        give(desk, stage, &range).await?;
-        sqlx::query("DELETE FROM exception WHERE stage = $1 AND task >= $2 AND task < $3")
-            .bind(stage)
-            .bind(int(range.lo))
-            .bind(int(range.hi))
-            .execute(&mut *desk.c)
-            .await?;
-    }
-    if retried > 0 {
-        sqlx::query("UPDATE job SET state = 0, ended_ms = NULL, tasks = NULL WHERE key = $1")
-            .bind(key)
-            .execute(&mut *desk.c)
-            .await
-            .map_err(|e| match e.as_database_error() {
-                Some(e) if e.is_unique_violation() => WriteError::Conflict(sql::LATER_JOB.into()),
-                _ => WriteError::Sql(e),
-            })?;
-        let message = format!("{retried} dead tasks are pending again");
-        let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
-        insert_events(desk, &[event]).await?;
-    }
-    Ok(retried)
 }

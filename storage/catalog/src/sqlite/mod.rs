@@ -3,6 +3,7 @@
 //! Reads have connections of their own.
 
 mod errors;
+mod jobs;
 mod write;
 
 use std::{
@@ -19,7 +20,9 @@ use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
     migrate::{MigrateError, Migrator},
     pool::PoolConnection,
-    sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous},
+    sqlite::{
+        SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
+    },
 };
 use tokio::sync::Mutex;
 use uuid::Uuid;
@@ -197,17 +200,17 @@ impl Catalog for SqliteCatalog {
         ranges: &[Range],
         events: &[NewEvent],
     ) -> Result<bool, CatalogError> {
-        self.write(async |c, keys| write::submit(c, keys, job, ranges, events).await)
+        self.write(async |c, keys| jobs::submit(c, keys, job, ranges, events).await)
             .await
     }
 
     async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError> {
-        self.write(async |c, keys| write::cancel(c, keys, job, now_ms).await)
+        self.write(async |c, keys| jobs::cancel(c, keys, job, now_ms).await)
             .await
     }
 
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
-        self.write(async |c, keys| write::retry(c, keys, job, now_ms).await)
+        self.write(async |c, keys| jobs::retry(c, keys, job, now_ms).await)
             .await
     }
 

@@ -3,8 +3,10 @@
 mod memory;
 mod output;
 mod render;
+pub mod reprocess;
 mod runner;
 mod scenes;
+pub mod split;
 mod subsets;
 
 use std::{

@@ -31,6 +31,8 @@ pub(super) struct Stores {
     runtime: Handle,
     /// Opened stores that passed the probe, by location: their connections are kept from task to task.
     probed: Mutex<BTreeMap<String, Place>>,
+    /// Opened stores that are only read, by location.
+    sources: Mutex<BTreeMap<String, Place>>,
     /// How long a rendered scene is held for a store that does not take it.
     patience: Duration,
 }
@@ -40,16 +42,49 @@ impl Stores {
         Self {
             runtime,
             probed: Mutex::default(),
+            sources: Mutex::default(),
             patience,
         }
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
     pub(super) fn open(&self, spec: &JobSpec, control: &Control) -> Result<Dataset, TaskError> {
-        let (store, prefix) = self.probed(&spec.output.store, control)?;
-        let prefix = prefix.join(spec.output.dataset.as_str());
-        let spec = dataset_spec(spec)?;
-        self.wait(control, Dataset::create_or_open(store, prefix, &spec))
+        let place = &spec.output;
+        let described = dataset_spec(spec)?;
+        self.create_or_open(&place.store, &place.dataset, &described, control)
+    }
+
+    /// Creates or opens a data set to write to. The first use of a location proves that its store is safe.
+    pub(super) fn create_or_open(
+        &self,
+        location: &str,
+        dataset: &str,
+        spec: &DatasetSpec,
+        control: &Control,
+    ) -> Result<Dataset, TaskError> {
+        let (store, prefix) = self.probed(location, control)?;
+        let prefix = prefix.join(dataset);
+        self.wait(control, Dataset::create_or_open(store, prefix, spec))
+    }
+
+    /// Opens a data set to read; creates nothing, and asks of its store nothing but reading.
+    pub(super) fn open_source(
+        &self,
+        location: &str,
+        dataset: &str,
+        control: &Control,
+    ) -> Result<Dataset, TaskError> {
+        let known = || self.sources.lock().expect("no panic while locked");
+        let place = known().get(location).cloned();
+        let (store, prefix) = match place {
+            Some(place) => place,
+            None => {
+                let place = open_store(location).map_err(of_dataset)?;
+                known().insert(location.to_owned(), place.clone());
+                place
+            }
+        };
+        self.wait(control, Dataset::open(store, prefix.join(dataset)))
     }
 
     fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
@@ -64,7 +99,7 @@ impl Stores {
     }
 
     /// Waits for the store, unless the task shall stop: a server that is away may take minutes to be given up.
-    fn wait<T>(
+    pub(super) fn wait<T>(
         &self,
         control: &Control,
         request: impl Future<Output = Result<T, DatasetError>>,
@@ -94,7 +129,7 @@ impl Stores {
         let looked = async {
             match dataset.published(index).await {
                 Err(error @ DatasetError::Damaged { .. }) => {
-                    warn!(%error, task = index, "a published scene is damaged; it is rendered again to mend it");
+                    warn!(%error, task = index, "a published scene is damaged; it is made again to mend it");
                     Ok(None)
                 }
                 other => other,
@@ -133,7 +168,7 @@ impl Stores {
                 return Err(error);
             }
             let wait = backoff.next(random());
-            warn!(%error, wait_s = wait.as_secs_f64(), "the rendered scene cannot be stored yet; trying again");
+            warn!(%error, wait_s = wait.as_secs_f64(), "the finished scene cannot be stored yet; trying again");
             let again = Instant::now() + wait;
             while Instant::now() < again {
                 if control.stopped() {

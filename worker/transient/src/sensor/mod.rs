@@ -23,7 +23,7 @@ pub use draw::{Draws, binomial, poisson};
 pub use kernel::Kernel;
 pub use sense::{Dropped, Histograms, Sensed, Values};
 pub use settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
-pub use spots::{SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
+pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
 
 /// Version of the sensed values: change it whenever any output bit may change.
 pub const SENSOR_VERSION: &str = "sensor-1";

@@ -46,11 +46,46 @@ pub fn multiplex(
         ));
     }
     let len = per_spot.len() / spots;
-    let mut sums = vec![0f64; len];
+    let mut sum = Multiplex::new(len);
     for spot in chosen {
-        for (sum, h) in sums.iter_mut().zip(&per_spot[spot * len..][..len]) {
+        sum.add(&per_spot[spot * len..][..len])?;
+    }
+    Ok(sum.finish())
+}
+
+/// [`multiplex`] for histograms that come one after the other.
+#[derive(Debug, Clone)]
+pub struct Multiplex(Vec<f64>);
+
+impl Multiplex {
+    /// A sum of histograms of `len` values each.
+    pub fn new(len: usize) -> Self {
+        Self(vec![0.0; len])
+    }
+
+    /// Adds a spot's histogram.
+    ///
+    /// # Errors
+    /// [`SensorError::Invalid`] where it has another number of values.
+    pub fn add(&mut self, h: &[f32]) -> Result<(), SensorError> {
+        if h.len() != self.0.len() {
+            return Err(SensorError::new(
+                "per_spot",
+                format!(
+                    "expected {} values of each spot, found {}",
+                    self.0.len(),
+                    h.len()
+                ),
+            ));
+        }
+        for (sum, h) in self.0.iter_mut().zip(h) {
             *sum += f64::from(*h);
         }
+        Ok(())
     }
-    Ok(sums.into_iter().map(|sum| sum as f32).collect())
+
+    /// The sum.
+    pub fn finish(self) -> Vec<f32> {
+        self.0.into_iter().map(|sum| sum as f32).collect()
+    }
 }

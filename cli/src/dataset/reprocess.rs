@@ -1,0 +1,162 @@
+//! `picofarm dataset reprocess`: every scene of a data set through a sensor, on this machine.
+
+use std::{sync::Arc, time::Instant};
+
+use picofarm_agent::{
+    Control, TaskError,
+    reprocess::{Reprocessor, sensor_settings, sensor_version},
+};
+use picofarm_proto::model::{OutputSettings, ReprocessSettings, SourceSettings};
+use serde_json::json;
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+
+use super::{store_and_folder, task_failed};
+use crate::{
+    args::DatasetReprocess,
+    error::{CliError, Code, Result},
+    output::{Meter, Output, bytes, duration},
+    roles,
+    sense::options,
+    signals,
+};
+
+pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
+    let (settings, target) = settings(&args)?;
+    let threads = args.threads.unwrap_or_else(roles::cores).max(1);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| {
+            CliError::new(
+                Code::Resource,
+                format!("cannot start {threads} threads: {e}"),
+            )
+        })?;
+    let work = Work {
+        reprocessor: Reprocessor::new(Handle::current()),
+        settings,
+        target,
+        stop: signals::stop_on_signal()?,
+        runtime: Handle::current(),
+    };
+    let start = Instant::now();
+    let done = tokio::task::spawn_blocking(move || pool.install(|| work.all(output)))
+        .await
+        .map_err(|e| CliError::new(Code::Failed, format!("reprocessing broke: {e}")))??;
+    let seconds = start.elapsed().as_secs_f64();
+    let facts = json!({
+        "source": args.source, "target": args.target, "scenes": done.computed + done.adopted,
+        "computed": done.computed, "adopted": done.adopted, "missing": done.missing,
+        "bytes": done.bytes, "seconds": seconds,
+    });
+    output.result(&facts, || {
+        let mut text = format!(
+            "{}: {} scenes measured, {} found finished, {} in {}",
+            args.target,
+            done.computed,
+            done.adopted,
+            bytes(done.bytes),
+            duration(seconds)
+        );
+        if done.missing > 0 {
+            text += &format!(
+                "; {} scenes are not in {} yet: run the same command again once they are",
+                done.missing, args.source
+            );
+        }
+        text
+    });
+    Ok(())
+}
+
+/// What the arguments ask for, with everything that a key depends on filled in.
+fn settings(args: &DatasetReprocess) -> Result<(ReprocessSettings, OutputSettings)> {
+    let (store, dataset) = store_and_folder(&args.source)?;
+    let mut settings = ReprocessSettings {
+        source: SourceSettings { store, dataset },
+        histogram: args.histogram,
+        spots: args.spots.clone(),
+        sensor: sensor_settings(&options::settings(&args.sensor)?),
+        drop_left_over: args.drop_left_over,
+        seed: args.seed,
+        version: sensor_version(),
+    };
+    settings.normalise();
+    let profile = args.profile.clone();
+    let profile = profile.unwrap_or_else(|| settings.natural_profile().to_owned());
+    settings.check(&profile)?;
+    let (store, dataset) = store_and_folder(&args.target)?;
+    let target = OutputSettings {
+        store,
+        dataset,
+        profile,
+    };
+    Ok((settings, target))
+}
+
+struct Work {
+    reprocessor: Reprocessor,
+    settings: ReprocessSettings,
+    target: OutputSettings,
+    stop: CancellationToken,
+    runtime: Handle,
+}
+
+#[derive(Default)]
+struct Done {
+    computed: u64,
+    adopted: u64,
+    missing: u64,
+    bytes: u64,
+}
+
+impl Work {
+    fn all(&self, output: Output) -> Result<Done> {
+        let (scenes, room) = self
+            .reprocessor
+            .source(&self.settings, &Control::default())
+            .map_err(task_failed)?;
+        if scenes.is_empty() {
+            return Err(CliError::input(format!(
+                "{}: no scene is published yet",
+                self.settings.source.dataset
+            )));
+        }
+        let mut done = Done {
+            missing: room - scenes.len() as u64,
+            ..Done::default()
+        };
+        let mut meter = Meter::new(output);
+        for (at, scene) in scenes.iter().enumerate() {
+            let text = format!("{at} of {} scenes, {}", scenes.len(), bytes(done.bytes));
+            meter.at(at as f64 / scenes.len() as f64, text);
+            let result = self.one(*scene).map_err(task_failed)?;
+            done.bytes += result.bytes;
+            match result.adopted {
+                true => done.adopted += 1,
+                false => done.computed += 1,
+            }
+        }
+        meter.finish();
+        Ok(done)
+    }
+
+    /// One scene, given up when a signal comes.
+    fn one(&self, scene: u64) -> Result<picofarm_agent::Output, TaskError> {
+        let control = Arc::new(Control::default());
+        let (stop, told) = (self.stop.clone(), control.clone());
+        let watch = self.runtime.spawn(async move {
+            stop.cancelled().await;
+            told.stop();
+        });
+        if self.stop.is_cancelled() {
+            return Err(TaskError::Stopped);
+        }
+        let result = self
+            .reprocessor
+            .run(&self.settings, &self.target, scene, &control);
+        watch.abort();
+        result
+    }
+}

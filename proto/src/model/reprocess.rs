@@ -1,0 +1,156 @@
+//! Reprocessing: the histograms of a finished data set through a sensor, into another data set. One task a scene;
+//! nothing is rendered.
+
+use serde::{Deserialize, Serialize};
+
+use super::{job::SpecError, sensor::SensorSettings};
+
+/// What is done to each scene.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReprocessSettings {
+    /// The data set that is read.
+    pub source: SourceSettings,
+    /// Which of its histograms.
+    #[serde(default)]
+    pub histogram: Histogram,
+    /// Only these spots, summed: multiplexing. Only with `histogram = "transient_spots"`, which needs it; ascending.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub spots: Vec<u32>,
+    /// The sensor.
+    #[serde(default)]
+    pub sensor: SensorSettings,
+    /// Bins that `sensor.rebin` leaves over at the end of the gate are dropped; otherwise it must divide the bins.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub drop_left_over: bool,
+    /// Chooses another draw of the same noise (default 0).
+    #[serde(default)]
+    pub seed: u64,
+    /// Version of the sensor model and the encoder, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+/// A data set that is read. Its place is not part of any key: keys follow from the keys of its scenes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SourceSettings {
+    /// The store: a path or URL that every worker can reach.
+    pub store: String,
+    /// Folder of the data set in the store.
+    pub dataset: String,
+}
+
+/// The histograms that a data set may have, by the names of their arrays.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Histogram {
+    /// All spots at once.
+    #[default]
+    Transient,
+    /// 4 of the 100 spots.
+    #[serde(rename = "transient_4")]
+    Transient4,
+    /// 25 of the 100 spots.
+    #[serde(rename = "transient_25")]
+    Transient25,
+    /// Each spot alone; [`ReprocessSettings::spots`] are summed.
+    TransientSpots,
+}
+
+impl Histogram {
+    /// All there are.
+    pub const ALL: [Self; 4] = [
+        Self::Transient,
+        Self::Transient4,
+        Self::Transient25,
+        Self::TransientSpots,
+    ];
+
+    /// Name of the array.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Transient => "transient",
+            Self::Transient4 => "transient_4",
+            Self::Transient25 => "transient_25",
+            Self::TransientSpots => "transient_spots",
+        }
+    }
+
+    /// The histogram of this name.
+    ///
+    /// # Errors
+    /// A message that lists those there are.
+    pub fn parse(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|h| h.name() == name);
+        found.ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            format!("{name:?} is unknown; there are {names}")
+        })
+    }
+}
+
+impl ReprocessSettings {
+    /// The codec profile that loses nothing that matters: whole counts are kept exactly, rates to a fraction of the
+    /// photon noise.
+    pub fn natural_profile(&self) -> &'static str {
+        if self.sensor.poisson {
+            "counts-u16"
+        } else {
+            "sqrt-u16"
+        }
+    }
+
+    /// Puts the spots in order: the order in which somebody names them shall not make other results of them.
+    pub fn normalise(&mut self) {
+        self.spots.sort_unstable();
+    }
+
+    /// Checks every field against its limits, and the codec profile of the target against the sensor.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self, profile: &str) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("reprocess.{field}"), what));
+        if self.source.store.is_empty() {
+            return fail("source.store", "is empty; give a path or URL".into());
+        }
+        if self.source.dataset.is_empty() {
+            return fail(
+                "source.dataset",
+                "is empty; give the data set's folder".into(),
+            );
+        }
+        if self.histogram == Histogram::TransientSpots && self.spots.is_empty() {
+            return fail(
+                "spots",
+                "is empty; name the spots to sum, or take histogram = \"transient\" for all".into(),
+            );
+        }
+        if self.histogram != Histogram::TransientSpots && !self.spots.is_empty() {
+            return fail(
+                "spots",
+                format!(
+                    "are summed from histogram = \"transient_spots\"; remove them from histogram = {:?}",
+                    self.histogram.name()
+                ),
+            );
+        }
+        if !self.spots.is_sorted_by(|a, b| a < b) {
+            return fail(
+                "spots",
+                format!("{:?} must name each once, ascending", self.spots),
+            );
+        }
+        self.sensor.check("reprocess.sensor")?;
+        if profile == "counts-u16" && !self.sensor.poisson {
+            return Err(SpecError::new(
+                "output.profile",
+                "\"counts-u16\" holds whole counts, but reprocess.sensor.poisson = false gives rates; use \"sqrt-u16\" \
+                 or \"plain-f32\"",
+            ));
+        }
+        Ok(())
+    }
+}

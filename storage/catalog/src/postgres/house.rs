@@ -1,0 +1,131 @@
+//! The life of a house: founded, renewed, lost, left; what falls to it from others.
+
+use std::collections::BTreeSet;
+
+use picofarm_proto::ids::{HouseId, RangeId, WorkerId};
+use sqlx::{PgConnection, Row};
+use uuid::Uuid;
+
+use super::write::{Desk, RANGE, Result, Sql, WriteError, ranges};
+use crate::Range;
+
+/// Holds the house's row until the transaction ends: it is alive, and cannot be found lost meanwhile.
+pub(super) async fn fence(c: &mut PgConnection, house: HouseId) -> Result<()> {
+    let alive: Option<i32> = sqlx::query_scalar(
+        "SELECT 1 FROM house WHERE id = $1 AND until > clock_timestamp() FOR KEY SHARE",
+    )
+    .bind(house.uuid())
+    .fetch_optional(c)
+    .await?;
+    alive.map(|_| ()).ok_or(WriteError::Fenced)
+}
+
+/// Founds a house, which inherits from a former life of the same process.
+pub(super) async fn found(
+    c: &mut PgConnection,
+    house: HouseId,
+    former: Option<HouseId>,
+    name: &str,
+    seconds: f64,
+) -> Sql<()> {
+    sqlx::query(
+        "INSERT INTO house (id, name, workers, until) \
+         VALUES ($1, $2, 0, clock_timestamp() + make_interval(secs => $3))",
+    )
+    .bind(house.uuid())
+    .bind(name)
+    .bind(seconds)
+    .execute(&mut *c)
+    .await?;
+    if let Some(former) = former {
+        sqlx::query("DELETE FROM house WHERE id = $1")
+            .bind(former.uuid())
+            .execute(c)
+            .await?;
+    }
+    Ok(())
+}
+
+/// Prolongs the house's time; `false` where it is over.
+pub(super) async fn renew(
+    c: &mut PgConnection,
+    house: HouseId,
+    workers: u32,
+    seconds: f64,
+) -> Sql<bool> {
+    let renewed = sqlx::query(
+        "UPDATE house SET until = clock_timestamp() + make_interval(secs => $3), workers = $2 \
+         WHERE id = $1 AND until > clock_timestamp()",
+    )
+    .bind(house.uuid())
+    .bind(i64::from(workers))
+    .bind(seconds)
+    .execute(c)
+    .await?;
+    Ok(renewed.rows_affected() == 1)
+}
+
+/// Takes over the ranges of houses whose time is over, or that are no more. A house that writes just now holds its row,
+/// so this waits for it and then sees what it wrote.
+pub(super) async fn take_lost(c: &mut PgConnection, house: HouseId) -> Sql<Vec<Range>> {
+    sqlx::query("DELETE FROM house WHERE until < clock_timestamp()")
+        .execute(&mut *c)
+        .await?;
+    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+        "UPDATE task_range SET owner = $1 WHERE owner IS NOT NULL \
+         AND NOT EXISTS (SELECT 1 FROM house WHERE house.id = owner) RETURNING {RANGE}"
+    )))
+    .bind(house.uuid())
+    .fetch_all(c)
+    .await?;
+    ranges(&rows)
+}
+
+/// Houses alive and their workers.
+pub(super) async fn count_houses(c: &mut PgConnection) -> Sql<(u32, u32)> {
+    let row = sqlx::query(
+        "SELECT count(*) AS houses, CAST(coalesce(sum(workers), 0) AS BIGINT) AS workers FROM house \
+         WHERE until > clock_timestamp()",
+    )
+    .fetch_one(c)
+    .await?;
+    let number = |column| {
+        row.try_get::<i64, _>(column)
+            .map(|n| u32::try_from(n).unwrap_or(u32::MAX))
+    };
+    Ok((number("houses")?, number("workers")?))
+}
+
+/// The leased ranges that are this house's.
+pub(super) async fn leased(c: &mut PgConnection, house: HouseId) -> Sql<BTreeSet<RangeId>> {
+    let ids: Vec<Uuid> =
+        sqlx::query_scalar("SELECT id FROM task_range WHERE owner = $1 AND state = 1")
+            .bind(house.uuid())
+            .fetch_all(c)
+            .await?;
+    Ok(ids.into_iter().map(RangeId::from_uuid).collect())
+}
+
+/// Gives everything up that is not leased, and the house. Its leases find a new one.
+pub(super) async fn leave(c: &mut PgConnection, house: HouseId) -> Sql<()> {
+    sqlx::query("UPDATE task_range SET owner = NULL WHERE owner = $1 AND state = 0")
+        .bind(house.uuid())
+        .execute(&mut *c)
+        .await?;
+    sqlx::query("DELETE FROM house WHERE id = $1")
+        .bind(house.uuid())
+        .execute(c)
+        .await?;
+    Ok(())
+}
+
+pub(super) async fn adopt(desk: &mut Desk<'_>, worker: WorkerId) -> Result<Vec<Range>> {
+    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+        "UPDATE task_range SET owner = $1 WHERE worker = $2 AND state = 1 AND owner <> $1 RETURNING {RANGE}"
+    )))
+    .bind(desk.house)
+    .bind(worker.uuid())
+    .fetch_all(&mut *desk.c)
+    .await?;
+    Ok(ranges(&rows)?)
+}

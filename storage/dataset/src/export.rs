@@ -1,0 +1,261 @@
+//! A data set packed for sharing: several scenes an object, so that whole data sets stay below the 100,000 files that
+//! public hosts allow. Coded chunks are copied as they are, not decoded: nothing is lost and little is computed.
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
+use object_store::path::Path;
+use serde_json::{Map, Value, json};
+
+use crate::codec::ChunkCodec;
+use crate::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
+use crate::error::DatasetError;
+use crate::layout::{Element, Layout, index_codecs};
+use crate::manifest::{Manifest, sha256_hex};
+use crate::objects;
+use crate::shard;
+use crate::spec::DatasetSpec;
+
+/// Version of the packed layout.
+const EXPORT_VERSION: u32 = 1;
+/// Scenes in an object.
+const PACK: usize = 16;
+/// Requests in flight.
+const CONCURRENCY: usize = 8;
+/// Name of the array of the scenes' indices in the source.
+const SOURCE_SCENE: &str = "source_scene";
+
+/// What was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Exported {
+    /// Scenes.
+    pub scenes: u64,
+    /// Files.
+    pub files: u64,
+    /// Their bytes.
+    pub bytes: u64,
+}
+
+/// An export under way.
+pub struct Export<'a> {
+    source: &'a Dataset,
+    scenes: &'a [u64],
+    store: &'a dyn ObjectStore,
+    prefix: Path,
+    done: Exported,
+}
+
+impl<'a> Export<'a> {
+    /// Packs the given scenes, in that order, into a new Zarr v3 group at `prefix`. Scene k of it is `scenes[k]`, which
+    /// its array `source_scene` tells. All objects are put create-only: run again after an interruption, it goes on.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there are no scenes, or the source has a histogram for each spot (16 scenes of
+    /// these are too large for an object).
+    pub fn new(
+        source: &'a Dataset,
+        scenes: &'a [u64],
+        store: &'a dyn ObjectStore,
+        prefix: Path,
+    ) -> Result<Self, DatasetError> {
+        if scenes.is_empty() {
+            let what = "expected at least one published scene, found none";
+            return Err(DatasetError::invalid("scenes", what));
+        }
+        if source.spec.per_spot {
+            let what = "a histogram for each spot is too large to pack; reprocess the data set into one with the spots \
+                        you want to share, and export that";
+            return Err(DatasetError::invalid("spec.per_spot", what));
+        }
+        Ok(Self {
+            source,
+            scenes,
+            store,
+            prefix,
+            done: Exported::default(),
+        })
+    }
+
+    /// Number of [`Self::pack`]s.
+    pub fn packs(&self) -> usize {
+        self.scenes.len().div_ceil(PACK)
+    }
+
+    /// Writes the objects of pack `k`: one for each quantity, and the scenes' manifests.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
+    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
+    pub async fn pack(&mut self, k: usize) -> Result<(), DatasetError> {
+        let first = k * PACK;
+        let scenes = &self.scenes[first..self.scenes.len().min(first + PACK)];
+        let reads = scenes.iter().map(|scene| self.source.manifest(*scene));
+        let manifests: Vec<Manifest> = stream::iter(reads.collect::<Vec<_>>())
+            .buffered(CONCURRENCY)
+            .try_collect()
+            .await?;
+        for array in self.source.arrays.iter() {
+            let reads = manifests.iter().map(|m| self.source.object(array, m));
+            let objects: Vec<Bytes> = stream::iter(reads.collect::<Vec<_>>())
+                .buffered(CONCURRENCY)
+                .try_collect()
+                .await?;
+            let bytes = packed(&array.layout, &objects)?;
+            let zeros = "/0".repeat(array.layout.shape.len());
+            let key = format!("{}/c/{k}{zeros}", array.layout.quantity.name());
+            self.put(&key, bytes.into()).await?;
+        }
+        // Straight to text, as manifests are stored: by way of a Value, 32-bit floats would get the digits of 64 bits.
+        let mut text = serde_json::to_vec_pretty(&manifests).expect("manifests are plain data");
+        text.push(b'\n');
+        self.put(&format!("manifests/{k}.json"), text.into())
+            .await?;
+        self.done.scenes += scenes.len() as u64;
+        Ok(())
+    }
+
+    /// Writes the metadata, the root's last: the group exists once all packs do.
+    ///
+    /// # Errors
+    /// [`DatasetError::Conflict`], [`DatasetError::Store`].
+    pub async fn finish(mut self) -> Result<Exported, DatasetError> {
+        let spec = DatasetSpec {
+            scenes: self.scenes.len() as u64,
+            ..self.source.spec
+        };
+        let mut all = Map::new();
+        for array in self.source.arrays.iter() {
+            let metadata = metadata(&array.layout, spec.scenes);
+            all.insert(array.layout.quantity.name().into(), metadata);
+        }
+        all.insert(SOURCE_SCENE.into(), self.put_source_scenes().await?);
+        for (name, metadata) in &all {
+            self.put(&format!("{name}/{METADATA}"), pretty(metadata))
+                .await?;
+        }
+        let mut root = root_metadata(&spec);
+        let attributes = root["attributes"].as_object_mut().expect("just made");
+        attributes.remove("picofarm");
+        attributes.insert(
+            "picofarm_export".into(),
+            json!({"format": EXPORT_VERSION, "scenes_a_file": PACK, "spec": spec}),
+        );
+        root["consolidated_metadata"]["metadata"] = Value::Object(all);
+        self.put(METADATA, pretty(&rename_manifests(&root))).await?;
+        Ok(self.done)
+    }
+
+    async fn put_source_scenes(&mut self) -> Result<Value, DatasetError> {
+        let codecs =
+            json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]);
+        let n = self.scenes.len() as u64;
+        // A data set has at most 2³² scenes.
+        let values: Vec<u32> = self.scenes.iter().map(|s| *s as u32).collect();
+        let codec = ChunkCodec::plain(&codecs, &[n], Element::U32);
+        let bytes = codec.encode(bytemuck::cast_slice(&values))?;
+        self.put(&format!("{SOURCE_SCENE}/c/0"), bytes.into())
+            .await?;
+        Ok(json!({
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": [n],
+            "data_type": Element::U32.name(),
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [n]}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": 0,
+            "codecs": codecs,
+            "attributes": {"long_name": "index of the scene in the data set that this was exported from"},
+            "dimension_names": ["scene"],
+        }))
+    }
+
+    async fn put(&mut self, key: &str, bytes: Bytes) -> Result<(), DatasetError> {
+        self.done.files += 1;
+        self.done.bytes += bytes.len() as u64;
+        let path = objects::path_of(&self.prefix, key);
+        objects::create_or_match(self.store, &path, bytes).await
+    }
+}
+
+impl Dataset {
+    /// A scene's object as it lies in the store, checked against the manifest.
+    async fn object(&self, array: &ArrayCodec, manifest: &Manifest) -> Result<Bytes, DatasetError> {
+        let key = array.layout.key(manifest.scene);
+        let path = self.path(&key);
+        let bytes = objects::require(&*self.store, &path).await?;
+        if manifest.object(&key).map(|o| &o.sha256) == Some(&sha256_hex(&bytes)) {
+            return Ok(bytes);
+        }
+        Err(DatasetError::Damaged {
+            object: self.shown(&path),
+            what: "its SHA-256 is not the manifest's".into(),
+        })
+    }
+}
+
+/// The chunks of several scenes' objects in one shard.
+fn packed(layout: &Layout, objects: &[Bytes]) -> Result<Vec<u8>, DatasetError> {
+    let each = inner_chunks(layout);
+    let mut chunks = Vec::with_capacity(PACK * each);
+    for bytes in objects {
+        if layout.inner.is_none() {
+            chunks.push(Some(bytes.clone()));
+            continue;
+        }
+        let Some(start) = bytes.len().checked_sub(shard::index_len(each)) else {
+            let what = format!("{} bytes are too few", bytes.len());
+            return Err(DatasetError::codec("cannot read a shard's index", what));
+        };
+        let index = shard::parse_index(&bytes[start..], each, bytes.len() as u64)?;
+        let slice = |r: std::ops::Range<u64>| bytes.slice(r.start as usize..r.end as usize);
+        chunks.extend(index.into_iter().map(|entry| entry.map(slice)));
+    }
+    chunks.resize(PACK * each, None);
+    shard::assemble_some(&chunks)
+}
+
+/// Inner chunks of one scene.
+fn inner_chunks(layout: &Layout) -> usize {
+    match &layout.inner {
+        None => 1,
+        Some(inner) => {
+            let sizes = layout.object_shape.iter().zip(inner);
+            sizes.map(|(o, i)| (o / i) as usize).product()
+        }
+    }
+}
+
+/// An array's `zarr.json`, with shards of [`PACK`] scenes.
+fn metadata(layout: &Layout, scenes: u64) -> Value {
+    let with_scenes = |first: u64, rest: &[u64]| -> Vec<u64> {
+        std::iter::once(first).chain(rest.iter().copied()).collect()
+    };
+    let inner = layout.inner.as_ref().unwrap_or(&layout.object_shape);
+    let mut metadata = layout.metadata(scenes);
+    metadata["chunk_grid"]["configuration"]["chunk_shape"] =
+        json!(with_scenes(PACK as u64, &layout.object_shape));
+    metadata["codecs"] = json!([{"name": "sharding_indexed", "configuration": {
+        "chunk_shape": with_scenes(1, inner),
+        "codecs": layout.chunk_codecs(),
+        "index_codecs": index_codecs(),
+        "index_location": "end",
+    }}]);
+    rename_manifests(&metadata)
+}
+
+/// Texts that say where a scene's manifest is say where it is now.
+fn rename_manifests(value: &Value) -> Value {
+    let now = format!("manifests/<i//{PACK}>.json[i%{PACK}]");
+    match value {
+        Value::String(text) => {
+            let text = text.replace("manifests/<i>.json", &now);
+            Value::String(text.replace("manifests/<scene>.json", &now))
+        }
+        Value::Array(all) => all.iter().map(rename_manifests).collect(),
+        Value::Object(all) => {
+            let each = all.iter().map(|(k, v)| (k.clone(), rename_manifests(v)));
+            Value::Object(each.collect())
+        }
+        other => other.clone(),
+    }
+}

@@ -1,0 +1,97 @@
+//! Splits beside a data set: `splits/<name>/v<k>.json`, create-only and never changed.
+
+use futures::TryStreamExt;
+use object_store::ObjectStore;
+
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::objects;
+
+impl Dataset {
+    /// The versions of a split that are stored, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn split_versions(&self, name: &str) -> Result<Vec<u64>, DatasetError> {
+        let folder = self.path(&format!("splits/{name}"));
+        let mut versions: Vec<u64> = self
+            .store
+            .list(Some(&folder))
+            .try_filter_map(
+                |object| async move { Ok(object.location.filename().and_then(version)) },
+            )
+            .try_collect()
+            .await
+            .map_err(|e| DatasetError::store("list", self.shown(&folder), e))?;
+        versions.sort_unstable();
+        Ok(versions)
+    }
+
+    /// The bytes of a version of a split.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`] where it is missing; [`DatasetError::Store`].
+    pub async fn read_split(&self, name: &str, version: u64) -> Result<Vec<u8>, DatasetError> {
+        let path = self.path(&split_key(name, version));
+        Ok(objects::require(&*self.store, &path).await?.to_vec())
+    }
+
+    /// Stores a version of a split create-only. `false` where it exists already: somebody else was faster.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn create_split(
+        &self,
+        name: &str,
+        version: u64,
+        bytes: Vec<u8>,
+    ) -> Result<bool, DatasetError> {
+        let path = self.path(&split_key(name, version));
+        objects::create(&*self.store, &path, bytes.into()).await
+    }
+
+    /// Where a version of a split lies, for a message.
+    pub fn split_place(&self, name: &str, version: u64) -> String {
+        self.shown(&self.path(&split_key(name, version)))
+    }
+}
+
+/// Key of a version of a split, relative to the data set.
+fn split_key(name: &str, version: u64) -> String {
+    format!("splits/{name}/v{version}.json")
+}
+
+/// Whether a key relative to the data set is that of a split.
+pub(crate) fn is_split(key: &str) -> bool {
+    let mut parts = key.split('/');
+    let folder = parts.next() == Some("splits");
+    let name = parts.next().is_some_and(|name| !name.is_empty());
+    folder && name && parts.next().and_then(version).is_some() && parts.next().is_none()
+}
+
+fn version(file: &str) -> Option<u64> {
+    let number = file.strip_prefix('v')?.strip_suffix(".json")?;
+    let version: u64 = number.parse().ok()?;
+    (version > 0 && version.to_string() == number).then_some(version)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_splits_are_taken_for_splits() {
+        assert!(is_split("splits/default/v1.json"));
+        assert!(is_split(&split_key("a-b", 12)));
+        for other in [
+            "splits/v1.json",
+            "splits/a/v0.json",
+            "splits/a/v01.json",
+            "splits/a/b/v1.json",
+            "splits/a/v1.txt",
+            "depth/c/0/0/0",
+        ] {
+            assert!(!is_split(other), "{other}");
+        }
+    }
+}
