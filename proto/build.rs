@@ -3,6 +3,7 @@
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let files = [
         "picofarm/v1/job.proto",
+        "picofarm/v1/explain.proto",
         "picofarm/v1/jobs_service.proto",
         "picofarm/v1/farm_service.proto",
     ];

@@ -79,6 +79,17 @@ pub enum Command {
     /// Write, plan, submit and follow jobs
     #[command(subcommand)]
     Job(Job),
+    /// List the workers connected to the coordinator
+    Workers,
+    /// Show what happened, of all jobs
+    Events {
+        /// Go on showing what happens, until Ctrl-C
+        #[arg(long, short)]
+        follow: bool,
+        /// The last N lines before now
+        #[arg(long, default_value_t = 100, value_name = "N")]
+        last: u32,
+    },
     /// Look at data sets, check them, and make others of them
     #[command(subcommand)]
     Dataset(Dataset),
@@ -145,6 +156,8 @@ pub struct Up {
     #[arg(long, default_value_t = 1)]
     pub workers: usize,
     #[command(flatten)]
+    pub http: Http,
+    #[command(flatten)]
     pub guard: Guard,
 }
 
@@ -166,7 +179,17 @@ pub struct Coordinator {
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub lease_s: f64,
     #[command(flatten)]
+    pub http: Http,
+    #[command(flatten)]
     pub guard: Guard,
+}
+
+#[derive(Args)]
+pub struct Http {
+    /// Serve /healthz, /readyz and /metrics here over plain HTTP, e.g. 127.0.0.1:7421 (port 0 = any free port; the address is
+    /// printed). Counts only, no names; whoever reaches the address may read them without a token [default: nowhere]
+    #[arg(long, value_name = "ADDR", env = "PICOFARM_HTTP")]
+    pub http: Option<SocketAddr>,
 }
 
 #[derive(Args)]
@@ -249,6 +272,17 @@ pub enum Job {
         /// Only the last N lines
         #[arg(long, default_value_t = 100, value_name = "N")]
         last: u32,
+        /// Go on showing what happens, until the job ends or Ctrl-C
+        #[arg(long, short)]
+        follow: bool,
+    },
+    /// Say why a job does not run, or why one of its tasks was run, run again or reused
+    Explain {
+        /// Job id, or the first letters of one
+        job: String,
+        /// This task
+        #[arg(long)]
+        task: Option<u64>,
     },
 }
 

@@ -6,9 +6,10 @@ use picofarm_agent::{Access, Bearer, Target, Trouble, lost_connection};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{Event, JobPlan, JobSpec, JobStatus},
+    model::{ConnectedWorker, Event, JobPlan, JobSpec, JobStatus, Reason, TaskExplanation},
     wire::{self, jobs_client::JobsClient},
 };
+use serde::Serialize;
 use tonic::{Code as Grpc, Status, service::interceptor::InterceptedService, transport::Channel};
 
 use crate::error::{CliError, Code, Result};
@@ -254,30 +255,114 @@ impl Client {
         Ok(reply.into_inner().retried)
     }
 
+    /// A job's events after a sequence number, at most a thousand.
     pub async fn events(
         &mut self,
         job: JobId,
         after: u64,
         task: Option<u64>,
     ) -> Result<Vec<Event>> {
-        let request = wire::ListEventsRequest {
-            job_id: job.to_string(),
+        let page = Page {
+            job: Some(job),
+            task,
             after,
             limit: 1000,
-            task,
+            newest: false,
+        };
+        Ok(self.history(page).await?.0)
+    }
+
+    /// A page of the history, and whether its job had ended before it was read.
+    pub async fn history(&mut self, page: Page) -> Result<(Vec<Event>, bool)> {
+        let request = wire::ListEventsRequest {
+            job_id: page.job.map(|job| job.to_string()).unwrap_or_default(),
+            after: page.after,
+            limit: page.limit,
+            task: page.task,
+            newest: page.newest,
         };
         let reply = self
             .jobs
             .list_events(request)
             .await
-            .map_err(|s| refused(&s))?;
-        reply
-            .into_inner()
-            .events
-            .into_iter()
-            .map(|e| e.try_into().map_err(unreadable))
-            .collect()
+            .map_err(|s| refused(&s))?
+            .into_inner();
+        let events = reply.events.into_iter().map(TryInto::try_into);
+        let events = events.collect::<Result<_, _>>().map_err(unreadable)?;
+        Ok((events, reply.ended))
     }
+
+    /// Why a job, or a task of it, is as it is.
+    pub async fn explain(&mut self, job: JobId, task: Option<u64>) -> Result<Explained> {
+        let request = wire::ExplainJobRequest {
+            job_id: job.to_string(),
+            task,
+        };
+        let reply = self
+            .jobs
+            .explain_job(request)
+            .await
+            .map_err(|s| refused(&s))?
+            .into_inner();
+        Ok(Explained {
+            job: required(reply.job, "job")?.try_into().map_err(unreadable)?,
+            reasons: reply.reasons.into_iter().map(Into::into).collect(),
+            task: reply
+                .task
+                .map(TryInto::try_into)
+                .transpose()
+                .map_err(unreadable)?,
+        })
+    }
+
+    /// The workers connected to the coordinator that answers.
+    pub async fn workers(&mut self) -> Result<Workers> {
+        let reply = self
+            .jobs
+            .list_workers(wire::ListWorkersRequest {})
+            .await
+            .map_err(|s| refused(&s))?
+            .into_inner();
+        Ok(Workers {
+            coordinator: reply.coordinator,
+            workers: reply.workers.into_iter().map(Into::into).collect(),
+            elsewhere: reply.elsewhere,
+            coordinators: reply.coordinators,
+        })
+    }
+}
+
+/// Which part of the history.
+#[derive(Debug, Clone, Copy)]
+pub struct Page {
+    /// `None` = of all jobs.
+    pub job: Option<JobId>,
+    pub task: Option<u64>,
+    /// Only events after this sequence number.
+    pub after: u64,
+    pub limit: u32,
+    /// The last `limit` rather than the first.
+    pub newest: bool,
+}
+
+/// Answer to the question why.
+#[derive(Debug, Serialize)]
+pub struct Explained {
+    pub job: JobStatus,
+    pub reasons: Vec<Reason>,
+    pub task: Option<TaskExplanation>,
+}
+
+/// Who works for a coordinator.
+#[derive(Debug, Serialize)]
+pub struct Workers {
+    /// Names the process that answered.
+    pub coordinator: String,
+    pub workers: Vec<ConnectedWorker>,
+    /// Workers connected to other coordinators of the same catalog.
+    pub elsewhere: u32,
+    /// Coordinators of the catalog.
+    pub coordinators: u32,
 }
 
 /// Why there is no connection.

@@ -82,6 +82,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
         workers,
         settings,
         Guarded::default(),
+        None,
     )
     .await?;
     // This process's own coordinator asks nobody who they are.
@@ -177,8 +178,16 @@ pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
     std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
     let stop = signals::stop_on_signal()?;
     let catalog = args.dir.join("catalog.sqlite");
-    let mut farm = Local::start(&catalog, args.listen, args.workers, settings, guarded).await?;
-    output.result(&json!({"coordinator": farm.url, "workers": args.workers}), || {
+    let mut farm = Local::start(
+        &catalog,
+        args.listen,
+        args.workers,
+        settings,
+        guarded,
+        args.http.http,
+    )
+    .await?;
+    output.result(&json!({"coordinator": farm.url, "workers": args.workers, "http": farm.http}), || {
         format!(
             "coordinator at {} with {} worker(s); submit with `picofarm --coordinator {} job submit FILE`",
             farm.url, args.workers, farm.url

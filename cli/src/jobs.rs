@@ -9,10 +9,12 @@ use crate::{
     args::{Job, SceneKindArg},
     client::Client,
     error::{CliError, Code, Result, io},
+    explain,
     follow::{Show, follow, verdict},
     jobfile,
     output::{Output, duration, table},
     settings::Settings,
+    tail,
 };
 
 pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()> {
@@ -99,7 +101,24 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             });
             Ok(())
         }
-        Job::Logs { job, task, last } => {
+        Job::Explain { job, task } => {
+            let job = client.find(&job).await?;
+            let explained = client.explain(job, task).await?;
+            output.result(&explained, || explain::describe(&explained));
+            Ok(())
+        }
+        Job::Logs {
+            job,
+            task,
+            last,
+            follow: true,
+        } => {
+            let job = client.find(&job).await?;
+            tail::follow(client, Some(job), task, last, output).await
+        }
+        Job::Logs {
+            job, task, last, ..
+        } => {
             let job = client.find(&job).await?;
             let events = history(&mut client, job, task, last).await?;
             output.result(&events, || events.iter().map(describe_event).collect());
@@ -222,7 +241,7 @@ pub fn describe(s: &JobStatus) -> String {
     )
 }
 
-fn describe_event(e: &Event) -> String {
+pub fn describe_event(e: &Event) -> String {
     let task = match (e.task, e.lo, e.hi) {
         (Some(task), ..) => format!("task {task} "),
         (None, Some(lo), Some(hi)) => format!("tasks {lo}..{hi} "),
@@ -250,7 +269,7 @@ fn describe_event(e: &Event) -> String {
 }
 
 /// Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
-fn clock(ms: i64) -> String {
+pub fn clock(ms: i64) -> String {
     let (days, second) = (ms.div_euclid(86_400_000), ms.rem_euclid(86_400_000) / 1000);
     // Civil date from days since 1970-01-01 (Hinnant's algorithm).
     let z = days + 719_468;

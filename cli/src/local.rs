@@ -19,6 +19,8 @@ const LEASE: Duration = Duration::from_secs(20);
 /// A farm on this machine.
 pub struct Local {
     pub url: String,
+    /// Where its health and metrics are served.
+    pub http: Option<String>,
     coordinator: roles::Coordinator,
     workers: JoinSet<Result<Summary, AgentError>>,
     stop_workers: CancellationToken,
@@ -35,6 +37,7 @@ impl Local {
         workers: usize,
         settings: &Settings,
         guarded: roles::Guarded,
+        http: Option<SocketAddr>,
     ) -> Result<Self> {
         let access = if guarded.is_open() {
             Access::default()
@@ -42,10 +45,12 @@ impl Local {
             settings.access()?
         };
         let coordinator =
-            roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded).await?;
-        let url = coordinator.url();
+            roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded, http)
+                .await?;
+        let (url, http) = (coordinator.url(), coordinator.http());
         let mut local = Self {
             url: url.clone(),
+            http,
             coordinator,
             workers: JoinSet::new(),
             stop_workers: CancellationToken::new(),

@@ -9,6 +9,7 @@ mod dataset;
 mod demo;
 mod doctor;
 mod error;
+mod explain;
 mod follow;
 mod groups;
 mod jobfile;
@@ -22,6 +23,7 @@ mod scene;
 mod sense;
 mod settings;
 mod signals;
+mod tail;
 mod token;
 
 use std::{
@@ -72,6 +74,8 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Coordinator(args) => roles::coordinator(args, output).await,
         Command::Worker(args) => roles::worker(args, settings, output).await,
         Command::Job(command) => jobs::run(command, settings, output).await,
+        Command::Workers => explain::workers(settings, output).await,
+        Command::Events { follow, last } => tail::events(follow, last, settings, output).await,
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),

@@ -134,6 +134,7 @@ impl Coordinator {
         listen: SocketAddr,
         lease: Duration,
         guarded: Guarded,
+        http: Option<SocketAddr>,
     ) -> Result<Self> {
         let mut config = CoordinatorConfig::new(catalog, listen);
         config.lease_ms = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
@@ -142,6 +143,7 @@ impl Coordinator {
         let secure = guarded.access.tls.is_some();
         config.access = guarded.access;
         config.quotas = guarded.quotas;
+        config.http = http;
         let stop = CancellationToken::new();
         let running = serve(config, stop.clone())
             .await
@@ -160,6 +162,11 @@ impl Coordinator {
             true => format!("https://localhost:{}", address.port()),
             false => format!("http://{address}"),
         }
+    }
+
+    /// Where its health and metrics are served.
+    pub fn http(&self) -> Option<String> {
+        self.running.http.map(|address| format!("http://{address}"))
     }
 
     /// Stops it and waits until the catalog is closed.
@@ -197,17 +204,24 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     }
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
+    let guarded = Guarded::of(&args.guard);
     let coordinator = Coordinator::start(
         args.catalog.clone(),
         args.listen,
         lease,
-        Guarded::of(&args.guard),
+        guarded,
+        args.http.http,
     )
     .await?;
-    let url = coordinator.url();
+    let (url, http) = (coordinator.url(), coordinator.http());
     output.result(
-        &json!({"coordinator": url, "catalog": args.catalog.to_string()}),
-        || format!("coordinator at {url} on {}", args.catalog),
+        &json!({"coordinator": url, "catalog": args.catalog.to_string(), "http": http}),
+        || {
+            let metrics = http
+                .as_ref()
+                .map_or_else(String::new, |at| format!(", metrics at {at}/metrics"));
+            format!("coordinator at {url} on {}{metrics}", args.catalog)
+        },
     );
     stop.cancelled().await;
     coordinator.stop().await

@@ -28,8 +28,11 @@ use uuid::Uuid;
 use crate::{
     clock::Clock,
     core::{
-        Core, OutputHint, Prepared, Say, SessionId, Settings, Timings, place_is_free, stands_for,
+        Core, JobLook, Look, OutputHint, Prepared, Say, SessionId, Settings, Timings,
+        place_is_free, stands_for,
     },
+    http::Pulse,
+    metrics::{Metrics, Tally},
     plan,
 };
 
@@ -81,6 +84,9 @@ pub(crate) enum Command {
     Cancel(JobId, Reply<JobStatus>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
+    /// What the house knows, without asking the catalog.
+    Look(Reply<Look>),
+    LookAt(JobId, Option<u64>, Reply<JobLook>),
 }
 
 /// What a worker says in its session.
@@ -101,6 +107,8 @@ pub(crate) struct Actor {
     pub clock: Clock,
     /// Grows with every change that people may want to see.
     pub revision: watch::Sender<u64>,
+    pub metrics: Arc<Metrics>,
+    pub pulse: Arc<Pulse>,
     pub stop: CancellationToken,
 }
 
@@ -109,6 +117,7 @@ struct Life<'a> {
     actor: &'a Actor,
     core: Core,
     sessions: HashMap<SessionId, mpsc::Sender<Say>>,
+    tally: Tally,
 }
 
 impl Actor {
@@ -124,6 +133,7 @@ impl Actor {
                 Err(_) => "the coordinator panicked; please report this with its log".to_owned(),
             };
             tracing::error!("{why}; trying again in {} s", MEND.as_secs());
+            self.pulse.trouble(&why);
             tokio::select! {
                 () = tokio::time::sleep(MEND) => {}
                 () = self.stop.cancelled() => {}
@@ -158,6 +168,7 @@ impl Actor {
             actor: self,
             core,
             sessions: HashMap::new(),
+            tally: Tally::default(),
         })
     }
 }
@@ -204,6 +215,7 @@ impl Life<'_> {
                     if n == 0 {
                         return self.end().await;
                     }
+                    self.actor.metrics.handled(n);
                     self.handle(&mut batch).await?;
                 }
             }
@@ -240,6 +252,7 @@ impl Life<'_> {
         self.core.give_back();
         self.flush().await?;
         let news = self.actor.catalog.beat(self.core.connected()).await?;
+        self.actor.pulse.beat();
         let now = self.now();
         for job in self.core.hear(news, now) {
             if let Some(record) = self.actor.catalog.job(job).await? {
@@ -339,6 +352,12 @@ impl Life<'_> {
                 Command::Workers(reply) => {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
+                Command::Look(reply) => {
+                    let _ = reply.send(Ok(self.core.look()));
+                }
+                Command::LookAt(job, task, reply) => {
+                    let _ = reply.send(Ok(self.core.look_at(job, task)));
+                }
             }
         }
         Ok(())
@@ -363,7 +382,14 @@ impl Life<'_> {
                     .and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
                 self.core.finished(session, &report, OutputHint(hint), now);
             }
-            FromWorker::Failed(failure) => self.core.failed(session, &failure, now),
+            FromWorker::Failed(failure) => {
+                let before = self.core.noted();
+                self.core.failed(session, &failure, now);
+                // A refused report leaves no line.
+                if self.core.noted() > before {
+                    self.tally.failed(failure.kind);
+                }
+            }
             FromWorker::Release(lease, reason) => self.core.released(session, lease, &reason, now),
             FromWorker::Closed => {
                 self.sessions.remove(&session);
@@ -472,7 +498,14 @@ impl Life<'_> {
     async fn flush(&mut self) -> Result<(), CatalogError> {
         let (changes, say) = self.core.take();
         let changed = !changes.is_empty();
+        let mut tally = std::mem::take(&mut self.tally);
+        tally.note(&changes, &say);
+        let began = Instant::now();
         let ended = self.actor.catalog.commit(changes).await?;
+        self.actor.metrics.add(&tally);
+        if changed {
+            self.actor.metrics.committed(began.elapsed());
+        }
         self.core.ended(&ended);
         let mut deaf = Vec::new();
         for (session, what) in say {
@@ -515,5 +548,7 @@ fn refuse(command: Command, error: &str) {
         Command::Get(_, reply) | Command::Cancel(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
+        Command::Look(reply) => no(reply, error),
+        Command::LookAt(_, _, reply) => no(reply, error),
     }
 }

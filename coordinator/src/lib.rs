@@ -1,18 +1,22 @@
 //! The coordinator: plans jobs, places their tasks on workers, leases ranges of them, and commits what workers
-//! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`]).
+//! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`], [`explain`]).
 
 mod actor;
 pub mod auth;
 pub mod budget;
 mod clock;
 mod core;
+pub mod explain;
+mod http;
 #[cfg(test)]
 mod laws;
+mod metrics;
 pub mod place;
 pub mod plan;
 mod rpc;
 mod server;
 pub mod stage;
+mod timed;
 pub mod transition;
 
 pub use budget::Backoff;

@@ -7,7 +7,7 @@ use picofarm_proto::credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
 use tokio::{
     net::TcpListener,
-    sync::{mpsc, watch},
+    sync::{Mutex, mpsc, watch},
     task::JoinHandle,
 };
 use tokio_util::sync::CancellationToken;
@@ -19,7 +19,10 @@ use crate::{
     budget::Backoff,
     clock::Clock,
     core::Settings,
+    http::{self, Pages, Pulse},
+    metrics::Metrics,
     rpc::{FarmService, JobsService, Link},
+    timed::Timed,
 };
 
 /// Largest message either way: a job of 100,000 scene files is about 15 MB.
@@ -56,6 +59,9 @@ pub struct CoordinatorConfig {
     pub access: Access,
     /// The most of everything.
     pub quotas: Quotas,
+    /// Where `/healthz`, `/readyz` and `/metrics` are served, for anyone who reaches it; port 0 = any free port; by default
+    /// nowhere.
+    pub http: Option<SocketAddr>,
 }
 
 impl CoordinatorConfig {
@@ -72,6 +78,7 @@ impl CoordinatorConfig {
             clock: Clock::system(),
             access: Access::default(),
             quotas: Quotas::default(),
+            http: None,
         }
     }
 }
@@ -117,6 +124,8 @@ pub enum CoordinatorError {
 pub struct Running {
     /// Where it listens, with the port it got.
     pub address: SocketAddr,
+    /// Where its HTTP endpoint listens.
+    pub http: Option<SocketAddr>,
     /// Ends after a shutdown, when the catalog is closed.
     pub task: JoinHandle<Result<(), CoordinatorError>>,
 }
@@ -132,6 +141,16 @@ impl Running {
     pub async fn wait(self) -> Result<(), CoordinatorError> {
         self.task.await.expect("the server task does not panic")
     }
+}
+
+async fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+    let failed = |source: io::Error| match source.kind() {
+        io::ErrorKind::AddrInUse => CoordinatorError::AddressInUse { address },
+        _ => CoordinatorError::Listen { address, source },
+    };
+    let listener = TcpListener::bind(address).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    Ok((listener, address))
 }
 
 /// Starts a coordinator; it runs until `shutdown` is cancelled
@@ -151,22 +170,18 @@ pub async fn serve(
     }
     let tls = config.access.tls.as_ref().map(TlsFiles::read).transpose()?;
     let gate = Gate::new(&config.access, shutdown.clone())?;
-    let failed = |source: io::Error| match source.kind() {
-        io::ErrorKind::AddrInUse => CoordinatorError::AddressInUse {
-            address: config.listen,
-        },
-        _ => CoordinatorError::Listen {
-            address: config.listen,
-            source,
-        },
+    let (listener, address) = listen(config.listen).await?;
+    let endpoint = match config.http {
+        Some(address) => Some(listen(address).await?),
+        None => None,
     };
-    let listener = TcpListener::bind(config.listen).await.map_err(failed)?;
-    let address = listener.local_addr().map_err(failed)?;
+    let http = endpoint.as_ref().map(|(_, address)| *address);
     let holder = format!("process {}, listening on {address}", std::process::id());
     let catalog = config.catalog.open(&holder).await?;
 
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
+    let (metrics, pulse) = (Arc::new(Metrics::default()), Arc::new(Pulse::default()));
     let actor = Actor {
         catalog: Arc::clone(&catalog),
         settings: Settings {
@@ -175,8 +190,10 @@ pub async fn serve(
             backoff: config.backoff,
         },
         tick: config.tick,
-        clock: config.clock,
+        clock: config.clock.clone(),
         revision,
+        metrics: Arc::clone(&metrics),
+        pulse: Arc::clone(&pulse),
         stop: shutdown.clone(),
     };
     let link = Link {
@@ -184,9 +201,21 @@ pub async fn serve(
         revision: seen,
         catalog,
         stop: shutdown.clone(),
+        name: holder.into(),
+        clock: config.clock,
         lease_ms: config.lease_ms,
         heartbeat_ms: config.heartbeat_ms,
     };
+    if let Some((listener, address)) = endpoint {
+        let pages = Pages {
+            link: link.clone(),
+            metrics: Arc::clone(&metrics),
+            pulse,
+            gauges: Mutex::new(None),
+        };
+        tracing::info!(%address, "health and metrics over HTTP");
+        tokio::spawn(http::run(listener, Arc::new(pages), shutdown.clone()));
+    }
     let actor = tokio::spawn(actor.run(queue));
     let mut server = Server::builder();
     if let Some(tls) = tls {
@@ -194,6 +223,7 @@ pub async fn serve(
     }
     let server = server
         .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))
+        .layer(Timed(metrics))
         .layer(Guard::new(gate))
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
@@ -219,5 +249,9 @@ pub async fn serve(
         Ok(served?)
     });
     tracing::info!(%address, catalog = %config.catalog, "coordinator listens");
-    Ok(Running { address, task })
+    Ok(Running {
+        address,
+        http,
+        task,
+    })
 }

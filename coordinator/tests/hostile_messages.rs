@@ -309,9 +309,16 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
             after: draws.next(&number()),
             limit: draws.next(&small()),
             task: Some(draws.next(&number())),
+            newest: draws.next(&small()).is_multiple_of(2),
         };
         // Any answer will do; that there is one is the point.
         let _ = jobs.list_events(query).await;
+        let _ = jobs
+            .explain_job(wire::ExplainJobRequest {
+                job_id: id.clone(),
+                task: Some(draws.next(&number())),
+            })
+            .await;
         let _ = jobs
             .get_job(wire::GetJobRequest { job_id: id.clone() })
             .await;

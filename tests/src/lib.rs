@@ -8,6 +8,7 @@ pub mod binary;
 pub mod cli;
 pub mod cluster;
 pub mod farm;
+pub mod http;
 pub mod job;
 pub mod mount;
 pub mod postgres;

@@ -40,13 +40,22 @@ impl Postgres {
         Some(server)
     }
 
-    fn up(&mut self) {
+    /// Starts it again.
+    ///
+    /// # Panics
+    /// When it does not start.
+    pub fn up(&mut self) {
         let started = script(&["start", &self.dir.display().to_string()]);
         let error = String::from_utf8_lossy(&started.stderr);
         assert!(started.status.success(), "{error}");
         String::from_utf8_lossy(&started.stdout)
             .trim()
             .clone_into(&mut self.url);
+    }
+
+    /// Ends it in order: connections break, what was committed stays.
+    pub fn down(&self) {
+        script(&["stop", &self.dir.display().to_string()]);
     }
 
     /// Ends it without a word to anyone and starts it again: it recovers what was committed.

@@ -17,6 +17,7 @@ use tonic::Status;
 pub(crate) use guard::Guard;
 pub use quota::Quotas;
 pub(crate) use quota::{Throttle, WorkerIds};
+pub(crate) use roles::METHODS;
 pub use roles::{Needs, Role, Roles, needs};
 pub use tls::TlsFiles;
 pub use tokens::{Entry, TOKEN_PREFIX, TokenError, Tokens};

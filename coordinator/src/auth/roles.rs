@@ -112,6 +112,8 @@ pub(crate) const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/GetJob", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/WatchJob", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ListEvents", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/ExplainJob", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/ListWorkers", Needs::Role(Role::View)),
 ];
 
 /// What a path needs. One that is not listed is for administrators: forgetting it opens nothing.

@@ -6,6 +6,7 @@
 
 mod commit;
 mod dispatch;
+mod facts;
 mod jobs;
 mod leases;
 mod sessions;
@@ -28,6 +29,7 @@ use uuid::Uuid;
 use crate::{budget::Backoff, place::Abilities, stage::Stage};
 
 pub(crate) use commit::OutputHint;
+pub(crate) use facts::{JobLook, Look};
 pub(crate) use jobs::{Prepared, Timings, place_is_free, stands_for};
 
 /// Makes UUIDs; passed in, so that the core is deterministic.
@@ -94,6 +96,10 @@ struct WorkerEntry {
     session: SessionId,
     incarnation: Incarnation,
     name: String,
+    version: String,
+    cores: u32,
+    /// When its session began.
+    since_ms: i64,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,

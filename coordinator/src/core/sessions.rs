@@ -50,6 +50,9 @@ impl Core {
                 session,
                 incarnation: hello.incarnation,
                 name: hello.name,
+                version: hello.version,
+                cores: hello.cores,
+                since_ms: now_ms,
                 abilities: Abilities {
                     renderer: hello.renderer,
                     assets: hello.assets,

@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, caller, invalid, users::UserJobs};
+use super::{Link, caller, invalid, look, users::UserJobs};
 use crate::{
     VERSION,
     actor::Command,
@@ -175,9 +175,18 @@ impl Jobs for JobsService {
         request: Request<wire::ListEventsRequest>,
     ) -> Result<Response<wire::ListEventsResponse>, Status> {
         let request = request.into_inner();
-        let job = job_id(&request.job_id)?;
+        let job = match request.job_id.as_str() {
+            "" => None,
+            id => Some(job_id(id)?),
+        };
         // A job that does not exist is an error, not an empty history.
-        self.link.ask(|reply| Command::Get(job, reply)).await?;
+        let ended = match job {
+            None => false,
+            Some(job) => {
+                let status = self.link.ask(|reply| Command::Get(job, reply)).await?;
+                status.state != JobState::Active
+            }
+        };
         let query = EventQuery {
             job,
             after: request.after,
@@ -186,15 +195,36 @@ impl Jobs for JobsService {
                 n => n.min(MOST_EVENTS),
             },
             task: request.task,
+            newest: request.newest,
         };
-        let events = self
-            .link
-            .catalog
-            .events(&query)
-            .await
-            .map_err(|e| Status::unavailable(e.to_string()))?;
+        let events = self.link.catalog.events(&query).await;
+        let events = events.map_err(|e| Status::unavailable(e.to_string()))?;
         Ok(Response::new(wire::ListEventsResponse {
             events: events.into_iter().map(Into::into).collect(),
+            ended,
+        }))
+    }
+
+    async fn explain_job(
+        &self,
+        request: Request<wire::ExplainJobRequest>,
+    ) -> Result<Response<wire::ExplainJobResponse>, Status> {
+        let request = request.into_inner();
+        let job = job_id(&request.job_id)?;
+        let explained = look::explain(&self.link, job, request.task).await?;
+        Ok(Response::new(explained))
+    }
+
+    async fn list_workers(
+        &self,
+        _: Request<wire::ListWorkersRequest>,
+    ) -> Result<Response<wire::ListWorkersResponse>, Status> {
+        let look = self.link.ask(Command::Look).await?;
+        Ok(Response::new(wire::ListWorkersResponse {
+            coordinator: self.link.name.to_string(),
+            workers: look.workers.into_iter().map(Into::into).collect(),
+            elsewhere: look.elsewhere,
+            coordinators: look.houses,
         }))
     }
 }

@@ -2,6 +2,7 @@
 
 mod farm;
 mod jobs;
+mod look;
 mod users;
 
 use std::sync::Arc;
@@ -15,6 +16,7 @@ use tonic::{Request, Status};
 use crate::{
     actor::{Command, Refusal, Reply},
     auth::Caller,
+    clock::Clock,
 };
 
 pub(crate) use farm::FarmService;
@@ -27,13 +29,19 @@ pub(crate) struct Link {
     pub revision: watch::Receiver<u64>,
     pub catalog: Arc<dyn Catalog>,
     pub stop: CancellationToken,
+    /// Names this coordinator, for people.
+    pub name: Arc<str>,
+    pub clock: Clock,
     pub lease_ms: u32,
     pub heartbeat_ms: u32,
 }
 
 impl Link {
     /// Asks the actor and waits for its answer.
-    async fn ask<T>(&self, command: impl FnOnce(Reply<T>) -> Command) -> Result<T, Status> {
+    pub(crate) async fn ask<T>(
+        &self,
+        command: impl FnOnce(Reply<T>) -> Command,
+    ) -> Result<T, Status> {
         let (reply, answer) = oneshot::channel();
         let gone = || {
             Status::unavailable("the coordinator is stopping or cannot use its catalog; try again")

@@ -138,6 +138,7 @@ impl Farm {
             after: 0,
             limit: 0,
             task,
+            newest: false,
         };
         let response = self.jobs.list_events(request).await.unwrap();
         response.into_inner().events

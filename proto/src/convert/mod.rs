@@ -1,5 +1,6 @@
 //! Wire → model and back. Every error names the field that cannot be used.
 
+mod explain;
 mod job;
 mod session;
 mod status;

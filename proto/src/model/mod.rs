@@ -1,5 +1,6 @@
 //! The checked model: what the coordinator and the agent reason about. Wire types convert into these.
 
+pub mod explain;
 pub mod job;
 pub mod lease;
 pub mod reprocess;
@@ -7,6 +8,7 @@ pub mod sensor;
 pub mod status;
 mod text;
 
+pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::{
     Budget, Choice, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind,
     SceneSource, SpecError,

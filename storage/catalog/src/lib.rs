@@ -36,8 +36,9 @@ pub use error::CatalogError;
 pub use place::CatalogPlace;
 pub use postgres::PostgresCatalog;
 pub use record::{
-    Claim, EventQuery, Exception, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent, News, Output,
-    Owned, Range, RangeState, ResultSet, Run, Snapshot, StageRecord, Timing, Want, Worker,
+    Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,
+    News, Output, Owned, Range, RangeState, ResultSet, Run, Snapshot, StageRecord, TaskRecord,
+    Timing, Want, Worker,
 };
 pub use sqlite::SqliteCatalog;
 
@@ -122,7 +123,13 @@ pub trait Catalog: Send + Sync + 'static {
     /// How long the computed (not adopted) outputs of `set` took.
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError>;
 
-    /// History of a job, oldest first.
+    /// What the tasks of a job wait for at this time.
+    async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError>;
+
+    /// What is known of one task.
+    async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError>;
+
+    /// History, oldest first.
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError>;
 
     /// Lets go of what the house owns, as far as that is possible, and of the database.

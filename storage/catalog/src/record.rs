@@ -300,17 +300,43 @@ impl Timing {
     }
 }
 
-/// Which part of a job's history.
+/// What a job's tasks wait for, as far as the catalog knows.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Holdups {
+    /// Pending tasks that may run at once.
+    pub ready: u64,
+    /// Pending tasks that may not run before a time.
+    pub waiting: u64,
+    /// The first of these times, Unix milliseconds.
+    pub next_ms: Option<i64>,
+    /// The tasks that failed most often, a few of them.
+    pub failed: Vec<Exception>,
+}
+
+/// All that is known of one task.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TaskRecord {
+    /// The range that has it; `None` where its job was stopped.
+    pub range: Option<Range>,
+    /// Its failures.
+    pub exception: Option<Exception>,
+    /// Its result.
+    pub output: Option<Output>,
+}
+
+/// Which part of the history.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventQuery {
-    /// The job.
-    pub job: JobId,
+    /// The job; `None` = all of them.
+    pub job: Option<JobId>,
     /// Only events after this sequence number.
     pub after: u64,
     /// At most this many.
     pub limit: u32,
     /// Only events that concern this task.
     pub task: Option<u64>,
+    /// The last `limit` rather than the first.
+    pub newest: bool,
 }
 
 /// What a house finds when its life begins.

@@ -153,6 +153,21 @@ pub(crate) fn equal_manifests(
 /// The words for a job that cannot become active again.
 pub(crate) const LATER_JOB: &str = "another job with the same spec is active or done";
 
+/// A query of the history: which job, in which order.
+macro_rules! history {
+    ($job:literal, $order:literal) => {
+        concat!(
+            "SELECT event.*, job.id AS job_id FROM event \
+             JOIN job ON job.key = event.job WHERE sequence > $1 AND ",
+            $job,
+            " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) ",
+            $order,
+            " LIMIT $3"
+        )
+    };
+}
+pub(crate) use history;
+
 /// The queries, for one database: `queries!(SqliteConnection, SqliteRow)` makes a module `query`.
 macro_rules! queries {
     ($connection:ty, $row:ty) => {
@@ -171,10 +186,10 @@ macro_rules! queries {
 
             use crate::{
                 record::{
-                    EventQuery, Exception, Job, JobRecord, LeaseState, Mark, Range, RangeState, ResultSet, Run,
-                    Timing, Worker,
+                    EventQuery, Exception, Holdups, Job, JobRecord, LeaseState, Mark, Output, Range, RangeState,
+                    ResultSet, Run, TaskRecord, Timing, Worker,
                 },
-                sql::{self, bad, int},
+                sql::{self, bad, history, int},
             };
 
             type Connection = $connection;
@@ -304,14 +319,7 @@ macro_rules! queries {
                     .fetch_all(&mut *c)
                     .await?;
                     for row in &rows {
-                        found.push(Exception {
-                            stage: stage_of(row)?,
-                            task: uint(row, "task")?,
-                            failures: small(row, "failures")?,
-                            crashes: small(row, "crashes")?,
-                            dead: row.try_get("dead")?,
-                            last_error: row.try_get("last_error")?,
-                        });
+                        found.push(exception(row, stage_of(row)?)?);
                     }
                 }
                 Ok(found)
@@ -482,18 +490,139 @@ macro_rules! queries {
                 rows.iter().map(job).collect()
             }
 
-            pub(crate) async fn events(c: &mut Connection, query: &EventQuery) -> Result<Vec<Event>> {
-                let rows = sqlx::query(
-                    "SELECT sequence, at_ms, kind, lo, hi, worker, seconds, message FROM event \
-                     WHERE job = (SELECT key FROM job WHERE id = $1) AND sequence > $2 \
-                     AND (CAST($3 AS BIGINT) IS NULL OR (lo <= $3 AND $3 < hi)) ORDER BY sequence LIMIT $4",
+            fn exception(row: &DbRow, stage: StageRef) -> Result<Exception> {
+                Ok(Exception {
+                    stage,
+                    task: uint(row, "task")?,
+                    failures: small(row, "failures")?,
+                    crashes: small(row, "crashes")?,
+                    dead: row.try_get("dead")?,
+                    last_error: row.try_get("last_error")?,
+                })
+            }
+
+            pub(crate) async fn holdups(c: &mut Connection, job: JobId, now_ms: i64) -> Result<Holdups> {
+                let row = sqlx::query(
+                    "SELECT CAST(coalesce(sum(CASE WHEN not_before_ms <= $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS ready, \
+                     CAST(coalesce(sum(CASE WHEN not_before_ms > $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS waiting, \
+                     min(CASE WHEN not_before_ms > $2 THEN not_before_ms END) AS next_ms \
+                     FROM task_range JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+                     WHERE job.id = $1 AND task_range.state = 0",
                 )
-                .bind(query.job.uuid())
-                .bind(i64::try_from(query.after).unwrap_or(i64::MAX))
-                .bind(query.task.map(|t| i64::try_from(t).unwrap_or(i64::MAX)))
-                .bind(i64::from(query.limit))
+                .bind(job.uuid())
+                .bind(now_ms)
+                .fetch_one(&mut *c)
+                .await?;
+                let failed = sqlx::query(
+                    "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
+                     JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
+                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes DESC, task LIMIT 5",
+                )
+                .bind(job.uuid())
                 .fetch_all(c)
                 .await?;
+                Ok(Holdups {
+                    ready: uint(&row, "ready")?,
+                    waiting: uint(&row, "waiting")?,
+                    next_ms: row.try_get("next_ms")?,
+                    failed: failed
+                        .iter()
+                        .map(|row| exception(row, stage_of(row)?))
+                        .collect::<Result<_>>()?,
+                })
+            }
+
+            pub(crate) async fn task(c: &mut Connection, stage: StageRef, task: u64) -> Result<TaskRecord> {
+                let key: Option<(i64, i64)> = sqlx::query_as(
+                    "SELECT stage.key, stage.result_set FROM stage JOIN job ON job.key = stage.job \
+                     WHERE job.id = $1 AND ordinal = $2",
+                )
+                .bind(stage.job.uuid())
+                .bind(i64::from(stage.stage))
+                .fetch_optional(&mut *c)
+                .await?;
+                let Some((key, set)) = key else {
+                    return Ok(TaskRecord::default());
+                };
+                let rows = sqlx::query(
+                    "SELECT task_range.*, job.id AS job_id, stage.ordinal FROM task_range \
+                     JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+                     WHERE task_range.stage = $1 AND lo <= $2 AND $2 < hi",
+                )
+                .bind(key)
+                .bind(int(task))
+                .fetch_all(&mut *c)
+                .await?;
+                let ranges = rows.iter().map(range).collect::<Result<Vec<_>>>()?;
+                let row = sqlx::query("SELECT * FROM exception WHERE stage = $1 AND task = $2")
+                    .bind(key)
+                    .bind(int(task))
+                    .fetch_optional(&mut *c)
+                    .await?;
+                let failures = row.as_ref().map(|row| exception(row, stage)).transpose()?;
+                let row = sqlx::query("SELECT * FROM output WHERE result_set = $1 AND task = $2")
+                    .bind(set)
+                    .bind(int(task))
+                    .fetch_optional(c)
+                    .await?;
+                let output = row.map(|row| -> Result<Output> {
+                    let manifest: Vec<u8> = row.try_get("manifest")?;
+                    Ok(Output {
+                        stage,
+                        task,
+                        manifest: manifest
+                            .try_into()
+                            .map_err(|_| bad("manifest", "not 32 bytes"))?,
+                        bytes: uint(&row, "bytes")?,
+                        seconds: row.try_get("seconds")?,
+                        epoch: Epoch(uint(&row, "epoch")?),
+                        adopted: row.try_get("adopted")?,
+                    })
+                });
+                Ok(TaskRecord {
+                    // A task that left a lease has a range of its own, beside the lease that it left.
+                    range: ranges.into_iter().find(|range| match &range.state {
+                        RangeState::Leased(lease) => {
+                            lease.marks.get((task - range.lo) as usize) != Some(&Mark::Left)
+                        }
+                        _ => true,
+                    }),
+                    exception: failures,
+                    output: output.transpose()?,
+                })
+            }
+
+            pub(crate) async fn events(c: &mut Connection, query: &EventQuery) -> Result<Vec<Event>> {
+                let job = match query.job {
+                    None => None,
+                    Some(id) => {
+                        let key = sqlx::query_scalar::<_, i64>("SELECT key FROM job WHERE id = $1")
+                            .bind(id.uuid())
+                            .fetch_optional(&mut *c)
+                            .await?;
+                        let Some(key) = key else {
+                            return Ok(Vec::new());
+                        };
+                        Some(key)
+                    }
+                };
+                // Four texts, so that each has an index that fits.
+                let text = match (job, query.newest) {
+                    (Some(_), false) => history!("event.job = $4", "ORDER BY sequence"),
+                    (Some(_), true) => history!("event.job = $4", "ORDER BY sequence DESC"),
+                    (None, false) => history!("CAST($4 AS BIGINT) IS NULL", "ORDER BY sequence"),
+                    (None, true) => history!("CAST($4 AS BIGINT) IS NULL", "ORDER BY sequence DESC"),
+                };
+                let mut rows = sqlx::query(text)
+                    .bind(i64::try_from(query.after).unwrap_or(i64::MAX))
+                    .bind(query.task.map(|t| i64::try_from(t).unwrap_or(i64::MAX)))
+                    .bind(i64::from(query.limit))
+                    .bind(job)
+                    .fetch_all(c)
+                    .await?;
+                if query.newest {
+                    rows.reverse();
+                }
                 rows.iter()
                     .map(|row| {
                         let task = |column| {
@@ -504,7 +633,7 @@ macro_rules! queries {
                         Ok(Event {
                             sequence: uint(row, "sequence")?,
                             at_ms: row.try_get("at_ms")?,
-                            job: query.job,
+                            job: JobId::from_uuid(row.try_get("job_id")?),
                             kind: sql::event_kind(row.try_get("kind")?)?,
                             task: lo.filter(|lo| hi == Some(lo + 1)),
                             lo,

@@ -351,10 +351,11 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     };
     catalog.commit(changes).await.unwrap();
     let mut query = EventQuery {
-        job: job().id,
+        job: Some(job().id),
         after: 0,
         limit: 3,
         task: None,
+        newest: false,
     };
     let page = catalog.events(&query).await.unwrap();
     assert_eq!(page.len(), 3);
@@ -375,6 +376,91 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
             (EventKind::Committed, Some(2), Some(2), Some(3))
         ]
     );
+    // The last ones, of whichever job, in order still.
+    query = EventQuery {
+        job: None,
+        limit: 2,
+        task: None,
+        newest: true,
+        ..query
+    };
+    let last = catalog.events(&query).await.unwrap();
+    let tasks: Vec<_> = last.iter().map(|e| (e.job, e.task)).collect();
+    assert_eq!(tasks, [(job().id, Some(2)), (job().id, Some(1))]);
+    assert!(last[0].sequence < last[1].sequence);
+}
+
+async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn Catalog) {
+    catalog.load().await.unwrap();
+    let later = range(3, 8, 9, RangeState::Pending { not_before_ms: 700 });
+    let lease = leased(
+        range(1, 0, 3, RangeState::Dead),
+        &[Mark::Todo, Mark::Left, Mark::Done],
+    );
+    let ranges = [pending(1, 0, 3), pending(2, 3, 8), pending(3, 8, 9)];
+    catalog.submit(&job(), &ranges, &[]).await.unwrap();
+    let want = Want {
+        stage: stage(),
+        tasks: 9,
+        now_ms: 0,
+    };
+    catalog.claim(&[want]).await.unwrap();
+    let mut changes = Changes::default();
+    changes.put(lease.clone());
+    changes.put(later.clone());
+    changes.give(pending(2, 3, 8));
+    changes.put(pending(9, 1, 2));
+    changes
+        .minted
+        .insert(RangeId::from_uuid(Uuid::from_u128(9)));
+    for (task, crashes) in [(1, 1), (8, 2)] {
+        let exception = Exception {
+            stage: stage(),
+            task,
+            failures: 1,
+            crashes,
+            dead: false,
+            last_error: "no light".into(),
+        };
+        changes.exceptions.insert((stage(), task), exception);
+    }
+    let output = Output {
+        stage: stage(),
+        task: 2,
+        manifest: [7; 32],
+        bytes: 10,
+        seconds: 1.5,
+        epoch: Epoch(4),
+        adopted: false,
+    };
+    changes.outputs.push(output.clone());
+    catalog.commit(changes).await.unwrap();
+
+    let holdups = catalog.holdups(job().id, 600).await.unwrap();
+    assert_eq!(
+        (holdups.ready, holdups.waiting, holdups.next_ms),
+        (6, 1, Some(700))
+    );
+    let failed: Vec<_> = holdups.failed.iter().map(|e| e.task).collect();
+    assert_eq!(failed, [8, 1]);
+    let holdups = catalog.holdups(job().id, 700).await.unwrap();
+    assert_eq!(
+        (holdups.ready, holdups.waiting, holdups.next_ms),
+        (7, 0, None)
+    );
+
+    let task = async |task| catalog.task(stage(), task).await.unwrap();
+    let left = task(1).await;
+    assert_eq!(
+        left.range,
+        Some(pending(9, 1, 2)),
+        "what left a lease is found where it is"
+    );
+    assert_eq!(left.exception.map(|e| e.crashes), Some(1));
+    let done = task(2).await;
+    assert_eq!((done.range, done.output), (Some(lease), Some(output)));
+    assert_eq!(task(8).await.range, Some(later));
+    assert_eq!(task(99).await, picofarm_catalog::TaskRecord::default());
 }
 
 async fn every_kind_of_spec_is_read_back_as_written(catalog: &dyn Catalog) {
@@ -443,6 +529,7 @@ promises! {
     given_up_tasks_can_be_tried_again
     the_same_spec_is_recorded_once
     history_is_read_in_pages_and_by_task
+    what_holds_tasks_up_and_what_became_of_one_can_be_asked
     every_kind_of_spec_is_read_back_as_written
 }
 

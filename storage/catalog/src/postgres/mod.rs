@@ -31,7 +31,7 @@ use uuid::Uuid;
 use crate::{
     Catalog, CatalogError, Changes, Claim, Job, JobEnd, JobRecord, NewEvent, News, Owned, Range,
     RangeState, Snapshot, Want,
-    record::{EventQuery, ResultSet, Run, Timing},
+    record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
 crate::sql::queries!(sqlx::PgConnection, super::PgRow);
@@ -371,6 +371,20 @@ impl Catalog for PostgresCatalog {
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError> {
         let mut c = self.reader().await?;
         query::timing(&mut c, set).await.map_err(|e| self.failed(e))
+    }
+
+    async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError> {
+        let mut c = self.reader().await?;
+        query::holdups(&mut c, job, now_ms)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError> {
+        let mut c = self.reader().await?;
+        query::task(&mut c, stage, task)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError> {

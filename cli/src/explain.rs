@@ -1,0 +1,118 @@
+//! `picofarm job explain` and `picofarm workers`.
+
+use crate::{
+    client::{Client, Explained, Workers},
+    error::Result,
+    jobs::{clock, describe_event},
+    output::{Output, bytes, duration, table},
+    settings::Settings,
+};
+
+/// Why a job is as it is, for people.
+pub fn describe(explained: &Explained) -> String {
+    let status = &explained.job;
+    let tasks = &status.tasks;
+    let mut text = format!(
+        "job {} \"{}\": {}\n  {} tasks: {} done ({} reused), {} leased, {} pending, {} dead\n",
+        status.id,
+        status.name,
+        format!("{:?}", status.state).to_lowercase(),
+        tasks.total,
+        tasks.done,
+        tasks.reused,
+        tasks.leased,
+        tasks.pending,
+        tasks.dead
+    );
+    for reason in &explained.reasons {
+        text += &format!("  - {}\n", reason.words);
+    }
+    let Some(task) = &explained.task else {
+        return text;
+    };
+    text += &format!("task {}: {}\n", task.index, task.words);
+    if task.failures + task.crashes > 0 {
+        text += &format!(
+            "  {} of {} failures and {} of {} lost workers before it is given up; the last: {}\n",
+            task.failures, task.max_failures, task.crashes, task.max_crashes, task.last_error
+        );
+    }
+    for why in &task.reruns {
+        text += &format!("  run again because {why}\n");
+    }
+    if let Some(output) = &task.output {
+        text += &format!(
+            "  output: manifest {}, {} in {}\n",
+            output.manifest_sha256,
+            bytes(output.bytes),
+            duration(output.seconds)
+        );
+        if let Some(made) = &output.made {
+            text += &format!(
+                "  committed {} by {} under job {}\n",
+                clock(made.at_ms),
+                made.worker,
+                made.job
+            );
+        }
+    }
+    if !task.events.is_empty() {
+        text += "  history:\n";
+    }
+    for event in &task.events {
+        text += &format!("    {}", describe_event(event));
+    }
+    text
+}
+
+/// `picofarm workers`.
+///
+/// # Errors
+/// The coordinator cannot be reached, or refuses.
+pub async fn workers(settings: &Settings, output: Output) -> Result<()> {
+    let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
+    let workers = client.workers().await?;
+    output.result(&workers, || describe_workers(&workers));
+    Ok(())
+}
+
+fn describe_workers(all: &Workers) -> String {
+    let mut text = format!(
+        "coordinator ({}): {} connected\n",
+        all.coordinator,
+        all.workers.len()
+    );
+    if !all.workers.is_empty() {
+        let header =
+            ["worker", "version", "cores", "leases", "tasks", "since", ""].map(String::from);
+        let rows = all.workers.iter().map(|w| {
+            let note = if w.quarantined {
+                "on probation: its range crashed others"
+            } else {
+                ""
+            };
+            vec![
+                w.name.clone(),
+                w.version.clone(),
+                w.cores.to_string(),
+                w.leases.to_string(),
+                w.tasks.to_string(),
+                clock(w.since_ms),
+                note.to_owned(),
+            ]
+        });
+        text += &table(
+            &std::iter::once(header.to_vec())
+                .chain(rows)
+                .collect::<Vec<_>>(),
+        );
+    }
+    if all.coordinators > 1 {
+        text += &format!(
+            "{} more at the other {} coordinator(s) of this catalog; ask them with --coordinator\n",
+            all.elsewhere,
+            all.coordinators - 1
+        );
+    }
+    text
+}

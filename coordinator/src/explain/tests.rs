@@ -1,0 +1,339 @@
+//! Each answer has the facts that call for it.
+
+use picofarm_catalog::{LeaseState, Mark, Output, Range};
+use picofarm_proto::ids::{Epoch, Incarnation, RangeId, StageRef, WorkerId};
+use uuid::Uuid;
+
+use super::*;
+
+const NOW: i64 = 1_000_000;
+
+fn id(n: u128) -> JobId {
+    JobId::from_uuid(Uuid::from_u128(n))
+}
+
+fn facts() -> JobFacts {
+    JobFacts {
+        job: id(7),
+        state: JobState::Active,
+        counts: TaskCounts {
+            total: 10,
+            pending: 10,
+            ..TaskCounts::default()
+        },
+        holdups: Holdups {
+            ready: 10,
+            ..Holdups::default()
+        },
+        candidates: vec![able("a")],
+        ahead: vec![],
+        elsewhere: 0,
+        now_ms: NOW,
+    }
+}
+
+fn able(name: &str) -> Candidate {
+    Candidate {
+        name: name.into(),
+        may_run: Ok(()),
+        idle: false,
+        quarantined: false,
+    }
+}
+
+fn failed(task: u64, dead: bool) -> Exception {
+    Exception {
+        stage: stage(),
+        task,
+        failures: 2,
+        crashes: 1,
+        dead,
+        last_error: "no light in the scene".into(),
+    }
+}
+
+fn stage() -> StageRef {
+    StageRef {
+        job: id(7),
+        stage: 0,
+    }
+}
+
+/// The first reason's code and words.
+fn first(facts: &JobFacts) -> (String, String) {
+    let reasons = job(facts);
+    (reasons[0].code.clone(), reasons[0].words.clone())
+}
+
+#[test]
+fn a_waiting_job_says_what_it_waits_for() {
+    let none = JobFacts {
+        candidates: vec![],
+        ..facts()
+    };
+    let (code, words) = first(&none);
+    assert_eq!(code, "no_workers");
+    assert!(
+        words.contains("10 tasks") && words.contains("picofarm worker"),
+        "{words}"
+    );
+
+    let elsewhere = JobFacts {
+        elsewhere: 3,
+        ..none
+    };
+    let (code, words) = first(&elsewhere);
+    assert_eq!(code, "elsewhere");
+    assert!(
+        words.contains("3 workers are connected to other coordinators"),
+        "{words}"
+    );
+
+    let refused = |name: &str| Candidate {
+        may_run: Err("the job needs renderer \"2\", the worker has \"1\"".into()),
+        ..able(name)
+    };
+    let unable = JobFacts {
+        candidates: vec![refused("old-1"), refused("old-2")],
+        ..facts()
+    };
+    let (code, words) = first(&unable);
+    assert_eq!(code, "unable");
+    assert_eq!(
+        words.matches("needs renderer").count(),
+        1,
+        "each reason once: {words}"
+    );
+
+    let (code, words) = first(&facts());
+    assert_eq!(code, "busy");
+    assert!(
+        words.contains("the one worker that may run them is busy"),
+        "{words}"
+    );
+
+    let behind = JobFacts {
+        ahead: vec![id(3), id(4)],
+        ..facts()
+    };
+    let (code, words) = first(&behind);
+    assert_eq!(code, "behind");
+    assert!(
+        words.contains(&id(3).to_string()) && words.contains("1 job"),
+        "{words}"
+    );
+
+    let starting = JobFacts {
+        candidates: vec![Candidate {
+            idle: true,
+            ..able("a")
+        }],
+        ..behind
+    };
+    assert_eq!(first(&starting).0, "starting");
+}
+
+#[test]
+fn a_task_that_failed_says_when_it_goes_on_and_what_went_wrong() {
+    let facts = JobFacts {
+        holdups: Holdups {
+            waiting: 1,
+            next_ms: Some(NOW + 12_500),
+            failed: vec![failed(4, false)],
+            ..Holdups::default()
+        },
+        ..facts()
+    };
+    let reasons = job(&facts);
+    assert_eq!(reasons[0].code, "after_failure");
+    assert_eq!(reasons[0].until_ms, Some(NOW + 12_500));
+    let words = &reasons[0].words;
+    assert!(
+        words.contains("another 12 s") && words.contains("task 4: no light"),
+        "{words}"
+    );
+}
+
+#[test]
+fn every_state_of_a_job_has_an_answer() {
+    let counts = TaskCounts {
+        total: 10,
+        done: 8,
+        dead: 2,
+        ..TaskCounts::default()
+    };
+    let ended = JobFacts {
+        state: JobState::Failed,
+        counts,
+        holdups: Holdups {
+            failed: vec![failed(4, true)],
+            ..Holdups::default()
+        },
+        ..facts()
+    };
+    let (code, words) = first(&ended);
+    assert_eq!(code, "dead");
+    assert!(
+        words.contains("job retry") && words.contains("no light"),
+        "{words}"
+    );
+    let cancelled = JobFacts {
+        state: JobState::Cancelled,
+        counts: TaskCounts { dead: 0, ..counts },
+        ..ended.clone()
+    };
+    let (code, words) = first(&cancelled);
+    assert_eq!(code, "cancelled");
+    assert!(words.contains("2 tasks not done"), "{words}");
+    let done = JobFacts {
+        state: JobState::Done,
+        counts: TaskCounts {
+            done: 10,
+            dead: 0,
+            ..counts
+        },
+        ..ended
+    };
+    assert_eq!(first(&done).0, "ended");
+    let ending = JobFacts {
+        holdups: Holdups::default(),
+        ..facts()
+    };
+    assert_eq!(first(&ending).0, "ending");
+}
+
+fn event(kind: EventKind, worker: &str, message: &str) -> Event {
+    Event {
+        sequence: 1,
+        at_ms: NOW - 5_000,
+        job: id(7),
+        kind,
+        task: Some(4),
+        lo: Some(4),
+        hi: Some(5),
+        worker: worker.into(),
+        message: message.into(),
+        seconds: 0.0,
+    }
+}
+
+fn range(state: RangeState) -> Range {
+    Range {
+        id: RangeId::from_uuid(Uuid::from_u128(1)),
+        stage: stage(),
+        lo: 4,
+        hi: 5,
+        epoch: Epoch(1),
+        crashes: 0,
+        state,
+    }
+}
+
+fn task_facts(state: RangeState) -> TaskFacts {
+    TaskFacts {
+        index: 4,
+        job: id(7),
+        record: TaskRecord {
+            range: Some(range(state)),
+            ..TaskRecord::default()
+        },
+        events: vec![],
+        limits: Limits::default(),
+        elsewhere: None,
+        running: None,
+        now_ms: NOW,
+    }
+}
+
+fn leased_state() -> RangeState {
+    RangeState::Leased(LeaseState {
+        worker: WorkerId::from_uuid(Uuid::from_u128(1)),
+        incarnation: Incarnation::from_uuid(Uuid::from_u128(1)),
+        until_ms: NOW,
+        marks: vec![Mark::Todo],
+    })
+}
+
+#[test]
+fn each_run_of_a_task_but_the_first_has_its_cause() {
+    let mut facts = task_facts(leased_state());
+    facts.record.exception = Some(failed(4, false));
+    facts.events = vec![
+        event(EventKind::Leased, "a", "tasks 4..5"),
+        event(EventKind::Expired, "a", "the lease ran out"),
+        event(EventKind::Failed, "a", "the lease ran out"),
+        event(EventKind::Leased, "b", "tasks 4..5"),
+        event(EventKind::Released, "b", "the worker is stopping"),
+        event(EventKind::Leased, "c", "tasks 4..5"),
+        event(EventKind::Dead, "c", "no light"),
+        event(EventKind::Leased, "d", "tasks 4..5"),
+    ];
+    let told = task(facts.clone());
+    assert_eq!(told.state, TaskState::Leased);
+    assert!(told.words.contains("leased to d for 5 s"), "{}", told.words);
+    assert_eq!(
+        told.reruns,
+        [
+            "a was lost with it: the lease ran out",
+            "b gave it back: the worker is stopping",
+            "it was given up on c: no light, and then tried again",
+        ]
+    );
+    assert_eq!((told.failures, told.crashes), (2, 1));
+    facts.running = Some(("d".into(), 0.4, NOW - 3_000));
+    assert_eq!(task(facts).words, "runs on d for 3 s: 40 % done");
+}
+
+#[test]
+fn a_finished_task_says_who_made_it() {
+    let output = Output {
+        stage: stage(),
+        task: 4,
+        manifest: [1; 32],
+        bytes: 100,
+        seconds: 2.5,
+        epoch: Epoch(1),
+        adopted: false,
+    };
+    let mut facts = task_facts(RangeState::Done { reused: true });
+    facts.record.output = Some(output);
+    let unknown = task(facts.clone());
+    assert_eq!(unknown.state, TaskState::Done);
+    assert!(unknown.words.contains("does not tell"), "{}", unknown.words);
+    facts.elsewhere = Some((id(3), "first".into(), event(EventKind::Committed, "a", "")));
+    let reused = task(facts.clone());
+    assert!(
+        reused.words.contains("under job") && reused.words.contains("(first)"),
+        "{}",
+        reused.words
+    );
+    facts.events = vec![event(EventKind::Committed, "b", "")];
+    let own = task(facts);
+    assert_eq!(own.words, "done: computed by b under this job");
+    assert_eq!(own.output.unwrap().manifest_sha256, "01".repeat(32));
+}
+
+#[test]
+fn a_task_that_waits_or_was_given_up_says_why() {
+    let mut facts = task_facts(RangeState::Pending {
+        not_before_ms: NOW + 8_000,
+    });
+    facts.record.exception = Some(failed(4, false));
+    let told = task(facts.clone());
+    assert_eq!(told.state, TaskState::Pending);
+    assert!(
+        told.words.contains("another 8 s") && told.words.contains("no light"),
+        "{}",
+        told.words
+    );
+    facts.record.range = Some(range(RangeState::Dead));
+    let told = task(facts.clone());
+    assert_eq!(told.state, TaskState::Dead);
+    assert!(
+        told.words.contains("2 of 3 failures") && told.words.contains("job retry"),
+        "{}",
+        told.words
+    );
+    facts.record.range = None;
+    assert_eq!(task(facts).state, TaskState::Gone);
+}
