@@ -107,7 +107,12 @@ pub fn agent_error(error: &AgentError) -> CliError {
     let ended = CliError::new(code, error);
     match error {
         AgentError::Refused { .. } => {
-            if error.to_string().contains("install the same version") {
+            // Others are about tokens and certificates, and say themselves what to do.
+            let text = error.to_string();
+            if ["version", "protocol"]
+                .iter()
+                .any(|word| text.contains(word))
+            {
                 ended.hint("compare `picofarm --version` on both machines and install the same one")
             } else {
                 ended

@@ -1,6 +1,6 @@
 //! What is written of ranges, outputs and history, in one transaction each.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use picofarm_proto::ids::{JobId, RangeId, StageRef};
 use sqlx::{Connection, QueryBuilder, Row, Sqlite, SqliteConnection};
@@ -352,29 +352,36 @@ async fn insert_outputs(
     Ok(())
 }
 
-/// The manifests of many tasks: one short query each, which costs SQLite little.
+/// The manifests of many tasks, in one query for each stage.
 pub(super) async fn manifests(
     c: &mut SqliteConnection,
     tasks: &[(StageRef, u64)],
 ) -> std::result::Result<Vec<Option<[u8; 32]>>, sqlx::Error> {
-    let mut found = Vec::with_capacity(tasks.len());
+    let mut by_stage: BTreeMap<StageRef, Vec<u64>> = BTreeMap::new();
     for (stage, task) in tasks {
-        let manifest: Option<Vec<u8>> = sqlx::query_scalar(
-            "SELECT manifest FROM output WHERE task = $1 AND result_set = (SELECT result_set FROM stage \
-             JOIN job ON job.key = stage.job WHERE job.id = $2 AND ordinal = $3)",
+        by_stage.entry(*stage).or_default().push(*task);
+    }
+    let mut found = HashMap::new();
+    for (stage, indices) in by_stage {
+        let rows = sqlx::query(
+            "SELECT task, manifest FROM output WHERE task IN (SELECT value FROM json_each(?3)) AND result_set = \
+             (SELECT result_set FROM stage JOIN job ON job.key = stage.job WHERE job.id = ?1 AND ordinal = ?2)",
         )
-        .bind(int(*task))
         .bind(stage.job.uuid())
         .bind(i64::from(stage.stage))
-        .fetch_optional(&mut *c)
+        .bind(serde_json::to_string(&indices).expect("numbers are JSON"))
+        .fetch_all(&mut *c)
         .await?;
-        let manifest = manifest.map(|m| {
-            m.try_into()
-                .map_err(|_| sql::bad("manifest", "not 32 bytes long"))
-        });
-        found.push(manifest.transpose()?);
+        for row in rows {
+            let manifest: Vec<u8> = row.try_get("manifest")?;
+            let manifest: [u8; 32] = manifest
+                .try_into()
+                .map_err(|_| sql::bad("manifest", "not 32 bytes long"))?;
+            let task = row.try_get::<i64, _>("task")?.unsigned_abs();
+            found.insert((stage, task), manifest);
+        }
     }
-    Ok(found)
+    Ok(tasks.iter().map(|t| found.get(t).copied()).collect())
 }
 
 pub(super) async fn insert_events(
