@@ -200,8 +200,9 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
         assert!(matches!(error, DatasetError::Conflict { .. }), "{error}");
     }
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+    // Where each of them came upon another's object, nobody won, and what they wrote is nobody's.
     let left = dataset.collect(Duration::ZERO, false).await.unwrap();
-    assert!(left.orphans.is_empty(), "{left:?}");
+    assert_eq!(left.orphans.is_empty(), winners == 1, "{left:?}");
 }
 
 #[tokio::test]

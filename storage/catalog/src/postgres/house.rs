@@ -9,14 +9,13 @@ use uuid::Uuid;
 use super::write::{Desk, RANGE, Result, Sql, WriteError, ranges};
 use crate::Range;
 
-/// Holds the house's row until the transaction ends: it is alive, and cannot be found lost meanwhile.
+/// Holds the house's row until the transaction ends, so that nobody can find it lost meanwhile. A row whose time is over
+/// but that nobody has removed will do: what the house owns is still its own.
 pub(super) async fn fence(c: &mut PgConnection, house: HouseId) -> Result<()> {
-    let alive: Option<i32> = sqlx::query_scalar(
-        "SELECT 1 FROM house WHERE id = $1 AND until > clock_timestamp() FOR KEY SHARE",
-    )
-    .bind(house.uuid())
-    .fetch_optional(c)
-    .await?;
+    let alive: Option<i32> = sqlx::query_scalar("SELECT 1 FROM house WHERE id = $1 FOR KEY SHARE")
+        .bind(house.uuid())
+        .fetch_optional(c)
+        .await?;
     alive.map(|_| ()).ok_or(WriteError::Fenced)
 }
 
@@ -46,7 +45,7 @@ pub(super) async fn found(
     Ok(())
 }
 
-/// Prolongs the house's time; `false` where it is over.
+/// Prolongs the house's time; `false` where it was found lost.
 pub(super) async fn renew(
     c: &mut PgConnection,
     house: HouseId,
@@ -55,7 +54,7 @@ pub(super) async fn renew(
 ) -> Sql<bool> {
     let renewed = sqlx::query(
         "UPDATE house SET until = clock_timestamp() + make_interval(secs => $3), workers = $2 \
-         WHERE id = $1 AND until > clock_timestamp()",
+         WHERE id = $1",
     )
     .bind(house.uuid())
     .bind(i64::from(workers))
