@@ -188,35 +188,38 @@ impl Life<'_> {
                 Some(at) if hinted => BEAT_AT_LEAST.saturating_sub(at.elapsed()),
                 Some(at) => BEAT.saturating_sub(at.elapsed()),
             };
-            tokio::select! {
-                biased;
-                () = self.actor.stop.cancelled() => return self.end().await,
-                () = tokio::time::sleep(due) => {
-                    beaten = Some(Instant::now());
-                    hinted = false;
-                    self.beat().await?;
-                }
-                () = self.actor.catalog.changed(), if !hinted => {
-                    hinted = true;
-                    continue;
-                }
-                _ = tick.tick() => {
-                    let now = self.now();
-                    // A stall of this process (a suspended laptop, a stopped debugger) is no worker's fault.
-                    let stall = ticked.elapsed();
-                    if stall > self.actor.tick + Duration::from_millis(u64::from(self.actor.settings.lease_ms) / 2) {
-                        tracing::warn!(seconds = stall.as_secs_f64(), "the coordinator was stalled; leases are prolonged");
-                        self.core.grace(now);
+            if due.is_zero() {
+                // Not left to the timer below: while messages keep coming, one made anew each turn is never heard.
+                beaten = Some(Instant::now());
+                hinted = false;
+                self.beat().await?;
+            } else {
+                tokio::select! {
+                    biased;
+                    () = self.actor.stop.cancelled() => return self.end().await,
+                    () = self.actor.catalog.changed(), if !hinted => {
+                        hinted = true;
+                        continue;
                     }
-                    ticked = Instant::now();
-                    self.core.expire(now);
-                }
-                n = commands.recv_many(&mut batch, BATCH) => {
-                    if n == 0 {
-                        return self.end().await;
+                    _ = tick.tick() => {
+                        let now = self.now();
+                        // A stall of this process (a suspended laptop, a stopped debugger) is no worker's fault.
+                        let stall = ticked.elapsed();
+                        if stall > self.actor.tick + Duration::from_millis(u64::from(self.actor.settings.lease_ms) / 2) {
+                            tracing::warn!(seconds = stall.as_secs_f64(), "the coordinator was stalled; leases are prolonged");
+                            self.core.grace(now);
+                        }
+                        ticked = Instant::now();
+                        self.core.expire(now);
                     }
-                    self.actor.metrics.handled(n);
-                    self.handle(&mut batch).await?;
+                    n = commands.recv_many(&mut batch, BATCH) => {
+                        if n == 0 {
+                            return self.end().await;
+                        }
+                        self.actor.metrics.handled(n);
+                        self.handle(&mut batch).await?;
+                    }
+                    () = tokio::time::sleep(due) => continue,
                 }
             }
             self.supply().await?;
