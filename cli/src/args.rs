@@ -2,6 +2,7 @@
 
 mod data;
 mod guard;
+mod job;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -11,6 +12,7 @@ use picofarm_coordinator::CatalogPlace;
 
 pub use data::{DatasetExport, DatasetReprocess, DatasetSplit, SensorArgs};
 pub use guard::{Guard, Token};
+pub use job::{Job, JobKind};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
@@ -79,8 +81,11 @@ pub enum Command {
     /// Write, plan, submit and follow jobs
     #[command(subcommand)]
     Job(Job),
-    /// List the workers connected to the coordinator
-    Workers,
+    /// List the workers connected to the coordinator, or tell one to end
+    Workers {
+        #[command(subcommand)]
+        what: Option<Workers>,
+    },
     /// Show what happened, of all jobs
     Events {
         /// Go on showing what happens, until Ctrl-C
@@ -178,6 +183,9 @@ pub struct Coordinator {
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub lease_s: f64,
+    /// Forget jobs this many days after their end, with their history; their outputs stay, and are reused [default: never]
+    #[arg(long, value_name = "DAYS")]
+    pub forget_after_days: Option<f64>,
     #[command(flatten)]
     pub http: Http,
     #[command(flatten)]
@@ -192,6 +200,15 @@ pub struct Http {
     pub http: Option<SocketAddr>,
 }
 
+#[derive(Subcommand)]
+pub enum Workers {
+    /// Tell a worker to finish the task in hand, give the rest back, and end
+    Drain {
+        /// Its name or id
+        worker: String,
+    },
+}
+
 #[derive(Args)]
 pub struct Worker {
     /// Name, for people [default: host name and process id]
@@ -200,97 +217,18 @@ pub struct Worker {
     /// Threads to render with [default: all cores]
     #[arg(long)]
     pub threads: Option<usize>,
+    /// Memory that tasks may take, GiB [default: three quarters of this machine's]
+    #[arg(long, value_name = "GIB")]
+    pub memory_gib: Option<f64>,
+    /// Graphics processors it may use
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub gpus: u32,
+    /// Label that stages may ask for (give it again for more)
+    #[arg(long, value_name = "LABEL")]
+    pub label: Vec<String>,
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]
     #[arg(long, value_name = "URL")]
     pub store_prefix: Vec<String>,
-}
-
-#[derive(Subcommand)]
-pub enum Job {
-    /// Write a commented job file to start from
-    Init {
-        /// Where to write it
-        #[arg(default_value = "job.toml")]
-        file: PathBuf,
-        /// Kind of scenes
-        #[arg(long, value_enum, default_value_t = SceneKindArg::Furnished)]
-        kind: SceneKindArg,
-    },
-    /// Say what a submission would run and what it would reuse; changes nothing
-    Plan {
-        /// The job file
-        file: PathBuf,
-    },
-    /// Submit a job file; the same file again answers with the same job
-    Submit {
-        /// The job file
-        file: PathBuf,
-        /// Follow the job until it ends
-        #[arg(long)]
-        watch: bool,
-        /// Submit again although the same job failed or was cancelled
-        #[arg(long)]
-        again: bool,
-    },
-    /// List all jobs
-    List,
-    /// Show one job
-    Status {
-        /// Job id, or the first letters of one
-        job: String,
-    },
-    /// Follow a job with progress until it ends
-    Watch {
-        /// Job id, or the first letters of one
-        job: String,
-    },
-    /// Wait silently until a job ends
-    Wait {
-        /// Job id, or the first letters of one
-        job: String,
-        /// Give up after this many seconds (exit code 1)
-        #[arg(long, value_name = "S")]
-        timeout_s: Option<f64>,
-    },
-    /// Stop a job; what it finished stays
-    Cancel {
-        /// Job id, or the first letters of one
-        job: String,
-    },
-    /// Make a job's dead tasks pending again
-    Retry {
-        /// Job id, or the first letters of one
-        job: String,
-    },
-    /// Show what happened to a job
-    Logs {
-        /// Job id, or the first letters of one
-        job: String,
-        /// Only this task
-        #[arg(long)]
-        task: Option<u64>,
-        /// Only the last N lines
-        #[arg(long, default_value_t = 100, value_name = "N")]
-        last: u32,
-        /// Go on showing what happens, until the job ends or Ctrl-C
-        #[arg(long, short)]
-        follow: bool,
-    },
-    /// Say why a job does not run, or why one of its tasks was run, run again or reused
-    Explain {
-        /// Job id, or the first letters of one
-        job: String,
-        /// This task
-        #[arg(long)]
-        task: Option<u64>,
-    },
-}
-
-#[derive(Debug, Clone, Copy, ValueEnum)]
-pub enum SceneKindArg {
-    Furnished,
-    Primitive,
-    Files,
 }
 
 #[derive(Subcommand)]
@@ -457,6 +395,9 @@ pub struct BenchQueue {
     /// Lease time to live in seconds
     #[arg(long, default_value_t = 60.0, value_name = "S")]
     pub lease_s: f64,
+    /// Forget jobs this many days after their end, with their history; their outputs stay, and are reused [default: never]
+    #[arg(long, value_name = "DAYS")]
+    pub forget_after_days: Option<f64>,
 }
 
 #[derive(Args)]

@@ -255,6 +255,33 @@ impl Client {
         Ok(reply.into_inner().retried)
     }
 
+    /// Holds a job, or lets it go on.
+    pub async fn pause(&mut self, job: JobId, paused: bool) -> Result<JobStatus> {
+        let job_id = job.to_string();
+        let status = match paused {
+            true => {
+                let request = wire::PauseJobRequest { job_id };
+                let reply = self.jobs.pause_job(request).await;
+                reply.map_err(|s| refused(&s))?.into_inner().job
+            }
+            false => {
+                let request = wire::ResumeJobRequest { job_id };
+                let reply = self.jobs.resume_job(request).await;
+                reply.map_err(|s| refused(&s))?.into_inner().job
+            }
+        };
+        required(status, "job")?.try_into().map_err(unreadable)
+    }
+
+    /// Tells workers of this name or id to end; how many there are.
+    pub async fn drain(&mut self, worker: &str) -> Result<u32> {
+        let request = wire::DrainWorkerRequest {
+            worker: worker.to_owned(),
+        };
+        let reply = self.jobs.drain_worker(request).await;
+        Ok(reply.map_err(|s| refused(&s))?.into_inner().workers)
+    }
+
     /// A job's events after a sequence number, at most a thousand.
     pub async fn events(
         &mut self,
@@ -264,6 +291,7 @@ impl Client {
     ) -> Result<Vec<Event>> {
         let page = Page {
             job: Some(job),
+            stage: None,
             task,
             after,
             limit: 1000,
@@ -279,6 +307,7 @@ impl Client {
             after: page.after,
             limit: page.limit,
             task: page.task,
+            stage: page.stage,
             newest: page.newest,
         };
         let reply = self
@@ -293,9 +322,15 @@ impl Client {
     }
 
     /// Why a job, or a task of it, is as it is.
-    pub async fn explain(&mut self, job: JobId, task: Option<u64>) -> Result<Explained> {
+    pub async fn explain(
+        &mut self,
+        job: JobId,
+        stage: u32,
+        task: Option<u64>,
+    ) -> Result<Explained> {
         let request = wire::ExplainJobRequest {
             job_id: job.to_string(),
+            stage,
             task,
         };
         let reply = self
@@ -337,6 +372,8 @@ impl Client {
 pub struct Page {
     /// `None` = of all jobs.
     pub job: Option<JobId>,
+    /// Position of the stage in the job.
+    pub stage: Option<u32>,
     pub task: Option<u64>,
     /// Only events after this sequence number.
     pub after: u64,

@@ -6,8 +6,8 @@ use picofarm_agent::Access;
 use picofarm_proto::{
     ids::JobId,
     model::{
-        Budget, JobSpec, JobState, JobStatus, Limits, OutputSettings, RenderSettings, SceneKind,
-        SceneSource,
+        Budget, JobSpec, JobState, JobStatus, OutputSettings, RenderSettings, RenderTask,
+        SceneKind, SceneSource,
     },
 };
 use serde_json::json;
@@ -26,9 +26,8 @@ use crate::{
     signals,
 };
 
-fn spec(args: &Demo) -> JobSpec {
-    JobSpec {
-        name: "demo".into(),
+fn task(args: &Demo) -> RenderTask {
+    RenderTask {
         scenes: SceneSource {
             kind: SceneKind::Furnished {
                 assets: args.assets.clone(),
@@ -49,7 +48,6 @@ fn spec(args: &Demo) -> JobSpec {
             dataset: "rooms".into(),
             profile: "sqrt-u16".into(),
         },
-        limits: Limits::default(),
     }
 }
 
@@ -59,17 +57,18 @@ fn spec(args: &Demo) -> JobSpec {
 /// Bad arguments, a folder that holds another demo, an interruption, or a failure on the way.
 pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()> {
     let dir = std::path::absolute(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
-    let spec = jobfile::resolve(spec(&args), &dir, &settings.assets)?;
+    let task = jobfile::resolve_render(task(&args), &dir, &settings.assets)?;
+    let spec = JobSpec::render("demo", task.clone());
     std::fs::create_dir_all(&dir).map_err(|e| io(dir.display(), &e))?;
     let workers = args.workers.unwrap_or_else(|| roles::cores().min(2)).max(1);
-    let r = &spec.render;
+    let r = &task.render;
     output.say(format!(
         "{} furnished rooms, {1}x{1} pixels x {2} bins, {3} spots, {4}; {workers} worker{5} in {6}",
-        spec.scenes.count,
+        task.scenes.count,
         r.resolution,
         r.bins,
-        spec.scenes.spots,
-        furniture(&spec),
+        task.scenes.spots,
+        furniture(&task),
         if workers == 1 { "" } else { "s" },
         dir.display(),
     ));
@@ -87,7 +86,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
     .await?;
     // This process's own coordinator asks nobody who they are.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
-    let place = format!("{}/{}", spec.output.store, spec.output.dataset);
+    let place = format!("{}/{}", task.output.store, task.output.dataset);
     let rendered = tokio::select! {
         status = render(&mut client, spec, output) => Some(status),
         lost = farm.worker_lost() => Some(Err(lost)),
@@ -201,8 +200,8 @@ pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
     lost.map_or(Ok(()), Err)
 }
 
-fn furniture(spec: &JobSpec) -> String {
-    match &spec.scenes.kind {
+fn furniture(task: &RenderTask) -> String {
+    match &task.scenes.kind {
         SceneKind::Furnished { assets, .. } if assets.starts_with("parametric") => {
             "parametric furniture (`picofarm assets install` fetches real models)".into()
         }

@@ -1,9 +1,10 @@
 //! `picofarm job explain` and `picofarm workers`.
 
 use crate::{
+    args,
     client::{Client, Explained, Workers},
     error::Result,
-    jobs::{clock, describe_event},
+    jobs::{self, clock, describe_event},
     output::{Output, bytes, duration, table},
     settings::Settings,
 };
@@ -16,7 +17,7 @@ pub fn describe(explained: &Explained) -> String {
         "job {} \"{}\": {}\n  {} tasks: {} done ({} reused), {} leased, {} pending, {} dead\n",
         status.id,
         status.name,
-        format!("{:?}", status.state).to_lowercase(),
+        jobs::state(status),
         tasks.total,
         tasks.done,
         tasks.reused,
@@ -69,8 +70,19 @@ pub fn describe(explained: &Explained) -> String {
 ///
 /// # Errors
 /// The coordinator cannot be reached, or refuses.
-pub async fn workers(settings: &Settings, output: Output) -> Result<()> {
+pub async fn workers(
+    what: Option<args::Workers>,
+    settings: &Settings,
+    output: Output,
+) -> Result<()> {
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
+    if let Some(args::Workers::Drain { worker }) = what {
+        let told = client.drain(&worker).await?;
+        output.result(&serde_json::json!({"worker": worker, "told": told}), || {
+            format!("{told} told to finish the task in hand and to end")
+        });
+        return Ok(());
+    }
     let workers = client.workers().await?;
     output.result(&workers, || describe_workers(&workers));
     Ok(())

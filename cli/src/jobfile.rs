@@ -3,18 +3,19 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_proto::model::{JobSpec, SceneKind};
+use picofarm_proto::model::{JobSpec, RenderTask, SceneKind, TaskSpec};
 
 use crate::{
-    args::SceneKindArg,
+    args::JobKind,
     assets,
     error::{CliError, Code, Result, io},
 };
 
 /// A job file to start from.
-pub fn template(kind: SceneKindArg) -> String {
+pub fn template(kind: JobKind) -> String {
     let scenes = match kind {
-        SceneKindArg::Furnished => {
+        JobKind::Graph => return graph(),
+        JobKind::Furnished => {
             "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
              count = 8\n\
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
@@ -23,14 +24,14 @@ pub fn template(kind: SceneKindArg) -> String {
              assets = \"auto\"           # sweethome3d where installed, else parametric\n\
              min_specular = 1          # mirrors a room at least\n"
         }
-        SceneKindArg::Primitive => {
+        JobKind::Primitive => {
             "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
              count = 8\n\
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
              spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
              fov_deg = 90.0            # horizontal field of view; jittered by scene\n"
         }
-        SceneKindArg::Files => {
+        JobKind::Files => {
             "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\
              files = [\"scene.glb\"]     # relative to this file\n\
              spots = 25                # for files that bring no laser\n"
@@ -56,15 +57,60 @@ pub fn template(kind: SceneKindArg) -> String {
          profile = \"sqrt-u16\"            # or: plain-f32\n\n\
          [limits]\n\
          max_failures = 3          # a task's own failures before it is given up\n\
-         max_crashes = 3           # losses of the worker under it before it is given up\n"
+         max_crashes = 3           # losses of the worker under it before it is given up\n\
+         # max_workers = 8         # workers that may run the job at a time\n\
+         # deadline = \"2027-01-31T18:00:00Z\"   # what is not done by then is cancelled\n\n\
+         # [resources]             # what a worker must have\n\
+         # cores = 8\n\
+         # memory_gib = 16\n\
+         # labels = [\"fast\"]       # of `picofarm worker --label`\n"
     )
 }
 
-/// Reads a job file and pins everything a submission needs.
-///
-/// # Errors
-/// Input errors that name the file, the field and what was expected.
-pub fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
+/// A job of several stages.
+fn graph() -> String {
+    "# A picofarm job of several stages. `picofarm job plan FILE` says what it would run.\n\
+     name = \"noisy rooms\"\n\
+     priority = 0              # jobs of a higher priority get workers first\n\n\
+     [[stage]]                 # kind = \"render\" unless it says another\n\
+     name = \"render\"\n\
+     scenes = { kind = \"primitive\", count = 8, seed = 1, spots = 25 }\n\
+     render = { resolution = 64, samples = 16 }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"clean\" }\n\n\
+     [[stage]]                 # one stage for each value of the matrix; {dark} stands for it\n\
+     name = \"noise\"\n\
+     kind = \"reprocess\"\n\
+     source = \"render\"         # a stage that makes a data set, or { store = \"…\", dataset = \"…\" }\n\
+     matrix = { dark = [0.0, 0.5] }\n\
+     reprocess = { seed = 1, sensor = { dark_per_bin = \"{dark}\" } }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"noisy-{dark}\", profile = \"counts-u16\" }\n\n\
+     [[stage]]\n\
+     name = \"split\"\n\
+     kind = \"split\"\n\
+     source = \"noise[0.5]\"     # it begins when that stage is done\n\
+     split = { fractions = [0.5, 0.25, 0.25] }\n\n\
+     [[stage]]\n\
+     name = \"export\"\n\
+     kind = \"export\"\n\
+     source = \"noise[0.5]\"\n\
+     needs = [\"split\"]\n\
+     export = { dest = \"picofarm-data/export\", scenes = \"split:train\" }\n"
+        .to_owned()
+}
+
+/// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
+#[cfg(test)]
+fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
+    checked(read_uncounted(path, asset_dir)?, path)
+}
+
+fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
+    let checked = spec.check().and_then(|()| spec.check_places());
+    checked.map_err(|e| CliError::input(format!("{}: {e}", path.display())))?;
+    Ok(spec)
+}
+
+fn read_uncounted(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
     let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
     let spec: JobSpec = toml::from_str(&text).map_err(|e| {
         CliError::input(format!("{}: {}", path.display(), e.to_string().trim_end()))
@@ -80,35 +126,92 @@ pub fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
     })
 }
 
-/// Pins furniture, file contents, the renderer's version and the store's absolute place.
+/// Reads a job file and pins everything a submission needs. The number of scenes of data sets that exist, where the file
+/// does not say it, is asked of their stores.
+///
+/// # Errors
+/// Input errors that name the file, the field and what was expected; a data set that cannot be opened.
+pub async fn read_counted(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
+    let mut spec = read_uncounted(path, asset_dir)?;
+    for stage in &mut spec.stages {
+        if let Some((source, count)) = stage.task.reads_mut()
+            && *count == 0
+        {
+            let failed = |e: picofarm_dataset::DatasetError| {
+                CliError::input(format!(
+                    "{}: stage {:?}: source: {e}",
+                    path.display(),
+                    stage.name
+                ))
+                .hint("give the number of its scenes as `count`, or make the data set first")
+            };
+            let (store, prefix) = picofarm_dataset::open_store(&source.store).map_err(failed)?;
+            let dataset = picofarm_dataset::Dataset::open(store, prefix.join(&*source.dataset));
+            *count = dataset.await.map_err(failed)?.spec().scenes;
+        }
+    }
+    checked(spec, path)
+}
+
+/// Pins furniture, file contents, versions and absolute places.
 ///
 /// # Errors
 /// A field out of its limits, a store that cannot be one, a missing file, or furniture that is not installed.
-pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
+fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
+    let several = spec.stages.len() > 1;
+    for stage in &mut spec.stages {
+        let named = |e: CliError| match several {
+            true => CliError {
+                message: format!("stage {:?}: {}", stage.name, e.message),
+                ..e
+            },
+            false => e,
+        };
+        if let Some((source, _)) = stage.task.reads_mut() {
+            source.store = store(base, &source.store, "source.store").map_err(named)?;
+        }
+        match &mut stage.task {
+            TaskSpec::Render(task) => {
+                *task = resolve_render(task.clone(), base, asset_dir).map_err(named)?;
+            }
+            TaskSpec::Reprocess(task) => {
+                task.output.store =
+                    store(base, &task.output.store, "output.store").map_err(named)?;
+                task.reprocess.normalise();
+                let version = picofarm_agent::reprocess::sensor_version();
+                let asked = &mut task.reprocess.version;
+                pin(asked, version, "reprocess.version").map_err(named)?;
+                profile(&task.output.profile).map_err(named)?;
+                picofarm_agent::reprocess::sensor(&task.reprocess.sensor)
+                    .map_err(|e| named(CliError::input(e.to_string())))?;
+            }
+            TaskSpec::Split(_) => {}
+            TaskSpec::Export(task) => {
+                task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
+                picofarm_agent::export::Scenes::parse(&task.export.scenes)
+                    .map_err(|e| named(CliError::input(format!("export.scenes: {e}"))))?;
+            }
+        }
+    }
+    Ok(spec)
+}
+
+/// The same for one rendering.
+///
+/// # Errors
+/// As [`read_counted`].
+pub fn resolve_render(mut task: RenderTask, base: &Path, asset_dir: &Path) -> Result<RenderTask> {
     let renderer = picofarm_agent::renderer_version();
-    if spec.render.renderer.is_empty() {
-        spec.render.renderer = renderer;
-    } else if spec.render.renderer != renderer {
-        return Err(CliError::input(format!(
-            "render.renderer: this program renders {renderer:?}, the job asks for {:?}",
-            spec.render.renderer
-        ))
-        .hint("leave the field out, or use the picofarm version that made the data set"));
-    }
-    spec.check()?;
-    picofarm_agent::strategy(&spec.render.strategy)
+    pin(&mut task.render.renderer, renderer, "render.renderer")?;
+    task.check()?;
+    picofarm_agent::strategy(&task.render.strategy)
         .map_err(|e| CliError::input(format!("render.strategy: {e}")))?;
-    picofarm_dataset::Profile::parse(&spec.output.profile)
-        .map_err(|e| CliError::input(format!("output.profile: {e}")))?;
-    if !spec.output.store.contains("://") {
-        spec.output.store = absolute(base, &spec.output.store)?.display().to_string();
-    }
-    picofarm_dataset::check_location(&spec.output.store)
-        .map_err(|e| CliError::input(format!("output.store: {e}")))?;
-    match &mut spec.scenes.kind {
+    profile(&task.output.profile)?;
+    task.output.store = store(base, &task.output.store, "output.store")?;
+    match &mut task.scenes.kind {
         SceneKind::Furnished { assets: name, .. } => *name = assets::resolve(name, asset_dir)?,
         SceneKind::Primitive => {}
-        SceneKind::Files { files } => {
+        SceneKind::Files { files, .. } => {
             for (i, file) in files.iter_mut().enumerate() {
                 let path = absolute(base, &file.path)?;
                 let hash = picofarm_scene::import::fingerprint(&path)
@@ -125,8 +228,38 @@ pub fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSp
             }
         }
     }
-    spec.check_places()?;
-    Ok(spec)
+    Ok(task)
+}
+
+/// Fills in this program's version, or checks that it is the one asked for.
+fn pin(asked: &mut String, ours: String, field: &str) -> Result<()> {
+    if !asked.is_empty() && *asked != ours {
+        return Err(CliError::input(format!(
+            "{field}: this program has {ours:?}, the job asks for {asked:?}"
+        ))
+        .hint("leave the field out, or use the picofarm version that made the data set"));
+    }
+    *asked = ours;
+    Ok(())
+}
+
+fn profile(name: &str) -> Result<()> {
+    picofarm_dataset::Profile::parse(name)
+        .map(|_| ())
+        .map_err(|e| CliError::input(format!("output.profile: {e}")))
+}
+
+/// A store's place, absolute.
+fn store(base: &Path, text: &str, field: &str) -> Result<String> {
+    let place = match text.is_empty() || text.contains("://") {
+        true => text.to_owned(),
+        false => absolute(base, text)?.display().to_string(),
+    };
+    if !place.is_empty() {
+        picofarm_dataset::check_location(&place)
+            .map_err(|e| CliError::input(format!("{field}: {e}")))?;
+    }
+    Ok(place)
 }
 
 /// The place that `path` means in `base`, without `.` and `..`.
@@ -165,20 +298,22 @@ mod tests {
         )
         .unwrap();
         for kind in [
-            SceneKindArg::Furnished,
-            SceneKindArg::Primitive,
-            SceneKindArg::Files,
+            JobKind::Furnished,
+            JobKind::Primitive,
+            JobKind::Files,
+            JobKind::Graph,
         ] {
             let path = written(dir.path(), &template(kind));
             let spec = read(&path, dir.path()).unwrap();
-            assert!(Path::new(&spec.output.store).is_absolute());
+            let store = spec.stages[0].task.writes().unwrap().0;
+            assert!(Path::new(store).is_absolute());
         }
     }
 
     #[test]
     fn an_unknown_field_is_named_with_its_line() {
         let dir = tempfile::tempdir().unwrap();
-        let text = template(SceneKindArg::Primitive).replace("bins = 637", "binns = 637");
+        let text = template(JobKind::Primitive).replace("bins = 637", "binns = 637");
         let error = read(&written(dir.path(), &text), dir.path()).unwrap_err();
         assert_eq!(error.code, Code::Input);
         assert!(
@@ -192,7 +327,7 @@ mod tests {
     fn a_negative_gate_is_named() {
         let dir = tempfile::tempdir().unwrap();
         let text =
-            template(SceneKindArg::Primitive).replace("gate_start_m = 1.0", "gate_start_m = -1.0");
+            template(JobKind::Primitive).replace("gate_start_m = 1.0", "gate_start_m = -1.0");
         let error = read(&written(dir.path(), &text), dir.path()).unwrap_err();
         assert!(
             error.message.contains("render.gate_start_m"),
@@ -204,15 +339,16 @@ mod tests {
     #[test]
     fn subsets_and_strategies_can_be_switched_on_in_the_template() {
         let dir = tempfile::tempdir().unwrap();
-        let text = template(SceneKindArg::Primitive)
+        let text = template(JobKind::Primitive)
             .replace("spots = 25 ", "spots = 100 ")
             .replace("# subsets", "subsets")
             .replace("# per_spot", "per_spot")
             .replace("# strategy", "strategy");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
-        assert_eq!(spec.render.subsets, [4, 25]);
-        assert!(spec.render.per_spot);
-        assert_eq!(spec.render.strategy.len(), 2);
+        let render = &spec.stages[0].task.as_render().unwrap().render;
+        assert_eq!(render.subsets, [4, 25]);
+        assert!(render.per_spot);
+        assert_eq!(render.strategy.len(), 2);
         let wrong = text.replace("image_lobes", "lobes");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(
@@ -226,20 +362,17 @@ mod tests {
     #[test]
     fn an_error_may_be_asked_for_instead_of_paths() {
         let dir = tempfile::tempdir().unwrap();
-        let text = template(SceneKindArg::Primitive).replace("samples = 32", "error = \"10%\"");
+        let text = template(JobKind::Primitive).replace("samples = 32", "error = \"10%\"");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let budget = picofarm_proto::model::Budget::Error(0.1);
-        assert_eq!(spec.render.budget, budget);
+        let render = &spec.stages[0].task.as_render().unwrap().render;
+        assert_eq!(render.budget, budget);
     }
 
     #[test]
     fn a_missing_scene_file_is_named() {
         let dir = tempfile::tempdir().unwrap();
-        let error = read(
-            &written(dir.path(), &template(SceneKindArg::Files)),
-            dir.path(),
-        )
-        .unwrap_err();
+        let error = read(&written(dir.path(), &template(JobKind::Files)), dir.path()).unwrap_err();
         assert!(
             error.message.contains("scenes.files[0]"),
             "{}",
@@ -259,11 +392,12 @@ mod tests {
             300 * times
         }
 
-        fn kind() -> impl Strategy<Value = SceneKindArg> {
+        fn kind() -> impl Strategy<Value = JobKind> {
             prop_oneof![
-                Just(SceneKindArg::Furnished),
-                Just(SceneKindArg::Primitive),
-                Just(SceneKindArg::Files)
+                Just(JobKind::Furnished),
+                Just(JobKind::Primitive),
+                Just(JobKind::Files),
+                Just(JobKind::Graph)
             ]
         }
 
@@ -326,10 +460,11 @@ mod tests {
     fn a_store_beside_the_job_file_is_resolved_and_a_url_that_climbs_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let at = |store: &str| {
-            let text = template(SceneKindArg::Primitive).replace("\"picofarm-data/store\"", store);
+            let text = template(JobKind::Primitive).replace("\"picofarm-data/store\"", store);
             read(&written(dir.path(), &text), dir.path())
         };
-        let above = at("\"../store\"").unwrap().output.store;
+        let spec = at("\"../store\"").unwrap();
+        let above = spec.stages[0].task.writes().unwrap().0;
         let parent = dir
             .path()
             .canonicalize()
@@ -337,7 +472,7 @@ mod tests {
             .parent()
             .unwrap()
             .join("store");
-        assert_eq!(Path::new(&above), parent);
+        assert_eq!(Path::new(above), parent);
         let error = at("\"file:///data/../etc\"").unwrap_err();
         assert!(error.message.contains("output.store"), "{}", error.message);
     }

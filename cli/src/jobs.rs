@@ -2,12 +2,15 @@
 
 use std::{path::Path, time::Duration};
 
-use picofarm_proto::model::{Event, JobPlan, JobStatus};
+use picofarm_proto::{
+    ids::JobId,
+    model::{Event, JobPlan, JobSpec, JobStatus},
+};
 use serde_json::json;
 
 use crate::{
-    args::{Job, SceneKindArg},
-    client::Client,
+    args::{Job, JobKind},
+    client::{Client, Page},
     error::{CliError, Code, Result, io},
     explain,
     follow::{Show, follow, verdict},
@@ -22,8 +25,16 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         return init(file, *kind, output);
     }
     let spec = match &command {
-        Job::Plan { file } | Job::Submit { file, .. } => {
-            Some(jobfile::read(file, &settings.assets)?)
+        Job::Plan { file } => Some(jobfile::read_counted(file, &settings.assets).await?),
+        Job::Submit {
+            file,
+            force,
+            from_stage,
+            ..
+        } => {
+            let mut spec = jobfile::read_counted(file, &settings.assets).await?;
+            force_stages(&mut spec, *force, from_stage.as_deref())?;
+            Some(spec)
         }
         _ => None,
     };
@@ -34,6 +45,28 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             let plan = client.plan(spec.expect("read above")).await?;
             output.result(&plan, || describe_plan(&plan));
             Ok(())
+        }
+        Job::Submit {
+            only_failed: true,
+            watch,
+            ..
+        } => {
+            let plan = client.plan(spec.expect("read above")).await?;
+            let job = plan.existing_job.ok_or_else(|| {
+                CliError::input("--only-failed: this job was not submitted before")
+                    .hint("submit it without --only-failed")
+            })?;
+            let retried = client.retry(job).await?;
+            output.result(&json!({"job": job, "retried": retried}), || {
+                format!("{retried} dead tasks of job {job} are pending again")
+            });
+            match watch {
+                true => {
+                    let status = follow(&mut client, job, output, Show::Progress).await?;
+                    finish(&status, output)
+                }
+                false => Ok(()),
+            }
         }
         Job::Submit { watch, again, .. } => {
             let submitted = client.submit(spec.expect("read above"), again).await?;
@@ -93,6 +126,18 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             output.result(&status, || describe(&status));
             Ok(())
         }
+        Job::Pause { job } => {
+            let job = client.find(&job).await?;
+            let status = client.pause(job, true).await?;
+            output.result(&status, || describe(&status));
+            Ok(())
+        }
+        Job::Resume { job } => {
+            let job = client.find(&job).await?;
+            let status = client.pause(job, false).await?;
+            output.result(&status, || describe(&status));
+            Ok(())
+        }
         Job::Retry { job } => {
             let job = client.find(&job).await?;
             let retried = client.retry(job).await?;
@@ -101,33 +146,40 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             });
             Ok(())
         }
-        Job::Explain { job, task } => {
+        Job::Explain { job, stage, task } => {
             let job = client.find(&job).await?;
-            let explained = client.explain(job, task).await?;
+            let stage = position(&mut client, job, stage.as_deref()).await?;
+            let explained = client.explain(job, stage.unwrap_or(0), task).await?;
             output.result(&explained, || explain::describe(&explained));
             Ok(())
         }
         Job::Logs {
             job,
+            stage,
             task,
             last,
-            follow: true,
+            follow,
         } => {
             let job = client.find(&job).await?;
-            tail::follow(client, Some(job), task, last, output).await
-        }
-        Job::Logs {
-            job, task, last, ..
-        } => {
-            let job = client.find(&job).await?;
-            let events = history(&mut client, job, task, last).await?;
+            let page = Page {
+                job: Some(job),
+                stage: position(&mut client, job, stage.as_deref()).await?,
+                task,
+                after: 0,
+                limit: last,
+                newest: true,
+            };
+            if follow {
+                return tail::follow(client, page, output).await;
+            }
+            let events = history(&mut client, page).await?;
             output.result(&events, || events.iter().map(describe_event).collect());
             Ok(())
         }
     }
 }
 
-fn init(file: &Path, kind: SceneKindArg, output: Output) -> Result<()> {
+fn init(file: &Path, kind: JobKind, output: Output) -> Result<()> {
     use std::io::Write;
     std::fs::File::create_new(file)
         .and_then(|mut f| f.write_all(jobfile::template(kind).as_bytes()))
@@ -144,20 +196,66 @@ fn init(file: &Path, kind: SceneKindArg, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// The last `last` events, in order.
-async fn history(
-    client: &mut Client,
-    job: picofarm_proto::ids::JobId,
-    task: Option<u64>,
-    last: u32,
-) -> Result<Vec<Event>> {
+/// Marks what `--force` and `--from-stage` ask for. The job is one of its own: the same without would be there already.
+fn force_stages(spec: &mut JobSpec, all: bool, from: Option<&str>) -> Result<()> {
+    let mut forced: Vec<String> = Vec::new();
+    if let Some(from) = from
+        && spec.stage(from).is_none()
+    {
+        let names: Vec<&str> = spec.stages.iter().map(|s| &*s.name).collect();
+        return Err(CliError::input(format!(
+            "--from-stage: the job has no stage {from:?}; it has {}",
+            names.join(", ")
+        )));
+    }
+    for stage in &mut spec.stages {
+        let needs = stage.needs.iter().any(|need| forced.contains(need));
+        if all || from == Some(&*stage.name) || needs {
+            stage.force = true;
+            forced.push(stage.name.clone());
+        }
+    }
+    if !forced.is_empty() {
+        spec.nonce = uuid::Uuid::new_v4().to_string();
+    }
+    Ok(())
+}
+
+/// The position of a stage that is given by name or position.
+async fn position(client: &mut Client, job: JobId, stage: Option<&str>) -> Result<Option<u32>> {
+    let Some(stage) = stage else {
+        return Ok(None);
+    };
+    let stages = client.status(job).await?.stages;
+    let named = stages.iter().position(|s| s.name == stage);
+    let at = named.or_else(|| stage.parse().ok().filter(|at| *at < stages.len()));
+    let at = at.ok_or_else(|| {
+        let names: Vec<&str> = stages.iter().map(|s| &*s.name).collect();
+        CliError::input(format!(
+            "--stage: job {job} has no stage {stage:?}; it has {}",
+            names.join(", ")
+        ))
+    })?;
+    Ok(u32::try_from(at).ok())
+}
+
+/// The last events, in order.
+async fn history(client: &mut Client, page: Page) -> Result<Vec<Event>> {
+    // A page of the coordinator's may be shorter than what is asked for: going forward, the last ones are kept.
     let (mut events, mut after) = (Vec::new(), 0);
+    let last = page.limit as usize;
     loop {
-        let page = client.events(job, after, task).await?;
+        let next = Page {
+            after,
+            limit: 1000,
+            newest: false,
+            ..page
+        };
+        let (page, _) = client.history(next).await?;
         let Some(end) = page.last() else { break };
         after = end.sequence;
         events.extend(page);
-        let surplus = events.len().saturating_sub(last as usize);
+        let surplus = events.len().saturating_sub(last);
         events.drain(..surplus);
     }
     Ok(events)
@@ -173,14 +271,30 @@ pub fn describe_plan(plan: &JobPlan) -> String {
         "{} tasks: {} reuse, {} run\n",
         plan.total, plan.reuse, plan.run
     );
-    for reason in &plan.reasons {
-        text += &format!("  {reason}\n");
+    let several = plan.stages.len() > 1;
+    for stage in &plan.stages {
+        if several {
+            text += &format!(
+                "  {} ({}): {} reuse, {} run\n",
+                stage.name, stage.kind, stage.reuse, stage.run
+            );
+        }
+        for reason in &stage.reasons {
+            let indent = if several { "    " } else { "  " };
+            text += &format!("{indent}{reason}\n");
+        }
+    }
+    if let Some(job) = plan.existing_job {
+        text += &format!("  job {job} has this exact spec\n");
     }
     text
 }
 
-fn state(status: &JobStatus) -> String {
-    format!("{:?}", status.state).to_lowercase()
+pub fn state(status: &JobStatus) -> String {
+    match status.paused {
+        true => "held".into(),
+        false => format!("{:?}", status.state).to_lowercase(),
+    }
 }
 
 fn describe_list(jobs: &[JobStatus]) -> String {
@@ -226,26 +340,61 @@ pub fn describe(s: &JobStatus) -> String {
             duration((end - s.submitted_at_ms) as f64 / 1000.0)
         );
     }
+    let several = s.stages.len() > 1;
+    if several {
+        text += &describe_stages(s);
+    }
     for r in &s.running {
+        let of = match s.stages.get(r.stage as usize) {
+            Some(stage) if several => format!("{} ", stage.name),
+            _ => String::new(),
+        };
         text += &format!(
-            "  task {} on {}: {:.0} % after {}\n",
+            "  {of}task {} on {}: {:.0} % after {}\n",
             r.index,
             r.worker,
             r.fraction * 100.0,
             duration(r.seconds)
         );
     }
-    text + &format!(
-        "  data set {}/{}\n",
-        s.spec.output.store, s.spec.output.dataset
-    )
+    for stage in &s.spec.stages {
+        if let Some((store, dataset)) = stage.task.writes() {
+            text += &format!("  data set {store}/{dataset}\n");
+        }
+    }
+    text
+}
+
+fn describe_stages(s: &JobStatus) -> String {
+    let header = [
+        "  stage", "kind", "state", "done", "running", "pending", "dead", "needs",
+    ];
+    let rows = s.stages.iter().map(|stage| {
+        let t = &stage.tasks;
+        vec![
+            format!("  {}", stage.name),
+            stage.kind.clone(),
+            format!("{:?}", stage.state).to_lowercase(),
+            format!("{}/{}", t.done, t.total),
+            t.leased.to_string(),
+            t.pending.to_string(),
+            t.dead.to_string(),
+            stage.needs.join(", "),
+        ]
+    });
+    let header = header.map(String::from).to_vec();
+    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>()) + "\n"
 }
 
 pub fn describe_event(e: &Event) -> String {
-    let task = match (e.task, e.lo, e.hi) {
-        (Some(task), ..) => format!("task {task} "),
-        (None, Some(lo), Some(hi)) => format!("tasks {lo}..{hi} "),
+    let stage = match e.stage {
+        Some(stage) if stage > 0 => format!("stage {stage} "),
         _ => String::new(),
+    };
+    let task = match (e.task, e.lo, e.hi) {
+        (Some(task), ..) => format!("{stage}task {task} "),
+        (None, Some(lo), Some(hi)) => format!("{stage}tasks {lo}..{hi} "),
+        _ => stage,
     };
     let worker = if e.worker.is_empty() {
         String::new()

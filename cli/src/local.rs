@@ -44,9 +44,15 @@ impl Local {
         } else {
             settings.access()?
         };
-        let coordinator =
-            roles::Coordinator::start(catalog.to_owned().into(), listen, LEASE, guarded, http)
-                .await?;
+        let coordinator = roles::Coordinator::start(
+            catalog.to_owned().into(),
+            listen,
+            LEASE,
+            guarded,
+            http,
+            None,
+        )
+        .await?;
         let (url, http) = (coordinator.url(), coordinator.http());
         let mut local = Self {
             url: url.clone(),
@@ -63,6 +69,9 @@ impl Local {
                 name: format!("local-{}", i + 1),
                 worker_id: None,
                 threads,
+                memory_mib: picofarm_agent::memory_mib() / workers.max(1) as u64,
+                gpus: 0,
+                labels: Vec::new(),
                 asset_dirs: vec![settings.assets.clone()],
                 access: access.clone(),
                 store_prefixes: Vec::new(),

@@ -74,7 +74,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Coordinator(args) => roles::coordinator(args, output).await,
         Command::Worker(args) => roles::worker(args, settings, output).await,
         Command::Job(command) => jobs::run(command, settings, output).await,
-        Command::Workers => explain::workers(settings, output).await,
+        Command::Workers { what } => explain::workers(what, settings, output).await,
         Command::Events { follow, last } => tail::events(follow, last, settings, output).await,
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,

@@ -140,6 +140,7 @@ impl Coordinator {
         lease: Duration,
         guarded: Guarded,
         http: Option<SocketAddr>,
+        forget_after: Option<Duration>,
     ) -> Result<Self> {
         let mut config = CoordinatorConfig::new(catalog, listen);
         config.lease_ms = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
@@ -149,6 +150,7 @@ impl Coordinator {
         config.access = guarded.access;
         config.quotas = guarded.quotas;
         config.http = http;
+        config.forget_after = forget_after;
         let stop = CancellationToken::new();
         let running = serve(config, stop.clone())
             .await
@@ -207,6 +209,17 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
             args.lease_s
         )));
     }
+    let forget_after = match args.forget_after_days {
+        None => None,
+        Some(days) if (0.0..=36_500.0).contains(&days) => {
+            Some(Duration::from_secs_f64(days * 86_400.0))
+        }
+        Some(days) => {
+            return Err(CliError::input(format!(
+                "--forget-after-days {days}: expected 0 to 36500 days"
+            )));
+        }
+    };
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
     let guarded = Guarded::of(&args.guard);
@@ -216,6 +229,7 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
         lease,
         guarded,
         args.http.http,
+        forget_after,
     )
     .await?;
     let (url, http) = (coordinator.url(), coordinator.http());
@@ -243,6 +257,11 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         name: args.name.unwrap_or_else(default_name),
         worker_id: None,
         threads: args.threads.unwrap_or_else(cores),
+        memory_mib: args
+            .memory_gib
+            .map_or_else(picofarm_agent::memory_mib, |gib| (gib * 1024.0) as u64),
+        gpus: args.gpus,
+        labels: args.label,
         asset_dirs: vec![settings.assets.clone()],
         access: settings.access()?,
         store_prefixes: args.store_prefix,

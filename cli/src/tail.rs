@@ -68,22 +68,27 @@ impl Window {
 /// The coordinator cannot be reached, refuses, or stays away; Ctrl-C ends it with exit code 130.
 pub async fn events(follow_on: bool, last: u32, settings: &Settings, output: Output) -> Result<()> {
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
+    let page = Page {
+        job: None,
+        stage: None,
+        task: None,
+        after: 0,
+        limit: last,
+        newest: true,
+    };
     if follow_on {
-        return follow(client, None, None, last, output).await;
+        return follow(client, page, output).await;
     }
-    let (events, _) = client.history(newest(None, None, last)).await?;
+    let (events, _) = client.history(newest(page)).await?;
     output.result(&events, || events.iter().map(|e| line(e, None)).collect());
     Ok(())
 }
 
-fn newest(job: Option<JobId>, task: Option<u64>, last: u32) -> Page {
+fn newest(page: Page) -> Page {
     Page {
-        job,
-        task,
-        after: 0,
         // 0 would be the coordinator's own limit.
-        limit: last.clamp(1, PAGE),
-        newest: true,
+        limit: page.limit.clamp(1, PAGE),
+        ..page
     }
 }
 
@@ -98,16 +103,11 @@ fn line(event: &Event, job: Option<JobId>) -> String {
 ///
 /// # Errors
 /// The coordinator refuses, or stays away for a minute; Ctrl-C ends it with exit code 130.
-pub async fn follow(
-    mut client: Client,
-    job: Option<JobId>,
-    task: Option<u64>,
-    last: u32,
-    output: Output,
-) -> Result<()> {
+pub async fn follow(mut client: Client, page: Page, output: Output) -> Result<()> {
+    let job = page.job;
     let shown = async {
         let mut window = Window::default();
-        let (first, ended) = client.history(newest(job, task, last)).await?;
+        let (first, ended) = client.history(newest(page)).await?;
         window.after = first.first().map_or(0, |event| event.sequence - 1);
         show(window.take(first, Instant::now()), job, output);
         if ended {
@@ -116,7 +116,7 @@ pub async fn follow(
         let mut away: Option<Instant> = None;
         loop {
             tokio::time::sleep(PAUSE).await;
-            match news(&mut client, job, task, &mut window, output).await {
+            match news(&mut client, page, &mut window, output).await {
                 Ok(true) => return Ok(()),
                 Ok(false) => away = None,
                 Err(error) if error.code != Code::Coordinator => return Err(error),
@@ -141,26 +141,19 @@ pub async fn follow(
 }
 
 /// Shows what is new; whether the job has ended and all of it was shown.
-async fn news(
-    client: &mut Client,
-    job: Option<JobId>,
-    task: Option<u64>,
-    window: &mut Window,
-    output: Output,
-) -> Result<bool> {
+async fn news(client: &mut Client, of: Page, window: &mut Window, output: Output) -> Result<bool> {
     let mut after = window.after;
     loop {
         let page = Page {
-            job,
-            task,
             after,
             limit: PAGE,
             newest: false,
+            ..of
         };
         let (events, ended) = client.history(page).await?;
         let whole = events.len() < PAGE as usize;
         after = events.last().map_or(after, |event| event.sequence);
-        show(window.take(events, Instant::now()), job, output);
+        show(window.take(events, Instant::now()), of.job, output);
         if whole {
             window.advance(Instant::now());
             return Ok(ended);
@@ -186,6 +179,7 @@ mod tests {
             sequence: *sequence,
             at_ms: 0,
             job: JobId::from_uuid(uuid::Uuid::from_u128(1)),
+            stage: None,
             kind: EventKind::Leased,
             task: None,
             lo: None,

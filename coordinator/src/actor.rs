@@ -9,7 +9,7 @@ use std::{
 };
 
 use futures::FutureExt;
-use picofarm_catalog::{Catalog, CatalogError, Job, ResultSet};
+use picofarm_catalog::{Catalog, CatalogError, Job, ResultSet, Run};
 use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     key::spec_hash,
@@ -42,6 +42,11 @@ const BATCH: usize = 1024;
 const MEND: Duration = Duration::from_secs(1);
 /// How often the catalog hears that this house lives, and is asked for news.
 const BEAT: Duration = Duration::from_secs(1);
+/// How often jobs to forget are looked for, and how many are forgotten at a time: other work waits for it.
+const FORGET: Duration = Duration::from_secs(600);
+const FORGET_AT_ONCE: u32 = 4;
+/// Jobs that a new one is compared with.
+const RECENT: u32 = 50;
 /// Least time between two beats, whatever the hints.
 const BEAT_AT_LEAST: Duration = Duration::from_millis(100);
 
@@ -53,6 +58,7 @@ pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
 pub(crate) enum Refusal {
     NoSuchJob(JobId),
     NotNow(String),
+    TooMany(String),
     Spec(SpecError),
     Catalog(String),
 }
@@ -76,17 +82,36 @@ pub(crate) enum Command {
     Plan(Box<JobSpec>, Reply<JobPlan>),
     Submit {
         spec: Box<JobSpec>,
+        user: String,
+        /// Jobs that the user may have that have not ended.
+        most: u64,
         again: bool,
         reply: Reply<Submitted>,
     },
     List(Reply<Vec<JobStatus>>),
     Get(JobId, Reply<JobStatus>),
-    Cancel(JobId, Reply<JobStatus>),
+    Cancel {
+        job: JobId,
+        why: String,
+        reply: Reply<JobStatus>,
+    },
+    Pause {
+        job: JobId,
+        paused: bool,
+        who: String,
+        reply: Reply<JobStatus>,
+    },
+    Drain(String, Reply<u32>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
     /// What the house knows, without asking the catalog.
     Look(Reply<Look>),
-    LookAt(JobId, Option<u64>, Reply<JobLook>),
+    LookAt {
+        job: JobId,
+        stage: Option<u32>,
+        task: Option<u64>,
+        reply: Reply<JobLook>,
+    },
 }
 
 /// What a worker says in its session.
@@ -104,6 +129,8 @@ pub(crate) struct Actor {
     pub catalog: Arc<dyn Catalog>,
     pub settings: Settings,
     pub tick: Duration,
+    /// Jobs that ended so long ago are forgotten.
+    pub forget_after: Option<Duration>,
     pub clock: Clock,
     /// Grows with every change that people may want to see.
     pub revision: watch::Sender<u64>,
@@ -118,6 +145,8 @@ struct Life<'a> {
     core: Core,
     sessions: HashMap<SessionId, mpsc::Sender<Say>>,
     tally: Tally,
+    /// When jobs to forget were last looked for and none were left.
+    forgot: Option<Instant>,
 }
 
 impl Actor {
@@ -169,6 +198,7 @@ impl Actor {
             core,
             sessions: HashMap::new(),
             tally: Tally::default(),
+            forgot: None,
         })
     }
 }
@@ -211,6 +241,10 @@ impl Life<'_> {
                         }
                         ticked = Instant::now();
                         self.core.expire(now);
+                        for (job, deadline) in self.core.overdue(now) {
+                            self.flush().await?;
+                            self.cancel(job, &format!("limits.deadline = {deadline:?} has passed")).await?;
+                        }
                     }
                     n = commands.recv_many(&mut batch, BATCH) => {
                         if n == 0 {
@@ -250,8 +284,32 @@ impl Life<'_> {
         Ok(())
     }
 
+    /// Forgets a few of the jobs that ended long ago, if it is time to look for some.
+    async fn forget(&mut self) -> Result<(), CatalogError> {
+        let Some(age) = self.actor.forget_after else {
+            return Ok(());
+        };
+        if self.forgot.is_some_and(|at| at.elapsed() < FORGET) {
+            return Ok(());
+        }
+        let before_ms = self.now() - i64::try_from(age.as_millis()).unwrap_or(i64::MAX);
+        let forgotten = self.actor.catalog.forget(before_ms, FORGET_AT_ONCE).await?;
+        if forgotten > 0 {
+            tracing::info!(
+                jobs = forgotten,
+                "jobs that ended long ago are forgotten; their outputs stay"
+            );
+        }
+        // Where there are more, they follow with the next beat.
+        if forgotten < FORGET_AT_ONCE {
+            self.forgot = Some(Instant::now());
+        }
+        Ok(())
+    }
+
     /// Tells the catalog that this house lives, and hears what is new.
     async fn beat(&mut self) -> Result<(), CatalogError> {
+        self.forget().await?;
         self.core.give_back();
         self.flush().await?;
         let news = self.actor.catalog.beat(self.core.connected()).await?;
@@ -317,10 +375,16 @@ impl Life<'_> {
                     let answer = self.plan(&spec).await?;
                     let _ = reply.send(answer.map(|(plan, _)| plan));
                 }
-                Command::Submit { spec, again, reply } => {
+                Command::Submit {
+                    spec,
+                    user,
+                    most,
+                    again,
+                    reply,
+                } => {
                     // First what is under way, so that no output is missed.
                     self.flush().await?;
-                    let answer = self.submit(*spec, again).await?;
+                    let answer = self.submit(*spec, user, most, again).await?;
                     let _ = reply.send(answer);
                 }
                 Command::List(reply) => {
@@ -334,19 +398,19 @@ impl Life<'_> {
                     self.flush().await?;
                     let _ = reply.send(self.status(id).await?);
                 }
-                Command::Cancel(id, reply) => {
+                Command::Cancel { job, why, reply } => {
                     self.flush().await?;
-                    let answer = match self.actor.catalog.job(id).await? {
-                        None => Err(Refusal::NoSuchJob(id)),
-                        Some(_) => {
-                            if self.actor.catalog.cancel(id, self.now()).await? {
-                                self.core.drop_job(id, "the job was cancelled");
-                                self.flush().await?;
-                            }
-                            self.status(id).await?
-                        }
-                    };
-                    let _ = reply.send(answer);
+                    self.cancel(job, &why).await?;
+                    let _ = reply.send(self.status(job).await?);
+                }
+                Command::Pause {
+                    job,
+                    paused,
+                    who,
+                    reply,
+                } => {
+                    self.flush().await?;
+                    let _ = reply.send(self.pause(job, paused, &who).await?);
                 }
                 Command::Retry(id, reply) => {
                     self.flush().await?;
@@ -358,8 +422,17 @@ impl Life<'_> {
                 Command::Look(reply) => {
                     let _ = reply.send(Ok(self.core.look()));
                 }
-                Command::LookAt(job, task, reply) => {
-                    let _ = reply.send(Ok(self.core.look_at(job, task)));
+                Command::LookAt {
+                    job,
+                    stage,
+                    task,
+                    reply,
+                } => {
+                    let look = self.core.look_at(job, stage, task, self.now());
+                    let _ = reply.send(Ok(look));
+                }
+                Command::Drain(worker, reply) => {
+                    let _ = reply.send(Ok(self.core.drain(&worker)));
                 }
             }
         }
@@ -407,26 +480,74 @@ impl Life<'_> {
         Ok(status.ok_or(Refusal::NoSuchJob(id)))
     }
 
+    /// Stops a job, if it is active.
+    async fn cancel(&mut self, job: JobId, why: &str) -> Result<(), CatalogError> {
+        let catalog = &self.actor.catalog;
+        if catalog.job(job).await?.is_some() && catalog.cancel(job, why, self.now()).await? {
+            self.core.drop_job(job, "the job was cancelled");
+            self.flush().await?;
+        }
+        Ok(())
+    }
+
+    async fn pause(
+        &mut self,
+        job: JobId,
+        paused: bool,
+        who: &str,
+    ) -> Result<Result<JobStatus, Refusal>, CatalogError> {
+        let catalog = &self.actor.catalog;
+        let Some(record) = catalog.job(job).await? else {
+            return Ok(Err(Refusal::NoSuchJob(job)));
+        };
+        if record.job.state != JobState::Active {
+            return Ok(Err(Refusal::NotNow(format!("job {job} has ended"))));
+        }
+        if catalog.pause(job, paused, who, self.now()).await? {
+            self.core.paused(job, paused);
+            self.flush().await?;
+        }
+        self.status(job).await
+    }
+
     /// What submitting would do, and the job that has this spec already.
     async fn plan(
         &self,
         spec: &JobSpec,
     ) -> Result<Result<(JobPlan, Option<Job>), Refusal>, CatalogError> {
         let catalog = &self.actor.catalog;
-        let set = ResultSet::of(spec);
-        let others = catalog.jobs_at(&set.store, &set.dataset).await?;
-        if let Err(why) = place_is_free(spec, &others) {
-            return Ok(Err(Refusal::Spec(why)));
+        for stage in &spec.stages {
+            let set = ResultSet::of(stage);
+            if stage.task.writes().is_none() {
+                continue;
+            }
+            let others = catalog.jobs_at(&set.store, &set.dataset).await?;
+            if let Err(why) = place_is_free(stage, &others) {
+                return Ok(Err(Refusal::Spec(spec.at(stage, why))));
+            }
         }
-        let runs = catalog.output_runs(&set, spec.scenes.count).await?;
+        let runs = self.existing(spec).await?;
         let latest = catalog.job_with(&spec_hash(spec)).await?;
-        let plan = plan::plan(spec, &runs, latest.as_ref().map(|job| job.id));
+        let recent = catalog.recent(RECENT).await?;
+        let plan = plan::plan(spec, &runs, latest.as_ref().map(|job| job.id), &recent);
         Ok(Ok((plan, latest)))
+    }
+
+    /// The outputs there are, by stage.
+    async fn existing(&self, spec: &JobSpec) -> Result<Vec<Vec<Run>>, CatalogError> {
+        let mut runs = Vec::with_capacity(spec.stages.len());
+        for stage in &spec.stages {
+            let set = ResultSet::of(stage);
+            runs.push(self.actor.catalog.output_runs(&set, stage.tasks()).await?);
+        }
+        Ok(runs)
     }
 
     async fn submit(
         &mut self,
         spec: JobSpec,
+        user: String,
+        most: u64,
         again: bool,
     ) -> Result<Result<Submitted, Refusal>, CatalogError> {
         let (plan, latest) = match self.plan(&spec).await? {
@@ -444,14 +565,19 @@ impl Life<'_> {
             return existed(job.id, plan);
         }
         let catalog = &self.actor.catalog;
-        let set = ResultSet::of(&spec);
-        let runs = catalog.output_runs(&set, spec.scenes.count).await?;
+        if catalog.jobs_of(&user).await? >= most {
+            return Ok(Err(Refusal::TooMany(format!(
+                "{user:?} has {most} jobs that have not ended, the most that --max-jobs-per-user allows; wait for some to \
+                 end, or cancel some"
+            ))));
+        }
+        let runs = self.existing(&spec).await?;
         let now = self.now();
         let Prepared {
             job,
             ranges,
             events,
-        } = self.core.prepare(spec, &runs, now);
+        } = self.core.prepare(spec, user, &runs, now);
         if !catalog.submit(&job, &ranges, &events).await? {
             // Another coordinator was first.
             return Ok(match catalog.job_with(&job.spec_hash).await? {
@@ -504,12 +630,12 @@ impl Life<'_> {
         let mut tally = std::mem::take(&mut self.tally);
         tally.note(&changes, &say);
         let began = Instant::now();
-        let ended = self.actor.catalog.commit(changes).await?;
+        let settled = self.actor.catalog.commit(changes).await?;
         self.actor.metrics.add(&tally);
         if changed {
             self.actor.metrics.committed(began.elapsed());
         }
-        self.core.ended(&ended);
+        self.core.settled(&settled);
         let mut deaf = Vec::new();
         for (session, what) in say {
             let over = what == Say::Replaced;
@@ -548,10 +674,13 @@ fn refuse(command: Command, error: &str) {
         Command::Plan(_, reply) => no(reply, error),
         Command::Submit { reply, .. } => no(reply, error),
         Command::List(reply) => no(reply, error),
-        Command::Get(_, reply) | Command::Cancel(_, reply) => no(reply, error),
+        Command::Get(_, reply) | Command::Cancel { reply, .. } | Command::Pause { reply, .. } => {
+            no(reply, error)
+        }
+        Command::Drain(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
         Command::Look(reply) => no(reply, error),
-        Command::LookAt(_, _, reply) => no(reply, error),
+        Command::LookAt { reply, .. } => no(reply, error),
     }
 }

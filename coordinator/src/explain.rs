@@ -4,8 +4,8 @@ use picofarm_catalog::{Exception, Holdups, RangeState, TaskRecord};
 use picofarm_proto::{
     ids::JobId,
     model::{
-        Event, EventKind, JobState, Limits, Made, Reason, TaskCounts, TaskExplanation, TaskOutput,
-        TaskState,
+        Event, EventKind, JobState, Limits, Made, Reason, StageState, StageStatus, TaskCounts,
+        TaskExplanation, TaskOutput, TaskState,
     },
 };
 
@@ -29,6 +29,10 @@ pub struct JobFacts {
     pub job: JobId,
     /// Where it stands.
     pub state: JobState,
+    /// It is held by a person.
+    pub paused: bool,
+    /// Its stages.
+    pub stages: Vec<StageStatus>,
     /// Its tasks.
     pub counts: TaskCounts,
     /// What its tasks wait for.
@@ -104,9 +108,10 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
             );
             reasons.push(reason("cancelled", left, words));
         }
-        JobState::Failed => {}
+        JobState::Failed => blocked(facts, &mut reasons),
         JobState::Active => {
             waiting(facts, &mut reasons);
+            blocked(facts, &mut reasons);
             if counts.leased > 0 {
                 let words = format!("{} under lease at workers now", n(counts.leased, "task"));
                 reasons.push(reason("leased", counts.leased, words));
@@ -137,11 +142,21 @@ fn last_error<'a>(mut failed: impl Iterator<Item = &'a Exception>) -> String {
 /// Why pending tasks of an active job are not leased.
 fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     let Holdups {
+        blocked: _,
         ready,
         waiting,
         next_ms,
         failed,
     } = &facts.holdups;
+    if facts.paused {
+        let words = format!(
+            "the job is held: {} not begun until `picofarm job resume {}`",
+            n(facts.counts.pending, "task"),
+            facts.job
+        );
+        reasons.push(reason("paused", facts.counts.pending, words));
+        return;
+    }
     if *ready > 0 {
         reasons.push(unleased(facts, *ready));
     }
@@ -162,6 +177,34 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
             until_ms: *next_ms,
             ..reason("after_failure", *waiting, words)
         });
+    }
+}
+
+/// Which stages wait for others.
+fn blocked(facts: &JobFacts, reasons: &mut Vec<Reason>) {
+    let stands = |need: &String| {
+        let stage = facts.stages.iter().find(|s| s.name == *need);
+        let done = stage.is_some_and(|s| s.state == StageState::Done);
+        (!done).then(|| match stage {
+            Some(s) if s.state == StageState::Failed => {
+                format!("{need:?} ({} given up)", n(s.tasks.dead, "task"))
+            }
+            Some(s) => format!("{need:?} ({} of {} done)", s.tasks.done, s.tasks.total),
+            None => format!("{need:?}"),
+        })
+    };
+    for stage in &facts.stages {
+        if stage.state != StageState::Blocked {
+            continue;
+        }
+        let needs: Vec<String> = stage.needs.iter().filter_map(stands).collect();
+        let words = format!(
+            "{} of stage {:?} after {}",
+            n(stage.tasks.pending, "task"),
+            stage.name,
+            needs.join(", ")
+        );
+        reasons.push(reason("blocked", stage.tasks.pending, words));
     }
 }
 

@@ -299,10 +299,7 @@ impl Pages {
         };
         for job in look.jobs {
             if let Some(record) = self.link.catalog.job(job).await.ok()? {
-                gauges.tasks.pending += record.counts.pending;
-                gauges.tasks.leased += record.counts.leased;
-                gauges.tasks.done += record.counts.done;
-                gauges.tasks.dead += record.counts.dead;
+                gauges.tasks += record.counts();
             }
         }
         Some(gauges)

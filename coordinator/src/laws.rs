@@ -214,7 +214,7 @@ proptest! {
 
     #[test]
     fn budgets_are_separate_and_interruptions_free(kinds in prop::collection::vec(0..3u8, 0..30)) {
-        let limits = Limits { max_failures: 3, max_crashes: 2 };
+        let limits = Limits { max_failures: 3, max_crashes: 2, ..Limits::default() };
         let backoff = Backoff::default();
         let fresh = || picofarm_catalog::Exception {
             stage: stage_ref(), task: 0, failures: 0, crashes: 0, dead: false, last_error: String::new(),

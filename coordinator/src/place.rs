@@ -1,6 +1,6 @@
 //! Which worker may take tasks of which job, and how many at once. Pure.
 
-use picofarm_proto::model::{JobSpec, SceneKind};
+use picofarm_proto::model::{Abilities, SceneKind, StageSpec};
 
 /// Furniture that every worker makes by itself.
 pub const PARAMETRIC: &str = "parametric-1";
@@ -13,32 +13,57 @@ const MOST: u64 = 1024;
 /// A lease takes at most this part of an even share of what is left, so that all workers end together.
 const SHARE: u64 = 2;
 
-/// What placement knows of a worker.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Abilities {
-    /// Its renderer's version.
-    pub renderer: String,
-    /// Furniture fingerprints it has.
-    pub assets: Vec<String>,
-}
-
-/// Whether a worker may run a job's tasks.
+/// Whether a worker may run a stage's tasks.
 ///
 /// # Errors
 /// Why not, in words.
-pub fn may_run(spec: &JobSpec, worker: &Abilities) -> Result<(), String> {
-    if worker.renderer != spec.render.renderer {
-        return Err(format!(
-            "the job needs renderer {:?}, the worker has {:?}",
-            spec.render.renderer, worker.renderer
-        ));
+pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
+    let (kind, version) = (stage.task.kind(), stage.task.version());
+    match worker.kinds.get(kind) {
+        None => return Err(format!("the worker runs no {kind} tasks")),
+        Some(theirs) if theirs != version => {
+            return Err(format!(
+                "the job needs {} {version:?}, the worker has {theirs:?}",
+                match kind {
+                    "render" => "renderer",
+                    other => other,
+                }
+            ));
+        }
+        Some(_) => {}
     }
-    if let SceneKind::Furnished { assets, .. } = &spec.scenes.kind
+    if let Some(task) = stage.task.as_render()
+        && let SceneKind::Furnished { assets, .. } = &task.scenes.kind
         && assets != PARAMETRIC
         && !worker.assets.contains(assets)
     {
         return Err(format!(
             "the job needs furniture {assets:?}, the worker has none of that fingerprint"
+        ));
+    }
+    let needs = &stage.resources;
+    if needs.cores > worker.cores {
+        return Err(format!(
+            "the stage needs {} cores, the worker has {}",
+            needs.cores, worker.cores
+        ));
+    }
+    let memory_gib = worker.memory_mib as f64 / 1024.0;
+    if needs.memory_gib > memory_gib {
+        return Err(format!(
+            "the stage needs {} GiB of memory, the worker has {memory_gib:.1}",
+            needs.memory_gib
+        ));
+    }
+    if needs.gpus > worker.gpus {
+        return Err(format!(
+            "the stage needs {} GPUs, the worker has {}",
+            needs.gpus, worker.gpus
+        ));
+    }
+    if let Some(label) = needs.labels.iter().find(|l| !worker.labels.contains(l)) {
+        return Err(format!(
+            "the stage needs the label {label:?}, which the worker has not"
         ));
     }
     Ok(())

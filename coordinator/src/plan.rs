@@ -1,11 +1,14 @@
 //! What a job's tasks are and which of them run, given the outputs that exist. Pure.
 
-use picofarm_catalog::{Range, RangeState, Run};
+use std::collections::BTreeSet;
+
+use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
     key::spec_hash,
-    model::{JobPlan, JobSpec, SceneKind, SpecError},
+    model::{JobPlan, JobSpec, SceneKind, SpecError, StagePlan, StageSpec},
 };
+use serde_json::Value;
 
 /// The ranges of a new stage: a done range for each run of existing outputs, a pending one for each gap.
 /// `existing` is ascending and disjoint.
@@ -40,65 +43,135 @@ pub fn expand(
     ranges
 }
 
-/// What submitting `spec` would do, given the outputs of exactly these settings and the job that has this spec.
-pub fn plan(spec: &JobSpec, existing: &[Run], existing_job: Option<JobId>) -> JobPlan {
-    let total = spec.scenes.count;
-    let reuse: u64 = existing
-        .iter()
-        .map(|r| r.hi.min(total) - r.lo.min(total))
-        .sum();
-    let run = total - reuse;
-    let mut reasons = Vec::new();
-    if reuse > 0 {
-        reasons.push(format!(
-            "{reuse} of {total} outputs exist for exactly these scenes and settings: reused"
-        ));
-    }
-    if run > 0 && reuse == 0 {
-        reasons.push(format!(
-            "{run} tasks run: the catalog has no output for these scenes, render settings and renderer {:?} in data set {:?} of {}",
-            spec.render.renderer, spec.output.dataset, spec.output.store
-        ));
-    } else if run > 0 {
-        reasons.push(format!("{run} tasks run: their outputs do not exist yet"));
-    }
-    if let Some(job) = existing_job {
-        reasons.push(format!("job {job} has this exact spec"));
+/// What submitting `spec` would do, given for each stage the outputs of exactly its settings, the job that has this spec,
+/// and recent jobs, latest first, to compare with.
+pub fn plan(
+    spec: &JobSpec,
+    existing: &[Vec<Run>],
+    existing_job: Option<JobId>,
+    recent: &[Job],
+) -> JobPlan {
+    let mut stages = Vec::with_capacity(spec.stages.len());
+    for (stage, existing) in spec.stages.iter().zip(existing) {
+        let total = stage.tasks();
+        let there: u64 = existing
+            .iter()
+            .map(|r| r.hi.min(total) - r.lo.min(total))
+            .sum();
+        let reuse = if stage.force { 0 } else { there };
+        stages.push(StagePlan {
+            name: stage.name.clone(),
+            kind: stage.task.kind().to_owned(),
+            total,
+            reuse,
+            run: total - reuse,
+            reasons: reasons(stage, total, there, recent),
+        });
     }
     JobPlan {
         spec_hash: spec_hash(spec),
-        total,
-        reuse,
-        run,
+        total: stages.iter().map(|s| s.total).sum(),
+        reuse: stages.iter().map(|s| s.reuse).sum(),
+        run: stages.iter().map(|s| s.run).sum(),
         existing_job,
-        reasons,
+        stages,
     }
 }
 
-/// The first setting that shapes results and differs between two jobs, in words: `: render.bins is 637 there and
-/// 300 here`. `None` where none differs.
-pub fn difference(there: &JobSpec, here: &JobSpec) -> Option<String> {
-    let shaping = |spec: &JobSpec| {
-        let mut scenes = serde_json::to_value(&spec.scenes).expect("settings are plain data");
-        scenes["count"] = serde_json::Value::Null;
-        serde_json::json!({
-            "scenes": scenes, "render": spec.render, "output": {"profile": spec.output.profile},
-        })
-    };
-    let (there, here) = (shaping(there), shaping(here));
-    ["scenes", "render", "output"]
-        .into_iter()
-        .find_map(|section| {
-            let (a, b) = (there[section].as_object()?, here[section].as_object()?);
-            let name = a.keys().chain(b.keys()).find(|k| a.get(*k) != b.get(*k))?;
-            let text =
-                |v: Option<&serde_json::Value>| v.map_or("unset".into(), ToString::to_string);
-            Some(format!(
-                ": {section}.{name} is {} there and {} here",
-                text(a.get(name)),
-                text(b.get(name))
-            ))
-        })
+/// Why tasks of a stage run or do not, given how many outputs there are.
+fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<String> {
+    let mut reasons = Vec::new();
+    if stage.force {
+        let what = "all run: the stage is forced; each result must equal the one that exists";
+        return vec![what.to_owned()];
+    }
+    if there > 0 {
+        reasons.push(format!(
+            "{there} of {total} outputs exist for exactly these settings: reused"
+        ));
+    }
+    let run = total - there;
+    if run > 0 && there > 0 {
+        reasons.push(format!("{run} run: their outputs do not exist yet"));
+    } else if run > 0 {
+        reasons.push(match kin(stage, recent) {
+            Some((job, changes)) if changes.is_empty() => format!(
+                "{run} run: the settings are those of job {job}, but it put its results elsewhere"
+            ),
+            Some((job, changes)) => {
+                format!("{run} run: since job {job}, {}", changes.join(", "))
+            }
+            None => format!("{run} run: no job has done the like of it"),
+        });
+    }
+    reasons
+}
+
+/// The latest job with a stage like this one, and what has changed since.
+fn kin(stage: &StageSpec, recent: &[Job]) -> Option<(JobId, Vec<String>)> {
+    let like =
+        |other: &&StageSpec| other.task.kind() == stage.task.kind() && other.name == stage.name;
+    let (job, other) = recent.iter().find_map(|job| {
+        let other = job.spec.stages.iter().find(like)?;
+        Some((job.id, other))
+    })?;
+    Some((job, changes(other, stage)))
+}
+
+/// The settings that shape results and differ between two stages of one kind, each in words:
+/// `render.bins is 300 and was 637`.
+pub fn changes(was: &StageSpec, is: &StageSpec) -> Vec<String> {
+    let (was, is) = (shaping(was), shaping(is));
+    let mut changes = Vec::new();
+    differences(&mut changes, String::new(), Some(&was), Some(&is));
+    changes
+}
+
+/// Everything of a stage that shapes its results, as one tree.
+fn shaping(stage: &StageSpec) -> Value {
+    let mut tree = serde_json::to_value(&stage.task).expect("settings are plain data");
+    tree["count"] = Value::Null;
+    tree["output"] = tree["output"]["profile"].take();
+    if let Some(scenes) = tree.get_mut("scenes").and_then(Value::as_object_mut) {
+        scenes.remove("count");
+        if let Some(files) = scenes.get_mut("files").and_then(Value::as_array_mut) {
+            for file in files {
+                *file = file["sha256"].take();
+            }
+        }
+    }
+    tree
+}
+
+/// Most differences that are told.
+const TOLD: usize = 8;
+
+fn differences(told: &mut Vec<String>, path: String, was: Option<&Value>, is: Option<&Value>) {
+    if was == is || told.len() >= TOLD {
+        return;
+    }
+    if let (Some(Value::Object(a)), Some(Value::Object(b))) = (was, is) {
+        let names: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+        for name in names {
+            let dot = if path.is_empty() { "" } else { "." };
+            let path = format!("{path}{dot}{name}");
+            differences(told, path, a.get(name), b.get(name));
+        }
+        return;
+    }
+    if let (Some(Value::Array(a)), Some(Value::Array(b))) = (was, is)
+        && a.len().max(b.len()) > TOLD
+    {
+        let equal = a.iter().zip(b).filter(|(a, b)| a == b).count();
+        let (changed, others) = (b.len() - equal, a.len());
+        told.push(format!(
+            "{changed} of {} {path} differ ({others} before)",
+            b.len()
+        ));
+        return;
+    }
+    let text = |v: Option<&Value>| v.map_or("unset".into(), ToString::to_string);
+    told.push(format!("{path} is {} and was {}", text(is), text(was)));
 }
 
 /// Checks what a client must have resolved before it submits.
@@ -106,13 +179,25 @@ pub fn difference(there: &JobSpec, here: &JobSpec) -> Option<String> {
 /// # Errors
 /// [`SpecError`] naming the field.
 pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
-    if spec.render.renderer.is_empty() {
+    let mut stages = spec.stages.iter();
+    stages.try_for_each(|stage| resolved(stage).map_err(|e| spec.at(stage, e)))
+}
+
+fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
+    if stage.task.version().is_empty() {
+        let (field, whose) = match stage.task.kind() {
+            "render" => ("render.renderer", "renderer"),
+            _ => ("reprocess.version", "sensor model"),
+        };
         return Err(SpecError::new(
-            "render.renderer",
-            "is empty; the client must fill in the renderer's version before it submits",
+            field,
+            format!("is empty; the client must fill in the {whose}'s version before it submits"),
         ));
     }
-    match &spec.scenes.kind {
+    let Some(task) = stage.task.as_render() else {
+        return Ok(());
+    };
+    match &task.scenes.kind {
         SceneKind::Furnished { assets, .. }
             if matches!(
                 assets.as_str(),
@@ -126,7 +211,7 @@ pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
                 ),
             ))
         }
-        SceneKind::Files { files } => match files.iter().find(|f| f.sha256.len() != 64) {
+        SceneKind::Files { files, .. } => match files.iter().find(|f| f.sha256.len() != 64) {
             Some(file) => Err(SpecError::new(
                 "scenes.files",
                 format!(

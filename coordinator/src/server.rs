@@ -62,6 +62,8 @@ pub struct CoordinatorConfig {
     /// Where `/healthz`, `/readyz` and `/metrics` are served, for anyone who reaches it; port 0 = any free port; by default
     /// nowhere.
     pub http: Option<SocketAddr>,
+    /// Jobs that ended so long ago are forgotten, with their history; by default never.
+    pub forget_after: Option<Duration>,
 }
 
 impl CoordinatorConfig {
@@ -79,6 +81,7 @@ impl CoordinatorConfig {
             access: Access::default(),
             quotas: Quotas::default(),
             http: None,
+            forget_after: None,
         }
     }
 }
@@ -190,6 +193,7 @@ pub async fn serve(
             backoff: config.backoff,
         },
         tick: config.tick,
+        forget_after: config.forget_after,
         clock: config.clock.clone(),
         revision,
         metrics: Arc::clone(&metrics),

@@ -9,7 +9,7 @@ use std::{
 use picofarm_coordinator::{CoordinatorConfig, Running, VERSION, serve};
 use picofarm_proto::{
     PROTOCOL,
-    model::JobSpec,
+    model::{JobSpec, RenderTask, TaskSpec},
     wire::{
         self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
         session_response::Message as Heard,
@@ -21,7 +21,6 @@ use proptest::{
     strategy::ValueTree,
     test_runner::{Config, TestRunner},
 };
-use prost::Message;
 use tokio_stream::StreamExt;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
@@ -81,7 +80,8 @@ impl Server {
         let mut jobs = self.jobs();
         let mut spec = good();
         spec.name = Uuid::new_v4().to_string();
-        spec.output.dataset = spec.name.clone();
+        let spec_name = spec.name.clone();
+        rendering(&mut spec).output.dataset = spec_name;
         let request = wire::SubmitJobRequest {
             spec: Some(spec.into()),
             again: false,
@@ -145,6 +145,26 @@ fn good() -> JobSpec {
     .unwrap()
 }
 
+fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
+    match &mut spec.stages[0].task {
+        TaskSpec::Render(task) => task,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Two stages, one of which needs the other.
+fn graph() -> JobSpec {
+    serde_json::from_str(
+        r#"{"name": "graph", "priority": 3, "limits": {"max_workers": 2, "deadline": "2030-01-01T00:00:00Z"}, "stage": [
+            {"scenes": {"kind": "primitive", "count": 3}, "render": {"renderer": "r1"},
+             "output": {"store": "file:///nowhere", "dataset": "g"}, "resources": {"cores": 2, "labels": ["x"]}},
+            {"kind": "reprocess", "source": "render", "reprocess": {"version": "s", "sensor": {"dark_per_bin": 0.1}},
+             "output": {"store": "file:///nowhere", "dataset": "h"}},
+            {"kind": "split", "source": "reprocess", "split": {"fractions": [0.5, 0.25, 0.25]}}]}"#,
+    )
+    .unwrap()
+}
+
 fn hello(id: String) -> wire::Hello {
     wire::Hello {
         worker_id: id,
@@ -154,8 +174,11 @@ fn hello(id: String) -> wire::Hello {
         protocol: PROTOCOL,
         cores: 1,
         held: Vec::new(),
-        renderer: "r1".into(),
+        kinds: [("render".to_owned(), "r1".to_owned())].into(),
         assets: Vec::new(),
+        memory_mib: 1,
+        gpus: 0,
+        labels: Vec::new(),
     }
 }
 
@@ -242,16 +265,79 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
     prop_oneof![hello, beat, done, failed, release, credit].prop_map(request_of)
 }
 
-/// The wire form of a job with some bytes changed, where that still is a message.
+fn job() -> impl Strategy<Value = serde_json::Value> {
+    let jobs = [good(), graph()].map(|job| serde_json::to_value(job).unwrap());
+    prop::sample::select(jobs.to_vec())
+}
+
+/// A job with some bytes of its text changed, or values of it put in another's place.
 fn spoilt_spec() -> impl Strategy<Value = Option<wire::JobSpec>> {
-    vec((any::<prop::sample::Index>(), any::<u8>()), 1..5).prop_map(|changes| {
-        let mut bytes = wire::JobSpec::from(good()).encode_to_vec();
-        for (at, byte) in changes {
-            let at = at.index(bytes.len());
-            bytes[at] = byte;
+    let bytes = (
+        job(),
+        vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
+    )
+        .prop_map(|(job, changes)| {
+            let mut bytes = job.to_string().into_bytes();
+            for (at, byte) in changes {
+                let at = at.index(bytes.len());
+                bytes[at] = byte;
+            }
+            String::from_utf8_lossy(&bytes).into_owned()
+        });
+    let values = (job(), vec((any::<prop::sample::Index>(), value()), 1..3)).prop_map(
+        |(mut job, changes)| {
+            for (at, value) in changes {
+                let mut places = Vec::new();
+                leaves(&job, "", &mut places);
+                let place = &places[at.index(places.len())];
+                *job.pointer_mut(place).expect("just found") = value;
+            }
+            job.to_string()
+        },
+    );
+    prop_oneof![
+        1 => Just(None),
+        4 => bytes.prop_map(|json| Some(wire::JobSpec { json })),
+        6 => values.prop_map(|json| Some(wire::JobSpec { json })),
+    ]
+}
+
+/// A value where another was expected, or one beyond every limit.
+fn value() -> impl Strategy<Value = serde_json::Value> {
+    use serde_json::json;
+    prop_oneof![
+        Just(json!(null)),
+        Just(json!(u64::MAX)),
+        Just(json!(-1)),
+        Just(json!(1e300)),
+        Just(json!([])),
+        Just(json!({})),
+        Just(json!("render")),
+        Just(json!("../../etc")),
+        Just(json!("x".repeat(10_000))),
+        Just(json!(vec![0; 5_000])),
+        Just(json!({"a": vec![1; 40], "b": vec![1; 40], "c": [1]})),
+        any::<u32>().prop_map(|n| json!(n)),
+        any::<f64>().prop_map(|n| json!(n)),
+        ".{0,20}".prop_map(|text| json!(text)),
+    ]
+}
+
+/// Pointers to every place in a value that may hold another.
+fn leaves(value: &serde_json::Value, path: &str, found: &mut Vec<String>) {
+    match value {
+        serde_json::Value::Object(all) if !all.is_empty() => {
+            for (name, value) in all {
+                leaves(value, &format!("{path}/{name}"), found);
+            }
         }
-        wire::JobSpec::decode(&bytes[..]).ok()
-    })
+        serde_json::Value::Array(all) if !all.is_empty() => {
+            for (at, value) in all.iter().enumerate() {
+                leaves(value, &format!("{path}/{at}"), found);
+            }
+        }
+        _ => found.push(path.to_owned()),
+    }
 }
 
 /// Draws values one after the other: proptest's own loop knows no asynchronous tests.
@@ -310,6 +396,7 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
             limit: draws.next(&small()),
             task: Some(draws.next(&number())),
             newest: draws.next(&small()).is_multiple_of(2),
+            stage: Some(draws.next(&small())),
         };
         // Any answer will do; that there is one is the point.
         let _ = jobs.list_events(query).await;
@@ -317,7 +404,17 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
             .explain_job(wire::ExplainJobRequest {
                 job_id: id.clone(),
                 task: Some(draws.next(&number())),
+                stage: draws.next(&small()),
             })
+            .await;
+        let _ = jobs
+            .pause_job(wire::PauseJobRequest { job_id: id.clone() })
+            .await;
+        let _ = jobs
+            .resume_job(wire::ResumeJobRequest { job_id: id.clone() })
+            .await;
+        let _ = jobs
+            .drain_worker(wire::DrainWorkerRequest { worker: id.clone() })
             .await;
         let _ = jobs
             .get_job(wire::GetJobRequest { job_id: id.clone() })
@@ -351,7 +448,7 @@ async fn messages_beyond_their_limit_are_refused_by_name_and_leave_nothing_behin
     assert_eq!(refused.code(), tonic::Code::OutOfRange, "{refused:?}");
 
     let mut spec = good();
-    spec.scenes.count = 50_000_000;
+    rendering(&mut spec).scenes.count = 50_000_000;
     let submit = wire::SubmitJobRequest {
         spec: Some(spec.into()),
         again: false,
@@ -364,7 +461,7 @@ async fn messages_beyond_their_limit_are_refused_by_name_and_leave_nothing_behin
     );
 
     let mut climbing = good();
-    climbing.output.store = "file:///data/%2E./etc".into();
+    rendering(&mut climbing).output.store = "file:///data/%2E./etc".into();
     let plan = wire::PlanJobRequest {
         spec: Some(climbing.into()),
     };

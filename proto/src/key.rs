@@ -6,7 +6,10 @@ use std::fmt;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    model::{JobSpec, ReprocessSettings, SceneKind},
+    model::{
+        JobSpec, RenderTask, ReprocessSettings, SceneKind, SourceSettings, StageSpec, TaskSpec,
+        job::{EXPORT_VERSION, SPLIT_VERSION},
+    },
     split::SplitSettings,
 };
 
@@ -43,10 +46,37 @@ macro_rules! hex_text {
 hex_text!(StageKey);
 hex_text!(TaskKey);
 
-/// The stage key of a job's render stage: scene source (without `count`), render settings and codec profile.
+/// The key of a stage: everything that shapes the results of its tasks but their number. A data set that is read counts
+/// by its place.
+pub fn stage_key(stage: &StageSpec) -> StageKey {
+    let source = |s: &SourceSettings| serde_json::json!([s.store, s.dataset]);
+    let description = match &stage.task {
+        TaskSpec::Render(task) => return render_stage_key(task),
+        TaskSpec::Reprocess(task) => serde_json::json!({
+            "stage": "reprocess",
+            "source": source(&task.source),
+            "settings": reprocess_stage_key(&task.reprocess, &task.output.profile).to_string(),
+        }),
+        TaskSpec::Split(task) => serde_json::json!({
+            "stage": SPLIT_VERSION,
+            "source": source(&task.source),
+            "count": task.count,
+            "settings": serde_json::to_value(&task.split).expect("settings are plain data"),
+        }),
+        TaskSpec::Export(task) => serde_json::json!({
+            "stage": EXPORT_VERSION,
+            "source": source(&task.source),
+            "count": task.count,
+            "settings": serde_json::to_value(&task.export).expect("settings are plain data"),
+        }),
+    };
+    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// The key of a render stage: scene source (without `count`), render settings and codec profile.
 /// File scenes count by content and position, not by path; the place where results go does not count.
-pub fn stage_key(spec: &JobSpec) -> StageKey {
-    let scenes = match &spec.scenes.kind {
+pub fn render_stage_key(task: &RenderTask) -> StageKey {
+    let scenes = match &task.scenes.kind {
         SceneKind::Furnished {
             assets,
             min_specular,
@@ -54,7 +84,7 @@ pub fn stage_key(spec: &JobSpec) -> StageKey {
             serde_json::json!({"kind": "furnished", "assets": assets, "min_specular": min_specular})
         }
         SceneKind::Primitive => serde_json::json!({"kind": "primitive"}),
-        SceneKind::Files { files } => serde_json::json!({
+        SceneKind::Files { files, .. } => serde_json::json!({
             "kind": "files",
             "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
         }),
@@ -62,11 +92,11 @@ pub fn stage_key(spec: &JobSpec) -> StageKey {
     let description = serde_json::json!({
         "task": "render",
         "scenes": scenes,
-        "seed": spec.scenes.seed,
-        "fov_deg": spec.scenes.fov_deg,
-        "spots": spec.scenes.spots,
-        "render": serde_json::to_value(&spec.render).expect("settings are plain data"),
-        "profile": spec.output.profile,
+        "seed": task.scenes.seed,
+        "fov_deg": task.scenes.fov_deg,
+        "spots": task.scenes.spots,
+        "render": serde_json::to_value(&task.render).expect("settings are plain data"),
+        "profile": task.output.profile,
     });
     StageKey(Sha256::digest(canonical(description).as_bytes()).into())
 }

@@ -16,4 +16,4 @@ pub mod wire {
 }
 
 /// Version of the worker protocol; coordinator and worker must agree exactly.
-pub const PROTOCOL: u32 = 1;
+pub const PROTOCOL: u32 = 2;

@@ -1,7 +1,7 @@
 //! Job settings from file to model to wire and back, what is refused, and what a key depends on.
 
 use picofarm_proto::{
-    key::{spec_hash, stage_key},
+    key::{StageKey, spec_hash, stage_key},
     model::{Choice, JobSpec, SpecError},
     wire,
 };
@@ -20,6 +20,10 @@ fn good(render: &str) -> JobSpec {
     spec
 }
 
+fn key(spec: &JobSpec) -> StageKey {
+    stage_key(&spec.stages[0])
+}
+
 fn complaint(scenes: &str, render: &str) -> SpecError {
     read(scenes, render).unwrap().check().unwrap_err()
 }
@@ -27,11 +31,11 @@ fn complaint(scenes: &str, render: &str) -> SpecError {
 #[test]
 fn a_job_without_subsets_keeps_the_key_it_had_before_there_were_any() {
     assert_eq!(
-        stage_key(&good("")).to_string(),
+        key(&good("")).to_string(),
         "a65f63ca6fb2563240587717a1b36e8917c6a63f1d3f9517bf979c1df92df2d4"
     );
     let named = good("subsets = []\nper_spot = false\nstrategy = {}");
-    assert_eq!(stage_key(&named), stage_key(&good("")));
+    assert_eq!(key(&named), key(&good("")));
     assert_eq!(spec_hash(&named), spec_hash(&good("")));
 }
 
@@ -48,11 +52,11 @@ fn other_subsets_and_other_strategies_are_other_results() {
         "strategy = { image_lobes = false }",
         "strategy = { image_lobes = true }",
     ];
-    let keys = jobs.map(|job| stage_key(&good(job)));
+    let keys = jobs.map(|job| key(&good(job)));
     for (i, key) in keys.iter().enumerate() {
         assert!(!keys[..i].contains(key), "{:?}", jobs[i]);
     }
-    let reversed = stage_key(&good("subsets = [25, 4]"));
+    let reversed = key(&good("subsets = [25, 4]"));
     assert_eq!(keys[3], reversed, "their order changes nothing");
 }
 
@@ -61,8 +65,9 @@ fn subsets_and_strategies_survive_the_wire_and_the_catalog() {
     let spec = good(
         "subsets = [25, 4]\nper_spot = true\nstrategy = { share = 1, light_vertices = false }",
     );
-    assert_eq!(spec.render.subsets, [4, 25]);
-    assert_eq!(spec.render.strategy["light_vertices"], Choice::On(false));
+    let render = &spec.stages[0].task.as_render().unwrap().render;
+    assert_eq!(render.subsets, [4, 25]);
+    assert_eq!(render.strategy["light_vertices"], Choice::On(false));
     let back = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
     assert_eq!(back, spec);
     let stored = serde_json::to_string(&spec).unwrap();
@@ -90,13 +95,4 @@ fn what_cannot_be_used_is_named() {
     );
     let wrong = read("", "strategy = { share = \"much\" }").unwrap_err();
     assert!(wrong.to_string().contains("share"), "{wrong}");
-
-    let mut twice = wire::JobSpec::from(good("strategy = { share = 1 }"));
-    let strategy = &mut twice.render.as_mut().unwrap().strategy;
-    strategy.push(strategy[0].clone());
-    let error = JobSpec::try_from(twice).unwrap_err();
-    assert!(
-        error.to_string().contains("\"share\" is chosen twice"),
-        "{error}"
-    );
 }

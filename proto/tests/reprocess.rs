@@ -5,10 +5,8 @@ use picofarm_proto::{
     model::ReprocessSettings,
 };
 
-const SOURCE: &str = "source = { store = \"/store\", dataset = \"rooms\" }\n";
-
 fn read(text: &str) -> Result<ReprocessSettings, toml::de::Error> {
-    toml::from_str::<ReprocessSettings>(&format!("{SOURCE}{text}")).map(|mut settings| {
+    toml::from_str::<ReprocessSettings>(text).map(|mut settings| {
         settings.normalise();
         settings
     })
@@ -46,9 +44,6 @@ fn everything_that_shapes_a_result_is_part_of_its_key_and_nothing_else_is() {
     // Written out or left to the default, here or there, in this order or that: the same.
     let written = good("[sensor]\nrebin = 1\npulse = { kind = \"analytic\", fwhm_ps = 128.0 }");
     assert_eq!(reprocess_stage_key(&written, "sqrt-u16"), keys[0]);
-    let mut moved = good("");
-    moved.source.store = "/elsewhere".into();
-    assert_eq!(reprocess_stage_key(&moved, "sqrt-u16"), keys[0]);
     let reversed = good("histogram = \"transient_spots\"\nspots = [5, 0]");
     assert_eq!(reprocess_stage_key(&reversed, "sqrt-u16"), keys[2]);
     let tasks = [1, 2].map(|k| derived_key(&keys[0], &TaskKey([k; 32])));

@@ -29,8 +29,11 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
         protocol,
         cores: 1,
         held: Vec::new(),
-        renderer: "transient-0".into(),
+        kinds: [("render".to_owned(), "transient-0".to_owned())].into(),
         assets: Vec::new(),
+        memory_mib: 0,
+        gpus: 0,
+        labels: Vec::new(),
     }
 }
 

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use picofarm_proto::model::Histogram;
 
-use crate::dataset::export::Scenes;
+use picofarm_agent::export::Scenes;
 
 /// A sensor.
 #[derive(Args, Clone, Default)]
@@ -99,7 +99,7 @@ pub struct DatasetExport {
     /// Folder or URL for the export
     pub dest: String,
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
-    #[arg(long, value_name = "SCENES", value_parser = crate::dataset::export::parse)]
+    #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
 }
 

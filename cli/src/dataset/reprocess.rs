@@ -6,7 +6,7 @@ use picofarm_agent::{
     Control, TaskError,
     reprocess::{Reprocessor, sensor_settings, sensor_version},
 };
-use picofarm_proto::model::{OutputSettings, ReprocessSettings, SourceSettings};
+use picofarm_proto::model::{OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
@@ -22,7 +22,7 @@ use crate::{
 };
 
 pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
-    let (settings, target) = settings(&args)?;
+    let task = task(&args)?;
     let threads = args.threads.unwrap_or_else(roles::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -35,8 +35,7 @@ pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
         })?;
     let work = Work {
         reprocessor: Reprocessor::new(Handle::current()),
-        settings,
-        target,
+        task,
         stop: signals::stop_on_signal()?,
         runtime: Handle::current(),
     };
@@ -71,10 +70,10 @@ pub async fn run(args: DatasetReprocess, output: Output) -> Result<()> {
 }
 
 /// What the arguments ask for, with everything that a key depends on filled in.
-fn settings(args: &DatasetReprocess) -> Result<(ReprocessSettings, OutputSettings)> {
+fn task(args: &DatasetReprocess) -> Result<ReprocessTask> {
     let (store, dataset) = store_and_folder(&args.source)?;
+    let source = SourceSettings { store, dataset };
     let mut settings = ReprocessSettings {
-        source: SourceSettings { store, dataset },
         histogram: args.histogram,
         spots: args.spots.clone(),
         sensor: sensor_settings(&options::settings(&args.sensor)?),
@@ -85,20 +84,26 @@ fn settings(args: &DatasetReprocess) -> Result<(ReprocessSettings, OutputSetting
     settings.normalise();
     let profile = args.profile.clone();
     let profile = profile.unwrap_or_else(|| settings.natural_profile().to_owned());
-    settings.check(&profile)?;
     let (store, dataset) = store_and_folder(&args.target)?;
-    let target = OutputSettings {
+    let output = OutputSettings {
         store,
         dataset,
         profile,
     };
-    Ok((settings, target))
+    let task = ReprocessTask {
+        source,
+        // As many as there are; not known yet.
+        count: 1,
+        reprocess: settings,
+        output,
+    };
+    task.check()?;
+    Ok(task)
 }
 
 struct Work {
     reprocessor: Reprocessor,
-    settings: ReprocessSettings,
-    target: OutputSettings,
+    task: ReprocessTask,
     stop: CancellationToken,
     runtime: Handle,
 }
@@ -115,12 +120,12 @@ impl Work {
     fn all(&self, output: Output) -> Result<Done> {
         let (scenes, room) = self
             .reprocessor
-            .source(&self.settings, &Control::default())
+            .source(&self.task.source, &Control::default())
             .map_err(task_failed)?;
         if scenes.is_empty() {
             return Err(CliError::input(format!(
                 "{}: no scene is published yet",
-                self.settings.source.dataset
+                self.task.source.dataset
             )));
         }
         let mut done = Done {
@@ -153,9 +158,7 @@ impl Work {
         if self.stop.is_cancelled() {
             return Err(TaskError::Stopped);
         }
-        let result = self
-            .reprocessor
-            .run(&self.settings, &self.target, scene, &control);
+        let result = self.reprocessor.run(&self.task, scene, &control);
         watch.abort();
         result
     }

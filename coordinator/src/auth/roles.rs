@@ -107,6 +107,8 @@ pub(crate) const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/PlanJob", Needs::Role(Role::Submit)),
     ("/picofarm.v1.Jobs/SubmitJob", Needs::Role(Role::Submit)),
     ("/picofarm.v1.Jobs/CancelJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/PauseJob", Needs::Role(Role::Submit)),
+    ("/picofarm.v1.Jobs/ResumeJob", Needs::Role(Role::Submit)),
     ("/picofarm.v1.Jobs/RetryJob", Needs::Role(Role::Submit)),
     ("/picofarm.v1.Jobs/ListJobs", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/GetJob", Needs::Role(Role::View)),
@@ -114,6 +116,7 @@ pub(crate) const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/ListEvents", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ExplainJob", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ListWorkers", Needs::Role(Role::View)),
+    ("/picofarm.v1.Jobs/DrainWorker", Needs::Role(Role::Admin)),
 ];
 
 /// What a path needs. One that is not listed is for administrators: forgetting it opens nothing.

@@ -96,7 +96,7 @@ impl Core {
                 let about = About::message(message.clone())
                     .task(report.index)
                     .worker(name);
-                self.event(now_ms, id.job, EventKind::Alarm, about);
+                self.event(now_ms, id, EventKind::Alarm, about);
                 Err(message)
             }
             (Err(reason), None) => Err(reason),
@@ -114,6 +114,10 @@ impl Core {
     ) {
         let task = report.index;
         let set = self.stages[&id].set;
+        if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
+        {
+            entry.trouble.succeeded(*worker);
+        }
         self.fresh.insert((set, task), manifest);
         self.changes.outputs.push(Output {
             stage: id,
@@ -136,7 +140,7 @@ impl Core {
             .task(task)
             .worker(self.session_name(session))
             .seconds(report.seconds);
-        self.event(now_ms, id.job, kind, about);
+        self.event(now_ms, id, kind, about);
         self.mark(
             range,
             &RangeEvent::Finish {

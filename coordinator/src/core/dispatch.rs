@@ -1,5 +1,7 @@
 //! Grants: pending tasks to workers with credit, in memory and only when something has changed.
 
+use std::cmp::Reverse;
+
 use picofarm_catalog::RangeState;
 use picofarm_proto::{
     ids::{StageRef, WorkerId},
@@ -15,7 +17,7 @@ impl Core {
         let waiting: Vec<StageRef> = self
             .stages
             .iter()
-            .filter(|(_, e)| e.stage.pending_tasks() > 0 || e.free != Some(0))
+            .filter(|(_, e)| e.waits())
             .map(|(id, _)| *id)
             .collect();
         for stage in &waiting {
@@ -24,22 +26,23 @@ impl Core {
         let hungry: Vec<WorkerId> = self
             .workers
             .iter()
-            .filter(|(_, w)| w.credits > 0 && !w.quarantined)
+            .filter(|(_, w)| w.hungry())
             .map(|(id, _)| *id)
             .collect();
         if hungry.is_empty() {
             return;
         }
-        let waiting: Vec<(StageRef, u64)> = waiting
+        let mut waiting: Vec<(StageRef, u64)> = waiting
             .into_iter()
             .filter(|stage| self.stages[stage].stage.pending_tasks() > 0)
-            .map(|stage| (stage, self.able(stage)))
+            .map(|stage| (stage, self.able(stage, now_ms)))
             .collect();
-        // In rounds, so that the first worker does not take everything.
+        // In rounds, so that the first worker does not take everything; and in order of rank, which each grant changes.
         let mut granted = true;
         while granted {
             granted = false;
             for worker in &hungry {
+                waiting.sort_by_cached_key(|(stage, _)| self.rank(*stage));
                 granted |= waiting
                     .iter()
                     .any(|(stage, able)| self.grant(*stage, *worker, *able, now_ms));
@@ -47,14 +50,65 @@ impl Core {
         }
     }
 
+    /// Who goes first: the higher priority; then whose user has the fewest leases; then which job has; then who came
+    /// first.
+    pub(super) fn rank(&self, id: StageRef) -> impl Ord + use<> {
+        let job = &self.stages[&id].job;
+        (
+            Reverse(job.spec.priority),
+            self.load.of_user(&job.user),
+            self.load.of_job(job.id),
+            id,
+        )
+    }
+
+    pub(super) fn priority(&self, id: StageRef) -> i32 {
+        self.stages[&id].job.spec.priority
+    }
+
+    /// Whether a connected worker may run a stage's tasks now.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    pub(super) fn may_run(
+        &self,
+        id: StageRef,
+        worker: WorkerId,
+        now_ms: i64,
+    ) -> Result<(), String> {
+        let entry = &self.stages[&id];
+        place::may_run(entry.spec(id), &self.workers[&worker].abilities)?;
+        let most = entry.job.spec.limits.max_workers;
+        if most > 0 && !self.load.may_join(id.job, worker, most) {
+            return Err(format!(
+                "limits.max_workers = {most}, and so many work on the job"
+            ));
+        }
+        match entry.trouble.avoids(worker, now_ms) {
+            Some(ms) if self.another(id, worker, now_ms) => Err(format!(
+                "tasks of the stage failed on it one after another; it is passed over for another {} min",
+                ms / 60_000 + 1
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether a worker other than this one may run a stage, and has not failed at it.
+    fn another(&self, id: StageRef, than: WorkerId, now_ms: i64) -> bool {
+        let entry = &self.stages[&id];
+        self.workers.iter().any(|(worker, w)| {
+            *worker != than
+                && !w.drains
+                && entry.trouble.avoids(*worker, now_ms).is_none()
+                && place::may_run(entry.spec(id), &w.abilities).is_ok()
+        })
+    }
+
     /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
     fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let who = &self.workers[&worker];
-        if who.credits == 0
-            || who.quarantined
-            || place::may_run(&entry.job.spec, &who.abilities).is_err()
-        {
+        if !who.hungry() || self.may_run(id, worker, now_ms).is_err() {
             return false;
         }
         // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
@@ -84,6 +138,7 @@ impl Core {
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
         self.leases.insert(granted.id, id);
+        self.load.begun(granted.id, &entry.job, worker);
         let lease = Lease {
             lease: granted.lease(),
             job: id.job,
@@ -91,23 +146,22 @@ impl Core {
             hi: granted.hi,
             skip: Vec::new(),
             ttl_ms: self.settings.lease_ms,
-            spec: (*entry.job.spec).clone(),
+            stage: entry.spec(id).only(granted.lo, granted.hi),
+            ordinal: id.stage,
+            key: self.sets[entry.set].key,
         };
         self.say.push((who.session, Say::Lease(Box::new(lease))));
         let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))
             .tasks(granted.lo, granted.hi)
             .worker(who.name.clone());
-        self.event(now_ms, id.job, EventKind::Leased, about);
+        self.event(now_ms, id, EventKind::Leased, about);
         true
     }
 
     /// Number of connected workers that may run a stage's tasks.
-    fn able(&self, id: StageRef) -> u64 {
-        let spec = &self.stages[&id].job.spec;
-        self.workers
-            .values()
-            .filter(|w| place::may_run(spec, &w.abilities).is_ok())
-            .count() as u64
+    fn able(&self, id: StageRef, now_ms: i64) -> u64 {
+        let able = |worker: &&WorkerId| self.may_run(id, **worker, now_ms).is_ok();
+        self.workers.keys().filter(able).count() as u64
     }
 
     /// Where workers are connected but none may run a job, its history says why, once for each reason.
@@ -116,7 +170,7 @@ impl Core {
         let mut reasons = self
             .workers
             .values()
-            .map(|w| (&w.name, place::may_run(&entry.job.spec, &w.abilities)));
+            .map(|w| (&w.name, place::may_run(entry.spec(id), &w.abilities)));
         let Some((name, Err(reason))) = reasons.next() else {
             return;
         };
@@ -132,7 +186,7 @@ impl Core {
         let message = format!("no connected worker may run this job: {reason}");
         self.event(
             now_ms,
-            id.job,
+            id,
             EventKind::Waiting,
             About::message(message).worker(name),
         );

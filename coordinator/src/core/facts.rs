@@ -6,7 +6,7 @@ use picofarm_proto::{
 };
 
 use super::{Core, StageEntry, WorkerEntry};
-use crate::{explain::Candidate, place};
+use crate::explain::Candidate;
 
 /// What the house knows at this moment.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,14 +37,25 @@ pub(crate) struct JobLook {
 impl Core {
     /// What is known now.
     pub(crate) fn look(&self) -> Look {
-        let mut jobs: Vec<JobId> = self.stages.keys().map(|stage| stage.job).collect();
-        jobs.dedup();
+        let mut stages: Vec<StageRef> = self.stages.keys().copied().collect();
+        stages.sort_by_cached_key(|id| self.rank(*id));
+        let mut jobs: Vec<JobId> = Vec::new();
+        for stage in stages {
+            if !jobs.contains(&stage.job) {
+                jobs.push(stage.job);
+            }
+        }
         let workers = self.workers.iter().map(|(id, worker)| ConnectedWorker {
             id: id.to_string(),
             name: worker.name.clone(),
             version: worker.version.clone(),
-            renderer: worker.abilities.renderer.clone(),
-            cores: worker.cores,
+            renderer: worker
+                .abilities
+                .kinds
+                .get("render")
+                .cloned()
+                .unwrap_or_default(),
+            cores: worker.abilities.cores,
             leases: u32::try_from(worker.leases.len()).unwrap_or(u32::MAX),
             tasks: self.tasks_of(worker),
             since_ms: worker.since_ms,
@@ -75,9 +86,24 @@ impl Core {
             .sum()
     }
 
-    /// What is known with regard to a job, and to one of its tasks.
-    pub(crate) fn look_at(&self, job: JobId, task: Option<u64>) -> JobLook {
-        let here = StageRef { job, stage: 0 };
+    /// What is known with regard to a stage (of a job as a whole: the first that has tasks waiting), and to one of its
+    /// tasks.
+    pub(crate) fn look_at(
+        &self,
+        job: JobId,
+        stage: Option<u32>,
+        task: Option<u64>,
+        now_ms: i64,
+    ) -> JobLook {
+        let waits = |e: &StageEntry| e.waits() && (e.stage.pending_tasks() > 0 || e.free > Some(0));
+        let stage = stage.or_else(|| {
+            let mut of_job = self.stages.iter().filter(|(id, _)| id.job == job);
+            of_job.find(|(_, e)| waits(e)).map(|(id, _)| id.stage)
+        });
+        let here = StageRef {
+            job,
+            stage: stage.unwrap_or(0),
+        };
         let Some(entry) = self.stages.get(&here) else {
             return JobLook {
                 elsewhere: self.elsewhere,
@@ -86,28 +112,31 @@ impl Core {
         };
         let candidates: Vec<Candidate> = self
             .workers
-            .values()
-            .map(|worker| Candidate {
+            .iter()
+            .map(|(id, worker)| Candidate {
                 name: worker.name.clone(),
-                may_run: place::may_run(&entry.job.spec, &worker.abilities),
+                may_run: match worker.drains {
+                    true => Err("it has been told to end".into()),
+                    false => self.may_run(here, *id, now_ms),
+                },
                 idle: worker.credits > 0,
                 quarantined: worker.quarantined,
             })
             .collect();
-        let waits =
-            |e: &StageEntry| e.stage.pending_tasks() > 0 || e.free.is_none_or(|free| free > 0);
-        let able = |e: &StageEntry| {
-            self.workers.values().any(|w| {
-                place::may_run(&entry.job.spec, &w.abilities).is_ok()
-                    && place::may_run(&e.job.spec, &w.abilities).is_ok()
+        let able = |other: StageRef| {
+            self.workers.keys().any(|w| {
+                self.may_run(here, *w, now_ms).is_ok() && self.may_run(other, *w, now_ms).is_ok()
             })
         };
-        let mut ahead: Vec<JobId> = self
+        let rank = self.rank(here);
+        let mut first: Vec<StageRef> = self
             .stages
-            .range(..here)
-            .filter(|(_, e)| waits(e) && able(e))
-            .map(|(id, _)| id.job)
+            .iter()
+            .filter(|(id, e)| id.job != job && waits(e) && self.rank(**id) < rank && able(**id))
+            .map(|(id, _)| *id)
             .collect();
+        first.sort_by_cached_key(|id| self.rank(*id));
+        let mut ahead: Vec<JobId> = first.into_iter().map(|id| id.job).collect();
         ahead.dedup();
         JobLook {
             candidates,

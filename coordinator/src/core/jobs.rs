@@ -1,12 +1,15 @@
 //! Submission, the end of jobs, and what is known of them here.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use picofarm_catalog::{Job, JobRecord, NewEvent, Range, ResultSet, Run, Timing};
 use picofarm_proto::{
     ids::{JobId, StageRef},
     key::spec_hash,
-    model::{EventKind, JobSpec, JobState, JobStatus, RunningTask, SpecError},
+    model::{
+        EventKind, JobSpec, JobState, JobStatus, RunningTask, SpecError, StageSpec, StageState,
+        StageStatus,
+    },
 };
 
 use super::{Core, Say};
@@ -21,20 +24,26 @@ pub(crate) struct Prepared {
     pub events: Vec<NewEvent>,
 }
 
-/// Checks that no job has put scenes of other settings into the data set that `spec` names: their keys would be the
+/// Checks that no job has put scenes of other settings into the data set that a stage names: their keys would be the
 /// same, their bytes not. `others` are the jobs that write there.
 ///
 /// # Errors
 /// [`SpecError`] at `output.dataset` that names the job and the first setting that differs.
-pub(crate) fn place_is_free(spec: &JobSpec, others: &[Job]) -> Result<(), SpecError> {
-    let set = ResultSet::of(spec);
+pub(crate) fn place_is_free(stage: &StageSpec, others: &[Job]) -> Result<(), SpecError> {
+    let set = ResultSet::of(stage);
     for other in others {
-        if ResultSet::of(&other.spec).stage_key != set.stage_key {
-            let what = plan::difference(&other.spec, spec).unwrap_or_default();
+        for there in &other.spec.stages {
+            let theirs = ResultSet::of(there);
+            if (&theirs.store, &theirs.dataset) != (&set.store, &set.dataset)
+                || theirs.stage_key == set.stage_key
+            {
+                continue;
+            }
+            let changes = plan::changes(there, stage).join(", ");
             return Err(SpecError::new(
                 "output.dataset",
                 format!(
-                    "{:?} in {} holds scenes of job {} ({:?}) with other settings{what}; \
+                    "{:?} in {} holds scenes of job {} ({:?}) with other settings: {changes}; \
                      name another data set, or use that job's settings",
                     set.dataset, set.store, other.id, other.spec.name
                 ),
@@ -51,8 +60,14 @@ pub(crate) fn stands_for(latest: Option<Job>, again: bool) -> Option<Job> {
 }
 
 impl Core {
-    /// Lays a job out as ranges, given the outputs that exist.
-    pub(crate) fn prepare(&mut self, spec: JobSpec, existing: &[Run], now_ms: i64) -> Prepared {
+    /// Lays a job out as ranges, given the outputs that exist, by stage.
+    pub(crate) fn prepare(
+        &mut self,
+        spec: JobSpec,
+        user: String,
+        existing: &[Vec<Run>],
+        now_ms: i64,
+    ) -> Prepared {
         let id = JobId::from_uuid((self.make_id)());
         let job = Job {
             id,
@@ -61,22 +76,28 @@ impl Core {
             state: JobState::Active,
             submitted_ms: now_ms,
             ended_ms: None,
+            paused: false,
+            user,
         };
         let mut ranges = Vec::new();
-        let mut total = 0;
-        for stage in job.stages() {
-            total += stage.tasks;
+        let mut reused = Vec::new();
+        let (mut total, mut there) = (0, 0);
+        for (stage, existing) in job.stages().into_iter().zip(existing) {
+            let existing: &[Run] = if stage.force { &[] } else { existing };
             let mut ids = Self::range_id(&mut self.make_id);
             ranges.extend(plan::expand(stage.id, stage.tasks, existing, &mut ids));
+            total += stage.tasks;
+            there += existing.iter().map(|r| r.hi - r.lo).sum::<u64>();
+            reused.extend(existing.iter().map(|run| (stage.id.stage, *run)));
         }
-        let reused: u64 = existing.iter().map(|r| r.hi - r.lo).sum();
-        let message = format!("{total} tasks, {} to run", total - reused);
+        let message = format!("{total} tasks, {} to run", total - there);
         let mut events = vec![NewEvent::of(id, now_ms, EventKind::Submitted, message)];
-        for run in existing {
+        for (stage, run) in reused {
             let message = format!("outputs of tasks {}..{} exist already", run.lo, run.hi);
             let event = NewEvent::of(id, now_ms, EventKind::Reused, message);
             events.push(NewEvent {
-                tasks: Some(*run),
+                stage: Some(stage),
+                tasks: Some(run),
                 ..event
             });
         }
@@ -85,6 +106,27 @@ impl Core {
             ranges,
             events,
         }
+    }
+
+    /// A job is held, or goes on: what is pending goes back, what runs goes on.
+    pub(crate) fn paused(&mut self, job: JobId, paused: bool) {
+        for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
+            entry.job.paused = paused;
+            entry.free = None;
+            if paused {
+                entry.stage.give_pending(&mut self.changes);
+            }
+        }
+    }
+
+    /// Jobs whose time is over.
+    pub(crate) fn overdue(&self, now_ms: i64) -> BTreeMap<JobId, String> {
+        let late = self.stages.iter().filter(|(_, entry)| {
+            let deadline = entry.deadline_ms;
+            deadline.is_some_and(|at| at <= now_ms)
+        });
+        late.map(|(id, entry)| (id.job, entry.job.spec.limits.deadline.clone()))
+            .collect()
     }
 
     /// A job that is no longer active: its leases are revoked, what is not done goes back to the catalog.
@@ -127,20 +169,26 @@ impl Core {
 
     /// A job as people see it.
     pub(crate) fn status(&self, record: JobRecord, now_ms: i64) -> JobStatus {
+        let counts = record.counts();
         let JobRecord {
             job,
-            counts,
+            stages,
             timing,
         } = record;
         let mut running = Vec::new();
         let mut mean = timing.mean();
-        for (_, entry) in self.stages.iter().filter(|(id, _)| id.job == job.id) {
-            mean = self.sets[entry.set].timing.mean();
+        for (id, entry) in self.stages.iter().filter(|(id, _)| id.job == job.id) {
+            // Of the stages that run, the last: the others are nearly done.
+            let runs = stages.get(id.stage as usize);
+            if runs.is_some_and(|s| s.state == StageState::Open) {
+                mean = self.sets[entry.set].timing.mean();
+            }
             for (range, lease) in entry.stage.leased() {
                 let Some(tasks) = self.progress.get(&range.id) else {
                     continue;
                 };
                 running.extend(tasks.iter().map(|(index, progress)| RunningTask {
+                    stage: id.stage,
                     index: *index,
                     worker: self.name_of(lease.worker),
                     fraction: progress.fraction,
@@ -148,7 +196,8 @@ impl Core {
                 }));
             }
         }
-        running.sort_by_key(|r| r.index);
+        running.sort_by_key(|r| (r.stage, r.index));
+        let stages = job.spec.stages.iter().zip(stages);
         JobStatus {
             id: job.id,
             name: job.spec.name.clone(),
@@ -156,7 +205,25 @@ impl Core {
             tasks: counts,
             submitted_at_ms: job.submitted_ms,
             ended_at_ms: job.ended_ms,
-            spec: (*job.spec).clone(),
+            paused: job.paused && job.state == JobState::Active,
+            user: job.user,
+            stages: stages
+                .map(|(spec, stage)| StageStatus {
+                    name: spec.name.clone(),
+                    kind: spec.task.kind().to_owned(),
+                    state: stage.state,
+                    needs: spec.needs.clone(),
+                    tasks: stage.counts,
+                })
+                .collect(),
+            spec: JobSpec {
+                name: job.spec.name.clone(),
+                priority: job.spec.priority,
+                limits: job.spec.limits.clone(),
+                nonce: job.spec.nonce.clone(),
+                // Lists of files may be long.
+                stages: job.spec.stages.iter().map(|s| s.only(0, 0)).collect(),
+            },
             mean_task_seconds: mean,
             running,
             workers: self.connected() + self.elsewhere,

@@ -2,7 +2,7 @@
 
 use picofarm_catalog::{Exception, Mark, Range, RangeState};
 use picofarm_proto::{
-    ids::{LeaseRef, RangeId},
+    ids::{LeaseRef, RangeId, WorkerId},
     model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
@@ -43,7 +43,7 @@ impl Core {
             let about = About::message(reason)
                 .tasks(range.lo, range.hi)
                 .worker(self.session_name(session));
-            self.event(now_ms, range.stage.job, EventKind::Released, about);
+            self.event(now_ms, range.stage, EventKind::Released, about);
             self.close(&range, false);
         });
         self.acknowledge(session, lease, 0, verdict);
@@ -122,7 +122,7 @@ impl Core {
             self.say.push((entry.session, revoke));
         }
         let about = About::message(why).tasks(range.lo, range.hi).worker(&*name);
-        self.event(now_ms, range.stage.job, EventKind::Expired, about);
+        self.event(now_ms, range.stage, EventKind::Expired, about);
         let todo = |task: &u64| to_do(range, *task);
         let mut in_hand: Vec<u64> = self
             .progress
@@ -177,6 +177,13 @@ impl Core {
             &self.settings.backoff,
             now_ms,
         );
+        if kind != FailureKind::Interrupted
+            && let Some(id) = self.leases_worker(range)
+        {
+            let entry = self.stages.get_mut(&range.stage).expect("as above");
+            entry.trouble.failed(id, task, now_ms);
+        }
+        let entry = self.stages.get_mut(&range.stage).expect("as above");
         let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
         if let Some(exception) = verdict.exception {
             self.changes
@@ -199,7 +206,7 @@ impl Core {
             None => EventKind::Dead,
         };
         let about = About::message(message).task(task).worker(worker);
-        self.event(now_ms, range.stage.job, kind, about);
+        self.event(now_ms, range.stage, kind, about);
     }
 
     /// Ends a lease; what is not done becomes pending.
@@ -247,9 +254,18 @@ impl Core {
         }
     }
 
+    /// Who holds a leased range.
+    fn leases_worker(&self, range: &Range) -> Option<WorkerId> {
+        match &range.state {
+            RangeState::Leased(lease) => Some(lease.worker),
+            _ => None,
+        }
+    }
+
     /// Forgets a lease.
     pub(super) fn lease_over(&mut self, id: RangeId) {
         self.leases.remove(&id);
+        self.load.over(id);
         self.progress.remove(&id);
         for worker in self.workers.values_mut() {
             if worker.leases.remove(&id) && worker.leases.is_empty() {
@@ -259,7 +275,7 @@ impl Core {
     }
 
     /// A leased range.
-    fn range(&self, id: RangeId) -> Option<&Range> {
+    pub(super) fn range(&self, id: RangeId) -> Option<&Range> {
         let stage = self.leases.get(&id)?;
         self.stages[stage].stage.leased_range(id)
     }

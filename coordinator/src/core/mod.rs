@@ -9,24 +9,28 @@ mod dispatch;
 mod facts;
 mod jobs;
 mod leases;
+mod load;
 mod sessions;
 mod supply;
 #[cfg(test)]
 mod tests;
+mod trouble;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{
-    Changes, Exception, Job, JobEnd, NewEvent, ResultSet, Run, Snapshot, Timing,
+    Changes, Exception, Job, NewEvent, ResultSet, Run, Settled, Snapshot, Timing,
 };
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::StageKey,
-    model::{EventKind, Lease},
+    model::{Abilities, EventKind, Lease, StageSpec},
 };
 use uuid::Uuid;
 
-use crate::{budget::Backoff, place::Abilities, stage::Stage};
+use crate::{budget::Backoff, stage::Stage};
+use load::Load;
+use trouble::Trouble;
 
 pub(crate) use commit::OutputHint;
 pub(crate) use facts::{JobLook, Look};
@@ -67,6 +71,13 @@ pub(crate) enum Say {
         lease: LeaseRef,
         reason: String,
     },
+    /// Of this lease, tasks from `hi` on are another's.
+    Trim {
+        lease: LeaseRef,
+        hi: u64,
+    },
+    /// Finish what is in hand, and end.
+    Drain,
     /// The session ends; a newer one has taken its place.
     Replaced,
 }
@@ -84,6 +95,21 @@ struct StageEntry {
     ask_at_ms: i64,
     /// Why no connected worker may run it, as last told.
     waiting: Option<String>,
+    /// The workers on which its tasks failed.
+    trouble: Trouble,
+    /// When its job is given up, Unix milliseconds.
+    deadline_ms: Option<i64>,
+}
+
+impl StageEntry {
+    fn spec(&self, id: StageRef) -> &StageSpec {
+        &self.job.spec.stages[id.stage as usize]
+    }
+
+    /// Whether it has or may have tasks to be given out now.
+    fn waits(&self) -> bool {
+        !self.job.paused && (self.stage.pending_tasks() > 0 || self.free != Some(0))
+    }
 }
 
 /// Jobs that share outputs.
@@ -97,7 +123,6 @@ struct WorkerEntry {
     incarnation: Incarnation,
     name: String,
     version: String,
-    cores: u32,
     /// When its session began.
     since_ms: i64,
     abilities: Abilities,
@@ -105,6 +130,15 @@ struct WorkerEntry {
     leases: BTreeSet<RangeId>,
     /// It holds a range under suspicion and gets nothing else.
     quarantined: bool,
+    /// It has been told to end, and gets nothing more.
+    drains: bool,
+}
+
+impl WorkerEntry {
+    /// Whether it may be given leases now.
+    fn hungry(&self) -> bool {
+        self.credits > 0 && !self.quarantined && !self.drains
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -127,6 +161,8 @@ pub(crate) struct Core {
     names: HashMap<WorkerId, String>,
     /// The stage of each leased range.
     leases: BTreeMap<RangeId, StageRef>,
+    /// Who works on which job.
+    load: Load,
     /// Tasks in hand, by lease, as last reported.
     progress: BTreeMap<RangeId, BTreeMap<u64, Progress>>,
     /// Houses alive, this one too.
@@ -163,6 +199,7 @@ impl Core {
                 .map(|w| (w.id, w.name))
                 .collect(),
             leases: BTreeMap::new(),
+            load: Load::default(),
             progress: BTreeMap::new(),
             houses: 1,
             elsewhere: 0,
@@ -202,14 +239,22 @@ impl Core {
                     free: None,
                     ask_at_ms: 0,
                     waiting: None,
+                    trouble: Trouble::default(),
+                    deadline_ms: job.spec.limits.deadline_ms().ok().flatten(),
                 },
             );
         }
     }
 
-    /// Takes note of jobs that have ended.
-    pub(crate) fn ended(&mut self, ends: &[JobEnd]) {
-        for end in ends {
+    /// Takes note of stages that may begin and of jobs that have ended.
+    pub(crate) fn settled(&mut self, settled: &Settled) {
+        for id in &settled.opened {
+            if let Some(entry) = self.stages.get_mut(id) {
+                entry.free = None;
+                entry.ask_at_ms = 0;
+            }
+        }
+        for end in &settled.ends {
             tracing::info!(job = %end.job, state = ?end.state, "job ended");
             self.stages.retain(|id, _| id.job != end.job);
         }
@@ -240,10 +285,10 @@ impl Core {
     }
 
     /// Notes a line of history. Neighbouring tasks that a worker finished in one batch share a line.
-    fn event(&mut self, at_ms: i64, job: JobId, kind: EventKind, about: About) {
+    fn event(&mut self, at_ms: i64, stage: StageRef, kind: EventKind, about: About) {
         if let (Some(last), Some(tasks)) = (self.changes.events.last_mut(), about.tasks)
             && matches!(kind, EventKind::Committed | EventKind::Reused)
-            && (last.kind, last.job) == (kind, job)
+            && (last.kind, last.job, last.stage) == (kind, stage.job, Some(stage.stage))
             && last.worker == about.worker
             && last.message == about.message
             && let Some(before) = last.tasks.as_mut().filter(|t| t.hi == tasks.lo)
@@ -254,7 +299,8 @@ impl Core {
         }
         self.changes.events.push(NewEvent {
             at_ms,
-            job,
+            job: stage.job,
+            stage: Some(stage.stage),
             kind,
             tasks: about.tasks,
             worker: about.worker,
@@ -263,11 +309,11 @@ impl Core {
         });
     }
 
-    /// Where nothing of a stage is in hand any more, its job may be over.
+    /// Where nothing of a stage is in hand any more, it may be over.
     fn perhaps_over(&mut self, stage: StageRef, now_ms: i64) {
         let empty = self.stages.get(&stage).is_none_or(|e| e.stage.is_empty());
         if empty {
-            self.changes.perhaps_over.insert(stage.job, now_ms);
+            self.changes.perhaps_over.insert(stage, now_ms);
         }
     }
 

@@ -4,7 +4,6 @@ use picofarm_catalog::{Range, Worker};
 use picofarm_proto::{ids::LeaseRef, model::WorkerHello};
 
 use super::{Core, Say, SessionId, WorkerEntry};
-use crate::place::Abilities;
 
 impl Core {
     /// A worker connects. Leases it still holds live on; those it does not know of become pending again; those
@@ -51,15 +50,12 @@ impl Core {
                 incarnation: hello.incarnation,
                 name: hello.name,
                 version: hello.version,
-                cores: hello.cores,
                 since_ms: now_ms,
-                abilities: Abilities {
-                    renderer: hello.renderer,
-                    assets: hello.assets,
-                },
+                abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),
                 quarantined: false,
+                drains: false,
             },
         );
         self.keep_held(session, &hello.held, mine, now_ms);
@@ -104,6 +100,19 @@ impl Core {
                 n => entry.credits.saturating_add(n),
             };
         }
+    }
+
+    /// Workers of this id or name are told to finish what is in hand and to end; returns how many there are.
+    pub(crate) fn drain(&mut self, worker: &str) -> u32 {
+        let mut told = 0;
+        for (id, entry) in &mut self.workers {
+            if entry.name == worker || id.to_string() == worker {
+                entry.drains = true;
+                self.say.push((entry.session, Say::Drain));
+                told += 1;
+            }
+        }
+        told
     }
 
     /// A session has ended. Leases that were not given back live on for a moment: the worker may come back. If its

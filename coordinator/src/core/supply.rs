@@ -16,41 +16,68 @@ const AHEAD: u64 = 2;
 const ASK_AGAIN_MS: i64 = 100;
 
 impl Core {
-    /// The pending tasks that connected workers could run now and that are not in hand.
+    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one priority share: the
+    /// first in rank are asked for as many as there are leases wanted. Those of lower priority get their turn when the
+    /// others have nothing left.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
+        let mut ranked: Vec<StageRef> = self
+            .stages
+            .iter()
+            .filter(|(_, entry)| entry.waits())
+            .map(|(id, _)| *id)
+            .collect();
+        ranked.sort_by_cached_key(|id| self.rank(*id));
         let mut wants = Vec::new();
-        for (id, entry) in &self.stages {
-            if entry.free == Some(0) || entry.ask_at_ms > now_ms {
-                continue;
+        let mut covered = 0;
+        for level in ranked.chunk_by(|a, b| self.priority(*a) == self.priority(*b)) {
+            let hungry: Vec<_> = level
+                .iter()
+                .map(|id| (*id, self.appetite(*id, now_ms)))
+                .filter(|(_, appetite)| appetite.leases > covered)
+                .collect();
+            let most = hungry.iter().map(|(_, a)| a.leases - covered).max();
+            let sharing = most.unwrap_or(0).min(hungry.len() as u64).max(1);
+            let mut found = 0;
+            for (id, appetite) in hungry.into_iter().take(sharing as usize) {
+                let entry = &self.stages[&id];
+                let leases = (appetite.leases - covered).div_ceil(sharing);
+                let have = entry.stage.pending_tasks();
+                let size = self.lease_size(entry, appetite.able, u64::MAX);
+                let short = have < leases * size || entry.stage.front(now_ms, true).is_none();
+                if short && entry.free != Some(0) && entry.ask_at_ms <= now_ms {
+                    wants.push(Want {
+                        stage: id,
+                        tasks: AHEAD * leases * size,
+                        now_ms,
+                        force: entry.spec(id).force,
+                    });
+                }
+                let there = entry
+                    .free
+                    .map_or(u64::MAX, |free| (free + have).div_ceil(size));
+                found += there.min(leases);
             }
-            let may_run =
-                |w: &&super::WorkerEntry| place::may_run(&entry.job.spec, &w.abilities).is_ok();
-            let able = self.workers.values().filter(may_run).count() as u64;
-            let credits: u64 = self
-                .workers
-                .values()
-                .filter(may_run)
-                .filter(|w| !w.quarantined)
-                .map(|w| u64::from(w.credits))
-                .sum();
-            if credits == 0 {
-                continue;
-            }
-            let have = entry.stage.pending_tasks();
-            let size = self.lease_size(entry, able, u64::MAX);
-            if have < credits * size || entry.stage.front(now_ms, true).is_none() {
-                wants.push(Want {
-                    stage: *id,
-                    tasks: AHEAD * credits * size,
-                    now_ms,
-                });
-            }
-            // Others get their turn when this one has nothing left.
-            if entry.free.is_none_or(|free| free + have >= credits * size) {
+            covered += found;
+            if most.is_some_and(|most| found >= most) {
                 break;
             }
         }
         wants
+    }
+
+    /// Workers that may run a stage now, and the leases they ask for.
+    fn appetite(&self, id: StageRef, now_ms: i64) -> Appetite {
+        let mut appetite = Appetite { able: 0, leases: 0 };
+        for (worker, entry) in &self.workers {
+            if self.may_run(id, *worker, now_ms).is_err() {
+                continue;
+            }
+            appetite.able += 1;
+            if entry.hungry() {
+                appetite.leases += u64::from(entry.credits);
+            }
+        }
+        appetite
     }
 
     /// Tasks of the next lease of a stage, at most `in_range`.
@@ -91,7 +118,7 @@ impl Core {
                 )
                 .expect("pending tasks can be settled");
             let about = About::message("the outputs exist already").tasks(run.lo, run.hi);
-            self.event(now_ms, stage.job, EventKind::Reused, about);
+            self.event(now_ms, stage, EventKind::Reused, about);
             self.perhaps_over(stage, now_ms);
         }
     }
@@ -107,8 +134,9 @@ impl Core {
             let id = range.id;
             match self.stages.get_mut(&range.stage) {
                 Some(entry) => {
-                    if matches!(range.state, RangeState::Leased(_)) {
+                    if let RangeState::Leased(lease) = &range.state {
                         self.leases.insert(id, range.stage);
+                        self.load.begun(id, &entry.job, lease.worker);
                     }
                     entry.stage.receive(range, &mut self.changes);
                     self.renew(id, now_ms);
@@ -138,14 +166,16 @@ impl Core {
             .stages
             .keys()
             .map(|stage| stage.job)
-            .filter(|job| !news.active.contains(job))
+            .filter(|job| !news.active.contains_key(job))
             .collect();
         for job in over {
             self.drop_job(job, "the job was stopped");
         }
         for (id, entry) in &mut self.stages {
             entry.free = Some(news.free.get(id).copied().unwrap_or(0));
+            entry.job.paused = news.active.get(&id.job).copied().unwrap_or(false);
         }
+        self.load.hear_elsewhere(news.busy);
         if let Some(leased) = &news.leased {
             let lost: Vec<_> = self
                 .leases
@@ -162,9 +192,16 @@ impl Core {
             }
         }
         self.receive(news.taken, now_ms);
-        let unknown = news.active.into_iter().filter(|job| !self.knows(*job));
+        let active = news.active.into_keys();
+        let unknown = active.filter(|job| !self.knows(*job));
         unknown.collect()
     }
+}
+
+/// What connected workers ask of a stage.
+struct Appetite {
+    able: u64,
+    leases: u64,
 }
 
 /// The pieces of a range whose job is not active, as the catalog keeps them.

@@ -13,8 +13,8 @@ use picofarm_catalog::{
 use picofarm_proto::{
     PROTOCOL,
     ids::{HouseId, Incarnation, JobId, WorkerId},
-    key::{stage_key, task_key},
-    model::{Failure, FailureKind, Finished, JobSpec, JobState, Lease, WorkerHello},
+    key::task_key,
+    model::{Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, WorkerHello},
 };
 use proptest::prelude::*;
 use uuid::Uuid;
@@ -53,6 +53,8 @@ enum Op {
     /// A house's time runs out while it sleeps.
     HouseIsLost(u8),
     Retry,
+    /// The first job is held, or goes on.
+    Pause(bool),
     Cancel,
     /// A second job over the same outputs.
     Grow,
@@ -76,14 +78,19 @@ fn op() -> impl Strategy<Value = Op> {
         1 => h.prop_map(Op::HouseRestarts),
         1 => h.prop_map(Op::HouseIsLost),
         1 => Just(Op::Retry),
+        1 => any::<bool>().prop_map(Op::Pause),
         1 => prop_oneof![9 => Just(Op::Grow), 1 => Just(Op::Cancel)],
     ]
 }
 
 fn spec(count: u64) -> JobSpec {
+    // The second stage needs the first.
     serde_json::from_str(&format!(
-        r#"{{"name": "law", "scenes": {{"kind": "primitive", "count": {count}}},
-            "render": {{"renderer": "r"}}, "output": {{"store": "s", "dataset": "d"}}}}"#
+        r#"{{"name": "law", "stage": [
+            {{"scenes": {{"kind": "primitive", "count": {count}}}, "render": {{"renderer": "r"}},
+             "output": {{"store": "s", "dataset": "d"}}}},
+            {{"kind": "reprocess", "source": "render", "reprocess": {{"version": "r"}},
+             "output": {{"store": "s", "dataset": "e"}}}}]}}"#
     ))
     .unwrap()
 }
@@ -129,8 +136,8 @@ struct World {
     now: i64,
     workers: Vec<FakeWorker>,
     next: u128,
-    /// What the model knows to be committed.
-    committed: BTreeMap<u64, String>,
+    /// What the model knows to be committed, by stage and task.
+    committed: BTreeMap<(u32, u64), String>,
     jobs: Vec<JobId>,
 }
 
@@ -184,11 +191,13 @@ impl World {
         if super::stands_for(latest.unwrap(), true).is_some() {
             return;
         }
-        let runs = catalog
-            .output_runs(&ResultSet::of(&spec), count)
-            .await
-            .unwrap();
-        let prepared = self.houses[h].core.prepare(spec, &runs, self.now);
+        let mut runs = Vec::new();
+        for stage in &spec.stages {
+            let set = ResultSet::of(stage);
+            runs.push(catalog.output_runs(&set, count).await.unwrap());
+        }
+        let core = &mut self.houses[h].core;
+        let prepared = core.prepare(spec, "ada".into(), &runs, self.now);
         let recorded = catalog
             .submit(&prepared.job, &prepared.ranges, &prepared.events)
             .await;
@@ -215,10 +224,10 @@ impl World {
         let house = &mut self.houses[h];
         let (changes, say) = house.core.take();
         let written = house.catalog.commit(changes).await;
-        let Some(ended) = self.or_reload(h, written).await else {
+        let Some(settled) = self.or_reload(h, written).await else {
             return Vec::new();
         };
-        self.houses[h].core.ended(&ended);
+        self.houses[h].core.settled(&settled);
         for (session, what) in &say {
             let worker = self
                 .workers
@@ -257,10 +266,13 @@ impl World {
             name: format!("w{w}"),
             version: String::new(),
             protocol: PROTOCOL,
-            cores: 1,
             held: worker.leases.iter().map(|l| l.lease).collect(),
-            renderer: "r".into(),
-            assets: Vec::new(),
+            abilities: Abilities {
+                kinds: ["render", "reprocess"]
+                    .map(|kind| (kind.to_owned(), "r".to_owned()))
+                    .into(),
+                ..Abilities::default()
+            },
         };
         worker.session = None;
         self.flush(h).await;
@@ -276,7 +288,7 @@ impl World {
         let report = Finished {
             lease: lease.lease,
             index,
-            key: task_key(&stage_key(&lease.spec), index),
+            key: task_key(&lease.key, index),
             manifest_sha256: format!("{index:064x}"),
             bytes: 1,
             seconds: 1.0,
@@ -296,7 +308,15 @@ impl World {
             .iter()
             .any(|(_, s)| matches!(s, Say::Acknowledge { accepted: true, .. }));
         if accepted {
-            self.committed.insert(index, report.manifest_sha256);
+            if lease.ordinal == 1 {
+                let made = |task| self.committed.contains_key(&(0, task));
+                assert!(
+                    (0..lease.stage.tasks()).all(made),
+                    "a stage ran before what it needs"
+                );
+            }
+            self.committed
+                .insert((lease.ordinal, index), report.manifest_sha256);
         }
     }
 
@@ -383,10 +403,22 @@ impl World {
                     }
                 }
             }
+            Op::Pause(paused) => {
+                let job = self.jobs[0];
+                self.flush(0).await;
+                let changed = self.houses[0]
+                    .catalog
+                    .pause(job, *paused, "", self.now)
+                    .await;
+                if self.or_reload(0, changed).await == Some(true) {
+                    self.houses[0].core.paused(job, *paused);
+                    self.flush(0).await;
+                }
+            }
             Op::Cancel => {
                 let job = self.jobs[0];
                 self.flush(0).await;
-                let cancelled = self.houses[0].catalog.cancel(job, self.now).await;
+                let cancelled = self.houses[0].catalog.cancel(job, "", self.now).await;
                 if self.or_reload(0, cancelled).await == Some(true) {
                     self.houses[0].core.drop_job(job, "cancelled");
                 }
@@ -421,20 +453,31 @@ impl World {
         let catalog = &self.houses[0].catalog;
         for job in &self.jobs {
             let record = catalog.job(*job).await.unwrap().unwrap();
-            let count = record.job.spec.scenes.count;
-            assert_eq!(record.counts.total, count, "each task stands in one range");
-            let known = self.committed.keys().filter(|t| **t < count).count() as u64;
-            assert!(record.counts.done <= known, "done without an output");
-            if record.job.state == JobState::Done {
-                assert_eq!(record.counts.done, count);
+            for (ordinal, stage) in record.stages.iter().enumerate() {
+                let (counts, count) = (stage.counts, record.job.spec.stages[ordinal].tasks());
+                assert_eq!(counts.total, count, "each task stands in one range");
+                let range = (ordinal as u32, 0)..(ordinal as u32, count);
+                let known = self.committed.range(range).count() as u64;
+                assert!(counts.done <= known, "done without an output");
+                if record.job.state == JobState::Done {
+                    assert_eq!(counts.done, count);
+                }
             }
         }
-        let outputs = catalog
-            .output_runs(&ResultSet::of(&spec(1)), u64::from(u32::MAX))
-            .await
-            .unwrap();
-        let outputs: BTreeSet<u64> = outputs.iter().flat_map(|r| r.lo..r.hi).collect();
-        let known: BTreeSet<u64> = self.committed.keys().copied().collect();
+        let mut outputs = BTreeSet::new();
+        for (ordinal, stage) in spec(1).stages.iter().enumerate() {
+            let set = ResultSet::of(stage);
+            let runs = catalog
+                .output_runs(&set, u64::from(u32::MAX))
+                .await
+                .unwrap();
+            outputs.extend(
+                runs.iter()
+                    .flat_map(|r| r.lo..r.hi)
+                    .map(|t| (ordinal as u32, t)),
+            );
+        }
+        let known: BTreeSet<(u32, u64)> = self.committed.keys().copied().collect();
         assert_eq!(outputs, known, "outputs are exactly what was accepted");
     }
 
@@ -443,6 +486,7 @@ impl World {
         for w in 0..WORKERS {
             self.act(&Op::Drop(w, true)).await;
         }
+        self.act(&Op::Pause(false)).await;
         for turn in 0..400u64 {
             self.act(&Op::Pass(1_200)).await;
             for h in 0..self.houses.len() {
@@ -476,8 +520,10 @@ impl World {
         self.check().await;
         for job in &self.jobs {
             let record = self.houses[0].catalog.job(*job).await.unwrap().unwrap();
-            let (state, counts) = (record.job.state, record.counts);
-            assert!(state == JobState::Cancelled || counts.done + counts.dead == counts.total);
+            let (state, counts) = (record.job.state, record.counts());
+            let stuck = counts.pending > 0 && counts.dead > 0;
+            let over = counts.leased == 0 && (counts.pending == 0 || stuck);
+            assert!(state == JobState::Cancelled || over, "{counts:?}");
         }
         for house in &self.houses {
             house.catalog.close().await;

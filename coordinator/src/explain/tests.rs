@@ -16,6 +16,8 @@ fn facts() -> JobFacts {
     JobFacts {
         job: id(7),
         state: JobState::Active,
+        paused: false,
+        stages: vec![],
         counts: TaskCounts {
             total: 10,
             pending: 10,
@@ -204,6 +206,7 @@ fn every_state_of_a_job_has_an_answer() {
 
 fn event(kind: EventKind, worker: &str, message: &str) -> Event {
     Event {
+        stage: Some(0),
         sequence: 1,
         at_ms: NOW - 5_000,
         job: id(7),

@@ -254,6 +254,11 @@ async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out) -> Result<(), Status> 
                 lease: Some(lease.into()),
                 reason,
             }),
+            Say::Trim { lease, hi } => To::Trim(wire::Trim {
+                lease: Some(lease.into()),
+                hi,
+            }),
+            Say::Drain => To::Drain(wire::Drain {}),
             Say::Replaced => {
                 return Err(Status::aborted(
                     "a newer session of this worker id took over; if that is another worker, give each its own id",

@@ -8,14 +8,14 @@ use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
     ids::JobId,
-    model::{JobSpec, JobState},
+    model::{JobSpec, JobState, StageSpec},
     wire::{self, jobs_server::Jobs},
 };
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, caller, invalid, look, users::UserJobs};
+use super::{Link, caller, invalid, look};
 use crate::{
     VERSION,
     actor::Command,
@@ -32,30 +32,44 @@ const MOST_EVENTS: u32 = 10_000;
 pub(crate) struct JobsService {
     link: Link,
     quotas: Quotas,
-    users: UserJobs,
 }
 
 impl JobsService {
     pub(crate) fn new(link: Link, quotas: Quotas) -> Self {
-        Self {
-            link,
-            quotas,
-            users: UserJobs::default(),
-        }
+        Self { link, quotas }
     }
 
     fn spec(&self, wire: Option<wire::JobSpec>) -> Result<Box<JobSpec>, Status> {
         let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
         let spec = JobSpec::try_from(wire).map_err(invalid)?;
+        spec.check().map_err(|e| invalid(e.into()))?;
         plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
         spec.check_places().map_err(|e| invalid(e.into()))?;
-        let (tasks, most) = (spec.scenes.count, self.quotas.tasks_per_job);
+        let tasks: u64 = spec.stages.iter().map(StageSpec::tasks).sum();
+        let most = self.quotas.tasks_per_job;
         if tasks > most {
             return Err(Status::resource_exhausted(format!(
-                "scenes.count: {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
+                "the job's {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
             )));
         }
         Ok(Box::new(spec))
+    }
+}
+
+impl JobsService {
+    async fn pause(
+        &self,
+        job: JobId,
+        paused: bool,
+        who: &Caller,
+    ) -> Result<wire::JobStatus, Status> {
+        let pause = |reply| Command::Pause {
+            job,
+            paused,
+            who: format!("by {}", who.name),
+            reply,
+        };
+        Ok(self.link.ask(pause).await?.into())
     }
 }
 
@@ -95,17 +109,16 @@ impl Jobs for JobsService {
         let caller = caller(&request);
         let request = request.into_inner();
         let spec = self.spec(request.spec)?;
-        let limit = self.quotas.jobs_per_user;
-        let room = self
-            .users
-            .reserve(&self.link, &caller, limit, &spec)
-            .await?;
-        let again = request.again;
         let submitted = self
             .link
-            .ask(|reply| Command::Submit { spec, again, reply })
+            .ask(|reply| Command::Submit {
+                spec,
+                user: caller.name.to_string(),
+                most: self.quotas.jobs_per_user as u64,
+                again: request.again,
+                reply,
+            })
             .await?;
-        room.filled(submitted.job);
         Ok(Response::new(wire::SubmitJobResponse {
             job_id: submitted.job.to_string(),
             existed: submitted.existed,
@@ -154,11 +167,52 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
-        let id = job_id(&request.into_inner().job_id)?;
-        let job = self.link.ask(|reply| Command::Cancel(id, reply)).await?;
+        let why = format!("by {}", caller(&request).name);
+        let job = job_id(&request.into_inner().job_id)?;
+        let cancel = |reply| Command::Cancel { job, why, reply };
+        let job = self.link.ask(cancel).await?;
         Ok(Response::new(wire::CancelJobResponse {
             job: Some(job.into()),
         }))
+    }
+
+    async fn pause_job(
+        &self,
+        request: Request<wire::PauseJobRequest>,
+    ) -> Result<Response<wire::PauseJobResponse>, Status> {
+        let who = caller(&request);
+        let job = job_id(&request.into_inner().job_id)?;
+        Ok(Response::new(wire::PauseJobResponse {
+            job: Some(self.pause(job, true, &who).await?),
+        }))
+    }
+
+    async fn resume_job(
+        &self,
+        request: Request<wire::ResumeJobRequest>,
+    ) -> Result<Response<wire::ResumeJobResponse>, Status> {
+        let who = caller(&request);
+        let job = job_id(&request.into_inner().job_id)?;
+        Ok(Response::new(wire::ResumeJobResponse {
+            job: Some(self.pause(job, false, &who).await?),
+        }))
+    }
+
+    async fn drain_worker(
+        &self,
+        request: Request<wire::DrainWorkerRequest>,
+    ) -> Result<Response<wire::DrainWorkerResponse>, Status> {
+        let worker = request.into_inner().worker;
+        let workers = self
+            .link
+            .ask(|reply| Command::Drain(worker.clone(), reply))
+            .await?;
+        if workers == 0 {
+            return Err(Status::not_found(format!(
+                "no worker of the name or id {worker:?} is connected to this coordinator; see `picofarm workers`"
+            )));
+        }
+        Ok(Response::new(wire::DrainWorkerResponse { workers }))
     }
 
     async fn retry_job(
@@ -195,6 +249,7 @@ impl Jobs for JobsService {
                 n => n.min(MOST_EVENTS),
             },
             task: request.task,
+            stage: request.stage,
             newest: request.newest,
         };
         let events = self.link.catalog.events(&query).await;
@@ -211,7 +266,7 @@ impl Jobs for JobsService {
     ) -> Result<Response<wire::ExplainJobResponse>, Status> {
         let request = request.into_inner();
         let job = job_id(&request.job_id)?;
-        let explained = look::explain(&self.link, job, request.task).await?;
+        let explained = look::explain(&self.link, job, request.stage, request.task).await?;
         Ok(Response::new(explained))
     }
 

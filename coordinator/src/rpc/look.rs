@@ -1,6 +1,6 @@
 //! Gathering the facts for an explanation.
 
-use picofarm_catalog::{CatalogError, EventQuery, Job, ResultSet};
+use picofarm_catalog::{CatalogError, EventQuery, ResultSet};
 use picofarm_proto::{
     ids::{JobId, StageRef},
     model::Event,
@@ -31,16 +31,31 @@ fn failed(error: CatalogError) -> Status {
 pub(super) async fn explain(
     link: &Link,
     job: JobId,
+    stage: u32,
     task: Option<u64>,
 ) -> Result<wire::ExplainJobResponse, Status> {
     let status = link.ask(|reply| Command::Get(job, reply)).await?;
-    if let Some(task) = task.filter(|task| *task >= status.tasks.total) {
+    let Some(of) = status.stages.get(stage as usize) else {
         return Err(Status::not_found(format!(
-            "job {job} has no task {task}: its {} tasks count from 0",
-            status.tasks.total
+            "job {job} has no stage {stage}: its {} stages count from 0",
+            status.stages.len()
+        )));
+    };
+    if let Some(task) = task.filter(|task| *task >= of.tasks.total) {
+        return Err(Status::not_found(format!(
+            "stage {:?} of job {job} has no task {task}: its {} tasks count from 0",
+            of.name, of.tasks.total
         )));
     }
-    let look = link.ask(|reply| Command::LookAt(job, task, reply)).await?;
+    let look = link
+        .ask(|reply| Command::LookAt {
+            job,
+            stage: task.map(|_| stage),
+            task,
+            reply,
+        })
+        .await?;
+    let here = StageRef { job, stage };
     let now_ms = link.clock.now_ms();
     let JobLook {
         candidates,
@@ -51,6 +66,8 @@ pub(super) async fn explain(
     let reasons = explain::job(&JobFacts {
         job,
         state: status.state,
+        paused: status.paused,
+        stages: status.stages.clone(),
         counts: status.tasks,
         holdups: link.catalog.holdups(job, now_ms).await.map_err(failed)?,
         candidates,
@@ -61,12 +78,11 @@ pub(super) async fn explain(
     let told = match task {
         None => None,
         Some(index) => {
-            let events = history(link, job, index).await?;
-            let stage = StageRef { job, stage: 0 };
-            let record = link.catalog.task(stage, index).await.map_err(failed)?;
+            let events = history(link, here, index).await?;
+            let record = link.catalog.task(here, index).await.map_err(failed)?;
             let made_here = events.iter().any(explain::committed);
             let elsewhere = match &record.output {
-                Some(_) if !made_here => maker(link, job, index).await?,
+                Some(_) if !made_here => maker(link, here, index).await?,
                 _ => None,
             };
             Some(explain::task(TaskFacts {
@@ -74,7 +90,7 @@ pub(super) async fn explain(
                 job,
                 record,
                 events,
-                limits: status.spec.limits,
+                limits: status.spec.limits.clone(),
                 elsewhere,
                 running,
                 now_ms,
@@ -89,9 +105,10 @@ pub(super) async fn explain(
 }
 
 /// The history of a task: its last lines.
-async fn history(link: &Link, job: JobId, task: u64) -> Result<Vec<Event>, Status> {
+async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, Status> {
     let query = EventQuery {
-        job: Some(job),
+        job: Some(stage.job),
+        stage: Some(stage.stage),
         after: 0,
         limit: EVENTS,
         task: Some(task),
@@ -103,23 +120,27 @@ async fn history(link: &Link, job: JobId, task: u64) -> Result<Vec<Event>, Statu
 /// The job with the same results under which a task was handed in, and the line that says so.
 async fn maker(
     link: &Link,
-    job: JobId,
+    stage: StageRef,
     task: u64,
 ) -> Result<Option<(JobId, String, Event)>, Status> {
-    let Some(record) = link.catalog.job(job).await.map_err(failed)? else {
+    let Some(record) = link.catalog.job(stage.job).await.map_err(failed)? else {
         return Ok(None);
     };
-    let set = ResultSet::of(&record.job.spec);
+    let Some(spec) = record.job.spec.stages.get(stage.stage as usize) else {
+        return Ok(None);
+    };
+    let set = ResultSet::of(spec);
     let others = link
         .catalog
         .jobs_at(&set.store, &set.dataset)
         .await
         .map_err(failed)?;
-    let shares = |other: &Job| other.id != job && ResultSet::of(&other.spec) == set;
-    for other in others.iter().filter(|o| shares(o)).take(OTHERS) {
-        let events = history(link, other.id, task).await?;
-        if let Some(event) = events.into_iter().find(explain::committed) {
-            return Ok(Some((other.id, other.spec.name.clone(), event)));
+    for other in others.iter().filter(|o| o.id != stage.job).take(OTHERS) {
+        for theirs in other.stages().into_iter().filter(|s| s.set == set) {
+            let events = history(link, theirs.id, task).await?;
+            if let Some(event) = events.into_iter().find(explain::committed) {
+                return Ok(Some((other.id, other.spec.name.clone(), event)));
+            }
         }
     }
     Ok(None)

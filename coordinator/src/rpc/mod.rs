@@ -3,7 +3,6 @@
 mod farm;
 mod jobs;
 mod look;
-mod users;
 
 use std::sync::Arc;
 
@@ -56,6 +55,7 @@ impl Link {
                 "there is no job {id}; list the jobs to see their ids"
             ))),
             Err(Refusal::Spec(why)) => Err(Status::invalid_argument(why.to_string())),
+            Err(Refusal::TooMany(why)) => Err(Status::resource_exhausted(why)),
             Err(Refusal::NotNow(why)) => Err(Status::failed_precondition(why)),
             Err(Refusal::Catalog(why)) => Err(Status::unavailable(why)),
         }

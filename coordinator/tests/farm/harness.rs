@@ -14,8 +14,8 @@ use picofarm_coordinator::{
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
-    key::{stage_key, task_key},
-    model::{JobSpec, JobState, JobStatus, Lease, WorkerHello},
+    key::task_key,
+    model::{Abilities, JobSpec, JobState, JobStatus, Lease, RenderTask, TaskSpec, WorkerHello},
     wire::{
         self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
         session_response::Message as Heard,
@@ -134,6 +134,7 @@ impl Farm {
 
     pub async fn events(&mut self, job: &str, task: Option<u64>) -> Vec<wire::Event> {
         let request = wire::ListEventsRequest {
+            stage: None,
             job_id: job.into(),
             after: 0,
             limit: 0,
@@ -171,10 +172,15 @@ pub fn hello(name: &str) -> WorkerHello {
         name: name.into(),
         version: VERSION.into(),
         protocol: PROTOCOL,
-        cores: 1,
         held: Vec::new(),
-        renderer: "r1".into(),
-        assets: vec!["parametric-1".into()],
+        abilities: Abilities {
+            kinds: ["render", "reprocess"]
+                .map(|kind| (kind.to_owned(), "r1".to_owned()))
+                .into(),
+            assets: vec!["parametric-1".into()],
+            cores: 1,
+            ..Abilities::default()
+        },
     }
 }
 
@@ -185,6 +191,14 @@ pub fn spec(count: u64) -> JobSpec {
             "output": {{"store": "file:///nowhere", "dataset": "d", "profile": "sqrt-u16"}}}}"#
     );
     serde_json::from_str(&text).unwrap()
+}
+
+/// The rendering of a job's first stage.
+pub fn rendering(spec: &mut JobSpec) -> &mut RenderTask {
+    match &mut spec.stages[0].task {
+        TaskSpec::Render(task) => task,
+        other => panic!("{other:?}"),
+    }
 }
 
 /// The manifest hash that an honest worker reports for a task.
@@ -255,7 +269,7 @@ impl Worker {
         let done = wire::TaskDone {
             lease: Some(lease.lease.into()),
             index,
-            task_key: task_key(&stage_key(&lease.spec), index).to_string(),
+            task_key: task_key(&lease.key, index).to_string(),
             manifest_sha256: manifest.into(),
             bytes: 100,
             seconds: 2.0,

@@ -3,7 +3,7 @@
 use picofarm_proto::{model::JobState, wire};
 use tonic::Code;
 
-use crate::harness::{Farm, hello, spec};
+use crate::harness::{Farm, hello, rendering, spec};
 
 #[tokio::test]
 async fn a_whole_job_completes() {
@@ -46,7 +46,7 @@ async fn a_larger_job_reuses_the_outputs_of_a_smaller_one() {
         .plan
         .unwrap();
     assert_eq!((plan.reuse, plan.run), (8, 8));
-    assert_eq!(plan.reasons.len(), 2);
+    assert_eq!(plan.stages[0].reasons.len(), 2);
     let large = farm.submit(&spec(16)).await.job_id;
     let status = farm.status(&large).await;
     assert_eq!((status.tasks.reused, status.tasks.pending), (8, 8));
@@ -65,7 +65,7 @@ async fn a_job_that_would_mix_settings_in_one_data_set_is_refused() {
     let mut farm = Farm::start().await;
     let first = farm.submit(&spec(2)).await.job_id;
     let mut other = spec(2);
-    other.render.bins += 1;
+    rendering(&mut other).render.bins += 1;
     let request = wire::SubmitJobRequest {
         spec: Some(other.clone().into()),
         again: false,
@@ -76,7 +76,7 @@ async fn a_job_that_would_mix_settings_in_one_data_set_is_refused() {
         assert!(refused.message().contains(part), "{}", refused.message());
     }
     // Another data set is another matter.
-    other.output.dataset = "elsewhere".into();
+    rendering(&mut other).output.dataset = "elsewhere".into();
     assert!(!farm.submit(&other).await.existed);
 }
 
@@ -208,7 +208,7 @@ async fn watching_ends_with_the_job() {
 async fn a_job_for_another_renderer_says_why_it_waits() {
     let mut farm = Farm::start().await;
     let mut other = hello("old");
-    other.renderer = "r0".into();
+    other.abilities.kinds.insert("render".into(), "r0".into());
     let worker = farm.connect(other).await.unwrap();
     worker.credit(1).await;
     let job = farm.submit(&spec(2)).await.job_id;
@@ -227,7 +227,7 @@ async fn a_job_for_another_renderer_says_why_it_waits() {
 async fn what_a_client_must_resolve_is_refused_by_name() {
     let mut farm = Farm::start().await;
     let mut unresolved = spec(2);
-    unresolved.render.renderer.clear();
+    rendering(&mut unresolved).render.renderer.clear();
     let request = wire::SubmitJobRequest {
         spec: Some(unresolved.into()),
         again: false,

@@ -3,8 +3,8 @@
 use super::{ConvertError, finite, parse, required};
 use crate::{
     ids::{Epoch, LeaseRef},
-    key::TaskKey,
-    model::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello},
+    key::{StageKey, TaskKey},
+    model::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello},
     wire,
 };
 
@@ -42,14 +42,19 @@ impl TryFrom<wire::Hello> for WorkerHello {
             name: w.name,
             version: w.version,
             protocol: w.protocol,
-            cores: w.cores,
             held: w
                 .held
                 .into_iter()
                 .map(LeaseRef::try_from)
                 .collect::<Result<_, _>>()?,
-            renderer: w.renderer,
-            assets: w.assets,
+            abilities: Abilities {
+                kinds: w.kinds.into_iter().collect(),
+                assets: w.assets,
+                cores: w.cores,
+                memory_mib: w.memory_mib,
+                gpus: w.gpus,
+                labels: w.labels,
+            },
         })
     }
 }
@@ -62,10 +67,13 @@ impl From<WorkerHello> for wire::Hello {
             name: m.name,
             version: m.version,
             protocol: m.protocol,
-            cores: m.cores,
             held: m.held.into_iter().map(Into::into).collect(),
-            renderer: m.renderer,
-            assets: m.assets,
+            kinds: m.abilities.kinds.into_iter().collect(),
+            assets: m.abilities.assets,
+            cores: m.abilities.cores,
+            memory_mib: m.abilities.memory_mib,
+            gpus: m.abilities.gpus,
+            labels: m.abilities.labels,
         }
     }
 }
@@ -87,7 +95,12 @@ impl TryFrom<wire::Lease> for Lease {
             hi: w.hi,
             skip: w.skip,
             ttl_ms: w.ttl_ms,
-            spec: required(w.spec, "lease.spec")?.try_into()?,
+            stage: super::job::stage(w.stage)?,
+            ordinal: w.ordinal,
+            key: StageKey::parse(&w.stage_key).ok_or(ConvertError::Invalid {
+                field: "lease.stage_key",
+                what: "expected 64 hexadecimal digits".into(),
+            })?,
         })
     }
 }
@@ -101,7 +114,9 @@ impl From<Lease> for wire::Lease {
             hi: m.hi,
             skip: m.skip,
             ttl_ms: m.ttl_ms,
-            spec: Some(m.spec.into()),
+            stage: Some(m.stage.into()),
+            ordinal: m.ordinal,
+            stage_key: m.key.to_string(),
         }
     }
 }

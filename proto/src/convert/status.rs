@@ -2,7 +2,10 @@
 
 use super::{ConvertError, parse, required};
 use crate::{
-    model::{Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, TaskCounts},
+    model::{
+        Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
+        StageStatus, TaskCounts,
+    },
     wire,
 };
 
@@ -38,9 +41,68 @@ enum_pairs!(
     "event.kind",
     [
         Submitted, Leased, Committed, Reused, Failed, Dead, Expired, Released, Cancelled, Retried,
-        Ended, Waiting, Alarm,
+        Ended, Waiting, Alarm, Opened, Paused, Resumed,
     ]
 );
+
+enum_pairs!(
+    StageState,
+    wire::StageState,
+    "stage.state",
+    [Blocked, Open, Done, Failed]
+);
+
+impl From<TaskCounts> for wire::TaskCounts {
+    fn from(m: TaskCounts) -> Self {
+        wire::TaskCounts {
+            total: m.total,
+            done: m.done,
+            reused: m.reused,
+            leased: m.leased,
+            pending: m.pending,
+            dead: m.dead,
+        }
+    }
+}
+
+impl From<wire::TaskCounts> for TaskCounts {
+    fn from(w: wire::TaskCounts) -> Self {
+        TaskCounts {
+            total: w.total,
+            done: w.done,
+            reused: w.reused,
+            leased: w.leased,
+            pending: w.pending,
+            dead: w.dead,
+        }
+    }
+}
+
+impl From<StageStatus> for wire::StageStatus {
+    fn from(m: StageStatus) -> Self {
+        wire::StageStatus {
+            name: m.name,
+            kind: m.kind,
+            state: wire::StageState::from(m.state).into(),
+            needs: m.needs,
+            tasks: Some(m.tasks.into()),
+        }
+    }
+}
+
+impl TryFrom<wire::StageStatus> for StageStatus {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::StageStatus) -> Result<Self, ConvertError> {
+        Ok(StageStatus {
+            state: w.state().try_into()?,
+            name: w.name,
+            kind: w.kind,
+            needs: w.needs,
+            tasks: required(w.tasks, "stage.tasks")?.into(),
+        })
+    }
+}
 
 impl From<JobStatus> for wire::JobStatus {
     fn from(m: JobStatus) -> Self {
@@ -48,14 +110,10 @@ impl From<JobStatus> for wire::JobStatus {
             id: m.id.to_string(),
             name: m.name,
             state: wire::JobState::from(m.state).into(),
-            tasks: Some(wire::TaskCounts {
-                total: m.tasks.total,
-                done: m.tasks.done,
-                reused: m.tasks.reused,
-                leased: m.tasks.leased,
-                pending: m.tasks.pending,
-                dead: m.tasks.dead,
-            }),
+            tasks: Some(m.tasks.into()),
+            paused: m.paused,
+            user: m.user,
+            stages: m.stages.into_iter().map(Into::into).collect(),
             submitted_at_ms: m.submitted_at_ms,
             ended_at_ms: m.ended_at_ms.unwrap_or(0),
             spec: Some(m.spec.into()),
@@ -64,6 +122,7 @@ impl From<JobStatus> for wire::JobStatus {
                 .running
                 .into_iter()
                 .map(|r| wire::RunningTask {
+                    stage: r.stage,
                     index: r.index,
                     worker: r.worker,
                     fraction: r.fraction,
@@ -79,19 +138,18 @@ impl TryFrom<wire::JobStatus> for JobStatus {
     type Error = ConvertError;
 
     fn try_from(w: wire::JobStatus) -> Result<Self, ConvertError> {
-        let tasks = required(w.tasks, "job.tasks")?;
         Ok(JobStatus {
             state: w.state().try_into()?,
             id: parse(&w.id, "job.id")?,
             name: w.name,
-            tasks: TaskCounts {
-                total: tasks.total,
-                done: tasks.done,
-                reused: tasks.reused,
-                leased: tasks.leased,
-                pending: tasks.pending,
-                dead: tasks.dead,
-            },
+            tasks: required(w.tasks, "job.tasks")?.into(),
+            paused: w.paused,
+            user: w.user,
+            stages: w
+                .stages
+                .into_iter()
+                .map(TryInto::try_into)
+                .collect::<Result<_, _>>()?,
             submitted_at_ms: w.submitted_at_ms,
             ended_at_ms: (w.ended_at_ms != 0).then_some(w.ended_at_ms),
             spec: required(w.spec, "job.spec")?.try_into()?,
@@ -100,6 +158,7 @@ impl TryFrom<wire::JobStatus> for JobStatus {
                 .running
                 .into_iter()
                 .map(|r| RunningTask {
+                    stage: r.stage,
                     index: r.index,
                     worker: r.worker,
                     fraction: r.fraction,
@@ -119,7 +178,18 @@ impl From<JobPlan> for wire::JobPlan {
             reuse: m.reuse,
             run: m.run,
             existing_job: m.existing_job.map(|j| j.to_string()).unwrap_or_default(),
-            reasons: m.reasons,
+            stages: m
+                .stages
+                .into_iter()
+                .map(|s| wire::StagePlan {
+                    name: s.name,
+                    kind: s.kind,
+                    total: s.total,
+                    reuse: s.reuse,
+                    run: s.run,
+                    reasons: s.reasons,
+                })
+                .collect(),
         }
     }
 }
@@ -137,7 +207,18 @@ impl TryFrom<wire::JobPlan> for JobPlan {
                 "" => None,
                 id => Some(parse(id, "plan.existing_job")?),
             },
-            reasons: w.reasons,
+            stages: w
+                .stages
+                .into_iter()
+                .map(|s| StagePlan {
+                    name: s.name,
+                    kind: s.kind,
+                    total: s.total,
+                    reuse: s.reuse,
+                    run: s.run,
+                    reasons: s.reasons,
+                })
+                .collect(),
         })
     }
 }
@@ -148,6 +229,7 @@ impl From<Event> for wire::Event {
             sequence: m.sequence,
             at_ms: m.at_ms,
             job_id: m.job.to_string(),
+            stage: m.stage,
             kind: wire::EventKind::from(m.kind).into(),
             task: m.task,
             lo: m.lo,
@@ -168,6 +250,7 @@ impl TryFrom<wire::Event> for Event {
             sequence: w.sequence,
             at_ms: w.at_ms,
             job: parse(&w.job_id, "event.job_id")?,
+            stage: w.stage,
             task: w.task,
             lo: w.lo,
             hi: w.hi,

@@ -1,11 +1,21 @@
-//! A job: which scenes, rendered how, stored where. The TOML job file has exactly these fields; see
-//! [`JobSpec::check`] for their limits and the `Default` impls for what may be left out.
+//! A job: a graph of stages, each of them many tasks of one kind. The TOML job file has exactly these fields; see
+//! [`JobSpec::check`] for their limits, and [`super::file`] for what may be left out or written shorter.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use super::text::{RenderSettingsText, SceneSourceText};
+use super::{
+    file::JobText,
+    render::RenderTask,
+    reprocess::{ReprocessTask, SourceSettings},
+};
+use crate::split::SplitSettings;
+
+/// Most tasks in one job.
+pub const MAX_TASKS: u64 = 100_000_000;
+/// Most stages in one job.
+pub const MAX_STAGES: usize = 1_000;
 
 /// A field of a job that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -29,156 +39,139 @@ impl SpecError {
 
 /// A whole job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "JobText")]
 pub struct JobSpec {
     /// Name, for people.
     pub name: String,
-    /// Which scenes.
-    pub scenes: SceneSource,
-    /// How they are rendered.
-    #[serde(default)]
-    pub render: RenderSettings,
-    /// Where results go.
-    pub output: OutputSettings,
-    /// When a task is given up.
-    #[serde(default)]
+    /// Jobs of a higher priority get workers first (default 0).
+    pub priority: i32,
+    /// When a task, or the job, is given up.
     pub limits: Limits,
+    /// Sets it apart from a job that is otherwise the same; empty but for those that run again what is done.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub nonce: String,
+    /// What is done, in an order in which each stage comes after those that it needs.
+    #[serde(rename = "stage")]
+    pub stages: Vec<StageSpec>,
 }
 
-/// The scenes of a job: one task each.
+/// One step of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "SceneSourceText")]
-pub struct SceneSource {
-    /// Where scenes come from.
+#[serde(try_from = "serde_json::Value")]
+pub struct StageSpec {
+    /// Its name in the job.
+    pub name: String,
+    /// Stages that must be done before this one begins.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub needs: Vec<String>,
+    /// It begins although tasks of the stages that it needs were given up.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub tolerate_dead: bool,
+    /// Its tasks run although their results exist. Equal tasks give equal bytes: this proves it.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub force: bool,
+    /// What a worker must have.
+    #[serde(skip_serializing_if = "Resources::is_none")]
+    pub resources: Resources,
+    /// What its tasks do.
     #[serde(flatten)]
-    pub kind: SceneKind,
-    /// Number of scenes; with `kind = "files"`, the number of files (may be left out).
-    pub count: u64,
-    /// Seed (default 0); scene i derives its own from (seed, i).
-    pub seed: u64,
-    /// Horizontal field of view in degrees (generated scenes; default 90).
-    pub fov_deg: f64,
-    /// Laser spots: 1, 4, 16, 25 (default) or 100 (generated scenes, and files without a laser).
-    pub spots: u32,
+    pub task: TaskSpec,
 }
 
-/// Where scenes come from.
+/// What the tasks of a stage do. A further kind is a variant here, a file under the agent's `execute`, and a line in each
+/// `match` that the compiler then asks for.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
-pub enum SceneKind {
-    /// Furnished rooms.
-    Furnished {
-        /// `parametric`, `sweethome3d`, `auto` (default: whichever is installed; resolved before
-        /// submission), or a resolved fingerprint.
-        assets: String,
-        /// At least this many mirrors a room (default 1).
-        min_specular: u32,
-    },
-    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale.
-    Primitive,
-    /// Scene files (.glb, .gltf, .json), one scene each.
-    Files {
-        /// The files; in a job file, plain paths.
-        files: Vec<SceneFile>,
-    },
+pub enum TaskSpec {
+    /// Scenes are rendered: one task each.
+    Render(RenderTask),
+    /// Scenes of a data set go through a sensor into another: one task each.
+    Reprocess(ReprocessTask),
+    /// The scenes of a data set are divided into training, validation and test: one task.
+    Split(SplitTask),
+    /// A data set is packed for sharing: one task.
+    Export(ExportTask),
 }
 
-/// A scene file, pinned by its content.
+/// Dividing a data set.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SplitTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// How.
+    pub split: SplitSettings,
+}
+
+/// Packing a data set.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ExportTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// What is packed, and where it goes.
+    pub export: ExportSettings,
+}
+
+/// What is packed, and where it goes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "SceneFileText")]
-pub struct SceneFile {
-    /// Path as the workers see it.
-    pub path: String,
-    /// SHA-256 of the content in hexadecimal; empty until submission fills it in.
-    pub sha256: String,
+#[serde(deny_unknown_fields)]
+pub struct ExportSettings {
+    /// A path or URL that every worker can reach.
+    pub dest: String,
+    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub scenes: String,
 }
 
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum SceneFileText {
-    Path(String),
-    Pinned { path: String, sha256: String },
+/// What a worker must have to run a stage's tasks. A worker runs one task at a time with all that it has.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Resources {
+    /// CPU cores.
+    pub cores: u32,
+    /// Memory in GiB (2^30 bytes).
+    pub memory_gib: f64,
+    /// Graphics processors.
+    pub gpus: u32,
+    /// Labels, each of which the worker must have been given.
+    pub labels: Vec<String>,
 }
 
-impl From<SceneFileText> for SceneFile {
-    fn from(text: SceneFileText) -> Self {
-        match text {
-            SceneFileText::Path(path) => Self {
-                path,
-                sha256: String::new(),
-            },
-            SceneFileText::Pinned { path, sha256 } => Self { path, sha256 },
+impl Resources {
+    /// Whether nothing is asked for.
+    pub fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        if !(0.0..=1e6).contains(&self.memory_gib) {
+            return Err(SpecError::new(
+                "resources.memory_gib",
+                format!("{} lies outside 0..=1000000", self.memory_gib),
+            ));
         }
+        for label in &self.labels {
+            check_label(label).map_err(|what| SpecError::new("resources.labels", what))?;
+        }
+        Ok(())
     }
 }
 
-/// How scenes are rendered.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "RenderSettingsText")]
-pub struct RenderSettings {
-    /// Image width and height in pixels.
-    pub resolution: u32,
-    /// ℓ_min, metres of optical path.
-    pub gate_start_m: f64,
-    /// Δ, metres.
-    pub bin_width_m: f64,
-    /// Number of bins.
-    pub bins: u32,
-    /// Multi-bounce work: `samples = N` (paths per pixel) or `error = 0.1` (target).
-    #[serde(flatten)]
-    pub budget: Budget,
-    /// Longest path in bounces; 0 = until the gate ends.
-    pub max_bounces: u32,
-    /// Version of the renderer, part of every task key; filled in at submission where left out.
-    pub renderer: String,
-    /// Subsets of the 10×10 grid of spots that get histograms of their own, from the same rays: 4 and 25, ascending.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub subsets: Vec<u32>,
-    /// Each spot gets a histogram of its own, from the same rays.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub per_spot: bool,
-    /// The renderer's ways of finding light that are chosen by hand, by name; the others are left to the renderer,
-    /// which knows their names.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub strategy: BTreeMap<String, Choice>,
-}
-
-/// A choice by hand, of [`RenderSettings::strategy`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum Choice {
-    /// Used or not.
-    On(bool),
-    /// A size, in the unit that the name stands for.
-    Size(u32),
-}
-
-/// How much multi-bounce work to do.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Budget {
-    /// Camera paths per pixel.
-    Samples(u32),
-    /// Until the median per-pixel relative error falls to this share.
-    Error(f64),
-}
-
-impl Default for RenderSettings {
-    /// The measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m, 256×256 px.
-    fn default() -> Self {
-        Self {
-            resolution: 256,
-            gate_start_m: 1.0,
-            bin_width_m: 0.0384,
-            bins: 637,
-            budget: Budget::Samples(32),
-            max_bounces: 0,
-            renderer: String::new(),
-            subsets: vec![],
-            per_spot: false,
-            strategy: BTreeMap::new(),
-        }
+/// Checks a label: it stands between commas and in messages.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_label(label: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.=".contains(c);
+    if label.is_empty() || label.len() > 64 || !label.chars().all(plain) {
+        return Err(format!(
+            "{label:?} must be up to 64 letters, digits, '-', '_', '.' and '='"
+        ));
     }
+    Ok(())
 }
 
 /// Where results go.
@@ -198,14 +191,47 @@ fn default_profile() -> String {
     "sqrt-u16".into()
 }
 
-/// When a task is given up. Interruptions are free and have no limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+impl OutputSettings {
+    pub(super) fn check(&self) -> Result<(), SpecError> {
+        if self.store.is_empty() {
+            return Err(SpecError::new(
+                "output.store",
+                "is empty; give a path or URL",
+            ));
+        }
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+        let dataset = &self.dataset;
+        if dataset.is_empty() || dataset.starts_with('.') || !dataset.chars().all(plain) {
+            return Err(SpecError::new(
+                "output.dataset",
+                format!(
+                    "{dataset:?} must be a plain folder name of letters, digits, '-', '_' and '.'"
+                ),
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// When a task, or the job, is given up. Interruptions are free and have no limit.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
     /// Failures of the task itself before it is dead.
     pub max_failures: u32,
     /// Losses of the worker while it ran the task before it is dead.
     pub max_crashes: u32,
+    /// Workers that may run the job at a time; 0 = as many as there are.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub max_workers: u32,
+    /// What is not done by then (RFC 3339, e.g. `2026-12-01T18:00:00Z`) is cancelled; empty = never.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub deadline: String,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u32) -> bool {
+    *n == 0
 }
 
 impl Default for Limits {
@@ -213,73 +239,316 @@ impl Default for Limits {
         Self {
             max_failures: 3,
             max_crashes: 3,
+            max_workers: 0,
+            deadline: String::new(),
         }
     }
 }
 
+impl Limits {
+    /// The deadline as Unix time, milliseconds.
+    ///
+    /// # Errors
+    /// It is no time.
+    pub fn deadline_ms(&self) -> Result<Option<i64>, SpecError> {
+        if self.deadline.is_empty() {
+            return Ok(None);
+        }
+        let time = humantime::parse_rfc3339(&self.deadline);
+        let since = time.map(|t| t.duration_since(std::time::UNIX_EPOCH));
+        match since {
+            Ok(Ok(since)) => Ok(i64::try_from(since.as_millis()).ok()),
+            _ => Err(SpecError::new(
+                "limits.deadline",
+                format!(
+                    "{:?} is no time such as \"2026-12-01T18:00:00Z\"",
+                    self.deadline
+                ),
+            )),
+        }
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        if self.max_failures == 0 || self.max_crashes == 0 {
+            return Err(SpecError::new("limits", "budgets must be at least 1"));
+        }
+        self.deadline_ms().map(|_| ())
+    }
+}
+
 impl JobSpec {
+    /// A job of one stage that renders.
+    pub fn render(name: impl Into<String>, task: RenderTask) -> Self {
+        Self {
+            name: name.into(),
+            priority: 0,
+            limits: Limits::default(),
+            nonce: String::new(),
+            stages: vec![StageSpec::new(TaskSpec::Render(task))],
+        }
+    }
+
     /// Checks every field against its limits.
     ///
     /// # Errors
     /// [`SpecError`] naming the first field that cannot be used.
     pub fn check(&self) -> Result<(), SpecError> {
-        let fail = |field: &str, what: String| Err(SpecError::new(field, what));
         if self.name.trim().is_empty() {
-            return fail("name", "is empty; give the job a name".into());
+            return Err(SpecError::new("name", "is empty; give the job a name"));
         }
-        self.scenes.check()?;
-        self.render.check()?;
-        if let [smallest, ..] = self.render.subsets[..]
-            && self.scenes.spots != 100
-        {
-            return fail(
-                "render.subsets",
-                format!(
-                    "{smallest} is a subset of the 10x10 grid, which scenes.spots = {} is not; set scenes.spots = 100, \
-                     or leave subsets out",
-                    self.scenes.spots
-                ),
+        self.limits.check()?;
+        if self.stages.is_empty() || self.stages.len() > MAX_STAGES {
+            let what = format!(
+                "a job has 1 to {MAX_STAGES} stages, this one {}",
+                self.stages.len()
             );
+            return Err(SpecError::new("stage", what));
         }
-        if self.output.store.is_empty() {
-            return fail("output.store", "is empty; give a path or URL".into());
+        for (i, stage) in self.stages.iter().enumerate() {
+            let before = &self.stages[..i];
+            let checked = stage
+                .check()
+                .and_then(|()| stage.check_among(before, &self.stages[i + 1..]));
+            checked.map_err(|e| self.at(stage, e))?;
         }
-        let dataset = &self.output.dataset;
-        let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
-        if dataset.is_empty() || dataset.starts_with('.') || !dataset.chars().all(plain) {
-            return fail(
-                "output.dataset",
-                format!(
-                    "{dataset:?} must be a plain folder name of letters, digits, '-', '_' and '.'"
-                ),
-            );
-        }
-        if self.limits.max_failures == 0 || self.limits.max_crashes == 0 {
-            return fail("limits", "budgets must be at least 1".into());
+        let total: u64 = self.stages.iter().map(StageSpec::tasks).sum();
+        if total > MAX_TASKS {
+            let what = format!("its stages have {total} tasks together, at most {MAX_TASKS}");
+            return Err(SpecError::new("stage", what));
         }
         Ok(())
     }
-}
 
-impl JobSpec {
     /// Checks where a submitted job reads and writes: absolute paths or URLs, none of which climbs. (Job files may name
     /// relative ones; submission resolves them.)
     ///
     /// # Errors
     /// [`SpecError`] naming the first field that cannot be used.
     pub fn check_places(&self) -> Result<(), SpecError> {
-        place("output.store", &self.output.store)?;
-        if let SceneKind::Files { files } = &self.scenes.kind {
-            for (i, file) in files.iter().enumerate() {
-                place(&format!("scenes.files[{i}]"), &file.path)?;
+        let mut stages = self.stages.iter();
+        stages.try_for_each(|stage| stage.check_places().map_err(|e| self.at(stage, e)))
+    }
+
+    /// The field's full name: of several stages it says which.
+    pub fn at(&self, stage: &StageSpec, error: SpecError) -> SpecError {
+        match self.stages.len() {
+            1 => error,
+            _ => SpecError::new(format!("stage.{}.{}", stage.name, error.field), error.what),
+        }
+    }
+
+    /// The stage of this name and its position.
+    pub fn stage(&self, name: &str) -> Option<(usize, &StageSpec)> {
+        self.stages.iter().enumerate().find(|(_, s)| s.name == name)
+    }
+}
+
+impl StageSpec {
+    /// A stage named after its kind, which needs nothing.
+    pub fn new(task: TaskSpec) -> Self {
+        Self {
+            name: task.kind().to_owned(),
+            needs: Vec::new(),
+            tolerate_dead: false,
+            force: false,
+            resources: Resources::default(),
+            task,
+        }
+    }
+
+    /// Number of its tasks.
+    pub fn tasks(&self) -> u64 {
+        match &self.task {
+            TaskSpec::Render(task) => task.scenes.count,
+            TaskSpec::Reprocess(task) => task.count,
+            TaskSpec::Split(_) | TaskSpec::Export(_) => 1,
+        }
+    }
+
+    /// The same with as much of its lists as a lease of tasks `lo..hi` needs.
+    pub fn only(&self, lo: u64, hi: u64) -> Self {
+        Self {
+            task: match &self.task {
+                TaskSpec::Render(task) => TaskSpec::Render(task.only(lo, hi)),
+                other => other.clone(),
+            },
+            name: self.name.clone(),
+            needs: self.needs.clone(),
+            resources: self.resources.clone(),
+            ..*self
+        }
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        let plain = |c: char| !c.is_control() && !"{}\"'`".contains(c);
+        if self.name.trim().is_empty() || self.name.len() > 128 || !self.name.chars().all(plain) {
+            let what = format!("{:?} must be 1 to 128 plain characters", self.name);
+            return Err(SpecError::new("name", what));
+        }
+        self.resources.check()?;
+        match &self.task {
+            TaskSpec::Render(task) => task.check(),
+            TaskSpec::Reprocess(task) => task.check(),
+            TaskSpec::Split(task) => {
+                check_source(&task.source)?;
+                check_count("count", task.count)?;
+                task.split.check()
+            }
+            TaskSpec::Export(task) => {
+                check_source(&task.source)?;
+                check_count("count", task.count)?;
+                match task.export.dest.is_empty() {
+                    true => Err(SpecError::new(
+                        "export.dest",
+                        "is empty; give a path or URL",
+                    )),
+                    false => Ok(()),
+                }
+            }
+        }
+    }
+
+    /// Checks that it fits the stages before it and after it.
+    fn check_among(&self, before: &[Self], after: &[Self]) -> Result<(), SpecError> {
+        if before.iter().any(|other| other.name == self.name) {
+            let what = format!("{:?} is another stage's too", self.name);
+            return Err(SpecError::new("name", what));
+        }
+        let mut seen = BTreeSet::new();
+        for need in &self.needs {
+            if !before.iter().any(|other| other.name == *need) {
+                let what = match after.iter().any(|other| other.name == *need) {
+                    true => format!("{need:?} comes after this stage; put it before"),
+                    false => format!("there is no stage {need:?} before this one"),
+                };
+                return Err(SpecError::new("needs", what));
+            }
+            if !seen.insert(need) {
+                return Err(SpecError::new("needs", format!("{need:?} is named twice")));
+            }
+        }
+        if let Some(place) = self.task.writes()
+            && let Some(other) = before.iter().find(|s| s.task.writes() == Some(place))
+        {
+            let what = format!(
+                "{:?} in {} is where stage {:?} puts its scenes; give each stage its own",
+                place.1, place.0, other.name
+            );
+            return Err(SpecError::new("output.dataset", what));
+        }
+        if let Some(source) = self.task.reads() {
+            let makes = |s: &&Self| s.task.writes() == Some((&source.store, &source.dataset));
+            if let Some(other) = after.iter().find(makes) {
+                let what = format!("is made by stage {:?}; put that before", other.name);
+                return Err(SpecError::new("source", what));
+            }
+            if let Some(other) = before.iter().find(makes)
+                && !self.needs.contains(&other.name)
+            {
+                let what = format!("lacks {:?}, whose scenes it reads", other.name);
+                return Err(SpecError::new("needs", what));
             }
         }
         Ok(())
     }
+
+    /// As [`JobSpec::check_places`], of one stage.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check_places(&self) -> Result<(), SpecError> {
+        if let Some(source) = self.task.reads() {
+            place("source.store", &source.store)?;
+        }
+        match &self.task {
+            TaskSpec::Render(task) => task.check_places(),
+            TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
+            TaskSpec::Split(_) => Ok(()),
+            TaskSpec::Export(task) => place("export.dest", &task.export.dest),
+        }
+    }
+}
+
+impl TaskSpec {
+    /// The kind's name, as in a job file.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Render(_) => "render",
+            Self::Reprocess(_) => "reprocess",
+            Self::Split(_) => "split",
+            Self::Export(_) => "export",
+        }
+    }
+
+    /// Version of the code that decides the bytes of its results; a worker's must equal it.
+    pub fn version(&self) -> &str {
+        match self {
+            Self::Render(task) => &task.render.renderer,
+            Self::Reprocess(task) => &task.reprocess.version,
+            Self::Split(_) => SPLIT_VERSION,
+            Self::Export(_) => EXPORT_VERSION,
+        }
+    }
+
+    /// The data set that is read.
+    pub fn reads(&self) -> Option<&SourceSettings> {
+        match self {
+            Self::Render(_) => None,
+            Self::Reprocess(task) => Some(&task.source),
+            Self::Split(task) => Some(&task.source),
+            Self::Export(task) => Some(&task.source),
+        }
+    }
+
+    /// The data set that scenes are put into: store and folder.
+    pub fn writes(&self) -> Option<(&String, &String)> {
+        match self {
+            Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Split(_) | Self::Export(_) => None,
+        }
+    }
+
+    /// The rendering, where it is one.
+    pub fn as_render(&self) -> Option<&RenderTask> {
+        match self {
+            Self::Render(task) => Some(task),
+            _ => None,
+        }
+    }
+}
+
+/// Version of the split task.
+pub const SPLIT_VERSION: &str = "split-1";
+/// Version of the export task.
+pub const EXPORT_VERSION: &str = "export-1";
+
+pub(super) fn check_source(source: &SourceSettings) -> Result<(), SpecError> {
+    if source.store.is_empty() {
+        return Err(SpecError::new(
+            "source.store",
+            "is empty; give a path or URL, or name a stage of the job",
+        ));
+    }
+    if source.dataset.is_empty() {
+        return Err(SpecError::new(
+            "source.dataset",
+            "is empty; give the data set's folder",
+        ));
+    }
+    Ok(())
+}
+
+pub(super) fn check_count(field: &str, count: u64) -> Result<(), SpecError> {
+    if count == 0 || count > MAX_TASKS {
+        let what = format!("{count} lies outside 1..={MAX_TASKS}");
+        return Err(SpecError::new(field, what));
+    }
+    Ok(())
 }
 
 /// A place that means the same to everyone: absolute, and without a way up.
-fn place(field: &str, text: &str) -> Result<(), SpecError> {
+pub(super) fn place(field: &str, text: &str) -> Result<(), SpecError> {
     let fail = |what: &str| Err(SpecError::new(field, format!("{text:?} {what}")));
     if text.contains('\0') {
         return fail("holds a zero byte");
@@ -299,114 +568,4 @@ fn place(field: &str, text: &str) -> Result<(), SpecError> {
         );
     }
     Ok(())
-}
-
-impl SceneSource {
-    /// Most tasks in one job.
-    pub const MAX_COUNT: u64 = 100_000_000;
-
-    fn check(&self) -> Result<(), SpecError> {
-        if self.count == 0 || self.count > Self::MAX_COUNT {
-            return Err(SpecError::new(
-                "scenes.count",
-                format!("{} lies outside 1..={}", self.count, Self::MAX_COUNT),
-            ));
-        }
-        if let SceneKind::Files { files } = &self.kind
-            && files.len() as u64 != self.count
-        {
-            return Err(SpecError::new(
-                "scenes.count",
-                format!(
-                    "{} differs from the {} files listed; leave count out",
-                    self.count,
-                    files.len()
-                ),
-            ));
-        }
-        if !(10.0..=150.0).contains(&self.fov_deg) {
-            return Err(SpecError::new(
-                "scenes.fov_deg",
-                format!("{} lies outside 10..=150 degrees", self.fov_deg),
-            ));
-        }
-        if ![1, 4, 16, 25, 100].contains(&self.spots) {
-            return Err(SpecError::new(
-                "scenes.spots",
-                format!("{} is not one of 1, 4, 16, 25, 100", self.spots),
-            ));
-        }
-        Ok(())
-    }
-}
-
-impl RenderSettings {
-    /// The subsets of the 10×10 grid of spots there are.
-    pub const SUBSETS: [u32; 2] = [4, 25];
-
-    fn check(&self) -> Result<(), SpecError> {
-        let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
-        if !(1..=4096).contains(&self.resolution) {
-            return fail(
-                "resolution",
-                format!("{} lies outside 1..=4096 pixels", self.resolution),
-            );
-        }
-        if !(self.gate_start_m >= 0.0 && self.gate_start_m.is_finite()) {
-            return fail(
-                "gate_start_m",
-                format!("{} must be a finite length ≥ 0 m", self.gate_start_m),
-            );
-        }
-        if !(self.bin_width_m > 0.0 && self.bin_width_m.is_finite()) {
-            return fail(
-                "bin_width_m",
-                format!("{} must be a positive length in metres", self.bin_width_m),
-            );
-        }
-        if !(1..=65_536).contains(&self.bins) {
-            return fail("bins", format!("{} lies outside 1..=65536", self.bins));
-        }
-        if let Some(n) = self.subsets.iter().find(|n| !Self::SUBSETS.contains(n)) {
-            return fail(
-                "subsets",
-                format!(
-                    "{n} is no subset of the 10x10 grid of spots; there are {:?}",
-                    Self::SUBSETS
-                ),
-            );
-        }
-        if !self.subsets.is_sorted_by(|a, b| a < b) {
-            return fail(
-                "subsets",
-                format!("{:?} must name each once, ascending", self.subsets),
-            );
-        }
-        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-        if let Some(name) = self
-            .strategy
-            .keys()
-            .find(|n| n.is_empty() || !n.chars().all(plain))
-        {
-            return fail(
-                "strategy",
-                format!("{name:?} is no name such as light_vertices"),
-            );
-        }
-        match self.budget {
-            Budget::Samples(n) if !(2..=1_048_576).contains(&n) => fail(
-                "samples",
-                format!("{n} lies outside 2..=1048576 paths per pixel"),
-            ),
-            Budget::Error(e) if !(e > 0.0 && e < 1.0) => fail(
-                "error",
-                format!("{e} must lie between 0 and 1, e.g. 0.1 for 10 %"),
-            ),
-            _ if self.max_bounces == 1 => fail(
-                "max_bounces",
-                "1 keeps nothing but the spots; use 0 (all) or at least 2".into(),
-            ),
-            _ => Ok(()),
-        }
-    }
 }

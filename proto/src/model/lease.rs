@@ -1,9 +1,11 @@
 //! What passes between coordinator and worker, checked.
 
+use std::collections::BTreeMap;
+
 use crate::{
     ids::{Incarnation, JobId, LeaseRef, WorkerId},
-    key::TaskKey,
-    model::JobSpec,
+    key::{StageKey, TaskKey},
+    model::StageSpec,
 };
 
 /// Who a worker says it is at the start of a session.
@@ -19,14 +21,27 @@ pub struct WorkerHello {
     pub version: String,
     /// Protocol version; see [`crate::PROTOCOL`].
     pub protocol: u32,
-    /// CPU cores it uses.
-    pub cores: u32,
     /// Leases it still holds from before a reconnect.
     pub held: Vec<LeaseRef>,
-    /// Its renderer's version.
-    pub renderer: String,
+    /// What it is able to do and what it has.
+    pub abilities: Abilities,
+}
+
+/// What a worker is able to do and what it has.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Abilities {
+    /// The kinds of task that it runs, each with the version of its code.
+    pub kinds: BTreeMap<String, String>,
     /// Fingerprints of the furniture it has.
     pub assets: Vec<String>,
+    /// CPU cores it uses.
+    pub cores: u32,
+    /// Memory in MiB; 0 = not known.
+    pub memory_mib: u64,
+    /// Graphics processors.
+    pub gpus: u32,
+    /// Labels it was given.
+    pub labels: Vec<String>,
 }
 
 /// A granted lease: tasks `lo ≤ i < hi` less `skip`.
@@ -44,8 +59,12 @@ pub struct Lease {
     pub skip: Vec<u64>,
     /// Time to live from receipt, milliseconds.
     pub ttl_ms: u32,
-    /// The job's spec.
-    pub spec: JobSpec,
+    /// The stage; of its lists as much as these tasks need.
+    pub stage: StageSpec,
+    /// Position of the stage in the job.
+    pub ordinal: u32,
+    /// The stage's key.
+    pub key: StageKey,
 }
 
 /// A finished task as the worker reports it.

@@ -1,8 +1,10 @@
 //! The checked model: what the coordinator and the agent reason about. Wire types convert into these.
 
 pub mod explain;
+pub mod file;
 pub mod job;
 pub mod lease;
+pub mod render;
 pub mod reprocess;
 pub mod sensor;
 pub mod status;
@@ -10,11 +12,15 @@ mod text;
 
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::{
-    Budget, Choice, JobSpec, Limits, OutputSettings, RenderSettings, SceneFile, SceneKind,
-    SceneSource, SpecError,
+    ExportSettings, ExportTask, JobSpec, Limits, OutputSettings, Resources, SpecError, SplitTask,
+    StageSpec, TaskSpec, check_label,
 };
-pub use lease::{Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
-pub use reprocess::{Histogram, ReprocessSettings, SourceSettings};
+pub use lease::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
+pub use render::{Budget, Choice, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource};
+pub use reprocess::{Histogram, ReprocessSettings, ReprocessTask, SourceSettings};
 pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};
-pub use status::{Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, TaskCounts};
+pub use status::{
+    Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
+    StageStatus, TaskCounts,
+};
 pub use text::parse_share;

@@ -3,37 +3,67 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{job::SpecError, sensor::SensorSettings};
+use super::{
+    job::{OutputSettings, SpecError, check_count, check_source},
+    sensor::SensorSettings,
+};
+
+/// Reprocessing a data set into another: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReprocessTask {
+    /// The data set that is read. Its place is not part of a result's name: that follows from the names of its scenes.
+    pub source: SourceSettings,
+    /// The number of scenes that the source has room for.
+    pub count: u64,
+    /// What is done to each scene.
+    pub reprocess: ReprocessSettings,
+    /// Where results go.
+    pub output: OutputSettings,
+}
+
+impl ReprocessTask {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        let (from, to) = (&self.source, &self.output);
+        if (&from.store, &from.dataset) == (&to.store, &to.dataset) {
+            let what = format!(
+                "{:?} is the source itself; choose another data set for the results",
+                to.dataset
+            );
+            return Err(SpecError::new("output.dataset", what));
+        }
+        self.reprocess.check(&to.profile)?;
+        to.check()
+    }
+}
 
 /// What is done to each scene.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct ReprocessSettings {
-    /// The data set that is read.
-    pub source: SourceSettings,
     /// Which of its histograms.
-    #[serde(default)]
     pub histogram: Histogram,
     /// Only these spots, summed: multiplexing. Only with `histogram = "transient_spots"`, which needs it; ascending.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
     /// The sensor.
-    #[serde(default)]
     pub sensor: SensorSettings,
     /// Bins that `sensor.rebin` leaves over at the end of the gate are dropped; otherwise it must divide the bins.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub drop_left_over: bool,
     /// Chooses another draw of the same noise (default 0).
-    #[serde(default)]
     pub seed: u64,
     /// Version of the sensor model and the encoder, part of every task key; filled in at submission where left out.
-    #[serde(default)]
     pub version: String,
 }
 
-/// A data set that is read. Its place is not part of any key: keys follow from the keys of its scenes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A data set that is read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SourceSettings {
     /// The store: a path or URL that every worker can reach.
     pub store: String,
@@ -113,15 +143,6 @@ impl ReprocessSettings {
     pub fn check(&self, profile: &str) -> Result<(), SpecError> {
         let fail =
             |field: &str, what: String| Err(SpecError::new(format!("reprocess.{field}"), what));
-        if self.source.store.is_empty() {
-            return fail("source.store", "is empty; give a path or URL".into());
-        }
-        if self.source.dataset.is_empty() {
-            return fail(
-                "source.dataset",
-                "is empty; give the data set's folder".into(),
-            );
-        }
         if self.histogram == Histogram::TransientSpots && self.spots.is_empty() {
             return fail(
                 "spots",

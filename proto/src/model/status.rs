@@ -35,9 +35,51 @@ pub struct TaskCounts {
     pub dead: u64,
 }
 
+impl std::ops::AddAssign for TaskCounts {
+    fn add_assign(&mut self, other: Self) {
+        self.total += other.total;
+        self.done += other.done;
+        self.reused += other.reused;
+        self.leased += other.leased;
+        self.pending += other.pending;
+        self.dead += other.dead;
+    }
+}
+
+/// Where a stage stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StageState {
+    /// It waits for others.
+    Blocked,
+    /// Its tasks may run.
+    Open,
+    /// Every task is done.
+    Done,
+    /// Every task is done or dead, and at least one is dead.
+    Failed,
+}
+
+/// A stage as people see it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StageStatus {
+    /// Its name.
+    pub name: String,
+    /// What its tasks do.
+    pub kind: String,
+    /// State.
+    pub state: StageState,
+    /// The stages it needs.
+    pub needs: Vec<String>,
+    /// Counts.
+    pub tasks: TaskCounts,
+}
+
 /// A task that runs now.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunningTask {
+    /// Position of its stage in the job.
+    pub stage: u32,
     /// Task index.
     pub index: u64,
     /// Worker's name.
@@ -63,9 +105,15 @@ pub struct JobStatus {
     pub submitted_at_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_at_ms: Option<i64>,
-    /// The job.
+    /// It is held: nothing of it is begun.
+    pub paused: bool,
+    /// Who submitted it.
+    pub user: String,
+    /// Its stages, in order.
+    pub stages: Vec<StageStatus>,
+    /// The job, without lists of files.
     pub spec: JobSpec,
-    /// Mean seconds of a computed task on one worker; `None` before the first.
+    /// Mean seconds of a computed task on one worker, of the stage that runs; `None` before the first.
     pub mean_task_seconds: Option<f64>,
     /// Tasks that run now.
     pub running: Vec<RunningTask>,
@@ -86,6 +134,23 @@ pub struct JobPlan {
     pub run: u64,
     /// The job that has this exact spec already.
     pub existing_job: Option<JobId>,
+    /// The same by stage, with the reasons.
+    pub stages: Vec<StagePlan>,
+}
+
+/// What a submission would do in a stage.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct StagePlan {
+    /// Its name.
+    pub name: String,
+    /// What its tasks do.
+    pub kind: String,
+    /// Tasks.
+    pub total: u64,
+    /// Tasks whose output exists.
+    pub reuse: u64,
+    /// Tasks that will run.
+    pub run: u64,
     /// Why tasks run, in words.
     pub reasons: Vec<String>,
 }
@@ -120,6 +185,12 @@ pub enum EventKind {
     Waiting,
     /// Something that must not happen did, e.g. two different results of one task.
     Alarm,
+    /// A stage's tasks may run: what it needs is done.
+    Opened,
+    /// Job held by a person.
+    Paused,
+    /// Job let go on.
+    Resumed,
 }
 
 /// One line of a job's history.
@@ -131,6 +202,8 @@ pub struct Event {
     pub at_ms: i64,
     /// The job.
     pub job: JobId,
+    /// Position of the stage that it concerns, where it concerns one.
+    pub stage: Option<u32>,
     /// What.
     pub kind: EventKind,
     /// Task, where it concerns one.

@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
-use super::job::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource, SpecError};
+use super::{
+    job::SpecError,
+    render::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource},
+};
 
 /// `[scenes]`.
 #[derive(Deserialize)]
@@ -15,6 +18,9 @@ pub(super) struct SceneSourceText {
     assets: Option<String>,
     min_specular: Option<u32>,
     files: Option<Vec<SceneFile>>,
+    /// Only in a lease.
+    #[serde(default)]
+    first: u64,
     count: Option<u64>,
     #[serde(default)]
     seed: u64,
@@ -42,6 +48,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
         only("assets", "furnished", text.assets.is_some())?;
         only("min_specular", "furnished", text.min_specular.is_some())?;
         only("files", "files", text.files.is_some())?;
+        only("first", "files", text.first != 0)?;
         let mut count = text.count;
         let kind = match text.kind.as_str() {
             "furnished" => SceneKind::Furnished {
@@ -52,7 +59,10 @@ impl TryFrom<SceneSourceText> for SceneSource {
             "files" => {
                 let files = text.files.unwrap_or_default();
                 count = count.or(Some(files.len() as u64));
-                SceneKind::Files { files }
+                SceneKind::Files {
+                    files,
+                    first: text.first,
+                }
             }
             other => {
                 return Err(SpecError::new(

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_proto::ids::{JobId, RangeId, StageRef, WorkerId};
+use picofarm_proto::ids::{RangeId, StageRef, WorkerId};
 
 use crate::record::{Exception, NewEvent, Output, Range, Worker};
 
@@ -27,8 +27,9 @@ pub struct Changes {
     pub workers: BTreeMap<WorkerId, Worker>,
     /// History, in order.
     pub events: Vec<NewEvent>,
-    /// Jobs of which this house has nothing left: if nobody else has either, they have ended.
-    pub perhaps_over: BTreeMap<JobId, i64>,
+    /// Stages of which this house has nothing left: if nobody else has either, they are over, and with them perhaps
+    /// their jobs.
+    pub perhaps_over: BTreeMap<StageRef, i64>,
 }
 
 impl Changes {

@@ -15,12 +15,14 @@
 
 mod changes;
 mod error;
+mod graph;
 mod lock;
 mod place;
 mod postgres;
 mod raw;
 mod record;
 mod sql;
+mod sql_jobs;
 mod sqlite;
 #[cfg(feature = "testing")]
 pub mod testing;
@@ -37,8 +39,8 @@ pub use place::CatalogPlace;
 pub use postgres::PostgresCatalog;
 pub use record::{
     Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,
-    News, Output, Owned, Range, RangeState, ResultSet, Run, Snapshot, StageRecord, TaskRecord,
-    Timing, Want, Worker,
+    News, Output, Owned, Range, RangeState, ResultSet, Run, Settled, Snapshot, StageCounts,
+    StageRecord, TaskRecord, Timing, Want, Worker,
 };
 pub use sqlite::SqliteCatalog;
 
@@ -74,12 +76,13 @@ pub trait Catalog: Send + Sync + 'static {
     /// [`CatalogError::Fenced`].
     async fn adopt(&self, worker: WorkerId) -> Result<Owned, CatalogError>;
 
-    /// Makes all of `changes` durable, or none of them; returns after the commit, with the jobs that ended by it.
+    /// Makes all of `changes` durable, or none of them; returns after the commit, with the stages that opened and the
+    /// jobs that ended by it.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`]; [`CatalogError::Conflict`] when the database holds something the caller did not know
     /// of (another manifest for a task, a range that is another house's now).
-    async fn commit(&self, changes: Changes) -> Result<Vec<JobEnd>, CatalogError>;
+    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError>;
 
     /// Records a job with its ranges, which are nobody's, and the first lines of its history. `false` where a job with
     /// the same spec is active or done: then nothing is recorded.
@@ -90,8 +93,24 @@ pub trait Catalog: Send + Sync + 'static {
         events: &[NewEvent],
     ) -> Result<bool, CatalogError>;
 
-    /// Stops an active job; `false` where it is not active.
-    async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError>;
+    /// Stops an active job; `false` where it is not active. `why` goes into its history.
+    async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError>;
+
+    /// Holds an active job, or lets it go on; `false` where that changes nothing. `who` goes into its history.
+    async fn pause(
+        &self,
+        job: JobId,
+        paused: bool,
+        who: &str,
+        now_ms: i64,
+    ) -> Result<bool, CatalogError>;
+
+    /// Removes up to `most` jobs that ended before this Unix time (milliseconds) with their history; returns how many.
+    /// Outputs stay: they are reused.
+    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError>;
+
+    /// Active jobs of a user.
+    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError>;
 
     /// Makes the given-up tasks of a job that is active or failed pending again, with fresh budgets; returns how many.
     ///
@@ -107,6 +126,9 @@ pub trait Catalog: Send + Sync + 'static {
 
     /// The latest job with this spec hash.
     async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError>;
+
+    /// The latest jobs, the last first.
+    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError>;
 
     /// Jobs that write into a data set and are active or have written something, the latest first.
     async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError>;

@@ -8,7 +8,7 @@ use std::{
 use picofarm_proto::{
     ids::{Epoch, HouseId, Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::{StageKey, stage_key},
-    model::{EventKind, JobSpec, JobState, TaskCounts},
+    model::{EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec},
 };
 
 /// One submission.
@@ -26,6 +26,10 @@ pub struct Job {
     pub submitted_ms: i64,
     /// Unix time of the end, milliseconds.
     pub ended_ms: Option<i64>,
+    /// It is held: nothing of it is begun.
+    pub paused: bool,
+    /// Who submitted it.
+    pub user: String,
 }
 
 /// A stage of a job: its tasks are `0..tasks`.
@@ -33,6 +37,12 @@ pub struct Job {
 pub struct StageRecord {
     /// Its name.
     pub id: StageRef,
+    /// Positions of the stages that it needs.
+    pub needs: Vec<u32>,
+    /// It begins although tasks of those were given up.
+    pub tolerate_dead: bool,
+    /// Outputs that exist do not count.
+    pub force: bool,
     /// Where its results go.
     pub set: ResultSet,
     /// Number of tasks.
@@ -42,14 +52,24 @@ pub struct StageRecord {
 impl Job {
     /// The job's stages, in order.
     pub fn stages(&self) -> Vec<StageRecord> {
-        vec![StageRecord {
-            id: StageRef {
-                job: self.id,
-                stage: 0,
-            },
-            set: ResultSet::of(&self.spec),
-            tasks: self.spec.scenes.count,
-        }]
+        let stages = self.spec.stages.iter().enumerate();
+        stages
+            .map(|(ordinal, stage)| StageRecord {
+                id: StageRef {
+                    job: self.id,
+                    stage: ordinal as u32,
+                },
+                needs: stage
+                    .needs
+                    .iter()
+                    .filter_map(|need| Some(self.spec.stage(need)?.0 as u32))
+                    .collect(),
+                tolerate_dead: stage.tolerate_dead,
+                force: stage.force,
+                set: ResultSet::of(stage),
+                tasks: stage.tasks(),
+            })
+            .collect()
     }
 }
 
@@ -58,10 +78,30 @@ impl Job {
 pub struct JobRecord {
     /// The job.
     pub job: Job,
-    /// Its tasks by state, as last committed.
-    pub counts: TaskCounts,
+    /// Its stages, in order.
+    pub stages: Vec<StageCounts>,
     /// How long its tasks took.
     pub timing: Timing,
+}
+
+/// Where a stage stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StageCounts {
+    /// Whether its tasks may run.
+    pub state: StageState,
+    /// Its tasks by state, as last committed.
+    pub counts: TaskCounts,
+}
+
+impl JobRecord {
+    /// Tasks of all stages by state.
+    pub fn counts(&self) -> TaskCounts {
+        let mut counts = TaskCounts::default();
+        for stage in &self.stages {
+            counts += stage.counts;
+        }
+        counts
+    }
 }
 
 /// Where the results of a job's tasks live and what shapes them: two jobs with the same set share outputs.
@@ -76,12 +116,21 @@ pub struct ResultSet {
 }
 
 impl ResultSet {
-    /// The set a job's tasks write to.
-    pub fn of(spec: &JobSpec) -> Self {
+    /// The set a stage's tasks write to. What is no data set has a place that none can have.
+    pub fn of(stage: &StageSpec) -> Self {
+        let (store, dataset) = match &stage.task {
+            TaskSpec::Render(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Reprocess(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Split(task) => (
+                task.source.store.clone(),
+                format!("{}/split/{}", task.source.dataset, task.split.name),
+            ),
+            TaskSpec::Export(task) => (task.export.dest.clone(), "/export".into()),
+        };
         Self {
-            store: spec.output.store.clone(),
-            dataset: spec.output.dataset.clone(),
-            stage_key: stage_key(spec),
+            store,
+            dataset,
+            stage_key: stage_key(stage),
         }
     }
 }
@@ -235,6 +284,8 @@ pub struct NewEvent {
     pub at_ms: i64,
     /// The job.
     pub job: JobId,
+    /// Position of the stage concerned, where one is.
+    pub stage: Option<u32>,
     /// What.
     pub kind: EventKind,
     /// The tasks concerned, where any are.
@@ -253,6 +304,7 @@ impl NewEvent {
         Self {
             at_ms,
             job,
+            stage: None,
             kind,
             tasks: None,
             worker: String::new(),
@@ -263,10 +315,13 @@ impl NewEvent {
 
     /// The end of a job.
     pub(crate) fn ended(job: JobId, at_ms: i64, counts: &TaskCounts) -> Self {
-        let message = format!(
+        let mut message = format!(
             "{} of {} tasks done, {} dead",
             counts.done, counts.total, counts.dead
         );
+        if counts.pending > 0 {
+            message += &format!(", {} not begun because they need those", counts.pending);
+        }
         Self::of(job, at_ms, EventKind::Ended, message)
     }
 }
@@ -303,6 +358,8 @@ impl Timing {
 /// What a job's tasks wait for, as far as the catalog knows.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Holdups {
+    /// Pending tasks of stages that wait for others.
+    pub blocked: u64,
     /// Pending tasks that may run at once.
     pub ready: u64,
     /// Pending tasks that may not run before a time.
@@ -335,6 +392,8 @@ pub struct EventQuery {
     pub limit: u32,
     /// Only events that concern this task.
     pub task: Option<u64>,
+    /// Only events that concern this stage.
+    pub stage: Option<u32>,
     /// The last `limit` rather than the first.
     pub newest: bool,
 }
@@ -370,6 +429,8 @@ pub struct Want {
     pub tasks: u64,
     /// Only tasks that may run at this time, Unix milliseconds.
     pub now_ms: i64,
+    /// Outputs that exist are not asked for.
+    pub force: bool,
 }
 
 /// The answer to a [`Want`].
@@ -386,9 +447,11 @@ pub struct Claim {
 /// What a house learns from time to time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct News {
-    /// Jobs that are active.
-    pub active: BTreeSet<JobId>,
-    /// Pending tasks that are nobody's.
+    /// Jobs that are active, and whether they are held.
+    pub active: BTreeMap<JobId, bool>,
+    /// Workers of other houses that have leases, by job.
+    pub busy: BTreeMap<JobId, u32>,
+    /// Pending tasks that are nobody's and whose stage is open.
     pub free: BTreeMap<StageRef, u64>,
     /// Ranges of houses that were lost.
     pub taken: Owned,
@@ -398,6 +461,23 @@ pub struct News {
     pub houses: u32,
     /// Workers connected to any of them.
     pub workers: u32,
+}
+
+/// What came of a commit for whole stages and jobs.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Settled {
+    /// Stages that may begin.
+    pub opened: Vec<StageRef>,
+    /// Jobs that have ended.
+    pub ends: Vec<JobEnd>,
+}
+
+impl Settled {
+    /// Adds what came of another part.
+    pub(crate) fn join(&mut self, other: Self) {
+        self.opened.extend(other.opened);
+        self.ends.extend(other.ends);
+    }
 }
 
 /// A job that has ended.

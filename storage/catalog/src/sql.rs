@@ -1,7 +1,7 @@
 //! What SQLite and Postgres have in common: the codes in columns, and the queries, whose text both understand. The
 //! queries are a macro over the database's types because sqlx has no common type for a connection.
 
-use picofarm_proto::model::{EventKind, JobState};
+use picofarm_proto::model::{EventKind, JobState, StageState};
 
 use crate::record::Mark;
 
@@ -36,7 +36,38 @@ pub(crate) fn job_state(code: i64) -> Result<JobState, sqlx::Error> {
         .ok_or_else(|| bad("state", code))
 }
 
-const EVENT_KINDS: [EventKind; 13] = [
+const STAGE_STATES: [StageState; 4] = [
+    StageState::Blocked,
+    StageState::Open,
+    StageState::Done,
+    StageState::Failed,
+];
+
+pub(crate) fn stage_state_code(state: StageState) -> i64 {
+    code(&STAGE_STATES, state)
+}
+
+pub(crate) fn stage_state(code: i64) -> Result<StageState, sqlx::Error> {
+    usize::try_from(code)
+        .ok()
+        .and_then(|i| STAGE_STATES.get(i).copied())
+        .ok_or_else(|| bad("state", code))
+}
+
+/// The stages that a stage needs, as they are stored: ordinals with commas between.
+pub(crate) fn needs_text(needs: &[u32]) -> String {
+    let needs: Vec<String> = needs.iter().map(u32::to_string).collect();
+    needs.join(",")
+}
+
+pub(crate) fn needs(text: &str) -> Result<Vec<u32>, sqlx::Error> {
+    let parts = text.split(',').filter(|part| !part.is_empty());
+    parts
+        .map(|part| part.parse().map_err(|e| bad("needs", e)))
+        .collect()
+}
+
+const EVENT_KINDS: [EventKind; 16] = [
     EventKind::Submitted,
     EventKind::Leased,
     EventKind::Committed,
@@ -50,6 +81,9 @@ const EVENT_KINDS: [EventKind; 13] = [
     EventKind::Ended,
     EventKind::Waiting,
     EventKind::Alarm,
+    EventKind::Opened,
+    EventKind::Paused,
+    EventKind::Resumed,
 ];
 
 pub(crate) fn event_kind_code(kind: EventKind) -> i64 {
@@ -160,7 +194,8 @@ macro_rules! history {
             "SELECT event.*, job.id AS job_id FROM event \
              JOIN job ON job.key = event.job WHERE sequence > $1 AND ",
             $job,
-            " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) ",
+            " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) \
+             AND (CAST($5 AS BIGINT) IS NULL OR event.stage = $5) ",
             $order,
             " LIMIT $3"
         )
@@ -172,22 +207,16 @@ pub(crate) use history;
 macro_rules! queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod query {
-            use std::{
-                collections::{BTreeMap, BTreeSet},
-                sync::Arc,
-            };
-
             use picofarm_proto::{
                 ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
-                model::{Event, JobSpec, TaskCounts},
+                model::Event,
             };
             use sqlx::Row;
-            use uuid::Uuid;
 
             use crate::{
                 record::{
-                    EventQuery, Exception, Holdups, Job, JobRecord, LeaseState, Mark, Output, Range, RangeState,
-                    ResultSet, Run, TaskRecord, Timing, Worker,
+                    EventQuery, Exception, LeaseState, Mark, Output, Range, RangeState, ResultSet, Run, TaskRecord,
+                    Worker,
                 },
                 sql::{self, bad, history, int},
             };
@@ -196,15 +225,15 @@ macro_rules! queries {
             type DbRow = $row;
             type Result<T> = std::result::Result<T, sqlx::Error>;
 
-            fn uint(row: &DbRow, column: &'static str) -> Result<u64> {
+            pub(crate) fn uint(row: &DbRow, column: &'static str) -> Result<u64> {
                 u64::try_from(row.try_get::<i64, _>(column)?).map_err(|e| bad(column, e))
             }
 
-            fn small(row: &DbRow, column: &'static str) -> Result<u32> {
+            pub(crate) fn small(row: &DbRow, column: &'static str) -> Result<u32> {
                 u32::try_from(row.try_get::<i64, _>(column)?).map_err(|e| bad(column, e))
             }
 
-            fn stage_of(row: &DbRow) -> Result<StageRef> {
+            pub(crate) fn stage_of(row: &DbRow) -> Result<StageRef> {
                 Ok(StageRef {
                     job: JobId::from_uuid(row.try_get("job_id")?),
                     stage: small(row, "ordinal")?,
@@ -239,52 +268,9 @@ macro_rules! queries {
                 })
             }
 
-            fn marks(row: &DbRow) -> Result<Vec<Mark>> {
+            pub(crate) fn marks(row: &DbRow) -> Result<Vec<Mark>> {
                 let bytes: Vec<u8> = row.try_get("marks")?;
                 bytes.into_iter().map(sql::mark).collect()
-            }
-
-            fn job(row: &DbRow) -> Result<Job> {
-                let spec: JobSpec =
-                    serde_json::from_str(row.try_get("spec")?).map_err(|e| bad("spec", e))?;
-                Ok(Job {
-                    id: JobId::from_uuid(row.try_get("id")?),
-                    spec_hash: row.try_get("spec_hash")?,
-                    spec: Arc::new(spec),
-                    state: sql::job_state(row.try_get("state")?)?,
-                    submitted_ms: row.try_get("submitted_ms")?,
-                    ended_ms: row.try_get("ended_ms")?,
-                })
-            }
-
-            pub(crate) async fn active_jobs(c: &mut Connection) -> Result<Vec<Job>> {
-                let rows = sqlx::query("SELECT * FROM job WHERE state = 0 ORDER BY key")
-                    .fetch_all(c)
-                    .await?;
-                rows.iter().map(job).collect()
-            }
-
-            pub(crate) async fn active_ids(c: &mut Connection) -> Result<BTreeSet<JobId>> {
-                let rows = sqlx::query("SELECT id FROM job WHERE state = 0")
-                    .fetch_all(c)
-                    .await?;
-                rows.iter()
-                    .map(|row| Ok(JobId::from_uuid(row.try_get("id")?)))
-                    .collect()
-            }
-
-            /// Pending tasks of active jobs that are nobody's.
-            pub(crate) async fn free(c: &mut Connection) -> Result<BTreeMap<StageRef, u64>> {
-                let rows = sqlx::query(
-                    "SELECT job.id AS job_id, stage.ordinal, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
-                     JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
-                     WHERE task_range.state = 0 AND owner IS NULL AND job.state = 0 GROUP BY job.id, stage.ordinal",
-                )
-                .fetch_all(c)
-                .await?;
-                rows.iter()
-                    .map(|row| Ok((stage_of(row)?, uint(row, "tasks")?)))
-                    .collect()
             }
 
             pub(crate) async fn workers(c: &mut Connection) -> Result<Vec<Worker>> {
@@ -366,131 +352,7 @@ macro_rules! queries {
                 })
             }
 
-            pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
-                let row = sqlx::query(
-                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds \
-                     FROM output WHERE NOT adopted AND result_set = \
-                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3)",
-                )
-                .bind(&set.store)
-                .bind(&set.dataset)
-                .bind(&set.stage_key.0[..])
-                .fetch_one(c)
-                .await?;
-                timing_of(&row)
-            }
-
-            fn timing_of(row: &DbRow) -> Result<Timing> {
-                Ok(Timing {
-                    tasks: uint(row, "timed")?,
-                    seconds: row.try_get("seconds")?,
-                })
-            }
-
-            /// Jobs with their counts: all, or one.
-            pub(crate) async fn jobs(c: &mut Connection, one: Option<JobId>) -> Result<Vec<JobRecord>> {
-                let id: Option<Uuid> = one.map(JobId::uuid);
-                let rows = match id {
-                    Some(id) => sqlx::query("SELECT * FROM job WHERE id = $1").bind(id),
-                    None => sqlx::query("SELECT * FROM job ORDER BY key"),
-                }
-                .fetch_all(&mut *c)
-                .await?;
-                let mut records = Vec::with_capacity(rows.len());
-                for row in &rows {
-                    // The counts of a job that has ended are final.
-                    let counts = match row.try_get::<Option<i64>, _>("tasks")? {
-                        Some(_) => TaskCounts {
-                            total: uint(row, "tasks")?,
-                            done: uint(row, "done")?,
-                            reused: uint(row, "reused")?,
-                            leased: 0,
-                            pending: 0,
-                            dead: uint(row, "dead")?,
-                        },
-                        None => counts(c, row.try_get("key")?).await?,
-                    };
-                    records.push(JobRecord {
-                        job: job(row)?,
-                        counts,
-                        timing: timing_of(row)?,
-                    });
-                }
-                Ok(records)
-            }
-
-            /// Tasks of a job by state.
-            pub(crate) async fn counts(c: &mut Connection, key: i64) -> Result<TaskCounts> {
-                let mut counts = TaskCounts::default();
-                let rows = sqlx::query(
-                    "SELECT task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
-                     JOIN stage ON stage.key = task_range.stage \
-                     WHERE stage.job = $1 AND task_range.state <> 1 GROUP BY task_range.state",
-                )
-                .bind(key)
-                .fetch_all(&mut *c)
-                .await?;
-                for row in &rows {
-                    let n = uint(row, "tasks")?;
-                    match row.try_get::<i64, _>("state")? {
-                        sql::PENDING => counts.pending += n,
-                        sql::DONE => counts.done += n,
-                        sql::DONE_REUSED => {
-                            counts.done += n;
-                            counts.reused += n;
-                        }
-                        sql::DEAD => counts.dead += n,
-                        other => return Err(bad("state", other)),
-                    }
-                }
-                let rows = sqlx::query(
-                    "SELECT marks FROM task_range JOIN stage ON stage.key = task_range.stage \
-                     WHERE stage.job = $1 AND task_range.state = 1",
-                )
-                .bind(key)
-                .fetch_all(&mut *c)
-                .await?;
-                for row in &rows {
-                    for mark in marks(row)? {
-                        match mark {
-                            Mark::Todo => counts.leased += 1,
-                            Mark::Done => counts.done += 1,
-                            Mark::Reused => {
-                                counts.done += 1;
-                                counts.reused += 1;
-                            }
-                            Mark::Left => {}
-                        }
-                    }
-                }
-                counts.total = counts.done + counts.leased + counts.pending + counts.dead;
-                Ok(counts)
-            }
-
-            pub(crate) async fn job_with(c: &mut Connection, spec_hash: &str) -> Result<Option<Job>> {
-                let row = sqlx::query("SELECT * FROM job WHERE spec_hash = $1 ORDER BY key DESC LIMIT 1")
-                    .bind(spec_hash)
-                    .fetch_optional(c)
-                    .await?;
-                row.as_ref().map(job).transpose()
-            }
-
-            pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
-                let rows = sqlx::query(
-                    "SELECT * FROM job WHERE key IN (SELECT stage.job FROM stage \
-                       JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2) \
-                     AND (state = 0 OR done > 0 OR EXISTS (SELECT 1 FROM task_range \
-                       JOIN stage ON stage.key = task_range.stage WHERE stage.job = job.key AND task_range.state IN (2, 3))) \
-                     ORDER BY key DESC",
-                )
-                .bind(store)
-                .bind(dataset)
-                .fetch_all(c)
-                .await?;
-                rows.iter().map(job).collect()
-            }
-
-            fn exception(row: &DbRow, stage: StageRef) -> Result<Exception> {
+            pub(crate) fn exception(row: &DbRow, stage: StageRef) -> Result<Exception> {
                 Ok(Exception {
                     stage,
                     task: uint(row, "task")?,
@@ -498,37 +360,6 @@ macro_rules! queries {
                     crashes: small(row, "crashes")?,
                     dead: row.try_get("dead")?,
                     last_error: row.try_get("last_error")?,
-                })
-            }
-
-            pub(crate) async fn holdups(c: &mut Connection, job: JobId, now_ms: i64) -> Result<Holdups> {
-                let row = sqlx::query(
-                    "SELECT CAST(coalesce(sum(CASE WHEN not_before_ms <= $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS ready, \
-                     CAST(coalesce(sum(CASE WHEN not_before_ms > $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS waiting, \
-                     min(CASE WHEN not_before_ms > $2 THEN not_before_ms END) AS next_ms \
-                     FROM task_range JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
-                     WHERE job.id = $1 AND task_range.state = 0",
-                )
-                .bind(job.uuid())
-                .bind(now_ms)
-                .fetch_one(&mut *c)
-                .await?;
-                let failed = sqlx::query(
-                    "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
-                     JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
-                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes DESC, task LIMIT 5",
-                )
-                .bind(job.uuid())
-                .fetch_all(c)
-                .await?;
-                Ok(Holdups {
-                    ready: uint(&row, "ready")?,
-                    waiting: uint(&row, "waiting")?,
-                    next_ms: row.try_get("next_ms")?,
-                    failed: failed
-                        .iter()
-                        .map(|row| exception(row, stage_of(row)?))
-                        .collect::<Result<_>>()?,
                 })
             }
 
@@ -618,6 +449,7 @@ macro_rules! queries {
                     .bind(query.task.map(|t| i64::try_from(t).unwrap_or(i64::MAX)))
                     .bind(i64::from(query.limit))
                     .bind(job)
+                    .bind(query.stage.map(i64::from))
                     .fetch_all(c)
                     .await?;
                 if query.newest {
@@ -634,6 +466,10 @@ macro_rules! queries {
                             sequence: uint(row, "sequence")?,
                             at_ms: row.try_get("at_ms")?,
                             job: JobId::from_uuid(row.try_get("job_id")?),
+                            stage: row
+                                .try_get::<Option<i64>, _>("stage")?
+                                .map(|n| u32::try_from(n).map_err(|e| bad("stage", e)))
+                                .transpose()?,
                             kind: sql::event_kind(row.try_get("kind")?)?,
                             task: lo.filter(|lo| hi == Some(lo + 1)),
                             lo,

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, EventQuery, Exception, Job, LeaseState, Mark, NewEvent, Output,
-    PostgresCatalog, Range, RangeState, ResultSet, Run, SqliteCatalog, Want, Worker, testing,
+    PostgresCatalog, Range, RangeState, ResultSet, Run, Settled, SqliteCatalog, Want, Worker,
+    testing,
 };
 use picofarm_proto::{
     ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
@@ -27,7 +28,13 @@ fn job() -> Job {
         state: JobState::Active,
         submitted_ms: 5,
         ended_ms: None,
+        paused: false,
+        user: "ada".into(),
     }
+}
+
+fn set() -> ResultSet {
+    ResultSet::of(&job().spec.stages[0])
 }
 
 fn stage() -> StageRef {
@@ -90,6 +97,7 @@ fn want(tasks: u64) -> Want {
         stage: stage(),
         tasks,
         now_ms: 100,
+        force: false,
     }
 }
 
@@ -129,23 +137,22 @@ async fn what_is_written_is_read_again_by_the_next_life(catalog: &dyn Catalog) {
     changes.put(lease.clone());
     changes.exceptions.insert((stage(), 2), exception.clone());
     changes.workers.insert(worker().id, worker());
-    assert_eq!(catalog.commit(changes).await.unwrap(), []);
+    assert_eq!(catalog.commit(changes).await.unwrap(), Settled::default());
     let snapshot = catalog.load().await.unwrap();
     assert_eq!(snapshot.jobs, [job()]);
     assert_eq!(snapshot.owned.ranges.len(), 2);
     assert!(snapshot.owned.ranges.contains(&lease) && snapshot.owned.ranges.contains(&b));
     assert_eq!(snapshot.owned.exceptions, [exception]);
     assert_eq!(snapshot.workers, [worker()]);
-    let set = ResultSet::of(&job().spec);
-    let runs = catalog.output_runs(&set, 9).await.unwrap();
+    let runs = catalog.output_runs(&set(), 9).await.unwrap();
     assert_eq!(runs, [Run { lo: 0, hi: 1 }, Run { lo: 5, hi: 7 }]);
-    let runs = catalog.output_runs(&set, 6).await.unwrap();
+    let runs = catalog.output_runs(&set(), 6).await.unwrap();
     assert_eq!(runs, [Run { lo: 0, hi: 1 }, Run { lo: 5, hi: 6 }]);
-    assert_eq!(catalog.timing(&set).await.unwrap().mean(), Some(1.5));
+    assert_eq!(catalog.timing(&set()).await.unwrap().mean(), Some(1.5));
     let found = catalog.manifests(&[(stage(), 5), (stage(), 4)]).await;
     assert_eq!(found.unwrap(), [Some([5; 32]), None]);
     let record = catalog.job(job().id).await.unwrap().unwrap();
-    let c = record.counts;
+    let c = record.counts();
     assert_eq!(
         (c.total, c.done, c.reused, c.leased, c.pending),
         (8, 2, 1, 1, 5)
@@ -228,7 +235,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         "{refused:?}"
     );
     assert_eq!(catalog.load().await.unwrap().owned.ranges, [mine]);
-    let runs = catalog.output_runs(&ResultSet::of(&job().spec), 9).await;
+    let runs = catalog.output_runs(&set(), 9).await;
     assert_eq!(runs.unwrap(), [Run { lo: 0, hi: 1 }]);
     // The same manifest again is no news.
     let again = Changes {
@@ -243,10 +250,10 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
     let mine = claim_all(catalog).await.remove(0);
     let id = job().id;
     let mut changes = Changes::default();
-    changes.perhaps_over.insert(id, 50);
+    changes.perhaps_over.insert(stage(), 50);
     assert_eq!(
         catalog.commit(changes.clone()).await.unwrap(),
-        [],
+        Settled::default(),
         "tasks are pending"
     );
     let dead = range(2, 8, 9, RangeState::Dead);
@@ -257,7 +264,7 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
         state: RangeState::Done { reused: false },
         ..mine
     });
-    let ended = catalog.commit(changes).await.unwrap();
+    let ended = catalog.commit(changes).await.unwrap().ends;
     assert_eq!(
         (ended[0].job, ended[0].state, ended[0].at_ms),
         (id, JobState::Failed, 50)
@@ -265,7 +272,11 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
     assert!(catalog.beat(0).await.unwrap().active.is_empty());
     let record = catalog.job(id).await.unwrap().unwrap();
     assert_eq!(
-        (record.counts.total, record.counts.done, record.counts.dead),
+        (
+            record.counts().total,
+            record.counts().done,
+            record.counts().dead
+        ),
         (9, 8, 1)
     );
     assert_eq!(record.job.ended_ms, Some(50));
@@ -302,8 +313,8 @@ async fn given_up_tasks_can_be_tried_again(catalog: &dyn Catalog) {
         .map(|r| (r.lo, r.hi))
         .collect();
     assert_eq!(spans, [(0, 2)]);
-    assert!(catalog.cancel(id, 70).await.unwrap());
-    assert!(!catalog.cancel(id, 71).await.unwrap(), "once");
+    assert!(catalog.cancel(id, "", 70).await.unwrap());
+    assert!(!catalog.cancel(id, "", 71).await.unwrap(), "once");
     assert_eq!(state().await, JobState::Cancelled);
     assert!(
         claim_all(catalog).await.is_empty(),
@@ -355,6 +366,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         after: 0,
         limit: 3,
         task: None,
+        stage: None,
         newest: false,
     };
     let page = catalog.events(&query).await.unwrap();
@@ -381,6 +393,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         job: None,
         limit: 2,
         task: None,
+        stage: None,
         newest: true,
         ..query
     };
@@ -403,6 +416,7 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
         stage: stage(),
         tasks: 9,
         now_ms: 0,
+        force: false,
     };
     catalog.claim(&[want]).await.unwrap();
     let mut changes = Changes::default();
@@ -608,12 +622,7 @@ async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
         a.commit(late).await,
         Err(CatalogError::Conflict(_))
     ));
-    assert!(
-        b.output_runs(&ResultSet::of(&job().spec), 9)
-            .await
-            .unwrap()
-            .is_empty()
-    );
+    assert!(b.output_runs(&set(), 9).await.unwrap().is_empty());
 }
 
 #[tokio::test]
@@ -673,7 +682,7 @@ async fn of_two_houses_that_finish_at_once_the_second_ends_the_job() {
     let second = claim_all(&b).await.remove(0);
     let done = |range: Range| {
         let mut changes = Changes::default();
-        changes.perhaps_over.insert(job().id, 50);
+        changes.perhaps_over.insert(stage(), 50);
         changes.give(Range {
             state: RangeState::Done { reused: false },
             ..range
@@ -681,7 +690,7 @@ async fn of_two_houses_that_finish_at_once_the_second_ends_the_job() {
         changes
     };
     let (x, y) = tokio::join!(a.commit(done(first)), b.commit(done(second)));
-    assert_eq!(x.unwrap().len() + y.unwrap().len(), 1);
+    assert_eq!(x.unwrap().ends.len() + y.unwrap().ends.len(), 1);
     assert_eq!(
         a.job(job().id).await.unwrap().unwrap().job.state,
         JobState::Done

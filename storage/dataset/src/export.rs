@@ -6,6 +6,7 @@ use futures::{StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
 use object_store::path::Path;
 use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
 
 use crate::codec::ChunkCodec;
 use crate::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
@@ -34,6 +35,8 @@ pub struct Exported {
     pub files: u64,
     /// Their bytes.
     pub bytes: u64,
+    /// SHA-256 over the names and contents of the files, in the order in which they are written.
+    pub sha256: [u8; 32],
 }
 
 /// An export under way.
@@ -43,6 +46,7 @@ pub struct Export<'a> {
     store: &'a dyn ObjectStore,
     prefix: Path,
     done: Exported,
+    digest: Sha256,
 }
 
 impl<'a> Export<'a> {
@@ -73,6 +77,7 @@ impl<'a> Export<'a> {
             store,
             prefix,
             done: Exported::default(),
+            digest: Sha256::new(),
         })
     }
 
@@ -142,6 +147,7 @@ impl<'a> Export<'a> {
         );
         root["consolidated_metadata"]["metadata"] = Value::Object(all);
         self.put(METADATA, pretty(&rename_manifests(&root))).await?;
+        self.done.sha256 = self.digest.finalize().into();
         Ok(self.done)
     }
 
@@ -172,6 +178,9 @@ impl<'a> Export<'a> {
     async fn put(&mut self, key: &str, bytes: Bytes) -> Result<(), DatasetError> {
         self.done.files += 1;
         self.done.bytes += bytes.len() as u64;
+        self.digest.update(key);
+        self.digest.update([0]);
+        self.digest.update(Sha256::digest(&bytes));
         let path = objects::path_of(&self.prefix, key);
         objects::create_or_match(self.store, &path, bytes).await
     }

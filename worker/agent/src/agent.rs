@@ -10,7 +10,7 @@ use std::{
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
-    model::WorkerHello,
+    model::{Abilities, WorkerHello},
 };
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
@@ -31,6 +31,8 @@ use crate::{
 
 /// A running task this close to its end may finish after the shutdown signal.
 const FINISH_WITHIN: Duration = Duration::from_millis(1500);
+/// How long a worker that is drained waits for its task.
+const LONGEST_TASK: Duration = Duration::from_secs(30 * 86_400);
 /// How long a task may take to stop before the worker leaves without it.
 const STOP_WITHIN: Duration = Duration::from_secs(10);
 /// How long the last words may wait for their acknowledgement.
@@ -42,14 +44,14 @@ const GOOD_SESSION: Duration = Duration::from_secs(10);
 const NEXT_COORDINATOR: Duration = Duration::from_millis(300);
 const SHUTDOWN: &str = "the worker is shutting down";
 
-/// Runs a worker that renders, until `shutdown` or a refusal.
+/// Runs a worker for every kind of task, until `shutdown` or a refusal.
 ///
 /// # Errors
 /// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
 /// coordinator is no error: the worker tries again for ever.
 pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
     config.check()?;
-    let executor = crate::execute::RenderExecutor::new(&config.asset_dirs, Handle::current());
+    let executor = crate::execute::TaskExecutor::new(&config.asset_dirs, Handle::current());
     run_with(config, Arc::new(executor), shutdown).await
 }
 
@@ -73,10 +75,15 @@ pub async fn run_with(
         name: config.name.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         protocol: PROTOCOL,
-        cores: u32::try_from(config.threads).unwrap_or(u32::MAX),
         held: Vec::new(),
-        renderer: executor.renderer(),
-        assets: executor.assets(),
+        abilities: Abilities {
+            kinds: executor.kinds(),
+            assets: executor.assets(),
+            cores: u32::try_from(config.threads).unwrap_or(u32::MAX),
+            memory_mib: config.memory_mib,
+            gpus: config.gpus,
+            labels: config.labels,
+        },
     };
     info!(worker = %hello.id, name = hello.name, threads = config.threads,
         coordinator = config.coordinator, "worker starts");
@@ -144,8 +151,18 @@ impl Link {
     }
 }
 
+/// How to leave.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Haste {
+    /// Now.
+    Stop,
+    /// When the task in hand is finished.
+    Finish,
+}
+
 /// The way out.
 struct Leaving {
+    haste: Haste,
     /// The running task is told to stop at this time.
     stop_at: Instant,
     /// Leave whatever still runs or waits.
@@ -184,11 +201,15 @@ impl Agent {
             }
             self.work(now);
             let wake = self.wake(now);
+            let stopping = self
+                .leaving
+                .as_ref()
+                .is_some_and(|l| l.haste == Haste::Stop);
             tokio::select! {
                 event = self.link.event() => self.link_event(event)?,
                 result = self.runner.finished() => self.task_ended(result),
                 () = tokio::time::sleep_until(wake.into()) => {}
-                () = shutdown.cancelled(), if self.leaving.is_none() => self.begin_leaving(),
+                () = shutdown.cancelled(), if !stopping => self.begin_leaving(Haste::Stop),
             }
         }
     }
@@ -364,6 +385,11 @@ impl Agent {
                     control.stop();
                 }
             }
+            Incoming::Trim { lease, hi } => {
+                info!(range = %lease.range, epoch = %lease.epoch, hi, "the end of this lease is another worker's now");
+                self.desk.trimmed(lease, hi);
+            }
+            Incoming::Drain => self.begin_leaving(Haste::Finish),
             Incoming::Unknown(what) => warn!(what, "the coordinator sent a message of no use"),
         }
     }
@@ -403,22 +429,25 @@ impl Agent {
         }
     }
 
-    /// The shutdown signal came.
-    fn begin_leaving(&mut self) {
+    /// The shutdown signal came, or the coordinator's wish.
+    fn begin_leaving(&mut self, haste: Haste) {
         let now = Instant::now();
         self.desk.drain();
         let nearly_done = self
             .remaining(now)
             .is_some_and(|left| left <= FINISH_WITHIN);
-        let stop_at = if nearly_done {
-            now + FINISH_WITHIN
-        } else {
-            now
+        let stop_at = match haste {
+            Haste::Finish => now + LONGEST_TASK,
+            Haste::Stop if nearly_done => now + FINISH_WITHIN,
+            Haste::Stop => now,
         };
         info!(
             running = self.desk.in_hand().is_some(),
-            nearly_done, "shutting down"
+            nearly_done,
+            ?haste,
+            "shutting down"
         );
+        self.desk.release_waiting(SHUTDOWN);
         let fraction = self.control.as_ref().map_or(0.0, |c| c.fraction());
         if let Link::Up { session, .. } = &self.link {
             for message in self.desk.withdraw(now, fraction) {
@@ -426,6 +455,7 @@ impl Agent {
             }
         }
         self.leaving = Some(Leaving {
+            haste,
             stop_at,
             give_up: stop_at + STOP_WITHIN,
             released: false,

@@ -2,11 +2,11 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_proto::model::{JobSpec, SceneKind};
+use picofarm_proto::model::{StageSpec, TaskSpec};
 
 use crate::AgentError;
 
-/// Where tasks may write their output and read scene files. Without any prefix: anywhere.
+/// Where tasks may write their output and read their input. Without any prefix: anywhere.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct StorePrefixes(Vec<Place>);
 
@@ -37,19 +37,26 @@ impl StorePrefixes {
             .map(Self)
     }
 
-    /// Whether task `index` of the job touches only allowed places; else why not.
-    pub(crate) fn check(&self, spec: &JobSpec, index: u64) -> Result<(), String> {
-        spec.check_places().map_err(|e| e.to_string())?;
+    /// Whether task `index` of a stage touches only allowed places; else why not.
+    pub(crate) fn check(&self, stage: &StageSpec, index: u64) -> Result<(), String> {
+        stage.check_places().map_err(|e| e.to_string())?;
         if self.0.is_empty() {
             return Ok(());
         }
-        self.allowed("output.store", &spec.output.store)?;
-        if let SceneKind::Files { files } = &spec.scenes.kind
-            && let Some(file) = usize::try_from(index).ok().and_then(|i| files.get(i))
-        {
-            self.allowed(&format!("scenes.files[{index}]"), &file.path)?;
+        if let Some(source) = stage.task.reads() {
+            self.allowed("source.store", &source.store)?;
         }
-        Ok(())
+        if let Some((store, _)) = stage.task.writes() {
+            self.allowed("output.store", store)?;
+        }
+        match &stage.task {
+            TaskSpec::Render(task) => match task.scenes.kind.file(index) {
+                Some(file) => self.allowed(&format!("scenes.files[{index}]"), &file.path),
+                None => Ok(()),
+            },
+            TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
+            TaskSpec::Reprocess(_) | TaskSpec::Split(_) => Ok(()),
+        }
     }
 
     fn allowed(&self, field: &str, text: &str) -> Result<(), String> {

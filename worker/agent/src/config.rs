@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use picofarm_proto::ids::WorkerId;
+use picofarm_proto::{ids::WorkerId, model::check_label};
 
 use crate::{Access, AccessError};
 
@@ -18,6 +18,12 @@ pub struct AgentConfig {
     pub worker_id: Option<WorkerId>,
     /// Threads of the render pool, at least 1.
     pub threads: usize,
+    /// Memory that tasks may take, MiB; 0 = not known, which meets no stage that asks for any.
+    pub memory_mib: u64,
+    /// Graphics processors.
+    pub gpus: u32,
+    /// Labels that stages may ask for.
+    pub labels: Vec<String>,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,
     /// What this worker has to show, and whom it trusts.
@@ -37,6 +43,11 @@ impl AgentConfig {
         };
         if self.threads == 0 {
             return fail("threads", "is 0; give the worker at least 1 thread");
+        }
+        for label in &self.labels {
+            if let Err(what) = check_label(label) {
+                return fail("label", &what);
+            }
         }
         if self.name.trim().is_empty() {
             return fail("name", "is empty; give the worker a name");

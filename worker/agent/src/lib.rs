@@ -15,5 +15,8 @@ pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
 pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
-pub use execute::{check_memory, render_bytes, renderer_version, strategy, strategy_names};
-pub use execute::{reprocess, split};
+pub use execute::{
+    TaskExecutor, check_memory, memory_mib, render_bytes, renderer_version, strategy,
+    strategy_names,
+};
+pub use execute::{export, reprocess, split};

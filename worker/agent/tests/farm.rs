@@ -8,7 +8,7 @@ use common::{Gate, Worker, config, output, soon, spec, until};
 use picofarm_coordinator::{CoordinatorConfig, Running, serve};
 use picofarm_dataset::{Dataset, VerifyMode, open_store};
 use picofarm_proto::{
-    model::{JobSpec, JobState, JobStatus},
+    model::{JobSpec, JobState, JobStatus, RenderTask},
     wire::{self, jobs_client::JobsClient},
 };
 use tokio_util::sync::CancellationToken;
@@ -50,9 +50,9 @@ impl Farm {
             .unwrap()
     }
 
-    async fn submit(&self, spec: &JobSpec) -> String {
+    async fn submit(&self, spec: &RenderTask) -> String {
         let request = wire::SubmitJobRequest {
-            spec: Some(spec.clone().into()),
+            spec: Some(JobSpec::render("test", spec.clone()).into()),
             again: false,
         };
         self.client()

@@ -10,13 +10,13 @@ use std::{
     time::Duration,
 };
 
-use common::{FakeFarm, soon, spec};
-use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::RenderExecutor};
+use common::{FakeFarm, soon, spec, stage};
+use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::TaskExecutor};
 use picofarm_dataset::{Dataset, VerifyMode, open_store};
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
-    model::{JobSpec, SceneFile, SceneKind},
+    model::{RenderTask, SceneFile, SceneKind},
 };
 use picofarm_scene::{export, primitive};
 use sha2::{Digest, Sha256};
@@ -27,7 +27,7 @@ use uuid::Uuid;
 /// A store in a folder of its own, and a job that writes there.
 struct Place {
     dir: TempDir,
-    spec: JobSpec,
+    spec: RenderTask,
 }
 
 impl Place {
@@ -63,13 +63,13 @@ impl Place {
     ) -> Result<Output, TaskError> {
         let task = Task {
             job: JobId::from_uuid(Uuid::nil()),
-            stage: stage_key(&self.spec),
-            spec: Arc::new(self.spec.clone()),
+            stage: stage_key(&stage(self.spec.clone())),
+            spec: Arc::new(stage(self.spec.clone())),
             index,
         };
         let runtime = Handle::current();
         let work = tokio::task::spawn_blocking(move || {
-            let executor = RenderExecutor::new(&[], runtime);
+            let executor = TaskExecutor::new(&[], runtime);
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             pool.unwrap().install(|| executor.run(&task, &control))
         });
@@ -197,6 +197,7 @@ fn of_file(name: &str, content: &[u8]) -> Place {
             path: path.to_str().unwrap().into(),
             sha256: sha256(content),
         }],
+        first: 0,
     };
     place.spec.scenes.count = 1;
     place
@@ -395,7 +396,8 @@ async fn a_whole_worker_renders_a_lease_and_its_successor_adopts_it() {
         let (mut c, hello) = farm.welcome(60_000).await;
         assert!(hello.assets.contains(&"parametric-1".into()));
         let mut lease = common::lease(1, 0, 2);
-        lease.spec = place.spec.clone();
+        lease.stage = stage(place.spec.clone());
+        lease.key = stage_key(&lease.stage);
         c.grant(lease).await;
         for index in 0..2 {
             let done = c.done().await;

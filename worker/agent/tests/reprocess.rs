@@ -12,7 +12,7 @@ use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
     model::{
         DeadTimeSettings, Histogram, JitterSettings, OutputSettings, PulseSettings,
-        ReprocessSettings, ScaleSettings, SensorSettings, SourceSettings,
+        ReprocessSettings, ReprocessTask, ScaleSettings, SensorSettings, SourceSettings,
     },
 };
 use serde_json::json;
@@ -53,10 +53,6 @@ impl Place {
         };
         Self {
             settings: ReprocessSettings {
-                source: SourceSettings {
-                    store: store.clone(),
-                    dataset: "source".into(),
-                },
                 histogram: Histogram::Transient,
                 spots: vec![],
                 sensor,
@@ -155,7 +151,15 @@ impl Place {
     }
 
     async fn run_on(&self, threads: usize, index: u64) -> Result<Output, TaskError> {
-        let (settings, target) = (self.settings.clone(), self.target.clone());
+        let task = ReprocessTask {
+            source: SourceSettings {
+                store: self.target.store.clone(),
+                dataset: "source".into(),
+            },
+            count: 4,
+            reprocess: self.settings.clone(),
+            output: self.target.clone(),
+        };
         let reprocessor = Reprocessor::new(tokio::runtime::Handle::current());
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -163,7 +167,7 @@ impl Place {
             .unwrap();
         tokio::task::spawn_blocking(move || {
             let control = Arc::new(Control::default());
-            pool.install(|| reprocessor.run(&settings, &target, index, &control))
+            pool.install(|| reprocessor.run(&task, index, &control))
         })
         .await
         .unwrap()
@@ -496,16 +500,16 @@ async fn counts_beyond_sixteen_bits_are_kept() {
 }
 
 #[tokio::test]
-async fn a_scene_that_is_not_there_yet_costs_nothing_and_one_that_cannot_be_is_refused() {
+async fn a_scene_that_is_not_there_is_named_and_one_that_cannot_be_is_refused() {
     let mut place = Place::new(SensorSettings::default());
     let text = place.complaint(0).await;
     assert!(
-        text.starts_with("reprocess.source: ") && text.contains("no data set here"),
+        text.starts_with("source: ") && text.contains("no data set here"),
         "{text}"
     );
     place.publish(0, lively).await;
     match place.run(1).await {
-        Err(TaskError::Interrupted(text)) => assert!(text.contains("scene 1 is not there yet")),
+        Err(TaskError::User(text)) => assert!(text.contains("scene 1 is not there")),
         other => panic!("{other:?}"),
     }
     let text = place.complaint(4).await;

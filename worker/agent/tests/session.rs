@@ -4,7 +4,7 @@ mod common;
 
 use std::time::Duration;
 
-use common::{Conversation, FakeFarm, Gate, Worker, lease, output, spec};
+use common::{Conversation, FakeFarm, Gate, Worker, lease, output, spec, stage};
 use picofarm_agent::{AgentError, TaskError};
 use picofarm_proto::{
     PROTOCOL,
@@ -31,17 +31,15 @@ async fn a_lease_is_worked_off_in_order_without_the_tasks_to_skip_and_the_next_i
     });
     let (mut c, hello) = farm.welcome(60_000).await;
     assert_eq!((hello.protocol, hello.cores), (PROTOCOL, 1));
-    assert_eq!(
-        (hello.renderer.as_str(), &hello.assets[..]),
-        ("fake-1", &["parametric-1".into()][..])
-    );
+    assert_eq!(hello.kinds["render"], "fake-1");
+    assert_eq!(hello.assets, ["parametric-1"]);
     assert!(hello.held.is_empty());
     c.listen_until("credit", |c| c.credit == 1).await;
 
     let mut first = lease(1, 3, 7);
     first.skip = vec![3, 5];
     c.grant(first).await;
-    let stage = stage_key(&spec("/nowhere"));
+    let stage = stage_key(&stage(spec("/nowhere")));
     for index in [4, 6] {
         let done = c.done().await;
         assert_eq!(done.index, index);

@@ -10,8 +10,8 @@ use std::{
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, LeaseRef, WorkerId},
-    key::{StageKey, stage_key, task_key},
-    model::{Finished, Lease, WorkerHello},
+    key::{StageKey, task_key},
+    model::{Abilities, Finished, Lease, WorkerHello},
     wire::{
         self, farm_client::FarmClient, session_request::Message as Say,
         session_response::Message as Heard,
@@ -64,10 +64,12 @@ impl Simulated {
             name: format!("simulated-{i}"),
             version: env!("CARGO_PKG_VERSION").into(),
             protocol: PROTOCOL,
-            cores: 1,
             held: Vec::new(),
-            renderer: RENDERER.into(),
-            assets: Vec::new(),
+            abilities: Abilities {
+                kinds: [("render".to_owned(), RENDERER.to_owned())].into(),
+                cores: 1,
+                ..Abilities::default()
+            },
         };
         Self {
             url,
@@ -169,7 +171,7 @@ impl Simulated {
                 }
                 self.leases.push_back(Held {
                     lease: lease.lease,
-                    stage: stage_key(&lease.spec),
+                    stage: lease.key,
                     next: lease.lo,
                     hi: lease.hi,
                 });
@@ -194,7 +196,17 @@ impl Simulated {
                 }
             }
             Heard::Revoke(_) => self.stats.revoke(),
-            Heard::Renewed(_) | Heard::Welcome(_) => {}
+            Heard::Trim(trim) => {
+                let lease = trim
+                    .lease
+                    .ok_or("a trimming without a lease")?
+                    .try_into()
+                    .map_err(|e| format!("{e}"))?;
+                for held in self.leases.iter_mut().filter(|h| h.lease == lease) {
+                    held.hi = held.hi.min(trim.hi);
+                }
+            }
+            Heard::Renewed(_) | Heard::Welcome(_) | Heard::Drain(_) => {}
         }
         Ok(())
     }

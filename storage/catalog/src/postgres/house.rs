@@ -1,8 +1,8 @@
 //! The life of a house: founded, renewed, lost, left; what falls to it from others.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_proto::ids::{HouseId, RangeId, WorkerId};
+use picofarm_proto::ids::{HouseId, JobId, RangeId, WorkerId};
 use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
@@ -103,6 +103,23 @@ pub(super) async fn leased(c: &mut PgConnection, house: HouseId) -> Sql<BTreeSet
             .fetch_all(c)
             .await?;
     Ok(ids.into_iter().map(RangeId::from_uuid).collect())
+}
+
+/// Workers of other houses that have leases, by job.
+pub(super) async fn busy(c: &mut PgConnection, house: HouseId) -> Sql<BTreeMap<JobId, u32>> {
+    let rows = sqlx::query(
+        "SELECT job.id, count(DISTINCT worker) AS workers FROM task_range JOIN stage ON stage.key = task_range.stage \
+         JOIN job ON job.key = stage.job WHERE task_range.state = 1 AND owner <> $1 GROUP BY job.id",
+    )
+    .bind(house.uuid())
+    .fetch_all(c)
+    .await?;
+    rows.iter()
+        .map(|row| {
+            let workers = u32::try_from(row.try_get::<i64, _>("workers")?).unwrap_or(u32::MAX);
+            Ok((JobId::from_uuid(row.try_get("id")?), workers))
+        })
+        .collect()
 }
 
 /// Gives everything up that is not leased, and the house. Its leases find a new one.

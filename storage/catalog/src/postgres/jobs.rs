@@ -3,71 +3,47 @@
 use std::collections::HashMap;
 
 use picofarm_proto::{
-    ids::JobId,
-    model::{EventKind, JobState},
+    ids::{JobId, StageRef},
+    model::EventKind,
 };
 
 use super::{
-    query,
+    job_query,
     write::{Desk, RANGE, Result, WriteError, give, insert_events, insert_ranges, ranges},
 };
 use crate::{
-    Job, JobEnd, NewEvent, Range, RangeState,
+    Job, NewEvent, Range, RangeState, Settled,
     sql::{self, int},
 };
 
-/// Ends an active job of which nothing is pending or leased. Its row is locked first: of two houses that finish their
-/// last tasks at once, the second sees what the first wrote.
-pub(super) async fn end_if_over(
+/// Where a stage is over, opens those that waited for it and ends the job if that was the last. The job's row is locked
+/// first: of two houses that finish their last tasks at once, the second sees what the first wrote.
+pub(super) async fn stage_over(
     desk: &mut Desk<'_>,
-    id: JobId,
+    stage: StageRef,
     at_ms: i64,
-) -> Result<Option<JobEnd>> {
+) -> Result<Settled> {
+    let keys = desk.keys(stage).await?;
+    if !hold(desk, keys.job).await? || job_query::is_open(desk.c, keys.stage).await? {
+        return Ok(Settled::default());
+    }
+    settle(desk, stage.job, at_ms).await
+}
+
+/// Locks the row of a job; whether it is active.
+async fn hold(desk: &mut Desk<'_>, key: i64) -> Result<bool> {
+    let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE key = $1 FOR UPDATE")
+        .bind(key)
+        .fetch_optional(&mut *desk.c)
+        .await?;
+    Ok(state == Some(0))
+}
+
+async fn settle(desk: &mut Desk<'_>, id: JobId, at_ms: i64) -> Result<Settled> {
     let key = desk.job(id).await?;
-    let active: Option<i32> =
-        sqlx::query_scalar("SELECT 1 FROM job WHERE key = $1 AND state = 0 FOR UPDATE")
-            .bind(key)
-            .fetch_optional(&mut *desk.c)
-            .await?;
-    if active.is_none() {
-        return Ok(None);
-    }
-    let open: Option<i32> = sqlx::query_scalar(
-        "SELECT 1 FROM task_range JOIN stage ON stage.key = task_range.stage \
-         WHERE stage.job = $1 AND state IN (0, 1) LIMIT 1",
-    )
-    .bind(key)
-    .fetch_optional(&mut *desk.c)
-    .await?;
-    if open.is_some() {
-        return Ok(None);
-    }
-    let counts = query::counts(desk.c, key).await?;
-    let state = if counts.dead > 0 {
-        JobState::Failed
-    } else {
-        JobState::Done
-    };
-    sqlx::query(
-        "UPDATE job SET state = $2, ended_ms = $3, tasks = $4, done = $5, reused = $6, dead = $7, \
-         (timed, seconds) = (SELECT count(*), coalesce(sum(seconds), 0) FROM output \
-           WHERE NOT adopted AND result_set IN (SELECT result_set FROM stage WHERE job = $1)) WHERE key = $1",
-    )
-    .bind(key)
-    .bind(sql::job_state_code(state))
-    .bind(at_ms)
-    .bind(int(counts.total))
-    .bind(int(counts.done))
-    .bind(int(counts.reused))
-    .bind(int(counts.dead))
-    .execute(&mut *desk.c)
-    .await?;
-    insert_events(desk, &[NewEvent::ended(id, at_ms, &counts)]).await?;
-    Ok(Some(JobEnd {
-        job: id,
-        state,
-        at_ms,
-    }))
+    let (settled, events) = job_query::settle(desk.c, key, id, at_ms).await?;
+    insert_events(desk, &events).await?;
+    Ok(settled)
 }
 
 pub(super) async fn submit(
@@ -78,13 +54,14 @@ pub(super) async fn submit(
 ) -> Result<bool> {
     let spec = serde_json::to_string(&*job.spec).expect("a spec is plain data");
     let key: Option<i64> = sqlx::query_scalar(
-        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms) VALUES ($1, $2, $3, 0, $4) \
+        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms, username) VALUES ($1, $2, $3, 0, $4, $5) \
          ON CONFLICT DO NOTHING RETURNING key",
     )
     .bind(job.id.uuid())
     .bind(&job.spec_hash)
     .bind(spec)
     .bind(job.submitted_ms)
+    .bind(&job.user)
     .fetch_optional(&mut *desk.c)
     .await?;
     let Some(key) = key else {
@@ -102,7 +79,8 @@ pub(super) async fn submit(
         .execute(&mut *desk.c)
         .await?;
         let stage_key: i64 = sqlx::query_scalar(
-            "INSERT INTO stage (job, ordinal, result_set, tasks) SELECT $1, $2, key, $3 FROM result_set \
+            "INSERT INTO stage (job, ordinal, result_set, tasks, state, needs, tolerate_dead) \
+             SELECT $1, $2, key, $3, 0, $7, $8 FROM result_set \
              WHERE store = $4 AND dataset = $5 AND stage_key = $6 RETURNING key",
         )
         .bind(key)
@@ -111,6 +89,8 @@ pub(super) async fn submit(
         .bind(&set.store)
         .bind(&set.dataset)
         .bind(&set.stage_key.0[..])
+        .bind(sql::needs_text(&stage.needs))
+        .bind(stage.tolerate_dead)
         .fetch_one(&mut *desk.c)
         .await?;
         stages.insert(stage.id, stage_key);
@@ -118,35 +98,49 @@ pub(super) async fn submit(
     let rows: Vec<_> = ranges.iter().map(|r| (stages[&r.stage], r)).collect();
     insert_ranges(desk, &rows, false).await?;
     insert_events(desk, events).await?;
-    end_if_over(desk, job.id, job.submitted_ms).await?;
+    settle(desk, job.id, job.submitted_ms).await?;
     Ok(true)
 }
 
-pub(super) async fn cancel(desk: &mut Desk<'_>, job: JobId, now_ms: i64) -> Result<bool> {
+pub(super) async fn cancel(
+    desk: &mut Desk<'_>,
+    job: JobId,
+    why: &str,
+    now_ms: i64,
+) -> Result<bool> {
     let key = desk.job(job).await?;
-    let cancelled =
-        sqlx::query("UPDATE job SET state = $1, ended_ms = $2 WHERE key = $3 AND state = 0")
-            .bind(sql::job_state_code(JobState::Cancelled))
-            .bind(now_ms)
-            .bind(key)
-            .execute(&mut *desk.c)
-            .await?
-            .rows_affected()
-            > 0;
+    let cancelled = job_query::cancel(desk.c, key, now_ms).await?;
     if cancelled {
-        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, String::new());
+        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, why.to_owned());
         insert_events(desk, &[event]).await?;
     }
     Ok(cancelled)
 }
 
+pub(super) async fn pause(
+    desk: &mut Desk<'_>,
+    job: JobId,
+    paused: bool,
+    who: &str,
+    now_ms: i64,
+) -> Result<bool> {
+    let key = desk.job(job).await?;
+    let changed = job_query::pause(desk.c, key, paused).await?;
+    if changed {
+        let kind = match paused {
+            true => EventKind::Paused,
+            false => EventKind::Resumed,
+        };
+        let event = NewEvent::of(job, now_ms, kind, who.to_owned());
+        insert_events(desk, &[event]).await?;
+    }
+    Ok(changed)
+}
+
 pub(super) async fn retry(desk: &mut Desk<'_>, job: JobId, now_ms: i64) -> Result<u64> {
     let key = desk.job(job).await?;
     // The job's row first, as whoever ends it does.
-    sqlx::query("SELECT 1 FROM job WHERE key = $1 FOR UPDATE")
-        .bind(key)
-        .execute(&mut *desk.c)
-        .await?;
+    hold(desk, key).await?;
     let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
         "DELETE FROM task_range WHERE state = 4 AND stage IN (SELECT key FROM stage WHERE job = $1) RETURNING {RANGE}"
     )))
@@ -179,6 +173,7 @@ pub(super) async fn retry(desk: &mut Desk<'_>, job: JobId, now_ms: i64) -> Resul
         let message = format!("{retried} dead tasks are pending again");
         let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
         insert_events(desk, &[event]).await?;
+        settle(desk, job, now_ms).await?;
     }
     Ok(retried)
 }

@@ -29,12 +29,13 @@ use sqlx::{
 use uuid::Uuid;
 
 use crate::{
-    Catalog, CatalogError, Changes, Claim, Job, JobEnd, JobRecord, NewEvent, News, Owned, Range,
-    RangeState, Snapshot, Want,
+    Catalog, CatalogError, Changes, Claim, Job, JobRecord, NewEvent, News, Owned, Range,
+    RangeState, Settled, Snapshot, Want,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
 crate::sql::queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
 
@@ -203,7 +204,7 @@ impl Catalog for PostgresCatalog {
             let ranges = house::take_lost(&mut tx, house).await?;
             let snapshot = Snapshot {
                 house,
-                jobs: query::active_jobs(&mut tx).await?,
+                jobs: job_query::active_jobs(&mut tx).await?,
                 owned: Owned {
                     exceptions: query::exceptions(&mut tx, &ranges).await?,
                     ranges,
@@ -229,8 +230,9 @@ impl Catalog for PostgresCatalog {
             let taken = house::take_lost(&mut tx, house).await?;
             let (houses, workers) = house::count_houses(&mut tx).await?;
             let news = News {
-                active: query::active_ids(&mut tx).await?,
-                free: query::free(&mut tx).await?,
+                active: job_query::active(&mut tx).await?,
+                busy: house::busy(&mut tx, house).await?,
+                free: job_query::free(&mut tx).await?,
                 taken: Owned {
                     exceptions: query::exceptions(&mut tx, &taken).await?,
                     ranges: taken,
@@ -278,18 +280,18 @@ impl Catalog for PostgresCatalog {
         .await
     }
 
-    async fn commit(&self, changes: Changes) -> Result<Vec<JobEnd>, CatalogError> {
+    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError> {
         if changes.is_empty() {
-            return Ok(Vec::new());
+            return Ok(Settled::default());
         }
-        let ended = self
+        let settled = self
             .write(async |desk| write::changes(desk, &changes).await)
             .await?;
         let pending = |r: &Range| matches!(r.state, RangeState::Pending { .. });
-        if !ended.is_empty() || changes.free.values().any(pending) {
+        if settled != Settled::default() || changes.free.values().any(pending) {
             self.hint().await;
         }
-        Ok(ended)
+        Ok(settled)
     }
 
     async fn submit(
@@ -305,12 +307,46 @@ impl Catalog for PostgresCatalog {
         Ok(new)
     }
 
-    async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError> {
+    async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError> {
         let cancelled = self
-            .write(async |desk| jobs::cancel(desk, job, now_ms).await)
+            .write(async |desk| jobs::cancel(desk, job, why, now_ms).await)
             .await?;
         self.hint().await;
         Ok(cancelled)
+    }
+
+    async fn pause(
+        &self,
+        job: JobId,
+        paused: bool,
+        who: &str,
+        now_ms: i64,
+    ) -> Result<bool, CatalogError> {
+        let changed = self
+            .write(async |desk| jobs::pause(desk, job, paused, who, now_ms).await)
+            .await?;
+        self.hint().await;
+        Ok(changed)
+    }
+
+    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError> {
+        let mut forgotten = 0;
+        // One transaction each: they may be long.
+        while forgotten < most
+            && self
+                .write(async |desk| Ok(job_query::forget(desk.c, before_ms).await?))
+                .await?
+        {
+            forgotten += 1;
+        }
+        Ok(forgotten)
+    }
+
+    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::jobs_of(&mut c, user)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
@@ -323,7 +359,7 @@ impl Catalog for PostgresCatalog {
 
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        let mut found = query::jobs(&mut c, Some(id))
+        let mut found = job_query::jobs(&mut c, Some(id))
             .await
             .map_err(|e| self.failed(e))?;
         Ok(found.pop())
@@ -331,19 +367,28 @@ impl Catalog for PostgresCatalog {
 
     async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        query::jobs(&mut c, None).await.map_err(|e| self.failed(e))
+        job_query::jobs(&mut c, None)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        query::job_with(&mut c, spec_hash)
+        job_query::job_with(&mut c, spec_hash)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::recent(&mut c, most)
             .await
             .map_err(|e| self.failed(e))
     }
 
     async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        query::jobs_at(&mut c, store, dataset)
+        job_query::jobs_at(&mut c, store, dataset)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -370,12 +415,14 @@ impl Catalog for PostgresCatalog {
 
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError> {
         let mut c = self.reader().await?;
-        query::timing(&mut c, set).await.map_err(|e| self.failed(e))
+        job_query::timing(&mut c, set)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError> {
         let mut c = self.reader().await?;
-        query::holdups(&mut c, job, now_ms)
+        job_query::holdups(&mut c, job, now_ms)
             .await
             .map_err(|e| self.failed(e))
     }

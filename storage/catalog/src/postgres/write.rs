@@ -8,7 +8,7 @@ use uuid::Uuid;
 
 use super::{jobs, query};
 use crate::{
-    Changes, Claim, Exception, JobEnd, NewEvent, Output, Owned, Range, Want,
+    Changes, Claim, Exception, NewEvent, Output, Owned, Range, Settled, Want,
     sql::{self, StateColumns, int},
 };
 
@@ -90,7 +90,8 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
         let key = desk.keys(want.stage).await?.stage;
         let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
             "SELECT {RANGE} FROM task_range WHERE stage = $1 AND state = 0 AND owner IS NULL AND not_before_ms <= $2 \
-             AND EXISTS (SELECT 1 FROM job JOIN stage ON stage.job = job.key WHERE stage.key = $1 AND job.state = 0) \
+             AND EXISTS (SELECT 1 FROM job JOIN stage ON stage.job = job.key \
+               WHERE stage.key = $1 AND stage.state = 1 AND job.state = 0 AND NOT job.paused) \
              ORDER BY not_before_ms, lo LIMIT $3 FOR UPDATE SKIP LOCKED"
         )))
         .bind(key)
@@ -128,7 +129,7 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
             .execute(&mut *desk.c)
             .await?;
         let mut existing = Vec::new();
-        for range in &claimed {
+        for range in claimed.iter().filter(|_| !want.force) {
             existing.extend(query::runs_of_stage(desk.c, want.stage, range.lo, range.hi).await?);
         }
         existing.sort_unstable_by_key(|run| run.lo);
@@ -151,7 +152,7 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
     Ok(claims)
 }
 
-pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Vec<JobEnd>> {
+pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Settled> {
     replace_known(desk, changes).await?;
     let mut rows = Vec::with_capacity(changes.ranges.len());
     for range in changes.ranges.values() {
@@ -180,11 +181,11 @@ pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Ve
         .await?;
     }
     insert_events(desk, &changes.events).await?;
-    let mut ended = Vec::new();
-    for (job, at_ms) in &changes.perhaps_over {
-        ended.extend(jobs::end_if_over(desk, *job, *at_ms).await?);
+    let mut settled = Settled::default();
+    for (stage, at_ms) in &changes.perhaps_over {
+        settled.join(jobs::stage_over(desk, *stage, *at_ms).await?);
     }
-    Ok(ended)
+    Ok(settled)
 }
 
 async fn put_exception(desk: &mut Desk<'_>, exception: &Exception) -> Result<()> {
@@ -370,9 +371,9 @@ pub(super) async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> R
     let text =
         |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
     sqlx::query(
-        "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message) \
+        "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message, stage) \
          SELECT * FROM UNNEST($1::BIGINT[], $2::BIGINT[], $3::BIGINT[], $4::BIGINT[], $5::BIGINT[], $6::TEXT[], \
-         $7::DOUBLE PRECISION[], $8::TEXT[])",
+         $7::DOUBLE PRECISION[], $8::TEXT[], $9::BIGINT[])",
     )
     .bind(events.iter().map(|e| e.at_ms).collect::<Vec<_>>())
     .bind(jobs)
@@ -401,6 +402,12 @@ pub(super) async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> R
         events
             .iter()
             .map(|e| e.message.replace('\0', "\u{fffd}"))
+            .collect::<Vec<_>>(),
+    )
+    .bind(
+        events
+            .iter()
+            .map(|e| e.stage.map(i64::from))
             .collect::<Vec<_>>(),
     )
     .execute(&mut *desk.c)

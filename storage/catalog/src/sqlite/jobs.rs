@@ -3,68 +3,48 @@
 use std::collections::HashMap;
 
 use picofarm_proto::{
-    ids::JobId,
-    model::{EventKind, JobState},
+    ids::{JobId, StageRef},
+    model::EventKind,
 };
 use sqlx::SqliteConnection;
 
 use super::{
-    query,
+    job_query, query,
     write::{Keys, Result, WriteError, give, insert_events, insert_ranges},
 };
 use crate::{
-    Job, JobEnd, NewEvent, Range, RangeState,
+    Job, NewEvent, Range, RangeState, Settled,
     sql::{self, int},
 };
 
-/// Ends an active job of which nothing is pending or leased.
-pub(super) async fn end_if_over(
+/// Where a stage is over, opens those that waited for it and ends the job if that was the last.
+pub(super) async fn stage_over(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    stage: StageRef,
+    at_ms: i64,
+) -> Result<Settled> {
+    let key = keys.of(c, stage).await?;
+    let state: i64 = sqlx::query_scalar("SELECT state FROM job WHERE key = ?")
+        .bind(key.job)
+        .fetch_one(&mut *c)
+        .await?;
+    if state != 0 || job_query::is_open(c, key.stage).await? {
+        return Ok(Settled::default());
+    }
+    settle(c, keys, stage.job, at_ms).await
+}
+
+async fn settle(
     c: &mut SqliteConnection,
     keys: &mut Keys,
     id: JobId,
     at_ms: i64,
-) -> Result<Option<JobEnd>> {
+) -> Result<Settled> {
     let key = keys.job(c, id).await?;
-    let active: Option<i64> = sqlx::query_scalar("SELECT 1 FROM job WHERE key = ? AND state = 0")
-        .bind(key)
-        .fetch_optional(&mut *c)
-        .await?;
-    let open: Option<i64> = sqlx::query_scalar(
-        "SELECT 1 FROM task_range JOIN stage ON stage.key = task_range.stage \
-         WHERE stage.job = ? AND state IN (0, 1) LIMIT 1",
-    )
-    .bind(key)
-    .fetch_optional(&mut *c)
-    .await?;
-    if active.is_none() || open.is_some() {
-        return Ok(None);
-    }
-    let counts = query::counts(c, key).await?;
-    let state = if counts.dead > 0 {
-        JobState::Failed
-    } else {
-        JobState::Done
-    };
-    sqlx::query(
-        "UPDATE job SET state = ?2, ended_ms = ?3, tasks = ?4, done = ?5, reused = ?6, dead = ?7, \
-         (timed, seconds) = (SELECT count(*), coalesce(sum(seconds), 0.0) FROM output \
-           WHERE NOT adopted AND result_set IN (SELECT result_set FROM stage WHERE job = ?1)) WHERE key = ?1",
-    )
-    .bind(key)
-    .bind(sql::job_state_code(state))
-    .bind(at_ms)
-    .bind(int(counts.total))
-    .bind(int(counts.done))
-    .bind(int(counts.reused))
-    .bind(int(counts.dead))
-    .execute(&mut *c)
-    .await?;
-    insert_events(c, keys, &[NewEvent::ended(id, at_ms, &counts)]).await?;
-    Ok(Some(JobEnd {
-        job: id,
-        state,
-        at_ms,
-    }))
+    let (settled, events) = job_query::settle(c, key, id, at_ms).await?;
+    insert_events(c, keys, &events).await?;
+    Ok(settled)
 }
 
 pub(super) async fn submit(
@@ -76,13 +56,14 @@ pub(super) async fn submit(
 ) -> Result<bool> {
     let spec = serde_json::to_string(&*job.spec).expect("a spec is plain data");
     let key: Option<i64> = sqlx::query_scalar(
-        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms) VALUES (?, ?, ?, 0, ?) \
+        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms, username) VALUES (?, ?, ?, 0, ?, ?) \
          ON CONFLICT DO NOTHING RETURNING key",
     )
     .bind(job.id.uuid())
     .bind(&job.spec_hash)
     .bind(spec)
     .bind(job.submitted_ms)
+    .bind(&job.user)
     .fetch_optional(&mut *c)
     .await?;
     let Some(key) = key else {
@@ -98,8 +79,9 @@ pub(super) async fn submit(
             .execute(&mut *c)
             .await?;
         let stage_key: i64 = sqlx::query_scalar(
-            "INSERT INTO stage (job, ordinal, result_set, tasks) SELECT ?, ?, key, ? FROM result_set \
-             WHERE store = ? AND dataset = ? AND stage_key = ? RETURNING key",
+            "INSERT INTO stage (job, ordinal, result_set, tasks, state, needs, tolerate_dead) \
+             SELECT ?1, ?2, key, ?3, 0, ?7, ?8 FROM result_set \
+             WHERE store = ?4 AND dataset = ?5 AND stage_key = ?6 RETURNING key",
         )
         .bind(key)
         .bind(i64::from(stage.id.stage))
@@ -107,6 +89,8 @@ pub(super) async fn submit(
         .bind(&set.store)
         .bind(&set.dataset)
         .bind(&set.stage_key.0[..])
+        .bind(sql::needs_text(&stage.needs))
+        .bind(stage.tolerate_dead)
         .fetch_one(&mut *c)
         .await?;
         stages.insert(stage.id, stage_key);
@@ -114,7 +98,7 @@ pub(super) async fn submit(
     let rows: Vec<_> = ranges.iter().map(|r| (stages[&r.stage], r)).collect();
     insert_ranges(c, &rows, false).await?;
     insert_events(c, keys, events).await?;
-    end_if_over(c, keys, job.id, job.submitted_ms).await?;
+    settle(c, keys, job.id, job.submitted_ms).await?;
     Ok(true)
 }
 
@@ -122,23 +106,37 @@ pub(super) async fn cancel(
     c: &mut SqliteConnection,
     keys: &mut Keys,
     job: JobId,
+    why: &str,
     now_ms: i64,
 ) -> Result<bool> {
     let key = keys.job(c, job).await?;
-    let cancelled =
-        sqlx::query("UPDATE job SET state = ?, ended_ms = ? WHERE key = ? AND state = 0")
-            .bind(sql::job_state_code(JobState::Cancelled))
-            .bind(now_ms)
-            .bind(key)
-            .execute(&mut *c)
-            .await?
-            .rows_affected()
-            > 0;
+    let cancelled = job_query::cancel(c, key, now_ms).await?;
     if cancelled {
-        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, String::new());
+        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, why.to_owned());
         insert_events(c, keys, &[event]).await?;
     }
     Ok(cancelled)
+}
+
+pub(super) async fn pause(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    job: JobId,
+    paused: bool,
+    who: &str,
+    now_ms: i64,
+) -> Result<bool> {
+    let key = keys.job(c, job).await?;
+    let changed = job_query::pause(c, key, paused).await?;
+    if changed {
+        let kind = match paused {
+            true => EventKind::Paused,
+            false => EventKind::Resumed,
+        };
+        let event = NewEvent::of(job, now_ms, kind, who.to_owned());
+        insert_events(c, keys, &[event]).await?;
+    }
+    Ok(changed)
 }
 
 pub(super) async fn retry(
@@ -183,6 +181,7 @@ pub(super) async fn retry(
         let message = format!("{retried} dead tasks are pending again");
         let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
         insert_events(c, keys, &[event]).await?;
+        settle(c, keys, job, now_ms).await?;
     }
     Ok(retried)
 }

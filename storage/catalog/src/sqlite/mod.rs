@@ -7,6 +7,7 @@ mod jobs;
 mod write;
 
 use std::{
+    collections::BTreeMap,
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -28,13 +29,14 @@ use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use crate::{
-    Catalog, CatalogError, Changes, Claim, Job, JobEnd, JobRecord, NewEvent, News, Owned, Range,
+    Catalog, CatalogError, Changes, Claim, Job, JobRecord, NewEvent, News, Owned, Range, Settled,
     Snapshot, Want,
     lock::CatalogLock,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
 crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
+crate::sql_jobs::job_queries!(sqlx::SqliteConnection, super::SqliteRow);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
@@ -142,7 +144,7 @@ impl Catalog for SqliteCatalog {
         let read = async {
             // One transaction, so that all tables are of one moment.
             let mut tx = c.begin().await?;
-            let jobs = query::active_jobs(&mut tx).await?;
+            let jobs = job_query::active_jobs(&mut tx).await?;
             let ranges = write::owned(&mut tx).await?;
             let exceptions = query::exceptions(&mut tx, &ranges).await?;
             let workers = query::workers(&mut tx).await?;
@@ -161,8 +163,9 @@ impl Catalog for SqliteCatalog {
         let mut c = self.reader().await?;
         let read = async {
             Ok(News {
-                active: query::active_ids(&mut c).await?,
-                free: query::free(&mut c).await?,
+                active: job_query::active(&mut c).await?,
+                busy: BTreeMap::new(),
+                free: job_query::free(&mut c).await?,
                 taken: Owned::default(),
                 leased: None,
                 houses: 1,
@@ -186,9 +189,9 @@ impl Catalog for SqliteCatalog {
         Ok(Owned::default())
     }
 
-    async fn commit(&self, changes: Changes) -> Result<Vec<JobEnd>, CatalogError> {
+    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError> {
         if changes.is_empty() {
-            return Ok(Vec::new());
+            return Ok(Settled::default());
         }
         self.write(async |c, keys| write::changes(c, keys, &changes).await)
             .await
@@ -204,9 +207,40 @@ impl Catalog for SqliteCatalog {
             .await
     }
 
-    async fn cancel(&self, job: JobId, now_ms: i64) -> Result<bool, CatalogError> {
-        self.write(async |c, keys| jobs::cancel(c, keys, job, now_ms).await)
+    async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError> {
+        self.write(async |c, keys| jobs::cancel(c, keys, job, why, now_ms).await)
             .await
+    }
+
+    async fn pause(
+        &self,
+        job: JobId,
+        paused: bool,
+        who: &str,
+        now_ms: i64,
+    ) -> Result<bool, CatalogError> {
+        self.write(async |c, keys| jobs::pause(c, keys, job, paused, who, now_ms).await)
+            .await
+    }
+
+    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError> {
+        let mut forgotten = 0;
+        // One transaction each: they may be long.
+        while forgotten < most
+            && self
+                .write(async |c, _| Ok(job_query::forget(c, before_ms).await?))
+                .await?
+        {
+            forgotten += 1;
+        }
+        Ok(forgotten)
+    }
+
+    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::jobs_of(&mut c, user)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
@@ -216,7 +250,7 @@ impl Catalog for SqliteCatalog {
 
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        let mut found = query::jobs(&mut c, Some(id))
+        let mut found = job_query::jobs(&mut c, Some(id))
             .await
             .map_err(|e| self.failed(e))?;
         Ok(found.pop())
@@ -224,19 +258,28 @@ impl Catalog for SqliteCatalog {
 
     async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        query::jobs(&mut c, None).await.map_err(|e| self.failed(e))
+        job_query::jobs(&mut c, None)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        query::job_with(&mut c, spec_hash)
+        job_query::job_with(&mut c, spec_hash)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::recent(&mut c, most)
             .await
             .map_err(|e| self.failed(e))
     }
 
     async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        query::jobs_at(&mut c, store, dataset)
+        job_query::jobs_at(&mut c, store, dataset)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -260,12 +303,14 @@ impl Catalog for SqliteCatalog {
 
     async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError> {
         let mut c = self.reader().await?;
-        query::timing(&mut c, set).await.map_err(|e| self.failed(e))
+        job_query::timing(&mut c, set)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError> {
         let mut c = self.reader().await?;
-        query::holdups(&mut c, job, now_ms)
+        job_query::holdups(&mut c, job, now_ms)
             .await
             .map_err(|e| self.failed(e))
     }

@@ -8,7 +8,7 @@ use uuid::Uuid;
 
 use super::{jobs, query};
 use crate::{
-    Changes, Claim, JobEnd, NewEvent, Output, Owned, Range, Want,
+    Changes, Claim, NewEvent, Output, Owned, Range, Settled, Want,
     sql::{self, StateColumns, int},
 };
 
@@ -130,7 +130,8 @@ pub(super) async fn claim(
         let rows = sqlx::query(
             "SELECT task_range.*, job.id AS job_id, ordinal FROM task_range JOIN stage ON stage.key = task_range.stage \
              JOIN job ON job.key = stage.job WHERE stage = ? AND task_range.state = 0 AND owner IS NULL \
-             AND not_before_ms <= ? AND job.state = 0 ORDER BY not_before_ms, lo LIMIT ?",
+             AND not_before_ms <= ? AND stage.state = 1 AND job.state = 0 AND NOT job.paused \
+             ORDER BY not_before_ms, lo LIMIT ?",
         )
         .bind(key)
         .bind(want.now_ms)
@@ -164,7 +165,7 @@ pub(super) async fn claim(
             ranges.push(range);
         }
         let mut existing = Vec::new();
-        for range in &ranges {
+        for range in ranges.iter().filter(|_| !want.force) {
             existing.extend(query::runs_of_stage(c, want.stage, range.lo, range.hi).await?);
         }
         existing.sort_unstable_by_key(|run| run.lo);
@@ -190,7 +191,7 @@ pub(super) async fn changes(
     c: &mut SqliteConnection,
     keys: &mut Keys,
     changes: &Changes,
-) -> Result<Vec<JobEnd>> {
+) -> Result<Settled> {
     replace_known(c, changes).await?;
     let mut rows = Vec::with_capacity(changes.ranges.len());
     for range in changes.ranges.values() {
@@ -232,11 +233,11 @@ pub(super) async fn changes(
         .await?;
     }
     insert_events(c, keys, &changes.events).await?;
-    let mut ended = Vec::new();
-    for (job, at_ms) in &changes.perhaps_over {
-        ended.extend(jobs::end_if_over(c, keys, *job, *at_ms).await?);
+    let mut settled = Settled::default();
+    for (stage, at_ms) in &changes.perhaps_over {
+        settled.join(jobs::stage_over(c, keys, *stage, *at_ms).await?);
     }
-    Ok(ended)
+    Ok(settled)
 }
 
 /// Removes the former state of every range that changes, having checked that it is there.
@@ -395,7 +396,7 @@ pub(super) async fn insert_events(
             jobs.push(keys.job(c, event.job).await?);
         }
         let mut insert = QueryBuilder::<Sqlite>::new(
-            "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message) ",
+            "INSERT INTO event (at_ms, job, kind, lo, hi, worker, seconds, message, stage) ",
         );
         insert.push_values(chunk.iter().zip(jobs), |mut row, (event, job)| {
             row.push_bind(event.at_ms)
@@ -405,7 +406,8 @@ pub(super) async fn insert_events(
                 .push_bind(event.tasks.map(|t| int(t.hi)))
                 .push_bind(event.worker.clone())
                 .push_bind(event.seconds)
-                .push_bind(event.message.clone());
+                .push_bind(event.message.clone())
+                .push_bind(event.stage.map(i64::from));
         });
         insert.build().execute(&mut *c).await?;
     }

@@ -47,6 +47,11 @@ pub fn check_memory(
     }
 }
 
+/// MiB of memory that tasks may take on this machine; 0 where the system does not tell.
+pub fn memory_mib() -> u64 {
+    memory().map_or(0, |bytes| (SHARE * bytes as f64) as u64 >> 20)
+}
+
 /// Bytes of memory of this machine, or of the control group that this process is in, whichever is less.
 fn memory() -> Option<u64> {
     let text = fs::read_to_string("/proc/meminfo").ok()?;

@@ -1,5 +1,6 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
+pub mod export;
 mod memory;
 mod output;
 mod render;
@@ -8,8 +9,10 @@ mod runner;
 mod scenes;
 pub mod split;
 mod subsets;
+mod tasks;
 
 use std::{
+    collections::BTreeMap,
     fmt,
     sync::{
         Arc,
@@ -20,24 +23,25 @@ use std::{
 use picofarm_proto::{
     ids::JobId,
     key::{StageKey, TaskKey, task_key},
-    model::JobSpec,
+    model::StageSpec,
 };
 
-pub use memory::{check_memory, render_bytes};
-pub use render::{RenderExecutor, renderer_version};
+pub use memory::{check_memory, memory_mib, render_bytes};
+pub use render::renderer_version;
 pub(crate) use runner::Runner;
 pub use subsets::{strategy, strategy_names};
+pub use tasks::TaskExecutor;
 
 /// One task to run.
 #[derive(Debug, Clone)]
 pub struct Task {
     /// The job.
     pub job: JobId,
-    /// Its spec.
-    pub spec: Arc<JobSpec>,
-    /// The stage key of `spec` (worked out once for all tasks of a lease).
+    /// Its stage; of lists as much as the lease's tasks need.
+    pub spec: Arc<StageSpec>,
+    /// The stage's key.
     pub stage: StageKey,
-    /// Task index, which is also the scene's index in the data set.
+    /// Task index; where tasks are scenes, also the scene's index in the data set.
     pub index: u64,
 }
 
@@ -79,8 +83,8 @@ pub enum TaskError {
 /// Runs tasks. Called on a thread of the worker's own rayon pool, one task at a time; it may block. A panic
 /// counts as [`TaskError::Crash`] and the worker lives on.
 pub trait Executor: Send + Sync + 'static {
-    /// Version of the renderer that task keys name.
-    fn renderer(&self) -> String;
+    /// The kinds of task that it runs, each with the version of its code.
+    fn kinds(&self) -> BTreeMap<String, String>;
 
     /// Fingerprints of the furniture at hand.
     fn assets(&self) -> Vec<String>;

@@ -12,7 +12,7 @@ use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
     probe,
 };
-use picofarm_proto::{key::TaskKey, model::JobSpec};
+use picofarm_proto::{key::TaskKey, model::RenderTask};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::warn;
@@ -48,7 +48,7 @@ impl Stores {
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
-    pub(super) fn open(&self, spec: &JobSpec, control: &Control) -> Result<Dataset, TaskError> {
+    pub(super) fn open(&self, spec: &RenderTask, control: &Control) -> Result<Dataset, TaskError> {
         let place = &spec.output;
         let described = dataset_spec(spec)?;
         self.create_or_open(&place.store, &place.dataset, &described, control)
@@ -181,7 +181,7 @@ impl Stores {
 }
 
 /// The data set that a job's settings describe.
-fn dataset_spec(spec: &JobSpec) -> Result<DatasetSpec, TaskError> {
+fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
     let render = &spec.render;
     Ok(DatasetSpec {
         scenes: spec.scenes.count,

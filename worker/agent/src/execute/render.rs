@@ -1,22 +1,19 @@
-//! The executor that renders: adopt, or make the scene, render it, code it and publish it.
-
-use std::{path::PathBuf, time::Duration};
+//! Rendering: adopt, or make the scene, render it, code it and publish it.
 
 use picofarm_dataset::{
     DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{Budget, JobSpec},
+    model::{Budget, RenderTask},
 };
 use picofarm_scene::{AssetLibrary, Camera, Scene};
 use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
-use tokio::runtime::Handle;
 use tracing::debug;
 
 use super::{
-    Control, Executor, Output, Task, TaskError, memory,
+    Control, Output, Task, TaskError, memory,
     output::{Stores, manifest_sha256, of_dataset},
     scenes, subsets,
 };
@@ -25,9 +22,6 @@ use super::{
 const PEAK_PHOTONS: f32 = 400.0;
 /// Share of a task's progress that is rendering; the rest is coding and storing.
 const RENDER_SHARE: f32 = 0.95;
-/// How long a rendered scene waits for a store that is full or away before its task is handed back.
-const STORE_PATIENCE: Duration = Duration::from_secs(120);
-
 /// Everything of this program that decides a task's bytes: renderer, generators and encoder. Part of every task
 /// key, so that a change of any of them renames the results.
 pub fn renderer_version() -> String {
@@ -39,92 +33,73 @@ pub fn renderer_version() -> String {
     )
 }
 
-/// Renders scenes into data sets.
-pub struct RenderExecutor {
-    libraries: Vec<AssetLibrary>,
-    stores: Stores,
-}
-
-impl RenderExecutor {
-    /// An executor with the furniture found in `asset_dirs` and the usual places. Stores are reached through
-    /// `runtime`, which must not be a thread of the executor's own.
-    pub fn new(asset_dirs: &[PathBuf], runtime: Handle) -> Self {
-        Self {
-            libraries: scenes::find_libraries(asset_dirs),
-            stores: Stores::new(runtime, STORE_PATIENCE),
-        }
+/// Renders scene `task.index` of `spec` into its data set.
+pub(super) fn run(
+    stores: &Stores,
+    libraries: &[AssetLibrary],
+    spec: &RenderTask,
+    task: &Task,
+    control: &Control,
+) -> Result<Output, TaskError> {
+    let key = task.key();
+    let ours = renderer_version();
+    if spec.render.renderer != ours {
+        return Err(TaskError::User(format!(
+            "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
+             version, or run workers of the other one",
+            spec.render.renderer
+        )));
     }
-}
-
-impl Executor for RenderExecutor {
-    fn renderer(&self) -> String {
-        renderer_version()
-    }
-
-    fn assets(&self) -> Vec<String> {
-        let fingerprints = self.libraries.iter().map(|l| l.fingerprint().to_owned());
-        fingerprints.collect()
-    }
-
-    fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let (spec, key) = (&*task.spec, task.key());
-        let ours = renderer_version();
-        if spec.render.renderer != ours {
-            return Err(TaskError::User(format!(
-                "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
-                 version, or run workers of the other one",
-                spec.render.renderer
-            )));
-        }
-        let dataset = self.stores.open(spec, control)?;
-        if let Some(manifest) = self.stores.finished(&dataset, task.index, &key, control)? {
-            return Ok(Output {
-                manifest_sha256: manifest_sha256(&manifest),
-                bytes: manifest.total_bytes(),
-                adopted: true,
-            });
-        }
-        let scene = scenes::scene(spec, task.index, &self.libraries)?;
-        debug!(
-            task = task.index,
-            scene = scene.name,
-            triangles = scene.triangle_count(),
-            "scene made"
-        );
-        let settings = settings(spec, dataset.spec(), &key)?;
-        if !settings.groups.is_empty() {
-            let side = spec.render.resolution;
-            memory::check_memory(&settings, side, side, rayon::current_num_threads())
-                .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
-        }
-        let rendered =
-            picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
-        let camera = &scene.camera;
-        let spots: Vec<_> = rendered
-            .spots
-            .iter()
-            .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
-            .collect();
-        let subsets = subsets::records(dataset.spec(), &rendered);
-        let record = record(&scene, &rendered, &subsets, &spots);
-        let provenance = Provenance {
-            task_key: key.to_string(),
-            renderer: spec.render.renderer.clone(),
-            seed: settings.seed,
-            plan: account(&scene, &rendered),
-        };
-        let encoded = dataset
-            .encode(task.index, &record, &provenance)
-            .map_err(of_dataset)?;
-        control.at((1.0 + RENDER_SHARE) / 2.0);
-        let manifest = self.stores.publish(&dataset, encoded, control)?;
-        control.at(1.0);
-        Ok(Output {
+    let dataset = stores.open(spec, control)?;
+    if !task.spec.force
+        && let Some(manifest) = stores.finished(&dataset, task.index, &key, control)?
+    {
+        return Ok(Output {
             manifest_sha256: manifest_sha256(&manifest),
             bytes: manifest.total_bytes(),
-            adopted: false,
-        })
+            adopted: true,
+        });
     }
+    let scene = scenes::scene(spec, task.index, libraries)?;
+    debug!(
+        task = task.index,
+        scene = scene.name,
+        triangles = scene.triangle_count(),
+        "scene made"
+    );
+    let settings = settings(spec, dataset.spec(), &key)?;
+    if !settings.groups.is_empty() {
+        let side = spec.render.resolution;
+        memory::check_memory(&settings, side, side, rayon::current_num_threads())
+            .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
+    }
+    let rendered =
+        picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
+    let camera = &scene.camera;
+    let spots: Vec<_> = rendered
+        .spots
+        .iter()
+        .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
+        .collect();
+    let subsets = subsets::records(dataset.spec(), &rendered);
+    let record = record(&scene, &rendered, &subsets, &spots);
+    let provenance = Provenance {
+        task_key: key.to_string(),
+        renderer: spec.render.renderer.clone(),
+        seed: settings.seed,
+        plan: account(&scene, &rendered),
+    };
+    let encoded = dataset
+        .encode(task.index, &record, &provenance)
+        .map_err(of_dataset)?;
+    control.at((1.0 + RENDER_SHARE) / 2.0);
+    let manifest = stores.publish(&dataset, encoded, control)?;
+    control.at(1.0);
+    Ok(Output {
+        manifest_sha256: manifest_sha256(&manifest),
+        bytes: manifest.total_bytes(),
+        adopted: false,
+    })
 }
 
 /// Carries the renderer's progress to the task's control.
@@ -138,7 +113,11 @@ impl Progress for Watched<'_> {
 
 /// The renderer's settings for a task. The seed is the head of the task's key, so that nothing but the task
 /// decides the numbers.
-fn settings(spec: &JobSpec, dataset: &DatasetSpec, key: &TaskKey) -> Result<Settings, TaskError> {
+fn settings(
+    spec: &RenderTask,
+    dataset: &DatasetSpec,
+    key: &TaskKey,
+) -> Result<Settings, TaskError> {
     let render = &spec.render;
     let head = key.0[..8].try_into().expect("a key has 32 bytes");
     let strategy = subsets::strategy(&render.strategy)
@@ -163,7 +142,7 @@ fn settings(spec: &JobSpec, dataset: &DatasetSpec, key: &TaskKey) -> Result<Sett
 }
 
 /// The field that asks for further histograms.
-fn asked(spec: &JobSpec) -> &'static str {
+fn asked(spec: &RenderTask) -> &'static str {
     if spec.render.per_spot {
         "per_spot"
     } else {

@@ -1,11 +1,8 @@
 //! Reprocessing: a scene of a finished data set through a sensor into another data set. Adopt, or read the histogram,
 //! measure it, and publish it with the source's ground truth. Nothing is rendered.
 //!
-//! A scene that the source has room for but has not published is *not there yet*: [`TaskError::Interrupted`], which
-//! costs the task nothing, since the same task succeeds once the scene is there. A source without room for the scene, or
-//! without the histogram asked for, can never succeed: [`TaskError::User`].
-
-use std::time::Duration;
+//! A scene that the source does not have is the task's own failure: where another stage makes the source, this one waits
+//! for it, so the scene was given up; where nothing makes it, waiting would have no end.
 
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, Gate, Manifest, Profile, Provenance,
@@ -13,7 +10,7 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
-    model::{Histogram, OutputSettings, ReprocessSettings, SensorSettings},
+    model::{Histogram, ReprocessSettings, ReprocessTask, SensorSettings, SourceSettings},
 };
 use picofarm_transient::sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values,
@@ -24,10 +21,9 @@ use tokio::runtime::Handle;
 use super::{
     Control, Output, TaskError,
     output::{Stores, manifest_sha256, of_dataset},
+    tasks::STORE_PATIENCE,
 };
 
-/// How long a measured scene waits for a store that is full or away before its task is handed back.
-const STORE_PATIENCE: Duration = Duration::from_secs(120);
 /// Progress once the histogram is read, and once it is measured.
 const READ: f32 = 0.3;
 const MEASURED: f32 = 0.8;
@@ -56,10 +52,10 @@ impl Reprocessor {
     /// [`TaskError::User`] where there is no such data set.
     pub fn source(
         &self,
-        settings: &ReprocessSettings,
+        source: &SourceSettings,
         control: &Control,
     ) -> Result<(Vec<u64>, u64), TaskError> {
-        let source = open_source(&self.stores, settings, control)?;
+        let source = open_source(&self.stores, source, control)?;
         let present = self.stores.wait(control, source.scenes_present())?;
         Ok((present, source.spec().scenes))
     }
@@ -70,26 +66,24 @@ impl Reprocessor {
     /// [`TaskError`], by who is to blame.
     pub fn run(
         &self,
-        settings: &ReprocessSettings,
-        target: &OutputSettings,
+        task: &ReprocessTask,
         index: u64,
         control: &Control,
     ) -> Result<Output, TaskError> {
-        run(&self.stores, settings, target, index, control)
+        run(&self.stores, task, false, index, control)
     }
 }
 
-/// Reprocesses scene `index` into `target`.
+/// Reprocesses scene `index`; with `force` although it is there.
 pub(super) fn run(
     stores: &Stores,
-    settings: &ReprocessSettings,
-    target: &OutputSettings,
+    task: &ReprocessTask,
+    force: bool,
     index: u64,
     control: &Control,
 ) -> Result<Output, TaskError> {
-    settings
-        .check(&target.profile)
-        .map_err(|e| TaskError::User(e.to_string()))?;
+    task.check().map_err(|e| TaskError::User(e.to_string()))?;
+    let (settings, target) = (&task.reprocess, &task.output);
     let ours = sensor_version();
     if settings.version != ours {
         return Err(TaskError::User(format!(
@@ -98,26 +92,19 @@ pub(super) fn run(
             settings.version
         )));
     }
-    let place = &settings.source;
-    if (&place.store, &place.dataset) == (&target.store, &target.dataset) {
-        return Err(TaskError::User(format!(
-            "output.dataset: {:?} is the source itself; choose another data set for the results",
-            target.dataset
-        )));
-    }
     let sensor = sensor(&settings.sensor)?;
-    let source = open_source(stores, settings, control)?;
+    let source = open_source(stores, &task.source, control)?;
     let spec = target_spec(source.spec(), settings, &target.profile)?;
     let found = source_manifest(stores, &source, index, control)?;
     let source_key = TaskKey::parse(&found.provenance.task_key).ok_or_else(|| {
         TaskError::User(format!(
-            "reprocess.source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
+            "source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
             found.provenance.task_key
         ))
     })?;
     let key = derived_key(&reprocess_stage_key(settings, &target.profile), &source_key);
     let dataset = stores.create_or_open(&target.store, &target.dataset, &spec, control)?;
-    if let Some(manifest) = stores.finished(&dataset, index, &key, control)? {
+    if !force && let Some(manifest) = stores.finished(&dataset, index, &key, control)? {
         return Ok(Output {
             manifest_sha256: manifest_sha256(&manifest),
             bytes: manifest.total_bytes(),
@@ -171,13 +158,12 @@ fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
 
 fn open_source(
     stores: &Stores,
-    settings: &ReprocessSettings,
+    place: &SourceSettings,
     control: &Control,
 ) -> Result<Dataset, TaskError> {
-    let place = &settings.source;
     let opened = stores.open_source(&place.store, &place.dataset, control);
     opened.map_err(|error| match error {
-        TaskError::User(text) => TaskError::User(format!("reprocess.source: {text}")),
+        TaskError::User(text) => TaskError::User(format!("source: {text}")),
         other => other,
     })
 }
@@ -191,7 +177,7 @@ fn source_manifest(
 ) -> Result<Manifest, TaskError> {
     if index >= source.spec().scenes {
         return Err(TaskError::User(format!(
-            "reprocess.source: scene {index} does not exist: {} has room for {} scenes",
+            "source: scene {index} does not exist: {} has room for {} scenes",
             source.prefix(),
             source.spec().scenes
         )));
@@ -203,11 +189,9 @@ fn source_manifest(
             Err(error) => Err(error),
         }
     };
-    stores.wait(control, looked)?.map_err(|error| {
-        TaskError::Interrupted(format!(
-            "reprocess.source: scene {index} is not there yet ({error})"
-        ))
-    })
+    stores
+        .wait(control, looked)?
+        .map_err(|error| TaskError::User(format!("source: scene {index} is not there ({error})")))
 }
 
 /// The data set that a source becomes.

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use picofarm_proto::{
     key::scene_seed,
-    model::{JobSpec, SceneFile, SceneKind},
+    model::{RenderTask, SceneFile, SceneKind},
 };
 use picofarm_scene::{
     AssetLibrary, LaserGrid, Scene, SceneError,
@@ -44,7 +44,7 @@ pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
 
 /// The scene of task `index`, with the job's resolution and spots.
 pub(super) fn scene(
-    spec: &JobSpec,
+    spec: &RenderTask,
     index: u64,
     libraries: &[AssetLibrary],
 ) -> Result<Scene, TaskError> {
@@ -76,14 +76,10 @@ pub(super) fn scene(
             };
             primitive::generate(seed, &settings).map_err(of_scene)
         }
-        SceneKind::Files { files } => {
+        SceneKind::Files { .. } => {
             let at = format!("scenes.files[{index}]");
-            let file = usize::try_from(index).ok().and_then(|i| files.get(i));
-            let file = file.ok_or_else(|| {
-                TaskError::User(format!(
-                    "{at}: the job lists only {} files; submit it again",
-                    files.len()
-                ))
+            let file = source.kind.file(index).ok_or_else(|| {
+                TaskError::User(format!("{at}: the job lists no such file; submit it again"))
             })?;
             read(file, &at, spec)
         }
@@ -106,7 +102,7 @@ fn library<'a>(
 }
 
 /// Reads a scene file after checking its hash, and gives it the job's resolution.
-fn read(file: &SceneFile, at: &str, spec: &JobSpec) -> Result<Scene, TaskError> {
+fn read(file: &SceneFile, at: &str, spec: &RenderTask) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
     let found = import::fingerprint(path).map_err(|e| named(at, e))?;
     if found != file.sha256 {

@@ -9,8 +9,8 @@ use std::{
 
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
-    key::{StageKey, stage_key},
-    model::{Failure, FailureKind, Finished, JobSpec, Lease, TaskProgress},
+    key::StageKey,
+    model::{Failure, FailureKind, Finished, Lease, StageSpec, TaskProgress},
 };
 
 use super::{
@@ -28,7 +28,7 @@ const AHEAD: Duration = Duration::from_secs(2);
 struct Held {
     lease: LeaseRef,
     job: JobId,
-    spec: Arc<JobSpec>,
+    spec: Arc<StageSpec>,
     stage: StageKey,
     next: u64,
     hi: u64,
@@ -150,8 +150,8 @@ impl Desk {
         self.leases.push(Held {
             lease: lease.lease,
             job: lease.job,
-            stage: stage_key(&lease.spec),
-            spec: Arc::new(lease.spec),
+            stage: lease.key,
+            spec: Arc::new(lease.stage),
             next: lease.lo,
             hi: lease.hi,
             skip: lease.skip.into_iter().collect(),
@@ -214,6 +214,15 @@ impl Desk {
             .any(|h| h.lease == lease && now < h.end());
         self.leases.retain(|h| h.lease != lease);
         live && self.in_hand.as_ref().is_some_and(|t| t.lease == lease)
+    }
+
+    /// Tasks of a lease from `hi` on are another worker's.
+    pub(crate) fn trimmed(&mut self, lease: LeaseRef, hi: u64) {
+        if let Some(held) = self.leases.iter_mut().find(|h| h.lease == lease) {
+            held.hi = held.hi.min(hi);
+            held.next = held.next.min(held.hi);
+        }
+        self.tidy();
     }
 
     /// An acknowledgement arrived. Returns the report it answers.
@@ -316,6 +325,20 @@ impl Desk {
             .leases
             .iter()
             .filter(|h| h.next < h.hi || Some(h.lease) == in_hand)
+            .map(|h| h.lease)
+            .collect();
+        for lease in open {
+            self.release(lease, reason);
+        }
+    }
+
+    /// Gives back every lease with work left but for the one in hand, of which the rest is given back with it.
+    pub(crate) fn release_waiting(&mut self, reason: &str) {
+        let in_hand = self.in_hand.as_ref().map(|t| t.lease);
+        let open: Vec<_> = self
+            .leases
+            .iter()
+            .filter(|h| h.next < h.hi && Some(h.lease) != in_hand)
             .map(|h| h.lease)
             .collect();
         for lease in open {

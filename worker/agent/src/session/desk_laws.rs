@@ -7,7 +7,11 @@ use std::{
 
 use picofarm_proto::{
     ids::{Epoch, JobId, LeaseRef, RangeId},
-    model::{JobSpec, Lease, Limits, OutputSettings, RenderSettings, SceneKind, SceneSource},
+    key::StageKey,
+    model::{
+        Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
+        TaskSpec,
+    },
 };
 use proptest::prelude::*;
 use uuid::Uuid;
@@ -66,8 +70,9 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
         hi: tasks,
         skip,
         ttl_ms: TTL.as_millis() as u32,
-        spec: JobSpec {
-            name: "laws".into(),
+        ordinal: 0,
+        key: StageKey([0; 32]),
+        stage: StageSpec::new(TaskSpec::Render(RenderTask {
             scenes: SceneSource {
                 kind: SceneKind::Primitive,
                 count: 5,
@@ -81,8 +86,7 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
                 dataset: "d".into(),
                 profile: "plain-f32".into(),
             },
-            limits: Limits::default(),
-        },
+        })),
     }
 }
 

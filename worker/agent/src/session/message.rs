@@ -70,6 +70,15 @@ pub(crate) enum Incoming {
         /// Why, for people.
         reason: String,
     },
+    /// Of this lease, tasks from `hi` on are another worker's.
+    Trim {
+        /// The lease.
+        lease: LeaseRef,
+        /// Its new end.
+        hi: u64,
+    },
+    /// Finish what is in hand, and end.
+    Drain,
     /// A message that says nothing this version understands.
     Unknown(String),
 }
@@ -133,6 +142,11 @@ impl Incoming {
                 },
                 None => Incoming::Unknown("a revocation without a lease".into()),
             },
+            Some(M::Trim(w)) => match lease(w.lease) {
+                Some(lease) => Incoming::Trim { lease, hi: w.hi },
+                None => Incoming::Unknown("a trimming without a lease".into()),
+            },
+            Some(M::Drain(_)) => Incoming::Drain,
             Some(M::Welcome(_)) => Incoming::Unknown("a second welcome".into()),
             None => Incoming::Unknown("an empty message".into()),
         }

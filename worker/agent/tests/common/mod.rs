@@ -2,15 +2,17 @@
 //! executor that does what a test tells it to do.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{collections::BTreeMap, net::SocketAddr, sync::Arc, time::Duration};
 
 use picofarm_agent::{
     AgentConfig, AgentError, Control, Executor, Output, Summary, Task, TaskError,
 };
 use picofarm_proto::{
     ids::{Epoch, JobId, LeaseRef, RangeId},
+    key::stage_key,
     model::{
-        Budget, JobSpec, Lease, Limits, OutputSettings, RenderSettings, SceneKind, SceneSource,
+        Budget, Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource,
+        StageSpec, TaskSpec,
     },
     wire::{
         self, SessionRequest, SessionResponse,
@@ -249,9 +251,8 @@ impl Conversation {
 }
 
 /// A small job of primitive scenes with results in `store`.
-pub fn spec(store: &str) -> JobSpec {
-    JobSpec {
-        name: "test".into(),
+pub fn spec(store: &str) -> RenderTask {
+    RenderTask {
         scenes: SceneSource {
             kind: SceneKind::Primitive,
             count: 100,
@@ -274,8 +275,12 @@ pub fn spec(store: &str) -> JobSpec {
             dataset: "tiny".into(),
             profile: "sqrt-u16".into(),
         },
-        limits: Limits::default(),
     }
+}
+
+/// A stage of it.
+pub fn stage(spec: RenderTask) -> StageSpec {
+    StageSpec::new(TaskSpec::Render(spec))
 }
 
 /// Tasks `lo..hi` of a job under `epoch`.
@@ -290,7 +295,9 @@ pub fn lease(epoch: u64, lo: u64, hi: u64) -> Lease {
         hi,
         skip: Vec::new(),
         ttl_ms: 60_000,
-        spec: spec("/nowhere"),
+        key: stage_key(&stage(spec("/nowhere"))),
+        stage: stage(spec("/nowhere")),
+        ordinal: 0,
     }
 }
 
@@ -303,8 +310,8 @@ pub struct FakeExecutor {
 }
 
 impl Executor for FakeExecutor {
-    fn renderer(&self) -> String {
-        "fake-1".into()
+    fn kinds(&self) -> BTreeMap<String, String> {
+        [("render".to_owned(), "fake-1".to_owned())].into()
     }
 
     fn assets(&self) -> Vec<String> {
@@ -373,6 +380,9 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         name: "tester".into(),
         worker_id: None,
         threads: 1,
+        memory_mib: 4096,
+        gpus: 0,
+        labels: Vec::new(),
         asset_dirs: Vec::new(),
         access: Default::default(),
         store_prefixes: Vec::new(),

@@ -1,0 +1,69 @@
+//! The worker's executor: every kind of task there is, each in a file of its own beside this one.
+
+use std::{collections::BTreeMap, path::PathBuf, time::Duration};
+
+use picofarm_proto::model::{
+    TaskSpec,
+    job::{EXPORT_VERSION, SPLIT_VERSION},
+};
+use picofarm_scene::AssetLibrary;
+use tokio::runtime::Handle;
+
+use super::{
+    Control, Executor, Output, Task, TaskError, export, output::Stores, render, reprocess, scenes,
+    split,
+};
+
+/// How long a finished scene waits for a store that is full or away before its task is handed back.
+pub(super) const STORE_PATIENCE: Duration = Duration::from_secs(120);
+
+/// Runs tasks of every kind.
+pub struct TaskExecutor {
+    libraries: Vec<AssetLibrary>,
+    stores: Stores,
+}
+
+impl TaskExecutor {
+    /// An executor with the furniture found in `asset_dirs` and the usual places. Stores are reached through
+    /// `runtime`, which must not be a thread of the executor's own.
+    pub fn new(asset_dirs: &[PathBuf], runtime: Handle) -> Self {
+        Self {
+            libraries: scenes::find_libraries(asset_dirs),
+            stores: Stores::new(runtime, STORE_PATIENCE),
+        }
+    }
+}
+
+impl Executor for TaskExecutor {
+    fn kinds(&self) -> BTreeMap<String, String> {
+        [
+            ("render", render::renderer_version()),
+            ("reprocess", reprocess::sensor_version()),
+            ("split", SPLIT_VERSION.to_owned()),
+            ("export", EXPORT_VERSION.to_owned()),
+        ]
+        .map(|(kind, version)| (kind.to_owned(), version))
+        .into()
+    }
+
+    fn assets(&self) -> Vec<String> {
+        let fingerprints = self.libraries.iter().map(|l| l.fingerprint().to_owned());
+        fingerprints.collect()
+    }
+
+    fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let stores = &self.stores;
+        match &task.spec.task {
+            TaskSpec::Render(spec) => render::run(stores, &self.libraries, spec, task, control),
+            TaskSpec::Reprocess(spec) => {
+                reprocess::run(stores, spec, task.spec.force, task.index, control)
+            }
+            TaskSpec::Split(spec) => {
+                let place = &spec.source;
+                let run = split::run(stores, &spec.split, &place.store, &place.dataset, control);
+                run.map(|split| Output::from(&split))
+            }
+            TaskSpec::Export(spec) => export::run(stores, spec, control),
+        }
+    }
+}
