@@ -246,12 +246,18 @@ fn trace<E: Lanes, W: Lanes>(
         while mask != 0 {
             let i = mask.trailing_zeros() as usize & 7;
             mask &= mask - 1;
-            let met = rays.meet::<W>(&node.bounds, i, live & free);
+            let child = node.child[i];
+            let inner = child & LEAF == 0;
+            // The root's children are too large to be missed by all rays often.
+            let met = if inner && current == 0 {
+                live
+            } else {
+                rays.meet::<W>(&node.bounds, i, live & free)
+            };
             if met == 0 {
                 continue;
             }
-            let child = node.child[i];
-            if child & LEAF == 0 {
+            if inner {
                 bvh.prefetch::<E>(child);
                 (stack[depth].0, masks[depth]) = (child, met);
                 depth += 1;
