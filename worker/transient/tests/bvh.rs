@@ -183,6 +183,23 @@ fn bundles_in_a_room_of_axis_aligned_walls_agree_with_single_rays() {
 }
 
 #[test]
+fn a_fan_through_fine_meshes_agrees_with_single_rays() {
+    let mut r = noise(5);
+    let mut blocked = 0;
+    for (seed, size) in [(11, 0.02), (12, 0.2)] {
+        let triangles = random_soup(20_000, size, seed);
+        for spread in [0.3, 4.0] {
+            for number in [7, 25, 64] {
+                let (from, centre) = (v(r(), r(), r()) * 5.0, v(r(), r(), r()) * 5.0);
+                let to = targets(from, centre, spread, number, &mut r);
+                blocked += bundles_agree(&triangles, from, &to).expect("the same answers");
+            }
+        }
+    }
+    assert!((50..350).contains(&blocked), "{blocked} of 384 blocked");
+}
+
+#[test]
 fn a_bundle_into_an_empty_tree_is_free() {
     let empty = Bvh::build(&[]);
     let mut blocked = [true; 3];

@@ -4,7 +4,9 @@
 //! monotonic, so a ray that meets a box meets every box around it, and the tree above the leaves decides
 //! nothing. A bundle may therefore reach the leaves in any way that misses none, as long as each pair of
 //! ray and leaf, and of ray and triangle, is judged by the single ray's operations. Here the nodes are
-//! culled by a [`Pyramid`] around all rays, eight children at a time.
+//! culled by a [`Pyramid`] around all rays, eight children at a time, and what it leaves by the rays
+//! themselves: each entry on the stack knows which rays meet it. A pyramid alone holds more nodes the
+//! finer a mesh is; the rays in it meet few of them.
 
 use picofarm_scene::Vec3;
 
@@ -19,6 +21,8 @@ use super::{
 pub(super) const MOST: usize = 64;
 /// Fewer rays go singly.
 pub(super) const FEWEST: usize = 6;
+/// No more rays than this that are left at a node go on singly.
+const LAST: u32 = 2;
 
 /// One number for each ray.
 type Column = [f32; MOST];
@@ -76,7 +80,10 @@ pub(super) fn bundle<E: Lanes, W: Lanes>(
     blocked: &mut [bool],
 ) {
     let Stack {
-        entries, bundle, ..
+        entries,
+        masks,
+        bundle,
+        ..
     } = stack;
     for (to, blocked) in to.chunks(MOST).zip(blocked.chunks_mut(MOST)) {
         let [x, y, z] = &mut bundle.all;
@@ -94,7 +101,7 @@ pub(super) fn bundle<E: Lanes, W: Lanes>(
             if mask.count_ones() as usize >= FEWEST {
                 bundle.rays.take(o, &bundle.all, mask, class);
                 if let Some(pyramid) = bundle.rays.prepare::<W>() {
-                    let left = trace::<E, W>(&bundle.rays, &pyramid, bvh, entries);
+                    let left = trace::<E, W>(&bundle.rays, &pyramid, bvh, (entries, masks));
                     free |= spread(left, mask);
                     continue;
                 }
@@ -104,7 +111,7 @@ pub(super) fn bundle<E: Lanes, W: Lanes>(
                 let i = rest.trailing_zeros() as usize & (MOST - 1);
                 rest &= rest - 1;
                 let d = Vec3::new(bundle.all[0][i], bundle.all[1][i], bundle.all[2][i]);
-                let hit = traverse::<E, true>(bvh, entries, o, d, 1.0).1 != EMPTY;
+                let hit = traverse::<E, true>(bvh, entries, 0, o, d, 1.0).1 != EMPTY;
                 free |= u64::from(!hit) << i;
             }
         }
@@ -228,9 +235,10 @@ fn trace<E: Lanes, W: Lanes>(
     rays: &Rays,
     pyramid: &Pyramid,
     bvh: &Bvh,
-    stack: &mut [(u32, f32)],
+    (stack, masks): (&mut [(u32, f32)], &mut [u64]),
 ) -> u64 {
     let mut free = u64::MAX >> (MOST - rays.count);
+    let mut live = free;
     let (mut current, mut depth) = (0u32, 0);
     loop {
         let node = &bvh.nodes[current as usize];
@@ -239,24 +247,44 @@ fn trace<E: Lanes, W: Lanes>(
             let i = mask.trailing_zeros() as usize & 7;
             mask &= mask - 1;
             let child = node.child[i];
-            if child & LEAF == 0 {
+            let inner = child & LEAF == 0;
+            // The root's children are too large to be missed by all rays often.
+            let met = if inner && current == 0 {
+                live
+            } else {
+                rays.meet::<W>(&node.bounds, i, live & free)
+            };
+            if met == 0 {
+                continue;
+            }
+            if inner {
                 bvh.prefetch::<E>(child);
-                stack[depth].0 = child;
+                (stack[depth].0, masks[depth]) = (child, met);
                 depth += 1;
                 continue;
             }
-            let met = rays.meet::<W>(&node.bounds, i, free);
-            if met != 0 {
-                free &= !rays.leaf::<E, W>(bvh, child, met);
-                if free == 0 {
-                    return 0;
-                }
+            free &= !rays.leaf::<E, W>(bvh, child, met);
+            if free == 0 {
+                return 0;
             }
         }
-        if depth == 0 {
-            return free;
+        loop {
+            if depth == 0 {
+                return free;
+            }
+            depth -= 1;
+            (current, live) = (stack[depth].0, masks[depth] & free);
+            if live.count_ones() > LAST {
+                break;
+            }
+            while live != 0 {
+                let k = live.trailing_zeros() as usize & (MOST - 1);
+                live &= live - 1;
+                let d = Vec3::new(rays.d[0][k], rays.d[1][k], rays.d[2][k]);
+                let (_, hit) =
+                    traverse::<E, true>(bvh, &mut stack[depth..], current, rays.o, d, 1.0);
+                free &= !(u64::from(hit != EMPTY) << k);
+            }
         }
-        depth -= 1;
-        current = stack[depth].0;
     }
 }

@@ -77,6 +77,8 @@ pub struct Bvh {
 #[derive(Debug)]
 pub struct Stack {
     entries: Vec<(u32, f32)>,
+    /// Bundles: which rays an entry is for.
+    masks: Vec<u64>,
     bundle: Box<bundle::Scratch>,
     /// Rays traced with this stack.
     pub rays: u64,
@@ -99,8 +101,11 @@ impl Bvh {
 
     /// A stack deep enough for this tree.
     pub fn stack(&self) -> Stack {
+        // A bundle's entries, and above them those of a single ray that it sends on.
+        let deepest = 2 * 8 * (self.depth + 2);
         Stack {
-            entries: vec![(0, 0.0); 8 * (self.depth + 2)],
+            entries: vec![(0, 0.0); deepest],
+            masks: vec![0; deepest],
             bundle: Box::new(bundle::Scratch::new()),
             rays: 0,
         }

@@ -37,11 +37,11 @@ pub(super) fn available(kernel: Kernel) -> bool {
 }
 
 pub(super) fn closest_portable(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> (f32, u32) {
-    traverse::<[f32; 8], false>(b, &mut s.entries, o, d, t)
+    traverse::<[f32; 8], false>(b, &mut s.entries, 0, o, d, t)
 }
 
 pub(super) fn any_portable(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> bool {
-    traverse::<[f32; 8], true>(b, &mut s.entries, o, d, t).1 != EMPTY
+    traverse::<[f32; 8], true>(b, &mut s.entries, 0, o, d, t).1 != EMPTY
 }
 
 pub(super) fn bundle_portable(b: &Bvh, s: &mut Stack, o: Vec3, to: &[Vec3], blocked: &mut [bool]) {
@@ -77,7 +77,7 @@ mod native {
             ) -> (f32, u32) {
                 #[target_feature(enable = $feature)]
                 fn run(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> (f32, u32) {
-                    traverse::<Eight, false>(b, &mut s.entries, o, d, t)
+                    traverse::<Eight, false>(b, &mut s.entries, 0, o, d, t)
                 }
                 // SAFETY: the tree's kernel says that the machine has the feature (module proof).
                 unsafe { run(b, s, o, d, t) }
@@ -86,7 +86,7 @@ mod native {
             pub(in crate::bvh) fn $any(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> bool {
                 #[target_feature(enable = $feature)]
                 fn run(b: &Bvh, s: &mut Stack, o: Vec3, d: Vec3, t: f32) -> bool {
-                    traverse::<Eight, true>(b, &mut s.entries, o, d, t).1 != EMPTY
+                    traverse::<Eight, true>(b, &mut s.entries, 0, o, d, t).1 != EMPTY
                 }
                 // SAFETY: as above.
                 unsafe { run(b, s, o, d, t) }

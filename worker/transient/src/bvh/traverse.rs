@@ -27,12 +27,13 @@ pub(super) fn largest(d: Vec3) -> usize {
     }
 }
 
-/// Nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit`: (t, triangle), triangle
-/// [`EMPTY`] for a miss. The caller has checked that ray and tree are usable and `stack` deep enough.
+/// Nearest hit (`ANY` = false) or some hit (`ANY` = true) with 0 < t ≤ `limit` below node `root` (0: in the
+/// whole tree): (t, triangle), triangle [`EMPTY`] for a miss. The caller has checked that ray and tree are usable and `stack` deep enough.
 #[inline(always)]
 pub(super) fn traverse<L: Lanes, const ANY: bool>(
     bvh: &Bvh,
     stack: &mut [(u32, f32)],
+    root: u32,
     o: Vec3,
     d: Vec3,
     limit: f32,
@@ -64,7 +65,7 @@ pub(super) fn traverse<L: Lanes, const ANY: bool>(
 
     let (mut best, mut id) = (limit, EMPTY);
     let mut depth = 0;
-    let mut current = 0u32;
+    let mut current = root;
     'walk: loop {
         while current & LEAF == 0 {
             let node = &bvh.nodes[current as usize];
