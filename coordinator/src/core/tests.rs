@@ -14,7 +14,10 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{HouseId, Incarnation, JobId, WorkerId},
     key::task_key,
-    model::{Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, WorkerHello},
+    model::{
+        Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskProgress,
+        WorkerHello,
+    },
 };
 use proptest::prelude::*;
 use uuid::Uuid;
@@ -31,6 +34,8 @@ const SETTINGS: Settings = Settings {
         first_ms: 10,
         most_ms: 100,
     },
+    worth_ms: 20,
+    slow_ms: 300,
 };
 
 #[derive(Debug, Clone)]
@@ -139,6 +144,8 @@ struct World {
     /// What the model knows to be committed, by stage and task.
     committed: BTreeMap<(u32, u64), String>,
     jobs: Vec<JobId>,
+    trims: u32,
+    doubles: u32,
 }
 
 impl World {
@@ -155,6 +162,8 @@ impl World {
             next: 1,
             committed: BTreeMap::new(),
             jobs: Vec::new(),
+            trims: 0,
+            doubles: 0,
         };
         world.submit(0, TASKS).await;
         world
@@ -233,8 +242,13 @@ impl World {
                 .workers
                 .iter_mut()
                 .find(|w| w.session == Some((h, *session)));
-            if let (Some(worker), Say::Lease(lease)) = (worker, what) {
-                worker.leases.insert(0, (**lease).clone());
+            match (worker, what) {
+                (Some(worker), Say::Lease(lease)) => {
+                    self.doubles += u32::from(lease.lease.epoch.0 == 0);
+                    worker.leases.insert(0, (**lease).clone());
+                }
+                (_, Say::Trim { .. }) => self.trims += 1,
+                _ => {}
             }
         }
         say
@@ -291,7 +305,7 @@ impl World {
             key: task_key(&lease.key, index),
             manifest_sha256: format!("{index:064x}"),
             bytes: 1,
-            seconds: 1.0,
+            seconds: 0.01,
             adopted: false,
         };
         self.flush(h).await;
@@ -364,9 +378,15 @@ impl World {
                 let worker = &self.workers[usize::from(*w)];
                 if let Some((h, session)) = worker.session {
                     let leases: Vec<_> = worker.leases.iter().map(|l| l.lease).collect();
+                    let progress = worker.leases.iter().take(1).map(|l| TaskProgress {
+                        lease: l.lease,
+                        index: l.lo,
+                        fraction: 0.5,
+                    });
+                    let progress: Vec<_> = progress.collect();
                     self.houses[h]
                         .core
-                        .heartbeat(session, &leases, &[], self.now);
+                        .heartbeat(session, &leases, &progress, self.now);
                 }
             }
             Op::Drop(w, dies) => {
