@@ -87,6 +87,7 @@ impl Core {
             }
             (live, Some(known)) => {
                 // The output stands, whoever made it: the task is done.
+                let had_it = live.is_ok();
                 if let Ok(range) = live {
                     self.mark(
                         &range,
@@ -98,6 +99,17 @@ impl Core {
                     self.perhaps_over(id, now_ms);
                 }
                 if known == manifest {
+                    if had_it {
+                        let kind = match report.adopted {
+                            true => EventKind::Reused,
+                            false => EventKind::Committed,
+                        };
+                        let about = About::message("the same result as before")
+                            .task(report.index)
+                            .worker(self.session_name(session))
+                            .seconds(report.seconds);
+                        self.event(now_ms, id, kind, about);
+                    }
                     return Ok(());
                 }
                 let name = self.session_name(session);
