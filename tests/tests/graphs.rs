@@ -119,7 +119,9 @@ fn a_graph_whose_workers_are_killed_again_and_again_gives_what_an_undisturbed_on
     let mut kills = 0;
     loop {
         let worker = wild.farm.worker(&format!("wild-{kills}"));
-        std::thread::sleep(std::time::Duration::from_millis(150 + (rng.unit() * 400.0) as u64));
+        std::thread::sleep(std::time::Duration::from_millis(
+            150 + (rng.unit() * 400.0) as u64,
+        ));
         if wild.status(&job)["state"] != "active" || kills == 12 {
             ended_well(&wild.until_ended(&job));
             break;
@@ -181,7 +183,10 @@ fn a_held_job_waits_and_a_drained_worker_ends_after_its_task() {
         (workers["workers"].as_array()?.len() == 1).then_some(())
     });
     let status = graph.status(&job);
-    assert_eq!((&status["paused"], &status["tasks"]["done"]), (&true.into(), &0.into()));
+    assert_eq!(
+        (&status["paused"], &status["tasks"]["done"]),
+        (&true.into(), &0.into())
+    );
     let explained = graph.cli.run(&["job", "explain", &job]).ok().stdout;
     assert!(explained.contains("is held"), "{explained}");
     graph.cli.run(&["job", "resume", &job]).ok();
