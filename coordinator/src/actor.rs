@@ -37,7 +37,7 @@ use crate::{
 };
 
 /// Messages handled in one commit.
-const BATCH: usize = 1024;
+const BATCH: usize = 4096;
 /// How long to wait before trying a catalog again that failed.
 const MEND: Duration = Duration::from_secs(1);
 /// How often the catalog hears that this house lives, and is asked for news.

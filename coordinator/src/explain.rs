@@ -142,7 +142,6 @@ fn last_error<'a>(mut failed: impl Iterator<Item = &'a Exception>) -> String {
 /// Why pending tasks of an active job are not leased.
 fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
     let Holdups {
-        blocked: _,
         ready,
         waiting,
         next_ms,

@@ -127,7 +127,7 @@ fn what_cannot_be_reprocessed_is_named_and_nothing_is_written() {
     reprocess
         .cli
         .run(&args)
-        .fails(3, &["reprocess.source", "no data set here"]);
+        .fails(3, &["source: ", "no data set here"]);
     assert!(!Path::new(&target).exists());
     run(&[]).ok();
     let before = store::hashes(Path::new(&target));

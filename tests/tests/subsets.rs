@@ -267,17 +267,17 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
         (
             "fewer",
             "subsets = [4]\nper_spot = true\nstrategy = { share = 4 }\n",
-            "render.subsets is [4,25] there and [4] here",
+            "render.subsets is [4] and was [4,25]",
         ),
         (
             "none",
             "subsets = [4, 25]\nstrategy = { share = 4 }\n",
-            "render.per_spot is true there and unset here",
+            "render.per_spot is unset and was true",
         ),
         (
             "other",
             &render.replace("share = 4", "share = 2"),
-            "render.strategy is {\"share\":4} there",
+            "render.strategy.share is 2 and was 4",
         ),
     ] {
         let text = job

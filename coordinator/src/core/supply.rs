@@ -11,7 +11,7 @@ use super::{About, Core};
 use crate::{place, transition::RangeEvent};
 
 /// Leases claimed for each one that is wanted now, so that short tasks do not cost a transaction each.
-const AHEAD: u64 = 2;
+const AHEAD: u64 = 8;
 /// How long not to ask again after an empty answer.
 const ASK_AGAIN_MS: i64 = 100;
 

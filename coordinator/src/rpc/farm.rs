@@ -34,7 +34,7 @@ use crate::{
 /// How long a worker may take to say who it is.
 const HELLO: Duration = Duration::from_secs(20);
 /// Messages that may wait for a worker; one that reads none of them is let go.
-const OUTBOX: usize = 4096;
+const OUTBOX: usize = 16_384;
 
 pub(crate) struct FarmService {
     link: Link,

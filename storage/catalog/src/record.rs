@@ -358,9 +358,7 @@ impl Timing {
 /// What a job's tasks wait for, as far as the catalog knows.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Holdups {
-    /// Pending tasks of stages that wait for others.
-    pub blocked: u64,
-    /// Pending tasks that may run at once.
+    /// Pending tasks of open stages that may run at once.
     pub ready: u64,
     /// Pending tasks that may not run before a time.
     pub waiting: u64,

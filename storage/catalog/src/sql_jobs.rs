@@ -390,14 +390,11 @@ macro_rules! job_queries {
             pub(crate) async fn holdups(c: &mut Connection, job: JobId, now_ms: i64) -> Result<Holdups> {
                 let row = sqlx::query(
                     "SELECT \
-                     CAST(coalesce(sum(CASE WHEN stage.state <> 1 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS blocked, \
-                     CAST(coalesce(sum(CASE WHEN stage.state = 1 AND not_before_ms <= $2 THEN hi - lo ELSE 0 END), 0) \
-                       AS BIGINT) AS ready, \
-                     CAST(coalesce(sum(CASE WHEN stage.state = 1 AND not_before_ms > $2 THEN hi - lo ELSE 0 END), 0) \
-                       AS BIGINT) AS waiting, \
-                     min(CASE WHEN stage.state = 1 AND not_before_ms > $2 THEN not_before_ms END) AS next_ms \
+                     CAST(coalesce(sum(CASE WHEN not_before_ms <= $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS ready, \
+                     CAST(coalesce(sum(CASE WHEN not_before_ms > $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS waiting, \
+                     min(CASE WHEN not_before_ms > $2 THEN not_before_ms END) AS next_ms \
                      FROM task_range JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
-                     WHERE job.id = $1 AND task_range.state = 0",
+                     WHERE job.id = $1 AND task_range.state = 0 AND stage.state = 1",
                 )
                 .bind(job.uuid())
                 .bind(now_ms)
@@ -412,7 +409,6 @@ macro_rules! job_queries {
                 .fetch_all(c)
                 .await?;
                 Ok(Holdups {
-                    blocked: uint(&row, "blocked")?,
                     ready: uint(&row, "ready")?,
                     waiting: uint(&row, "waiting")?,
                     next_ms: row.try_get("next_ms")?,

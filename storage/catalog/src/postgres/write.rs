@@ -134,8 +134,8 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
         }
         existing.sort_unstable_by_key(|run| run.lo);
         let left: i64 = sqlx::query_scalar(
-            "SELECT CAST(coalesce(sum(hi - lo), 0) AS BIGINT) FROM task_range \
-             WHERE stage = $1 AND state = 0 AND owner IS NULL",
+            "SELECT CAST(coalesce(sum(hi - lo), 0) AS BIGINT) FROM task_range JOIN stage ON stage.key = task_range.stage \
+             WHERE stage = $1 AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
         )
         .bind(key)
         .fetch_one(&mut *desk.c)

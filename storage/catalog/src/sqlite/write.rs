@@ -170,7 +170,8 @@ pub(super) async fn claim(
         }
         existing.sort_unstable_by_key(|run| run.lo);
         let left: Option<i64> = sqlx::query_scalar(
-            "SELECT sum(hi - lo) FROM task_range WHERE stage = ? AND state = 0 AND owner IS NULL",
+            "SELECT sum(hi - lo) FROM task_range JOIN stage ON stage.key = task_range.stage \
+             WHERE stage = ? AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
         )
         .bind(key)
         .fetch_one(&mut *c)
