@@ -226,6 +226,9 @@ pub struct Worker {
     /// Label that stages may ask for (give it again for more)
     #[arg(long, value_name = "LABEL")]
     pub label: Vec<String>,
+    /// End after this many seconds without work [default: never]
+    #[arg(long, value_name = "S")]
+    pub exit_idle_s: Option<u64>,
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]
     #[arg(long, value_name = "URL")]
     pub store_prefix: Vec<String>,

@@ -72,6 +72,7 @@ impl Local {
                 memory_mib: picofarm_agent::memory_mib() / workers.max(1) as u64,
                 gpus: 0,
                 labels: Vec::new(),
+                exit_idle: None,
                 asset_dirs: vec![settings.assets.clone()],
                 access: access.clone(),
                 store_prefixes: Vec::new(),

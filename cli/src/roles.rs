@@ -262,6 +262,7 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
             .map_or_else(picofarm_agent::memory_mib, |gib| (gib * 1024.0) as u64),
         gpus: args.gpus,
         labels: args.label,
+        exit_idle: args.exit_idle_s.map(Duration::from_secs),
         asset_dirs: vec![settings.assets.clone()],
         access: settings.access()?,
         store_prefixes: args.store_prefix,

@@ -100,6 +100,8 @@ pub async fn run_with(
         retry: Backoff::new(Duration::from_millis(200), Duration::from_secs(10)),
         relief: Backoff::new(Duration::from_secs(1), Duration::from_secs(60)),
         leaving: None,
+        exit_idle: config.exit_idle,
+        idle_since: None,
         summary: Summary::default(),
         coordinator: config.coordinator,
     };
@@ -188,6 +190,10 @@ struct Agent {
     /// Waits after interruptions that come from this machine or the store.
     relief: Backoff,
     leaving: Option<Leaving>,
+    /// The worker ends when it has been idle for so long.
+    exit_idle: Option<Duration>,
+    /// Since when nothing is in hand and a coordinator is there who could give something.
+    idle_since: Option<Instant>,
     summary: Summary,
     coordinator: String,
 }
@@ -200,6 +206,7 @@ impl Agent {
                 return Ok(());
             }
             self.work(now);
+            self.idle(now);
             let wake = self.wake(now);
             let stopping = self
                 .leaving
@@ -233,10 +240,26 @@ impl Agent {
         }
     }
 
+    /// Ends a worker that has waited for work too long.
+    fn idle(&mut self, now: Instant) {
+        let connected = matches!(self.link, Link::Up { .. });
+        if self.desk.in_hand().is_some() || self.leaving.is_some() || !connected {
+            self.idle_since = None;
+            return;
+        }
+        let since = *self.idle_since.get_or_insert(now);
+        if self.exit_idle.is_some_and(|most| now - since >= most) {
+            info!(idle_s = (now - since).as_secs_f64(), "nothing to do");
+            self.begin_leaving(Haste::Stop);
+        }
+    }
+
     /// When the loop must look again although nothing came.
     fn wake(&self, now: Instant) -> Instant {
         let leaving = self.leaving.iter().flat_map(|l| [l.stop_at, l.give_up]);
+        let idle = self.idle_since.zip(self.exit_idle);
         leaving
+            .chain(idle.map(|(since, most)| since + most))
             .chain(self.desk.paused_until())
             .filter(|at| *at > now)
             .min()

@@ -1,6 +1,6 @@
 //! What a worker is told at its start, what it says at its end, and why it may end early.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, time::Duration};
 
 use picofarm_proto::{ids::WorkerId, model::check_label};
 
@@ -24,6 +24,8 @@ pub struct AgentConfig {
     pub gpus: u32,
     /// Labels that stages may ask for.
     pub labels: Vec<String>,
+    /// The worker ends when it has had nothing to do for so long, while connected; `None` = never.
+    pub exit_idle: Option<Duration>,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,
     /// What this worker has to show, and whom it trusts.

@@ -507,3 +507,27 @@ async fn an_unusable_setting_is_named() {
         }
     }
 }
+
+#[tokio::test]
+async fn a_worker_without_work_ends_when_it_was_told_to_and_not_while_it_has_some() {
+    let mut farm = FakeFarm::start().await;
+    let gate = Gate::new();
+    let held = gate.clone();
+    let config = picofarm_agent::AgentConfig {
+        exit_idle: Some(Duration::from_millis(300)),
+        ..common::config(farm.address)
+    };
+    let worker = Worker::start_with(config, move |task, control| {
+        held.pass(control)?;
+        Ok(output(task))
+    });
+    let (mut c, _) = farm.welcome(60_000).await;
+    c.listen_until("credit", |c| c.credit == 1).await;
+    c.grant(lease(1, 0, 1)).await;
+    tokio::time::sleep(Duration::from_millis(600)).await;
+    gate.open();
+    let done = c.done().await;
+    c.acknowledge(done.lease, 0).await;
+    let summary = worker.end().await.unwrap();
+    assert_eq!((summary.computed, summary.unacknowledged), (1, 0));
+}

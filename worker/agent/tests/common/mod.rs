@@ -345,6 +345,13 @@ impl Worker {
         address: SocketAddr,
         work: impl Fn(&Task, &Control) -> Result<Output, TaskError> + Send + Sync + 'static,
     ) -> Self {
+        Self::start_with(config(address), work)
+    }
+
+    pub fn start_with(
+        config: AgentConfig,
+        work: impl Fn(&Task, &Control) -> Result<Output, TaskError> + Send + Sync + 'static,
+    ) -> Self {
         let (sender, started) = mpsc::unbounded_channel();
         let executor = FakeExecutor {
             work: Box::new(work),
@@ -352,7 +359,7 @@ impl Worker {
         };
         let shutdown = CancellationToken::new();
         let life = tokio::spawn(picofarm_agent::run_with(
-            config(address),
+            config,
             Arc::new(executor),
             shutdown.clone(),
         ));
@@ -383,6 +390,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         memory_mib: 4096,
         gpus: 0,
         labels: Vec::new(),
+        exit_idle: None,
         asset_dirs: Vec::new(),
         access: Default::default(),
         store_prefixes: Vec::new(),
