@@ -172,6 +172,8 @@ pub(crate) struct Core {
     load: Load,
     /// Tasks that run a second time, by the lease of that.
     doubles: BTreeMap<RangeId, Double>,
+    /// When idle workers are looked after next.
+    help_at_ms: i64,
     /// What workers were charged with when their connection broke, for the case that they live.
     charged: HashMap<WorkerId, (Incarnation, Vec<(StageRef, u64)>)>,
     /// Tasks in hand, by lease, as last reported.
@@ -212,6 +214,7 @@ impl Core {
             leases: BTreeMap::new(),
             load: Load::default(),
             doubles: BTreeMap::new(),
+            help_at_ms: 0,
             charged: HashMap::new(),
             progress: BTreeMap::new(),
             houses: 1,

@@ -14,6 +14,8 @@ use picofarm_proto::{
 use super::{About, Core, Say, SessionId};
 use crate::transition::RangeEvent;
 
+/// How often idle workers are looked after, milliseconds.
+const LOOK_MS: i64 = 200;
 /// A task is doubled when it has taken so many times the mean of its like.
 const SLOW: f64 = 3.0;
 
@@ -28,35 +30,44 @@ pub(super) struct Double {
 }
 
 impl Core {
-    /// Gives idle workers a part of what others hold. To be called when all that was pending has been granted.
+    /// Gives idle workers a part of what others hold. To be called when all that was pending has been granted; looks a
+    /// few times a second only, since all leases are looked at.
     pub(super) fn help(&mut self, hungry: &[WorkerId], now_ms: i64) {
-        for worker in hungry {
-            let who = &self.workers[worker];
-            // A worker that only asks ahead is not idle.
-            if !who.hungry() || !who.leases.is_empty() {
-                continue;
-            }
-            let stages: Vec<StageRef> = self
-                .stages
-                .iter()
-                .filter(|(_, e)| !e.job.paused && e.free == Some(0))
-                .filter(|(_, e)| e.stage.pending_tasks() == 0 && e.stage.leased_tasks() > 0)
-                .map(|(id, _)| *id)
-                .collect();
-            for stage in stages {
-                if self.may_run(stage, *worker, now_ms).is_err() {
-                    continue;
-                }
-                if self.trim(stage, *worker, now_ms) {
+        // A worker that only asks ahead is not idle.
+        let idle = |worker: &&WorkerId| {
+            let who = &self.workers[*worker];
+            who.hungry() && who.leases.is_empty()
+        };
+        let mut idle: Vec<WorkerId> = hungry.iter().filter(idle).copied().collect();
+        if idle.is_empty() || now_ms < self.help_at_ms {
+            return;
+        }
+        self.help_at_ms = now_ms + LOOK_MS;
+        let mut stages: Vec<StageRef> = self
+            .stages
+            .iter()
+            .filter(|(_, e)| !e.job.paused && e.free == Some(0))
+            .filter(|(_, e)| e.stage.pending_tasks() == 0 && e.stage.leased_tasks() > 0)
+            .map(|(id, _)| *id)
+            .collect();
+        stages.sort_by_cached_key(|id| self.rank(*id));
+        for stage in stages {
+            let mut others = Vec::new();
+            let mut waiting = idle.into_iter();
+            for worker in waiting.by_ref() {
+                if self.may_run(stage, worker, now_ms).is_err() {
+                    others.push(worker);
+                } else if self.trim(stage, worker, now_ms) {
                     // What was cut off is pending now: this worker is the first to be asked.
                     let able = self.able(stage, now_ms);
-                    self.grant(stage, *worker, able, now_ms);
-                    break;
-                }
-                if self.double(stage, *worker, now_ms) {
+                    self.grant(stage, worker, able, now_ms);
+                } else if !self.double(stage, worker, now_ms) {
+                    others.push(worker);
                     break;
                 }
             }
+            others.extend(waiting);
+            idle = others;
         }
     }
 

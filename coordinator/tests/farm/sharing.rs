@@ -286,6 +286,7 @@ async fn a_double_ends_with_the_task_and_costs_it_nothing() {
     clumsy
         .fail(&double, double.lo, wire::FailureKind::User)
         .await;
+    farm.pass(1_000);
     let mut idle = Worker::connect(farm.address(), hello("idle"))
         .await
         .unwrap();

@@ -140,8 +140,10 @@ impl Bench<'_> {
         let server = self.server().await?;
         let mut client = server.client().await?;
         let start = Instant::now();
-        client.submit(spec(tasks), false).await?;
+        let job = client.submit(spec(tasks), false).await?.job;
         let seconds = start.elapsed().as_secs_f64();
+        // It would share the workers of what follows.
+        client.cancel(job).await?;
         let coordinator_peak_bytes = server.usage()?.peak_bytes;
         self.output
             .say(format!("submitted {tasks} tasks in {seconds:.3} s"));
@@ -216,13 +218,16 @@ impl Bench<'_> {
         let stats = fleet.stop().await?;
         let (first, last) = stats.span();
         let busy = tasks as f64 * self.args.task_s;
-        self.output.say(format!("{workers} workers: {wall_s:.1} s"));
+        let efficiency = busy / (workers as f64 * (last - first).as_secs_f64());
+        let percent = efficiency * 100.0;
+        self.output
+            .say(format!("{workers} workers: {wall_s:.1} s, {percent:.2} %"));
         Ok(Fleet {
             workers,
             task_s: self.args.task_s,
             tasks,
             wall_s,
-            efficiency: busy / (workers as f64 * (last - first).as_secs_f64()),
+            efficiency,
             lease: stats.lease(),
             heartbeat: stats.heartbeat(),
             reconnects: stats.reconnects(),
