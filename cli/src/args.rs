@@ -94,6 +94,9 @@ pub enum Command {
         /// The last N lines before now
         #[arg(long, default_value_t = 100, value_name = "N")]
         last: u32,
+        /// What tasks logged on their workers, too
+        #[arg(long, short)]
+        verbose: bool,
     },
     /// Look at data sets, check them, and make others of them
     #[command(subcommand)]

@@ -32,6 +32,7 @@ use std::{
 };
 
 use clap::{CommandFactory, Parser};
+use tracing_subscriber::{Layer, prelude::*};
 
 use crate::{
     args::{Cli, Command},
@@ -75,7 +76,11 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Worker(args) => roles::worker(args, settings, output).await,
         Command::Job(command) => jobs::run(command, settings, output).await,
         Command::Workers { what } => explain::workers(what, settings, output).await,
-        Command::Events { follow, last } => tail::events(follow, last, settings, output).await,
+        Command::Events {
+            follow,
+            last,
+            verbose,
+        } => tail::events(follow, last, verbose, settings, output).await,
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
@@ -127,10 +132,13 @@ fn log_to_stderr(filter: &str) -> Result<()> {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
     })?;
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let stderr = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .with_filter(filter);
+    tracing_subscriber::registry()
+        .with(stderr)
+        .with(picofarm_agent::task_logs())
         .init();
     Ok(())
 }

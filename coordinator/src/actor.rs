@@ -14,7 +14,7 @@ use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     key::spec_hash,
     model::{
-        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress,
+        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskLog, TaskProgress,
         WorkerHello,
     },
 };
@@ -121,6 +121,7 @@ pub(crate) enum FromWorker {
     Done(Finished),
     Failed(Failure),
     Release(LeaseRef, String),
+    Log(TaskLog),
     Closed,
 }
 
@@ -467,6 +468,7 @@ impl Life<'_> {
                 }
             }
             FromWorker::Release(lease, reason) => self.core.released(session, lease, &reason, now),
+            FromWorker::Log(log) => self.core.logged(session, &log, now),
             FromWorker::Closed => {
                 self.sessions.remove(&session);
                 self.core.closed(session, now);

@@ -140,6 +140,7 @@ impl Farm {
             limit: 0,
             task,
             newest: false,
+            logs: true,
         };
         let response = self.jobs.list_events(request).await.unwrap();
         response.into_inner().events

@@ -3,4 +3,5 @@
 mod harness;
 mod jobs;
 mod leases;
+mod logs;
 mod start;

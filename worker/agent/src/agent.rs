@@ -21,11 +21,12 @@ use crate::{
     AgentConfig, AgentError, Control, Executor, Output, Summary, Target, TaskError,
     allow::StorePrefixes,
     execute::Runner,
+    log::Unsent,
     session::{
         self, LinkError, Session, Welcome,
         backoff::{Backoff, random},
         desk::Desk,
-        message::Incoming,
+        message::{Incoming, Outgoing},
     },
 };
 
@@ -42,6 +43,8 @@ const GOOD_SESSION: Duration = Duration::from_secs(10);
 /// How long at most before the next coordinator of the list is tried: the workers of one that is lost shall not all
 /// come to the other in the same moment.
 const NEXT_COORDINATOR: Duration = Duration::from_millis(300);
+/// How often what the task in hand has logged is sent.
+const TELL: Duration = Duration::from_secs(1);
 const SHUTDOWN: &str = "the worker is shutting down";
 
 /// Runs a worker for every kind of task, until `shutdown` or a refusal.
@@ -91,6 +94,8 @@ pub async fn run_with(
         desk: Desk::new(),
         runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
+        unsent: Unsent::default(),
+        tell_at: Instant::now(),
         targets,
         at: 0,
         welcomed: false,
@@ -175,6 +180,10 @@ struct Agent {
     runner: Runner,
     /// Of the task in hand.
     control: Option<Arc<Control>>,
+    /// What tasks have logged.
+    unsent: Unsent,
+    /// When the log of the task in hand is to be looked at.
+    tell_at: Instant,
     /// The coordinators to choose from.
     targets: Vec<Target>,
     /// Which of them is in use or to be tried next.
@@ -226,7 +235,17 @@ impl Agent {
             self.control = Some(control.clone());
             self.runner.begin(task, control);
         }
+        if let Some(hand) = self.desk.in_hand()
+            && now >= self.tell_at
+        {
+            self.tell_at = now + TELL;
+            let lines = self.runner.log().take();
+            self.unsent.push(hand.lease, hand.task.index, lines);
+        }
         if let Link::Up { session, .. } = &self.link {
+            for log in self.unsent.drain(now) {
+                session.send(Outgoing::Log(log));
+            }
             for message in self.desk.outgoing(now) {
                 session.send(message);
             }
@@ -238,6 +257,7 @@ impl Agent {
         let leaving = self.leaving.iter().flat_map(|l| [l.stop_at, l.give_up]);
         leaving
             .chain(self.desk.paused_until())
+            .chain(self.desk.in_hand().map(|_| self.tell_at))
             .filter(|at| *at > now)
             .min()
             .unwrap_or(now + Duration::from_secs(60))
@@ -398,6 +418,9 @@ impl Agent {
         let now = Instant::now();
         self.control = None;
         let hand = self.desk.ended(now, &result);
+        // Sent ahead of the report on it, after which nothing is heard of it any more.
+        let lines = self.runner.log().end();
+        self.unsent.push(hand.lease, hand.task.index, lines);
         let (job, task, seconds) = (
             hand.task.job,
             hand.task.index,

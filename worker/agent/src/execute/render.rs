@@ -1,5 +1,7 @@
 //! Rendering: adopt, or make the scene, render it, code it and publish it.
 
+use std::time::Instant;
+
 use picofarm_dataset::{
     DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
 };
@@ -10,7 +12,7 @@ use picofarm_proto::{
 use picofarm_scene::{AssetLibrary, Camera, Scene};
 use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
-use tracing::debug;
+use tracing::info;
 
 use super::{
     Control, Output, Task, TaskError, memory,
@@ -60,11 +62,12 @@ pub(super) fn run(
             adopted: true,
         });
     }
+    let begun = Instant::now();
     let scene = scenes::scene(spec, task.index, libraries)?;
-    debug!(
-        task = task.index,
+    info!(
         scene = scene.name,
         triangles = scene.triangle_count(),
+        seconds = begun.elapsed().as_secs_f32(),
         "scene made"
     );
     let settings = settings(spec, dataset.spec(), &key)?;
@@ -73,8 +76,16 @@ pub(super) fn run(
         memory::check_memory(&settings, side, side, rayon::current_num_threads())
             .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
     }
+    let begun = Instant::now();
     let rendered =
         picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
+    info!(
+        samples = rendered.error.samples,
+        median_error = rendered.error.median_relative,
+        rays = rendered.rays,
+        seconds = begun.elapsed().as_secs_f32(),
+        "rendered"
+    );
     let camera = &scene.camera;
     let spots: Vec<_> = rendered
         .spots

@@ -8,9 +8,10 @@ use std::{
 };
 
 use tokio::sync::mpsc;
+use tracing::info_span;
 
 use super::{Control, Executor, Output, Task, TaskError};
-use crate::{AgentError, allow::StorePrefixes};
+use crate::{AgentError, allow::StorePrefixes, log::Collector};
 
 type Job = (Task, Arc<Control>);
 
@@ -18,6 +19,7 @@ type Job = (Task, Arc<Control>);
 pub(crate) struct Runner {
     jobs: std::sync::mpsc::Sender<Job>,
     results: mpsc::UnboundedReceiver<Result<Output, TaskError>>,
+    log: Arc<Collector>,
 }
 
 impl Runner {
@@ -28,9 +30,12 @@ impl Runner {
         allowed: StorePrefixes,
     ) -> Result<Self, AgentError> {
         let failed = |reason: String| AgentError::Threads { threads, reason };
+        let log = Arc::new(Collector::default());
+        let (ours, theirs) = (log.clone(), log.clone());
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .thread_name(|i| format!("render-{i}"))
+            .start_handler(move |_| theirs.serve())
             .build()
             .map_err(|e| failed(e.to_string()))?;
         let (jobs, inbox) = std::sync::mpsc::channel::<Job>();
@@ -38,12 +43,19 @@ impl Runner {
         std::thread::Builder::new()
             .name("executor".into())
             .spawn(move || {
+                ours.serve();
                 for (task, control) in inbox {
+                    ours.begin();
                     let result = catch_unwind(AssertUnwindSafe(|| {
                         allowed
                             .check(&task.spec, task.index)
                             .map_err(TaskError::User)?;
-                        pool.install(|| executor.run(&task, &control))
+                        pool.install(|| {
+                            let stage = &*task.spec.name;
+                            let _in = info_span!("task", job = %task.job, stage, task = task.index)
+                                .entered();
+                            executor.run(&task, &control)
+                        })
                     }))
                     .unwrap_or_else(|panic| Err(TaskError::Crash(said(panic.as_ref()))));
                     if outbox.send(result).is_err() {
@@ -52,7 +64,7 @@ impl Runner {
                 }
             })
             .map_err(|e| failed(e.to_string()))?;
-        Ok(Self { jobs, results })
+        Ok(Self { jobs, results, log })
     }
 
     /// Begins `task`. Its result comes from [`Runner::finished`].
@@ -60,6 +72,11 @@ impl Runner {
         self.jobs
             .send((task, control))
             .expect("the executor's thread lives as long as its runner: it catches every panic");
+    }
+
+    /// What the task in hand logs.
+    pub(crate) fn log(&self) -> &Collector {
+        &self.log
     }
 
     /// Waits for the task in hand. Safe to cancel; pends for ever while none is.
