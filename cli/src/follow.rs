@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use picofarm_proto::{
     ids::JobId,
-    model::{EventKind, JobState, JobStatus},
+    model::{EventKind, JobState, JobStatus, StageStatus},
 };
 
 use crate::{
@@ -147,8 +147,13 @@ impl Pace {
             0 => String::new(),
             n => format!(" ({n} reused)"),
         };
+        let renders = |s: &StageStatus| s.kind == "render";
+        let what = match s.stages.iter().all(renders) {
+            true => "scenes",
+            false => "tasks",
+        };
         let message = format!(
-            "{}/{} scenes{reused}{dead}, {} worker{}{eta}",
+            "{}/{} {what}{reused}{dead}, {} worker{}{eta}",
             s.tasks.done,
             s.tasks.total,
             s.workers,

@@ -385,7 +385,7 @@ fn describe_stages(s: &JobStatus) -> String {
         ]
     });
     let header = header.map(String::from).to_vec();
-    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>()) + "\n"
+    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
 }
 
 pub fn describe_event(e: &Event) -> String {

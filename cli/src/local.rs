@@ -85,11 +85,16 @@ impl Local {
 
     /// Resolves when a worker ends, which none should while the farm runs.
     pub async fn worker_lost(&mut self) -> CliError {
-        match self.workers.join_next().await {
-            Some(Ok(Ok(_))) => CliError::new(Code::Failed, "a worker ended early"),
-            Some(Ok(Err(e))) => roles::agent_error(&e),
-            Some(Err(e)) => CliError::new(Code::Failed, format!("a worker broke: {e}")),
-            None => std::future::pending().await,
+        loop {
+            match self.workers.join_next().await {
+                // It was drained: the others go on, and without any the farm waits for some from elsewhere.
+                Some(Ok(Ok(_))) => tracing::info!("a worker has ended"),
+                Some(Ok(Err(e))) => return roles::agent_error(&e),
+                Some(Err(e)) => {
+                    return CliError::new(Code::Failed, format!("a worker broke: {e}"));
+                }
+                None => std::future::pending::<()>().await,
+            }
         }
     }
 

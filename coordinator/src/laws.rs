@@ -64,7 +64,7 @@ proptest! {
     fn ranges_follow_a_table_of_tasks(
         total in 1..40u64,
         cut in prop::collection::vec(any::<bool>(), 40),
-        ops in prop::collection::vec((0..5u8, any::<u64>(), any::<u64>(), any::<bool>()), 0..80),
+        ops in prop::collection::vec((0..6u8, any::<u64>(), any::<u64>(), any::<bool>()), 0..80),
     ) {
         let mut ids = counter();
         let mut table: Vec<Task> = (0..total)
@@ -100,6 +100,10 @@ proptest! {
                     (range, RangeEvent::Leave { task, retry_at_ms, crashes: u32::from(flag) })
                 }
                 (3, Some(range)) => (range, RangeEvent::Close { halve: flag }),
+                (5, Some(range)) => {
+                    let at = range.lo + b % range.len();
+                    (range, RangeEvent::Trim { at })
+                }
                 (4, _) => {
                     let task = a % total;
                     let Some(range) = stage.pending_at(task).cloned() else {
@@ -123,6 +127,11 @@ proptest! {
                     }
                     RangeEvent::Leave { task, retry_at_ms, .. } => {
                         table[task as usize] = if retry_at_ms.is_some() { Task::Pending } else { Task::Dead };
+                    }
+                    RangeEvent::Trim { at } => {
+                        for t in at..range.hi {
+                            table[t as usize] = Task::Pending;
+                        }
                     }
                     RangeEvent::Close { .. } => {
                         let RangeState::Leased(lease) = &range.state else { unreachable!() };

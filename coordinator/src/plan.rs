@@ -107,15 +107,17 @@ fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<Str
     reasons
 }
 
-/// The latest job with a stage like this one, and what has changed since.
+/// The job with the stage most like this one (of equals the latest), and what has changed since. Stages are alike that
+/// have the same name, or come from the same matrix.
 fn kin(stage: &StageSpec, recent: &[Job]) -> Option<(JobId, Vec<String>)> {
-    let like =
-        |other: &&StageSpec| other.task.kind() == stage.task.kind() && other.name == stage.name;
-    let (job, other) = recent.iter().find_map(|job| {
-        let other = job.spec.stages.iter().find(like)?;
-        Some((job.id, other))
-    })?;
-    Some((job, changes(other, stage)))
+    let base = |stage: &StageSpec| stage.name.split('[').next().map(str::to_owned);
+    let stages = recent
+        .iter()
+        .flat_map(|job| job.spec.stages.iter().map(|other| (job.id, other)));
+    stages
+        .filter(|(_, other)| other.task.kind() == stage.task.kind() && base(other) == base(stage))
+        .map(|(job, other)| (job, changes(other, stage)))
+        .min_by_key(|(_, changes)| changes.len())
 }
 
 /// The settings that shape results and differ between two stages of one kind, each in words:

@@ -53,6 +53,11 @@ pub struct CoordinatorConfig {
     pub tick: Duration,
     /// Waiting times after failures.
     pub backoff: Backoff,
+    /// What is left of a lease is shared with an idle worker if it takes at least so long, milliseconds (default 2,000).
+    pub worth_ms: u32,
+    /// A task is run a second time by an idle worker when it has taken three times as long as its like, and at least so
+    /// long, milliseconds (default 10,000).
+    pub slow_ms: u32,
     /// The clock leases live by.
     pub clock: Clock,
     /// Who is let in; by default anyone who reaches the address.
@@ -77,6 +82,8 @@ impl CoordinatorConfig {
             reconnect_ms: 1_500,
             tick: Duration::from_millis(250),
             backoff: Backoff::default(),
+            worth_ms: 2_000,
+            slow_ms: 10_000,
             clock: Clock::system(),
             access: Access::default(),
             quotas: Quotas::default(),
@@ -191,6 +198,8 @@ pub async fn serve(
             lease_ms: config.lease_ms,
             reconnect_ms: config.reconnect_ms,
             backoff: config.backoff,
+            worth_ms: config.worth_ms,
+            slow_ms: config.slow_ms,
         },
         tick: config.tick,
         forget_after: config.forget_after,

@@ -39,6 +39,11 @@ pub enum RangeEvent {
         /// The worker was lost: halve what is left, so that a poison task is cornered.
         halve: bool,
     },
+    /// The holder loses the tasks from this one on, none of which it has begun.
+    Trim {
+        /// The first of them.
+        at: u64,
+    },
     /// The outputs of pending tasks turned up.
     Settle {
         /// The tasks, all of the range.
@@ -134,6 +139,26 @@ pub fn next(
             let mut pieces = after_mark(range, lease, ids);
             pieces.push(single);
             Ok(pieces)
+        }
+        (RangeState::Leased(lease), RangeEvent::Trim { at })
+            if range.lo < *at && *at < range.hi =>
+        {
+            let n = usize::try_from(at - range.lo).expect("a lease is small");
+            let (kept, lost) = lease.marks.split_at(n);
+            if !kept.contains(&Mark::Todo) || lost.iter().any(|m| *m != Mark::Todo) {
+                return Err(illegal());
+            }
+            let front = Range {
+                hi: *at,
+                state: RangeState::Leased(LeaseState {
+                    marks: kept.to_vec(),
+                    ..lease.clone()
+                }),
+                ..range.clone()
+            };
+            let state = RangeState::Pending { not_before_ms: 0 };
+            let rest = piece(range, *at, range.hi, range.crashes, state, 1, ids);
+            Ok(vec![front, rest])
         }
         (RangeState::Leased(lease), RangeEvent::Close { halve }) => {
             Ok(closed(range, lease, *halve, ids))

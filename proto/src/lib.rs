@@ -10,7 +10,6 @@ pub mod split;
 
 /// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
 #[expect(missing_docs, reason = "generated from the schema, which documents it")]
-#[expect(clippy::large_enum_variant, reason = "generated")]
 pub mod wire {
     tonic::include_proto!("picofarm.v1");
 }

@@ -6,7 +6,7 @@ use std::{
 };
 
 /// No wait of a healthy test comes near this; it keeps a broken one from hanging.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const PATIENCE: Duration = Duration::from_secs(300);
 
 /// Looks every few milliseconds until there is something.
 ///

@@ -4,7 +4,10 @@
 //!
 //! The short form runs with all tests. The long one: `PICOFARM_CHAOS=300 tests/run -E 'binary(chaos)'` (rounds).
 
-use std::{thread::sleep, time::Duration};
+use std::{
+    thread::sleep,
+    time::{Duration, Instant},
+};
 
 use picofarm_tests::{
     Cluster, Job, Process, Signal, farm::undisturbed, proxy::Mode, rng::Rng, s3, store,
@@ -170,6 +173,11 @@ fn with_objects_on_s3_too() {
     assert_eq!(there, undisturbed("chaos-s3", &job));
 }
 
+/// How long something took, for people: `--nocapture` shows it. On a busy machine it means little.
+fn told(what: &str, since: Instant) {
+    eprintln!("{what}: {:.2} s", since.elapsed().as_secs_f64());
+}
+
 #[test]
 fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() {
     let Some(mut cluster) = Cluster::start("failover", 2, 60.0) else {
@@ -184,9 +192,11 @@ fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() 
         worker.until_says("task starts");
     }
     cluster.kill_house(0);
+    let killed = Instant::now();
     for worker in &mut workers {
         worker.until_says("reconnected");
     }
+    told("all workers at the other coordinator", killed);
     done_once(&cluster, &id, 8);
     let started: usize = workers
         .iter()
@@ -207,8 +217,11 @@ fn the_lease_of_a_killed_worker_is_soon_anothers_although_it_had_long_to_live() 
     let id = cluster.submit(&job);
     let mut worker = cluster.worker("victim", 0);
     worker.until_says("task starts");
-    let heir = cluster.worker("heir", 0);
+    let mut heir = cluster.worker("heir", 0);
     worker.kill();
+    let killed = Instant::now();
+    heir.until_says("task starts");
+    told("the task of a killed worker at another", killed);
     // A lease lives for ten minutes here, longer than the patience of any test.
     done_once(&cluster, &id, 1);
     assert!(heir.stderr().contains("task done"), "{}", heir.stderr());

@@ -1,13 +1,13 @@
 //! The commit rule: a result is accepted only from the holder of a live lease, and each task has one result.
 
-use picofarm_catalog::{Output, Range};
+use picofarm_catalog::{Output, Range, RangeState};
 use picofarm_proto::{
     ids::StageRef,
     key::task_key,
     model::{EventKind, Finished},
 };
 
-use super::{About, Core, SessionId, StageEntry};
+use super::{About, Core, Say, SessionId, StageEntry};
 use crate::transition::RangeEvent;
 
 /// What the catalog already holds for a reported task: looked up before [`Core::finished`].
@@ -19,6 +19,9 @@ impl Core {
     pub(crate) fn stage_of(&self, report: &Finished) -> Option<StageRef> {
         let fits =
             |entry: &StageEntry| task_key(&self.sets[entry.set].key, report.index) == report.key;
+        if let Some(double) = self.doubles.get(&report.lease.range) {
+            return fits(self.stages.get(&double.stage)?).then_some(double.stage);
+        }
         if let Some(id) = self.leases.get(&report.lease.range) {
             return fits(&self.stages[id]).then_some(*id);
         }
@@ -62,9 +65,21 @@ impl Core {
         )?;
         let set = self.stages[&id].set;
         let known = known.or_else(|| self.fresh.get(&(set, report.index)).copied());
-        let live = self
-            .held_to_do(session, report.lease, report.index, now_ms)
-            .cloned();
+        let double = self
+            .sessions
+            .get(&session)
+            .and_then(|worker| self.doubled(*worker, report.lease))
+            .filter(|(double, _)| double.task == report.index)
+            .map(|(_, range)| range.clone());
+        let live = match double {
+            Some(range) => {
+                self.drop_double(session, report.lease);
+                Ok(range)
+            }
+            None => self
+                .held_to_do(session, report.lease, report.index, now_ms)
+                .cloned(),
+        };
         match (live, known) {
             (Ok(range), None) => {
                 self.commit_new(session, id, &range, report, manifest, now_ms);
@@ -72,6 +87,7 @@ impl Core {
             }
             (live, Some(known)) => {
                 // The output stands, whoever made it: the task is done.
+                let had_it = live.is_ok();
                 if let Ok(range) = live {
                     self.mark(
                         &range,
@@ -83,6 +99,17 @@ impl Core {
                     self.perhaps_over(id, now_ms);
                 }
                 if known == manifest {
+                    if had_it {
+                        let kind = match report.adopted {
+                            true => EventKind::Reused,
+                            false => EventKind::Committed,
+                        };
+                        let about = About::message("the same result as before")
+                            .task(report.index)
+                            .worker(self.session_name(session))
+                            .seconds(report.seconds);
+                        self.event(now_ms, id, kind, about);
+                    }
                     return Ok(());
                 }
                 let name = self.session_name(session);
@@ -125,7 +152,7 @@ impl Core {
             manifest,
             bytes: report.bytes,
             seconds: report.seconds,
-            epoch: report.lease.epoch,
+            epoch: range.epoch,
             adopted: report.adopted,
         });
         let kind = if report.adopted {
@@ -148,7 +175,25 @@ impl Core {
                 reused: report.adopted,
             },
         );
+        self.stop_first(session, range);
         self.perhaps_over(id, now_ms);
+    }
+
+    /// Where a double was first and nothing of the lease is left, its holder need not go on.
+    fn stop_first(&mut self, by: SessionId, range: &Range) {
+        let RangeState::Leased(lease) = &range.state else {
+            return;
+        };
+        if let Some(holder) = self.workers.get(&lease.worker)
+            && holder.session != by
+            && self.range(range.id).is_none()
+        {
+            let revoke = Say::Revoke {
+                lease: range.lease(),
+                reason: "its last task was finished by another worker".into(),
+            };
+            self.say.push((holder.session, revoke));
+        }
     }
 }
 

@@ -14,6 +14,7 @@ use crate::{place, transition::RangeEvent};
 impl Core {
     /// Grants whatever is in hand and can be granted now.
     pub(crate) fn dispatch(&mut self, now_ms: i64) {
+        self.end_doubles();
         let waiting: Vec<StageRef> = self
             .stages
             .iter()
@@ -48,6 +49,7 @@ impl Core {
                     .any(|(stage, able)| self.grant(*stage, *worker, *able, now_ms));
             }
         }
+        self.help(&hungry, now_ms);
     }
 
     /// Who goes first: the higher priority; then whose user has the fewest leases; then which job has; then who came
@@ -105,7 +107,7 @@ impl Core {
     }
 
     /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
-    fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
+    pub(super) fn grant(&mut self, id: StageRef, worker: WorkerId, able: u64, now_ms: i64) -> bool {
         let entry = &self.stages[&id];
         let who = &self.workers[&worker];
         if !who.hungry() || self.may_run(id, worker, now_ms).is_err() {
@@ -159,7 +161,7 @@ impl Core {
     }
 
     /// Number of connected workers that may run a stage's tasks.
-    fn able(&self, id: StageRef, now_ms: i64) -> u64 {
+    pub(super) fn able(&self, id: StageRef, now_ms: i64) -> u64 {
         let able = |worker: &&WorkerId| self.may_run(id, **worker, now_ms).is_ok();
         self.workers.keys().filter(able).count() as u64
     }

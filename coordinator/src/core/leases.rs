@@ -2,16 +2,22 @@
 
 use picofarm_catalog::{Exception, Mark, Range, RangeState};
 use picofarm_proto::{
-    ids::{LeaseRef, RangeId, WorkerId},
+    ids::{Incarnation, LeaseRef, RangeId, WorkerId},
     model::{EventKind, Failure, FailureKind, LogAllowance, TaskProgress},
 };
 
 use super::{About, Core, Progress, Say, SessionId};
 use crate::{budget, transition::RangeEvent};
 
+/// Lost workers remembered at most.
+const CHARGED: usize = 4096;
+
 impl Core {
     /// Charges a failed task to its budgets and takes it out of the lease.
     pub(crate) fn failed(&mut self, session: SessionId, failure: &Failure, now_ms: i64) {
+        if self.drop_double(session, failure.lease) {
+            return self.acknowledge(session, failure.lease, failure.index, Ok(()));
+        }
         let held = self
             .held_to_do(session, failure.lease, failure.index, now_ms)
             .cloned();
@@ -38,6 +44,9 @@ impl Core {
         reason: &str,
         now_ms: i64,
     ) {
+        if self.drop_double(session, lease) {
+            return self.acknowledge(session, lease, 0, Ok(()));
+        }
         let held = self.held(session, lease, now_ms).cloned();
         let verdict = held.map(|range| {
             let about = About::message(reason)
@@ -61,6 +70,10 @@ impl Core {
         for lease in leases {
             if self.held(session, *lease, now_ms).is_ok() {
                 self.renew(lease.range, now_ms);
+                alive.push(*lease);
+            } else if let Some(worker) = self.sessions.get(&session)
+                && self.doubled(*worker, *lease).is_some()
+            {
                 alive.push(*lease);
             }
         }
@@ -113,7 +126,7 @@ impl Core {
         let Some((_, lease)) = self.stages[&range.stage].stage.lease(range.lease()) else {
             return;
         };
-        let worker = lease.worker;
+        let (worker, incarnation) = (lease.worker, lease.incarnation);
         let name = self.name_of(worker);
         if let Some(entry) = self.workers.get(&worker) {
             let revoke = Say::Revoke {
@@ -135,6 +148,19 @@ impl Core {
         if in_hand.is_empty() {
             in_hand.extend((range.lo..range.hi).find(todo));
         }
+        if self.charged.len() > CHARGED {
+            self.charged.clear();
+        }
+        let charged = self
+            .charged
+            .entry(worker)
+            .or_insert((incarnation, Vec::new()));
+        if charged.0 != incarnation {
+            *charged = (incarnation, Vec::new());
+        }
+        charged
+            .1
+            .extend(in_hand.iter().map(|task| (range.stage, *task)));
         for task in in_hand {
             if let Some(range) = self.range(range.id).cloned() {
                 self.leave(&range, task, FailureKind::Crash, why, &name, now_ms);
@@ -145,6 +171,28 @@ impl Core {
             self.close(&range, true);
         }
         self.perhaps_over(range.stage, now_ms);
+    }
+
+    /// A worker that was thought dead is back: what it was charged with was a broken connection. (A task that was given
+    /// up by that stays so; `retry` is for that.)
+    pub(super) fn refund(&mut self, worker: WorkerId, incarnation: Incarnation) {
+        let Some((of, tasks)) = self.charged.remove(&worker) else {
+            return;
+        };
+        for (stage, task) in tasks.into_iter().filter(|_| of == incarnation) {
+            let Some(entry) = self.stages.get_mut(&stage) else {
+                continue;
+            };
+            if let Some(exception) = entry.exceptions.get_mut(&task)
+                && !exception.dead
+                && exception.crashes > 0
+            {
+                exception.crashes -= 1;
+                self.changes
+                    .exceptions
+                    .insert((stage, task), exception.clone());
+            }
+        }
     }
 
     /// One task fails and leaves its lease.

@@ -8,7 +8,15 @@ impl Core {
     /// Notes lines of a task that this session's worker has in hand, as far as the task's allowance goes; drops them where
     /// the lease is not its own, or not live. Nobody waits for an answer.
     pub(crate) fn logged(&mut self, session: SessionId, log: &TaskLog, now_ms: i64) {
-        let Ok(range) = self.held_to_do(session, log.lease, log.index, now_ms) else {
+        // A task in the hands of two has one allowance.
+        let double = self
+            .sessions
+            .get(&session)
+            .and_then(|worker| self.doubled(*worker, log.lease))
+            .filter(|(double, _)| double.task == log.index)
+            .map(|(_, range)| range);
+        let held = || self.held_to_do(session, log.lease, log.index, now_ms).ok();
+        let Some(range) = double.or_else(held) else {
             return;
         };
         let (range, stage) = (range.id, range.stage);

@@ -13,6 +13,7 @@ mod load;
 mod log;
 mod sessions;
 mod supply;
+mod tail;
 #[cfg(test)]
 mod tests;
 mod trouble;
@@ -31,6 +32,7 @@ use uuid::Uuid;
 
 use crate::{budget::Backoff, stage::Stage};
 use load::Load;
+use tail::Double;
 use trouble::Trouble;
 
 pub(crate) use commit::OutputHint;
@@ -52,6 +54,11 @@ pub(crate) struct Settings {
     pub reconnect_ms: u32,
     /// Waiting times after failures.
     pub backoff: Backoff,
+    /// What is left of a lease is shared with an idle worker if it takes at least so long, milliseconds.
+    pub worth_ms: u32,
+    /// A task is run a second time by an idle worker when it has taken three times as long as its like, and at least so
+    /// long, milliseconds.
+    pub slow_ms: u32,
 }
 
 /// Something to tell a worker once the changes are durable.
@@ -166,6 +173,10 @@ pub(crate) struct Core {
     leases: BTreeMap<RangeId, StageRef>,
     /// Who works on which job.
     load: Load,
+    /// Tasks that run a second time, by the lease of that.
+    doubles: BTreeMap<RangeId, Double>,
+    /// What workers were charged with when their connection broke, for the case that they live.
+    charged: HashMap<WorkerId, (Incarnation, Vec<(StageRef, u64)>)>,
     /// Tasks in hand, by lease, as last reported.
     progress: BTreeMap<RangeId, BTreeMap<u64, Progress>>,
     /// Houses alive, this one too.
@@ -203,6 +214,8 @@ impl Core {
                 .collect(),
             leases: BTreeMap::new(),
             load: Load::default(),
+            doubles: BTreeMap::new(),
+            charged: HashMap::new(),
             progress: BTreeMap::new(),
             houses: 1,
             elsewhere: 0,

@@ -15,6 +15,8 @@ impl Core {
             self.say.push((old.session, Say::Replaced));
         }
         self.names.insert(id, hello.name.clone());
+        self.doubles.retain(|_, double| double.worker != id);
+        self.refund(id, hello.incarnation);
         self.changes.workers.insert(
             id,
             Worker {

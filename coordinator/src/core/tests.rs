@@ -14,7 +14,10 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{HouseId, Incarnation, JobId, WorkerId},
     key::task_key,
-    model::{Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, WorkerHello},
+    model::{
+        Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskProgress,
+        WorkerHello,
+    },
 };
 use proptest::prelude::*;
 use uuid::Uuid;
@@ -31,6 +34,8 @@ const SETTINGS: Settings = Settings {
         first_ms: 10,
         most_ms: 100,
     },
+    worth_ms: 20,
+    slow_ms: 300,
 };
 
 #[derive(Debug, Clone)]
@@ -139,6 +144,8 @@ struct World {
     /// What the model knows to be committed, by stage and task.
     committed: BTreeMap<(u32, u64), String>,
     jobs: Vec<JobId>,
+    trims: u32,
+    doubles: u32,
 }
 
 impl World {
@@ -155,6 +162,8 @@ impl World {
             next: 1,
             committed: BTreeMap::new(),
             jobs: Vec::new(),
+            trims: 0,
+            doubles: 0,
         };
         world.submit(0, TASKS).await;
         world
@@ -233,8 +242,13 @@ impl World {
                 .workers
                 .iter_mut()
                 .find(|w| w.session == Some((h, *session)));
-            if let (Some(worker), Say::Lease(lease)) = (worker, what) {
-                worker.leases.insert(0, (**lease).clone());
+            match (worker, what) {
+                (Some(worker), Say::Lease(lease)) => {
+                    self.doubles += u32::from(lease.lease.epoch.0 == 0);
+                    worker.leases.insert(0, (**lease).clone());
+                }
+                (_, Say::Trim { .. }) => self.trims += 1,
+                _ => {}
             }
         }
         say
@@ -291,7 +305,7 @@ impl World {
             key: task_key(&lease.key, index),
             manifest_sha256: format!("{index:064x}"),
             bytes: 1,
-            seconds: 1.0,
+            seconds: 0.01,
             adopted: false,
         };
         self.flush(h).await;
@@ -364,9 +378,15 @@ impl World {
                 let worker = &self.workers[usize::from(*w)];
                 if let Some((h, session)) = worker.session {
                     let leases: Vec<_> = worker.leases.iter().map(|l| l.lease).collect();
+                    let progress = worker.leases.iter().take(1).map(|l| TaskProgress {
+                        lease: l.lease,
+                        index: l.lo,
+                        fraction: 0.5,
+                    });
+                    let progress: Vec<_> = progress.collect();
                     self.houses[h]
                         .core
-                        .heartbeat(session, &leases, &[], self.now);
+                        .heartbeat(session, &leases, &progress, self.now);
                 }
             }
             Op::Drop(w, dies) => {
@@ -511,7 +531,43 @@ impl World {
         panic!("the jobs do not end");
     }
 
-    async fn live(mut self, ops: &[Op]) {
+    /// One worker takes everything, and another comes and has nothing: trimming, then doubling.
+    async fn greedy(&mut self) {
+        for op in [Op::Connect(0, 0), Op::Credit(0), Op::Finish(0, 0, 0)] {
+            self.act(&op).await;
+        }
+        for _ in 0..8 {
+            self.act(&Op::Credit(0)).await;
+        }
+        self.act(&Op::HouseBeats(0)).await;
+        self.act(&Op::Connect(1, 0)).await;
+        for _ in 0..8 {
+            self.act(&Op::Credit(1)).await;
+        }
+        self.act(&Op::Beat(0)).await;
+        self.act(&Op::Beat(1)).await;
+        for _ in 0..2 {
+            self.act(&Op::Pass(300)).await;
+            self.act(&Op::Beat(0)).await;
+            self.act(&Op::Beat(1)).await;
+        }
+        self.act(&Op::Connect(2, 0)).await;
+        for _ in 0..10 {
+            self.act(&Op::Credit(2)).await;
+            for task in 0..4 {
+                self.act(&Op::Finish(2, 0, task)).await;
+            }
+            self.act(&Op::Pass(100)).await;
+            self.act(&Op::Beat(0)).await;
+            self.act(&Op::Beat(1)).await;
+        }
+    }
+
+    async fn live(mut self, greedy: bool, ops: &[Op]) {
+        if greedy {
+            self.greedy().await;
+            self.check().await;
+        }
         for op in ops {
             self.act(op).await;
             self.check().await;
@@ -539,27 +595,45 @@ fn block_on(work: impl Future<Output = ()>) {
         .block_on(work);
 }
 
+#[test]
+fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
+            .await
+            .unwrap();
+        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        world.greedy().await;
+        assert!(
+            world.trims > 0 && world.doubles > 0,
+            "{} {}",
+            world.trims,
+            world.doubles
+        );
+    });
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, max_shrink_iters: 200, ..ProptestConfig::default() })]
 
     #[test]
-    fn every_task_is_committed_exactly_once_whatever_happens(ops in prop::collection::vec(op(), 1..60)) {
+    fn every_task_is_committed_exactly_once_whatever_happens(greedy: bool, ops in prop::collection::vec(op(), 1..60)) {
         block_on(async {
             let folder = tempfile::tempdir().unwrap();
             let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test").await.unwrap();
-            World::new(vec![Arc::new(catalog)], None).await.live(&ops).await;
+            World::new(vec![Arc::new(catalog)], None).await.live(greedy, &ops).await;
         });
     }
 
     #[test]
-    fn two_houses_on_one_database_commit_every_task_exactly_once(ops in prop::collection::vec(op(), 1..80)) {
+    fn two_houses_on_one_database_commit_every_task_exactly_once(greedy: bool, ops in prop::collection::vec(op(), 1..80)) {
         block_on(async {
             let Some(url) = testing::postgres().await else { return };
             let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
             for name in ["a", "b"] {
                 catalogs.push(Arc::new(PostgresCatalog::open(&url, name).await.unwrap()));
             }
-            World::new(catalogs, Some(url)).await.live(&ops).await;
+            World::new(catalogs, Some(url)).await.live(greedy, &ops).await;
         });
     }
 }

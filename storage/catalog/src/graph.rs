@@ -99,36 +99,29 @@ mod tests {
         assert_eq!(now[1..], [StageState::Done, StageState::Open]);
     }
 
+    /// A node whose needs are not chosen yet.
+    fn one() -> impl Strategy<Value = (Vec<prop::sample::Index>, Node)> {
+        let needs = prop::collection::vec(any::<prop::sample::Index>(), 0..3);
+        let counts = (0u64..3, 0u64..3, 0u64..2, 0u64..2);
+        (needs, counts, any::<bool>()).prop_map(|(needs, counts, tolerate_dead)| {
+            let (pending, done, dead, leased) = counts;
+            let mut node = node(&[], pending, done, dead);
+            node.counts.leased = leased;
+            node.counts.total += leased;
+            node.tolerate_dead = tolerate_dead;
+            (needs, node)
+        })
+    }
+
     fn nodes() -> impl Strategy<Value = Vec<Node>> {
-        let one = (
-            prop::collection::vec(any::<prop::sample::Index>(), 0..3),
-            0u64..3,
-            0u64..3,
-            0u64..2,
-            0u64..2,
-            any::<bool>(),
-        );
-        prop::collection::vec(one, 1..8).prop_map(|all| {
-            let make = |(i, (needs, pending, done, dead, leased, tolerate_dead)): (
-                usize,
-                (Vec<prop::sample::Index>, u64, u64, u64, u64, bool),
-            )| Node {
-                needs: needs
-                    .iter()
-                    .filter(|_| i > 0)
-                    .map(|n| n.index(i) as u32)
-                    .collect(),
-                tolerate_dead,
-                counts: TaskCounts {
-                    total: pending + done + dead + leased,
-                    done,
-                    pending,
-                    dead,
-                    leased,
-                    reused: 0,
-                },
+        prop::collection::vec(one(), 1..8).prop_map(|all| {
+            let choose = |(i, (needs, mut node)): (usize, (Vec<prop::sample::Index>, Node))| {
+                // Of those before it; the first has none.
+                let needs = needs.iter().filter(|_| i > 0);
+                node.needs = needs.map(|n| n.index(i) as u32).collect();
+                node
             };
-            all.into_iter().enumerate().map(make).collect()
+            all.into_iter().enumerate().map(choose).collect()
         })
     }
 

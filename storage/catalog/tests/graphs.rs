@@ -157,11 +157,11 @@ async fn a_held_job_gives_nothing_until_it_goes_on(catalog: &dyn Catalog) {
         "once"
     );
     assert!(claim(catalog, 0).await.is_empty());
-    assert_eq!(catalog.beat(0).await.unwrap().active[&id], true);
+    assert!(catalog.beat(0).await.unwrap().active[&id]);
     assert!(catalog.job(id).await.unwrap().unwrap().job.paused);
     assert!(catalog.pause(id, false, "by ada", 62).await.unwrap());
     assert_eq!(claim(catalog, 0).await.len(), 1);
-    assert_eq!(catalog.beat(0).await.unwrap().active[&id], false);
+    assert!(!catalog.beat(0).await.unwrap().active[&id]);
     assert!(catalog.cancel(id, "enough", 63).await.unwrap());
     assert!(
         !catalog.pause(id, true, "", 64).await.unwrap(),

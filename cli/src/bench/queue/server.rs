@@ -1,7 +1,8 @@
 //! The coordinator under test: this program, in a process of its own.
 
 use std::{
-    io::{BufRead, BufReader},
+    io::{BufRead, BufReader, Read, Write},
+    net::TcpStream,
     process::{Child, Command, Stdio},
 };
 
@@ -16,6 +17,8 @@ use crate::{
 pub struct Server {
     child: Child,
     url: String,
+    /// Where its metrics are, `host:port`.
+    http: String,
     place: CatalogPlace,
     lease_s: f64,
 }
@@ -31,10 +34,11 @@ impl Server {
     pub async fn start(place: &CatalogPlace, lease_s: f64) -> Result<Self> {
         let place = place.clone();
         let started = tokio::task::spawn_blocking(move || {
-            let (child, url) = spawn(&place, "127.0.0.1:0", lease_s)?;
+            let (child, url, http) = spawn(&place, "127.0.0.1:0", lease_s)?;
             Ok(Self {
                 child,
                 url,
+                http,
                 place,
                 lease_s,
             })
@@ -57,9 +61,31 @@ impl Server {
         let usage = self.usage()?;
         self.end();
         let address = self.url.trim_start_matches("http://");
-        let (child, _) = spawn(&self.place, address, self.lease_s)?;
+        let (child, _, http) = spawn(&self.place, address, self.lease_s)?;
         self.child = child;
+        self.http = http;
         Ok(usage)
+    }
+
+    /// Commits to the catalog so far.
+    pub fn commits(&self) -> Result<u64> {
+        let failed =
+            |e: std::io::Error| CliError::new(Code::Resource, format!("reading metrics: {e}"));
+        let mut stream = TcpStream::connect(&self.http).map_err(failed)?;
+        let request = format!(
+            "GET /metrics HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
+            self.http
+        );
+        stream.write_all(request.as_bytes()).map_err(failed)?;
+        let mut page = String::new();
+        stream.read_to_string(&mut page).map_err(failed)?;
+        let count = page
+            .lines()
+            .filter_map(|line| line.split_once("catalog_commit_seconds_count "))
+            .find_map(|(_, count)| count.trim().parse::<f64>().ok());
+        count
+            .map(|count| count as u64)
+            .ok_or_else(|| CliError::new(Code::Failed, "the coordinator's metrics lack commits"))
     }
 
     /// CPU time and peak memory so far.
@@ -111,7 +137,7 @@ impl Drop for Server {
     }
 }
 
-fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, String)> {
+fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, String, String)> {
     let failed =
         |e: std::io::Error| CliError::new(Code::Resource, format!("starting a coordinator: {e}"));
     let program = std::env::current_exe().map_err(failed)?;
@@ -126,6 +152,8 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
             "--allow-insecure",
             "--listen",
             listen,
+            "--http",
+            "127.0.0.1:0",
         ])
         .args(["--lease-s", &lease_s.to_string(), "--log", "warn"])
         // Not an argument: it may hold a password.
@@ -137,9 +165,12 @@ fn spawn(place: &CatalogPlace, listen: &str, lease_s: f64) -> Result<(Child, Str
     let out = child.stdout.take().expect("stdout is piped");
     BufReader::new(out).read_line(&mut line).map_err(failed)?;
     let said: serde_json::Value = serde_json::from_str(&line).unwrap_or_default();
-    match said["coordinator"].as_str() {
-        Some(url) => Ok((child, url.to_owned())),
-        None => {
+    match (said["coordinator"].as_str(), said["http"].as_str()) {
+        (Some(url), Some(http)) => {
+            let http = http.trim_start_matches("http://").to_owned();
+            Ok((child, url.to_owned(), http))
+        }
+        _ => {
             let _ = child.kill();
             let _ = child.wait();
             Err(CliError::new(

@@ -1,0 +1,238 @@
+//! The end of a stage: when nothing waits any more, idle workers help those that are behind.
+//!
+//! *Trimming*: of the lease with the most left, the second half goes to whoever is idle; its holder hears where it ends
+//! now. *Doubling*: a task that takes far longer than its like is run a second time elsewhere; whichever is done first
+//! is committed. Both rest on tasks being pure: two workers that run the same task publish the same bytes, and the
+//! second finds the output there.
+
+use picofarm_catalog::{Mark, Range};
+use picofarm_proto::{
+    ids::{Epoch, LeaseRef, RangeId, StageRef, WorkerId},
+    model::{EventKind, Lease},
+};
+
+use super::{About, Core, Say, SessionId};
+use crate::transition::RangeEvent;
+
+/// A task is doubled when it has taken so many times the mean of its like.
+const SLOW: f64 = 3.0;
+
+/// A task that runs a second time. It is no range: the catalog knows nothing of it, and when its house is gone, so is it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Double {
+    /// The lease under which it is run first.
+    pub of: LeaseRef,
+    pub stage: StageRef,
+    pub task: u64,
+    pub worker: WorkerId,
+}
+
+impl Core {
+    /// Gives idle workers a part of what others hold. To be called when all that was pending has been granted.
+    pub(super) fn help(&mut self, hungry: &[WorkerId], now_ms: i64) {
+        for worker in hungry {
+            let who = &self.workers[worker];
+            // A worker that only asks ahead is not idle.
+            if !who.hungry() || !who.leases.is_empty() {
+                continue;
+            }
+            let stages: Vec<StageRef> = self
+                .stages
+                .iter()
+                .filter(|(_, e)| !e.job.paused && e.free == Some(0))
+                .filter(|(_, e)| e.stage.pending_tasks() == 0 && e.stage.leased_tasks() > 0)
+                .map(|(id, _)| *id)
+                .collect();
+            for stage in stages {
+                if self.may_run(stage, *worker, now_ms).is_err() {
+                    continue;
+                }
+                if self.trim(stage, *worker, now_ms) {
+                    // What was cut off is pending now: this worker is the first to be asked.
+                    let able = self.able(stage, now_ms);
+                    self.grant(stage, *worker, able, now_ms);
+                    break;
+                }
+                if self.double(stage, *worker, now_ms) {
+                    break;
+                }
+            }
+        }
+    }
+
+    /// Cuts the second half off the lease of a stage that has the most left, if that is worth it.
+    fn trim(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
+        let entry = &self.stages[&id];
+        let Some(mean) = self.sets[entry.set].timing.mean() else {
+            return false;
+        };
+        let longest = entry
+            .stage
+            .leased()
+            .filter(|(range, lease)| range.crashes == 0 && lease.worker != idle)
+            .map(|(range, lease)| {
+                let todo = lease.marks.iter().filter(|m| **m == Mark::Todo).count();
+                (todo, range, lease)
+            })
+            .max_by_key(|(todo, ..)| *todo);
+        let Some((todo, range, lease)) = longest else {
+            return false;
+        };
+        if todo < 2 || todo as f64 * mean * 1000.0 < f64::from(self.settings.worth_ms) {
+            return false;
+        }
+        // Leases are worked off in order: what is in hand stays.
+        let mut left = (range.lo..)
+            .zip(&lease.marks)
+            .filter(|(_, m)| **m == Mark::Todo);
+        let Some((at, _)) = left.nth(todo.div_ceil(2)) else {
+            return false;
+        };
+        let from = usize::try_from(at - range.lo).expect("a lease is small");
+        if lease.marks[from..].iter().any(|m| *m != Mark::Todo) {
+            return false;
+        }
+        let (range, holder) = (range.clone(), lease.worker);
+        if let Some(entry) = self.workers.get(&holder) {
+            let trim = Say::Trim {
+                lease: range.lease(),
+                hi: at,
+            };
+            self.say.push((entry.session, trim));
+        }
+        let about = About::message("an idle worker takes the rest over")
+            .tasks(at, range.hi)
+            .worker(self.name_of(holder));
+        self.event(now_ms, id, EventKind::Released, about);
+        self.mark(&range, &RangeEvent::Trim { at });
+        true
+    }
+
+    /// Runs the slowest task of a stage a second time, if it is slow and alone.
+    fn double(&mut self, id: StageRef, idle: WorkerId, now_ms: i64) -> bool {
+        let entry = &self.stages[&id];
+        let Some(mean) = self.sets[entry.set].timing.mean() else {
+            return false;
+        };
+        let slow_ms = i64::from(self.settings.slow_ms).max((SLOW * mean * 1000.0) as i64);
+        let doubled = |of: LeaseRef, task: u64| {
+            let mut doubles = self.doubles.values();
+            doubles.any(|d| d.of == of && d.task == task)
+        };
+        let slowest = entry
+            .stage
+            .leased()
+            .filter(|(range, lease)| range.crashes == 0 && lease.worker != idle)
+            .filter_map(|(range, _)| {
+                let tasks = self.progress.get(&range.id)?;
+                let mut tasks = tasks.iter().filter(|(task, p)| {
+                    now_ms - p.since_ms >= slow_ms && !doubled(range.lease(), **task)
+                });
+                let (task, progress) = tasks.next()?;
+                Some((progress.since_ms, range.lease(), *task))
+            })
+            .min();
+        let Some((since_ms, of, task)) = slowest else {
+            return false;
+        };
+        let lease = LeaseRef {
+            range: RangeId::from_uuid((self.make_id)()),
+            epoch: Epoch(0),
+        };
+        let entry = &self.stages[&id];
+        let grant = Lease {
+            lease,
+            job: id.job,
+            lo: task,
+            hi: task + 1,
+            skip: Vec::new(),
+            ttl_ms: self.settings.lease_ms,
+            stage: entry.spec(id).only(task, task + 1),
+            ordinal: id.stage,
+            key: self.sets[entry.set].key,
+        };
+        let double = Double {
+            of,
+            stage: id,
+            task,
+            worker: idle,
+        };
+        self.doubles.insert(lease.range, double);
+        let who = self.workers.get_mut(&idle).expect("it is hungry");
+        who.credits -= 1;
+        who.leases.insert(lease.range);
+        let (session, name) = (who.session, who.name.clone());
+        self.say.push((session, Say::Lease(Box::new(grant))));
+        let seconds = (now_ms - since_ms) / 1000;
+        let message = format!(
+            "a second time, as the first has taken {seconds} s and others took {mean:.1} s"
+        );
+        let about = About::message(message).task(task).worker(name);
+        self.event(now_ms, id, EventKind::Leased, about);
+        true
+    }
+
+    /// The double that a session's worker holds under this lease, with the range under which its task runs first, if
+    /// that still has it to do.
+    pub(super) fn doubled(&self, worker: WorkerId, lease: LeaseRef) -> Option<(Double, &Range)> {
+        let double = self.doubles.get(&lease.range)?;
+        if lease.epoch != Epoch(0) || double.worker != worker {
+            return None;
+        }
+        let (range, state) = self.stages.get(&double.stage)?.stage.lease(double.of)?;
+        let at = usize::try_from(double.task.checked_sub(range.lo)?).ok()?;
+        (state.marks.get(at) == Some(&Mark::Todo)).then_some((*double, range))
+    }
+
+    /// Forgets doubles whose task is no longer to be done, and tells those who work on it; and those of a worker that
+    /// is gone.
+    pub(super) fn end_doubles(&mut self) {
+        let over: Vec<(RangeId, WorkerId)> = self
+            .doubles
+            .iter()
+            .filter(|(id, double)| {
+                let lease = LeaseRef {
+                    range: **id,
+                    epoch: Epoch(0),
+                };
+                !self.workers.contains_key(&double.worker)
+                    || self.doubled(double.worker, lease).is_none()
+            })
+            .map(|(id, double)| (*id, double.worker))
+            .collect();
+        for (id, worker) in over {
+            self.doubles.remove(&id);
+            if let Some(entry) = self.workers.get_mut(&worker)
+                && entry.leases.remove(&id)
+            {
+                let revoke = Say::Revoke {
+                    lease: LeaseRef {
+                        range: id,
+                        epoch: Epoch(0),
+                    },
+                    reason: "the task was finished, or taken back, where it ran first".into(),
+                };
+                self.say.push((entry.session, revoke));
+            }
+        }
+    }
+
+    /// A worker gives a double up, or fails at it: it is as if it had never been. `false` where it is none.
+    pub(super) fn drop_double(&mut self, session: SessionId, lease: LeaseRef) -> bool {
+        let Some(worker) = self.sessions.get(&session) else {
+            return false;
+        };
+        if self
+            .doubles
+            .get(&lease.range)
+            .is_none_or(|d| d.worker != *worker)
+        {
+            return false;
+        }
+        self.doubles.remove(&lease.range);
+        if let Some(entry) = self.workers.get_mut(worker) {
+            entry.leases.remove(&lease.range);
+        }
+        true
+    }
+}
