@@ -25,6 +25,7 @@ mod settings;
 mod signals;
 mod tail;
 mod token;
+mod traces;
 
 use std::{
     io::{IsTerminal, Write},
@@ -39,6 +40,7 @@ use crate::{
     error::Result,
     output::{Output, table},
     settings::{Resolved, resolve},
+    traces::Traces,
 };
 
 fn main() -> ExitCode {
@@ -56,15 +58,26 @@ fn main() -> ExitCode {
 
 fn start(cli: Cli) -> Result<()> {
     let resolved = resolve(&cli.global)?;
-    log_to_stderr(&resolved.settings.log)?;
     let output = Output {
         json: cli.global.json,
     };
-    tokio::runtime::Builder::new_multi_thread()
+    let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
-        .map_err(|e| error::io("cannot start the runtime", &e))?
-        .block_on(run(cli.command, &resolved, output))
+        .map_err(|e| error::io("cannot start the runtime", &e))?;
+    let traces = {
+        let _in = runtime.enter();
+        let traces = cli.command.traces();
+        traces
+            .map(|(url, service)| Traces::start(url, service))
+            .transpose()?
+    };
+    log(&resolved.settings.log, traces.as_ref())?;
+    let ended = runtime.block_on(run(cli.command, &resolved, output));
+    if let Some(traces) = traces {
+        traces.end();
+    }
+    ended
 }
 
 async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
@@ -127,7 +140,8 @@ fn show_settings(resolved: &Resolved, output: Output) {
     output.result(&document, || table(&rows));
 }
 
-fn log_to_stderr(filter: &str) -> Result<()> {
+/// Log lines go to stderr, those of tasks also to their coordinator, and spans to a collector, if one is named.
+fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
     let filter = tracing_subscriber::EnvFilter::try_new(filter).map_err(|e| {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
@@ -139,6 +153,7 @@ fn log_to_stderr(filter: &str) -> Result<()> {
     tracing_subscriber::registry()
         .with(stderr)
         .with(picofarm_agent::task_logs())
+        .with(traces.map(Traces::layer))
         .init();
     Ok(())
 }

@@ -23,6 +23,7 @@ use tokio::{
     time::MissedTickBehavior,
 };
 use tokio_util::sync::CancellationToken;
+use tracing::Span;
 use uuid::Uuid;
 
 use crate::{
@@ -33,7 +34,7 @@ use crate::{
     },
     http::Pulse,
     metrics::{Metrics, Tally},
-    plan,
+    plan, trace,
 };
 
 /// Messages handled in one commit.
@@ -146,6 +147,8 @@ struct Life<'a> {
     core: Core,
     sessions: HashMap<SessionId, mpsc::Sender<Say>>,
     tally: Tally,
+    /// Of reports that are not durable yet.
+    commits: Vec<Span>,
     /// When jobs to forget were last looked for and none were left.
     forgot: Option<Instant>,
 }
@@ -199,6 +202,7 @@ impl Actor {
             core,
             sessions: HashMap::new(),
             tally: Tally::default(),
+            commits: Vec::new(),
             forgot: None,
         })
     }
@@ -453,6 +457,7 @@ impl Life<'_> {
                 self.core.heartbeat(session, &leases, &progress, now);
             }
             FromWorker::Done(report) => {
+                self.commits.extend(trace::commit(&report));
                 let hint = self
                     .core
                     .stage_of(&report)
@@ -627,7 +632,10 @@ impl Life<'_> {
 
     /// Makes what the core decided durable, then says it.
     async fn flush(&mut self) -> Result<(), CatalogError> {
-        let (changes, say) = self.core.take();
+        let (changes, mut say) = self.core.take();
+        // Spans end when what they stand for is durable.
+        let _grants = trace::grants(&mut say);
+        let _commits = std::mem::take(&mut self.commits);
         let changed = !changes.is_empty();
         let mut tally = std::mem::take(&mut self.tally);
         tally.note(&changes, &say);

@@ -238,18 +238,22 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
         number(),
         any::<f64>(),
         any::<bool>(),
+        ".{0,60}",
     )
-        .prop_map(|(lease, index, hex, bytes, seconds, adopted)| {
-            Say::Done(wire::TaskDone {
-                lease,
-                index,
-                task_key: format!("{hex:0>64}"),
-                manifest_sha256: hex,
-                bytes,
-                seconds,
-                adopted,
-            })
-        });
+        .prop_map(
+            |(lease, index, hex, bytes, seconds, adopted, traceparent)| {
+                Say::Done(wire::TaskDone {
+                    lease,
+                    index,
+                    task_key: format!("{hex:0>64}"),
+                    manifest_sha256: hex,
+                    bytes,
+                    seconds,
+                    adopted,
+                    traceparent,
+                })
+            },
+        );
     let failed =
         (lease(), number(), -1..6i32, ".{0,60}").prop_map(|(lease, index, kind, message)| {
             Say::Failed(wire::TaskFailed {

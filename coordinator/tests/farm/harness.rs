@@ -275,6 +275,7 @@ impl Worker {
             bytes: 100,
             seconds: 2.0,
             adopted: false,
+            traceparent: String::new(),
         };
         self.say(Say::Done(done)).await;
         self.acknowledged().await

@@ -104,6 +104,7 @@ impl TryFrom<wire::Lease> for Lease {
                 field: "lease.stage_key",
                 what: "expected 64 hexadecimal digits".into(),
             })?,
+            traceparent: w.traceparent,
         })
     }
 }
@@ -120,6 +121,7 @@ impl From<Lease> for wire::Lease {
             stage: Some(m.stage.into()),
             ordinal: m.ordinal,
             stage_key: m.key.to_string(),
+            traceparent: m.traceparent,
         }
     }
 }
@@ -139,6 +141,7 @@ impl TryFrom<wire::TaskDone> for Finished {
             bytes: w.bytes,
             seconds: finite(w.seconds, "done.seconds")?,
             adopted: w.adopted,
+            traceparent: w.traceparent,
         })
     }
 }
@@ -153,6 +156,7 @@ impl From<Finished> for wire::TaskDone {
             bytes: m.bytes,
             seconds: m.seconds,
             adopted: m.adopted,
+            traceparent: m.traceparent,
         }
     }
 }

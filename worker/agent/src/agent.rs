@@ -11,10 +11,11 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
     model::{Abilities, WorkerHello},
+    trace,
 };
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
-use tracing::{error, info, warn};
+use tracing::{error, info, info_span, warn};
 use uuid::Uuid;
 
 use crate::{
@@ -233,7 +234,13 @@ impl Agent {
             info!(job = %task.job, task = task.index, "task starts");
             let control = Arc::new(Control::default());
             self.control = Some(control.clone());
-            self.runner.begin(task, control);
+            let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
+                task = task.index);
+            if let Some(hand) = self.desk.in_hand() {
+                trace::join(&span, &hand.traceparent);
+            }
+            self.desk.traced(trace::traceparent(&span));
+            self.runner.begin(task, control, span);
         }
         if let Some(hand) = self.desk.in_hand()
             && now >= self.tell_at

@@ -8,11 +8,12 @@ use picofarm_dataset::{
 use picofarm_proto::{
     key::TaskKey,
     model::{Budget, RenderTask},
+    trace,
 };
 use picofarm_scene::{AssetLibrary, Camera, Scene};
 use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
-use tracing::info;
+use tracing::{debug_span, info};
 
 use super::{
     Control, Output, Task, TaskError, memory,
@@ -63,7 +64,8 @@ pub(super) fn run(
         });
     }
     let begun = Instant::now();
-    let scene = scenes::scene(spec, task.index, libraries)?;
+    let scene = debug_span!(target: trace::TARGET, "scene")
+        .in_scope(|| scenes::scene(spec, task.index, libraries))?;
     info!(
         scene = scene.name,
         triangles = scene.triangle_count(),
@@ -77,8 +79,9 @@ pub(super) fn run(
             .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
     }
     let begun = Instant::now();
-    let rendered =
-        picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
+    let rendered = debug_span!(target: trace::TARGET, "render")
+        .in_scope(|| picofarm_transient::render(&scene, &settings, &Watched(control)))
+        .map_err(of_render)?;
     info!(
         samples = rendered.error.samples,
         median_error = rendered.error.median_relative,
@@ -100,8 +103,8 @@ pub(super) fn run(
         seed: settings.seed,
         plan: account(&scene, &rendered),
     };
-    let encoded = dataset
-        .encode(task.index, &record, &provenance)
+    let encoded = debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| dataset.encode(task.index, &record, &provenance))
         .map_err(of_dataset)?;
     control.at((1.0 + RENDER_SHARE) / 2.0);
     let manifest = stores.publish(&dataset, encoded, control)?;

@@ -8,12 +8,12 @@ use std::{
 };
 
 use tokio::sync::mpsc;
-use tracing::info_span;
+use tracing::Span;
 
 use super::{Control, Executor, Output, Task, TaskError};
 use crate::{AgentError, allow::StorePrefixes, log::Collector};
 
-type Job = (Task, Arc<Control>);
+type Job = (Task, Arc<Control>, Span);
 
 /// Hands tasks to the executor, one at a time.
 pub(crate) struct Runner {
@@ -44,20 +44,20 @@ impl Runner {
             .name("executor".into())
             .spawn(move || {
                 ours.serve();
-                for (task, control) in inbox {
+                for (task, control, span) in inbox {
                     ours.begin();
                     let result = catch_unwind(AssertUnwindSafe(|| {
                         allowed
                             .check(&task.spec, task.index)
                             .map_err(TaskError::User)?;
                         pool.install(|| {
-                            let stage = &*task.spec.name;
-                            let _in = info_span!("task", job = %task.job, stage, task = task.index)
-                                .entered();
+                            let _in = span.enter();
                             executor.run(&task, &control)
                         })
                     }))
                     .unwrap_or_else(|panic| Err(TaskError::Crash(said(panic.as_ref()))));
+                    // Its time ends here, and not with the answer to its report.
+                    drop(span);
                     if outbox.send(result).is_err() {
                         return;
                     }
@@ -67,10 +67,10 @@ impl Runner {
         Ok(Self { jobs, results, log })
     }
 
-    /// Begins `task`. Its result comes from [`Runner::finished`].
-    pub(crate) fn begin(&self, task: Task, control: Arc<Control>) {
+    /// Begins `task`, within `span`. Its result comes from [`Runner::finished`].
+    pub(crate) fn begin(&self, task: Task, control: Arc<Control>, span: Span) {
         self.jobs
-            .send((task, control))
+            .send((task, control, span))
             .expect("the executor's thread lives as long as its runner: it catches every panic");
     }
 
