@@ -41,12 +41,12 @@ async fn lines_are_kept_for_the_holder_of_the_live_lease_and_for_nobody_else() {
     let mut owner = farm.worker().await;
     let lease = owner.lease().await;
     owner.log(&lease, 0, &["the store\u{1b}[2J\nis full"]).await;
-    let said = (
+    let said = vec![(
         1_000_000 - 500,
         "ada".to_owned(),
         "warn: the store [2J is full".to_owned(),
-    );
-    assert_eq!(lines(&mut farm, &job, Some(0)).await, [said.clone()]);
+    )];
+    assert_eq!(lines(&mut farm, &job, Some(0)).await, said);
 
     let mut thief = farm.connect(hello("eve")).await.unwrap();
     thief.log(&lease, 0, &["not mine"]).await;
@@ -56,7 +56,7 @@ async fn lines_are_kept_for_the_holder_of_the_live_lease_and_for_nobody_else() {
     owner.log(&former, 0, &["an earlier epoch"]).await;
     assert!(owner.done(&lease, 0).await.accepted);
     owner.log(&lease, 0, &["done already"]).await;
-    assert_eq!(lines(&mut farm, &job, None).await, [said]);
+    assert_eq!(lines(&mut farm, &job, None).await, said);
 }
 
 #[tokio::test]
