@@ -68,6 +68,21 @@ pub struct Global {
     pub log: Option<String>,
 }
 
+impl Command {
+    /// Where its traces go, and what it is in them; nowhere for whatever runs no part of a farm.
+    pub fn traces(&self) -> Option<(&str, &'static str)> {
+        let (traces, service) = match self {
+            Self::Demo(demo) => (&demo.traces, "picofarm"),
+            Self::Up(up) => (&up.traces, "picofarm"),
+            Self::Coordinator(coordinator) => (&coordinator.traces, "picofarm-coordinator"),
+            Self::Worker(worker) => (&worker.traces, "picofarm-worker"),
+            _ => return None,
+        };
+        let url = traces.otlp.as_deref().filter(|url| !url.trim().is_empty());
+        url.map(|url| (url, service))
+    }
+}
+
 #[derive(Subcommand)]
 pub enum Command {
     /// Render a small furnished-room data set end to end on this machine, and show it
@@ -94,6 +109,9 @@ pub enum Command {
         /// The last N lines before now
         #[arg(long, default_value_t = 100, value_name = "N")]
         last: u32,
+        /// What tasks logged on their workers, too
+        #[arg(long, short)]
+        verbose: bool,
     },
     /// Look at data sets, check them, and make others of them
     #[command(subcommand)]
@@ -147,6 +165,8 @@ pub struct Demo {
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
+    #[command(flatten)]
+    pub traces: Traces,
 }
 
 #[derive(Args)]
@@ -164,6 +184,8 @@ pub struct Up {
     pub http: Http,
     #[command(flatten)]
     pub guard: Guard,
+    #[command(flatten)]
+    pub traces: Traces,
 }
 
 #[derive(Args)]
@@ -190,6 +212,20 @@ pub struct Coordinator {
     pub http: Http,
     #[command(flatten)]
     pub guard: Guard,
+    #[command(flatten)]
+    pub traces: Traces,
+}
+
+#[derive(Args)]
+pub struct Traces {
+    /// Send traces to an OpenTelemetry collector by OTLP over gRPC, e.g. http://127.0.0.1:4317 [default: nowhere]
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "OTEL_EXPORTER_OTLP_ENDPOINT",
+        hide_env_values = true
+    )]
+    pub otlp: Option<String>,
 }
 
 #[derive(Args)]
@@ -232,6 +268,8 @@ pub struct Worker {
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]
     #[arg(long, value_name = "URL")]
     pub store_prefix: Vec<String>,
+    #[command(flatten)]
+    pub traces: Traces,
 }
 
 #[derive(Subcommand)]

@@ -296,6 +296,7 @@ impl Client {
             after,
             limit: 1000,
             newest: false,
+            logs: false,
         };
         Ok(self.history(page).await?.0)
     }
@@ -309,6 +310,7 @@ impl Client {
             task: page.task,
             stage: page.stage,
             newest: page.newest,
+            logs: page.logs,
         };
         let reply = self
             .jobs
@@ -380,6 +382,8 @@ pub struct Page {
     pub limit: u32,
     /// The last `limit` rather than the first.
     pub newest: bool,
+    /// What tasks logged, too.
+    pub logs: bool,
 }
 
 /// Answer to the question why.

@@ -159,6 +159,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             task,
             last,
             follow,
+            verbose,
         } => {
             let job = client.find(&job).await?;
             let page = Page {
@@ -168,6 +169,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
                 after: 0,
                 limit: last,
                 newest: true,
+                logs: verbose || task.is_some(),
             };
             if follow {
                 return tail::follow(client, page, output).await;

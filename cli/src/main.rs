@@ -25,6 +25,7 @@ mod settings;
 mod signals;
 mod tail;
 mod token;
+mod traces;
 
 use std::{
     io::{IsTerminal, Write},
@@ -32,12 +33,14 @@ use std::{
 };
 
 use clap::{CommandFactory, Parser};
+use tracing_subscriber::{Layer, prelude::*};
 
 use crate::{
     args::{Cli, Command},
     error::Result,
     output::{Output, table},
     settings::{Resolved, resolve},
+    traces::Traces,
 };
 
 fn main() -> ExitCode {
@@ -55,15 +58,26 @@ fn main() -> ExitCode {
 
 fn start(cli: Cli) -> Result<()> {
     let resolved = resolve(&cli.global)?;
-    log_to_stderr(&resolved.settings.log)?;
     let output = Output {
         json: cli.global.json,
     };
-    tokio::runtime::Builder::new_multi_thread()
+    let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
-        .map_err(|e| error::io("cannot start the runtime", &e))?
-        .block_on(run(cli.command, &resolved, output))
+        .map_err(|e| error::io("cannot start the runtime", &e))?;
+    let traces = {
+        let _in = runtime.enter();
+        let traces = cli.command.traces();
+        traces
+            .map(|(url, service)| Traces::start(url, service))
+            .transpose()?
+    };
+    log(&resolved.settings.log, traces.as_ref())?;
+    let ended = runtime.block_on(run(cli.command, &resolved, output));
+    if let Some(traces) = traces {
+        traces.end();
+    }
+    ended
 }
 
 async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
@@ -75,7 +89,11 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Worker(args) => roles::worker(args, settings, output).await,
         Command::Job(command) => jobs::run(command, settings, output).await,
         Command::Workers { what } => explain::workers(what, settings, output).await,
-        Command::Events { follow, last } => tail::events(follow, last, settings, output).await,
+        Command::Events {
+            follow,
+            last,
+            verbose,
+        } => tail::events(follow, last, verbose, settings, output).await,
         Command::Dataset(command) => dataset::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
@@ -122,15 +140,20 @@ fn show_settings(resolved: &Resolved, output: Output) {
     output.result(&document, || table(&rows));
 }
 
-fn log_to_stderr(filter: &str) -> Result<()> {
+/// Log lines go to stderr, those of tasks also to their coordinator, and spans to a collector, if one is named.
+fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
     let filter = tracing_subscriber::EnvFilter::try_new(filter).map_err(|e| {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
     })?;
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let stderr = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .with_filter(filter);
+    tracing_subscriber::registry()
+        .with(stderr)
+        .with(picofarm_agent::task_logs())
+        .with(traces.map(Traces::layer))
         .init();
     Ok(())
 }

@@ -66,7 +66,13 @@ impl Window {
 ///
 /// # Errors
 /// The coordinator cannot be reached, refuses, or stays away; Ctrl-C ends it with exit code 130.
-pub async fn events(follow_on: bool, last: u32, settings: &Settings, output: Output) -> Result<()> {
+pub async fn events(
+    follow_on: bool,
+    last: u32,
+    verbose: bool,
+    settings: &Settings,
+    output: Output,
+) -> Result<()> {
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     let page = Page {
         job: None,
@@ -75,6 +81,7 @@ pub async fn events(follow_on: bool, last: u32, settings: &Settings, output: Out
         after: 0,
         limit: last,
         newest: true,
+        logs: verbose,
     };
     if follow_on {
         return follow(client, page, output).await;

@@ -14,7 +14,7 @@ use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     key::spec_hash,
     model::{
-        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskProgress,
+        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskLog, TaskProgress,
         WorkerHello,
     },
 };
@@ -23,6 +23,7 @@ use tokio::{
     time::MissedTickBehavior,
 };
 use tokio_util::sync::CancellationToken;
+use tracing::Span;
 use uuid::Uuid;
 
 use crate::{
@@ -33,7 +34,7 @@ use crate::{
     },
     http::Pulse,
     metrics::{Metrics, Tally},
-    plan,
+    plan, trace,
 };
 
 /// Messages handled in one commit.
@@ -121,6 +122,7 @@ pub(crate) enum FromWorker {
     Done(Finished),
     Failed(Failure),
     Release(LeaseRef, String),
+    Log(TaskLog),
     Closed,
 }
 
@@ -145,6 +147,8 @@ struct Life<'a> {
     core: Core,
     sessions: HashMap<SessionId, mpsc::Sender<Say>>,
     tally: Tally,
+    /// Of reports that are not durable yet.
+    commits: Vec<Span>,
     /// When jobs to forget were last looked for and none were left.
     forgot: Option<Instant>,
 }
@@ -198,6 +202,7 @@ impl Actor {
             core,
             sessions: HashMap::new(),
             tally: Tally::default(),
+            commits: Vec::new(),
             forgot: None,
         })
     }
@@ -452,6 +457,7 @@ impl Life<'_> {
                 self.core.heartbeat(session, &leases, &progress, now);
             }
             FromWorker::Done(report) => {
+                self.commits.extend(trace::commit(&report));
                 let hint = self
                     .core
                     .stage_of(&report)
@@ -467,6 +473,7 @@ impl Life<'_> {
                 }
             }
             FromWorker::Release(lease, reason) => self.core.released(session, lease, &reason, now),
+            FromWorker::Log(log) => self.core.logged(session, &log, now),
             FromWorker::Closed => {
                 self.sessions.remove(&session);
                 self.core.closed(session, now);
@@ -625,7 +632,10 @@ impl Life<'_> {
 
     /// Makes what the core decided durable, then says it.
     async fn flush(&mut self) -> Result<(), CatalogError> {
-        let (changes, say) = self.core.take();
+        let (changes, mut say) = self.core.take();
+        // Spans end when what they stand for is durable.
+        let _grants = trace::grants(&mut say);
+        let _commits = std::mem::take(&mut self.commits);
         let changed = !changes.is_empty();
         let mut tally = std::mem::take(&mut self.tally);
         tally.note(&changes, &say);

@@ -17,6 +17,7 @@ mod rpc;
 mod server;
 pub mod stage;
 mod timed;
+mod trace;
 pub mod transition;
 
 pub use budget::Backoff;

@@ -238,18 +238,22 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
         number(),
         any::<f64>(),
         any::<bool>(),
+        ".{0,60}",
     )
-        .prop_map(|(lease, index, hex, bytes, seconds, adopted)| {
-            Say::Done(wire::TaskDone {
-                lease,
-                index,
-                task_key: format!("{hex:0>64}"),
-                manifest_sha256: hex,
-                bytes,
-                seconds,
-                adopted,
-            })
-        });
+        .prop_map(
+            |(lease, index, hex, bytes, seconds, adopted, traceparent)| {
+                Say::Done(wire::TaskDone {
+                    lease,
+                    index,
+                    task_key: format!("{hex:0>64}"),
+                    manifest_sha256: hex,
+                    bytes,
+                    seconds,
+                    adopted,
+                    traceparent,
+                })
+            },
+        );
     let failed =
         (lease(), number(), -1..6i32, ".{0,60}").prop_map(|(lease, index, kind, message)| {
             Say::Failed(wire::TaskFailed {
@@ -261,8 +265,20 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
         });
     let release = (lease(), ".{0,20}")
         .prop_map(|(lease, reason)| Say::Release(wire::Release { lease, reason }));
+    let line = (small(), 0..5i32, ".{0,60}").prop_map(|(ago_ms, level, text)| wire::LogLine {
+        ago_ms,
+        level,
+        text,
+    });
+    let log = (lease(), number(), vec(line, 0..5)).prop_map(|(lease, index, lines)| {
+        Say::Log(wire::TaskLog {
+            lease,
+            index,
+            lines,
+        })
+    });
     let credit = small().prop_map(|leases| Say::Credit(wire::Credit { leases }));
-    prop_oneof![hello, beat, done, failed, release, credit].prop_map(request_of)
+    prop_oneof![hello, beat, done, failed, log, release, credit].prop_map(request_of)
 }
 
 fn job() -> impl Strategy<Value = serde_json::Value> {
@@ -396,6 +412,7 @@ async fn nothing_on_the_wire_makes_a_coordinator_panic_grow_or_stop_serving() {
             limit: draws.next(&small()),
             task: Some(draws.next(&number())),
             newest: draws.next(&small()).is_multiple_of(2),
+            logs: draws.next(&any::<bool>()),
             stage: Some(draws.next(&small())),
         };
         // Any answer will do; that there is one is the point.
@@ -446,6 +463,37 @@ async fn messages_beyond_their_limit_are_refused_by_name_and_leave_nothing_behin
     let mut heard = client.session(said).await.unwrap().into_inner();
     let refused = heard.message().await.unwrap_err();
     assert_eq!(refused.code(), tonic::Code::OutOfRange, "{refused:?}");
+
+    // A task's log: neither one line too long nor too many of them.
+    let line = |text: String| wire::LogLine {
+        ago_ms: 0,
+        level: wire::LogLevel::Info.into(),
+        text,
+    };
+    for (lines, field) in [
+        (vec![line("x".repeat(3_000))], "log.lines.text"),
+        (vec![line(String::new()); 300], "log.lines"),
+    ] {
+        let log = wire::TaskLog {
+            lease: Some(wire::LeaseRef {
+                range_id: Uuid::nil().to_string(),
+                epoch: 1,
+            }),
+            index: 0,
+            lines,
+        };
+        let hello = Say::Hello(hello(Uuid::new_v4().to_string()));
+        let said = tokio_stream::iter([hello, Say::Log(log)].map(request_of));
+        let mut heard = client.session(said).await.unwrap().into_inner();
+        let refused = loop {
+            match heard.message().await {
+                Ok(message) => assert!(message.is_some(), "{field}"),
+                Err(refused) => break refused,
+            }
+        };
+        assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{refused:?}");
+        assert!(refused.message().contains(field), "{refused:?}");
+    }
 
     let mut spec = good();
     rendering(&mut spec).scenes.count = 50_000_000;

@@ -7,6 +7,7 @@ pub mod ids;
 pub mod key;
 pub mod model;
 pub mod split;
+pub mod trace;
 
 /// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
 #[expect(missing_docs, reason = "generated from the schema, which documents it")]

@@ -93,6 +93,19 @@ fn the_metrics_agree_with_the_job_and_explain_says_what_it_waits_for() {
     let status = cli.json(&["job", "status", &id]);
     assert_eq!(status["tasks"]["done"], 4, "{status}");
 
+    // What a task logged on its worker is with its history; that of the whole job stays short unless asked.
+    let lines = |args: &[&str]| -> Vec<String> {
+        let events = cli.json(&[&["job", "logs", &id], args].concat());
+        let events = events.as_array().expect("a list of events");
+        let logs = events.iter().filter(|e| e["kind"] == "log");
+        logs.map(|e| format!("{}", e["message"])).collect()
+    };
+    let of_task = lines(&["--task", "0"]);
+    assert_eq!(of_task.len(), 2, "{of_task:?}");
+    assert!(of_task[0].contains("info: scene made"), "{of_task:?}");
+    assert!(of_task[1].contains("info: rendered"), "{of_task:?}");
+    assert!(lines(&[]).is_empty() && lines(&["--verbose"]).len() == 8);
+
     let page = get(&format!("{http}/metrics")).expect("it answers").1;
     for (name, value) in [
         ("picofarm_tasks_committed_total{adopted=\"false\"}", 4.0),

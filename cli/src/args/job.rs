@@ -80,7 +80,7 @@ pub enum Job {
         /// Job id, or the first letters of one
         job: String,
     },
-    /// Show what happened to a job
+    /// Show what happened to a job, or to one of its tasks and what it logged on its worker
     Logs {
         /// Job id, or the first letters of one
         job: String,
@@ -96,6 +96,9 @@ pub enum Job {
         /// Go on showing what happens, until the job ends or Ctrl-C
         #[arg(long, short)]
         follow: bool,
+        /// What tasks logged on their workers, too; with --task it is always shown
+        #[arg(long, short)]
+        verbose: bool,
     },
     /// Say why a job does not run, or why one of its tasks was run, run again or reused
     Explain {

@@ -151,6 +151,7 @@ impl Core {
             stage: entry.spec(id).only(granted.lo, granted.hi),
             ordinal: id.stage,
             key: self.sets[entry.set].key,
+            traceparent: String::new(),
         };
         self.say.push((who.session, Say::Lease(Box::new(lease))));
         let about = About::message(format!("tasks {}..{}", granted.lo, granted.hi))

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Exception, Mark, Range, RangeState};
 use picofarm_proto::{
     ids::{Incarnation, LeaseRef, RangeId, WorkerId},
-    model::{EventKind, Failure, FailureKind, TaskProgress},
+    model::{EventKind, Failure, FailureKind, LogAllowance, TaskProgress},
 };
 
 use super::{About, Core, Progress, Say, SessionId};
@@ -89,6 +89,7 @@ impl Core {
                 .or_insert(Progress {
                     fraction: 0.0,
                     since_ms: now_ms,
+                    log: LogAllowance::default(),
                 })
                 .fraction = report.fraction;
         }

@@ -10,6 +10,7 @@ mod facts;
 mod jobs;
 mod leases;
 mod load;
+mod log;
 mod sessions;
 mod supply;
 mod tail;
@@ -25,7 +26,7 @@ use picofarm_catalog::{
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::StageKey,
-    model::{Abilities, EventKind, Lease, StageSpec},
+    model::{Abilities, EventKind, Lease, LogAllowance, StageSpec},
 };
 use uuid::Uuid;
 
@@ -152,6 +153,8 @@ impl WorkerEntry {
 struct Progress {
     fraction: f32,
     since_ms: i64,
+    /// What its worker may still say in its name.
+    log: LogAllowance,
 }
 
 pub(crate) struct Core {

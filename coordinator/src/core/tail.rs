@@ -161,6 +161,7 @@ impl Core {
             stage: entry.spec(id).only(task, task + 1),
             ordinal: id.stage,
             key: self.sets[entry.set].key,
+            traceparent: String::new(),
         };
         let double = Double {
             of,

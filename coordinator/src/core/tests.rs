@@ -307,6 +307,7 @@ impl World {
             bytes: 1,
             seconds: 0.01,
             adopted: false,
+            traceparent: String::new(),
         };
         self.flush(h).await;
         let house = &mut self.houses[h];

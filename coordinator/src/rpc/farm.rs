@@ -226,6 +226,7 @@ fn checked(request: wire::SessionRequest) -> Result<FromWorker, ConvertError> {
         ),
         Some(From::Done(done)) => FromWorker::Done(done.try_into()?),
         Some(From::Failed(failed)) => FromWorker::Failed(failed.try_into()?),
+        Some(From::Log(log)) => FromWorker::Log(log.try_into()?),
         Some(From::Release(release)) => FromWorker::Release(lease(release.lease)?, release.reason),
     })
 }

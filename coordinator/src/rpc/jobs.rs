@@ -251,6 +251,7 @@ impl Jobs for JobsService {
             task: request.task,
             stage: request.stage,
             newest: request.newest,
+            logs: request.logs,
         };
         let events = self.link.catalog.events(&query).await;
         let events = events.map_err(|e| Status::unavailable(e.to_string()))?;

@@ -113,6 +113,7 @@ async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, 
         limit: EVENTS,
         task: Some(task),
         newest: true,
+        logs: false,
     };
     link.catalog.events(&query).await.map_err(failed)
 }

@@ -140,6 +140,7 @@ impl Farm {
             limit: 0,
             task,
             newest: false,
+            logs: true,
         };
         let response = self.jobs.list_events(request).await.unwrap();
         response.into_inner().events
@@ -274,6 +275,7 @@ impl Worker {
             bytes: 100,
             seconds: 2.0,
             adopted: false,
+            traceparent: String::new(),
         };
         self.say(Say::Done(done)).await;
         self.acknowledged().await

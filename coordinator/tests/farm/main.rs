@@ -3,5 +3,6 @@
 mod harness;
 mod jobs;
 mod leases;
+mod logs;
 mod sharing;
 mod start;

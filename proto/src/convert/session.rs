@@ -4,7 +4,10 @@ use super::{ConvertError, finite, parse, required};
 use crate::{
     ids::{Epoch, LeaseRef},
     key::{StageKey, TaskKey},
-    model::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello},
+    model::{
+        Abilities, Failure, FailureKind, Finished, Lease, LogLevel, LogLine, TaskLog, TaskProgress,
+        WorkerHello, log,
+    },
     wire,
 };
 
@@ -101,6 +104,7 @@ impl TryFrom<wire::Lease> for Lease {
                 field: "lease.stage_key",
                 what: "expected 64 hexadecimal digits".into(),
             })?,
+            traceparent: w.traceparent,
         })
     }
 }
@@ -117,6 +121,7 @@ impl From<Lease> for wire::Lease {
             stage: Some(m.stage.into()),
             ordinal: m.ordinal,
             stage_key: m.key.to_string(),
+            traceparent: m.traceparent,
         }
     }
 }
@@ -136,6 +141,7 @@ impl TryFrom<wire::TaskDone> for Finished {
             bytes: w.bytes,
             seconds: finite(w.seconds, "done.seconds")?,
             adopted: w.adopted,
+            traceparent: w.traceparent,
         })
     }
 }
@@ -150,6 +156,7 @@ impl From<Finished> for wire::TaskDone {
             bytes: m.bytes,
             seconds: m.seconds,
             adopted: m.adopted,
+            traceparent: m.traceparent,
         }
     }
 }
@@ -189,6 +196,78 @@ impl From<Failure> for wire::TaskFailed {
             index: m.index,
             kind: kind.into(),
             message: m.message,
+        }
+    }
+}
+
+impl TryFrom<wire::TaskLog> for TaskLog {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::TaskLog) -> Result<Self, ConvertError> {
+        if w.lines.len() > log::LINES {
+            return Err(ConvertError::Invalid {
+                field: "log.lines",
+                what: format!("{} lines are more than {}", w.lines.len(), log::LINES),
+            });
+        }
+        let lines = w.lines.into_iter().map(TryInto::try_into);
+        Ok(TaskLog {
+            lease: lease_ref(w.lease)?,
+            index: w.index,
+            lines: lines.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+impl From<TaskLog> for wire::TaskLog {
+    fn from(m: TaskLog) -> Self {
+        wire::TaskLog {
+            lease: Some(m.lease.into()),
+            index: m.index,
+            lines: m.lines.into_iter().map(Into::into).collect(),
+        }
+    }
+}
+
+impl TryFrom<wire::LogLine> for LogLine {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::LogLine) -> Result<Self, ConvertError> {
+        if w.text.len() > log::LINE_BYTES {
+            return Err(ConvertError::Invalid {
+                field: "log.lines.text",
+                what: format!("{} bytes are more than {}", w.text.len(), log::LINE_BYTES),
+            });
+        }
+        let level = match w.level() {
+            wire::LogLevel::Error => LogLevel::Error,
+            wire::LogLevel::Warn => LogLevel::Warn,
+            wire::LogLevel::Info => LogLevel::Info,
+            wire::LogLevel::Unspecified => {
+                return Err(ConvertError::Missing {
+                    field: "log.lines.level",
+                });
+            }
+        };
+        Ok(LogLine {
+            ago_ms: w.ago_ms,
+            level,
+            text: log::printable(&w.text),
+        })
+    }
+}
+
+impl From<LogLine> for wire::LogLine {
+    fn from(m: LogLine) -> Self {
+        let level = match m.level {
+            LogLevel::Error => wire::LogLevel::Error,
+            LogLevel::Warn => wire::LogLevel::Warn,
+            LogLevel::Info => wire::LogLevel::Info,
+        };
+        wire::LogLine {
+            ago_ms: m.ago_ms,
+            level: level.into(),
+            text: m.text,
         }
     }
 }

@@ -41,7 +41,7 @@ enum_pairs!(
     "event.kind",
     [
         Submitted, Leased, Committed, Reused, Failed, Dead, Expired, Released, Cancelled, Retried,
-        Ended, Waiting, Alarm, Opened, Paused, Resumed,
+        Ended, Waiting, Alarm, Opened, Paused, Resumed, Log,
     ]
 );
 

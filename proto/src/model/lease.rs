@@ -65,6 +65,8 @@ pub struct Lease {
     pub ordinal: u32,
     /// The stage's key.
     pub key: StageKey,
+    /// Where it belongs in a trace; see [`crate::trace`].
+    pub traceparent: String,
 }
 
 /// A finished task as the worker reports it.
@@ -84,6 +86,8 @@ pub struct Finished {
     pub seconds: f64,
     /// Found in the store, not computed.
     pub adopted: bool,
+    /// Where the task was in a trace; see [`crate::trace`].
+    pub traceparent: String,
 }
 
 /// Who is to blame for a failure; budgets are separate.

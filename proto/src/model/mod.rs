@@ -4,6 +4,7 @@ pub mod explain;
 pub mod file;
 pub mod job;
 pub mod lease;
+pub mod log;
 pub mod render;
 pub mod reprocess;
 pub mod sensor;
@@ -16,6 +17,7 @@ pub use job::{
     StageSpec, TaskSpec, check_label,
 };
 pub use lease::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
+pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
 pub use render::{Budget, Choice, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource};
 pub use reprocess::{Histogram, ReprocessSettings, ReprocessTask, SourceSettings};
 pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};

@@ -191,6 +191,8 @@ pub enum EventKind {
     Paused,
     /// Job let go on.
     Resumed,
+    /// A line that a task logged on its worker.
+    Log,
 }
 
 /// One line of a job's history.

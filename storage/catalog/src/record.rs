@@ -394,6 +394,8 @@ pub struct EventQuery {
     pub stage: Option<u32>,
     /// The last `limit` rather than the first.
     pub newest: bool,
+    /// What tasks logged, too.
+    pub logs: bool,
 }
 
 /// What a house finds when its life begins.

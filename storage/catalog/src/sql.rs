@@ -67,7 +67,7 @@ pub(crate) fn needs(text: &str) -> Result<Vec<u32>, sqlx::Error> {
         .collect()
 }
 
-const EVENT_KINDS: [EventKind; 16] = [
+const EVENT_KINDS: [EventKind; 17] = [
     EventKind::Submitted,
     EventKind::Leased,
     EventKind::Committed,
@@ -84,6 +84,7 @@ const EVENT_KINDS: [EventKind; 16] = [
     EventKind::Opened,
     EventKind::Paused,
     EventKind::Resumed,
+    EventKind::Log,
 ];
 
 pub(crate) fn event_kind_code(kind: EventKind) -> i64 {
@@ -195,7 +196,8 @@ macro_rules! history {
              JOIN job ON job.key = event.job WHERE sequence > $1 AND ",
             $job,
             " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) \
-             AND (CAST($5 AS BIGINT) IS NULL OR event.stage = $5) ",
+             AND (CAST($5 AS BIGINT) IS NULL OR event.stage = $5) \
+             AND (CAST($6 AS BIGINT) IS NULL OR event.kind <> $6) ",
             $order,
             " LIMIT $3"
         )
@@ -209,7 +211,7 @@ macro_rules! queries {
         pub(crate) mod query {
             use picofarm_proto::{
                 ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
-                model::Event,
+                model::{Event, EventKind},
             };
             use sqlx::Row;
 
@@ -450,6 +452,7 @@ macro_rules! queries {
                     .bind(i64::from(query.limit))
                     .bind(job)
                     .bind(query.stage.map(i64::from))
+                    .bind((!query.logs).then(|| sql::event_kind_code(EventKind::Log)))
                     .fetch_all(c)
                     .await?;
                 if query.newest {

@@ -368,6 +368,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         task: None,
         stage: None,
         newest: false,
+        logs: false,
     };
     let page = catalog.events(&query).await.unwrap();
     assert_eq!(page.len(), 3);
@@ -401,6 +402,20 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     let tasks: Vec<_> = last.iter().map(|e| (e.job, e.task)).collect();
     assert_eq!(tasks, [(job().id, Some(2)), (job().id, Some(1))]);
     assert!(last[0].sequence < last[1].sequence);
+    // What tasks logged is for those who ask for it.
+    let changes = Changes {
+        events: vec![event(EventKind::Log, Some(Run { lo: 1, hi: 2 }))],
+        ..Changes::default()
+    };
+    catalog.commit(changes).await.unwrap();
+    assert_eq!(catalog.events(&query).await.unwrap(), last);
+    query.logs = true;
+    let with_log = catalog.events(&query).await.unwrap();
+    assert_eq!(with_log[0], last[1]);
+    assert_eq!(
+        (with_log[1].kind, with_log[1].task),
+        (EventKind::Log, Some(1))
+    );
 }
 
 async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn Catalog) {

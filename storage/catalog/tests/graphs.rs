@@ -116,6 +116,7 @@ async fn a_stage_waits_for_those_that_it_needs(catalog: &dyn Catalog) {
         task: None,
         stage: Some(1),
         newest: false,
+        logs: false,
     };
     let events = catalog.events(&query).await.unwrap();
     let lines: Vec<_> = events.iter().map(|e| (e.kind, e.stage)).collect();
@@ -173,6 +174,7 @@ async fn a_held_job_gives_nothing_until_it_goes_on(catalog: &dyn Catalog) {
         task: None,
         stage: None,
         newest: false,
+        logs: false,
     };
     let events = catalog.events(&query).await.unwrap();
     let lines: Vec<_> = events.iter().map(|e| (e.kind, &*e.message)).collect();

@@ -11,21 +11,23 @@ use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
     model::{Abilities, WorkerHello},
+    trace,
 };
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
-use tracing::{error, info, warn};
+use tracing::{error, info, info_span, warn};
 use uuid::Uuid;
 
 use crate::{
     AgentConfig, AgentError, Control, Executor, Output, Summary, Target, TaskError,
     allow::StorePrefixes,
     execute::Runner,
+    log::Unsent,
     session::{
         self, LinkError, Session, Welcome,
         backoff::{Backoff, random},
         desk::Desk,
-        message::Incoming,
+        message::{Incoming, Outgoing},
     },
 };
 
@@ -42,6 +44,8 @@ const GOOD_SESSION: Duration = Duration::from_secs(10);
 /// How long at most before the next coordinator of the list is tried: the workers of one that is lost shall not all
 /// come to the other in the same moment.
 const NEXT_COORDINATOR: Duration = Duration::from_millis(300);
+/// How often what the task in hand has logged is sent.
+const TELL: Duration = Duration::from_secs(1);
 const SHUTDOWN: &str = "the worker is shutting down";
 
 /// Runs a worker for every kind of task, until `shutdown` or a refusal.
@@ -91,6 +95,8 @@ pub async fn run_with(
         desk: Desk::new(),
         runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
+        unsent: Unsent::default(),
+        tell_at: Instant::now(),
         targets,
         at: 0,
         welcomed: false,
@@ -177,6 +183,10 @@ struct Agent {
     runner: Runner,
     /// Of the task in hand.
     control: Option<Arc<Control>>,
+    /// What tasks have logged.
+    unsent: Unsent,
+    /// When the log of the task in hand is to be looked at.
+    tell_at: Instant,
     /// The coordinators to choose from.
     targets: Vec<Target>,
     /// Which of them is in use or to be tried next.
@@ -231,9 +241,25 @@ impl Agent {
             info!(job = %task.job, task = task.index, "task starts");
             let control = Arc::new(Control::default());
             self.control = Some(control.clone());
-            self.runner.begin(task, control);
+            let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
+                task = task.index);
+            if let Some(hand) = self.desk.in_hand() {
+                trace::join(&span, &hand.traceparent);
+            }
+            self.desk.traced(trace::traceparent(&span));
+            self.runner.begin(task, control, span);
+        }
+        if let Some(hand) = self.desk.in_hand()
+            && now >= self.tell_at
+        {
+            self.tell_at = now + TELL;
+            let lines = self.runner.log().take();
+            self.unsent.push(hand.lease, hand.task.index, lines);
         }
         if let Link::Up { session, .. } = &self.link {
+            for log in self.unsent.drain(now) {
+                session.send(Outgoing::Log(log));
+            }
             for message in self.desk.outgoing(now) {
                 session.send(message);
             }
@@ -261,6 +287,7 @@ impl Agent {
         leaving
             .chain(idle.map(|(since, most)| since + most))
             .chain(self.desk.paused_until())
+            .chain(self.desk.in_hand().map(|_| self.tell_at))
             .filter(|at| *at > now)
             .min()
             .unwrap_or(now + Duration::from_secs(60))
@@ -421,6 +448,9 @@ impl Agent {
         let now = Instant::now();
         self.control = None;
         let hand = self.desk.ended(now, &result);
+        // Sent ahead of the report on it, after which nothing is heard of it any more.
+        let lines = self.runner.log().end();
+        self.unsent.push(hand.lease, hand.task.index, lines);
         let (job, task, seconds) = (
             hand.task.job,
             hand.task.index,

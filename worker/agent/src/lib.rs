@@ -9,6 +9,7 @@ mod agent;
 mod allow;
 mod config;
 pub mod execute;
+mod log;
 mod session;
 
 pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
@@ -20,3 +21,4 @@ pub use execute::{
     strategy_names,
 };
 pub use execute::{export, reprocess, split};
+pub use log::task_logs;

@@ -249,6 +249,7 @@ impl Simulated {
             bytes: 1,
             seconds: self.task.as_secs_f64().max(1e-4),
             adopted: false,
+            traceparent: String::new(),
         };
         say(to, Say::Done(report.clone().into()));
         self.unacknowledged.insert((lease, index), report);

@@ -7,6 +7,7 @@ use picofarm_proto::{
     model::ExportTask,
     split::{SIDES, SplitRecord},
 };
+use tracing::info;
 
 use super::{
     Control, Output, TaskError,
@@ -125,6 +126,7 @@ pub(super) fn run(
     let packs = export.packs();
     for k in 0..packs {
         stores.wait(control, export.pack(k))?;
+        info!("file {} of {packs} written", k + 1);
         if !control.at((k + 1) as f32 / (packs + 1) as f32) {
             return Err(TaskError::Stopped);
         }

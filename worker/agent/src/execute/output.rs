@@ -12,10 +12,10 @@ use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
     probe,
 };
-use picofarm_proto::{key::TaskKey, model::RenderTask};
+use picofarm_proto::{key::TaskKey, model::RenderTask, trace};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
-use tracing::warn;
+use tracing::{debug_span, warn};
 
 use super::{Control, TaskError};
 use crate::session::backoff::{Backoff, random};
@@ -157,6 +157,7 @@ impl Stores {
         scene: EncodedScene,
         control: &Control,
     ) -> Result<Manifest, TaskError> {
+        let _in = debug_span!(target: trace::TARGET, "publish").entered();
         let until = Instant::now() + self.patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {

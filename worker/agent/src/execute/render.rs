@@ -1,16 +1,19 @@
 //! Rendering: adopt, or make the scene, render it, code it and publish it.
 
+use std::time::Instant;
+
 use picofarm_dataset::{
     DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
 };
 use picofarm_proto::{
     key::TaskKey,
     model::{Budget, RenderTask},
+    trace,
 };
 use picofarm_scene::{AssetLibrary, Camera, Scene};
 use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
-use tracing::debug;
+use tracing::{debug_span, info};
 
 use super::{
     Control, Output, Task, TaskError, memory,
@@ -60,11 +63,13 @@ pub(super) fn run(
             adopted: true,
         });
     }
-    let scene = scenes::scene(spec, task.index, libraries)?;
-    debug!(
-        task = task.index,
+    let begun = Instant::now();
+    let scene = debug_span!(target: trace::TARGET, "scene")
+        .in_scope(|| scenes::scene(spec, task.index, libraries))?;
+    info!(
         scene = scene.name,
         triangles = scene.triangle_count(),
+        seconds = begun.elapsed().as_secs_f32(),
         "scene made"
     );
     let settings = settings(spec, dataset.spec(), &key)?;
@@ -73,8 +78,17 @@ pub(super) fn run(
         memory::check_memory(&settings, side, side, rayon::current_num_threads())
             .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
     }
-    let rendered =
-        picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render)?;
+    let begun = Instant::now();
+    let rendered = debug_span!(target: trace::TARGET, "render")
+        .in_scope(|| picofarm_transient::render(&scene, &settings, &Watched(control)))
+        .map_err(of_render)?;
+    info!(
+        samples = rendered.error.samples,
+        median_error = rendered.error.median_relative,
+        rays = rendered.rays,
+        seconds = begun.elapsed().as_secs_f32(),
+        "rendered"
+    );
     let camera = &scene.camera;
     let spots: Vec<_> = rendered
         .spots
@@ -89,8 +103,8 @@ pub(super) fn run(
         seed: settings.seed,
         plan: account(&scene, &rendered),
     };
-    let encoded = dataset
-        .encode(task.index, &record, &provenance)
+    let encoded = debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| dataset.encode(task.index, &record, &provenance))
         .map_err(of_dataset)?;
     control.at((1.0 + RENDER_SHARE) / 2.0);
     let manifest = stores.publish(&dataset, encoded, control)?;

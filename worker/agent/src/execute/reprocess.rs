@@ -11,12 +11,14 @@ use picofarm_dataset::{
 use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
     model::{Histogram, ReprocessSettings, ReprocessTask, SensorSettings, SourceSettings},
+    trace,
 };
 use picofarm_transient::sensor::{
     Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values,
 };
 use serde_json::json;
 use tokio::runtime::Handle;
+use tracing::debug_span;
 
 use super::{
     Control, Output, TaskError,
@@ -111,7 +113,8 @@ pub(super) fn run(
             adopted: true,
         });
     }
-    let h = read(stores, &source, settings, index, control)?;
+    let h = debug_span!(target: trace::TARGET, "read")
+        .in_scope(|| read(stores, &source, settings, index, control))?;
     proceed(control, READ)?;
     let input = Histograms {
         transient: &h,
@@ -121,7 +124,9 @@ pub(super) fn run(
     };
     // The key is the seed of everything; the scene's number adds nothing to it.
     let seed = u64::from_le_bytes(key.0[..8].try_into().expect("a key has 32 bytes"));
-    let sensed = sensor.sense(&input, seed, 0).map_err(of_sensor)?;
+    let sensed = debug_span!(target: trace::TARGET, "measure")
+        .in_scope(|| sensor.sense(&input, seed, 0))
+        .map_err(of_sensor)?;
     drop(h);
     proceed(control, MEASURED)?;
     let truth = stores.wait(control, source.read_truth(index))?;
@@ -137,8 +142,8 @@ pub(super) fn run(
     };
     let (transient, scale) = as_radiance(&sensed);
     drop(sensed.values);
-    let encoded = dataset
-        .encode_derived(index, &truth, &transient, scale, &provenance)
+    let encoded = debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| dataset.encode_derived(index, &truth, &transient, scale, &provenance))
         .map_err(of_dataset)?;
     let manifest = stores.publish(&dataset, encoded, control)?;
     control.at(1.0);

@@ -30,6 +30,7 @@ struct Held {
     job: JobId,
     spec: Arc<StageSpec>,
     stage: StageKey,
+    traceparent: String,
     next: u64,
     hi: u64,
     skip: BTreeSet<u64>,
@@ -64,6 +65,8 @@ pub(crate) struct InHand {
     pub(crate) lease: LeaseRef,
     /// What runs.
     pub(crate) task: Task,
+    /// Where it is in a trace: at first where its lease is, then its own place.
+    pub(crate) traceparent: String,
     /// Since when.
     pub(crate) since: Instant,
 }
@@ -151,6 +154,7 @@ impl Desk {
             lease: lease.lease,
             job: lease.job,
             stage: lease.key,
+            traceparent: lease.traceparent,
             spec: Arc::new(lease.stage),
             next: lease.lo,
             hi: lease.hi,
@@ -252,9 +256,17 @@ impl Desk {
         self.in_hand = Some(InHand {
             lease: held.lease,
             task: task.clone(),
+            traceparent: held.traceparent.clone(),
             since: now,
         });
         Some(task)
+    }
+
+    /// The task in hand has a place of its own in a trace.
+    pub(crate) fn traced(&mut self, traceparent: String) {
+        if let Some(hand) = &mut self.in_hand {
+            hand.traceparent = traceparent;
+        }
     }
 
     /// The task in hand ended. What is to be told goes to the outbox: every finished task, even if its lease
@@ -277,6 +289,7 @@ impl Desk {
                 bytes: output.bytes,
                 seconds: (now - hand.since).as_secs_f64(),
                 adopted: output.adopted,
+                traceparent: hand.traceparent.clone(),
             })),
             Err(_) if !held => {}
             Err(TaskError::Stopped) => self.release(hand.lease, "the task was stopped half-way"),

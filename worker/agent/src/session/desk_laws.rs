@@ -72,6 +72,7 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
         ttl_ms: TTL.as_millis() as u32,
         ordinal: 0,
         key: StageKey([0; 32]),
+        traceparent: String::new(),
         stage: StageSpec::new(TaskSpec::Render(RenderTask {
             scenes: SceneSource {
                 kind: SceneKind::Primitive,
@@ -186,7 +187,7 @@ proptest! {
                         match message {
                             Outgoing::Report(report) => wire.push(report),
                             Outgoing::Credit(n) => prop_assert_eq!(n, 1),
-                            Outgoing::Heartbeat { .. } => unreachable!(),
+                            Outgoing::Heartbeat { .. } | Outgoing::Log(_) => unreachable!(),
                         }
                     }
                 }

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{Failure, Finished, Lease, TaskProgress},
+    model::{Failure, Finished, Lease, TaskLog, TaskProgress},
     wire::{self, session_request, session_response},
 };
 
@@ -18,6 +18,8 @@ pub(crate) enum Outgoing {
         /// The task in hand.
         progress: Vec<TaskProgress>,
     },
+    /// What the task in hand has logged.
+    Log(TaskLog),
     /// Something that must be acknowledged.
     Report(Report),
 }
@@ -92,6 +94,7 @@ impl From<Outgoing> for wire::SessionRequest {
                 leases: leases.into_iter().map(Into::into).collect(),
                 progress: progress.into_iter().map(Into::into).collect(),
             }),
+            Outgoing::Log(log) => M::Log(log.into()),
             Outgoing::Report(Report::Done(done)) => M::Done(done.into()),
             Outgoing::Report(Report::Failed(failed)) => M::Failed(failed.into()),
             Outgoing::Report(Report::Release { lease, reason }) => M::Release(wire::Release {

@@ -298,6 +298,7 @@ pub fn lease(epoch: u64, lo: u64, hi: u64) -> Lease {
         key: stage_key(&stage(spec("/nowhere"))),
         stage: stage(spec("/nowhere")),
         ordinal: 0,
+        traceparent: String::new(),
     }
 }
 

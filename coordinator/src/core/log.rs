@@ -1,0 +1,41 @@
+//! What tasks log on their workers, as lines of their history.
+
+use picofarm_proto::model::{EventKind, LogAllowance, TaskLog};
+
+use super::{About, Core, Progress, SessionId};
+
+impl Core {
+    /// Notes lines of a task that this session's worker has in hand, as far as the task's allowance goes; drops them where
+    /// the lease is not its own, or not live. Nobody waits for an answer.
+    pub(crate) fn logged(&mut self, session: SessionId, log: &TaskLog, now_ms: i64) {
+        // A task in the hands of two has one allowance.
+        let double = self
+            .sessions
+            .get(&session)
+            .and_then(|worker| self.doubled(*worker, log.lease))
+            .filter(|(double, _)| double.task == log.index)
+            .map(|(_, range)| range);
+        let held = || self.held_to_do(session, log.lease, log.index, now_ms).ok();
+        let Some(range) = double.or_else(held) else {
+            return;
+        };
+        let (range, stage) = (range.id, range.stage);
+        let worker = self.session_name(session);
+        for line in &log.lines {
+            let in_hand = self.progress.entry(range).or_default();
+            let task = in_hand.entry(log.index).or_insert(Progress {
+                fraction: 0.0,
+                since_ms: now_ms,
+                log: LogAllowance::default(),
+            });
+            if !task.log.take(line.text.len()) {
+                return;
+            }
+            let about = About::message(format!("{}: {}", line.level, line.text))
+                .task(log.index)
+                .worker(&*worker);
+            let at_ms = now_ms - i64::from(line.ago_ms);
+            self.event(at_ms, stage, EventKind::Log, about);
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! What a task logs on its worker, and how much of it is kept. Worker and coordinator count by the same rule: the one so
+//! that it sends no more, the other because nobody is trusted to.
+
+use std::fmt;
+
+use crate::ids::LeaseRef;
+
+/// Lines of a task that are kept.
+pub const LINES: usize = 200;
+/// Bytes of text of a task that are kept.
+pub const BYTES: usize = 16 << 10;
+/// Bytes of a line, at most.
+pub const LINE_BYTES: usize = 2 << 10;
+
+/// How grave a line is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogLevel {
+    /// It cannot go on so.
+    Error,
+    /// It goes on, and somebody should know.
+    Warn,
+    /// What it does.
+    Info,
+}
+
+impl fmt::Display for LogLevel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Error => "error",
+            Self::Warn => "warn",
+            Self::Info => "info",
+        })
+    }
+}
+
+/// One line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LogLine {
+    /// Milliseconds from its writing to its sending.
+    pub ago_ms: u32,
+    /// How grave it is.
+    pub level: LogLevel,
+    /// What it says.
+    pub text: String,
+}
+
+/// Lines of one task, in order.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TaskLog {
+    /// The lease it runs under.
+    pub lease: LeaseRef,
+    /// Task index.
+    pub index: u64,
+    /// The lines.
+    pub lines: Vec<LogLine>,
+}
+
+/// What a task may still log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LogAllowance {
+    lines: usize,
+    bytes: usize,
+}
+
+impl Default for LogAllowance {
+    fn default() -> Self {
+        Self {
+            lines: LINES,
+            bytes: BYTES,
+        }
+    }
+}
+
+impl LogAllowance {
+    /// Takes one line of so many bytes out of it; `false` where it is not enough, and from then on for every line.
+    #[must_use]
+    pub fn take(&mut self, bytes: usize) -> bool {
+        if self.lines == 0 || bytes > self.bytes {
+            self.lines = 0;
+            return false;
+        }
+        self.lines -= 1;
+        self.bytes -= bytes;
+        true
+    }
+}
+
+/// A text that a terminal only shows: control characters become spaces.
+pub fn printable(text: &str) -> String {
+    let shown = |c: char| if c.is_control() { ' ' } else { c };
+    text.chars().map(shown).collect()
+}
+
+/// The beginning of a text that fits a line, cut between two characters.
+pub fn cut(text: &mut String) {
+    if text.len() > LINE_BYTES {
+        const MARK: &str = " …";
+        text.truncate(text.floor_char_boundary(LINE_BYTES - MARK.len()));
+        text.push_str(MARK);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_allowance_ends_with_the_lines_or_with_the_bytes_and_never_begins_again() {
+        let mut many = LogAllowance::default();
+        assert_eq!((0..1000).filter(|_| many.take(1)).count(), LINES);
+        let mut long = LogAllowance::default();
+        assert_eq!(
+            (0..1000).filter(|_| long.take(LINE_BYTES)).count(),
+            BYTES / LINE_BYTES
+        );
+        let mut gap = LogAllowance::default();
+        assert!(
+            !gap.take(BYTES + 1) && !gap.take(1),
+            "no line from behind a gap"
+        );
+    }
+
+    #[test]
+    fn a_line_that_is_too_long_is_cut_between_characters() {
+        let mut text = "ü".repeat(LINE_BYTES);
+        cut(&mut text);
+        assert!(
+            text.len() <= LINE_BYTES && text.ends_with(" …"),
+            "{}",
+            text.len()
+        );
+        assert_eq!(printable("\u{1b}[31mred\r\nü"), " [31mred  ü");
+    }
+}
