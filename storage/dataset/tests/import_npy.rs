@@ -216,7 +216,7 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
         (
             "depth kind",
             &|d| d["depth"]["kind"] = json!("range"),
-            &["spots.npy: positions"],
+            &["depth.npy: kind of depth", "z-depth"],
         ),
         ("units", &|d| d["length_unit"] = json!("cm"), &["expected"]),
         (

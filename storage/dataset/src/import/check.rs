@@ -34,7 +34,10 @@ const OFF_SURFACE: f64 = 0.05;
 pub(super) struct Geometry<'a> {
     pub shape: &'a Shape,
     pub transient: &'a [f32],
+    /// z-depth.
     pub depth: &'a [f32],
+    /// Whether it was computed from distances along the rays.
+    pub of_range: bool,
     pub intrinsics: Intrinsics,
     /// Metres, camera frame.
     pub laser: [f32; 3],
@@ -59,8 +62,8 @@ pub(super) struct Blame<'a> {
 /// Another way to read the same files.
 #[derive(Debug, Clone, Copy, Default)]
 struct Reading {
-    /// The depth image holds distances along rays.
-    range: bool,
+    /// The depth image holds the other kind of depth.
+    other_depth: bool,
     flip_spots: [bool; 2],
     flip_image: [bool; 2],
 }
@@ -222,8 +225,8 @@ fn polarity(g: &Geometry<'_>, blame: &Blame<'_>, lit: &Profile) -> Result<(), Im
 
 /// Whether another reading fits better.
 fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportError> {
-    let range = Reading {
-        range: true,
+    let depth = Reading {
+        other_depth: true,
         ..Reading::default()
     };
     let spots = |x, y| Reading {
@@ -237,12 +240,20 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
     let turn = "turn the array round, or import as it is with --unchecked";
     let others = [
         (
-            range,
+            depth,
             blame.depth,
             "kind of depth",
-            "z-depth",
-            "distances along the rays",
-            "say so (--depth range, or the depth's kind in scene.json), or import as it is with --unchecked",
+            if g.of_range {
+                "distances along the rays, as was said"
+            } else {
+                "z-depth"
+            },
+            if g.of_range {
+                "a better fit as z-depth"
+            } else {
+                "a better fit as distances along the rays"
+            },
+            "say so (--depth z or range, or the depth's kind in scene.json), or import as it is with --unchecked",
         ),
         (
             spots(true, false),
@@ -413,10 +424,10 @@ fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
                 continue;
             }
             let d = direction(g.intrinsics, row, column);
-            let z = if reading.range {
-                depth / norm(d)
-            } else {
-                depth
+            let z = match (reading.other_depth, g.of_range) {
+                (false, _) => depth,
+                (true, false) => depth / norm(d),
+                (true, true) => depth * norm(d),
             };
             let x = d.map(|c| c * z);
             for (index, spot) in g.spots.iter().enumerate() {

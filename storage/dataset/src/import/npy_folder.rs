@@ -214,6 +214,7 @@ pub(super) fn read(
             shape: &scene.shape,
             transient: &scene.transient,
             depth: &scene.depth,
+            of_range: is.depth.kind == DepthKind::Range,
             intrinsics: scene.intrinsics,
             laser: scene.laser,
             spots: &scene.spots,

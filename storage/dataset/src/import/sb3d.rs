@@ -226,6 +226,7 @@ pub(super) fn read(
             shape: &scene.shape,
             transient: &scene.transient,
             depth: &scene.depth,
+            of_range: options.depth == Some(DepthKind::Range),
             intrinsics,
             laser: scene.laser,
             spots: &scene.spots,
