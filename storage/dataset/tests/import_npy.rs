@@ -216,9 +216,18 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
         (
             "depth kind",
             &|d| d["depth"]["kind"] = json!("range"),
-            &["depth.npy: kind of depth", "z-depth"],
+            &["spots.npy: positions"],
         ),
-        ("units", &|d| d["length_unit"] = json!("cm"), &["expected"]),
+        (
+            "units",
+            &|d| {
+                // The gate stays what it was: lengths alone shrink.
+                d["length_unit"] = json!("cm");
+                d["histogram"]["gate_start"] = json!(room.gate[0] * 100.0);
+                d["histogram"]["bin_width"] = json!(room.gate[1] * 100.0);
+            },
+            &["h.npy: light"],
+        ),
         (
             "axes",
             &|d| d["camera"]["axes"] = json!(["right", "up", "forward"]),

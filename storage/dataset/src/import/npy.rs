@@ -141,7 +141,7 @@ pub(crate) fn write<T: bytemuck::Pod>(descr: &str, shape: &[usize], values: &[T]
     };
     let mut header =
         format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}");
-    while (FIXED + header.len() + 1) % 64 != 0 {
+    while !(FIXED + header.len() + 1).is_multiple_of(64) {
         header.push(' ');
     }
     header.push('\n');
