@@ -10,7 +10,9 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
-pub use data::{DatasetExport, DatasetReprocess, DatasetSplit, SensorArgs};
+pub use data::{
+    DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, ExportFormat, SensorArgs,
+};
 pub use guard::{Guard, Token};
 pub use job::{Job, JobKind};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
@@ -314,8 +316,10 @@ pub enum Dataset {
     },
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
     Reprocess(DatasetReprocess),
-    /// Pack a data set, or a part of it, into few files for sharing; again to resume
+    /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's layout; again to resume
     Export(DatasetExport),
+    /// Make a data set of the paper's release, of PlatoNeRF's or bounce-flash lidar captures, or of .npy files; again to resume
+    Import(Box<DatasetImport>),
     /// Say which scenes are for training, validation and test; again to take in scenes added since
     Split(DatasetSplit),
 }

@@ -1,6 +1,7 @@
 //! `picofarm dataset …`: what a data set holds, whether it is whole, and what it looks like.
 
 pub mod export;
+pub mod import;
 pub mod reprocess;
 pub mod split;
 
@@ -45,6 +46,7 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
         }
         Command::Reprocess(args) => reprocess::run(args, output).await,
         Command::Export(args) => export::run(args, output).await,
+        Command::Import(args) => import::run(*args, output).await,
         Command::Split(args) => split::run(args, output).await,
         Command::Collect {
             dataset,

@@ -1,12 +1,13 @@
 //! The arguments of commands that make data of data: `scene sense`, `dataset reprocess`, `dataset split`,
-//! `dataset export`.
+//! `dataset export`, `dataset import`.
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use picofarm_proto::model::Histogram;
 
 use picofarm_agent::export::Scenes;
+use picofarm_dataset::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
 
 /// A sensor.
 #[derive(Args, Clone, Default)]
@@ -101,6 +102,148 @@ pub struct DatasetExport {
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
+    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves
+    #[arg(long, value_enum, default_value_t = ExportFormat::Zarr)]
+    pub format: ExportFormat,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ExportFormat {
+    Zarr,
+    Sb3d,
+}
+
+#[derive(Args)]
+#[command(after_long_help = IMPORT_HELP)]
+pub struct DatasetImport {
+    /// Folder with the files
+    pub source: PathBuf,
+    /// Folder or URL of the data set to make, or to go on with
+    pub target: String,
+    /// Layout of the files: sb3d, platonerf, bf-lidar or npy [default: whichever is found]
+    #[arg(long, value_name = "NAME", value_parser = Format::parse)]
+    pub format: Option<Format>,
+    /// Import the scenes named in this file, one a line, in this order [default: all, by name]
+    #[arg(long, value_name = "FILE")]
+    pub list: Option<PathBuf>,
+    /// Codec: sqrt-u16, plain-f32 or counts-u16
+    #[arg(long, default_value = "sqrt-u16", value_name = "NAME")]
+    pub profile: String,
+    #[command(flatten)]
+    pub options: ImportArgs,
+    /// Compare the contents of files whose scenes are there already, not only their sizes
+    #[arg(long)]
+    pub rehash: bool,
+    /// Threads [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+}
+
+const IMPORT_HELP: &str = "\
+What the files say is read; what a format is known for (gate, field of view, polarity, axes) is checked against the
+histograms: two-bounce light must arrive where depth and spots predict. What does not fit is refused, naming the file,
+what was expected and the option that overrides it. The manifest of each scene names its files with their SHA-256,
+everything that was converted, and what is missing. Run the same command again to go on.
+
+npy: a folder a scene, or one of such folders, with .npy files and scene.json:
+  {\"format\": \"picofarm-scene-1\", \"length_unit\": \"m\" (or cm, mm),
+   \"histogram\": {\"file\": \"h.npy\", \"axes\": [\"row\", \"column\", \"bin\"] (in the array's order),
+                 \"gate_start\": 1.0, \"bin_width\": 0.0384, \"gate_unit\": \"length\" (of path; or s, ns, ps)},
+   \"camera\": {\"fx\": 128, \"fy\": 128, \"cx\": 128, \"cy\": 128, \"pixel_centre\": 0.5 (or 0),
+              \"axes\": [\"right\", \"down\", \"forward\"] (or left, up, backward, in any order),
+              \"to_world\": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]] (if known)},
+   \"laser\": [0, 0, 0], \"spots\": {\"file\": \"spots.npy\"} (spots x 3),
+   \"depth\": {\"file\": \"depth.npy\", \"kind\": \"z\" (or range)}}
+and, if there are any: visibility {file, one_means: lit or shadow} (spots x rows x columns), specular {file} (1 = mirror),
+normal {file}, instance {file} and label {file} (0 = nothing), rgb_linear {file}, photons_per_unit.";
+
+/// What overrides the files, or what their format is known for.
+#[derive(Args, Clone, Default)]
+pub struct ImportArgs {
+    /// Path of light at the start of the first bin, metres (sb3d, platonerf); bf-lidar: from where to keep bins
+    #[arg(long, value_name = "M", allow_negative_numbers = true)]
+    pub gate_start_m: Option<f64>,
+    /// Width of a bin, metres of path (sb3d, platonerf, bf-lidar)
+    #[arg(long, value_name = "M")]
+    pub bin_width_m: Option<f64>,
+    /// Number of bins to keep (bf-lidar)
+    #[arg(long, value_name = "N")]
+    pub bins: Option<u32>,
+    /// Horizontal field of view, degrees (sb3d, platonerf)
+    #[arg(long, value_name = "DEG")]
+    pub fov_deg: Option<f64>,
+    /// Metres in the unit of depth and spots (sb3d)
+    #[arg(long, value_name = "M")]
+    pub length_unit_m: Option<f64>,
+    /// What 1 means in the masks of visibility (sb3d)
+    #[arg(long, value_enum)]
+    pub visibility: Option<PolarityArg>,
+    /// What the depth image holds (sb3d)
+    #[arg(long, value_enum)]
+    pub depth: Option<DepthArg>,
+    /// Which histograms to take, of 4, 25 or 100 spots (sb3d) [default: the most]
+    #[arg(long, value_name = "N")]
+    pub spots: Option<u32>,
+    /// Where the laser is, in the scan's axes: x left, y up, z forward (bf-lidar)
+    #[arg(long, value_name = "X,Y,Z", value_parser = three::<f64>, allow_negative_numbers = true)]
+    pub laser_m: Option<[f64; 3]>,
+    /// Time of arrival at no distance, seconds (bf-lidar)
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    pub t0_s: Option<f64>,
+    /// Captures of single spots: each a scene, or all of a folder summed into one (platonerf, bf-lidar)
+    #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
+    pub captures: CapturesArg,
+    /// Do not check histograms against geometry; the manifest says so
+    #[arg(long)]
+    pub unchecked: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum PolarityArg {
+    Lit,
+    Shadow,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum DepthArg {
+    Z,
+    Range,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum CapturesArg {
+    #[default]
+    Separate,
+    Sum,
+}
+
+impl ImportArgs {
+    /// As the importer takes them.
+    pub fn options(&self) -> ImportOptions {
+        ImportOptions {
+            gate_start_m: self.gate_start_m,
+            bin_width_m: self.bin_width_m,
+            bins: self.bins,
+            fov_deg: self.fov_deg,
+            length_unit_m: self.length_unit_m,
+            visibility: self.visibility.map(|v| match v {
+                PolarityArg::Lit => Polarity::Lit,
+                PolarityArg::Shadow => Polarity::Shadow,
+            }),
+            depth: self.depth.map(|d| match d {
+                DepthArg::Z => DepthKind::Z,
+                DepthArg::Range => DepthKind::Range,
+            }),
+            spots: self.spots,
+            laser_m: self.laser_m,
+            t0_s: self.t0_s,
+            captures: match self.captures {
+                CapturesArg::Separate => Captures::Separate,
+                CapturesArg::Sum => Captures::Sum,
+            },
+            unchecked: self.unchecked,
+        }
+    }
 }
 
 fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {

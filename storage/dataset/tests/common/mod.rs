@@ -1,6 +1,8 @@
 //! A small scene with every kind of value in it, and stores to put it in.
 #![allow(dead_code, reason = "each test binary uses a part of this")]
 
+pub mod npy;
+pub mod room;
 pub mod tricky;
 
 use std::sync::Arc;

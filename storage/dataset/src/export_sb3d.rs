@@ -1,0 +1,283 @@
+//! A data set in the layout of the paper's release: a folder a scene with histograms as OpenEXR images.
+//!
+//! `lidar_<spots>.exr` holds one half channel "Y", a pixel a line and a bin a column. Halves hold 11 bits between
+//! 6·10⁻⁵ and 65,504, so that the histograms are multiplied by a power of two that brings the scene's brightest bin
+//! to 16,384 at least and 32,768 at most. It stands in `picofarm.json`, with gate, intrinsics, spots and scale, for
+//! which the layout has no place. Compression is ZIP, which loses nothing (the release's DWAA does).
+
+use std::io::{Cursor, Write};
+
+use exr::prelude::{
+    AnyChannel, AnyChannels, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes,
+    SmallVec, WritableImage,
+};
+use half::f16;
+use object_store::ObjectStore;
+use object_store::path::Path;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::import::npy;
+use crate::layout::Quantity;
+use crate::objects;
+use crate::record::{Intrinsics, Spot};
+use crate::spec::Gate;
+
+/// Name of the file with what the layout has no place for.
+pub(crate) const ASIDE: &str = "picofarm.json";
+/// The brightest bin becomes so large at most.
+const BRIGHTEST: f32 = 32_768.0;
+
+/// What the paper's layout has no place for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Aside {
+    /// Always `picofarm-sb3d-1`.
+    pub format: String,
+    /// What the histograms were multiplied by: a power of two.
+    pub factor: f32,
+    pub gate: Gate,
+    /// fx, fy, cx, cy.
+    pub intrinsics: [f32; 4],
+    /// Camera-to-world matrix.
+    pub camera: [[f32; 4]; 4],
+    /// Laser origin, camera frame, metres.
+    pub laser: [f32; 3],
+    /// Position, normal and path from the laser of each spot; null where a beam meets nothing.
+    pub spots: Vec<Option<[f32; 7]>>,
+    /// Photons per unit of the histogram before multiplication.
+    pub photons_per_unit: f32,
+    /// Key of the task that made the scene.
+    pub task_key: String,
+}
+
+impl Aside {
+    /// The only value of `format`.
+    pub const FORMAT: &'static str = "picofarm-sb3d-1";
+
+    pub fn intrinsics(&self) -> Intrinsics {
+        let [fx, fy, cx, cy] = self.intrinsics;
+        Intrinsics { fx, fy, cx, cy }
+    }
+
+    pub fn spots(&self) -> Vec<Option<Spot>> {
+        let all = self.spots.iter();
+        all.map(|row| row.as_ref().and_then(|r| Spot::from_row(r)))
+            .collect()
+    }
+}
+
+/// Files of an exported scene and their bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ExportedScene {
+    /// Files.
+    pub files: u64,
+    /// Their bytes.
+    pub bytes: u64,
+}
+
+impl Dataset {
+    /// Writes a scene in the layout of the paper's release, into `prefix/<scene, six digits>`. All files are put
+    /// create-only: run again after an interruption, equal files count as written.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the data set has other than 4, 25 or 100 spots; [`DatasetError::NotPublished`];
+    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
+    pub async fn export_sb3d(
+        &self,
+        scene: u64,
+        store: &dyn ObjectStore,
+        prefix: &Path,
+    ) -> Result<ExportedScene, DatasetError> {
+        let spec = self.spec();
+        if ![4, 25, 100].contains(&spec.spots) {
+            let what = format!(
+                "the paper's layout has 4, 25 or 100 spots, the data set {}; reprocess it into one with as many",
+                spec.spots
+            );
+            return Err(DatasetError::invalid("spec.spots", what));
+        }
+        let mut out = Out {
+            store,
+            folder: prefix.clone().join(format!("{scene:06}")),
+            done: ExportedScene::default(),
+        };
+        let manifest = self.manifest(scene).await?;
+        let mut factor = None;
+        let histograms = [
+            Quantity::Transient,
+            Quantity::Transient25,
+            Quantity::Transient4,
+        ];
+        for quantity in histograms
+            .into_iter()
+            .filter(|q| spec.quantities().contains(q))
+        {
+            let spots = match quantity {
+                Quantity::Transient => spec.spots as usize,
+                subset => subset.spots_of_100().len(),
+            };
+            let h = self.read_histogram(scene, quantity).await?;
+            // Fewer spots are less light: the whole is the brightest.
+            let factor = *factor.get_or_insert_with(|| factor_of(&h));
+            let halves: Vec<f16> = h.par_iter().map(|h| f16::from_f32(h * factor)).collect();
+            drop(h);
+            let size = (spec.gate.bins as usize, spec.pixels());
+            out.put(
+                &format!("lidar_{spots}.exr"),
+                image(size, FlatSamples::F16(halves))?,
+            )
+            .await?;
+        }
+        let (w, h) = (spec.width as usize, spec.height as usize);
+        let depth: Vec<f32> = self.read(scene, Quantity::Depth).await?;
+        out.put("depth.exr", image((w, h), FlatSamples::F32(depth))?)
+            .await?;
+        let specular: Vec<u8> = self.read(scene, Quantity::Specular).await?;
+        out.put("specular_mask.png", grey(w, h, &specular)?).await?;
+        let lit: Vec<f32> = self
+            .read_visibility(scene)
+            .await?
+            .into_iter()
+            .map(f32::from)
+            .collect();
+        let lit = npy::write("<f4", &[spec.spots as usize, h, w], &lit);
+        out.put("shadows_v1.npz", zipped("shadows.npy", &lit)?)
+            .await?;
+        let spots = self.read_spots(scene).await?;
+        let positions: Vec<f32> = spots
+            .iter()
+            .flat_map(|s| s.map_or([f32::NAN; 3], |s| s.position))
+            .collect();
+        out.put(
+            "lights_camera_frame.npy",
+            npy::write("<f4", &[spots.len(), 3], &positions),
+        )
+        .await?;
+        let i = self.read_intrinsics(scene).await?;
+        let camera: Vec<f32> = self.read(scene, Quantity::Camera).await?;
+        let laser: Vec<f32> = self.read(scene, Quantity::Laser).await?;
+        let mut pose = [[0.0; 4]; 4];
+        pose.as_flattened_mut().copy_from_slice(&camera);
+        let aside = Aside {
+            format: Aside::FORMAT.into(),
+            factor: factor.expect("every data set has a transient"),
+            gate: spec.gate,
+            intrinsics: [i.fx, i.fy, i.cx, i.cy],
+            camera: pose,
+            laser: [laser[0], laser[1], laser[2]],
+            spots: spots.iter().map(|s| s.map(|s| s.row())).collect(),
+            photons_per_unit: manifest.scale,
+            task_key: manifest.provenance.task_key,
+        };
+        let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
+        text.push(b'\n');
+        // The last one: a folder with it is whole.
+        out.put(ASIDE, text).await?;
+        Ok(out.done)
+    }
+}
+
+struct Out<'a> {
+    store: &'a dyn ObjectStore,
+    folder: Path,
+    done: ExportedScene,
+}
+
+impl Out<'_> {
+    async fn put(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), DatasetError> {
+        self.done.files += 1;
+        self.done.bytes += bytes.len() as u64;
+        let path = objects::path_of(&self.folder, name);
+        objects::create_or_match(self.store, &path, bytes.into()).await
+    }
+}
+
+/// The power of two that brings the brightest value to (BRIGHTEST/2, BRIGHTEST].
+fn factor_of(h: &[f32]) -> f32 {
+    let brightest = h.iter().fold(0.0f32, |m, x| m.max(*x));
+    if brightest == 0.0 {
+        return 1.0;
+    }
+    let (_, exponent) = libm::frexpf(brightest);
+    // brightest ≤ 2^exponent, and more than half of it unless it is that half.
+    let (_, most) = libm::frexpf(BRIGHTEST);
+    libm::ldexpf(1.0, (most - 1 - exponent).clamp(-100, 100))
+}
+
+/// An OpenEXR file with one channel, Y.
+fn image(size: (usize, usize), samples: FlatSamples) -> Result<Vec<u8>, DatasetError> {
+    let mut channels = SmallVec::new();
+    channels.push(AnyChannel::new("Y", samples));
+    let encoding = Encoding {
+        compression: Compression::ZIP16,
+        ..Encoding::default()
+    };
+    let encoding = Encoding {
+        blocks: exr::image::Blocks::ScanLines,
+        line_order: exr::meta::attribute::LineOrder::Increasing,
+        ..encoding
+    };
+    let layer = Layer::new(
+        size,
+        LayerAttributes::default(),
+        encoding,
+        AnyChannels::sort(channels),
+    );
+    let mut bytes = Cursor::new(Vec::new());
+    let written = Image::from_layer(layer)
+        .write()
+        .non_parallel()
+        .to_buffered(&mut bytes);
+    written.map_err(|e| DatasetError::codec("cannot encode an OpenEXR image", e))?;
+    Ok(bytes.into_inner())
+}
+
+/// A grey PNG, 255 where the mask is 1.
+fn grey(width: usize, height: usize, mask: &[u8]) -> Result<Vec<u8>, DatasetError> {
+    let failed = |e: png::EncodingError| DatasetError::codec("cannot encode a PNG", e);
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width as u32, height as u32);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_depth(png::BitDepth::Eight);
+    let values: Vec<u8> = mask.iter().map(|m| m * 255).collect();
+    let mut writer = encoder.write_header().map_err(failed)?;
+    writer.write_image_data(&values).map_err(failed)?;
+    writer.finish().map_err(failed)?;
+    Ok(bytes)
+}
+
+/// A `.npz` with one array. The same bytes at any time: entries carry no date of today.
+fn zipped(name: &str, array: &[u8]) -> Result<Vec<u8>, DatasetError> {
+    let failed = |e: String| DatasetError::codec("cannot encode a .npz file", e);
+    let mut writer = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default()
+        .compression_method(zip::CompressionMethod::Deflated)
+        .last_modified_time(zip::DateTime::default());
+    writer
+        .start_file(name, options)
+        .map_err(|e| failed(e.to_string()))?;
+    writer.write_all(array).map_err(|e| failed(e.to_string()))?;
+    let done = writer.finish().map_err(|e| failed(e.to_string()))?;
+    Ok(done.into_inner())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_brightest_bin_comes_close_to_the_top_by_a_power_of_two() {
+        for x in [1e-9f32, 0.3, 0.5, 1.0, 1.5, 65_504.0, 3e7] {
+            let factor = factor_of(&[0.0, x]);
+            let scaled = x * factor;
+            assert!(
+                (BRIGHTEST / 2.0..=BRIGHTEST).contains(&scaled),
+                "{x}: {scaled}"
+            );
+            assert_eq!(factor.to_bits() & 0x7f_ffff, 0);
+        }
+    }
+}

@@ -1,0 +1,476 @@
+//! Do the histograms fit the geometry? Two-bounce light from a lit spot must arrive at its time of flight.
+//!
+//! For a sample of pixels, the energy at the predicted bin of each lit spot, relative to the pixel's whole, is
+//! averaged; so is the energy some bins before and after. If gate, units, depth, spots, masks and image axes are what
+//! they are taken for, the average has its peak at the predicted bin. Where another reading of the same files fits
+//! better, the import is refused.
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::ImportError;
+use super::scene::{Shape, direction};
+use crate::record::{Intrinsics, Spot};
+
+/// Pixels in the sample, at most about.
+const SAMPLE: usize = 2048;
+/// Bins before and after the predicted one that are looked at.
+const REACH: isize = 20;
+/// The peak may be so many steps away from the prediction.
+const TOLERANCE: isize = 1;
+/// A step is a bin, or as many bins as are about so long: pulses of real lasers are longer than their bins.
+const STEP_M: f64 = 0.0384;
+/// Pairs of pixel and spot for a judgement.
+const MIN_PAIRS: usize = 200;
+/// The peak stands out from its surroundings by this factor at least.
+const CONTRAST: f64 = 1.3;
+/// Another reading must fit better by this factor to be believed.
+const BETTER: f64 = 1.15;
+/// Spots may lie so far off the surface that the depth image shows, relative to their depth.
+const OFF_SURFACE: f64 = 0.05;
+
+/// Everything a prediction needs.
+pub(super) struct Geometry<'a> {
+    pub shape: &'a Shape,
+    pub transient: &'a [f32],
+    /// z-depth.
+    pub depth: &'a [f32],
+    /// Whether it was computed from distances along the rays.
+    pub of_range: bool,
+    pub intrinsics: Intrinsics,
+    /// Metres, camera frame.
+    pub laser: [f32; 3],
+    pub spots: &'a [Option<Spot>],
+    /// `[spot][row][column]`, 1 = lit; `None` where the files do not say.
+    pub visibility: Option<&'a [u8]>,
+    pub specular: &'a [u8],
+}
+
+/// The files that are at fault if the check fails, and the options that would override them.
+pub(super) struct Blame<'a> {
+    pub histogram: &'a Path,
+    pub depth: &'a Path,
+    pub spots: &'a Path,
+    pub visibility: &'a Path,
+    /// How geometry and gate are given in this format.
+    pub mend: &'a str,
+    /// How the masks' polarity is given.
+    pub polarity: &'a str,
+}
+
+/// Another way to read the same files.
+#[derive(Debug, Clone, Copy, Default)]
+struct Reading {
+    /// The depth image holds the other kind of depth.
+    other_depth: bool,
+    flip_spots: [bool; 2],
+    flip_image: [bool; 2],
+}
+
+/// Energy around the predicted bin, averaged over pairs of pixel and spot.
+struct Profile {
+    energy: Vec<f64>,
+    pairs: usize,
+}
+
+impl Profile {
+    fn at(&self, shift: isize) -> f64 {
+        self.energy[(shift + REACH) as usize] / self.pairs.max(1) as f64
+    }
+
+    fn peak(&self) -> isize {
+        let all = -REACH..=REACH;
+        all.max_by(|a, b| self.at(*a).total_cmp(&self.at(*b)))
+            .expect("not empty")
+    }
+
+    /// The best of the tolerated shifts.
+    fn hit(&self) -> f64 {
+        let near = (-TOLERANCE..=TOLERANCE).map(|s| self.at(s));
+        near.fold(0.0, f64::max)
+    }
+
+    /// What stands out at the prediction.
+    fn excess(&self) -> f64 {
+        self.hit() - self.background()
+    }
+
+    /// Median of the shifts farther off.
+    fn background(&self) -> f64 {
+        let far = (-REACH..=REACH).filter(|s| s.abs() > 2 * TOLERANCE + 2);
+        let mut far: Vec<f64> = far.map(|s| self.at(s)).collect();
+        far.sort_by(f64::total_cmp);
+        far[far.len() / 2]
+    }
+}
+
+/// Checks a scene and tells what was found.
+///
+/// # Errors
+/// [`ImportError::Refused`] with the reading that fits better, where there is one.
+pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, ImportError> {
+    let surface = on_surface(g, blame)?;
+    let own = Reading::default();
+    let mend = "see whether the files belong together, or import them as they are with --unchecked";
+    let all = profile(g, own, Which::All);
+    if all.pairs < MIN_PAIRS {
+        let expected = format!(
+            "at least {MIN_PAIRS} pairs of a sampled pixel and a spot, with light in the gate"
+        );
+        let found = format!("{}, too few to check anything", all.pairs);
+        return Err(ImportError::refused(
+            blame.histogram,
+            "light",
+            expected,
+            found,
+            mend,
+        ));
+    }
+    // Masks of the wrong polarity must not make the gate look wrong: they come last.
+    let step = step(g) as f64 * g.shape.gate.bin_width_m;
+    let peak = all.peak();
+    let clear = all.at(peak) > all.background() * CONTRAST;
+    if peak.abs() > TOLERANCE && all.at(peak) > all.hit() * BETTER && clear {
+        let expected = format!(
+            "two-bounce light at the time of flight that depth and spots predict, within {:.4} m of path",
+            TOLERANCE as f64 * step
+        );
+        let found = format!(
+            "it {:.4} m of path {} the prediction",
+            peak.unsigned_abs() as f64 * step,
+            if peak > 0 { "after" } else { "before" }
+        );
+        let mend = format!(
+            "the gate may be another one: {}; or import as it is with --unchecked",
+            blame.mend
+        );
+        return Err(ImportError::refused(
+            blame.histogram,
+            "gate",
+            expected,
+            found,
+            mend,
+        ));
+    }
+    readings(g, blame, all.excess())?;
+    let lit = profile(g, own, Which::Lit);
+    polarity(g, blame, &lit)?;
+    if lit.pairs < MIN_PAIRS {
+        let expected =
+            format!("at least {MIN_PAIRS} pairs of a sampled pixel and a spot that lights it");
+        let found = format!("{}, too few to check anything", lit.pairs);
+        return Err(ImportError::refused(
+            blame.visibility,
+            "lit pixels",
+            expected,
+            found,
+            mend,
+        ));
+    }
+    let (hit, background) = (lit.hit(), lit.background());
+    if hit < background * CONTRAST || hit == 0.0 {
+        let expected = format!(
+            "energy at the predicted bins {CONTRAST} times that of the bins around them at least"
+        );
+        let found = format!("{:.2} times", hit / background.max(f64::MIN_POSITIVE));
+        return Err(ImportError::refused(
+            blame.histogram,
+            "two-bounce light",
+            expected,
+            found,
+            format!(
+                "units, gate, intrinsics or the number of spots may be others: {}; or import as it is with --unchecked",
+                blame.mend
+            ),
+        ));
+    }
+    Ok(json!({
+        "pairs": lit.pairs, "tolerance_m": TOLERANCE as f64 * step, "peak_shift_m": peak as f64 * step,
+        "energy_at_prediction": round(hit), "energy_around": round(background),
+        "spots_off_surface": surface.map(round),
+    }))
+}
+
+/// Few digits: the manifest is for people, too.
+fn round(x: f64) -> f64 {
+    libm::round(x * 1e6) / 1e6
+}
+
+/// Masks the wrong way round light up where no light arrives.
+fn polarity(g: &Geometry<'_>, blame: &Blame<'_>, lit: &Profile) -> Result<(), ImportError> {
+    if g.visibility.is_none() {
+        return Ok(());
+    }
+    let dark = profile(g, Reading::default(), Which::Dark);
+    let clear = dark.hit() > dark.background() * CONTRAST;
+    if dark.pairs < MIN_PAIRS || !clear || dark.excess() <= lit.excess().max(0.0) * BETTER {
+        return Ok(());
+    }
+    Err(ImportError::refused(
+        blame.visibility,
+        "polarity of the visibility masks",
+        "more two-bounce light where a mask says lit",
+        format!(
+            "{:.5} of a pixel's energy there, {:.5} where it says shadow",
+            lit.excess().max(0.0),
+            dark.excess()
+        ),
+        format!(
+            "the masks may be the other way round: {}; or import as they are with --unchecked",
+            blame.polarity
+        ),
+    ))
+}
+
+/// Whether another reading fits better.
+fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportError> {
+    let depth = Reading {
+        other_depth: true,
+        ..Reading::default()
+    };
+    let spots = |x, y| Reading {
+        flip_spots: [x, y],
+        ..Reading::default()
+    };
+    let image = |x, y| Reading {
+        flip_image: [x, y],
+        ..Reading::default()
+    };
+    let turn = "turn the array round, or import as it is with --unchecked";
+    let others = [
+        (
+            depth,
+            blame.depth,
+            "kind of depth",
+            if g.of_range {
+                "distances along the rays, as was said"
+            } else {
+                "z-depth"
+            },
+            if g.of_range {
+                "a better fit as z-depth"
+            } else {
+                "a better fit as distances along the rays"
+            },
+            "say so (--depth z or range, or the depth's kind in scene.json), or import as it is with --unchecked",
+        ),
+        (
+            spots(true, false),
+            blame.spots,
+            "x axis of the spots",
+            "x to the right",
+            "a better fit with x to the left",
+            turn,
+        ),
+        (
+            spots(false, true),
+            blame.spots,
+            "y axis of the spots",
+            "y downwards",
+            "a better fit with y upwards",
+            turn,
+        ),
+        (
+            spots(true, true),
+            blame.spots,
+            "axes of the spots",
+            "x to the right, y downwards",
+            "a better fit with both turned round",
+            turn,
+        ),
+        (
+            image(true, false),
+            blame.histogram,
+            "columns",
+            "the depth image's order",
+            "a better fit from right to left",
+            turn,
+        ),
+        (
+            image(false, true),
+            blame.histogram,
+            "rows",
+            "the depth image's order",
+            "a better fit from bottom to top",
+            turn,
+        ),
+        (
+            image(true, true),
+            blame.histogram,
+            "rows and columns",
+            "the depth image's order",
+            "a better fit with both turned round",
+            turn,
+        ),
+    ];
+    let mut best: Option<(f64, &Path, &str, &str, &str, &str)> = None;
+    for (reading, file, field, expected, found, mend) in others {
+        let other = profile(g, reading, Which::All);
+        let excess = other.excess();
+        let beaten = best.as_ref().is_none_or(|(e, ..)| excess > *e);
+        if other.pairs >= MIN_PAIRS && excess > own.max(0.0) * BETTER + 1e-6 && beaten {
+            let clear = other.hit() > other.background() * CONTRAST;
+            if clear {
+                best = Some((excess, file, field, expected, found, mend));
+            }
+        }
+    }
+    match best {
+        None => Ok(()),
+        Some((excess, file, field, expected, found, mend)) => {
+            let found = format!(
+                "{found} ({:.5} of a pixel's energy stands out at the predicted bins, instead of {:.5})",
+                excess,
+                own.max(0.0)
+            );
+            Err(ImportError::refused(file, field, expected, found, mend))
+        }
+    }
+}
+
+/// How far the spots lie off the depth image: the median of |Δz|/z, where a spot is in view of a laser at the camera.
+fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, ImportError> {
+    if norm(g.laser.map(f64::from)) > 0.02 {
+        return Ok(None);
+    }
+    let i = g.intrinsics;
+    let mut seen: Vec<(f64, f64)> = Vec::new();
+    for spot in g.spots.iter().flatten() {
+        let [x, y, z] = spot.position.map(f64::from);
+        if z <= 0.0 {
+            continue;
+        }
+        let column = libm::floor(f64::from(i.fx) * x / z + f64::from(i.cx));
+        let row = libm::floor(f64::from(i.fy) * y / z + f64::from(i.cy));
+        let (w, h) = (g.shape.width as usize, g.shape.height as usize);
+        if !(0.0..w as f64).contains(&column) || !(0.0..h as f64).contains(&row) {
+            continue;
+        }
+        let pixel = row as usize * w + column as usize;
+        let depth = f64::from(g.depth[pixel]);
+        if depth > 0.0 && g.specular[pixel] == 0 {
+            seen.push((libm::fabs(z - depth) / depth, z / depth));
+        }
+    }
+    if seen.is_empty() {
+        return Ok(None);
+    }
+    let median = |mut all: Vec<f64>| {
+        all.sort_by(f64::total_cmp);
+        all[all.len() / 2]
+    };
+    let off = median(seen.iter().map(|s| s.0).collect());
+    if off > OFF_SURFACE {
+        let ratio = median(seen.iter().map(|s| s.1).collect());
+        return Err(ImportError::refused(
+            blame.spots,
+            "positions",
+            format!(
+                "spots on the surface of {}, in metres",
+                blame.depth.display()
+            ),
+            format!(
+                "z of the spots {ratio:.3} times the depth where they project to (median of {})",
+                seen.len()
+            ),
+            format!(
+                "units or axes may be others: {}; or import as they are with --unchecked",
+                blame.mend
+            ),
+        ));
+    }
+    Ok(Some(off))
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Which {
+    All,
+    Lit,
+    Dark,
+}
+
+/// Bins in a step.
+fn step(g: &Geometry<'_>) -> usize {
+    let width = g.shape.gate.bin_width_m;
+    (libm::round(STEP_M / width) as usize).clamp(1, g.shape.gate.bins as usize)
+}
+
+fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
+    let shape = g.shape;
+    let (w, h, bins) = (
+        shape.width as usize,
+        shape.height as usize,
+        shape.gate.bins as usize,
+    );
+    let stride = (1..)
+        .find(|s| (w / s) * (h / s) <= SAMPLE)
+        .expect("some stride is wide enough");
+    let step = step(g);
+    let mut sum = vec![0.0; 2 * REACH as usize + 1];
+    let mut pairs = 0;
+    for row in (stride / 2..h).step_by(stride) {
+        for column in (stride / 2..w).step_by(stride) {
+            let pixel = row * w + column;
+            let depth = f64::from(g.depth[pixel]);
+            if depth <= 0.0 || g.specular[pixel] != 0 {
+                continue;
+            }
+            let seen = flipped(row, h, reading.flip_image[1]) * w
+                + flipped(column, w, reading.flip_image[0]);
+            let histogram = &g.transient[seen * bins..][..bins];
+            let total: f64 = histogram.iter().map(|x| f64::from(*x)).sum();
+            if total <= 0.0 {
+                continue;
+            }
+            let d = direction(g.intrinsics, row, column);
+            let z = match (reading.other_depth, g.of_range) {
+                (false, _) => depth,
+                (true, false) => depth / norm(d),
+                (true, true) => depth * norm(d),
+            };
+            let x = d.map(|c| c * z);
+            for (index, spot) in g.spots.iter().enumerate() {
+                let Some(spot) = spot else { continue };
+                let lit = g.visibility.is_none_or(|v| v[index * w * h + pixel] == 1);
+                if which != Which::All && lit != (which == Which::Lit) {
+                    continue;
+                }
+                let mut l = spot.position.map(f64::from);
+                for (axis, flip) in reading.flip_spots.iter().enumerate() {
+                    if *flip {
+                        l[axis] = -l[axis];
+                    }
+                }
+                let path = f64::from(spot.path_m) + distance(l, x) + norm(x);
+                let bin = libm::floor((path - shape.gate.start_m) / shape.gate.bin_width_m);
+                if !(0.0..bins as f64).contains(&bin) {
+                    continue;
+                }
+                let centre = bin as usize / step;
+                for (energy, shift) in sum.iter_mut().zip(-REACH..=REACH) {
+                    let Some(at) = centre.checked_add_signed(shift) else {
+                        continue;
+                    };
+                    let range = (at * step).min(bins)..((at + 1) * step).min(bins);
+                    let there: f64 = histogram[range].iter().map(|x| f64::from(*x)).sum();
+                    *energy += there / total;
+                }
+                pairs += 1;
+            }
+        }
+    }
+    Profile { energy: sum, pairs }
+}
+
+fn flipped(at: usize, size: usize, flip: bool) -> usize {
+    if flip { size - 1 - at } else { at }
+}
+
+pub(super) fn norm(a: [f64; 3]) -> f64 {
+    libm::sqrt(a.iter().map(|x| x * x).sum())
+}
+
+pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    norm([a[0] - b[0], a[1] - b[1], a[2] - b[2]])
+}

@@ -1,0 +1,103 @@
+//! The files of a scene: read whole, and remembered with their SHA-256.
+
+use std::cell::RefCell;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::ImportError;
+
+/// A file that a scene was made of.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct SourceFile {
+    /// Path below the imported folder, with `/` between its parts.
+    pub name: String,
+    /// Size.
+    pub bytes: u64,
+    /// SHA-256, hexadecimal.
+    pub sha256: String,
+}
+
+/// The files of one scene that were read so far.
+pub(super) struct Files {
+    root: PathBuf,
+    read: RefCell<Vec<SourceFile>>,
+}
+
+impl Files {
+    pub fn new(root: &Path) -> Self {
+        Self {
+            root: root.to_owned(),
+            read: RefCell::default(),
+        }
+    }
+
+    /// The bytes of a file; `what` it is for goes into the error.
+    pub fn bytes(&self, path: &Path) -> Result<Vec<u8>, ImportError> {
+        let bytes = std::fs::read(path).map_err(|e| ImportError::io("read", path, e))?;
+        self.remember(path, bytes.len() as u64, &Sha256::digest(&bytes));
+        Ok(bytes)
+    }
+
+    /// Remembers a file that its decoder reads by itself, piece by piece.
+    pub fn hash(&self, path: &Path) -> Result<(), ImportError> {
+        let failed = |e| ImportError::io("read", path, e);
+        let mut file = std::fs::File::open(path).map_err(failed)?;
+        let (mut digest, mut total) = (Sha256::new(), 0);
+        let mut buffer = vec![0; 1 << 20];
+        loop {
+            let n = file.read(&mut buffer).map_err(failed)?;
+            if n == 0 {
+                break;
+            }
+            digest.update(&buffer[..n]);
+            total += n as u64;
+        }
+        self.remember(path, total, &digest.finalize());
+        Ok(())
+    }
+
+    fn remember(&self, path: &Path, bytes: u64, sha256: &[u8]) {
+        self.read.borrow_mut().push(SourceFile {
+            name: self.name(path),
+            bytes,
+            sha256: hex::encode(sha256),
+        });
+    }
+
+    /// A path as provenance names it.
+    pub fn name(&self, path: &Path) -> String {
+        let below = path.strip_prefix(&self.root).unwrap_or(path);
+        let parts: Vec<_> = below
+            .components()
+            .map(|c| c.as_os_str().to_string_lossy().into_owned())
+            .collect();
+        parts.join("/")
+    }
+
+    /// All files read, by name, each once.
+    pub fn into_list(self) -> Vec<SourceFile> {
+        let mut files = self.read.into_inner();
+        files.sort();
+        files.dedup();
+        files
+    }
+}
+
+/// The entries of a folder by name: (folders, files).
+pub(super) fn entries(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>), ImportError> {
+    let failed = |e| ImportError::io("list", folder, e);
+    let (mut folders, mut files) = (Vec::new(), Vec::new());
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        match path.is_dir() {
+            true => folders.push(path),
+            false => files.push(path),
+        }
+    }
+    folders.sort();
+    files.sort();
+    Ok((folders, files))
+}

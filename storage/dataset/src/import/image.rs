@@ -1,0 +1,153 @@
+//! Images: OpenEXR (any compression that the `exr` crate decodes, DWAA among them) and 8-bit PNG.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use exr::block::{UncompressedBlock, chunk::Chunk};
+use exr::meta::attribute::SampleType;
+use half::f16;
+use rayon::prelude::*;
+
+use super::ImportError;
+
+const MEND_EXR: &str = "convert it to scan lines of one resolution with ZIP compression, e.g. in Python: \
+                        import OpenEXR; f = OpenEXR.File(path); f.header()['compression'] = OpenEXR.ZIP_COMPRESSION; \
+                        f.write(path)";
+
+/// A channel of an OpenEXR file, `[row][column]`.
+#[derive(Debug, Clone)]
+pub(super) struct Channel {
+    pub name: String,
+    /// `half`, `float` or `uint`.
+    pub stored: &'static str,
+    pub values: Vec<f32>,
+}
+
+/// An OpenEXR file.
+#[derive(Debug, Clone)]
+pub(super) struct Exr {
+    pub width: usize,
+    pub height: usize,
+    /// Name of the compression.
+    pub compression: String,
+    pub channels: Vec<Channel>,
+}
+
+/// Width and height of an OpenEXR file's only layer.
+pub(super) fn exr_size(file: &Path) -> Result<(usize, usize), ImportError> {
+    let meta = exr::meta::MetaData::read_from_file(file, false)
+        .map_err(|e| ImportError::unreadable(file, e, MEND_EXR))?;
+    let size = meta.headers[0].layer_size;
+    Ok((size.width(), size.height()))
+}
+
+/// Decodes an OpenEXR file on rayon's threads.
+pub(super) fn exr(file: &Path, bytes: &[u8]) -> Result<Exr, ImportError> {
+    let failed = |e: exr::error::Error| ImportError::unreadable(file, e, MEND_EXR);
+    let reader = exr::block::read(Cursor::new(bytes), false).map_err(failed)?;
+    let header = reader.headers()[0].clone();
+    let plain = header.blocks == exr::meta::BlockDescription::ScanLines && !header.deep;
+    if reader.headers().len() != 1 || !plain {
+        let what = "expected one layer of scan lines";
+        return Err(ImportError::unreadable(file, what, MEND_EXR));
+    }
+    let (width, height) = (header.layer_size.width(), header.layer_size.height());
+    let mut chunks = reader.all_chunks(false).map_err(failed)?;
+    let meta = exr::block::reader::ChunksReader::meta_data(&chunks).clone();
+    let all: Vec<Chunk> = (&mut chunks).collect::<Result<_, _>>().map_err(failed)?;
+    let lines = header.compression.scan_lines_per_block();
+    let mut channels: Vec<Channel> = header
+        .channels
+        .list
+        .iter()
+        .map(|c| Channel {
+            name: c.name.to_string(),
+            stored: match c.sample_type {
+                SampleType::F16 => "half",
+                SampleType::F32 => "float",
+                SampleType::U32 => "uint",
+            },
+            values: vec![0.0; width * height],
+        })
+        .collect();
+    let mut targets: Vec<Vec<&mut [f32]>> = Vec::new();
+    targets.resize_with(height.div_ceil(lines), Vec::new);
+    for channel in &mut channels {
+        for (slot, target) in targets
+            .iter_mut()
+            .zip(channel.values.chunks_mut(lines * width))
+        {
+            slot.push(target);
+        }
+    }
+    if all.len() != targets.len() {
+        let what = format!("expected {} blocks, found {}", targets.len(), all.len());
+        return Err(ImportError::unreadable(file, what, MEND_EXR));
+    }
+    // Blocks may stand in any order in the file.
+    let mut slots: Vec<Option<Vec<&mut [f32]>>> = targets.into_iter().map(Some).collect();
+    let mut work = Vec::with_capacity(all.len());
+    for chunk in all {
+        let block = match &chunk.compressed_block {
+            exr::block::chunk::CompressedBlock::ScanLine(b) => {
+                (i64::from(b.y_coordinate) - i64::from(header.own_attributes.layer_position.y()))
+                    / lines as i64
+            }
+            _ => -1,
+        };
+        let slot = usize::try_from(block).ok().and_then(|b| slots.get_mut(b));
+        let Some(target) = slot.and_then(Option::take) else {
+            let what = "a block stands outside the image, or twice";
+            return Err(ImportError::unreadable(file, what, MEND_EXR));
+        };
+        work.push((chunk, target));
+    }
+    work.into_par_iter().try_for_each(|(chunk, mut target)| {
+        let block = UncompressedBlock::decompress_chunk(chunk, &meta, false).map_err(failed)?;
+        let top = block.index.pixel_position.y();
+        for line in block.lines(&header.channels) {
+            let at = (line.location.position.y() - top) * width;
+            let out = &mut target[line.location.channel][at..at + width];
+            match header.channels.list[line.location.channel].sample_type {
+                SampleType::F16 => fill(out, line.value, |raw: [u8; 2]| {
+                    f16::from_ne_bytes(raw).to_f32()
+                }),
+                SampleType::F32 => fill(out, line.value, f32::from_ne_bytes),
+                SampleType::U32 => fill(out, line.value, |raw: [u8; 4]| {
+                    u32::from_ne_bytes(raw) as f32
+                }),
+            }
+        }
+        Ok::<_, ImportError>(())
+    })?;
+    Ok(Exr {
+        width,
+        height,
+        compression: format!("{:?}", header.compression),
+        channels,
+    })
+}
+
+fn fill<const N: usize>(out: &mut [f32], raw: &[u8], value: impl Fn([u8; N]) -> f32) {
+    for (out, raw) in out.iter_mut().zip(raw.chunks_exact(N)) {
+        *out = value(raw.try_into().expect("chunks have this size"));
+    }
+}
+
+/// The first channel of an 8-bit PNG as (width, height, values); grey is its only one.
+pub(super) fn png(file: &Path, bytes: &[u8]) -> Result<(usize, usize, Vec<u8>), ImportError> {
+    let mend = "save it again as an 8-bit grey PNG";
+    let failed = |e: png::DecodingError| ImportError::unreadable(file, e, mend);
+    let mut decoder = png::Decoder::new(Cursor::new(bytes));
+    decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
+    let mut reader = decoder.read_info().map_err(failed)?;
+    let size = reader.output_buffer_size();
+    let mut buffer = vec![0; size.filter(|n| *n <= 1 << 30).unwrap_or(0)];
+    let info = reader.next_frame(&mut buffer).map_err(failed)?;
+    let samples = info.color_type.samples();
+    let values = buffer[..info.buffer_size()]
+        .chunks_exact(samples)
+        .map(|pixel| pixel[0])
+        .collect();
+    Ok((info.width as usize, info.height as usize, values))
+}

@@ -1,0 +1,310 @@
+//! MATLAB's files: numeric arrays of version 5 (plain or compressed) and of version 7.3 (HDF5).
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use super::ImportError;
+use super::files::Files;
+
+const MEND: &str = "save it again with save('file.mat', '-v7'), or in Python with scipy.io.savemat";
+
+/// A numeric array, first index fastest.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Matrix {
+    pub dims: Vec<usize>,
+    pub values: Vec<f64>,
+}
+
+/// An open file.
+pub(super) struct Mat {
+    path: PathBuf,
+    content: Content,
+}
+
+enum Content {
+    V5(BTreeMap<String, Matrix>),
+    V73(Box<hdf5_pure::File>),
+}
+
+impl Mat {
+    /// Opens a file; version 7.3 stays on disk until an array is read.
+    pub fn open(path: &Path, files: &Files) -> Result<Self, ImportError> {
+        let mut head = [0; 128];
+        let mut file = std::fs::File::open(path).map_err(|e| ImportError::io("read", path, e))?;
+        let whole_head = file.read_exact(&mut head).is_ok();
+        let hdf5 = hdf5_pure::is_hdf5(path).map_err(|e| ImportError::io("read", path, e))?;
+        let content = if hdf5 {
+            files.hash(path)?;
+            let opened = hdf5_pure::File::open_streaming(path);
+            Content::V73(Box::new(
+                opened.map_err(|e| ImportError::unreadable(path, e, MEND))?,
+            ))
+        } else if whole_head && matches!(&head[126..128], b"IM" | b"MI") {
+            let bytes = files.bytes(path)?;
+            let arrays = version_5(&bytes).map_err(|e| ImportError::unreadable(path, e, MEND))?;
+            Content::V5(arrays)
+        } else {
+            let what = "neither a MATLAB file of version 5 nor one of version 7.3 (HDF5)";
+            return Err(ImportError::unreadable(path, what, MEND));
+        };
+        Ok(Self {
+            path: path.to_owned(),
+            content,
+        })
+    }
+
+    /// Dimensions of an array as MATLAB tells them.
+    pub fn dims(&self, name: &str) -> Result<Vec<usize>, ImportError> {
+        match &self.content {
+            Content::V5(arrays) => arrays
+                .get(name)
+                .map(|m| m.dims.clone())
+                .ok_or_else(|| self.absent(name)),
+            Content::V73(file) => {
+                let set = file.dataset(name).map_err(|_| self.absent(name))?;
+                let shape = set.shape().map_err(|e| self.broken(name, e))?;
+                Ok(shape.iter().rev().map(|s| *s as usize).collect())
+            }
+        }
+    }
+
+    /// A whole array.
+    pub fn matrix(&self, name: &str) -> Result<Matrix, ImportError> {
+        let dims = self.dims(name)?;
+        match &self.content {
+            Content::V5(arrays) => Ok(arrays[name].clone()),
+            Content::V73(file) => {
+                let set = file.dataset(name).map_err(|_| self.absent(name))?;
+                let values = set.read_f64().map_err(|e| self.broken(name, e))?;
+                Ok(Matrix { dims, values })
+            }
+        }
+    }
+
+    /// A single number.
+    pub fn number(&self, name: &str) -> Result<f64, ImportError> {
+        let matrix = self.matrix(name)?;
+        match matrix.values[..] {
+            [x] => Ok(x),
+            _ => {
+                let found = format!("{:?}", matrix.dims);
+                Err(ImportError::refused(
+                    &self.path,
+                    name,
+                    "one number",
+                    found,
+                    "save it so",
+                ))
+            }
+        }
+    }
+
+    /// Some columns of a matrix `[row, column]` as `[row][column]`, reading no more than needed.
+    pub fn columns(&self, name: &str, columns: Range<usize>) -> Result<Vec<f32>, ImportError> {
+        let dims = self.dims(name)?;
+        let rows = dims[0];
+        let mut out = vec![0.0; rows * columns.len()];
+        let mut put = |column: usize, values: &[f64]| {
+            for (row, x) in values.iter().enumerate() {
+                out[row * columns.len() + column - columns.start] = *x as f32;
+            }
+        };
+        match &self.content {
+            Content::V5(arrays) => {
+                for c in columns.clone() {
+                    put(c, &arrays[name].values[c * rows..][..rows]);
+                }
+            }
+            Content::V73(file) => {
+                let set = file.dataset(name).map_err(|_| self.absent(name))?;
+                // HDF5 tells the axes the other way round: a column is a row there.
+                const AT_ONCE: usize = 64;
+                for first in columns.clone().step_by(AT_ONCE) {
+                    let n = AT_ONCE.min(columns.end - first);
+                    let read = set.read_f64_rows(first as u64, n as u64);
+                    let values = read.map_err(|e| self.broken(name, e))?;
+                    for (k, column) in values.chunks_exact(rows).enumerate() {
+                        put(first + k, column);
+                    }
+                }
+            }
+        }
+        Ok(out)
+    }
+
+    fn absent(&self, name: &str) -> ImportError {
+        let found = match &self.content {
+            Content::V5(arrays) => format!("{:?}", arrays.keys().collect::<Vec<_>>()),
+            Content::V73(file) => format!("{:?}", file.root().datasets().unwrap_or_default()),
+        };
+        ImportError::refused(
+            &self.path,
+            "arrays",
+            format!("a numeric array {name}"),
+            found,
+            "see whether it is the right file",
+        )
+    }
+
+    fn broken(&self, name: &str, error: hdf5_pure::Error) -> ImportError {
+        ImportError::unreadable(&self.path, format!("{name}: {error}"), MEND)
+    }
+}
+
+/// One element: type and contents.
+struct Element<'a> {
+    kind: u32,
+    data: &'a [u8],
+}
+
+/// Reads elements one after the other.
+struct Elements<'a> {
+    rest: &'a [u8],
+    big: bool,
+}
+
+impl<'a> Elements<'a> {
+    fn word(&self, at: usize) -> Option<u32> {
+        let raw: [u8; 4] = self.rest.get(at..at + 4)?.try_into().ok()?;
+        Some(if self.big {
+            u32::from_be_bytes(raw)
+        } else {
+            u32::from_le_bytes(raw)
+        })
+    }
+
+    fn next(&mut self) -> Result<Option<Element<'a>>, String> {
+        const CUT: &str = "an element is cut off";
+        if self.rest.is_empty() {
+            return Ok(None);
+        }
+        let first = self.word(0).ok_or(CUT)?;
+        if first >> 16 != 0 {
+            let size = (first >> 16) as usize;
+            let data = self
+                .rest
+                .get(4..4 + size.min(5))
+                .filter(|_| size <= 4)
+                .ok_or(CUT)?;
+            self.rest = self.rest.get(8..).unwrap_or_default();
+            return Ok(Some(Element {
+                kind: first & 0xffff,
+                data,
+            }));
+        }
+        let size = self.word(4).ok_or(CUT)? as usize;
+        let data = self.rest.get(8..8 + size).ok_or(CUT)?;
+        let padded = if first == COMPRESSED {
+            size
+        } else {
+            size.next_multiple_of(8)
+        };
+        self.rest = self.rest.get(8 + padded..).unwrap_or_default();
+        Ok(Some(Element { kind: first, data }))
+    }
+
+    fn expect(&mut self) -> Result<Element<'a>, String> {
+        self.next()?.ok_or_else(|| "an array is cut off".into())
+    }
+}
+
+const MATRIX: u32 = 14;
+const COMPRESSED: u32 = 15;
+/// An element may grow to so many bytes.
+const MAX: u64 = 1 << 33;
+
+/// The numeric arrays of a version 5 file; others (text, structures, cells) are passed over.
+fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
+    let big = &bytes[126..128] == b"MI";
+    let mut arrays = BTreeMap::new();
+    let mut elements = Elements {
+        rest: &bytes[128..],
+        big,
+    };
+    while let Some(element) = elements.next()? {
+        let mut inflated = Vec::new();
+        let element = match element.kind {
+            COMPRESSED => {
+                let reader = flate2::read::ZlibDecoder::new(element.data);
+                reader
+                    .take(MAX)
+                    .read_to_end(&mut inflated)
+                    .map_err(|e| format!("a compressed element: {e}"))?;
+                Elements {
+                    rest: &inflated,
+                    big,
+                }
+                .expect()?
+            }
+            _ => element,
+        };
+        if element.kind == MATRIX
+            && let Some((name, matrix)) = matrix(element.data, big)?
+        {
+            arrays.insert(name, matrix);
+        }
+    }
+    Ok(arrays)
+}
+
+fn matrix(data: &[u8], big: bool) -> Result<Option<(String, Matrix)>, String> {
+    let mut parts = Elements { rest: data, big };
+    if data.is_empty() {
+        return Ok(None);
+    }
+    let flags = numbers(&parts.expect()?, big)?;
+    let class = flags.first().copied().unwrap_or(0.0) as u32 & 0xff;
+    // Double to 64-bit integers.
+    if !(6..=15).contains(&class) {
+        return Ok(None);
+    }
+    let dims: Vec<usize> = numbers(&parts.expect()?, big)?
+        .iter()
+        .map(|d| *d as usize)
+        .collect();
+    let name = String::from_utf8_lossy(parts.expect()?.data).into_owned();
+    let values = numbers(&parts.expect()?, big)?;
+    let count = dims.iter().try_fold(1usize, |n, d| n.checked_mul(*d));
+    if count != Some(values.len()) {
+        return Err(format!(
+            "{name}: dimensions {dims:?} with {} values",
+            values.len()
+        ));
+    }
+    Ok(Some((name, Matrix { dims, values })))
+}
+
+fn numbers(element: &Element<'_>, big: bool) -> Result<Vec<f64>, String> {
+    macro_rules! read {
+        ($type:ty) => {{
+            let one = |raw: &[u8]| {
+                let raw = raw.try_into().expect("chunks have this size");
+                (if big {
+                    <$type>::from_be_bytes(raw)
+                } else {
+                    <$type>::from_le_bytes(raw)
+                }) as f64
+            };
+            Ok(element
+                .data
+                .chunks_exact(size_of::<$type>())
+                .map(one)
+                .collect())
+        }};
+    }
+    match element.kind {
+        1 => read!(i8),
+        2 => read!(u8),
+        3 => read!(i16),
+        4 => read!(u16),
+        5 => read!(i32),
+        6 => read!(u32),
+        7 => read!(f32),
+        9 => read!(f64),
+        12 => read!(i64),
+        13 => read!(u64),
+        other => Err(format!("numbers of unknown type {other}")),
+    }
+}

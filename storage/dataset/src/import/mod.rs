@@ -1,0 +1,264 @@
+//! Other people's data in our layout. What the files say is read, what a format is known for is checked against them
+//! (see `check.rs`), and what does not fit is refused by name; nothing is guessed.
+//!
+//! [`import_scene`] is a pure function of the files and options. The manifest of an imported scene names the format,
+//! the files with their SHA-256, and everything that was converted or is missing.
+
+mod bf_lidar;
+mod check;
+mod error;
+mod files;
+mod image;
+mod mat;
+pub(crate) mod npy;
+mod npy_folder;
+mod options;
+mod platonerf;
+mod publish;
+mod sb3d;
+mod scene;
+
+use std::path::{Path, PathBuf};
+
+pub use error::ImportError;
+pub use files::SourceFile;
+pub use options::{Captures, DepthKind, Format, ImportOptions, Polarity};
+pub use scene::ImportedScene;
+
+use files::Files;
+use scene::Shape;
+
+use crate::spec::{DatasetSpec, Profile};
+
+/// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
+pub const IMPORT_VERSION: &str = "import-1";
+
+/// Scenes in a folder that can be imported.
+#[derive(Debug, Clone)]
+pub struct Source {
+    root: PathBuf,
+    format: Format,
+    options: ImportOptions,
+    items: Vec<Item>,
+    shape: Shape,
+}
+
+/// Where a scene of a source lies.
+#[derive(Debug, Clone)]
+struct Item {
+    name: String,
+    /// The scene's folder.
+    folder: PathBuf,
+    /// Which capture of the folder; `None` = all of it.
+    capture: Option<usize>,
+}
+
+impl Item {
+    fn new(root: &Path, folder: PathBuf) -> Self {
+        let name = match folder == root {
+            true => ".".into(),
+            false => Files::new(root).name(&folder),
+        };
+        Self {
+            name,
+            folder,
+            capture: None,
+        }
+    }
+}
+
+impl Source {
+    /// Looks for scenes in `root` and its folders, in the order of their names; with `names`, these scenes in this
+    /// order. The first scene's files say what the data set's properties will be. `format` = `None`: whichever is
+    /// found.
+    ///
+    /// # Errors
+    /// [`ImportError::Refused`] where there is nothing of the format, or of several; where the first scene's files or
+    /// the options do not fit the format; [`ImportError::Io`].
+    pub fn open(
+        root: &Path,
+        format: Option<Format>,
+        options: ImportOptions,
+        names: Option<&[String]>,
+    ) -> Result<Self, ImportError> {
+        let (format, mut items) = match format {
+            Some(format) => (format, find(root, format, &options)?),
+            None => detect(root, &options)?,
+        };
+        options.check(format)?;
+        if let Some(names) = names {
+            items = choose(root, items, names)?;
+        }
+        let Some(first) = items.first() else {
+            let expected = format!(
+                "scenes in the layout {}: {}",
+                format.name(),
+                looks_like(format)
+            );
+            return Err(ImportError::refused(
+                root,
+                "contents",
+                expected,
+                "none",
+                "check the folder, or give another --format",
+            ));
+        };
+        let shape = match format {
+            Format::Sb3d => sb3d::shape(first, &options),
+            Format::Platonerf => platonerf::shape(first, &options),
+            Format::BfLidar => bf_lidar::shape(first, &options),
+            Format::Npy => npy_folder::shape(first),
+        }?;
+        Ok(Self {
+            root: root.to_owned(),
+            format,
+            options,
+            items,
+            shape,
+        })
+    }
+
+    /// Its format.
+    pub fn format(&self) -> Format {
+        self.format
+    }
+
+    /// Number of scenes.
+    pub fn scenes(&self) -> u64 {
+        self.items.len() as u64
+    }
+
+    /// Name of a scene: its folder below the source's, and the capture in it.
+    pub fn name(&self, index: u64) -> Option<&str> {
+        let item = self.items.get(usize::try_from(index).ok()?);
+        item.map(|i| i.name.as_str())
+    }
+
+    /// The data set that holds the scenes.
+    pub fn spec(&self, profile: Profile) -> DatasetSpec {
+        DatasetSpec {
+            scenes: self.scenes(),
+            height: self.shape.height,
+            width: self.shape.width,
+            spots: self.shape.spots,
+            subsets: self.shape.subsets,
+            per_spot: false,
+            gate: self.shape.gate,
+            profile,
+        }
+    }
+}
+
+/// Reads, checks and converts a scene. Blocks; decodes on rayon's threads. Holds one scene in memory.
+///
+/// # Errors
+/// [`ImportError`] naming file and field; there is no such scene.
+pub fn import_scene(source: &Source, index: u64) -> Result<ImportedScene, ImportError> {
+    let item = usize::try_from(index)
+        .ok()
+        .and_then(|i| source.items.get(i));
+    let Some(item) = item else {
+        let expected = format!("an index below {}", source.scenes());
+        return Err(ImportError::refused(
+            &source.root,
+            "scene",
+            expected,
+            index.to_string(),
+            "choose another one",
+        ));
+    };
+    let (options, files) = (&source.options, Files::new(&source.root));
+    let mut scene = match source.format {
+        Format::Sb3d => sb3d::read(item, options, &files),
+        Format::Platonerf => platonerf::read(item, options, &files),
+        Format::BfLidar => bf_lidar::read(item, options, &files),
+        Format::Npy => npy_folder::read(item, options, &files),
+    }?;
+    scene.files = files.into_list();
+    if let Some((field, first, this)) = source.shape.difference(&scene.shape) {
+        let expected = format!("{first}, as in scene {}", source.items[0].name);
+        let mend = "import scenes of other shapes into a data set of their own";
+        return Err(ImportError::refused(
+            &item.folder,
+            field,
+            expected,
+            this,
+            mend,
+        ));
+    }
+    Ok(scene)
+}
+
+fn find(root: &Path, format: Format, options: &ImportOptions) -> Result<Vec<Item>, ImportError> {
+    match format {
+        Format::Sb3d => sb3d::find(root),
+        Format::Platonerf => platonerf::find(root, options),
+        Format::BfLidar => bf_lidar::find(root, options),
+        Format::Npy => npy_folder::find(root),
+    }
+}
+
+fn detect(root: &Path, options: &ImportOptions) -> Result<(Format, Vec<Item>), ImportError> {
+    let mut found = Vec::new();
+    for format in Format::ALL {
+        let items = find(root, format, options)?;
+        if !items.is_empty() {
+            found.push((format, items));
+        }
+    }
+    if found.len() == 1 {
+        return Ok(found.remove(0));
+    }
+    let names: Vec<&str> = found.iter().map(|(f, _)| f.name()).collect();
+    let expected: Vec<String> = Format::ALL
+        .iter()
+        .map(|f| format!("{} ({})", f.name(), looks_like(*f)))
+        .collect();
+    let expected = format!("scenes in one of the layouts {}", expected.join(", "));
+    let found = match names.is_empty() {
+        true => "none of them".into(),
+        false => names.join(" and "),
+    };
+    let mend = "check the folder, or say which with --format";
+    Err(ImportError::refused(
+        root, "contents", expected, found, mend,
+    ))
+}
+
+fn looks_like(format: Format) -> &'static str {
+    match format {
+        Format::Sb3d => "lidar_4.exr, lidar_25.exr or lidar_100.exr in a folder for each scene",
+        Format::Platonerf => "transforms_train.json beside the folder of .npy captures",
+        Format::BfLidar => "spot_1.mat and so on beside a detector_scan*.mat",
+        Format::Npy => "scene.json in a folder for each scene",
+    }
+}
+
+/// The folders that `is_scene`: the root itself, or those in it.
+fn folders_with(root: &Path, is_scene: impl Fn(&Path) -> bool) -> Result<Vec<Item>, ImportError> {
+    if is_scene(root) {
+        return Ok(vec![Item::new(root, root.to_owned())]);
+    }
+    let (folders, _) = files::entries(root)?;
+    let scenes = folders.into_iter().filter(|f| is_scene(f));
+    Ok(scenes.map(|folder| Item::new(root, folder)).collect())
+}
+
+/// The named ones, in that order.
+fn choose(root: &Path, items: Vec<Item>, names: &[String]) -> Result<Vec<Item>, ImportError> {
+    let mut by_name: std::collections::BTreeMap<String, Item> =
+        items.into_iter().map(|i| (i.name.clone(), i)).collect();
+    let take = |name: &String| {
+        by_name.remove(name).ok_or_else(|| {
+            let mend = "correct the list: each scene once, named by its folder";
+            ImportError::refused(
+                root,
+                "scene",
+                format!("{name:?}"),
+                "no such folder, or listed twice",
+                mend,
+            )
+        })
+    };
+    names.iter().map(take).collect()
+}

@@ -1,0 +1,144 @@
+//! Imported scenes in a data set: coded with their provenance, and found again when an import goes on.
+
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use super::{IMPORT_VERSION, ImportError, ImportedScene, Source, SourceFile};
+use crate::dataset::Dataset;
+use crate::encode::EncodedScene;
+use crate::error::DatasetError;
+use crate::manifest::{ENCODER_VERSION, Manifest};
+use crate::record::Provenance;
+
+impl Source {
+    /// Codes an imported scene; publish it with [`Dataset::publish_encoded`]. Blocks; works on rayon's threads.
+    ///
+    /// # Errors
+    /// [`ImportError::Dataset`].
+    pub fn encode(
+        &self,
+        dataset: &Dataset,
+        index: u64,
+        scene: &ImportedScene,
+    ) -> Result<EncodedScene, ImportError> {
+        let key = json!({
+            "import": IMPORT_VERSION, "encoder": ENCODER_VERSION, "format": self.format, "options": self.options,
+            "profile": dataset.spec().profile, "scene": scene.name, "files": scene.files,
+        });
+        let plan = json!({
+            "kind": "import", "format": self.format, "options": self.options, "scene": scene.name,
+            "files": scene.files, "conversions": scene.conversions, "missing": scene.missing, "check": scene.check,
+        });
+        let provenance = Provenance {
+            task_key: hex::encode(Sha256::digest(key.to_string())),
+            renderer: format!("{IMPORT_VERSION}/{ENCODER_VERSION}"),
+            seed: 0,
+            plan,
+        };
+        let encoded = scene.with_record(|record| dataset.encode(index, record, &provenance));
+        Ok(encoded?)
+    }
+
+    /// The manifest of scene `index` if this import has published it before: from the same files by name and size,
+    /// with the same options. With `rehash`, the files' contents are compared too.
+    ///
+    /// # Errors
+    /// [`ImportError::Refused`] where the data set holds something else under this index;
+    /// [`ImportError::Dataset`] where a published scene is damaged.
+    pub async fn finished(
+        &self,
+        dataset: &Dataset,
+        index: u64,
+        rehash: bool,
+    ) -> Result<Option<Manifest>, ImportError> {
+        let manifest = match dataset.published(index).await {
+            Ok(Some(manifest)) => manifest,
+            Ok(None) => return Ok(None),
+            // Importing it again restores what is missing, or tells what is wrong.
+            Err(DatasetError::Damaged { .. }) => return Ok(None),
+            Err(error) => return Err(error.into()),
+        };
+        let plan = &manifest.provenance.plan;
+        let ours = [
+            ("kind", json!("import")),
+            ("scene", json!(self.name(index))),
+            ("format", json!(self.format)),
+            ("options", json!(self.options)),
+        ];
+        for (field, expected) in ours {
+            if plan[field] != expected {
+                return Err(self.other(dataset, index, field, &expected, &plan[field]));
+            }
+        }
+        let version = json!(format!("{IMPORT_VERSION}/{ENCODER_VERSION}"));
+        let stored = json!(manifest.provenance.renderer);
+        if stored != version {
+            return Err(self.other(dataset, index, "version", &version, &stored));
+        }
+        let files: Vec<SourceFile> =
+            serde_json::from_value(plan["files"].clone()).map_err(|e| {
+                self.other(
+                    dataset,
+                    index,
+                    "files",
+                    &json!("a list"),
+                    &json!(e.to_string()),
+                )
+            })?;
+        for file in &files {
+            self.unchanged(dataset, index, file, rehash)?;
+        }
+        Ok(Some(manifest))
+    }
+
+    fn unchanged(
+        &self,
+        dataset: &Dataset,
+        index: u64,
+        file: &SourceFile,
+        rehash: bool,
+    ) -> Result<(), ImportError> {
+        let path = file
+            .name
+            .split('/')
+            .fold(self.root.clone(), |p, part| p.join(part));
+        let now = std::fs::metadata(&path).map_err(|e| ImportError::io("look up", &path, e))?;
+        if now.len() != file.bytes {
+            let (now, then) = (json!(now.len()), json!(file.bytes));
+            return Err(self.other(
+                dataset,
+                index,
+                &format!("size of {}", file.name),
+                &now,
+                &then,
+            ));
+        }
+        if rehash {
+            let files = super::Files::new(&self.root);
+            files.hash(&path)?;
+            let now = files.into_list().remove(0).sha256;
+            if now != file.sha256 {
+                let what = format!("SHA-256 of {}", file.name);
+                return Err(self.other(dataset, index, &what, &json!(now), &json!(file.sha256)));
+            }
+        }
+        Ok(())
+    }
+
+    fn other(
+        &self,
+        dataset: &Dataset,
+        index: u64,
+        field: &str,
+        expected: &Value,
+        found: &Value,
+    ) -> ImportError {
+        ImportError::refused(
+            dataset.shown(&dataset.path(&Manifest::key(index))),
+            field,
+            format!("{expected}, as this import has it"),
+            found.to_string(),
+            "import into another data set; if scenes were added to the source, keep their order with --list",
+        )
+    }
+}

@@ -1,0 +1,296 @@
+//! A scene as read from files, in our units and axes, and ready to be coded.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::check::{distance, norm};
+use super::{ImportError, SourceFile};
+use crate::layout::Quantity;
+use crate::record::{Intrinsics, SceneRecord, Spot, SubsetRecord};
+use crate::spec::{Gate, Subsets};
+use crate::squareroot::photon_scale;
+
+/// Photons in the median pixel's brightest bin: the convention for the stored scale.
+const PEAK_PHOTONS: f32 = 400.0;
+/// Negative energy, relative to the whole, that a lossy code may have left.
+const NEGATIVE: f64 = 0.01;
+/// Depths beyond are the sky.
+const SKY_M: f32 = 1e4;
+
+/// Sizes that all scenes of a data set share.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Shape {
+    pub height: u32,
+    pub width: u32,
+    pub spots: u32,
+    pub subsets: Subsets,
+    pub gate: Gate,
+}
+
+impl Shape {
+    pub fn pixels(&self) -> usize {
+        self.height as usize * self.width as usize
+    }
+
+    /// The first field in which `other` differs: (field, ours, theirs).
+    pub fn difference(&self, other: &Self) -> Option<(&'static str, String, String)> {
+        let pairs = [
+            ("height", self.height.to_string(), other.height.to_string()),
+            ("width", self.width.to_string(), other.width.to_string()),
+            ("spots", self.spots.to_string(), other.spots.to_string()),
+            (
+                "subsets",
+                format!("{:?}", self.subsets.sizes()),
+                format!("{:?}", other.subsets.sizes()),
+            ),
+            (
+                "gate",
+                format!("{:?}", self.gate),
+                format!("{:?}", other.gate),
+            ),
+        ];
+        pairs.into_iter().find(|(_, ours, theirs)| ours != theirs)
+    }
+}
+
+/// A scene read, checked and converted.
+#[derive(Debug, Clone)]
+pub struct ImportedScene {
+    /// Its name in the source.
+    pub name: String,
+    /// The files it was made of.
+    pub files: Vec<SourceFile>,
+    /// What was converted, in words.
+    pub conversions: Vec<String>,
+    /// Quantities that the source does not have; they are stored as zeros.
+    pub missing: Vec<&'static str>,
+    /// What the cross-check found; null where it was left out.
+    pub check: Value,
+    pub(super) shape: Shape,
+    pub(super) transient: Vec<f32>,
+    pub(super) subsets: Vec<(Quantity, Vec<f32>)>,
+    pub(super) depth: Vec<f32>,
+    pub(super) range: Vec<f32>,
+    pub(super) normal: Vec<f32>,
+    pub(super) instance: Vec<u32>,
+    pub(super) label: Vec<u16>,
+    pub(super) specular: Vec<u8>,
+    pub(super) visibility: Vec<u8>,
+    pub(super) rgb: Vec<f32>,
+    pub(super) spots: Vec<Option<Spot>>,
+    pub(super) intrinsics: Intrinsics,
+    pub(super) camera: [[f32; 4]; 4],
+    pub(super) laser: [f32; 3],
+    /// Photons per unit of h; `None` = by the convention.
+    pub(super) scale: Option<f32>,
+}
+
+impl ImportedScene {
+    /// A scene of nothing but its histogram and geometry.
+    pub(super) fn new(
+        name: &str,
+        shape: Shape,
+        transient: Vec<f32>,
+        intrinsics: Intrinsics,
+    ) -> Self {
+        let n = shape.pixels();
+        Self {
+            name: name.to_owned(),
+            files: Vec::new(),
+            conversions: Vec::new(),
+            missing: Vec::new(),
+            check: Value::Null,
+            transient,
+            subsets: Vec::new(),
+            depth: vec![0.0; n],
+            range: vec![0.0; n],
+            normal: vec![0.0; n * 3],
+            instance: vec![0; n],
+            label: vec![0; n],
+            specular: vec![0; n],
+            visibility: vec![0; n * shape.spots as usize],
+            rgb: vec![0.0; n * 3],
+            spots: vec![None; shape.spots as usize],
+            intrinsics,
+            camera: IDENTITY,
+            laser: [0.0; 3],
+            scale: None,
+            shape,
+        }
+    }
+
+    /// Sets depth and range from an image of either.
+    pub(super) fn set_depth(
+        &mut self,
+        file: &Path,
+        values: &[f32],
+        is_range: bool,
+    ) -> Result<(), ImportError> {
+        let w = self.shape.width as usize;
+        let mut sky = 0u64;
+        for (pixel, value) in values.iter().enumerate() {
+            if *value < 0.0 || value.is_nan() {
+                return Err(ImportError::refused(
+                    file,
+                    format!("pixel ({}, {})", pixel % w, pixel / w),
+                    "a depth of at least 0 (0, infinity or more than 10 km where there is nothing)",
+                    value.to_string(),
+                    "mend the file",
+                ));
+            }
+            let value = match *value > SKY_M {
+                true => {
+                    sky += 1;
+                    0.0
+                }
+                false => *value,
+            };
+            let stretch = norm(direction(self.intrinsics, pixel / w, pixel % w)) as f32;
+            (self.depth[pixel], self.range[pixel]) = match is_range {
+                true => (value / stretch, value),
+                false => (value, value * stretch),
+            };
+        }
+        if sky > 0 {
+            self.conversions.push(format!(
+                "{sky} pixels deeper than {SKY_M} m became 0 (nothing)"
+            ));
+        }
+        let (from, to) = if is_range {
+            ("range", "depth")
+        } else {
+            ("depth", "range")
+        };
+        self.conversions
+            .push(format!("{to} computed from {from} and intrinsics"));
+        Ok(())
+    }
+
+    /// Sets spots that the laser reaches directly.
+    pub(super) fn set_spots(&mut self, positions: &[[f32; 3]], normals: Option<&[[f32; 3]]>) {
+        let laser = self.laser.map(f64::from);
+        let spot = |(index, p): (usize, &[f32; 3])| {
+            p.iter().all(|x| x.is_finite()).then(|| Spot {
+                position: *p,
+                normal: normals.map_or([0.0; 3], |n| n[index]),
+                path_m: distance(p.map(f64::from), laser) as f32,
+            })
+        };
+        self.spots = positions.iter().enumerate().map(spot).collect();
+        if normals.is_none() {
+            self.missing.push("spots.normal");
+        }
+    }
+
+    /// The record that the encoder takes.
+    pub(super) fn with_record<T>(&self, use_it: impl FnOnce(&SceneRecord<'_>) -> T) -> T {
+        let subsets: Vec<SubsetRecord<'_>> = self
+            .subsets
+            .iter()
+            .map(|(quantity, h)| SubsetRecord {
+                quantity: *quantity,
+                planes: vec![h],
+            })
+            .collect();
+        let bins = self.shape.gate.bins as usize;
+        let scale = self
+            .scale
+            .unwrap_or_else(|| photon_scale(&self.transient, bins, PEAK_PHOTONS));
+        use_it(&SceneRecord {
+            transient: &self.transient,
+            subsets: &subsets,
+            depth: &self.depth,
+            range: &self.range,
+            normal: &self.normal,
+            instance: &self.instance,
+            label: &self.label,
+            specular: &self.specular,
+            visibility: &self.visibility,
+            rgb: &self.rgb,
+            spots: &self.spots,
+            intrinsics: self.intrinsics,
+            camera: self.camera,
+            laser: self.laser,
+            scale,
+        })
+    }
+}
+
+pub(super) const IDENTITY: [[f32; 4]; 4] = [
+    [1.0, 0.0, 0.0, 0.0],
+    [0.0, 1.0, 0.0, 0.0],
+    [0.0, 0.0, 1.0, 0.0],
+    [0.0, 0.0, 0.0, 1.0],
+];
+
+/// Direction of a pixel's centre in the camera frame, with z = 1.
+pub(super) fn direction(i: Intrinsics, row: usize, column: usize) -> [f64; 3] {
+    [
+        (column as f64 + 0.5 - f64::from(i.cx)) / f64::from(i.fx),
+        (row as f64 + 0.5 - f64::from(i.cy)) / f64::from(i.fy),
+        1.0,
+    ]
+}
+
+/// Intrinsics of a horizontal field of view, the axis in the image's middle.
+pub(super) fn of_fov(width: u32, height: u32, degrees: f64) -> Intrinsics {
+    let f = f64::from(width) / 2.0 / libm::tan(degrees.to_radians() / 2.0);
+    Intrinsics {
+        fx: f as f32,
+        fy: f as f32,
+        cx: width as f32 / 2.0,
+        cy: height as f32 / 2.0,
+    }
+}
+
+/// Histograms have no negative and no undefined bins: what a lossy code left of the former becomes 0.
+pub(super) fn clean(
+    file: &Path,
+    h: &mut [f32],
+    bins: usize,
+    conversions: &mut Vec<String>,
+) -> Result<(), ImportError> {
+    let (mut negative, mut count, mut total) = (0.0f64, 0u64, 0.0f64);
+    for (at, x) in h.iter_mut().enumerate() {
+        if !x.is_finite() {
+            return Err(ImportError::refused(
+                file,
+                format!("bin {} of pixel {}", at % bins, at / bins),
+                "a finite number",
+                x.to_string(),
+                "mend or leave out this scene",
+            ));
+        }
+        match *x < 0.0 {
+            true => {
+                negative -= f64::from(*x);
+                count += 1;
+                *x = 0.0;
+            }
+            false => total += f64::from(*x),
+        }
+    }
+    if negative > NEGATIVE * total {
+        return Err(ImportError::refused(
+            file,
+            "histograms",
+            format!(
+                "values of at least 0 (a lossy code may leave up to {NEGATIVE} of the energy negative)"
+            ),
+            format!(
+                "{count} negative values with {:.3} of the energy",
+                negative / total.max(f64::MIN_POSITIVE)
+            ),
+            "subtract no background before importing",
+        ));
+    }
+    if count > 0 {
+        conversions.push(format!(
+            "{count} negative values in {} (together {:.2e} of its energy) became 0",
+            file.file_name().unwrap_or_default().to_string_lossy(),
+            negative / total.max(f64::MIN_POSITIVE)
+        ));
+    }
+    Ok(())
+}
