@@ -218,15 +218,23 @@ impl Farm {
         })
     }
 
-    /// Waits until the job ends: its last status.
+    /// Waits until the job ends: its last status. A long job may take long, as long as it gets on.
     ///
     /// # Panics
     /// When it does not end.
     pub fn until_ended(&self, job: &str) -> Value {
-        until(&format!("the end of job {job}"), || {
-            let status = self.status(job);
-            (status["state"] != "active").then_some(status)
-        })
+        let mut before = Value::Null;
+        loop {
+            let status = until(&format!("job {job} to get on"), || {
+                let status = self.status(job);
+                let over = status["state"] != "active";
+                (over || status["tasks"]["done"] != before).then_some(status)
+            });
+            if status["state"] != "active" {
+                return status;
+            }
+            before = status["tasks"]["done"].clone();
+        }
     }
 
     /// Waits until the job is done, and checks that each scene was committed exactly once and the data set is whole.
