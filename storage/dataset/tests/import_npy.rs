@@ -197,7 +197,8 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
         change(&mut other);
         refusal(folder, &other)
     };
-    let cases: [(&str, &dyn Fn(&mut Value), &[&str]); 8] = [
+    type Case<'a> = (&'a str, &'a dyn Fn(&mut Value), &'a [&'a str]);
+    let cases: [Case<'_>; 8] = [
         (
             "gate",
             &|d| d["histogram"]["gate_start"] = json!(1.6),
