@@ -227,12 +227,10 @@ impl Core {
             now_ms,
         );
         if kind != FailureKind::Interrupted
-            && let Some(id) = self.leases_worker(range)
+            && let RangeState::Leased(lease) = &range.state
         {
-            let entry = self.stages.get_mut(&range.stage).expect("as above");
-            entry.trouble.failed(id, task, now_ms);
+            entry.trouble.failed(lease.worker, task, now_ms);
         }
-        let entry = self.stages.get_mut(&range.stage).expect("as above");
         let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
         if let Some(exception) = verdict.exception {
             self.changes
@@ -300,14 +298,6 @@ impl Core {
         }
         if left.is_none() {
             self.lease_over(range.id);
-        }
-    }
-
-    /// Who holds a leased range.
-    fn leases_worker(&self, range: &Range) -> Option<WorkerId> {
-        match &range.state {
-            RangeState::Leased(lease) => Some(lease.worker),
-            _ => None,
         }
     }
 

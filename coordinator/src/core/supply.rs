@@ -20,6 +20,10 @@ impl Core {
     /// first in rank are asked for as many as there are leases wanted. Those of lower priority get their turn when the
     /// others have nothing left.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
+        // Mostly everyone is at work: then nothing need be looked at.
+        if !self.workers.values().any(super::WorkerEntry::hungry) {
+            return Vec::new();
+        }
         let mut ranked: Vec<StageRef> = self
             .stages
             .iter()
