@@ -25,4 +25,4 @@ mod world;
 pub use api::*;
 pub use bvh::{Bvh, Kernel, Stack};
 pub use emitter::trace_spots;
-pub use render::{Forecast, plan, render};
+pub use render::{Forecast, Part, PartOf, join_parts, plan, render, render_part};

@@ -41,14 +41,15 @@ pub(crate) fn centres(world: &World) -> Centres {
     }
 }
 
-/// Everything but the companion image. Visibility is per beam; a beam without a spot lights nothing.
+/// Everything but the companion image, and the rays it took. Visibility is per beam; a beam without a spot
+/// lights nothing.
 pub(crate) fn ground_truth(
     scene: &Scene,
     world: &World,
     emitters: &Emitters,
-    centres: &mut Centres,
+    centres: &Centres,
     beams: usize,
-) -> GroundTruth {
+) -> (GroundTruth, u64) {
     let i = world.camera.intrinsics;
     let count = i.width as usize * i.height as usize;
     let mut truth = GroundTruth {
@@ -97,6 +98,5 @@ pub(crate) fn ground_truth(
             })
             .sum::<u64>();
     }
-    centres.rays += rays;
-    truth
+    (truth, rays)
 }

@@ -10,7 +10,8 @@ use std::{
 use common::{grey, ok, quad, room, scene, settings, sphere, v};
 use picofarm_scene::{Bsdf, Distribution, Material, Scene, Texture, Wrap};
 use picofarm_transient::{
-    Budget, Progress, RENDERER_VERSION, RenderError, Rendered, Settings, render,
+    Budget, Part, PartOf, Progress, RENDERER_VERSION, RenderError, Rendered, Settings, Strategy,
+    join_parts, render, render_part,
 };
 
 /// A bit of everything: mirror, gloss, mix, texture, curved things, four spots.
@@ -176,6 +177,103 @@ fn a_render_stopped_and_started_again_gives_the_same_bits() {
         );
         assert_eq!(whole, hash(&ok(&s, &budget)));
     }
+}
+
+struct Unwatched;
+
+impl Progress for Unwatched {
+    fn at(&self, _done: f32) -> bool {
+        true
+    }
+}
+
+/// All parts, as another machine reads them.
+fn parts(s: &Scene, settings: &Settings, of: u32) -> Vec<Part> {
+    let part = |which| {
+        let part = render_part(s, settings, which, &Unwatched).unwrap();
+        let text = serde_json::to_string(&part).unwrap();
+        serde_json::from_str(&text).unwrap()
+    };
+    PartOf::all(of).map(part).collect()
+}
+
+#[test]
+fn parts_rendered_apart_join_to_the_bits_of_the_whole() {
+    let s = everything(40);
+    for caustics in [false, true] {
+        let settings = Settings {
+            strategy: Strategy {
+                caustics: Some(caustics),
+                ..Strategy::default()
+            },
+            ..set(Budget::Samples(3))
+        };
+        let whole = ok(&s, &settings);
+        let drawn = whole
+            .plan
+            .strategies
+            .iter()
+            .any(|s| s.starts_with("light paths"));
+        assert_eq!(drawn, caustics, "{:?}", whole.plan);
+        // 9 tiles: alone, unevenly, and with ranges that are empty.
+        for of in [1, 4, 11] {
+            let mut parts = parts(&s, &settings, of);
+            parts.reverse();
+            let joined = join_parts(&s, &settings, parts, &Unwatched).unwrap();
+            assert_eq!(
+                hash(&whole),
+                hash(&joined),
+                "{of} parts, caustics {caustics}"
+            );
+            assert_eq!(whole.plan, joined.plan);
+        }
+    }
+}
+
+#[test]
+fn parts_that_do_not_belong_together_are_refused_by_number() {
+    let s = everything(24);
+    let settings = set(Budget::Samples(2));
+    let refused = |parts: Vec<Part>, said: &str| {
+        let error = join_parts(&s, &settings, parts, &Unwatched)
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains(said), "{error}");
+    };
+    let all = parts(&s, &settings, 2);
+    refused(vec![], "parts: there are none");
+    refused(all[..2].to_vec(), "parts[2]: is missing");
+    refused(
+        vec![all[0].clone(), all[0].clone()],
+        "parts[0]: is there twice",
+    );
+    let other = Settings {
+        seed: 9,
+        ..settings.clone()
+    };
+    let stranger = parts(&s, &other, 2).swap_remove(1);
+    refused(
+        vec![all[0].clone(), stranger],
+        "parts[1]: is of another scene",
+    );
+    let stranger = parts(&s, &settings, 3).swap_remove(1);
+    refused(
+        vec![all[0].clone(), stranger],
+        "parts[1]: is of another scene",
+    );
+    let bare = everything(16);
+    let stranger = parts(&bare, &settings, 2).swap_remove(1);
+    refused(
+        vec![all[0].clone(), stranger],
+        "parts[1]: is of another scene",
+    );
+
+    let which = PartOf { index: 4, of: 3 };
+    let error = render_part(&s, &settings, which, &Unwatched).unwrap_err();
+    assert!(error.to_string().contains("part: 4 of 3"), "{error}");
+    let which = PartOf { index: 0, of: 3 };
+    let error = render_part(&s, &set(Budget::Error(0.1)), which, &Unwatched).unwrap_err();
+    assert!(error.to_string().contains("budget.error"), "{error}");
 }
 
 #[test]

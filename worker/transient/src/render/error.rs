@@ -1,5 +1,7 @@
 //! From variances to error estimates, and from those to a number of passes.
 
+use serde::{Deserialize, Serialize};
+
 use super::tile::Region;
 use crate::api::ErrorEstimate;
 
@@ -68,7 +70,7 @@ fn mean_of_three(
 }
 
 /// A pixel's sums for the error estimate.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Stat {
     /// Σ over bins of h².
     pub norm2: f64,

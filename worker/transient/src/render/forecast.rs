@@ -9,7 +9,7 @@ use super::{
     tile::{Bench, Done, Frame, Order, Region},
 };
 use crate::{
-    api::{Budget, Plan, Progress, RenderError},
+    api::{Budget, Plan},
     film::Film,
 };
 
@@ -29,34 +29,6 @@ pub struct Forecast {
     pub error: f32,
     /// Rays of the whole render.
     pub rays: u64,
-}
-
-/// How a render ends before its result.
-pub(super) enum Ended {
-    Failed(RenderError),
-    /// It was only to be planned.
-    Planned(Forecast),
-}
-
-impl From<RenderError> for Ended {
-    fn from(error: RenderError) -> Self {
-        Self::Failed(error)
-    }
-}
-
-impl From<picofarm_scene::SceneError> for Ended {
-    fn from(error: picofarm_scene::SceneError) -> Self {
-        Self::Failed(error.into())
-    }
-}
-
-/// Lets a plan go on to its end.
-pub(super) struct Unwatched;
-
-impl Progress for Unwatched {
-    fn at(&self, _done: f32) -> bool {
-        true
-    }
 }
 
 /// Renders a few tiles with a few passes and scales up; `rays` are those of the ground truth.

@@ -1,11 +1,15 @@
 //! The whole image: rounds over its tiles, joined to what earlier rounds found, and the pilot.
 
-use std::sync::{
-    Mutex,
-    atomic::{AtomicBool, AtomicUsize, Ordering},
+use std::{
+    ops::Range,
+    sync::{
+        Mutex,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+    },
 };
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::{
     error::Stat,
@@ -48,6 +52,16 @@ pub(super) struct Image {
     tile_overflow: Vec<f64>,
     width: usize,
     bins: usize,
+}
+
+/// A range of tiles taken out of an image.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Slice {
+    /// The planes of [`Image::planes`], pixels in the order of the tiles.
+    planes: Vec<Vec<f32>>,
+    stats: Vec<Stat>,
+    /// Passes, variance and overflow of each tile.
+    tiles: Vec<(u32, f64, f64)>,
 }
 
 /// Tells the caller how far the render is and hears whether to stop.
@@ -147,6 +161,87 @@ impl Image {
         })
     }
 
+    /// Everything that there is of each pixel and bin.
+    fn planes(&mut self) -> Vec<&mut Vec<f32>> {
+        let mut planes = vec![&mut self.transient];
+        if let Some(s) = &mut self.split {
+            let noise = &mut s.multi_noise;
+            planes.extend([
+                &mut s.two,
+                &mut s.two_se,
+                &mut s.multi,
+                &mut s.multi_se,
+                noise,
+            ]);
+        }
+        planes.extend(&mut self.groups);
+        planes
+    }
+
+    /// Places of the pixels of a range of tiles, a run of a tile's row each: first pixel and how many.
+    fn runs(&self, range: Range<usize>) -> Vec<(usize, usize)> {
+        let width = self.width;
+        let of_tile = |t: &Region| {
+            let (col, cols) = (t.col as usize, t.cols as usize);
+            let rows = t.row as usize..(t.row + t.rows) as usize;
+            rows.map(move |row| (row * width + col, cols))
+        };
+        self.tiles[range].iter().flat_map(of_tile).collect()
+    }
+
+    /// Takes a range of tiles out.
+    pub fn take(mut self, range: Range<usize>) -> Slice {
+        let (runs, bins) = (self.runs(range.clone()), self.bins);
+        let cut = |plane: &mut Vec<f32>| {
+            let run =
+                |&(first, count): &(usize, usize)| &plane[first * bins..(first + count) * bins];
+            runs.iter().flat_map(run).copied().collect()
+        };
+        let planes = self.planes().into_iter().map(cut).collect();
+        let stats = runs
+            .iter()
+            .flat_map(|&(first, count)| &self.stats[first..first + count]);
+        let tile = |t| (self.spent[t], self.tile_variance[t], self.tile_overflow[t]);
+        Slice {
+            planes,
+            stats: stats.copied().collect(),
+            tiles: range.map(tile).collect(),
+        }
+    }
+
+    /// Puts a range of tiles in; `false` if it is not one of such an image. [`Image::total`] when all are in.
+    pub fn put(&mut self, range: Range<usize>, slice: &Slice) -> bool {
+        let (runs, bins) = (self.runs(range.clone()), self.bins);
+        let pixels: usize = runs.iter().map(|(_, count)| count).sum();
+        let planes = self.planes();
+        if slice.tiles.len() != range.len()
+            || slice.stats.len() != pixels
+            || slice.planes.len() != planes.len()
+            || slice.planes.iter().any(|p| p.len() != pixels * bins)
+        {
+            return false;
+        }
+        for (to, mut from) in planes.into_iter().zip(slice.planes.iter().map(|p| &p[..])) {
+            for &(first, count) in &runs {
+                let (run, rest) = from.split_at(count * bins);
+                to[first * bins..(first + count) * bins].copy_from_slice(run);
+                from = rest;
+            }
+        }
+        let mut from = &slice.stats[..];
+        for (first, count) in runs {
+            let (run, rest) = from.split_at(count);
+            self.stats[first..first + count].copy_from_slice(run);
+            from = rest;
+        }
+        for (t, &(spent, variance, overflow)) in range.zip(&slice.tiles) {
+            self.spent[t] = spent;
+            self.tile_variance[t] = variance;
+            self.tile_overflow[t] = overflow;
+        }
+        true
+    }
+
     /// Passes of a tile on average.
     pub fn mean_passes(&self) -> u32 {
         let pixels: u64 = self.tiles.iter().map(|t| t.pixels() as u64).sum();
@@ -155,18 +250,19 @@ impl Image {
         all.div_ceil(pixels.max(1)) as u32
     }
 
-    /// More passes over the tiles, as many as `waves` says for each. Returns the rays traced.
+    /// More passes over a range of the tiles, as many as `waves` says for each. Returns the rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
+        range: Range<usize>,
         waves: &[u32],
         watch: &Watch,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
         let spent = self.spent.clone();
-        let count = tiles.len();
+        let count = range.len();
         let image = Mutex::new(&mut *self);
-        let rays: Vec<Option<u64>> = (0..count)
+        let rays: Vec<Option<u64>> = range
             .into_par_iter()
             .map_init(
                 || Bench::new(frame),
@@ -194,9 +290,14 @@ impl Image {
         for r in rays {
             all += r.ok_or(RenderError::Stopped)?;
         }
+        self.total();
+        Ok(all)
+    }
+
+    /// Sums over the tiles, in their order.
+    pub fn total(&mut self) {
         self.total_variance = self.tile_variance.iter().sum();
         self.overflow = self.tile_overflow.iter().sum();
-        Ok(all)
     }
 
     /// Joins a tile's new passes to its earlier ones, each weighed by its passes.

@@ -2,6 +2,7 @@
 //! so they are an estimate of their own beside the tiles', made of as many passes as the image's.
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::{
     error::{MULTI_REACH, Stat, estimate, pool},
@@ -20,7 +21,7 @@ const PATHS: f64 = 4.0;
 const CHUNK: u32 = 1024;
 
 /// Sums over passes, in render units.
-#[derive(Debug)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Splats {
     /// Σ, `[pixel]` as [`crate::film::Film::pixel`] slots.
     sum: Vec<f32>,
@@ -44,6 +45,13 @@ impl Splats {
             all: (0.0, 0.0),
             passes: 0,
         }
+    }
+
+    /// Whether they were made for such an image.
+    pub fn fits(&self, frame: &Frame) -> bool {
+        let new = Self::new(frame);
+        let lengths = |s: &Self| [s.sum.len(), s.square.len(), s.alternating.len()];
+        lengths(self) == lengths(&new)
     }
 
     /// `wave` more passes; returns the rays traced.

@@ -1,0 +1,237 @@
+//! A render in parts, so that several machines can share one heavy scene. The image's tiles are divided into
+//! ranges, which are independent of each other; light paths that are drawn into the image cross tiles and
+//! are a part by themselves. Joined, the parts give the bits that one machine would have given: every sum
+//! over tiles is made in their order, wherever they came from.
+//!
+//! Only with [`Budget::Samples`]: how many passes an error target needs is decided over the whole image
+//! after each round.
+
+use std::ops::Range;
+
+use picofarm_scene::Scene;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    error::estimate,
+    image::{Image, Slice, Watch},
+    ready::{Ready, prepare},
+    splat::Splats,
+};
+use crate::api::{Budget, Progress, RenderError, Rendered, Settings};
+
+/// Most ranges of tiles.
+const MAX_RANGES: u32 = 4096;
+
+/// Which part of a render: `index` of `of` ranges of tiles, or the light paths, which come after them as
+/// index `of`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PartOf {
+    /// 0 to `of`.
+    pub index: u32,
+    /// Ranges of tiles, 1 to 4096. More than there are tiles leaves some empty.
+    pub of: u32,
+}
+
+impl PartOf {
+    /// All parts of a render whose tiles are divided into `of` ranges: one more than that.
+    pub fn all(of: u32) -> impl Iterator<Item = Self> {
+        (0..=of).map(move |index| Self { index, of })
+    }
+
+    fn range(self, tiles: usize) -> Range<usize> {
+        let at = |i: u32| tiles * i as usize / self.of as usize;
+        at(self.index)..at(self.index + 1)
+    }
+}
+
+/// A rendered part: what [`join_parts`] needs of it and nothing of the scene. It is only good for the scene and
+/// the settings that it was rendered with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Part {
+    which: PartOf,
+    shape: Shape,
+    found: Found,
+    rays: u64,
+}
+
+impl Part {
+    /// Which part it is.
+    pub fn which(&self) -> PartOf {
+        self.which
+    }
+
+    /// Rays traced for it, without those that make the scene ready.
+    pub fn rays(&self) -> u64 {
+        self.rays
+    }
+}
+
+/// What must be the same in all parts of a render.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Shape {
+    width: u32,
+    height: u32,
+    bins: u32,
+    channels: u32,
+    split: bool,
+    passes: u32,
+    seed: u64,
+}
+
+impl Shape {
+    fn of(ready: &Ready) -> Self {
+        let frame = &ready.frame;
+        Self {
+            width: frame.width,
+            height: frame.height,
+            bins: frame.film.gate.bins,
+            channels: frame.film.channels as u32,
+            split: frame.split,
+            passes: ready.first_passes(),
+            seed: frame.seed,
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+enum Found {
+    Tiles(Slice),
+    /// `None` where the scene needs no light paths.
+    Paths(Option<Splats>),
+}
+
+fn wrong(field: &str, what: String) -> RenderError {
+    RenderError::Invalid {
+        field: field.into(),
+        what,
+    }
+}
+
+fn divisible(settings: &Settings) -> Result<(), RenderError> {
+    match settings.budget {
+        Budget::Samples(_) => Ok(()),
+        Budget::Error(_) => Err(wrong(
+            "budget.error",
+            "is decided over the whole image; a render in parts needs samples".into(),
+        )),
+    }
+}
+
+/// Renders one part of a scene. Runs on the caller's rayon pool.
+///
+/// # Errors
+/// Those of [`crate::render`], and [`RenderError::Invalid`] for a budget other than samples or for a part that
+/// there is not.
+pub fn render_part(
+    scene: &Scene,
+    settings: &Settings,
+    which: PartOf,
+    progress: &dyn Progress,
+) -> Result<Part, RenderError> {
+    divisible(settings)?;
+    let PartOf { index, of } = which;
+    if !(1..=MAX_RANGES).contains(&of) || index > of {
+        let what = format!(
+            "{index} of {of}: expected 1 to {MAX_RANGES} ranges, and a part up to that number"
+        );
+        return Err(wrong("part", what));
+    }
+    prepare(scene, settings, |ready| {
+        let frame = &ready.frame;
+        let shape = Shape::of(ready);
+        let watch = Watch::new(progress, 0.0, 1.0);
+        let (found, rays) = if index < of {
+            let mut image = Image::new(frame);
+            let range = which.range(image.tiles());
+            let waves = vec![shape.passes; image.tiles()];
+            let rays = image.round(frame, range.clone(), &waves, &watch)?;
+            (Found::Tiles(image.take(range)), rays)
+        } else if let Some(caustics) = frame.walk.caustics {
+            let mut splats = Splats::new(frame);
+            let rays = splats.round((frame, caustics), shape.passes, &watch)?;
+            (Found::Paths(Some(splats)), rays)
+        } else {
+            (Found::Paths(None), 0)
+        };
+        Ok(Part {
+            which,
+            shape,
+            found,
+            rays,
+        })
+    })
+}
+
+/// Joins all parts of a scene, in any order, into what [`crate::render`] gives for it, bit for bit. Runs on the caller's
+/// rayon pool.
+///
+/// # Errors
+/// Those of [`crate::render`], and [`RenderError::Invalid`] naming the part that is missing, there twice, or of
+/// another scene or other settings.
+pub fn join_parts(
+    scene: &Scene,
+    settings: &Settings,
+    parts: impl IntoIterator<Item = Part>,
+    progress: &dyn Progress,
+) -> Result<Rendered, RenderError> {
+    divisible(settings)?;
+    prepare(scene, settings, |ready| {
+        if !progress.at(0.0) {
+            return Err(RenderError::Stopped);
+        }
+        let seen = ready.seen();
+        let frame = &ready.frame;
+        let shape = Shape::of(ready);
+        let mut image = Image::new(frame);
+        let (mut splats, mut rays) = (None, 0);
+        let mut there: Vec<bool> = vec![];
+        for part in parts {
+            let PartOf { index, of } = part.which;
+            let name = format!("parts[{index}]");
+            if there.is_empty() && (1..=MAX_RANGES).contains(&of) {
+                there = vec![false; of as usize + 1];
+            }
+            if part.shape != shape || there.len() != of as usize + 1 || index > of {
+                let what =
+                    "is of another scene, other settings or another division; render it again";
+                return Err(wrong(&name, what.into()));
+            }
+            if std::mem::replace(&mut there[index as usize], true) {
+                return Err(wrong(&name, "is there twice".into()));
+            }
+            let taken = match part.found {
+                Found::Tiles(slice) if index < of => {
+                    image.put(part.which.range(image.tiles()), &slice)
+                }
+                Found::Paths(None) if index == of => frame.walk.caustics.is_none(),
+                Found::Paths(Some(found)) if index == of => {
+                    let fits = frame.walk.caustics.is_some() && found.fits(frame);
+                    splats = Some(found);
+                    fits
+                }
+                _ => false,
+            };
+            if !taken {
+                let what = "does not hold what this part of the scene holds; render it again";
+                return Err(wrong(&name, what.into()));
+            }
+            rays += part.rays;
+            if !progress.at(index as f32 / (of + 1) as f32) {
+                return Err(RenderError::Stopped);
+            }
+        }
+        if let Some(missing) = there.iter().position(|&t| !t) {
+            return Err(wrong(&format!("parts[{missing}]"), "is missing".into()));
+        }
+        if there.is_empty() {
+            return Err(wrong("parts", "there are none; render them first".into()));
+        }
+        image.total();
+        let error = match &splats {
+            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            Some(splats) => splats.estimate(frame, &image),
+        };
+        let plan = ready.plan(shape.passes);
+        Ok(ready.finish((image, splats), seen, (error, rays), plan))
+    })
+}

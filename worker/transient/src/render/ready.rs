@@ -1,0 +1,275 @@
+//! What every way of rendering begins and ends with: the scene made ready to trace, and the image made
+//! into a result.
+
+use picofarm_scene::{Scene, Spot};
+
+use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame};
+use crate::{
+    api::{
+        Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
+    },
+    caustic::Caustics,
+    ellipsoid::{self, Patches, Window},
+    emitter::{Emitters, find_spots},
+    film::Film,
+    lobe::Mirrors,
+    one, photo,
+    plan::plan as decide,
+    share::Effort,
+    truth::{self, Centres},
+    two::Sampling,
+    walk::Walk,
+    world::World,
+};
+
+/// Side in pixels of the tiles that share vertices.
+const SHARE: u32 = 8;
+
+/// A scene that is ready to be traced.
+pub(super) struct Ready<'a> {
+    pub scene: &'a Scene,
+    pub settings: &'a Settings,
+    pub frame: Frame<'a>,
+    centres: &'a Centres,
+    spots: &'a [Option<Spot>],
+}
+
+/// Checks a scene and its settings, makes the scene ready and hands it to `then`.
+pub(super) fn prepare<R>(
+    scene: &Scene,
+    settings: &Settings,
+    then: impl FnOnce(&Ready) -> Result<R, RenderError>,
+) -> Result<R, RenderError> {
+    check(settings)?;
+    scene.validate()?;
+    let world = World::new(scene)?;
+    let spots = find_spots(&world, &scene.laser.beams);
+    let emitters = Emitters::new(scene, &world, &spots)?;
+    let mirrors = if settings.strategy.image_lobes.unwrap_or(true) {
+        Mirrors::find(&world, &emitters)
+    } else {
+        Mirrors::default()
+    };
+    let centres = truth::centres(&world);
+    let sampling = Sampling::plan(&world, &emitters, &centres);
+    let of_spot = groups_of(settings, &emitters, spots.len())?;
+    let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
+    let strategy = &settings.strategy;
+    let narrow = strategy
+        .ellipsoidal
+        .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world));
+    let patches = narrow.then(|| Patches::new(&world, &emitters));
+    let mut walk = Walk {
+        world: &world,
+        emitters: &emitters,
+        mirrors: &mirrors,
+        gate: &settings.gate,
+        max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
+        lights: strategy.light_vertices.unwrap_or(true),
+        caustics: None,
+        window: narrow.then(|| Window::new(&settings.gate)),
+        patches: patches.as_ref(),
+        shortest_m: emitters
+            .list
+            .iter()
+            .fold(f64::INFINITY, |a, e| a.min(e.path_m)),
+    };
+    let caustics = match strategy.caustics {
+        Some(false) => None,
+        wanted => Caustics::find(&world, &emitters)
+            .filter(|c| walk.max_bounces >= 3 && (wanted.is_some() || c.pay(&walk, settings.seed))),
+    };
+    walk.caustics = caustics.as_ref();
+    let frame = Frame {
+        walk,
+        film: &film,
+        sampling: &sampling,
+        effort: Effort::new(strategy.share.unwrap_or(SHARE), narrow),
+        seed: settings.seed,
+        width: scene.camera.intrinsics.width,
+        height: scene.camera.intrinsics.height,
+        split: settings.split,
+    };
+    then(&Ready {
+        scene,
+        settings,
+        frame,
+        centres: &centres,
+        spots: &spots,
+    })
+}
+
+impl Ready<'_> {
+    /// Whether there is light of three bounces and more to look for.
+    pub fn walks(&self) -> bool {
+        let walk = &self.frame.walk;
+        walk.max_bounces >= 3 && !walk.emitters.list.is_empty()
+    }
+
+    /// Passes of the first round, which is the only one unless an error is asked for.
+    pub fn first_passes(&self) -> u32 {
+        match self.settings.budget {
+            _ if !self.walks() => 0,
+            Budget::Samples(n) => n,
+            Budget::Error(_) => FIRST_PASSES,
+        }
+    }
+
+    /// What the renderer decides to do, beginning with so many passes.
+    pub fn plan(&self, passes: u32) -> Plan {
+        decide(self.settings, &self.frame.walk, self.frame.sampling, passes)
+    }
+
+    /// The ground truth, and the rays it took.
+    pub fn seen(&self) -> (GroundTruth, u64) {
+        let walk = &self.frame.walk;
+        let beams = self.spots.len();
+        let (mut truth, rays) =
+            truth::ground_truth(self.scene, walk.world, walk.emitters, self.centres, beams);
+        let (rgb, photo_rays) = photo::photo(walk.world, self.settings.seed);
+        truth.rgb = rgb;
+        (truth, self.centres.rays + rays + photo_rays)
+    }
+
+    /// The result: the image with what was drawn into it and with the one-bounce peaks.
+    pub fn finish(
+        &self,
+        (mut image, splats): (Image, Option<Splats>),
+        (truth, seen): (GroundTruth, u64),
+        (error, mut rays): (ErrorEstimate, u64),
+        plan: Plan,
+    ) -> Rendered {
+        let (frame, settings) = (&self.frame, self.settings);
+        let (walk, film) = (&frame.walk, frame.film);
+        if let Some(splats) = &splats {
+            splats.join(frame, &mut image);
+        }
+        let mut overflow = Overflow {
+            energy: image.overflow,
+            share: 0.0,
+        };
+        if settings.one_bounce && walk.max_bounces >= 1 {
+            let mut stack = walk.world.bvh.stack();
+            let peaks = one::peaks(walk.world, &mut stack, walk.emitters);
+            for peak in &peaks {
+                if !one::add(peak, &settings.gate, &mut image.transient) {
+                    overflow.energy += f64::from(peak.value);
+                }
+                for &channel in &film.of_spot[peak.spot] {
+                    let group = &mut image.groups[usize::from(channel) - 1];
+                    one::add(peak, &settings.gate, group);
+                }
+            }
+            rays += stack.rays;
+        }
+        let inside: f64 = image.transient.iter().map(|&v| f64::from(v)).sum();
+        overflow.share = if overflow.energy > 0.0 {
+            overflow.energy / (overflow.energy + inside)
+        } else {
+            0.0
+        };
+        Rendered {
+            width: frame.width,
+            height: frame.height,
+            gate: settings.gate,
+            transient: image.transient,
+            split: image.split.map(|s| Split {
+                two: s.two,
+                two_se: s.two_se,
+                multi: s.multi,
+                multi_se: s.multi_se,
+                multi_noise: s.multi_noise,
+            }),
+            groups: image.groups,
+            truth,
+            spots: self.spots.to_vec(),
+            overflow,
+            error,
+            plan,
+            rays: rays + seen,
+        }
+    }
+}
+
+/// The channels beyond 0 that each emitter's light goes to.
+fn groups_of(
+    settings: &Settings,
+    emitters: &Emitters,
+    beams: usize,
+) -> Result<Vec<Vec<u16>>, RenderError> {
+    for (g, group) in settings.groups.iter().enumerate() {
+        if let Some(beam) = group.iter().find(|&&b| b as usize >= beams) {
+            return Err(RenderError::Invalid {
+                field: format!("groups[{g}]"),
+                what: format!("names beam {beam}, but the laser has {beams}, counted from 0"),
+            });
+        }
+    }
+    let channels = |beam: usize| {
+        let in_group = |g: &Vec<u32>| g.contains(&(beam as u32));
+        (1u16..)
+            .zip(&settings.groups)
+            .filter(|(_, g)| in_group(g))
+            .map(|(c, _)| c)
+            .collect()
+    };
+    Ok(emitters.list.iter().map(|e| channels(e.beam)).collect())
+}
+
+fn check(settings: &Settings) -> Result<(), RenderError> {
+    let bad = |field: &str, what: String| {
+        Err(RenderError::Invalid {
+            field: field.into(),
+            what,
+        })
+    };
+    let g = &settings.gate;
+    if !(g.bin_width_m.is_finite() && g.bin_width_m > 0.0) {
+        return bad(
+            "gate.bin_width_m",
+            format!("is {}, expected a positive length in metres", g.bin_width_m),
+        );
+    }
+    if !(g.start_m.is_finite() && g.start_m >= 0.0) {
+        return bad(
+            "gate.start_m",
+            format!("is {}, expected a path length of 0 m or more", g.start_m),
+        );
+    }
+    if g.bins == 0 || g.bins > 1 << 20 {
+        return bad("gate.bins", format!("is {}, expected 1 to 1048576", g.bins));
+    }
+    if settings
+        .strategy
+        .share
+        .is_some_and(|s| !(1..=16).contains(&s))
+    {
+        return bad(
+            "strategy.share",
+            "expected a tile of 1 to 16 pixels a side".into(),
+        );
+    }
+    if settings.groups.len() > 1024 {
+        return bad(
+            "groups",
+            format!("has {}, expected at most 1024", settings.groups.len()),
+        );
+    }
+    match settings.budget {
+        Budget::Samples(n) if n > MAX_PASSES * 16 => bad(
+            "budget.samples",
+            format!(
+                "is {n}, expected at most {} paths per pixel",
+                MAX_PASSES * 16
+            ),
+        ),
+        Budget::Error(e) if !(e > 0.0 && e.is_finite()) => bad(
+            "budget.error",
+            format!("is {e}, expected a positive share such as 0.1"),
+        ),
+        _ => match settings.max_bounces {
+            Some(0) => bad("max_bounces", "is 0, expected 1 or more".into()),
+            _ => Ok(()),
+        },
+    }
+}
