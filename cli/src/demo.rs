@@ -28,6 +28,7 @@ use crate::{
 
 fn task(args: &Demo) -> RenderTask {
     RenderTask {
+        parts: 1,
         scenes: SceneSource {
             kind: SceneKind::Furnished {
                 assets: args.assets.clone(),

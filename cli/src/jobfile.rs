@@ -3,7 +3,10 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_proto::model::{JobSpec, RenderTask, SceneKind, TaskSpec};
+use picofarm_proto::{
+    key::render_stage_key,
+    model::{JobSpec, RenderTask, SceneKind, TaskSpec},
+};
 
 use crate::{
     args::JobKind,
@@ -173,6 +176,10 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
         match &mut stage.task {
             TaskSpec::Render(task) => {
                 *task = resolve_render(task.clone(), base, asset_dir).map_err(named)?;
+            }
+            TaskSpec::Part(task) => {
+                task.whole = resolve_render(task.whole.clone(), base, asset_dir).map_err(named)?;
+                task.joined_by = render_stage_key(&task.whole).to_string();
             }
             TaskSpec::Reprocess(task) => {
                 task.output.store =

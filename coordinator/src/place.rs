@@ -25,7 +25,7 @@ pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
             return Err(format!(
                 "the job needs {} {version:?}, the worker has {theirs:?}",
                 match kind {
-                    "render" => "renderer",
+                    "render" | "part" => "renderer",
                     other => other,
                 }
             ));

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    key::spec_hash,
-    model::{JobPlan, JobSpec, SceneKind, SpecError, StagePlan, StageSpec},
+    key::{StageKey, render_stage_key, spec_hash},
+    model::{JobPlan, JobSpec, SceneKind, SpecError, StagePlan, StageSpec, TaskSpec},
 };
 use serde_json::Value;
 
@@ -188,13 +188,22 @@ pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
 fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
     if stage.task.version().is_empty() {
         let (field, whose) = match stage.task.kind() {
-            "render" => ("render.renderer", "renderer"),
+            "render" | "part" => ("render.renderer", "renderer"),
             _ => ("reprocess.version", "sensor model"),
         };
         return Err(SpecError::new(
             field,
             format!("is empty; the client must fill in the {whose}'s version before it submits"),
         ));
+    }
+    if let TaskSpec::Part(task) = &stage.task
+        && StageKey::parse(&task.joined_by) != Some(render_stage_key(&task.whole))
+    {
+        let what = format!(
+            "{:?} is not the key of such a render stage; the client must fill it in",
+            task.joined_by
+        );
+        return Err(SpecError::new("joined_by", what));
     }
     let Some(task) = stage.task.as_render() else {
         return Ok(());

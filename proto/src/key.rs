@@ -52,6 +52,11 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
     let source = |s: &SourceSettings| serde_json::json!([s.store, s.dataset]);
     let description = match &stage.task {
         TaskSpec::Render(task) => return render_stage_key(task),
+        TaskSpec::Part(task) => serde_json::json!({
+            "stage": "part",
+            "whole": render_stage_key(&task.whole).to_string(),
+            "parts": task.whole.parts,
+        }),
         TaskSpec::Reprocess(task) => serde_json::json!({
             "stage": "reprocess",
             "source": source(&task.source),

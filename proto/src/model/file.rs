@@ -5,6 +5,9 @@
 //! whose data set is read then; a stage needs those whose data it reads; and the number of scenes of a data set that
 //! another stage makes need not be said.
 //!
+//! `parts = 8` beside `[render]` divides each scene among that many tasks and the light paths' one, and joins them: the
+//! job gets a stage of kind `part`, called `NAME.parts`, before the render stage.
+//!
 //! `matrix = { dark = [0.0, 0.1], bins = [1, 4] }` makes a stage for each combination of values. Anywhere in the stage,
 //! the text `"{dark}"` stands for the value, and `{dark}` inside a text for its text. An instance is called
 //! `name[0.1,4]`, values in the order of the parameters' names; `needs = ["name"]` means all of them.
@@ -17,7 +20,7 @@ use super::{
         ExportSettings, ExportTask, JobSpec, Limits, MAX_STAGES, OutputSettings, Resources,
         SpecError, SplitTask, StageSpec, TaskSpec,
     },
-    render::{RenderSettings, RenderTask, SceneSource},
+    render::{PartTask, RenderSettings, RenderTask, SceneSource},
     reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
 };
 use crate::split::SplitSettings;
@@ -38,6 +41,7 @@ pub(super) struct JobText {
     scenes: Option<SceneSource>,
     render: Option<RenderSettings>,
     output: Option<OutputSettings>,
+    parts: Option<u32>,
     #[serde(default)]
     stage: Vec<Value>,
 }
@@ -64,6 +68,9 @@ struct StageText {
     split: Option<SplitSettings>,
     export: Option<ExportSettings>,
     output: Option<OutputSettings>,
+    parts: Option<u32>,
+    #[serde(default)]
+    joined_by: String,
 }
 
 /// A stage's name, or a place.
@@ -119,6 +126,7 @@ impl TryFrom<JobText> for JobSpec {
                 output: text
                     .output
                     .ok_or_else(|| missing("output", "say where results go"))?,
+                parts: text.parts.unwrap_or(1),
             };
             stages.push(StageSpec {
                 resources: text.resources,
@@ -129,6 +137,7 @@ impl TryFrom<JobText> for JobSpec {
                 ("scenes", text.scenes.is_some()),
                 ("render", text.render.is_some()),
                 ("output", text.output.is_some()),
+                ("parts", text.parts.is_some()),
                 ("resources", !text.resources.is_none()),
             ] {
                 if given {
@@ -154,12 +163,41 @@ impl TryFrom<JobText> for JobSpec {
             nonce: text.nonce,
             stages,
         };
+        spec.divide();
         spec.resolve()?;
         Ok(spec)
     }
 }
 
 impl JobSpec {
+    /// Puts a stage that renders the parts before each stage that joins them, unless it is there already.
+    fn divide(&mut self) {
+        let mut stages: Vec<StageSpec> = Vec::with_capacity(self.stages.len());
+        for mut stage in self.stages.drain(..) {
+            if let TaskSpec::Render(task) = &stage.task
+                && task.parts > 1
+            {
+                let name = format!("{}.parts", stage.name);
+                if !stages.iter().any(|s| s.name == name) {
+                    let whole = task.clone();
+                    stages.push(StageSpec {
+                        name: name.clone(),
+                        task: TaskSpec::Part(PartTask {
+                            whole,
+                            joined_by: String::new(),
+                        }),
+                        ..stage.clone()
+                    });
+                }
+                if !stage.needs.contains(&name) {
+                    stage.needs.push(name);
+                }
+            }
+            stages.push(stage);
+        }
+        self.stages = stages;
+    }
+
     /// Fills in what follows from other stages: places, needs and numbers of scenes.
     fn resolve(&mut self) -> Result<(), SpecError> {
         for i in 0..self.stages.len() {
@@ -215,7 +253,7 @@ impl TaskSpec {
     /// The data set that is read, and the number of its scenes; to be filled in.
     pub fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
         match self {
-            Self::Render(_) => None,
+            Self::Render(_) | Self::Part(_) => None,
             Self::Reprocess(task) => Some((&mut task.source, &mut task.count)),
             Self::Split(task) => Some((&mut task.source, &mut task.count)),
             Self::Export(task) => Some((&mut task.source, &mut task.count)),
@@ -238,38 +276,53 @@ impl TryFrom<Value> for StageSpec {
 impl StageText {
     fn read(self) -> Result<StageSpec, SpecError> {
         let kind = self.kind.unwrap_or_else(|| "render".into());
+        // What [`JobSpec::divide`] makes of a stage that renders in parts.
+        let like = match &*kind {
+            "part" => "render",
+            kind => kind,
+        };
         let given = [
             ("scenes", "render", self.scenes.is_some()),
             ("render", "render", self.render.is_some()),
+            ("parts", "render", self.parts.is_some()),
+            ("joined_by", "part", !self.joined_by.is_empty()),
             ("reprocess", "reprocess", self.reprocess.is_some()),
             ("split", "split", self.split.is_some()),
             ("export", "export", self.export.is_some()),
         ];
         for (field, of, given) in given {
-            if given && of != kind {
+            if given && of != like && of != kind {
                 let what = format!("belongs to kind = {of:?}; remove it from kind = {kind:?}");
                 return Err(SpecError::new(field, what));
             }
         }
         let missing =
             |field: &str| SpecError::new(field, format!("is missing; kind = {kind:?} needs it"));
-        let makes = matches!(&*kind, "render" | "reprocess");
+        let makes = matches!(like, "render" | "reprocess");
         if self.output.is_some() && !makes {
             let what = format!("is not for kind = {kind:?}, which makes no data set; remove it");
             return Err(SpecError::new("output", what));
         }
-        if kind == "render" && (self.source.is_some() || self.count.is_some()) {
+        if like == "render" && (self.source.is_some() || self.count.is_some()) {
             let what = "is not for kind = \"render\"; see [scenes]";
             return Err(SpecError::new("source", what));
         }
         let output = self.output.ok_or_else(|| missing("output"));
         let source = self.source.ok_or_else(|| missing("source"));
         let count = self.count.unwrap_or(0);
-        let task = match &*kind {
-            "render" => TaskSpec::Render(RenderTask {
+        let render = || -> Result<RenderTask, SpecError> {
+            Ok(RenderTask {
                 scenes: self.scenes.ok_or_else(|| missing("scenes"))?,
                 render: self.render.unwrap_or_default(),
-                output: output?,
+                output: output.clone()?,
+                parts: self.parts.unwrap_or(1),
+            })
+        };
+        let task = match &*kind {
+            "render" => TaskSpec::Render(render()?),
+            "part" => TaskSpec::Part(PartTask {
+                joined_by: self.joined_by,
+                whole: render()?,
             }),
             "reprocess" => TaskSpec::Reprocess(ReprocessTask {
                 source: source?,

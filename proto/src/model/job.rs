@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     file::JobText,
-    render::RenderTask,
+    render::{PartTask, RenderTask},
     reprocess::{ReprocessTask, SourceSettings},
 };
 use crate::split::SplitSettings;
@@ -85,6 +85,8 @@ pub struct StageSpec {
 pub enum TaskSpec {
     /// Scenes are rendered: one task each.
     Render(RenderTask),
+    /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
+    Part(PartTask),
     /// Scenes of a data set go through a sensor into another: one task each.
     Reprocess(ReprocessTask),
     /// The scenes of a data set are divided into training, validation and test: one task.
@@ -360,6 +362,7 @@ impl StageSpec {
     pub fn tasks(&self) -> u64 {
         match &self.task {
             TaskSpec::Render(task) => task.scenes.count,
+            TaskSpec::Part(task) => task.whole.scenes.count * task.tasks_per_scene(),
             TaskSpec::Reprocess(task) => task.count,
             TaskSpec::Split(_) | TaskSpec::Export(_) => 1,
         }
@@ -370,6 +373,7 @@ impl StageSpec {
         Self {
             task: match &self.task {
                 TaskSpec::Render(task) => TaskSpec::Render(task.only(lo, hi)),
+                TaskSpec::Part(task) => TaskSpec::Part(task.only(lo, hi)),
                 other => other.clone(),
             },
             name: self.name.clone(),
@@ -388,6 +392,7 @@ impl StageSpec {
         self.resources.check()?;
         match &self.task {
             TaskSpec::Render(task) => task.check(),
+            TaskSpec::Part(task) => task.whole.check(),
             TaskSpec::Reprocess(task) => task.check(),
             TaskSpec::Split(task) => {
                 check_source(&task.source)?;
@@ -462,6 +467,7 @@ impl StageSpec {
         }
         match &self.task {
             TaskSpec::Render(task) => task.check_places(),
+            TaskSpec::Part(task) => task.whole.check_places(),
             TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
             TaskSpec::Split(_) => Ok(()),
             TaskSpec::Export(task) => place("export.dest", &task.export.dest),
@@ -474,6 +480,7 @@ impl TaskSpec {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Render(_) => "render",
+            Self::Part(_) => "part",
             Self::Reprocess(_) => "reprocess",
             Self::Split(_) => "split",
             Self::Export(_) => "export",
@@ -484,6 +491,7 @@ impl TaskSpec {
     pub fn version(&self) -> &str {
         match self {
             Self::Render(task) => &task.render.renderer,
+            Self::Part(task) => &task.whole.render.renderer,
             Self::Reprocess(task) => &task.reprocess.version,
             Self::Split(_) => SPLIT_VERSION,
             Self::Export(_) => EXPORT_VERSION,
@@ -493,7 +501,7 @@ impl TaskSpec {
     /// The data set that is read.
     pub fn reads(&self) -> Option<&SourceSettings> {
         match self {
-            Self::Render(_) => None,
+            Self::Render(_) | Self::Part(_) => None,
             Self::Reprocess(task) => Some(&task.source),
             Self::Split(task) => Some(&task.source),
             Self::Export(task) => Some(&task.source),
@@ -505,14 +513,15 @@ impl TaskSpec {
         match self {
             Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
-            Self::Split(_) | Self::Export(_) => None,
+            Self::Part(_) | Self::Split(_) | Self::Export(_) => None,
         }
     }
 
-    /// The rendering, where it is one.
+    /// The rendering, where it is one or a part of one.
     pub fn as_render(&self) -> Option<&RenderTask> {
         match self {
             Self::Render(task) => Some(task),
+            Self::Part(task) => Some(&task.whole),
             _ => None,
         }
     }

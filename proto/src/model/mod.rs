@@ -18,7 +18,9 @@ pub use job::{
 };
 pub use lease::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
-pub use render::{Budget, Choice, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource};
+pub use render::{
+    Budget, Choice, PartTask, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource,
+};
 pub use reprocess::{Histogram, ReprocessSettings, ReprocessTask, SourceSettings};
 pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};
 pub use status::{

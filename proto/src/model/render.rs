@@ -18,9 +18,54 @@ pub struct RenderTask {
     pub render: RenderSettings,
     /// Where results go.
     pub output: OutputSettings,
+    /// Into how many ranges of tiles each scene is divided, for several workers to share it; 1 = not divided. The result
+    /// is the same to the bit.
+    #[serde(skip_serializing_if = "is_one")]
+    pub parts: u32,
+}
+
+/// Rendering parts of scenes, which the stage that needs it joins: one task a part. Task `i` is part
+/// `i % tasks_per_scene` of scene `i / tasks_per_scene`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PartTask {
+    /// The rendering.
+    #[serde(flatten)]
+    pub whole: RenderTask,
+    /// Key of the stage that joins the parts, hexadecimal; filled in at submission.
+    pub joined_by: String,
+}
+
+impl PartTask {
+    /// Tasks of each scene: the ranges of tiles, and the light paths that cross them.
+    pub fn tasks_per_scene(&self) -> u64 {
+        u64::from(self.whole.parts) + 1
+    }
+
+    /// The scene and the part that task `index` is.
+    pub fn split(&self, index: u64) -> (u64, u32) {
+        let part = index % self.tasks_per_scene();
+        (index / self.tasks_per_scene(), part as u32)
+    }
+
+    /// As [`RenderTask::only`].
+    pub(super) fn only(&self, lo: u64, hi: u64) -> Self {
+        let each = self.tasks_per_scene();
+        Self {
+            whole: self.whole.only(lo / each, hi.div_ceil(each)),
+            joined_by: self.joined_by.clone(),
+        }
+    }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_one(n: &u32) -> bool {
+    *n == 1
 }
 
 impl RenderTask {
+    /// Most ranges that a scene is divided into.
+    pub const MAX_PARTS: u32 = 1024;
+
     /// Checks every field against its limits.
     ///
     /// # Errors
@@ -28,6 +73,15 @@ impl RenderTask {
     pub fn check(&self) -> Result<(), SpecError> {
         self.scenes.check()?;
         self.render.check()?;
+        if !(1..=Self::MAX_PARTS).contains(&self.parts) {
+            let what = format!("{} lies outside 1..={}", self.parts, Self::MAX_PARTS);
+            return Err(SpecError::new("parts", what));
+        }
+        if self.parts > 1 && matches!(self.render.budget, Budget::Error(_)) {
+            let what = "needs render.samples: how many samples render.error takes is decided over the whole image; \
+                        `picofarm render --plan` tells how many that would be";
+            return Err(SpecError::new("parts", what));
+        }
         if let [smallest, ..] = self.render.subsets[..]
             && self.scenes.spots != 100
         {
@@ -73,6 +127,7 @@ impl RenderTask {
             },
             render: self.render.clone(),
             output: self.output.clone(),
+            parts: self.parts,
         }
     }
 }

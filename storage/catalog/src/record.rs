@@ -121,6 +121,10 @@ impl ResultSet {
         let (store, dataset) = match &stage.task {
             TaskSpec::Render(task) => (task.output.store.clone(), task.output.dataset.clone()),
             TaskSpec::Reprocess(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Part(task) => (
+                task.whole.output.store.clone(),
+                format!("{}/parts", task.whole.output.dataset),
+            ),
             TaskSpec::Split(task) => (
                 task.source.store.clone(),
                 format!("{}/split/{}", task.source.dataset, task.split.name),

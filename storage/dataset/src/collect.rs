@@ -26,6 +26,7 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::manifest::Manifest;
 use crate::objects;
+use crate::parts::part_scene;
 use crate::store::{PROBE, leftovers, probe_leftovers};
 use crate::verify::manifest_scene;
 
@@ -42,7 +43,7 @@ pub struct Orphan {
     pub object: String,
     /// Its size.
     pub bytes: u64,
-    /// The scene it would belong to; `None` for what a killed probe or a killed local write left.
+    /// The scene it would belong to; `None` for parts on their way and what a killed probe or a killed local write left.
     pub scene: Option<u64>,
 }
 
@@ -73,7 +74,7 @@ enum Found {
 
 impl Dataset {
     /// Finds what belongs to no published scene and was last written `grace` ago or earlier: objects of scenes without
-    /// a manifest, and what killed probes and killed local writes left. Deletes it if `delete` says so. Never touches
+    /// a manifest, parts of scenes that nobody joined, and what killed probes and killed local writes left. Deletes it if `delete` says so. Never touches
     /// an object that a manifest names, or that it does not know. With less than [`MIN_GRACE`] no worker may be writing
     /// to this data set.
     ///
@@ -114,10 +115,13 @@ impl Dataset {
         let mut objects: Vec<(u64, ObjectMeta)> = Vec::new();
         let mut listing = self.store.list(Some(&self.prefix));
         let mut seen = BTreeSet::new();
+        let mut parts = Vec::new();
         while let Some(object) = listing.try_next().await.map_err(failed)? {
             let key = self.relative(&object.location);
             if let Some(scene) = manifest_scene(&key) {
                 seen.insert(scene);
+            } else if part_scene(&key).is_some() {
+                parts.push(object);
             } else if let Some(scene) = self.object_scene(&key) {
                 objects.push((scene, object));
             }
@@ -125,18 +129,20 @@ impl Dataset {
         drop(listing);
         // Most are published and need not be kept until then.
         objects.retain(|(scene, _)| !seen.contains(scene));
-        if objects.is_empty() {
-            return Ok(Vec::new());
+        if !objects.is_empty() {
+            let published: BTreeSet<u64> = self.scenes_present().await?.into_iter().collect();
+            objects.retain(|(scene, _)| !published.contains(scene));
         }
-        let published: BTreeSet<u64> = self.scenes_present().await?.into_iter().collect();
-        objects.retain(|(scene, _)| !published.contains(scene));
-        let all = objects.len();
-        objects.retain(|(_, object)| SystemTime::from(object.last_modified) <= limit);
-        report.young = (all - objects.len()) as u64;
-        Ok(objects
-            .into_iter()
-            .map(|(scene, object)| Found::Object(object, Some(scene)))
-            .collect())
+        let all = objects.len() + parts.len();
+        let old = |object: &ObjectMeta| SystemTime::from(object.last_modified) <= limit;
+        objects.retain(|(_, object)| old(object));
+        // No manifest names a part, before or after its scene is published: who misses one renders it again.
+        parts.retain(old);
+        report.young = (all - objects.len() - parts.len()) as u64;
+        let scenes = objects.into_iter();
+        let scenes = scenes.map(|(scene, object)| Found::Object(object, Some(scene)));
+        let parts = parts.into_iter().map(|object| Found::Object(object, None));
+        Ok(scenes.chain(parts).collect())
     }
 
     /// What killed probes left beside the data set, and killed local writes in it.

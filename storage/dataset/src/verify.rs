@@ -13,6 +13,7 @@ use crate::dataset::{Dataset, METADATA};
 use crate::error::DatasetError;
 use crate::manifest::{Manifest, sha256_hex};
 use crate::objects;
+use crate::parts::part_scene;
 use crate::spec::DatasetSpec;
 use crate::splits;
 
@@ -375,6 +376,9 @@ impl Dataset {
 
     /// The scene whose object has this key.
     pub(crate) fn object_scene(&self, key: &str) -> Option<u64> {
+        if let Some(scene) = part_scene(key) {
+            return Some(scene);
+        }
         let mut parts = key.split('/');
         let name = parts.next()?;
         let scene: u64 = parts.nth(1)?.parse().ok()?;

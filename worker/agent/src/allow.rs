@@ -2,7 +2,7 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_proto::model::{StageSpec, TaskSpec};
+use picofarm_proto::model::{RenderTask, StageSpec, TaskSpec};
 
 use crate::AgentError;
 
@@ -49,11 +49,16 @@ impl StorePrefixes {
         if let Some((store, _)) = stage.task.writes() {
             self.allowed("output.store", store)?;
         }
+        let scene = |task: &RenderTask, index| match task.scenes.kind.file(index) {
+            Some(file) => self.allowed(&format!("scenes.files[{index}]"), &file.path),
+            None => Ok(()),
+        };
         match &stage.task {
-            TaskSpec::Render(task) => match task.scenes.kind.file(index) {
-                Some(file) => self.allowed(&format!("scenes.files[{index}]"), &file.path),
-                None => Ok(()),
-            },
+            TaskSpec::Render(task) => scene(task, index),
+            TaskSpec::Part(task) => {
+                self.allowed("output.store", &task.whole.output.store)?;
+                scene(&task.whole, task.split(index).0)
+            }
             TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
             TaskSpec::Reprocess(_) | TaskSpec::Split(_) => Ok(()),
         }

@@ -3,6 +3,7 @@
 pub mod export;
 mod memory;
 mod output;
+mod parts;
 mod render;
 pub mod reprocess;
 mod runner;

@@ -149,8 +149,7 @@ impl Stores {
         Ok(Some(manifest))
     }
 
-    /// Publishes a scene. A store that fails (unreachable, full) is asked again for a while, so that the
-    /// render is not lost with the first hiccup.
+    /// Publishes a scene.
     pub(super) fn publish(
         &self,
         dataset: &Dataset,
@@ -158,24 +157,36 @@ impl Stores {
         control: &Control,
     ) -> Result<Manifest, TaskError> {
         let _in = debug_span!(target: trace::TARGET, "publish").entered();
+        self.patiently(control, async || {
+            dataset.publish_encoded(scene.clone()).await
+        })
+    }
+
+    /// Asks a store that fails (unreachable, full) again for a while, so that what is rendered is not lost with the
+    /// first hiccup.
+    pub(super) fn patiently<T>(
+        &self,
+        control: &Control,
+        mut request: impl AsyncFnMut() -> Result<T, DatasetError>,
+    ) -> Result<T, TaskError> {
         let until = Instant::now() + self.patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {
-            let error = match self.wait(control, dataset.publish_encoded(scene.clone())) {
-                Ok(manifest) => return Ok(manifest),
+            let error = match self.wait(control, request()) {
+                Ok(done) => return Ok(done),
                 Err(error) => error,
             };
             if !matches!(error, TaskError::Interrupted(_)) || Instant::now() >= until {
                 return Err(error);
             }
             let wait = backoff.next(random());
-            warn!(%error, wait_s = wait.as_secs_f64(), "the finished scene cannot be stored yet; trying again");
+            warn!(%error, wait_s = wait.as_secs_f64(), "what is finished cannot be stored yet; trying again");
             let again = Instant::now() + wait;
             while Instant::now() < again {
                 if control.stopped() {
                     return Err(TaskError::Stopped);
                 }
-                std::thread::sleep(Duration::from_millis(50).min(wait));
+                std::thread::sleep(STOP_LOOK.min(wait));
             }
         }
     }

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use picofarm_dataset::{
-    DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
+    Dataset, DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -18,6 +18,7 @@ use tracing::{debug_span, info};
 use super::{
     Control, Output, Task, TaskError, memory,
     output::{Stores, manifest_sha256, of_dataset},
+    parts::Parts,
     scenes, subsets,
 };
 
@@ -45,14 +46,7 @@ pub(super) fn run(
     control: &Control,
 ) -> Result<Output, TaskError> {
     let key = task.key();
-    let ours = renderer_version();
-    if spec.render.renderer != ours {
-        return Err(TaskError::User(format!(
-            "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
-             version, or run workers of the other one",
-            spec.render.renderer
-        )));
-    }
+    check_version(spec)?;
     let dataset = stores.open(spec, control)?;
     if !task.spec.force
         && let Some(manifest) = stores.finished(&dataset, task.index, &key, control)?
@@ -63,25 +57,15 @@ pub(super) fn run(
             adopted: true,
         });
     }
+    let (scene, settings) = prepare(libraries, spec, &dataset, task.index, &key)?;
     let begun = Instant::now();
-    let scene = debug_span!(target: trace::TARGET, "scene")
-        .in_scope(|| scenes::scene(spec, task.index, libraries))?;
-    info!(
-        scene = scene.name,
-        triangles = scene.triangle_count(),
-        seconds = begun.elapsed().as_secs_f32(),
-        "scene made"
-    );
-    let settings = settings(spec, dataset.spec(), &key)?;
-    if !settings.groups.is_empty() {
-        let side = spec.render.resolution;
-        memory::check_memory(&settings, side, side, rayon::current_num_threads())
-            .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
-    }
-    let begun = Instant::now();
-    let rendered = debug_span!(target: trace::TARGET, "render")
-        .in_scope(|| picofarm_transient::render(&scene, &settings, &Watched(control)))
-        .map_err(of_render)?;
+    let rendered = debug_span!(target: trace::TARGET, "render").in_scope(|| match spec.parts {
+        1 => picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render),
+        _ => {
+            let parts = Parts::new(stores, &dataset, spec, task.index, key);
+            parts.join(&scene, &settings, control)
+        }
+    })?;
     info!(
         samples = rendered.error.samples,
         median_error = rendered.error.median_relative,
@@ -108,6 +92,9 @@ pub(super) fn run(
         .map_err(of_dataset)?;
     control.at((1.0 + RENDER_SHARE) / 2.0);
     let manifest = stores.publish(&dataset, encoded, control)?;
+    if spec.parts > 1 {
+        Parts::new(stores, &dataset, spec, task.index, key).delete(control);
+    }
     control.at(1.0);
     Ok(Output {
         manifest_sha256: manifest_sha256(&manifest),
@@ -116,8 +103,47 @@ pub(super) fn run(
     })
 }
 
+/// The job must ask for this renderer.
+pub(super) fn check_version(spec: &RenderTask) -> Result<(), TaskError> {
+    let ours = renderer_version();
+    if spec.render.renderer == ours {
+        return Ok(());
+    }
+    Err(TaskError::User(format!(
+        "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
+         version, or run workers of the other one",
+        spec.render.renderer
+    )))
+}
+
+/// Makes scene `index`, with the settings to render it by `key`.
+pub(super) fn prepare(
+    libraries: &[AssetLibrary],
+    spec: &RenderTask,
+    dataset: &Dataset,
+    index: u64,
+    key: &TaskKey,
+) -> Result<(Scene, Settings), TaskError> {
+    let begun = Instant::now();
+    let scene = debug_span!(target: trace::TARGET, "scene")
+        .in_scope(|| scenes::scene(spec, index, libraries))?;
+    info!(
+        scene = scene.name,
+        triangles = scene.triangle_count(),
+        seconds = begun.elapsed().as_secs_f32(),
+        "scene made"
+    );
+    let settings = settings(spec, dataset.spec(), key)?;
+    if !settings.groups.is_empty() {
+        let side = spec.render.resolution;
+        memory::check_memory(&settings, side, side, rayon::current_num_threads())
+            .map_err(|what| TaskError::User(format!("render.{}: {what}", asked(spec))))?;
+    }
+    Ok((scene, settings))
+}
+
 /// Carries the renderer's progress to the task's control.
-struct Watched<'a>(&'a Control);
+pub(super) struct Watched<'a>(pub &'a Control);
 
 impl Progress for Watched<'_> {
     fn at(&self, done: f32) -> bool {
@@ -229,7 +255,7 @@ fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
     })
 }
 
-fn of_render(error: RenderError) -> TaskError {
+pub(super) fn of_render(error: RenderError) -> TaskError {
     match error {
         RenderError::Stopped => TaskError::Stopped,
         RenderError::Scene(error) => scenes::of_scene(error),

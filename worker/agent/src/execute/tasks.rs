@@ -10,8 +10,8 @@ use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
 
 use super::{
-    Control, Executor, Output, Task, TaskError, export, output::Stores, render, reprocess, scenes,
-    split,
+    Control, Executor, Output, Task, TaskError, export, output::Stores, parts, render, reprocess,
+    scenes, split,
 };
 
 /// How long a finished scene waits for a store that is full or away before its task is handed back.
@@ -38,6 +38,7 @@ impl Executor for TaskExecutor {
     fn kinds(&self) -> BTreeMap<String, String> {
         [
             ("render", render::renderer_version()),
+            ("part", render::renderer_version()),
             ("reprocess", reprocess::sensor_version()),
             ("split", SPLIT_VERSION.to_owned()),
             ("export", EXPORT_VERSION.to_owned()),
@@ -55,6 +56,7 @@ impl Executor for TaskExecutor {
         let stores = &self.stores;
         match &task.spec.task {
             TaskSpec::Render(spec) => render::run(stores, &self.libraries, spec, task, control),
+            TaskSpec::Part(spec) => parts::run(stores, &self.libraries, spec, task, control),
             TaskSpec::Reprocess(spec) => {
                 reprocess::run(stores, spec, task.spec.force, task.index, control)
             }

@@ -74,6 +74,7 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
         key: StageKey([0; 32]),
         traceparent: String::new(),
         stage: StageSpec::new(TaskSpec::Render(RenderTask {
+            parts: 1,
             scenes: SceneSource {
                 kind: SceneKind::Primitive,
                 count: 5,

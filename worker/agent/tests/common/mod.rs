@@ -253,6 +253,7 @@ impl Conversation {
 /// A small job of primitive scenes with results in `store`.
 pub fn spec(store: &str) -> RenderTask {
     RenderTask {
+        parts: 1,
         scenes: SceneSource {
             kind: SceneKind::Primitive,
             count: 100,
