@@ -42,7 +42,8 @@ pub fn template(kind: JobKind) -> String {
     };
     format!(
         "# A picofarm job. `picofarm job plan FILE` says what it would run; `picofarm job submit FILE` runs it.\n\
-         name = \"rooms\"\n\n\
+         name = \"rooms\"\n\
+         # parts = 8               # heavy scenes: each divided among so many tasks, and joined; the same bytes\n\n\
          [scenes]\n{scenes}\n\
          [render]\n\
          resolution = 256          # pixels, square\n\

@@ -211,3 +211,52 @@ fn a_lease_brings_only_its_own_files() {
     };
     assert_eq!(whole.check().unwrap_err().field, "scenes.first");
 }
+
+const HEAVY: &str = "name = \"n\"\nparts = 4\n[scenes]\nkind = \"files\"\nfiles = [\"/0.glb\", \"/1.glb\", \"/2.glb\"]\n\
+                     [output]\nstore = \"/s\"\ndataset = \"d\"\n";
+
+#[test]
+fn a_render_stage_in_parts_needs_one_that_renders_them_and_its_result_has_the_same_key() {
+    let spec: JobSpec = toml::from_str(HEAVY).unwrap();
+    spec.check().unwrap();
+    let stages: Vec<_> = spec
+        .stages
+        .iter()
+        .map(|s| (&*s.name, s.task.kind(), s.tasks(), &s.needs[..]))
+        .collect();
+    let needs = ["render.parts".to_owned()];
+    let expected = [
+        ("render.parts", "part", 15, &[][..]),
+        ("render", "render", 3, &needs[..]),
+    ];
+    assert_eq!(stages, expected);
+    let whole: JobSpec = toml::from_str(&HEAVY.replace("parts = 4", "")).unwrap();
+    assert_eq!(stage_key(&whole.stages[0]), stage_key(&spec.stages[1]));
+    assert_ne!(stage_key(&whole.stages[0]), stage_key(&spec.stages[0]));
+    // Read again, from the catalog or the wire, it gets no further stages.
+    let text = serde_json::to_string(&spec).unwrap();
+    assert_eq!(serde_json::from_str::<JobSpec>(&text).unwrap(), spec);
+    // Tasks 4 to 6 are of scenes 0 and 1.
+    let leased = spec.stages[0].only(4, 7);
+    let scenes = &leased.task.as_render().unwrap().scenes;
+    let there = [0, 1, 2].map(|i| scenes.kind.file(i).is_some());
+    assert_eq!(there, [true, true, false]);
+}
+
+#[test]
+fn parts_of_what_cannot_be_divided_are_refused() {
+    let refused = |text: &str| {
+        let spec: JobSpec = toml::from_str(text).unwrap();
+        spec.check().unwrap_err().to_string()
+    };
+    let error = refused(&format!("{HEAVY}[render]\nerror = 0.1\n"));
+    assert!(
+        error.contains("parts") && error.contains("render.samples"),
+        "{error}"
+    );
+    let error = refused(&HEAVY.replace("parts = 4", "parts = 2000"));
+    assert!(error.contains("2000 lies outside 1..=1024"), "{error}");
+    let error =
+        toml::from_str::<JobSpec>(&HEAVY.replace("parts = 4", "parts = 4\njoined_by = \"ab\""));
+    assert!(error.unwrap_err().to_string().contains("joined_by"));
+}

@@ -79,7 +79,7 @@ impl RenderTask {
         }
         if self.parts > 1 && matches!(self.render.budget, Budget::Error(_)) {
             let what = "needs render.samples: how many samples render.error takes is decided over the whole image; \
-                        `picofarm render --plan` tells how many that would be";
+                        `picofarm scene plan` tells how many that would be";
             return Err(SpecError::new("parts", what));
         }
         if let [smallest, ..] = self.render.subsets[..]
