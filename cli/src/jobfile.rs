@@ -3,9 +3,10 @@
 
 use std::path::{Component, Path, PathBuf};
 
+use picofarm_dataset::import::Source;
 use picofarm_proto::{
     key::render_stage_key,
-    model::{JobSpec, RenderTask, SceneKind, TaskSpec},
+    model::{ImportTask, JobSpec, RenderTask, SceneKind, TaskSpec},
 };
 
 use crate::{
@@ -178,6 +179,16 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
             TaskSpec::Render(task) => {
                 *task = resolve_render(task.clone(), base, asset_dir).map_err(named)?;
             }
+            TaskSpec::Generate(task) => {
+                let settings = &mut task.generate;
+                settings.dest = store(base, &settings.dest, "generate.dest").map_err(named)?;
+                let version = picofarm_agent::generator_version();
+                pin(&mut settings.version, version, "generate.version").map_err(named)?;
+                if let SceneKind::Furnished { assets: name, .. } = &mut task.scenes.kind {
+                    *name = assets::resolve(name, asset_dir).map_err(named)?;
+                }
+            }
+            TaskSpec::Import(task) => resolve_import(task, base).map_err(named)?,
             TaskSpec::Part(task) => {
                 task.whole = resolve_render(task.whole.clone(), base, asset_dir).map_err(named)?;
                 task.joined_by = render_stage_key(&task.whole).to_string();
@@ -201,6 +212,8 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
             }
         }
     }
+    // What reads an import knows its number of scenes only now.
+    spec.resolve()?;
     Ok(spec)
 }
 
@@ -237,6 +250,27 @@ pub fn resolve_render(mut task: RenderTask, base: &Path, asset_dir: &Path) -> Re
         }
     }
     Ok(task)
+}
+
+/// The same for one import: which scenes there are is asked of the folder.
+fn resolve_import(task: &mut ImportTask, base: &Path) -> Result<()> {
+    task.output.store = store(base, &task.output.store, "output.store")?;
+    profile(&task.output.profile)?;
+    let import = &mut task.import;
+    let version = picofarm_agent::import_version();
+    pin(&mut import.version, version, "import.version")?;
+    let (format, options) = picofarm_agent::import_options(import).map_err(CliError::input)?;
+    let folder = absolute(base, &import.folder)?;
+    let names = (!import.scenes.is_empty()).then_some(&import.scenes[..]);
+    let source = Source::open(&folder, format, options, names)
+        .map_err(|e| CliError::input(format!("import.folder: {e}")))?;
+    import.folder = folder.display().to_string();
+    import.format = source.format().name().to_owned();
+    import.scenes = (0..source.scenes())
+        .filter_map(|i| source.name(i).map(str::to_owned))
+        .collect();
+    import.count = source.scenes();
+    Ok(())
 }
 
 /// Fills in this program's version, or checks that it is the one asked for.

@@ -1,6 +1,6 @@
 //! Which worker may take tasks of which job, and how many at once. Pure.
 
-use picofarm_proto::model::{Abilities, SceneKind, StageSpec};
+use picofarm_proto::model::{Abilities, SceneKind, StageSpec, TaskSpec};
 
 /// Furniture that every worker makes by itself.
 pub const PARAMETRIC: &str = "parametric-1";
@@ -32,8 +32,12 @@ pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
         }
         Some(_) => {}
     }
-    if let Some(task) = stage.task.as_render()
-        && let SceneKind::Furnished { assets, .. } = &task.scenes.kind
+    let scenes = match &stage.task {
+        TaskSpec::Generate(task) => Some(&task.scenes),
+        task => task.as_render().map(|task| &task.scenes),
+    };
+    if let Some(scenes) = scenes
+        && let SceneKind::Furnished { assets, .. } = &scenes.kind
         && assets != PARAMETRIC
         && !worker.assets.contains(assets)
     {

@@ -189,6 +189,8 @@ fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
     if stage.task.version().is_empty() {
         let (field, whose) = match stage.task.kind() {
             "render" | "part" => ("render.renderer", "renderer"),
+            "generate" => ("generate.version", "scene generator"),
+            "import" => ("import.version", "importer"),
             _ => ("reprocess.version", "sensor model"),
         };
         return Err(SpecError::new(
@@ -205,10 +207,14 @@ fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
         );
         return Err(SpecError::new("joined_by", what));
     }
-    let Some(task) = stage.task.as_render() else {
-        return Ok(());
+    let scenes = match &stage.task {
+        TaskSpec::Generate(task) => &task.scenes,
+        task => match task.as_render() {
+            Some(task) => &task.scenes,
+            None => return Ok(()),
+        },
     };
-    match &task.scenes.kind {
+    match &scenes.kind {
         SceneKind::Furnished { assets, .. }
             if matches!(
                 assets.as_str(),

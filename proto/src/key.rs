@@ -7,8 +7,9 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     model::{
-        JobSpec, RenderTask, ReprocessSettings, SceneKind, SourceSettings, StageSpec, TaskSpec,
-        job::{EXPORT_VERSION, SPLIT_VERSION},
+        JobSpec, RenderTask, ReprocessSettings, SceneKind, SceneSource, SourceSettings, StageSpec,
+        TaskSpec,
+        task::{EXPORT_VERSION, SPLIT_VERSION},
     },
     split::SplitSettings,
 };
@@ -57,6 +58,21 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
             "whole": render_stage_key(&task.whole).to_string(),
             "parts": task.whole.parts,
         }),
+        TaskSpec::Generate(task) => serde_json::json!({
+            "stage": "generate",
+            "scenes": scenes_of(&task.scenes),
+            "seed": task.scenes.seed,
+            "fov_deg": task.scenes.fov_deg,
+            "spots": task.scenes.spots,
+            "format": task.generate.format,
+            "resolution": task.generate.resolution,
+            "version": task.generate.version,
+        }),
+        TaskSpec::Import(task) => serde_json::json!({
+            "stage": "import",
+            "import": serde_json::to_value(&task.import).expect("settings are plain data"),
+            "profile": task.output.profile,
+        }),
         TaskSpec::Reprocess(task) => serde_json::json!({
             "stage": "reprocess",
             "source": source(&task.source),
@@ -81,7 +97,21 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
 /// The key of a render stage: scene source (without `count`), render settings and codec profile.
 /// File scenes count by content and position, not by path; the place where results go does not count.
 pub fn render_stage_key(task: &RenderTask) -> StageKey {
-    let scenes = match &task.scenes.kind {
+    let description = serde_json::json!({
+        "task": "render",
+        "scenes": scenes_of(&task.scenes),
+        "seed": task.scenes.seed,
+        "fov_deg": task.scenes.fov_deg,
+        "spots": task.scenes.spots,
+        "render": serde_json::to_value(&task.render).expect("settings are plain data"),
+        "profile": task.output.profile,
+    });
+    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// Where scenes come from, as keys know it.
+fn scenes_of(source: &SceneSource) -> serde_json::Value {
+    match &source.kind {
         SceneKind::Furnished {
             assets,
             min_specular,
@@ -93,17 +123,7 @@ pub fn render_stage_key(task: &RenderTask) -> StageKey {
             "kind": "files",
             "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
         }),
-    };
-    let description = serde_json::json!({
-        "task": "render",
-        "scenes": scenes,
-        "seed": task.scenes.seed,
-        "fov_deg": task.scenes.fov_deg,
-        "spots": task.scenes.spots,
-        "render": serde_json::to_value(&task.render).expect("settings are plain data"),
-        "profile": task.output.profile,
-    });
-    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
+    }
 }
 
 /// The key of task `index` of a stage.

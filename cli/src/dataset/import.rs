@@ -112,7 +112,7 @@ impl Work {
         }
         let found = self
             .source
-            .finished(&self.dataset, index, self.rehash)
+            .finished(&self.dataset, index, index, self.rehash)
             .await;
         if let Some(manifest) = found.map_err(refused)? {
             done.found += 1;

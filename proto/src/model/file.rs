@@ -16,12 +16,12 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{
-    job::{
-        ExportSettings, ExportTask, JobSpec, Limits, MAX_STAGES, OutputSettings, Resources,
-        SpecError, SplitTask, StageSpec, TaskSpec,
-    },
+    generate::{GenerateSettings, GenerateTask},
+    import::{ImportSettings, ImportTask},
+    job::{JobSpec, Limits, MAX_STAGES, OutputSettings, Resources, SpecError, StageSpec},
     render::{PartTask, RenderSettings, RenderTask, SceneSource},
     reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
+    task::{ExportSettings, ExportTask, SplitTask, TaskSpec},
 };
 use crate::split::SplitSettings;
 
@@ -67,6 +67,8 @@ struct StageText {
     reprocess: Option<ReprocessSettings>,
     split: Option<SplitSettings>,
     export: Option<ExportSettings>,
+    generate: Option<GenerateSettings>,
+    import: Option<ImportSettings>,
     output: Option<OutputSettings>,
     parts: Option<u32>,
     #[serde(default)]
@@ -199,7 +201,10 @@ impl JobSpec {
     }
 
     /// Fills in what follows from other stages: places, needs and numbers of scenes.
-    fn resolve(&mut self) -> Result<(), SpecError> {
+    ///
+    /// # Errors
+    /// A source that no stage before makes.
+    pub fn resolve(&mut self) -> Result<(), SpecError> {
         for i in 0..self.stages.len() {
             let (before, rest) = self.stages.split_at_mut(i);
             let stage = &mut rest[0];
@@ -249,18 +254,6 @@ impl JobSpec {
     }
 }
 
-impl TaskSpec {
-    /// The data set that is read, and the number of its scenes; to be filled in.
-    pub fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
-        match self {
-            Self::Render(_) | Self::Part(_) => None,
-            Self::Reprocess(task) => Some((&mut task.source, &mut task.count)),
-            Self::Split(task) => Some((&mut task.source, &mut task.count)),
-            Self::Export(task) => Some((&mut task.source, &mut task.count)),
-        }
-    }
-}
-
 impl TryFrom<Value> for StageSpec {
     type Error = SpecError;
 
@@ -281,8 +274,14 @@ impl StageText {
             "part" => "render",
             kind => kind,
         };
+        let scenes_for = match &*kind {
+            "generate" => "generate",
+            _ => "render",
+        };
         let given = [
-            ("scenes", "render", self.scenes.is_some()),
+            ("scenes", scenes_for, self.scenes.is_some()),
+            ("generate", "generate", self.generate.is_some()),
+            ("import", "import", self.import.is_some()),
             ("render", "render", self.render.is_some()),
             ("parts", "render", self.parts.is_some()),
             ("joined_by", "part", !self.joined_by.is_empty()),
@@ -298,31 +297,40 @@ impl StageText {
         }
         let missing =
             |field: &str| SpecError::new(field, format!("is missing; kind = {kind:?} needs it"));
-        let makes = matches!(like, "render" | "reprocess");
+        let makes = matches!(like, "render" | "reprocess" | "import");
         if self.output.is_some() && !makes {
             let what = format!("is not for kind = {kind:?}, which makes no data set; remove it");
             return Err(SpecError::new("output", what));
         }
-        if like == "render" && (self.source.is_some() || self.count.is_some()) {
-            let what = "is not for kind = \"render\"; see [scenes]";
+        let reads = matches!(like, "reprocess" | "split" | "export");
+        if !reads && (self.source.is_some() || self.count.is_some()) {
+            let what = format!("is not for kind = {kind:?}, which reads no data set; remove it");
             return Err(SpecError::new("source", what));
         }
         let output = self.output.ok_or_else(|| missing("output"));
         let source = self.source.ok_or_else(|| missing("source"));
         let count = self.count.unwrap_or(0);
-        let render = || -> Result<RenderTask, SpecError> {
-            Ok(RenderTask {
-                scenes: self.scenes.ok_or_else(|| missing("scenes"))?,
-                render: self.render.unwrap_or_default(),
-                output: output.clone()?,
-                parts: self.parts.unwrap_or(1),
-            })
+        let scenes = self.scenes.ok_or_else(|| missing("scenes"));
+        let (render, parts) = (self.render.unwrap_or_default(), self.parts.unwrap_or(1));
+        let whole = |scenes, output| RenderTask {
+            scenes,
+            render,
+            output,
+            parts,
         };
         let task = match &*kind {
-            "render" => TaskSpec::Render(render()?),
+            "generate" => TaskSpec::Generate(GenerateTask {
+                scenes: scenes?,
+                generate: self.generate.ok_or_else(|| missing("generate"))?,
+            }),
+            "import" => TaskSpec::Import(ImportTask {
+                import: self.import.ok_or_else(|| missing("import"))?,
+                output: output?,
+            }),
+            "render" => TaskSpec::Render(whole(scenes?, output?)),
             "part" => TaskSpec::Part(PartTask {
                 joined_by: self.joined_by,
-                whole: render()?,
+                whole: whole(scenes?, output?),
             }),
             "reprocess" => TaskSpec::Reprocess(ReprocessTask {
                 source: source?,
@@ -344,7 +352,7 @@ impl StageText {
                 return Err(SpecError::new(
                     "kind",
                     format!(
-                        "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\""
+                        "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\""
                     ),
                 ));
             }

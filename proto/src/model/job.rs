@@ -5,12 +5,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use super::{
-    file::JobText,
-    render::{PartTask, RenderTask},
-    reprocess::{ReprocessTask, SourceSettings},
-};
-use crate::split::SplitSettings;
+use super::{file::JobText, render::RenderTask, reprocess::SourceSettings, task::TaskSpec};
 
 /// Most tasks in one job.
 pub const MAX_TASKS: u64 = 100_000_000;
@@ -76,56 +71,6 @@ pub struct StageSpec {
     /// What its tasks do.
     #[serde(flatten)]
     pub task: TaskSpec,
-}
-
-/// What the tasks of a stage do. A further kind is a variant here, a file under the agent's `execute`, and a line in each
-/// `match` that the compiler then asks for.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(tag = "kind", rename_all = "snake_case")]
-pub enum TaskSpec {
-    /// Scenes are rendered: one task each.
-    Render(RenderTask),
-    /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
-    Part(PartTask),
-    /// Scenes of a data set go through a sensor into another: one task each.
-    Reprocess(ReprocessTask),
-    /// The scenes of a data set are divided into training, validation and test: one task.
-    Split(SplitTask),
-    /// A data set is packed for sharing: one task.
-    Export(ExportTask),
-}
-
-/// Dividing a data set.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct SplitTask {
-    /// The data set.
-    pub source: SourceSettings,
-    /// Its number of scenes.
-    pub count: u64,
-    /// How.
-    pub split: SplitSettings,
-}
-
-/// Packing a data set.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct ExportTask {
-    /// The data set.
-    pub source: SourceSettings,
-    /// Its number of scenes.
-    pub count: u64,
-    /// What is packed, and where it goes.
-    pub export: ExportSettings,
-}
-
-/// What is packed, and where it goes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ExportSettings {
-    /// A path or URL that every worker can reach.
-    pub dest: String,
-    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
-    pub scenes: String,
 }
 
 /// What a worker must have to run a stage's tasks. A worker runs one task at a time with all that it has.
@@ -363,6 +308,8 @@ impl StageSpec {
         match &self.task {
             TaskSpec::Render(task) => task.scenes.count,
             TaskSpec::Part(task) => task.whole.scenes.count * task.tasks_per_scene(),
+            TaskSpec::Generate(task) => task.scenes.count,
+            TaskSpec::Import(task) => task.import.count,
             TaskSpec::Reprocess(task) => task.count,
             TaskSpec::Split(_) | TaskSpec::Export(_) => 1,
         }
@@ -374,6 +321,7 @@ impl StageSpec {
             task: match &self.task {
                 TaskSpec::Render(task) => TaskSpec::Render(task.only(lo, hi)),
                 TaskSpec::Part(task) => TaskSpec::Part(task.only(lo, hi)),
+                TaskSpec::Import(task) => TaskSpec::Import(task.only(lo, hi)),
                 other => other.clone(),
             },
             name: self.name.clone(),
@@ -393,6 +341,8 @@ impl StageSpec {
         match &self.task {
             TaskSpec::Render(task) => task.check(),
             TaskSpec::Part(task) => task.whole.check(),
+            TaskSpec::Generate(task) => task.check(),
+            TaskSpec::Import(task) => task.check(),
             TaskSpec::Reprocess(task) => task.check(),
             TaskSpec::Split(task) => {
                 check_source(&task.source)?;
@@ -468,69 +418,14 @@ impl StageSpec {
         match &self.task {
             TaskSpec::Render(task) => task.check_places(),
             TaskSpec::Part(task) => task.whole.check_places(),
+            TaskSpec::Generate(task) => task.check_places(),
+            TaskSpec::Import(task) => task.check_places(),
             TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
             TaskSpec::Split(_) => Ok(()),
             TaskSpec::Export(task) => place("export.dest", &task.export.dest),
         }
     }
 }
-
-impl TaskSpec {
-    /// The kind's name, as in a job file.
-    pub fn kind(&self) -> &'static str {
-        match self {
-            Self::Render(_) => "render",
-            Self::Part(_) => "part",
-            Self::Reprocess(_) => "reprocess",
-            Self::Split(_) => "split",
-            Self::Export(_) => "export",
-        }
-    }
-
-    /// Version of the code that decides the bytes of its results; a worker's must equal it.
-    pub fn version(&self) -> &str {
-        match self {
-            Self::Render(task) => &task.render.renderer,
-            Self::Part(task) => &task.whole.render.renderer,
-            Self::Reprocess(task) => &task.reprocess.version,
-            Self::Split(_) => SPLIT_VERSION,
-            Self::Export(_) => EXPORT_VERSION,
-        }
-    }
-
-    /// The data set that is read.
-    pub fn reads(&self) -> Option<&SourceSettings> {
-        match self {
-            Self::Render(_) | Self::Part(_) => None,
-            Self::Reprocess(task) => Some(&task.source),
-            Self::Split(task) => Some(&task.source),
-            Self::Export(task) => Some(&task.source),
-        }
-    }
-
-    /// The data set that scenes are put into: store and folder.
-    pub fn writes(&self) -> Option<(&String, &String)> {
-        match self {
-            Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
-            Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
-            Self::Part(_) | Self::Split(_) | Self::Export(_) => None,
-        }
-    }
-
-    /// The rendering, where it is one or a part of one.
-    pub fn as_render(&self) -> Option<&RenderTask> {
-        match self {
-            Self::Render(task) => Some(task),
-            Self::Part(task) => Some(&task.whole),
-            _ => None,
-        }
-    }
-}
-
-/// Version of the split task.
-pub const SPLIT_VERSION: &str = "split-1";
-/// Version of the export task.
-pub const EXPORT_VERSION: &str = "export-1";
 
 pub(super) fn check_source(source: &SourceSettings) -> Result<(), SpecError> {
     if source.store.is_empty() {

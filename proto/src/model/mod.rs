@@ -2,6 +2,8 @@
 
 pub mod explain;
 pub mod file;
+mod generate;
+mod import;
 pub mod job;
 pub mod lease;
 pub mod log;
@@ -9,13 +11,13 @@ pub mod render;
 pub mod reprocess;
 pub mod sensor;
 pub mod status;
+pub mod task;
 mod text;
 
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
-pub use job::{
-    ExportSettings, ExportTask, JobSpec, Limits, OutputSettings, Resources, SpecError, SplitTask,
-    StageSpec, TaskSpec, check_label,
-};
+pub use generate::{GenerateSettings, GenerateTask};
+pub use import::{ImportSettings, ImportTask};
+pub use job::{JobSpec, Limits, OutputSettings, Resources, SpecError, StageSpec, check_label};
 pub use lease::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
 pub use render::{
@@ -27,4 +29,5 @@ pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,
 };
+pub use task::{ExportSettings, ExportTask, SplitTask, TaskSpec};
 pub use text::parse_share;

@@ -289,7 +289,7 @@ impl Default for RenderSettings {
 }
 
 impl SceneSource {
-    fn check(&self) -> Result<(), SpecError> {
+    pub(super) fn check(&self) -> Result<(), SpecError> {
         check_count("scenes.count", self.count)?;
         if let SceneKind::Files { first: 1.., .. } = &self.kind {
             return Err(SpecError::new(

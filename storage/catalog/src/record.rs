@@ -121,6 +121,8 @@ impl ResultSet {
         let (store, dataset) = match &stage.task {
             TaskSpec::Render(task) => (task.output.store.clone(), task.output.dataset.clone()),
             TaskSpec::Reprocess(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Import(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Generate(task) => (task.generate.dest.clone(), "/scenes".into()),
             TaskSpec::Part(task) => (
                 task.whole.output.store.clone(),
                 format!("{}/parts", task.whole.output.dataset),

@@ -39,6 +39,7 @@ pub use export::{Export, Exported};
 pub use export_sb3d::ExportedScene;
 pub use layout::{INNER_SIDE, Quantity};
 pub use manifest::{ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding};
+pub use objects::publish_files;
 pub use parts::PartName;
 pub use read::Stored;
 pub use record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};

@@ -97,6 +97,22 @@ pub(crate) async fn create_or_match(
     })
 }
 
+/// Puts files create-only, in their order: where the last one names the others, whoever sees it finds them. Files that
+/// exist must have equal bytes. For what is no data set.
+///
+/// # Errors
+/// [`DatasetError::Conflict`] for other bytes, [`DatasetError::Store`].
+pub async fn publish_files(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    files: &[(String, Bytes)],
+) -> Result<(), DatasetError> {
+    for (name, bytes) in files {
+        create_or_match(store, &path_of(prefix, name), bytes.clone()).await?;
+    }
+    Ok(())
+}
+
 /// Puts in any case (for metadata that grows).
 pub(crate) async fn overwrite(
     store: &dyn ObjectStore,

@@ -77,12 +77,18 @@ async fn a_scene_is_read_and_found_again() {
         .await
         .unwrap();
     for index in 0..2 {
-        assert_eq!(source.finished(&dataset, index, false).await.unwrap(), None);
+        assert_eq!(
+            source
+                .finished(&dataset, index, index, false)
+                .await
+                .unwrap(),
+            None
+        );
         let scene = import_scene(&source, index).unwrap();
         let encoded = source.encode(&dataset, index, &scene).unwrap();
         let manifest = dataset.publish_encoded(encoded).await.unwrap();
         assert_eq!(
-            source.finished(&dataset, index, true).await.unwrap(),
+            source.finished(&dataset, index, index, true).await.unwrap(),
             Some(manifest)
         );
     }
@@ -114,16 +120,22 @@ async fn a_scene_is_read_and_found_again() {
     let mut other = whole.clone();
     *other.last_mut().unwrap() ^= 1;
     std::fs::write(&file, &other).unwrap();
-    assert!(source.finished(&dataset, 1, false).await.unwrap().is_some());
+    assert!(
+        source
+            .finished(&dataset, 1, 1, false)
+            .await
+            .unwrap()
+            .is_some()
+    );
     let error = source
-        .finished(&dataset, 1, true)
+        .finished(&dataset, 1, 1, true)
         .await
         .unwrap_err()
         .to_string();
     assert!(error.contains("SHA-256 of b/depth.npy"), "{error}");
     std::fs::write(&file, &other[1..]).unwrap();
     let error = source
-        .finished(&dataset, 1, false)
+        .finished(&dataset, 1, 1, false)
         .await
         .unwrap_err()
         .to_string();

@@ -59,6 +59,8 @@ impl StorePrefixes {
                 self.allowed("output.store", &task.whole.output.store)?;
                 scene(&task.whole, task.split(index).0)
             }
+            TaskSpec::Generate(task) => self.allowed("generate.dest", &task.generate.dest),
+            TaskSpec::Import(task) => self.allowed("import.folder", &task.import.folder),
             TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
             TaskSpec::Reprocess(_) | TaskSpec::Split(_) => Ok(()),
         }

@@ -116,7 +116,12 @@ impl Simulated {
         let opened = client.session(UnboundedReceiverStream::new(requests)).await;
         let mut from = match opened {
             Ok(response) => response.into_inner(),
-            Err(status) if status.code() == tonic::Code::Unavailable => return End::Lost,
+            Err(status)
+                if status.code() == tonic::Code::Unavailable
+                    || picofarm_agent::lost_connection(&status) =>
+            {
+                return End::Lost;
+            }
             Err(status) => return End::Refused(status.message().to_owned()),
         };
         let welcome = match from.message().await {

@@ -329,7 +329,7 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
     }
 }
 
-/// How far the spots lie off the depth image: the median of |Δz|/z, where a spot is in view of a laser at the camera.
+/// How far the spots lie off the depth image, between a pixel's depth and its neighbours': the median of |Δz|/z, where a spot is in view of a laser at the camera.
 fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, ImportError> {
     if norm(g.laser.map(f64::from)) > 0.02 {
         return Ok(None);
@@ -347,11 +347,21 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
         if !(0.0..w as f64).contains(&column) || !(0.0..h as f64).contains(&row) {
             continue;
         }
-        let pixel = row as usize * w + column as usize;
-        let depth = f64::from(g.depth[pixel]);
-        if depth > 0.0 && g.specular[pixel] == 0 {
-            seen.push((libm::fabs(z - depth) / depth, z / depth));
+        let (row, column) = (row as usize, column as usize);
+        let depth = f64::from(g.depth[row * w + column]);
+        if depth <= 0.0 || g.specular[row * w + column] != 0 {
+            continue;
         }
+        // A pixel's depth is its centre's: the spot lies between those around it.
+        let rows = row.saturating_sub(1)..(row + 2).min(h);
+        let near = rows.flat_map(|r| {
+            let columns = column.saturating_sub(1)..(column + 2).min(w);
+            columns.map(move |c| f64::from(g.depth[r * w + c]))
+        });
+        let near = near.filter(|d| *d > 0.0);
+        let (low, high) = near.fold((depth, depth), |(a, b), d| (a.min(d), b.max(d)));
+        let off = (low - z).max(z - high).max(0.0);
+        seen.push((off / depth, z / depth));
     }
     if seen.is_empty() {
         return Ok(None);

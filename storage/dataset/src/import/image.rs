@@ -35,8 +35,11 @@ pub(super) struct Exr {
 
 /// Width and height of an OpenEXR file's only layer.
 pub(super) fn exr_size(file: &Path) -> Result<(usize, usize), ImportError> {
-    let meta = exr::meta::MetaData::read_from_file(file, false)
-        .map_err(|e| ImportError::unreadable(file, e, MEND_EXR))?;
+    let meta = exr::meta::MetaData::read_from_file(file, false);
+    let meta = meta.map_err(|e| match e {
+        exr::error::Error::Io(e) => ImportError::io("read", file, e),
+        e => ImportError::unreadable(file, e, MEND_EXR),
+    })?;
     let size = meta.headers[0].layer_size;
     Ok((size.width(), size.height()))
 }

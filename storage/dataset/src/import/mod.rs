@@ -31,7 +31,7 @@ use scene::Shape;
 use crate::spec::{DatasetSpec, Profile};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
-pub const IMPORT_VERSION: &str = "import-1";
+pub const IMPORT_VERSION: &str = "import-2";
 
 /// Scenes in a folder that can be imported.
 #[derive(Debug, Clone)]
@@ -126,6 +126,12 @@ impl Source {
     /// Number of scenes.
     pub fn scenes(&self) -> u64 {
         self.items.len() as u64
+    }
+
+    /// The index of the scene called `name`.
+    pub fn index_of(&self, name: &str) -> Option<u64> {
+        let found = self.items.iter().position(|i| i.name == name);
+        found.map(|i| i as u64)
     }
 
     /// Name of a scene: its folder below the source's, and the capture in it.

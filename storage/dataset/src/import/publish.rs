@@ -11,14 +11,15 @@ use crate::manifest::{ENCODER_VERSION, Manifest};
 use crate::record::Provenance;
 
 impl Source {
-    /// Codes an imported scene; publish it with [`Dataset::publish_encoded`]. Blocks; works on rayon's threads.
+    /// Codes an imported scene as scene `at` of the data set; publish it with [`Dataset::publish_encoded`]. Blocks;
+    /// works on rayon's threads.
     ///
     /// # Errors
     /// [`ImportError::Dataset`].
     pub fn encode(
         &self,
         dataset: &Dataset,
-        index: u64,
+        at: u64,
         scene: &ImportedScene,
     ) -> Result<EncodedScene, ImportError> {
         let key = json!({
@@ -35,12 +36,12 @@ impl Source {
             seed: 0,
             plan,
         };
-        let encoded = scene.with_record(|record| dataset.encode(index, record, &provenance));
+        let encoded = scene.with_record(|record| dataset.encode(at, record, &provenance));
         Ok(encoded?)
     }
 
-    /// The manifest of scene `index` if this import has published it before: from the same files by name and size,
-    /// with the same options. With `rehash`, the files' contents are compared too.
+    /// The manifest of scene `at` of the data set if this import has published its scene `index` there before: from the
+    /// same files by name and size, with the same options. With `rehash`, the files' contents are compared too.
     ///
     /// # Errors
     /// [`ImportError::Refused`] where the data set holds something else under this index;
@@ -48,10 +49,11 @@ impl Source {
     pub async fn finished(
         &self,
         dataset: &Dataset,
+        at: u64,
         index: u64,
         rehash: bool,
     ) -> Result<Option<Manifest>, ImportError> {
-        let manifest = match dataset.published(index).await {
+        let manifest = match dataset.published(at).await {
             Ok(Some(manifest)) => manifest,
             Ok(None) => return Ok(None),
             // Importing it again restores what is missing, or tells what is wrong.
@@ -67,26 +69,26 @@ impl Source {
         ];
         for (field, expected) in ours {
             if plan[field] != expected {
-                return Err(self.other(dataset, index, field, &expected, &plan[field]));
+                return Err(self.other(dataset, at, field, &expected, &plan[field]));
             }
         }
         let version = json!(format!("{IMPORT_VERSION}/{ENCODER_VERSION}"));
         let stored = json!(manifest.provenance.renderer);
         if stored != version {
-            return Err(self.other(dataset, index, "version", &version, &stored));
+            return Err(self.other(dataset, at, "version", &version, &stored));
         }
         let files: Vec<SourceFile> =
             serde_json::from_value(plan["files"].clone()).map_err(|e| {
                 self.other(
                     dataset,
-                    index,
+                    at,
                     "files",
                     &json!("a list"),
                     &json!(e.to_string()),
                 )
             })?;
         for file in &files {
-            self.unchanged(dataset, index, file, rehash)?;
+            self.unchanged(dataset, at, file, rehash)?;
         }
         Ok(Some(manifest))
     }

@@ -1,6 +1,8 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
 pub mod export;
+mod generate;
+mod import;
 mod memory;
 mod output;
 mod parts;
@@ -27,6 +29,8 @@ use picofarm_proto::{
     model::StageSpec,
 };
 
+pub use generate::generator_version;
+pub use import::{import_options, import_version};
 pub use memory::{check_memory, memory_mib, render_bytes};
 pub use render::renderer_version;
 pub(crate) use runner::Runner;

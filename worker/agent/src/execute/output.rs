@@ -87,7 +87,8 @@ impl Stores {
         self.wait(control, Dataset::open(store, prefix.join(dataset)))
     }
 
-    fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+    /// A place to write to. The first use of a location proves that its store is safe.
+    pub(super) fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
         let known = || self.probed.lock().expect("no panic while locked");
         if let Some(place) = known().get(location) {
             return Ok(place.clone());
@@ -104,6 +105,16 @@ impl Stores {
         control: &Control,
         request: impl Future<Output = Result<T, DatasetError>>,
     ) -> Result<T, TaskError> {
+        self.wait_for(control, request, of_dataset)
+    }
+
+    /// The same for requests that fail with errors of their own.
+    pub(super) fn wait_for<T, E>(
+        &self,
+        control: &Control,
+        request: impl Future<Output = Result<T, E>>,
+        blame: impl FnOnce(E) -> TaskError,
+    ) -> Result<T, TaskError> {
         let stopped = async {
             while !control.stopped() {
                 tokio::time::sleep(STOP_LOOK).await;
@@ -112,7 +123,7 @@ impl Stores {
         self.runtime.block_on(async {
             tokio::select! {
                 biased;
-                result = request => result.map_err(of_dataset),
+                result = request => result.map_err(blame),
                 () = stopped => Err(TaskError::Stopped),
             }
         })

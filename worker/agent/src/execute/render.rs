@@ -126,7 +126,7 @@ pub(super) fn prepare(
 ) -> Result<(Scene, Settings), TaskError> {
     let begun = Instant::now();
     let scene = debug_span!(target: trace::TARGET, "scene")
-        .in_scope(|| scenes::scene(spec, index, libraries))?;
+        .in_scope(|| scenes::scene(&spec.scenes, spec.render.resolution, index, libraries))?;
     info!(
         scene = scene.name,
         triangles = scene.triangle_count(),

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use picofarm_proto::{
     key::scene_seed,
-    model::{RenderTask, SceneFile, SceneKind},
+    model::{SceneFile, SceneKind, SceneSource},
 };
 use picofarm_scene::{
     AssetLibrary, LaserGrid, Scene, SceneError,
@@ -42,13 +42,13 @@ pub(super) fn find_libraries(dirs: &[PathBuf]) -> Vec<AssetLibrary> {
         .collect()
 }
 
-/// The scene of task `index`, with the job's resolution and spots.
+/// The scene of task `index`, with an image of `side` pixels and the job's spots.
 pub(super) fn scene(
-    spec: &RenderTask,
+    source: &SceneSource,
+    side: u32,
     index: u64,
     libraries: &[AssetLibrary],
 ) -> Result<Scene, TaskError> {
-    let (source, side) = (&spec.scenes, spec.render.resolution);
     let seed = scene_seed(source.seed, index);
     match &source.kind {
         SceneKind::Furnished {
@@ -81,7 +81,7 @@ pub(super) fn scene(
             let file = source.kind.file(index).ok_or_else(|| {
                 TaskError::User(format!("{at}: the job lists no such file; submit it again"))
             })?;
-            read(file, &at, spec)
+            read(file, &at, (source.spots, side))
         }
     }
 }
@@ -102,7 +102,7 @@ fn library<'a>(
 }
 
 /// Reads a scene file after checking its hash, and gives it the job's resolution.
-fn read(file: &SceneFile, at: &str, spec: &RenderTask) -> Result<Scene, TaskError> {
+fn read(file: &SceneFile, at: &str, (spots, side): (u32, u32)) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
     let found = import::fingerprint(path).map_err(|e| named(at, e))?;
     if found != file.sha256 {
@@ -112,15 +112,14 @@ fn read(file: &SceneFile, at: &str, spec: &RenderTask) -> Result<Scene, TaskErro
             file.path, file.sha256
         )));
     }
-    let mut scene = with_laser(path, spec.scenes.spots).map_err(|e| named(at, e))?;
-    let side = spec.render.resolution;
+    let mut scene = with_laser(path, spots).map_err(|e| named(at, e))?;
     scene.camera.intrinsics = scene.camera.intrinsics.resized(side, side);
     let beams = scene.laser.beams.len();
-    if beams != spec.scenes.spots as usize {
+    if beams != spots as usize {
         return Err(TaskError::User(format!(
-            "{at}: {} has a laser of {beams} beams, but the job says scenes.spots = {}; set scenes.spots to {beams}, \
+            "{at}: {} has a laser of {beams} beams, but the job says scenes.spots = {spots}; set scenes.spots to {beams}, \
              or remove the laser from the file to use the job's grid",
-            file.path, spec.scenes.spots
+            file.path
         )));
     }
     Ok(scene)

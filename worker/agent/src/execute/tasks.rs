@@ -4,14 +4,14 @@ use std::{collections::BTreeMap, path::PathBuf, time::Duration};
 
 use picofarm_proto::model::{
     TaskSpec,
-    job::{EXPORT_VERSION, SPLIT_VERSION},
+    task::{EXPORT_VERSION, SPLIT_VERSION},
 };
 use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
 
 use super::{
-    Control, Executor, Output, Task, TaskError, export, output::Stores, parts, render, reprocess,
-    scenes, split,
+    Control, Executor, Output, Task, TaskError, export, generate, import, output::Stores, parts,
+    render, reprocess, scenes, split,
 };
 
 /// How long a finished scene waits for a store that is full or away before its task is handed back.
@@ -21,6 +21,7 @@ pub(super) const STORE_PATIENCE: Duration = Duration::from_secs(120);
 pub struct TaskExecutor {
     libraries: Vec<AssetLibrary>,
     stores: Stores,
+    sources: import::Sources,
 }
 
 impl TaskExecutor {
@@ -30,6 +31,7 @@ impl TaskExecutor {
         Self {
             libraries: scenes::find_libraries(asset_dirs),
             stores: Stores::new(runtime, STORE_PATIENCE),
+            sources: import::Sources::default(),
         }
     }
 }
@@ -38,6 +40,8 @@ impl Executor for TaskExecutor {
     fn kinds(&self) -> BTreeMap<String, String> {
         [
             ("render", render::renderer_version()),
+            ("generate", generate::generator_version()),
+            ("import", import::import_version()),
             ("part", render::renderer_version()),
             ("reprocess", reprocess::sensor_version()),
             ("split", SPLIT_VERSION.to_owned()),
@@ -57,6 +61,8 @@ impl Executor for TaskExecutor {
         match &task.spec.task {
             TaskSpec::Render(spec) => render::run(stores, &self.libraries, spec, task, control),
             TaskSpec::Part(spec) => parts::run(stores, &self.libraries, spec, task, control),
+            TaskSpec::Generate(spec) => generate::run(stores, &self.libraries, spec, task, control),
+            TaskSpec::Import(spec) => import::run(stores, &self.sources, spec, task, control),
             TaskSpec::Reprocess(spec) => {
                 reprocess::run(stores, spec, task.spec.force, task.index, control)
             }

@@ -1,0 +1,137 @@
+//! What the tasks of a stage do: a kind of task is a variant here, and what it needs to know.
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    generate::GenerateTask,
+    import::ImportTask,
+    render::{PartTask, RenderTask},
+    reprocess::{ReprocessTask, SourceSettings},
+};
+use crate::split::SplitSettings;
+
+/// What the tasks of a stage do. A further kind is a variant here, a file under the agent's `execute`, and a line in each
+/// `match` that the compiler then asks for.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum TaskSpec {
+    /// Scenes are rendered: one task each.
+    Render(RenderTask),
+    /// Scenes are made and written as files: one task each.
+    Generate(GenerateTask),
+    /// Scenes of other people's data are converted into a data set: one task each.
+    Import(ImportTask),
+    /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
+    Part(PartTask),
+    /// Scenes of a data set go through a sensor into another: one task each.
+    Reprocess(ReprocessTask),
+    /// The scenes of a data set are divided into training, validation and test: one task.
+    Split(SplitTask),
+    /// A data set is packed for sharing: one task.
+    Export(ExportTask),
+}
+
+/// Dividing a data set.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SplitTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// How.
+    pub split: SplitSettings,
+}
+
+/// Packing a data set.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ExportTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// What is packed, and where it goes.
+    pub export: ExportSettings,
+}
+
+/// What is packed, and where it goes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExportSettings {
+    /// A path or URL that every worker can reach.
+    pub dest: String,
+    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub scenes: String,
+}
+
+impl TaskSpec {
+    /// The kind's name, as in a job file.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Render(_) => "render",
+            Self::Part(_) => "part",
+            Self::Generate(_) => "generate",
+            Self::Import(_) => "import",
+            Self::Reprocess(_) => "reprocess",
+            Self::Split(_) => "split",
+            Self::Export(_) => "export",
+        }
+    }
+
+    /// Version of the code that decides the bytes of its results; a worker's must equal it.
+    pub fn version(&self) -> &str {
+        match self {
+            Self::Render(task) => &task.render.renderer,
+            Self::Part(task) => &task.whole.render.renderer,
+            Self::Generate(task) => &task.generate.version,
+            Self::Import(task) => &task.import.version,
+            Self::Reprocess(task) => &task.reprocess.version,
+            Self::Split(_) => SPLIT_VERSION,
+            Self::Export(_) => EXPORT_VERSION,
+        }
+    }
+
+    /// The data set that is read.
+    pub fn reads(&self) -> Option<&SourceSettings> {
+        match self {
+            Self::Render(_) | Self::Part(_) | Self::Generate(_) | Self::Import(_) => None,
+            Self::Reprocess(task) => Some(&task.source),
+            Self::Split(task) => Some(&task.source),
+            Self::Export(task) => Some(&task.source),
+        }
+    }
+
+    /// The data set that scenes are put into: store and folder.
+    pub fn writes(&self) -> Option<(&String, &String)> {
+        match self {
+            Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Import(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Part(_) | Self::Generate(_) | Self::Split(_) | Self::Export(_) => None,
+        }
+    }
+
+    /// The rendering, where it is one or a part of one.
+    pub fn as_render(&self) -> Option<&RenderTask> {
+        match self {
+            Self::Render(task) => Some(task),
+            Self::Part(task) => Some(&task.whole),
+            _ => None,
+        }
+    }
+
+    /// The data set that is read, and the number of its scenes; to be filled in.
+    pub fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        match self {
+            Self::Render(_) | Self::Part(_) | Self::Generate(_) | Self::Import(_) => None,
+            Self::Reprocess(task) => Some((&mut task.source, &mut task.count)),
+            Self::Split(task) => Some((&mut task.source, &mut task.count)),
+            Self::Export(task) => Some((&mut task.source, &mut task.count)),
+        }
+    }
+}
+
+/// Version of the split task.
+pub const SPLIT_VERSION: &str = "split-1";
+/// Version of the export task.
+pub const EXPORT_VERSION: &str = "export-1";
