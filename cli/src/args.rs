@@ -10,9 +10,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
-pub use data::{
-    DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, ExportFormat, SensorArgs,
-};
+pub use data::{DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs};
 pub use guard::{Guard, Token};
 pub use job::{Job, JobKind};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};

@@ -207,6 +207,8 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
             TaskSpec::Split(_) => {}
             TaskSpec::Export(task) => {
                 task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
+                picofarm_dataset::ExportFormat::parse(&task.export.format)
+                    .map_err(|e| named(CliError::input(format!("export.format: {e}"))))?;
                 picofarm_agent::export::Scenes::parse(&task.export.scenes)
                     .map_err(|e| named(CliError::input(format!("export.scenes: {e}"))))?;
             }

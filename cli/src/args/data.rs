@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use picofarm_proto::model::Histogram;
 
 use picofarm_agent::export::Scenes;
+use picofarm_dataset::ExportFormat;
 use picofarm_dataset::import::{Captures, DepthKind, Format, ImportOptions, Polarity};
 
 /// A sensor.
@@ -102,15 +103,10 @@ pub struct DatasetExport {
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
     pub scenes: Option<Scenes>,
-    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves
-    #[arg(long, value_enum, default_value_t = ExportFormat::Zarr)]
+    /// Layout: zarr packs 16 scenes a file; sb3d is the paper's, with OpenEXR histograms in halves; webdataset makes tar
+    /// files of 8 scenes; hdf5 a file a scene
+    #[arg(long, default_value = "zarr", value_name = "NAME", value_parser = ExportFormat::parse)]
     pub format: ExportFormat,
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum ExportFormat {
-    Zarr,
-    Sb3d,
 }
 
 #[derive(Args)]

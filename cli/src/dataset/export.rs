@@ -1,16 +1,14 @@
-//! `picofarm dataset export`: a data set packed for sharing, or in the paper's layout.
+//! `picofarm dataset export`: a data set packed for sharing, or in a layout that other tools know.
 
 use std::time::Instant;
 
-use object_store::{ObjectStore, path::Path};
 use picofarm_agent::export::Scenes;
-use picofarm_dataset::{Dataset, Export, Exported, open_store};
+use picofarm_dataset::{Exported, Exporter, open_store};
 use serde_json::json;
-use tokio_util::sync::CancellationToken;
 
 use super::{failed, open};
 use crate::{
-    args::{DatasetExport, ExportFormat},
+    args::DatasetExport,
     error::Result,
     output::{Meter, Output, bytes, duration},
     signals,
@@ -25,54 +23,21 @@ pub async fn run(args: DatasetExport, output: Output) -> Result<()> {
     let which = args.scenes.unwrap_or(Scenes::All);
     let scenes = which.of(&dataset).await.map_err(failed)?;
     let (store, prefix) = open_store(&args.dest).map_err(failed)?;
-    if args.format == ExportFormat::Sb3d {
-        let written = sb3d(&dataset, &scenes, (&*store, &prefix), &stop, output).await?;
-        tell(&args.dataset, &args.dest, written, start, output);
-        return Ok(());
-    }
-    let mut export = Export::new(&dataset, &scenes, &*store, prefix).map_err(failed)?;
+    let mut export =
+        Exporter::new(args.format, &dataset, &scenes, &*store, prefix).map_err(failed)?;
     let mut meter = Meter::new(output);
-    let packs = export.packs();
-    for k in 0..packs {
-        meter.at(k as f64 / packs as f64, format!("{k} of {packs} packs"));
-        let given_up = tokio::select! {
-            packed = export.pack(k) => { packed.map_err(failed)?; false }
-            () = stop.cancelled() => true,
-        };
-        if given_up {
-            return Err(signals::interrupted(HINT));
+    let steps = export.steps();
+    for k in 0..steps {
+        meter.at(k as f64 / steps as f64, format!("{k} of {steps} steps"));
+        tokio::select! {
+            done = export.step(k) => done.map_err(failed)?,
+            () = stop.cancelled() => return Err(signals::interrupted(HINT)),
         }
     }
     let done = export.finish().await.map_err(failed)?;
     meter.finish();
     tell(&args.dataset, &args.dest, done, start, output);
     Ok(())
-}
-
-/// Scene by scene in the paper's layout.
-async fn sb3d(
-    dataset: &Dataset,
-    scenes: &[u64],
-    (store, prefix): (&dyn ObjectStore, &Path),
-    stop: &CancellationToken,
-    output: Output,
-) -> Result<Exported> {
-    let (mut done, mut meter) = (Exported::default(), Meter::new(output));
-    for (at, scene) in scenes.iter().enumerate() {
-        meter.at(
-            at as f64 / scenes.len() as f64,
-            format!("{at} of {} scenes", scenes.len()),
-        );
-        let written = tokio::select! {
-            written = dataset.export_sb3d(*scene, store, prefix) => written.map_err(failed)?,
-            () = stop.cancelled() => return Err(signals::interrupted(HINT)),
-        };
-        done.scenes += 1;
-        done.files += written.files;
-        done.bytes += written.bytes;
-    }
-    meter.finish();
-    Ok(done)
 }
 
 fn tell(dataset: &str, dest: &str, done: Exported, start: Instant, output: Output) {

@@ -62,6 +62,9 @@ pub struct ExportSettings {
     /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub scenes: String,
+    /// `zarr` (default), `sb3d`, `webdataset` or `hdf5`.
+    #[serde(default = "zarr")]
+    pub format: String,
 }
 
 impl TaskSpec {
@@ -131,7 +134,11 @@ impl TaskSpec {
     }
 }
 
+fn zarr() -> String {
+    "zarr".into()
+}
+
 /// Version of the split task.
 pub const SPLIT_VERSION: &str = "split-1";
 /// Version of the export task.
-pub const EXPORT_VERSION: &str = "export-1";
+pub const EXPORT_VERSION: &str = "export-2";

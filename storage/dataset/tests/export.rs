@@ -4,6 +4,7 @@
 mod common;
 
 use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
 use std::path::Path;
 use std::process::Command;
 
@@ -35,11 +36,20 @@ async fn source(folder: &Path, profile: Profile) -> (Dataset, Vec<u64>) {
 }
 
 async fn export(dataset: &Dataset, scenes: &[u64], to: &Path) -> Exported {
+    export_as(ExportFormat::Zarr, dataset, scenes, to).await
+}
+
+async fn export_as(format: ExportFormat, dataset: &Dataset, scenes: &[u64], to: &Path) -> Exported {
     let (store, prefix) = open_store(to.to_str().unwrap()).unwrap();
-    let mut export = Export::new(dataset, scenes, &*store, prefix).unwrap();
-    assert_eq!(export.packs(), scenes.len().div_ceil(16));
-    for k in 0..export.packs() {
-        export.pack(k).await.unwrap();
+    let mut export = Exporter::new(format, dataset, scenes, &*store, prefix).unwrap();
+    let each = match format {
+        ExportFormat::Zarr => 16,
+        ExportFormat::WebDataset => 8,
+        ExportFormat::Sb3d | ExportFormat::Hdf5 => 1,
+    };
+    assert_eq!(export.steps(), scenes.len().div_ceil(each));
+    for k in 0..export.steps() {
+        export.step(k).await.unwrap();
     }
     export.finish().await.unwrap()
 }
@@ -73,22 +83,56 @@ async fn zarr_python_reads_of_an_export_what_it_reads_of_its_source() {
         let folder = tempfile::tempdir().unwrap();
         let (dataset, scenes) = source(folder.path(), profile).await;
         export(&dataset, &scenes, &folder.path().join("packed")).await;
-        let script =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/interop/read_export.py");
         let list: Vec<String> = scenes.iter().map(u64::to_string).collect();
-        let output = Command::new(&python)
-            .arg(script)
-            .arg(folder.path().join("source"))
-            .arg(folder.path().join("packed"))
-            .arg(list.join(","))
-            .output()
-            .unwrap();
-        let (out, err) = (
-            String::from_utf8_lossy(&output.stdout),
-            String::from_utf8_lossy(&output.stderr),
+        let (source, packed) = (folder.path().join("source"), folder.path().join("packed"));
+        let args = [
+            source.as_os_str(),
+            packed.as_os_str(),
+            list.join(",").as_ref(),
+        ]
+        .map(Into::into);
+        reads(&python, "read_export.py", &args);
+    }
+}
+
+/// Runs a script of tests/interop.
+fn reads(python: &OsStr, script: &str, args: &[OsString]) {
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/interop");
+    let output = Command::new(python)
+        .arg(scripts.join(script))
+        .args(args)
+        .output()
+        .unwrap();
+    let (out, err) = (
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr),
+    );
+    println!("{args:?}\n{out}");
+    assert!(output.status.success(), "{args:?}\n{out}\n{err}");
+}
+
+#[tokio::test]
+async fn python_reads_of_tar_and_hdf5_files_what_the_data_set_holds() {
+    let Some(python) = std::env::var_os("PICOFARM_PYTHON") else {
+        println!(
+            "skipped: set PICOFARM_PYTHON to a Python with numpy, zarr, xarray and h5py to run this test"
         );
-        println!("{profile:?}\n{out}");
-        assert!(output.status.success(), "{profile:?}\n{out}\n{err}");
+        return;
+    };
+    for profile in PROFILES {
+        let folder = tempfile::tempdir().unwrap();
+        let (dataset, scenes) = source(folder.path(), profile).await;
+        for format in [ExportFormat::WebDataset, ExportFormat::Hdf5] {
+            let place = folder.path().join(format.name());
+            let done = export_as(format, &dataset, &scenes, &place).await;
+            let written = files(&place);
+            assert_eq!((done.scenes, done.files), (21, written.len() as u64));
+            let source = folder.path().join("source").into_os_string();
+            reads(&python, "read_files.py", &[source, place.clone().into()]);
+            // Again: the same bytes, so nothing conflicts.
+            assert_eq!(export_as(format, &dataset, &scenes, &place).await, done);
+            assert!(files(&place) == written);
+        }
     }
 }
 
@@ -107,15 +151,23 @@ async fn an_interrupted_export_goes_on_and_another_one_in_its_place_is_refused()
 
     let place = folder.path().join("halting");
     let (store, prefix) = open_store(place.to_str().unwrap()).unwrap();
-    let mut begun = Export::new(&dataset, &scenes, &*store, prefix.clone()).unwrap();
-    begun.pack(0).await.unwrap();
+    let mut begun = Exporter::new(
+        ExportFormat::Zarr,
+        &dataset,
+        &scenes,
+        &*store,
+        prefix.clone(),
+    )
+    .unwrap();
+    begun.step(0).await.unwrap();
     drop(begun);
     assert!(!place.join("zarr.json").exists());
     assert_eq!(export(&dataset, &scenes, &place).await, done);
     assert!(files(&place) == expected);
 
-    let mut other = Export::new(&dataset, &scenes[1..], &*store, prefix).unwrap();
-    let error = other.pack(0).await.unwrap_err();
+    let mut other =
+        Exporter::new(ExportFormat::Zarr, &dataset, &scenes[1..], &*store, prefix).unwrap();
+    let error = other.step(0).await.unwrap_err();
     assert!(matches!(error, DatasetError::Conflict { .. }), "{error}");
     assert!(files(&place) == expected);
 }
@@ -125,9 +177,10 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, scenes) = source(folder.path(), Profile::default()).await;
     let (store, prefix) = open_store(folder.path().join("out").to_str().unwrap()).unwrap();
-    assert!(Export::new(&dataset, &[], &*store, prefix.clone()).is_err());
-    let mut absent = Export::new(&dataset, &[2], &*store, prefix.clone()).unwrap();
-    let error = absent.pack(0).await.unwrap_err();
+    assert!(Exporter::new(ExportFormat::Zarr, &dataset, &[], &*store, prefix.clone()).is_err());
+    let mut absent =
+        Exporter::new(ExportFormat::Zarr, &dataset, &[2], &*store, prefix.clone()).unwrap();
+    let error = absent.step(0).await.unwrap_err();
     assert!(
         matches!(error, DatasetError::NotPublished { scene: 2, .. }),
         "{error}"
@@ -136,14 +189,23 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
     let mut bytes = std::fs::read(&victim).unwrap();
     bytes[20] ^= 1;
     std::fs::write(&victim, bytes).unwrap();
-    let mut damaged = Export::new(&dataset, &scenes, &*store, prefix.clone()).unwrap();
-    let error = damaged.pack(0).await.unwrap_err().to_string();
+    let mut damaged = Exporter::new(
+        ExportFormat::Zarr,
+        &dataset,
+        &scenes,
+        &*store,
+        prefix.clone(),
+    )
+    .unwrap();
+    let error = damaged.step(0).await.unwrap_err().to_string();
     assert!(error.contains("source/depth/c/4/0/0"), "{error}");
     let each = DatasetSpec {
         per_spot: true,
         ..spec(Profile::default())
     };
     let (_, dataset) = in_memory(&each).await;
-    let error = Export::new(&dataset, &[0], &*store, prefix).err().unwrap();
+    let error = Exporter::new(ExportFormat::Zarr, &dataset, &[0], &*store, prefix)
+        .err()
+        .unwrap();
     assert!(error.to_string().contains("per_spot"), "{error}");
 }

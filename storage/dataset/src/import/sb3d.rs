@@ -12,7 +12,7 @@ use super::check::{Blame, Geometry, check};
 use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity, image, npy};
-use crate::export_sb3d::{ASIDE, Aside};
+use crate::export::{ASIDE, Aside};
 use crate::layout::Quantity;
 use crate::spec::{Gate, Subsets};
 

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use picofarm_dataset::{Dataset, DatasetError, Export, open_store};
+use picofarm_dataset::{Dataset, DatasetError, ExportFormat, Exporter, open_store};
 use picofarm_proto::{
     model::ExportTask,
     split::{SIDES, SplitRecord},
@@ -122,12 +122,15 @@ pub(super) fn run(
         .map_err(|e| field(e, "export.scenes"))?;
     let (store, prefix) =
         open_store(&spec.export.dest).map_err(|e| field(of_dataset(e), "export.dest"))?;
-    let mut export = Export::new(&source, &scenes, &*store, prefix).map_err(of_dataset)?;
-    let packs = export.packs();
-    for k in 0..packs {
-        stores.wait(control, export.pack(k))?;
-        info!("file {} of {packs} written", k + 1);
-        if !control.at((k + 1) as f32 / (packs + 1) as f32) {
+    let format = ExportFormat::parse(&spec.export.format)
+        .map_err(|what| TaskError::User(format!("export.format: {what}")))?;
+    let mut export =
+        Exporter::new(format, &source, &scenes, &*store, prefix).map_err(of_dataset)?;
+    let steps = export.steps();
+    for k in 0..steps {
+        stores.wait(control, export.step(k))?;
+        info!("step {} of {steps} written", k + 1);
+        if !control.at((k + 1) as f32 / (steps + 1) as f32) {
             return Err(TaskError::Stopped);
         }
     }

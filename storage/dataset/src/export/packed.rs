@@ -20,7 +20,7 @@ use crate::spec::DatasetSpec;
 /// Version of the packed layout.
 const EXPORT_VERSION: u32 = 1;
 /// Scenes in an object.
-const PACK: usize = 16;
+pub(super) const PACK: usize = 16;
 /// Requests in flight.
 const CONCURRENCY: usize = 8;
 /// Name of the array of the scenes' indices in the source.
@@ -81,17 +81,12 @@ impl<'a> Export<'a> {
         })
     }
 
-    /// Number of [`Self::pack`]s.
-    pub fn packs(&self) -> usize {
-        self.scenes.len().div_ceil(PACK)
-    }
-
-    /// Writes the objects of pack `k`: one for each quantity, and the scenes' manifests.
+    /// Writes the objects of pack `k`: one for each quantity, and the scenes' manifests, which it returns.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
     /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
-    pub async fn pack(&mut self, k: usize) -> Result<(), DatasetError> {
+    pub async fn pack(&mut self, k: usize) -> Result<Vec<Manifest>, DatasetError> {
         let first = k * PACK;
         let scenes = &self.scenes[first..self.scenes.len().min(first + PACK)];
         let reads = scenes.iter().map(|scene| self.source.manifest(*scene));
@@ -116,7 +111,7 @@ impl<'a> Export<'a> {
         self.put(&format!("manifests/{k}.json"), text.into())
             .await?;
         self.done.scenes += scenes.len() as u64;
-        Ok(())
+        Ok(manifests)
     }
 
     /// Writes the metadata, the root's last: the group exists once all packs do.

@@ -7,13 +7,12 @@
 
 use std::io::{Cursor, Write};
 
+use bytes::Bytes;
 use exr::prelude::{
     AnyChannel, AnyChannels, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes,
     SmallVec, WritableImage,
 };
 use half::f16;
-use object_store::ObjectStore;
-use object_store::path::Path;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -21,9 +20,8 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::import::npy;
 use crate::layout::Quantity;
-use crate::objects;
 use crate::record::{Intrinsics, Spot};
-use crate::spec::Gate;
+use crate::spec::{DatasetSpec, Gate};
 
 /// Name of the file with what the layout has no place for.
 pub(crate) const ASIDE: &str = "picofarm.json";
@@ -69,41 +67,15 @@ impl Aside {
     }
 }
 
-/// Files of an exported scene and their bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ExportedScene {
-    /// Files.
-    pub files: u64,
-    /// Their bytes.
-    pub bytes: u64,
-}
-
 impl Dataset {
-    /// Writes a scene in the layout of the paper's release, into `prefix/<scene, six digits>`. All files are put
-    /// create-only: run again after an interruption, equal files count as written.
-    ///
-    /// # Errors
-    /// [`DatasetError::Invalid`] where the data set has other than 4, 25 or 100 spots; [`DatasetError::NotPublished`];
-    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
-    pub async fn export_sb3d(
+    /// A scene's files in the layout of the paper's release, for a folder of its own. The last one names what the others
+    /// have no place for: a folder with it is whole.
+    pub(super) async fn sb3d_files(
         &self,
         scene: u64,
-        store: &dyn ObjectStore,
-        prefix: &Path,
-    ) -> Result<ExportedScene, DatasetError> {
+    ) -> Result<Vec<(String, Bytes)>, DatasetError> {
         let spec = self.spec();
-        if ![4, 25, 100].contains(&spec.spots) {
-            let what = format!(
-                "the paper's layout has 4, 25 or 100 spots, the data set {}; reprocess it into one with as many",
-                spec.spots
-            );
-            return Err(DatasetError::invalid("spec.spots", what));
-        }
-        let mut out = Out {
-            store,
-            folder: prefix.clone().join(format!("{scene:06}")),
-            done: ExportedScene::default(),
-        };
+        let mut out = Out::default();
         let manifest = self.manifest(scene).await?;
         let mut factor = None;
         let histograms = [
@@ -128,15 +100,13 @@ impl Dataset {
             out.put(
                 &format!("lidar_{spots}.exr"),
                 image(size, FlatSamples::F16(halves))?,
-            )
-            .await?;
+            );
         }
         let (w, h) = (spec.width as usize, spec.height as usize);
         let depth: Vec<f32> = self.read(scene, Quantity::Depth).await?;
-        out.put("depth.exr", image((w, h), FlatSamples::F32(depth))?)
-            .await?;
+        out.put("depth.exr", image((w, h), FlatSamples::F32(depth))?);
         let specular: Vec<u8> = self.read(scene, Quantity::Specular).await?;
-        out.put("specular_mask.png", grey(w, h, &specular)?).await?;
+        out.put("specular_mask.png", grey(w, h, &specular)?);
         let lit: Vec<f32> = self
             .read_visibility(scene)
             .await?
@@ -144,8 +114,7 @@ impl Dataset {
             .map(f32::from)
             .collect();
         let lit = npy::write("<f4", &[spec.spots as usize, h, w], &lit);
-        out.put("shadows_v1.npz", zipped("shadows.npy", &lit)?)
-            .await?;
+        out.put("shadows_v1.npz", zipped("shadows.npy", &lit)?);
         let spots = self.read_spots(scene).await?;
         let positions: Vec<f32> = spots
             .iter()
@@ -154,8 +123,7 @@ impl Dataset {
         out.put(
             "lights_camera_frame.npy",
             npy::write("<f4", &[spots.len(), 3], &positions),
-        )
-        .await?;
+        );
         let i = self.read_intrinsics(scene).await?;
         let camera: Vec<f32> = self.read(scene, Quantity::Camera).await?;
         let laser: Vec<f32> = self.read(scene, Quantity::Laser).await?;
@@ -174,25 +142,30 @@ impl Dataset {
         };
         let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
         text.push(b'\n');
-        // The last one: a folder with it is whole.
-        out.put(ASIDE, text).await?;
-        Ok(out.done)
+        out.put(ASIDE, text);
+        Ok(out.0)
     }
 }
 
-struct Out<'a> {
-    store: &'a dyn ObjectStore,
-    folder: Path,
-    done: ExportedScene,
+#[derive(Default)]
+struct Out(Vec<(String, Bytes)>);
+
+impl Out {
+    fn put(&mut self, name: &str, bytes: Vec<u8>) {
+        self.0.push((name.into(), bytes.into()));
+    }
 }
 
-impl Out<'_> {
-    async fn put(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), DatasetError> {
-        self.done.files += 1;
-        self.done.bytes += bytes.len() as u64;
-        let path = objects::path_of(&self.folder, name);
-        objects::create_or_match(self.store, &path, bytes.into()).await
+/// The layout has a place for the data set.
+pub(super) fn check(spec: &DatasetSpec) -> Result<(), DatasetError> {
+    if [4, 25, 100].contains(&spec.spots) {
+        return Ok(());
     }
+    let what = format!(
+        "the paper's layout has 4, 25 or 100 spots, the data set {}; reprocess it into one with as many",
+        spec.spots
+    );
+    Err(DatasetError::invalid("spec.spots", what))
 }
 
 /// The power of two that brings the brightest value to (BRIGHTEST/2, BRIGHTEST].

@@ -1,0 +1,214 @@
+//! Data sets for other people: packed into few files, or in a layout that their tools know. Every export ends with a data
+//! card, a table of its scenes and Croissant metadata (`card.rs`), and goes on where it was interrupted: files are put
+//! create-only, and equal ones count as written.
+
+mod card;
+mod hdf5;
+mod packed;
+mod plain;
+mod sb3d;
+mod webdataset;
+
+use bytes::Bytes;
+use object_store::ObjectStore;
+use object_store::path::Path;
+use sha2::{Digest, Sha256};
+
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::manifest::Manifest;
+use crate::objects;
+
+pub use packed::{Export, Exported};
+pub(crate) use sb3d::{ASIDE, Aside};
+
+use card::Row;
+
+/// Scenes in a tar file of [`ExportFormat::WebDataset`].
+const TAR: usize = 8;
+
+/// Layouts of an export.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ExportFormat {
+    /// Zarr v3 with 16 scenes a file: chunks are copied, nothing is decoded.
+    #[default]
+    Zarr,
+    /// The paper's release: a folder a scene, histograms as OpenEXR images in halves.
+    Sb3d,
+    /// Tar files of 8 scenes with an `.npz` and a `.json` each, for the `webdataset` library.
+    WebDataset,
+    /// An HDF5 file a scene, with shuffle and gzip.
+    Hdf5,
+}
+
+impl ExportFormat {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Zarr, Self::Sb3d, Self::WebDataset, Self::Hdf5];
+
+    /// Its name in job files and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Zarr => "zarr",
+            Self::Sb3d => "sb3d",
+            Self::WebDataset => "webdataset",
+            Self::Hdf5 => "hdf5",
+        }
+    }
+
+    /// The format called `name`.
+    ///
+    /// # Errors
+    /// A message that lists the names there are.
+    pub fn parse(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|f| f.name() == name);
+        found.ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            format!("{name:?} is not one of {names}")
+        })
+    }
+}
+
+/// An export under way, in any format.
+pub struct Exporter<'a> {
+    format: ExportFormat,
+    source: &'a Dataset,
+    scenes: &'a [u64],
+    out: Out<'a>,
+    rows: Vec<Row>,
+    packed: Option<Export<'a>>,
+}
+
+/// Where files go, and what went there.
+struct Out<'a> {
+    store: &'a dyn ObjectStore,
+    prefix: Path,
+    done: Exported,
+    digest: Sha256,
+}
+
+impl Out<'_> {
+    async fn put(&mut self, name: &str, bytes: Bytes) -> Result<(), DatasetError> {
+        self.done.files += 1;
+        self.done.bytes += bytes.len() as u64;
+        self.digest.update(name);
+        self.digest.update([0]);
+        self.digest.update(Sha256::digest(&bytes));
+        let path = objects::path_of(&self.prefix, name);
+        objects::create_or_match(self.store, &path, bytes).await
+    }
+}
+
+impl<'a> Exporter<'a> {
+    /// Exports the given scenes, in that order, to `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there are no scenes, or the format has no place for the data set: a histogram for
+    /// each spot, other than 4, 25 or 100 spots in the paper's layout.
+    pub fn new(
+        format: ExportFormat,
+        source: &'a Dataset,
+        scenes: &'a [u64],
+        store: &'a dyn ObjectStore,
+        prefix: Path,
+    ) -> Result<Self, DatasetError> {
+        // The checks of a packed export are those of all.
+        let packed = Export::new(source, scenes, store, prefix.clone())?;
+        if format == ExportFormat::Sb3d {
+            sb3d::check(source.spec())?;
+        }
+        Ok(Self {
+            format,
+            source,
+            scenes,
+            out: Out {
+                store,
+                prefix,
+                done: Exported::default(),
+                digest: Sha256::new(),
+            },
+            rows: Vec::new(),
+            packed: (format == ExportFormat::Zarr).then_some(packed),
+        })
+    }
+
+    /// Number of [`Self::step`]s.
+    pub fn steps(&self) -> usize {
+        match self.format {
+            ExportFormat::Zarr => self.scenes.len().div_ceil(packed::PACK),
+            ExportFormat::WebDataset => self.scenes.len().div_ceil(TAR),
+            ExportFormat::Sb3d | ExportFormat::Hdf5 => self.scenes.len(),
+        }
+    }
+
+    /// Does step `k`; they are done in their order.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
+    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
+    pub async fn step(&mut self, k: usize) -> Result<(), DatasetError> {
+        let of = |each: usize| k * each..self.scenes.len().min((k + 1) * each);
+        match self.format {
+            ExportFormat::Zarr => {
+                let packed = self.packed.as_mut().expect("made for this format");
+                for manifest in packed.pack(k).await? {
+                    let row = Row::new(self.rows.len(), &manifest, "");
+                    self.rows.push(row);
+                }
+            }
+            ExportFormat::Sb3d => {
+                let scene = self.scenes[k];
+                let folder = format!("{scene:06}");
+                for (name, bytes) in self.source.sb3d_files(scene).await? {
+                    self.out.put(&format!("{folder}/{name}"), bytes).await?;
+                }
+                let manifest = self.source.manifest(scene).await?;
+                self.note(&manifest, &folder);
+            }
+            ExportFormat::Hdf5 => {
+                let scene = self.source.plain(self.scenes[k]).await?;
+                let name = format!("{:06}.h5", self.scenes[k]);
+                self.out
+                    .put(&name, hdf5::file(&scene, self.source.spec())?.into())
+                    .await?;
+                self.note(&scene.manifest, &name);
+            }
+            ExportFormat::WebDataset => {
+                let name = format!("scenes-{k:06}.tar");
+                let mut tar = webdataset::Tar::new();
+                for scene in &self.scenes[of(TAR)] {
+                    let scene = self.source.plain(*scene).await?;
+                    tar.add(&scene, self.source.spec())?;
+                    self.note(&scene.manifest, &name);
+                }
+                self.out.put(&name, tar.finish()?.into()).await?;
+            }
+        }
+        Ok(())
+    }
+
+    fn note(&mut self, manifest: &Manifest, file: &str) {
+        self.rows.push(Row::new(self.rows.len(), manifest, file));
+        self.out.done.scenes += 1;
+    }
+
+    /// Writes what belongs to the whole, after all steps.
+    ///
+    /// # Errors
+    /// [`DatasetError::Conflict`], [`DatasetError::Store`].
+    pub async fn finish(mut self) -> Result<Exported, DatasetError> {
+        let name = self.source.prefix().filename().unwrap_or("transients");
+        for (file, bytes) in card::files(name, self.format, self.source.spec(), &self.rows) {
+            self.out.put(file, bytes.into()).await?;
+        }
+        if let Some(packed) = self.packed {
+            let done = packed.finish().await?;
+            self.out.digest.update(done.sha256);
+            let all = &mut self.out.done;
+            all.scenes = done.scenes;
+            all.files += done.files;
+            all.bytes += done.bytes;
+        }
+        self.out.done.sha256 = self.out.digest.finalize().into();
+        Ok(self.out.done)
+    }
+}
