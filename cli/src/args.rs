@@ -2,6 +2,7 @@
 
 mod data;
 mod guard;
+mod integrity;
 mod job;
 mod render;
 
@@ -12,6 +13,7 @@ use picofarm_coordinator::CatalogPlace;
 
 pub use data::{DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs};
 pub use guard::{Guard, Token};
+pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
@@ -279,28 +281,18 @@ pub enum Dataset {
         /// Folder or URL of the data set
         dataset: String,
     },
+    /// Say where a scene came from: job, code version, seed, scene, parents
+    Show(DatasetShow),
     /// Check a data set against its manifests; exit code 6 if anything is wrong
-    Verify {
-        /// Folder or URL of the data set
-        dataset: String,
-        /// Manifests and sizes only; otherwise every object is hashed and decoded
-        #[arg(long)]
-        fast: bool,
-    },
+    Verify(DatasetVerify),
+    /// Make broken scenes again, exactly those, and put back what is broken of them
+    Repair(DatasetRepair),
+    /// Pin which scenes there are now, or see what was pinned
+    #[command(subcommand)]
+    Snapshot(Snapshot),
     /// Find objects that belong to no finished scene, left by killed workers, and delete them if asked to
-    Collect {
-        /// Folder or URL of the data set
-        dataset: String,
-        /// Spare what is younger, e.g. 90m, 24h or 7d; a worker may still be writing it
-        #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
-        older_than: std::time::Duration,
-        /// Delete them; otherwise only say what would be deleted
-        #[arg(long)]
-        delete: bool,
-        /// Allow ages under an hour: no worker runs on this data set now, nor will until this ends
-        #[arg(long)]
-        nothing_runs: bool,
-    },
+    #[command(alias = "collect")]
+    Gc(DatasetGc),
     /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
     Picture {
         /// Folder or URL of the data set
@@ -397,6 +389,8 @@ pub enum Bench {
     Render(BenchRender),
     /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and fleets of simulated workers
     Queue(BenchQueue),
+    /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot, gc
+    Dataset(BenchDataset),
 }
 
 #[derive(Args)]
@@ -476,50 +470,4 @@ pub struct Doctor {
     /// Store to check [default: the current folder]
     #[arg(long, default_value = ".", value_name = "PATH_OR_URL")]
     pub store: String,
-}
-
-/// An age with its unit: `30s`, `90m`, `24h`, `7d`.
-fn age(text: &str) -> Result<std::time::Duration, String> {
-    let expected = || format!("expected a number with s, m, h or d, e.g. 24h, found {text:?}");
-    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let unit = match &text[digits.len()..] {
-        "s" => 1,
-        "m" => 60,
-        "h" => 3600,
-        "d" => 86_400,
-        _ => return Err(expected()),
-    };
-    let number: u64 = digits.parse().map_err(|_| expected())?;
-    let seconds = number.checked_mul(unit).ok_or_else(expected)?;
-    Ok(std::time::Duration::from_secs(seconds))
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn an_age_has_a_unit() {
-        for (text, seconds) in [
-            ("30s", 30),
-            ("90m", 5400),
-            ("24h", 86_400),
-            ("7d", 604_800),
-            ("0s", 0),
-        ] {
-            assert_eq!(super::age(text).unwrap().as_secs(), seconds);
-        }
-        for text in [
-            "",
-            "24",
-            "h",
-            "-1h",
-            "1.5h",
-            "1w",
-            "1 h",
-            "99999999999999999999d",
-            "9999999999999999999d",
-        ] {
-            let error = super::age(text).unwrap_err();
-            assert!(error.contains("e.g. 24h"), "{error}");
-        }
-    }
 }

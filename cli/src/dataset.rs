@@ -1,16 +1,19 @@
 //! `picofarm dataset …`: what a data set holds, whether it is whole, and what it looks like.
 
 pub mod export;
+pub mod gc;
 pub mod import;
+pub mod repair;
 pub mod reprocess;
+pub mod show;
+pub mod snapshot;
 pub mod split;
+pub mod verify;
 
 use std::path::{Path, PathBuf};
 
 use picofarm_agent::TaskError;
-use picofarm_dataset::{
-    Collection, Dataset, DatasetError, MIN_GRACE, Summary, Verification, VerifyMode, open_store,
-};
+use picofarm_dataset::{Dataset, DatasetError, Summary, open_store};
 use serde_json::json;
 
 use crate::{
@@ -18,57 +21,26 @@ use crate::{
     error::{CliError, Code, Result, io},
     output::{Output, bytes},
     picture::{View, flight, sheet},
+    settings::Settings,
     signals,
 };
 
-pub async fn run(command: Command, output: Output) -> Result<()> {
+pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
     match command {
         Command::Info { dataset } => {
             let info = open(&dataset).await?.info().await.map_err(failed)?;
             output.result(&info_json(&dataset, &info), || describe(&dataset, &info));
             Ok(())
         }
-        Command::Verify { dataset, fast } => {
-            let report = check(&dataset, fast).await?;
-            let facts = json!({
-                "scenes": report.scenes, "objects": report.objects, "bytes": report.bytes,
-                "problems": [], "unpublished": report.unpublished,
-            });
-            output.result(&facts, || {
-                format!(
-                    "{} scenes, {} objects, {}: whole",
-                    report.scenes,
-                    report.objects,
-                    bytes(report.bytes)
-                )
-            });
-            Ok(())
-        }
+        Command::Show(args) => show::run(&args, output).await,
+        Command::Verify(args) => verify::run(&args, output).await,
+        Command::Repair(args) => repair::run(args, settings, output).await,
+        Command::Snapshot(command) => snapshot::run(command, output).await,
+        Command::Gc(args) => gc::run(&args, output).await,
         Command::Reprocess(args) => reprocess::run(args, output).await,
         Command::Export(args) => export::run(args, output).await,
         Command::Import(args) => import::run(*args, output).await,
         Command::Split(args) => split::run(args, output).await,
-        Command::Collect {
-            dataset,
-            older_than,
-            delete,
-            nothing_runs,
-        } => {
-            if older_than < MIN_GRACE && !nothing_runs {
-                return Err(CliError::input(format!(
-                    "--older-than: expected at least 1h, found {} s: a worker that is writing a scene now would lose \
-                     its objects",
-                    older_than.as_secs()
-                ))
-                .hint("give a longer age, or --nothing-runs if no worker runs on this data set"));
-            }
-            let opened = open(&dataset).await?;
-            let found = opened.collect(older_than, delete).await.map_err(failed)?;
-            output.result(&collection_json(&dataset, &found, delete), || {
-                collected(&dataset, &found, delete)
-            });
-            Ok(())
-        }
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
             let present = open(&dataset)
@@ -85,49 +57,6 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             Ok(())
         }
     }
-}
-
-fn collection_json(place: &str, found: &Collection, delete: bool) -> serde_json::Value {
-    let objects: Vec<_> = found
-        .orphans
-        .iter()
-        .map(|o| json!({"object": o.object, "bytes": o.bytes, "scene": o.scene}))
-        .collect();
-    json!({
-        "dataset": place, "deleted": delete, "objects": found.orphans.len(), "bytes": found.bytes(),
-        "orphans": objects, "young": found.young, "published": found.published,
-    })
-}
-
-fn collected(place: &str, found: &Collection, delete: bool) -> String {
-    let mut text: String = found
-        .orphans
-        .iter()
-        .map(|o| format!("{}  {}\n", o.object, bytes(o.bytes)))
-        .collect();
-    text += &format!(
-        "{place}: {} object(s), {} that belong to no finished scene{}",
-        found.orphans.len(),
-        bytes(found.bytes()),
-        match (delete, found.orphans.is_empty()) {
-            (_, true) => "",
-            (true, false) => ", deleted",
-            (false, false) => "; --delete deletes them",
-        }
-    );
-    if found.young > 0 {
-        text += &format!(
-            "\n{} younger object(s) of unfinished scenes were spared",
-            found.young
-        );
-    }
-    if found.published > 0 {
-        text += &format!(
-            "\n{} object(s) were spared: their scenes are finished by now",
-            found.published
-        );
-    }
-    text
 }
 
 fn info_json(place: &str, info: &Summary) -> serde_json::Value {
@@ -235,46 +164,28 @@ async fn open(place: &str) -> Result<Dataset> {
     Dataset::open(store, prefix).await.map_err(failed)
 }
 
-fn failed(error: DatasetError) -> CliError {
+pub(crate) fn failed(error: DatasetError) -> CliError {
     let code = match &error {
-        DatasetError::Damaged { .. } | DatasetError::Conflict { .. } => Code::Damaged,
+        DatasetError::Damaged { .. }
+        | DatasetError::Conflict { .. }
+        | DatasetError::Diverged { .. } => Code::Damaged,
         DatasetError::Store { .. } | DatasetError::Io { .. } | DatasetError::UnsafeStore { .. } => {
             Code::Resource
         }
         _ => Code::Input,
     };
-    CliError::new(code, error)
-}
-
-/// Verifies a data set.
-///
-/// # Errors
-/// Exit code 6 naming what is broken.
-pub async fn check(place: &str, fast: bool) -> Result<Verification> {
-    let mode = if fast {
-        VerifyMode::Fast
-    } else {
-        VerifyMode::Full
-    };
-    let report = open(place).await?.verify(mode).await.map_err(failed)?;
-    if report.is_sound() {
-        return Ok(report);
+    let damaged = matches!(error, DatasetError::Damaged { .. });
+    let rootless = matches!(error, DatasetError::NoDataset { .. });
+    let failed = CliError::new(code, error);
+    if damaged {
+        return failed.hint(
+            "picofarm dataset verify names all that is broken and how it is mended, mostly by dataset repair",
+        );
     }
-    let shown: Vec<String> = report
-        .problems
-        .iter()
-        .take(20)
-        .map(ToString::to_string)
-        .collect();
-    let more = match report.problems.len().saturating_sub(shown.len()) {
-        0 => String::new(),
-        n => format!("\n  … and {n} more"),
-    };
-    Err(CliError::new(
-        Code::Damaged,
-        format!("{place}: {} problem(s)\n  {}{more}", report.problems.len(), shown.join("\n  ")),
-    )
-    .hint("remove the objects named, then submit the job to a coordinator with a new catalog: whole scenes are adopted, only the others are rendered"))
+    if rootless {
+        return failed.hint("if its zarr.json was lost, dataset repair writes it again");
+    }
+    failed
 }
 
 /// Where the pictures are.

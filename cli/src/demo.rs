@@ -138,7 +138,7 @@ async fn show(
     output: Output,
 ) -> Result<()> {
     output.say("verifying what was written …");
-    let report = dataset::check(place, false).await?;
+    let report = dataset::verify::check(place).await?;
     let scenes: Vec<u64> = (0..args.scenes).collect();
     output.say("drawing …");
     let pictures = dataset::draw(place, &scenes[..scenes.len().min(16)], dir).await?;

@@ -94,7 +94,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
             last,
             verbose,
         } => tail::events(follow, last, verbose, settings, output).await,
-        Command::Dataset(command) => dataset::run(command, output).await,
+        Command::Dataset(command) => dataset::run(command, settings, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
         Command::Assets(command) => assets::run(command, settings, output).await,

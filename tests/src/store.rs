@@ -106,6 +106,23 @@ fn files(folder: &Path) -> BTreeMap<String, PathBuf> {
     found
 }
 
+/// The unfinished files `name#1` of killed writers under a folder.
+pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(&next).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if unfinished(&path.display().to_string()) {
+                found.push(path);
+            }
+        }
+    }
+    found
+}
+
 fn unfinished(name: &str) -> bool {
     let number = name.rsplit_once('#').map(|(_, n)| n);
     number.is_some_and(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))

@@ -1,7 +1,9 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears.
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very many scenes
+//! cost.
 
 mod axes;
 mod curve;
+mod dataset;
 mod deviation;
 mod ladder;
 mod measure;
@@ -28,6 +30,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
     let stop = signals::stop_on_signal()?;
     let args = match command {
         Command::Queue(args) => return queue::run(args, output, &stop).await,
+        Command::Dataset(args) => return dataset::run(args, output, &stop).await,
         Command::Render(args) => args,
     };
     check(&args)?;

@@ -4,6 +4,7 @@
 //! next finds them equal and publishes them. So only old ones are deleted, and a published scene never loses an
 //! object, whenever its manifest appears:
 //!
+//! - a scene that a snapshot names is spared although its manifest was lost;
 //! - objects are listed first, manifests after them, and the scene's manifest is looked for once more right before the
 //!   deletion of an object;
 //! - the publisher looks after its objects once more when its manifest stands ([`Dataset::publish_encoded`]);
@@ -28,7 +29,6 @@ use crate::manifest::Manifest;
 use crate::objects;
 use crate::parts::part_scene;
 use crate::store::{PROBE, leftovers, probe_leftovers};
-use crate::verify::manifest_scene;
 
 /// The shortest grace period where workers may be writing: longer than publishing a scene ever takes.
 pub const MIN_GRACE: Duration = Duration::from_secs(3600);
@@ -47,6 +47,19 @@ pub struct Orphan {
     pub scene: Option<u64>,
 }
 
+impl Orphan {
+    /// Why it is rubbish.
+    pub fn why(&self) -> &'static str {
+        let name = self.object.rsplit('/').next().unwrap_or_default();
+        match self.scene {
+            Some(_) => "its scene has no manifest: left by a killed worker",
+            None if name.starts_with(PROBE) => "left by a killed probe of the store",
+            None if name.contains('#') => "unfinished file of a killed write",
+            None => "part of a scene that nobody joined",
+        }
+    }
+}
+
 /// What [`Dataset::collect`] found.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Collection {
@@ -56,6 +69,9 @@ pub struct Collection {
     pub young: u64,
     /// Orphans that were left alone because their scene was published in the meantime.
     pub published: u64,
+    /// Objects without a manifest that were left alone because a snapshot names their scene: its manifest was lost, and
+    /// `repair` can put it back.
+    pub pinned: u64,
 }
 
 impl Collection {
@@ -73,12 +89,14 @@ enum Found {
 }
 
 impl Dataset {
-    /// Finds what belongs to no published scene and was last written `grace` ago or earlier: objects of scenes without
-    /// a manifest, parts of scenes that nobody joined, and what killed probes and killed local writes left. Deletes it if `delete` says so. Never touches
+    /// Finds what belongs to no published scene nor to one that a snapshot names, and was last written `grace` ago or
+    /// earlier: objects of scenes without a manifest, parts of scenes that nobody joined, and what killed probes and
+    /// killed local writes left. Deletes it if `delete` says so. Never touches
     /// an object that a manifest names, or that it does not know. With less than [`MIN_GRACE`] no worker may be writing
     /// to this data set.
     ///
     /// # Errors
+    /// [`DatasetError::Damaged`] where a snapshot cannot be read, so that it is unknown what it names;
     /// [`DatasetError::Store`], [`DatasetError::Io`]. What was deleted until then stays deleted; collect again.
     pub async fn collect(&self, grace: Duration, delete: bool) -> Result<Collection, DatasetError> {
         let now = match delete {
@@ -104,34 +122,38 @@ impl Dataset {
         Ok(report)
     }
 
-    /// Objects of scenes without a manifest, written before `limit`. Counts the younger ones.
+    /// Objects of scenes without a manifest that no snapshot names either, written before `limit`. Counts the younger
+    /// ones.
     async fn unpublished(
         &self,
         limit: SystemTime,
         report: &mut Collection,
     ) -> Result<Vec<Found>, DatasetError> {
         let failed = |e| DatasetError::store("list", self.shown(&self.prefix), e);
-        // The objects first: a scene published since is among the manifests then.
+        // What is published stays published: these need not be kept until the manifests are listed once more.
+        let seen = self.scenes_present().await?;
         let mut objects: Vec<(u64, ObjectMeta)> = Vec::new();
         let mut listing = self.store.list(Some(&self.prefix));
-        let mut seen = BTreeSet::new();
         let mut parts = Vec::new();
         while let Some(object) = listing.try_next().await.map_err(failed)? {
             let key = self.relative(&object.location);
-            if let Some(scene) = manifest_scene(&key) {
-                seen.insert(scene);
-            } else if part_scene(&key).is_some() {
+            let place = self.object_place(&key);
+            if part_scene(&key).is_some() {
                 parts.push(object);
-            } else if let Some(scene) = self.object_scene(&key) {
+            } else if let Some((_, scene)) = place
+                && seen.binary_search(&scene).is_err()
+            {
                 objects.push((scene, object));
             }
         }
-        drop(listing);
-        // Most are published and need not be kept until then.
-        objects.retain(|(scene, _)| !seen.contains(scene));
+        drop((listing, seen));
         if !objects.is_empty() {
-            let published: BTreeSet<u64> = self.scenes_present().await?.into_iter().collect();
-            objects.retain(|(scene, _)| !published.contains(scene));
+            let published = self.scenes_present().await?;
+            objects.retain(|(scene, _)| published.binary_search(scene).is_err());
+            let found = objects.len();
+            let pinned = self.pinned().await?;
+            objects.retain(|(scene, _)| !pinned.contains(scene));
+            report.pinned = (found - objects.len()) as u64;
         }
         let all = objects.len() + parts.len();
         let old = |object: &ObjectMeta| SystemTime::from(object.last_modified) <= limit;
@@ -143,6 +165,15 @@ impl Dataset {
         let scenes = scenes.map(|(scene, object)| Found::Object(object, Some(scene)));
         let parts = parts.into_iter().map(|object| Found::Object(object, None));
         Ok(scenes.chain(parts).collect())
+    }
+
+    /// The scenes that some snapshot names.
+    async fn pinned(&self) -> Result<BTreeSet<u64>, DatasetError> {
+        let mut pinned = BTreeSet::new();
+        for name in self.snapshots().await? {
+            pinned.extend(self.snapshot(&name).await?.scenes());
+        }
+        Ok(pinned)
     }
 
     /// What killed probes left beside the data set, and killed local writes in it.

@@ -116,7 +116,12 @@ impl Dataset {
         &self.prefix
     }
 
-    fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
+    /// The same for a message.
+    pub fn place(&self) -> String {
+        self.shown(&self.prefix)
+    }
+
+    pub(crate) fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
         let array = |quantity: Quantity| {
             let layout = quantity.layout(&spec);
             let codec = ChunkCodec::new(&layout);

@@ -109,7 +109,9 @@ pub(crate) fn assemble(
         overflow,
         subsets,
         objects,
-    };
+        checksum: None,
+    }
+    .sealed();
     Ok(EncodedScene { manifest, bytes })
 }
 

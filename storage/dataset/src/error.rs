@@ -70,10 +70,21 @@ pub enum DatasetError {
         /// SHA-256 of the bytes that were to be stored.
         ours: String,
     },
-    /// An object of a published scene is missing or broken.
+    /// A scene made again came out otherwise. Equal tasks must give equal bytes, so this is an alarm.
     #[error(
-        "{object}: {what}; publish the scene again to replace a missing object, or delete a broken one first"
+        "alarm at {object}: expected SHA-256 {expected} as recorded, but the scene made again has {ours}; nothing stored \
+         was changed. Use the program version that made it; if this is the one, its output is not reproducible: report it"
     )]
+    Diverged {
+        /// The object's full key (its path, in a local store).
+        object: String,
+        /// SHA-256 that the manifest, or a snapshot, names.
+        expected: String,
+        /// SHA-256 of what was made again.
+        ours: String,
+    },
+    /// An object of a published scene is missing or broken.
+    #[error("{object}: {what}")]
     Damaged {
         /// The object's full key (its path, in a local store).
         object: String,

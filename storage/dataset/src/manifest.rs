@@ -62,9 +62,28 @@ pub struct Manifest {
     pub subsets: BTreeMap<String, SubsetCoding>,
     /// The scene's objects.
     pub objects: Vec<ObjectEntry>,
+    /// What [`seal`] says of the rest, so that a flipped bit shows; `None` in manifests from before there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub checksum: Option<String>,
 }
 
 impl Manifest {
+    /// Itself with the checksum that belongs to it.
+    pub fn sealed(mut self) -> Self {
+        self.checksum = None;
+        self.checksum = Some(sha256_hex(&self.to_bytes()));
+        self
+    }
+
+    /// Whether both say the same; whether they have a checksum does not count.
+    pub fn same_as(&self, other: &Self) -> bool {
+        let bare = |manifest: &Self| Self {
+            checksum: None,
+            ..manifest.clone()
+        };
+        bare(self) == bare(other)
+    }
+
     /// Key of a scene's manifest, relative to the data set.
     pub fn key(scene: u64) -> String {
         format!("manifests/{scene}.json")
@@ -88,7 +107,8 @@ impl Manifest {
         }
     }
 
-    pub(crate) fn to_bytes(&self) -> Vec<u8> {
+    /// The manifest as it lies in the store.
+    pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self)
             .expect("a manifest has only string keys and finite numbers");
         bytes.push(b'\n');
@@ -115,11 +135,44 @@ impl Manifest {
                 manifest.scene
             )));
         }
+        if let Some(checksum) = &manifest.checksum {
+            unseal(bytes, checksum).map_err(damaged)?;
+        }
         Ok(manifest)
     }
 }
 
+/// Gives pretty JSON of an object a last member `checksum`: the SHA-256, hexadecimal, of its bytes without that member.
+pub(crate) fn seal(json: &[u8]) -> Vec<u8> {
+    let body = json
+        .strip_suffix(END)
+        .expect("pretty JSON of an object ends so");
+    [body, tail(&sha256_hex(json)).as_bytes()].concat()
+}
+
+/// The JSON below its `checksum`, if it is what was sealed; otherwise what is wrong.
+pub(crate) fn unseal(sealed: &[u8], checksum: &str) -> Result<Vec<u8>, String> {
+    let Some(body) = sealed.strip_suffix(tail(checksum).as_bytes()) else {
+        return Err(
+            "its checksum does not stand where it was written: the object was changed".into(),
+        );
+    };
+    let json = [body, END].concat();
+    match sha256_hex(&json) {
+        found if found == checksum => Ok(json),
+        found => Err(format!(
+            "its content has the checksum {found}, but says {checksum}: the object was changed"
+        )),
+    }
+}
+
+const END: &[u8] = b"\n}\n";
+
+fn tail(checksum: &str) -> String {
+    format!(",\n  \"checksum\": \"{checksum}\"\n}}\n")
+}
+
 /// SHA-256 in hexadecimal.
-pub(crate) fn sha256_hex(bytes: &[u8]) -> String {
+pub fn sha256_hex(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }

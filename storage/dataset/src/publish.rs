@@ -47,7 +47,18 @@ impl Dataset {
         let puts: Vec<_> = objects.iter().map(|(p, b)| put((p, b.clone()))).collect();
         all(puts).await?;
         let path = self.path(&Manifest::key(manifest.scene));
-        objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
+        let put_manifest =
+            objects::create_or_match(&*self.store, &path, manifest.to_bytes().into());
+        let manifest = match put_manifest.await {
+            Ok(()) => manifest,
+            Err(conflict @ DatasetError::Conflict { .. }) => {
+                match self.older_form(&path, &manifest).await? {
+                    Some(stored) => stored,
+                    None => return Err(conflict),
+                }
+            }
+            Err(error) => return Err(error),
+        };
         // A collector may have taken an object before there was a manifest to protect it: what a killed worker had
         // left and was found equal above, or what this process wrote before it stood still for long.
         let again: Vec<_> = objects
@@ -61,6 +72,17 @@ impl Dataset {
             .collect();
         all(again).await?;
         Ok(manifest)
+    }
+
+    /// The stored manifest, where it says the same in the form it had before manifests had a checksum.
+    async fn older_form(
+        &self,
+        path: &Path,
+        ours: &Manifest,
+    ) -> Result<Option<Manifest>, DatasetError> {
+        let stored = objects::require(&*self.store, path).await?;
+        let parsed = Manifest::parse(&stored, ours.scene, &self.shown(path));
+        Ok(parsed.ok().filter(|stored| stored.same_as(ours)))
     }
 
     /// Codes and publishes a scene; blocks its thread while coding.

@@ -116,12 +116,12 @@ async fn objects_that_match_a_wrong_manifest_are_decoded_and_found() {
         .await
         .unwrap();
     // The overflow list lost its entry.
-    let text = serde_json::to_string(&Manifest {
+    let changed = Manifest {
         overflow: vec![],
         ..manifest.clone()
-    })
-    .unwrap();
-    put(&*store, "sets/a/manifests/0.json", text.into_bytes()).await;
+    };
+    let bytes = changed.sealed().to_bytes();
+    put(&*store, "sets/a/manifests/0.json", bytes).await;
     let report = dataset.verify(VerifyMode::Full).await.unwrap();
     let [(object, Fault::Undecodable(why))] = found(&report)[..] else {
         panic!("{report:?}")
@@ -132,34 +132,37 @@ async fn objects_that_match_a_wrong_manifest_are_decoded_and_found() {
     );
     // Garbage, a wrong number, another format.
     let wrong = [
-        ("{}".to_string(), "not a manifest"),
+        (b"{}".to_vec(), "not a manifest"),
         (
-            serde_json::to_string(&Manifest {
+            Manifest {
                 scene: 1,
                 ..manifest.clone()
-            })
-            .unwrap(),
+            }
+            .sealed()
+            .to_bytes(),
             "holds scene 1",
         ),
         (
-            serde_json::to_string(&Manifest {
+            Manifest {
                 format: 9,
                 ..manifest.clone()
-            })
-            .unwrap(),
+            }
+            .sealed()
+            .to_bytes(),
             "format 9",
         ),
         (
-            serde_json::to_string(&Manifest {
+            Manifest {
                 objects: vec![],
-                ..manifest
-            })
-            .unwrap(),
+                ..manifest.clone()
+            }
+            .sealed()
+            .to_bytes(),
             "exactly",
         ),
     ];
-    for (text, words) in wrong {
-        put(&*store, "sets/a/manifests/0.json", text.into_bytes()).await;
+    for (bytes, words) in wrong {
+        put(&*store, "sets/a/manifests/0.json", bytes).await;
         let report = dataset.verify(VerifyMode::Fast).await.unwrap();
         let [("sets/a/manifests/0.json", Fault::BadManifest(why))] = found(&report)[..] else {
             panic!("{report:?}")

@@ -2,7 +2,7 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
@@ -33,6 +33,8 @@ pub(super) struct Stores {
     probed: Mutex<BTreeMap<String, Place>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<String, Place>>,
+    /// Recipes known to be stored: data set and key.
+    noted: Mutex<BTreeSet<(String, String)>>,
     /// How long a rendered scene is held for a store that does not take it.
     patience: Duration,
 }
@@ -43,6 +45,7 @@ impl Stores {
             runtime,
             probed: Mutex::default(),
             sources: Mutex::default(),
+            noted: Mutex::default(),
             patience,
         }
     }
@@ -85,6 +88,27 @@ impl Stores {
             }
         };
         self.wait(control, Dataset::open(store, prefix.join(dataset)))
+    }
+
+    /// Stores a recipe where there is none yet; one of all scenes is looked for once.
+    pub(super) fn note_recipe(
+        &self,
+        dataset: &Dataset,
+        key: &str,
+        scene: Option<u64>,
+        content: &serde_json::Value,
+        control: &Control,
+    ) -> Result<(), TaskError> {
+        let known = || self.noted.lock().expect("no panic while locked");
+        let name = (dataset.place(), key.to_owned());
+        if scene.is_none() && known().contains(&name) {
+            return Ok(());
+        }
+        self.wait(control, dataset.create_recipe(key, scene, content))?;
+        if scene.is_none() {
+            known().insert(name);
+        }
+        Ok(())
     }
 
     /// A place to write to. The first use of a location proves that its store is safe.
@@ -204,7 +228,7 @@ impl Stores {
 }
 
 /// The data set that a job's settings describe.
-fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
+pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
     let render = &spec.render;
     Ok(DatasetSpec {
         scenes: spec.scenes.count,
@@ -226,10 +250,7 @@ fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> {
 
 /// SHA-256 of a manifest's bytes as they lie in the store, hexadecimal.
 pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
-    let mut bytes = serde_json::to_vec_pretty(manifest)
-        .expect("a manifest has only string keys and finite numbers");
-    bytes.push(b'\n');
-    hex::encode(Sha256::digest(&bytes))
+    hex::encode(Sha256::digest(manifest.to_bytes()))
 }
 
 /// Who is to blame for a data set's error.

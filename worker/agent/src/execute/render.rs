@@ -3,7 +3,8 @@
 use std::time::Instant;
 
 use picofarm_dataset::{
-    Dataset, DatasetSpec, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord, photon_scale,
+    Dataset, DatasetSpec, EncodedScene, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord,
+    photon_scale,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -19,7 +20,7 @@ use super::{
     Control, Output, Task, TaskError, memory,
     output::{Stores, manifest_sha256, of_dataset},
     parts::Parts,
-    scenes, subsets,
+    recipe, scenes, subsets,
 };
 
 /// Photons in the median pixel's brightest bin: the measurement's convention for the stored scale.
@@ -57,15 +58,57 @@ pub(super) fn run(
             adopted: true,
         });
     }
-    let (scene, settings) = prepare(libraries, spec, &dataset, task.index, &key)?;
-    let begun = Instant::now();
-    let rendered = debug_span!(target: trace::TARGET, "render").in_scope(|| match spec.parts {
-        1 => picofarm_transient::render(&scene, &settings, &Watched(control)).map_err(of_render),
+    recipe::note(stores, &dataset, task, control)?;
+    let render = |scene: &Scene, settings: &Settings| match spec.parts {
+        1 => picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render),
         _ => {
             let parts = Parts::new(stores, &dataset, spec, task.index, key);
-            parts.join(&scene, &settings, control)
+            parts.join(scene, settings, control)
         }
-    })?;
+    };
+    let encoded = make_by(&dataset, libraries, spec, task.index, &key, render)?;
+    control.at((1.0 + RENDER_SHARE) / 2.0);
+    let manifest = stores.publish(&dataset, encoded, control)?;
+    if spec.parts > 1 {
+        Parts::new(stores, &dataset, spec, task.index, key).delete(control);
+    }
+    control.at(1.0);
+    Ok(Output {
+        manifest_sha256: manifest_sha256(&manifest),
+        bytes: manifest.total_bytes(),
+        adopted: false,
+    })
+}
+
+/// Scene `index` rendered in one piece and coded for the data set; `key` is its task's.
+pub(super) fn make(
+    dataset: &Dataset,
+    libraries: &[AssetLibrary],
+    spec: &RenderTask,
+    index: u64,
+    key: &TaskKey,
+    control: &Control,
+) -> Result<EncodedScene, TaskError> {
+    check_version(spec)?;
+    let render = |scene: &Scene, settings: &Settings| {
+        picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render)
+    };
+    make_by(dataset, libraries, spec, index, key, render)
+}
+
+/// The same, rendered as told.
+fn make_by(
+    dataset: &Dataset,
+    libraries: &[AssetLibrary],
+    spec: &RenderTask,
+    index: u64,
+    key: &TaskKey,
+    render: impl FnOnce(&Scene, &Settings) -> Result<Rendered, TaskError>,
+) -> Result<EncodedScene, TaskError> {
+    let (scene, settings) = prepare(libraries, spec, dataset, index, key)?;
+    let begun = Instant::now();
+    let rendered =
+        debug_span!(target: trace::TARGET, "render").in_scope(|| render(&scene, &settings))?;
     info!(
         samples = rendered.error.samples,
         median_error = rendered.error.median_relative,
@@ -87,20 +130,9 @@ pub(super) fn run(
         seed: settings.seed,
         plan: account(&scene, &rendered),
     };
-    let encoded = debug_span!(target: trace::TARGET, "encode")
-        .in_scope(|| dataset.encode(task.index, &record, &provenance))
-        .map_err(of_dataset)?;
-    control.at((1.0 + RENDER_SHARE) / 2.0);
-    let manifest = stores.publish(&dataset, encoded, control)?;
-    if spec.parts > 1 {
-        Parts::new(stores, &dataset, spec, task.index, key).delete(control);
-    }
-    control.at(1.0);
-    Ok(Output {
-        manifest_sha256: manifest_sha256(&manifest),
-        bytes: manifest.total_bytes(),
-        adopted: false,
-    })
+    debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| dataset.encode(index, &record, &provenance))
+        .map_err(of_dataset)
 }
 
 /// The job must ask for this renderer.

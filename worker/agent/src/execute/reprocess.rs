@@ -5,8 +5,8 @@
 //! for it, so the scene was given up; where nothing makes it, waiting would have no end.
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, Gate, Manifest, Profile, Provenance,
-    Quantity, Subsets,
+    Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile,
+    Provenance, Quantity, Subsets,
 };
 use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
@@ -23,6 +23,7 @@ use tracing::debug_span;
 use super::{
     Control, Output, TaskError,
     output::{Stores, manifest_sha256, of_dataset},
+    recipe,
     tasks::STORE_PATIENCE,
 };
 
@@ -85,66 +86,18 @@ pub(super) fn run(
     control: &Control,
 ) -> Result<Output, TaskError> {
     task.check().map_err(|e| TaskError::User(e.to_string()))?;
-    let (settings, target) = (&task.reprocess, &task.output);
-    let ours = sensor_version();
-    if settings.version != ours {
-        return Err(TaskError::User(format!(
-            "reprocess.version: the job asks for {:?}, this worker's sensor model is {ours:?}; submit the job again with \
-             this version, or run workers of the other one",
-            settings.version
-        )));
-    }
-    let sensor = sensor(&settings.sensor)?;
-    let source = open_source(stores, &task.source, control)?;
-    let spec = target_spec(source.spec(), settings, &target.profile)?;
-    let found = source_manifest(stores, &source, index, control)?;
-    let source_key = TaskKey::parse(&found.provenance.task_key).ok_or_else(|| {
-        TaskError::User(format!(
-            "source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
-            found.provenance.task_key
-        ))
-    })?;
-    let key = derived_key(&reprocess_stage_key(settings, &target.profile), &source_key);
-    let dataset = stores.create_or_open(&target.store, &target.dataset, &spec, control)?;
-    if !force && let Some(manifest) = stores.finished(&dataset, index, &key, control)? {
+    let target = &task.output;
+    let made = Made::of(stores, task, index, control)?;
+    let dataset = stores.create_or_open(&target.store, &target.dataset, &made.spec, control)?;
+    if !force && let Some(manifest) = stores.finished(&dataset, index, &made.key, control)? {
         return Ok(Output {
             manifest_sha256: manifest_sha256(&manifest),
             bytes: manifest.total_bytes(),
             adopted: true,
         });
     }
-    let h = debug_span!(target: trace::TARGET, "read")
-        .in_scope(|| read(stores, &source, settings, index, control))?;
-    proceed(control, READ)?;
-    let input = Histograms {
-        transient: &h,
-        two_bounce: None,
-        bins: source.spec().gate.bins as usize,
-        bin_width_ps: source.spec().gate.bin_width_m * PS_PER_M,
-    };
-    // The key is the seed of everything; the scene's number adds nothing to it.
-    let seed = u64::from_le_bytes(key.0[..8].try_into().expect("a key has 32 bytes"));
-    let sensed = debug_span!(target: trace::TARGET, "measure")
-        .in_scope(|| sensor.sense(&input, seed, 0))
-        .map_err(of_sensor)?;
-    drop(h);
-    proceed(control, MEASURED)?;
-    let truth = stores.wait(control, source.read_truth(index))?;
-    let truth = match chosen(settings) {
-        None => truth,
-        Some(spots) => truth.of_spots(&spots).map_err(of_dataset)?,
-    };
-    let provenance = Provenance {
-        task_key: key.to_string(),
-        renderer: settings.version.clone(),
-        seed,
-        plan: account(settings, &found, &sensed),
-    };
-    let (transient, scale) = as_radiance(&sensed);
-    drop(sensed.values);
-    let encoded = debug_span!(target: trace::TARGET, "encode")
-        .in_scope(|| dataset.encode_derived(index, &truth, &transient, scale, &provenance))
-        .map_err(of_dataset)?;
+    recipe::note_reprocess(stores, &dataset, task, control)?;
+    let encoded = made.encode(stores, &dataset, &task.reprocess, index, control)?;
     let manifest = stores.publish(&dataset, encoded, control)?;
     control.at(1.0);
     Ok(Output {
@@ -152,6 +105,100 @@ pub(super) fn run(
         bytes: manifest.total_bytes(),
         adopted: false,
     })
+}
+
+/// What a scene is made of.
+pub(super) struct Made {
+    source: Dataset,
+    /// The source's manifest of the scene.
+    found: Manifest,
+    sensor: Sensor,
+    /// The data set that it belongs to.
+    spec: DatasetSpec,
+    /// The task that makes it.
+    pub(super) key: TaskKey,
+}
+
+impl Made {
+    /// Looks at the source's scene `index`; nothing of the target is touched.
+    pub(super) fn of(
+        stores: &Stores,
+        task: &ReprocessTask,
+        index: u64,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let (settings, profile) = (&task.reprocess, &task.output.profile);
+        let ours = sensor_version();
+        if settings.version != ours {
+            return Err(TaskError::User(format!(
+                "reprocess.version: the job asks for {:?}, this worker's sensor model is {ours:?}; submit the job again with \
+                 this version, or run workers of the other one",
+                settings.version
+            )));
+        }
+        let sensor = sensor(&settings.sensor)?;
+        let source = open_source(stores, &task.source, control)?;
+        let spec = target_spec(source.spec(), settings, profile)?;
+        let found = source_manifest(stores, &source, index, control)?;
+        let source_key = TaskKey::parse(&found.provenance.task_key).ok_or_else(|| {
+            TaskError::User(format!(
+                "source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
+                found.provenance.task_key
+            ))
+        })?;
+        let key = derived_key(&reprocess_stage_key(settings, profile), &source_key);
+        Ok(Self {
+            source,
+            found,
+            sensor,
+            spec,
+            key,
+        })
+    }
+
+    /// Reads, measures and codes the scene for `dataset`.
+    pub(super) fn encode(
+        &self,
+        stores: &Stores,
+        dataset: &Dataset,
+        settings: &ReprocessSettings,
+        index: u64,
+        control: &Control,
+    ) -> Result<EncodedScene, TaskError> {
+        let source = &self.source;
+        let h = debug_span!(target: trace::TARGET, "read")
+            .in_scope(|| read(stores, source, settings, index, control))?;
+        proceed(control, READ)?;
+        let input = Histograms {
+            transient: &h,
+            two_bounce: None,
+            bins: source.spec().gate.bins as usize,
+            bin_width_ps: source.spec().gate.bin_width_m * PS_PER_M,
+        };
+        // The key is the seed of everything; the scene's number adds nothing to it.
+        let seed = u64::from_le_bytes(self.key.0[..8].try_into().expect("a key has 32 bytes"));
+        let sensed = debug_span!(target: trace::TARGET, "measure")
+            .in_scope(|| self.sensor.sense(&input, seed, 0))
+            .map_err(of_sensor)?;
+        drop(h);
+        proceed(control, MEASURED)?;
+        let truth = stores.wait(control, source.read_truth(index))?;
+        let truth = match chosen(settings) {
+            None => truth,
+            Some(spots) => truth.of_spots(&spots).map_err(of_dataset)?,
+        };
+        let provenance = Provenance {
+            task_key: self.key.to_string(),
+            renderer: settings.version.clone(),
+            seed,
+            plan: account(settings, &self.found, &sensed),
+        };
+        let (transient, scale) = as_radiance(&sensed);
+        drop(sensed.values);
+        debug_span!(target: trace::TARGET, "encode")
+            .in_scope(|| dataset.encode_derived(index, &truth, &transient, scale, &provenance))
+            .map_err(of_dataset)
+    }
 }
 
 fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {

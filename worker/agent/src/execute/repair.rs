@@ -1,0 +1,407 @@
+//! Making broken scenes again: from the recipe beside the data set, from a job file, from the data set that it was made
+//! of, or from the files that it was imported from. The task's key says whether that is what made it, and the manifest's
+//! hashes whether the same came out.
+
+use std::path::PathBuf;
+
+use picofarm_dataset::{
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Profile, Restored,
+    import::{Format, ImportOptions, Source, import_scene},
+    open_store, remains, restore_root,
+};
+use picofarm_proto::{
+    key::{StageKey, TaskKey, stage_key, task_key},
+    model::{
+        JobSpec, OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, StageSpec,
+        TaskSpec,
+    },
+};
+use picofarm_scene::AssetLibrary;
+use serde_json::Value;
+use tokio::runtime::Handle;
+
+use super::{
+    Control, TaskError,
+    output::{Stores, dataset_spec, of_dataset},
+    recipe, render, reprocess, scenes,
+    tasks::STORE_PATIENCE,
+};
+
+/// What a person says of how the data set was made, beyond what it says itself.
+#[derive(Debug, Clone, Default)]
+pub struct Hints {
+    /// The job that made it.
+    pub job: Option<JobSpec>,
+    /// Where the data set is now that it was made of.
+    pub source: Option<SourceSettings>,
+    /// Where the files are now that it was imported from.
+    pub files: Option<PathBuf>,
+}
+
+/// Repairs a data set.
+pub struct Repairer {
+    libraries: Vec<AssetLibrary>,
+    stores: Stores,
+    store: String,
+    dataset: String,
+    hints: Hints,
+}
+
+/// How a scene is made.
+#[derive(Debug)]
+enum Way {
+    Render(StageKey, Box<TaskSpec>),
+    Reprocess(Box<ReprocessTask>),
+    Import(PathBuf),
+}
+
+impl Repairer {
+    /// For the data set `dataset` in `store`. Stores are reached through `runtime`, which must not be a thread that calls
+    /// [`Self::run`].
+    pub fn new(
+        asset_dirs: &[PathBuf],
+        runtime: Handle,
+        store: &str,
+        dataset: &str,
+        hints: Hints,
+    ) -> Self {
+        Self {
+            libraries: scenes::find_libraries(asset_dirs),
+            stores: Stores::new(runtime, STORE_PATIENCE),
+            store: store.to_owned(),
+            dataset: dataset.to_owned(),
+            hints,
+        }
+    }
+
+    /// Makes a scene again and puts back what is broken of it; see [`Dataset::restore`]. Blocks; works on rayon's
+    /// current pool.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] where it is unknown how the scene was made, or where it came out otherwise.
+    pub fn run(
+        &self,
+        scene: u64,
+        witness: Option<&str>,
+        control: &Control,
+    ) -> Result<Restored, TaskError> {
+        let dataset = self
+            .stores
+            .open_source(&self.store, &self.dataset, control)?;
+        let manifest = self.manifest(&dataset, scene, control)?;
+        let encoded = self.make(&dataset, scene, manifest.as_ref(), control)?;
+        self.stores.wait(control, dataset.restore(encoded, witness))
+    }
+
+    /// Writes the root's metadata of a data set that cannot be opened.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] where neither a recipe nor the job says what its properties were, or its arrays contradict.
+    pub fn restore_root(&self, control: &Control) -> Result<Dataset, TaskError> {
+        let (store, prefix) = open_store(&self.store).map_err(of_dataset)?;
+        let prefix = prefix.join(&*self.dataset);
+        let left = self
+            .stores
+            .wait(control, remains(store.clone(), prefix.clone()))?;
+        let stages = self.hints.job.iter().flat_map(|job| &job.stages);
+        let mut tasks: Vec<_> = stages.map(|s| (stage_key(s), s.task.clone())).collect();
+        // Unproved by any scene, a person's word is not enough.
+        if left.scene.is_none() {
+            tasks.clear();
+        }
+        for stored in &left.recipes {
+            tasks.push(recipe::read(stored, &self.store, &self.dataset)?);
+        }
+        let mut last = None;
+        for (stage, task) in tasks {
+            let Some(spec) = self.described(&task, control)? else {
+                continue;
+            };
+            if let Some((scene, key)) = &left.scene {
+                let (_, ours) = self.keyed(Some(stage), task, *scene, control)?;
+                if ours.to_string() != *key {
+                    continue;
+                }
+            }
+            let restored = restore_root(store.clone(), prefix.clone(), &spec);
+            match self.stores.wait(control, restored) {
+                Err(error @ TaskError::User(_)) => last = Some(error),
+                other => return other,
+            }
+        }
+        Err(last.unwrap_or_else(|| {
+            TaskError::User(format!(
+                "{}/{}: zarr.json is broken or missing, and no recipe leads to its scenes; check the location, or give \
+                 the job file that made the data set with --job",
+                self.store, self.dataset
+            ))
+        }))
+    }
+
+    /// The properties of the data set that a task makes.
+    fn described(
+        &self,
+        task: &TaskSpec,
+        control: &Control,
+    ) -> Result<Option<DatasetSpec>, TaskError> {
+        match task {
+            TaskSpec::Render(task) => dataset_spec(task).map(Some),
+            TaskSpec::Reprocess(task) => {
+                let place = self.hints.source.as_ref().unwrap_or(&task.source);
+                let source = self
+                    .stores
+                    .open_source(&place.store, &place.dataset, control)?;
+                let profile = &task.output.profile;
+                reprocess::target_spec(source.spec(), &task.reprocess, profile).map(Some)
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// How the scene would be made, in a line for people; nothing is made.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] where that is unknown.
+    pub fn explain(&self, scene: u64, control: &Control) -> Result<String, TaskError> {
+        let dataset = self
+            .stores
+            .open_source(&self.store, &self.dataset, control)?;
+        let manifest = self.manifest(&dataset, scene, control)?;
+        let (way, _) = self.way(&dataset, scene, manifest.as_ref(), control)?;
+        Ok(match way {
+            Way::Render(key, _) => format!("rendered again, stage {key}"),
+            Way::Reprocess(task) => {
+                let SourceSettings { store, dataset } = &task.source;
+                format!("measured again from {store}/{dataset}")
+            }
+            Way::Import(files) => format!("imported again from {}", files.display()),
+        })
+    }
+
+    /// The scene's manifest, if it is usable.
+    fn manifest(
+        &self,
+        dataset: &Dataset,
+        scene: u64,
+        control: &Control,
+    ) -> Result<Option<Manifest>, TaskError> {
+        let read = async {
+            match dataset.manifest(scene).await {
+                Ok(manifest) => Ok(Some(manifest)),
+                Err(DatasetError::NotPublished { .. } | DatasetError::Damaged { .. }) => Ok(None),
+                Err(error) => Err(error),
+            }
+        };
+        self.stores.wait(control, read)
+    }
+
+    fn make(
+        &self,
+        dataset: &Dataset,
+        scene: u64,
+        manifest: Option<&Manifest>,
+        control: &Control,
+    ) -> Result<EncodedScene, TaskError> {
+        let (way, key) = self.way(dataset, scene, manifest, control)?;
+        match way {
+            Way::Render(_, task) => {
+                let TaskSpec::Render(task) = *task else {
+                    unreachable!("only renderings are ways of rendering");
+                };
+                let key = key.expect("a rendering has a key");
+                render::make(dataset, &self.libraries, &task, scene, &key, control)
+            }
+            Way::Reprocess(task) => {
+                let made = reprocess::Made::of(&self.stores, &task, scene, control)?;
+                made.encode(&self.stores, dataset, &task.reprocess, scene, control)
+            }
+            Way::Import(files) => {
+                let manifest = manifest.expect("an import is known by its manifest");
+                import(dataset, scene, manifest, files)
+            }
+        }
+    }
+
+    /// How the scene is made: the way whose key is the manifest's; without a manifest, the only one.
+    fn way(
+        &self,
+        dataset: &Dataset,
+        scene: u64,
+        manifest: Option<&Manifest>,
+        control: &Control,
+    ) -> Result<(Way, Option<TaskKey>), TaskError> {
+        let plan = manifest.map(|m| &m.provenance.plan);
+        if plan.is_some_and(|plan| plan["kind"] == "import") {
+            let files = self.hints.files.clone();
+            let files = files.ok_or_else(|| imported(scene, plan.expect("just seen")))?;
+            return Ok((Way::Import(files), None));
+        }
+        let mut found: Vec<(Way, TaskKey)> = Vec::new();
+        let mut others: Vec<String> = Vec::new();
+        for (stage, task) in self.candidates(dataset, scene, manifest, control)? {
+            match self.keyed(stage, task, scene, control) {
+                Ok((way, key)) if found.iter().all(|(_, k)| *k != key) => found.push((way, key)),
+                Ok(_) => {}
+                Err(TaskError::User(why)) => others.push(why),
+                Err(error) => return Err(error),
+            }
+        }
+        let known = found.len();
+        if let Some(manifest) = manifest {
+            let key = &manifest.provenance.task_key;
+            found.retain(|(_, k)| k.to_string() == *key);
+        }
+        if found.len() == 1 {
+            let (way, key) = found.remove(0);
+            return Ok((way, Some(key)));
+        }
+        let why = match (manifest, known) {
+            (Some(m), 1..) => format!(
+                "it was made by the task {}, which is none of the {known} known ways",
+                m.provenance.task_key
+            ),
+            (_, 0) => "the data set does not say how it was made (it is older than recipes, or they were deleted)".into(),
+            (None, _) => format!("its manifest is broken or missing, and {known} recipes could have made it"),
+        };
+        let others = others.iter().map(|o| format!("; {o}")).collect::<String>();
+        Err(TaskError::User(format!(
+            "scene {scene}: {why}{others}; give the job file that made the data set with --job, or with --source the data \
+             set that it was reprocessed from"
+        )))
+    }
+
+    /// Everything that may have made the scene.
+    fn candidates(
+        &self,
+        dataset: &Dataset,
+        scene: u64,
+        manifest: Option<&Manifest>,
+        control: &Control,
+    ) -> Result<Vec<(Option<StageKey>, TaskSpec)>, TaskError> {
+        let stages = self.hints.job.iter().flat_map(|job| &job.stages);
+        let mut all: Vec<_> = stages
+            .map(|s| (Some(stage_key(s)), s.task.clone()))
+            .collect();
+        for key in self.stores.wait(control, dataset.recipe_keys())? {
+            let stored = self.stores.wait(control, dataset.recipe(&key, scene))?;
+            let read = stored.map(|recipe| recipe::read(&recipe, &self.store, &self.dataset));
+            if let Some((key, task)) = read.transpose()? {
+                all.push((Some(key), task));
+            }
+        }
+        if let (Some(manifest), Some(source)) = (manifest, &self.hints.source)
+            && manifest.provenance.plan["kind"] == "reprocess"
+        {
+            all.push((None, self.reprocessed(manifest, source)?));
+        }
+        Ok(all)
+    }
+
+    /// The reprocessing that a manifest describes.
+    fn reprocessed(
+        &self,
+        manifest: &Manifest,
+        source: &SourceSettings,
+    ) -> Result<TaskSpec, TaskError> {
+        let plan = &manifest.provenance.plan;
+        let unusable = |e: serde_json::Error| {
+            TaskError::User(format!("the manifest's provenance cannot be read: {e}"))
+        };
+        let histogram = serde_json::from_value(plan["histogram"].clone()).map_err(unusable)?;
+        let mut settings = ReprocessSettings {
+            histogram,
+            sensor: serde_json::from_value(plan["sensor"].clone()).map_err(unusable)?,
+            drop_left_over: plan["drop_left_over"] == true,
+            seed: plan["seed"].as_u64().unwrap_or_default(),
+            version: manifest.provenance.renderer.clone(),
+            spots: Vec::new(),
+        };
+        if plan["histogram"] == "transient_spots" {
+            settings.spots = serde_json::from_value(plan["spots"].clone()).map_err(unusable)?;
+        }
+        Ok(TaskSpec::Reprocess(ReprocessTask {
+            source: source.clone(),
+            count: 1,
+            reprocess: settings,
+            output: OutputSettings {
+                store: self.store.clone(),
+                dataset: self.dataset.clone(),
+                profile: profile_name(manifest.profile).to_owned(),
+            },
+        }))
+    }
+
+    /// A candidate with the key of its task for `scene`.
+    fn keyed(
+        &self,
+        stage: Option<StageKey>,
+        task: TaskSpec,
+        scene: u64,
+        control: &Control,
+    ) -> Result<(Way, TaskKey), TaskError> {
+        match task {
+            TaskSpec::Render(_) => {
+                let stage = stage.unwrap_or_else(|| stage_key(&StageSpec::new(task.clone())));
+                let key = task_key(&stage, scene);
+                Ok((Way::Render(stage, Box::new(task)), key))
+            }
+            TaskSpec::Reprocess(mut task) => {
+                if let Some(source) = &self.hints.source {
+                    task.source = source.clone();
+                }
+                let made = reprocess::Made::of(&self.stores, &task, scene, control)?;
+                Ok((Way::Reprocess(Box::new(task)), made.key))
+            }
+            other => Err(TaskError::User(format!(
+                "the stage of kind {} makes no scenes",
+                other.kind()
+            ))),
+        }
+    }
+}
+
+/// What jobs call a profile.
+fn profile_name(profile: Profile) -> &'static str {
+    match profile {
+        Profile::SqrtU16 { .. } => "sqrt-u16",
+        Profile::PlainF32 => "plain-f32",
+        Profile::CountsU16 => "counts-u16",
+    }
+}
+
+/// An imported scene from its files.
+fn import(
+    dataset: &Dataset,
+    scene: u64,
+    manifest: &Manifest,
+    files: PathBuf,
+) -> Result<EncodedScene, TaskError> {
+    let plan = &manifest.provenance.plan;
+    let user = |e: String| TaskError::User(format!("scene {scene}, imported: {e}"));
+    let read = |field: &str| plan[field].clone();
+    let format: Format = serde_json::from_value(read("format")).map_err(|e| user(e.to_string()))?;
+    let options: ImportOptions =
+        serde_json::from_value(read("options")).map_err(|e| user(e.to_string()))?;
+    let name = plan["scene"].as_str().unwrap_or_default().to_owned();
+    let source = Source::open(&files, Some(format), options, Some(&[name]))
+        .map_err(|e| user(e.to_string()))?;
+    let imported = import_scene(&source, 0).map_err(|e| user(e.to_string()))?;
+    source
+        .encode(dataset, scene, &imported)
+        .map_err(|e| user(e.to_string()))
+}
+
+fn imported(scene: u64, plan: &Value) -> TaskError {
+    let files = plan["files"].as_array();
+    let names: Vec<&str> = files
+        .into_iter()
+        .flatten()
+        .filter_map(|f| f["name"].as_str())
+        .collect();
+    TaskError::User(format!(
+        "scene {scene} was imported ({}) from {}, which are not in the data set; give the folder that they lie in with \
+         --files",
+        plan["format"].as_str().unwrap_or("unknown format"),
+        names.join(", ")
+    ))
+}
