@@ -123,6 +123,20 @@ generate = {{ dest = "{store}/mitsuba", format = "mitsuba" }}
         SCENES
     );
 
+    // A broken scene comes back from its files, once it is said where they are.
+    let broken = target.join("transient/c/2/0/0/0");
+    let bytes = fs::read(&broken).expect("published");
+    fs::write(&broken, &bytes[..bytes.len() / 2]).expect("writable");
+    let repair = ["dataset", "repair", path(&target)];
+    cli.run(&repair)
+        .fails(6, &["scene 2", "imported", "--files"]);
+    let mended = cli.json(&[&repair[..], &["--files", path(&release)]].concat());
+    assert_eq!(
+        mended["scenes"][0]["written"],
+        serde_json::json!([path(&broken)])
+    );
+    assert_eq!(store::hashes(&by_stage), store::hashes(&target));
+
     // A scene file is the scene that was rendered.
     let scene = farm.store().join("scenes/000002.glb");
     let shown = cli.json(&["scene", "show", path(&scene)]);
