@@ -234,19 +234,19 @@ fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Resu
         "failed": failed, "left": problems_json(&done.left), "seconds": seconds,
     });
     output.result(&facts, || text(args, done, seconds));
-    if done.failed.is_empty() {
+    if done.failed.is_empty() && done.left.is_empty() {
         return Ok(());
     }
-    let lines = done.failed.iter().take(20);
-    let lines: Vec<String> = lines
-        .map(|(scene, _, why)| format!("scene {scene}: {why}"))
-        .collect();
+    let failed = done.failed.iter();
+    let failed = failed.map(|(scene, _, why)| format!("scene {scene}: {why}"));
+    let left = done.left.iter().map(|p| format!("{p}: {}", p.mend()));
+    let lines: Vec<String> = failed.chain(left).take(20).collect();
     Err(CliError::new(
         Code::Damaged,
         format!(
-            "{}: {} scene(s) could not be mended\n  {}",
+            "{}: {} problem(s) could not be mended\n  {}",
             args.dataset,
-            done.failed.len(),
+            done.failed.len() + done.left.len(),
             lines.join("\n  ")
         ),
     ))
@@ -275,15 +275,15 @@ fn text(args: &DatasetRepair, done: &Done, seconds: f64) -> String {
         .iter()
         .map(|w| format!("  written again: {w}\n"))
         .collect::<String>();
-    for problem in &done.left {
-        text += &format!("left alone: {problem}; {}\n", problem.mend());
-    }
     text += &match (
         args.dry_run,
         done.mended.len(),
         done.written.len() + done.metadata.len(),
     ) {
-        (_, 0, 0) => format!("{}: nothing to mend", args.dataset),
+        (_, 0, 0) => match done.failed.is_empty() && done.left.is_empty() {
+            true => format!("{}: nothing to mend", args.dataset),
+            false => format!("{}: nothing mended", args.dataset),
+        },
         (true, n, _) => format!("{}: {n} scene(s) to make again", args.dataset),
         (false, n, m) => format!(
             "{}: {n} scene(s) made again and equal to what they were, {m} metadata object(s) mended, in {}",

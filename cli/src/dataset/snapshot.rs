@@ -1,18 +1,18 @@
 //! `picofarm dataset snapshot …`: what a data set was at a time, for good.
 
-use std::{sync::Mutex, time::SystemTime};
+use std::time::SystemTime;
 
 use picofarm_dataset::{Dataset, Snapshot};
 use serde_json::json;
 
 use super::{
     failed, open,
-    verify::{How, look, tell},
+    verify::{How, Late, look, tell},
 };
 use crate::{
     args::Snapshot as Command,
     error::Result,
-    output::{Meter, Output, bytes, table},
+    output::{Output, bytes, table},
 };
 
 /// Scenes of a difference that are shown to people.
@@ -69,16 +69,10 @@ async fn create(place: &str, name: String, output: Output) -> Result<()> {
 }
 
 async fn present(dataset: &Dataset, output: Output) -> Result<Snapshot> {
-    let meter = Mutex::new(Meter::new(output));
-    let watch = |done: u64, of: u64| {
-        let mut meter = meter.lock().expect("no panic while locked");
-        meter.at(
-            done as f64 / of.max(1) as f64,
-            format!("{done} of {of} manifests read"),
-        );
-    };
+    let late = Late::new("manifests read", output);
+    let watch = |done, of| late.at(done, of);
     let snapshot = dataset.present(&watch).await.map_err(failed);
-    meter.into_inner().expect("no panic while locked").finish();
+    late.finish();
     snapshot
 }
 
@@ -86,29 +80,32 @@ async fn list(place: &str, output: Output) -> Result<()> {
     let dataset = open(place).await?;
     let mut all = Vec::new();
     for name in dataset.snapshots().await.map_err(failed)? {
-        all.push(dataset.snapshot(&name).await.map_err(failed)?);
+        all.push((dataset.snapshot(&name).await, name));
     }
     let facts: Vec<_> = all
         .iter()
-        .map(|s| json!({"name": s.name, "created": s.created, "scenes": s.len(), "bytes": s.bytes, "id": s.id()}))
+        .map(|(snapshot, name)| match snapshot {
+            Ok(s) => json!({
+                "name": name, "created": s.created, "scenes": s.len(), "bytes": s.bytes, "id": s.id(),
+            }),
+            Err(error) => json!({"name": name, "damaged": error.to_string()}),
+        })
         .collect();
     output.result(&facts, || {
         if all.is_empty() {
             return format!("{place}: no snapshots");
         }
-        let mut rows = vec![
-            ["name", "created", "scenes", "bytes", "id"]
-                .map(str::to_owned)
-                .to_vec(),
-        ];
-        rows.extend(all.iter().map(|s| {
-            vec![
-                s.name.clone(),
+        let head = ["name", "created", "scenes", "bytes", "id"];
+        let mut rows = vec![head.map(str::to_owned).to_vec()];
+        rows.extend(all.iter().map(|(snapshot, name)| match snapshot {
+            Ok(s) => vec![
+                name.clone(),
                 s.created.clone(),
                 s.len().to_string(),
                 bytes(s.bytes),
                 s.id(),
-            ]
+            ],
+            Err(error) => vec![name.clone(), format!("damaged: {error}")],
         }));
         table(&rows)
     });

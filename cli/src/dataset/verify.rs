@@ -1,6 +1,9 @@
 //! `picofarm dataset verify`: what is broken, and how it is mended.
 
-use std::sync::Mutex;
+use std::{
+    sync::Mutex,
+    time::{Duration, Instant},
+};
 
 use picofarm_dataset::{Dataset, Problem, Snapshot, Verification, VerifyMode, VerifyOptions};
 use serde_json::{Value, json};
@@ -39,12 +42,8 @@ pub struct How<'a> {
 
 /// Verifies, showing how far it is.
 pub async fn look(dataset: &Dataset, how: &How<'_>, output: Output) -> Result<Verification> {
-    let meter = Mutex::new(Meter::new(output));
-    let watch = |done: u64, of: u64| {
-        let text = format!("{done} of {of} scenes checked");
-        let mut meter = meter.lock().expect("no panic while locked");
-        meter.at(done as f64 / of.max(1) as f64, text);
-    };
+    let late = Late::new("scenes checked", output);
+    let watch = |done, of| late.at(done, of);
     let options = VerifyOptions {
         mode: mode(how.fast),
         complete: how.complete,
@@ -52,8 +51,45 @@ pub async fn look(dataset: &Dataset, how: &How<'_>, output: Output) -> Result<Ve
         watch: &watch,
     };
     let report = dataset.verify_with(&options).await.map_err(failed);
-    meter.into_inner().expect("no panic while locked").finish();
+    late.finish();
     report
+}
+
+/// Progress of what mostly is over in a moment: nothing is shown before it has taken a while.
+pub struct Late {
+    since: Instant,
+    what: &'static str,
+    meter: Mutex<Option<Meter>>,
+    output: Output,
+}
+
+impl Late {
+    const AFTER: Duration = Duration::from_secs(2);
+
+    pub fn new(what: &'static str, output: Output) -> Self {
+        Self {
+            since: Instant::now(),
+            what,
+            meter: Mutex::new(None),
+            output,
+        }
+    }
+
+    pub fn at(&self, done: u64, of: u64) {
+        if self.since.elapsed() > Self::AFTER {
+            let mut meter = self.meter.lock().expect("no panic while locked");
+            let text = format!("{done} of {of} {}", self.what);
+            meter
+                .get_or_insert_with(|| Meter::new(self.output))
+                .at(done as f64 / of.max(1) as f64, text);
+        }
+    }
+
+    pub fn finish(self) {
+        if let Some(meter) = self.meter.into_inner().expect("no panic while locked") {
+            meter.finish();
+        }
+    }
 }
 
 pub fn mode(fast: bool) -> VerifyMode {
