@@ -1,9 +1,11 @@
 //! A data set in numbers.
 
-use futures::{StreamExt, TryStreamExt, stream};
+use futures::future::BoxFuture;
+use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
+use crate::manifest::Manifest;
 use crate::spec::DatasetSpec;
 
 /// Requests in flight.
@@ -46,11 +48,11 @@ impl Dataset {
             noise: None,
         };
         let mut noise = Vec::new();
-        let reads: Vec<_> = scenes
-            .into_iter()
-            .map(|scene| self.manifest(scene))
-            .collect();
-        let mut manifests = stream::iter(reads).buffer_unordered(CONCURRENCY);
+        let read = |scene: u64| -> BoxFuture<'_, Result<Manifest, DatasetError>> {
+            self.manifest(scene).boxed()
+        };
+        let mut manifests =
+            stream::iter(scenes.into_iter().map(read)).buffer_unordered(CONCURRENCY);
         while let Some(manifest) = manifests.try_next().await? {
             summary.bytes += manifest.total_bytes();
             summary.overflow += manifest.overflow.len() as u64;

@@ -1,0 +1,95 @@
+//! Checking what is no scene: metadata, snapshots, recipes.
+
+use serde_json::Value;
+
+use super::{Fault, Problem, Verification};
+use crate::dataset::{Dataset, METADATA};
+use crate::error::DatasetError;
+use crate::listing::Listing;
+use crate::objects;
+use crate::snapshot::Snapshot;
+use crate::{recipe, snapshot};
+
+impl Dataset {
+    /// Metadata must be those that the specification asks for.
+    pub(super) async fn verify_metadata(
+        &self,
+        report: &mut Verification,
+    ) -> Result<(), DatasetError> {
+        for (key, expected) in self.metadata() {
+            let path = self.path(&key);
+            let fault = match objects::get(&*self.store, &path).await? {
+                None => Some(Fault::Missing),
+                Some(bytes) => metadata_fault(&bytes, &expected),
+            };
+            report.problems.extend(fault.map(|fault| Problem {
+                object: self.shown(&path),
+                scene: None,
+                fault,
+            }));
+        }
+        Ok(())
+    }
+
+    /// Keys and contents of the metadata that the specification asks for, the root's first.
+    pub(crate) fn metadata(&self) -> Vec<(String, Value)> {
+        let root = crate::dataset::root_metadata(&self.spec);
+        let arrays = self.arrays.iter().map(|array| {
+            let key = format!("{}/{METADATA}", array.layout.quantity.name());
+            (key, array.layout.metadata(self.spec.scenes))
+        });
+        std::iter::once((METADATA.to_string(), root))
+            .chain(arrays)
+            .collect()
+    }
+
+    /// Snapshots and recipes must be what was written.
+    pub(super) async fn verify_records(
+        &self,
+        listing: &Listing,
+        report: &mut Verification,
+    ) -> Result<(), DatasetError> {
+        for key in &listing.records {
+            let path = self.path(key);
+            let Some(bytes) = objects::get(&*self.store, &path).await? else {
+                continue;
+            };
+            let checked = match snapshot::is_snapshot(key) {
+                true => Snapshot::parse(&bytes).map(drop),
+                false => recipe::parse(&bytes).map(drop),
+            };
+            report.problems.extend(checked.err().map(|why| Problem {
+                object: self.shown(&path),
+                scene: None,
+                fault: Fault::BadRecord(why),
+            }));
+        }
+        Ok(())
+    }
+}
+
+fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
+    let stored: Value = match serde_json::from_slice(bytes) {
+        Ok(stored) => stored,
+        Err(e) => return Some(Fault::BadMetadata(format!("not JSON: {e}"))),
+    };
+    let member = |value: &Value| value.as_object().cloned().unwrap_or_default();
+    let (stored, expected) = (member(&stored), member(expected));
+    let differing: Vec<&str> = expected
+        .iter()
+        .filter(|(key, value)| stored.get(*key) != Some(*value))
+        .map(|(key, _)| key.as_str())
+        .chain(
+            stored
+                .keys()
+                .filter(|key| !expected.contains_key(*key))
+                .map(String::as_str),
+        )
+        .collect();
+    (!differing.is_empty()).then(|| {
+        Fault::BadMetadata(format!(
+            "not what the data set's specification gives: {}",
+            differing.join(", ")
+        ))
+    })
+}
