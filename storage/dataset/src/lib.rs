@@ -5,6 +5,7 @@
 //! task, so whoever runs a task again writes the same bytes.
 
 mod codec;
+mod coding;
 mod collect;
 mod counts;
 mod dataset;
@@ -23,12 +24,17 @@ mod read;
 mod record;
 mod render_group;
 mod render_read;
+mod rounding;
 mod shard;
 mod spec;
 mod splits;
 mod squareroot;
 mod store;
+mod tiles;
+mod transient;
+mod values;
 mod verify;
+mod window;
 
 pub use collect::{Collection, MIN_GRACE, Orphan};
 pub use dataset::Dataset;
@@ -48,4 +54,5 @@ pub use render_read::RenderGroup;
 pub use spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use store::{check_location, open_store, probe};
+pub use transient::{CodedImage, TransientCodec};
 pub use verify::{Fault, Problem, Summary, Verification, VerifyMode};

@@ -253,7 +253,7 @@ impl Dataset {
         listed: &mut BTreeMap<String, u64>,
         report: &mut Verification,
     ) -> Result<(), DatasetError> {
-        let root = crate::dataset::root_metadata(&self.spec);
+        let root = crate::dataset::root_metadata(&self.spec, self.format);
         let arrays = self.arrays.iter().map(|array| {
             let key = format!("{}/{METADATA}", array.layout.quantity.name());
             (key, array.layout.metadata(self.spec.scenes))
