@@ -11,7 +11,8 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
 pub use data::{
-    DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, ExportFormat, SensorArgs,
+    BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, ExportFormat,
+    SensorArgs,
 };
 pub use guard::{Guard, Token};
 pub use job::{Job, JobKind};
@@ -399,6 +400,8 @@ pub enum Bench {
     Render(BenchRender),
     /// Measure the scheduler: durable no-op tasks a second beside the database's own limit, and fleets of simulated workers
     Queue(BenchQueue),
+    /// Measure storage on scenes of this renderer: size, error and speed of all profiles beside other formats, and reading
+    Store(BenchStore),
 }
 
 #[derive(Args)]

@@ -1,4 +1,5 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears.
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what
+//! storing histograms costs.
 
 mod axes;
 mod curve;
@@ -11,6 +12,7 @@ mod queue;
 mod report;
 mod scaling;
 mod scenes;
+mod store;
 mod tessellate;
 mod truth;
 
@@ -28,6 +30,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
     let stop = signals::stop_on_signal()?;
     let args = match command {
         Command::Queue(args) => return queue::run(args, output, &stop).await,
+        Command::Store(args) => return store::run(args, settings, output, &stop).await,
         Command::Render(args) => args,
     };
     check(&args)?;
