@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use crate::dataset::{Dataset, METADATA, pretty, root_metadata};
 use crate::error::DatasetError;
+use crate::manifest::FORMAT_VERSION;
 use crate::objects;
 use crate::recipe::Recipe;
 use crate::spec::{DatasetSpec, Gate, Profile, Subsets};
@@ -38,9 +39,9 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
             bin_width_m: 1.0,
             bins: 1,
         },
-        profile: Profile::PlainF32,
+        profile: Profile::default(),
     };
-    let blind = Dataset::assume(store, prefix, anything);
+    let blind = Dataset::assume(store, prefix, anything, FORMAT_VERSION);
     let mut found = Remains::default();
     for scene in blind.scenes_present().await? {
         match blind.manifest(scene).await {
@@ -67,7 +68,7 @@ impl Dataset {
     pub async fn root_agrees(&self) -> Result<bool, DatasetError> {
         let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
         let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
-        Ok(stored == Some(root_metadata(&self.spec)))
+        Ok(stored == Some(root_metadata(&self.spec, self.format)))
     }
 }
 
@@ -83,11 +84,44 @@ pub async fn restore_root(
     spec: &DatasetSpec,
 ) -> Result<Dataset, DatasetError> {
     let mut spec = *spec;
-    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec);
+    let assume = |format| Dataset::assume(store.clone(), prefix.clone(), spec, format);
+    let (mut agreed, mut assumed) = (
+        scenes_of(&assume(FORMAT_VERSION)).await,
+        assume(FORMAT_VERSION),
+    );
+    for format in (1..FORMAT_VERSION).rev() {
+        // Perhaps it was written by an older program.
+        if agreed.is_err() {
+            let older = assume(format);
+            if let Ok(scenes) = scenes_of(&older).await {
+                (agreed, assumed) = (Ok(scenes), older);
+            }
+        }
+    }
+    let root = assumed.path(METADATA);
+    let Some(scenes) = agreed?.filter(|n| *n > 0) else {
+        return Err(DatasetError::Damaged {
+            object: assumed.shown(&root),
+            what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
+        });
+    };
+    spec.scenes = scenes;
+    spec.check()?;
+    objects::overwrite(
+        &*store,
+        &root,
+        pretty(&root_metadata(&spec, assumed.format)),
+    )
+    .await?;
+    Dataset::open(store, prefix).await
+}
+
+/// The number of scenes on which all array metadata that can be read agree; `None` where none can be read.
+async fn scenes_of(assumed: &Dataset) -> Result<Option<u64>, DatasetError> {
     let mut agreed = None;
     for array in assumed.arrays.iter() {
         let path = assumed.metadata_path(&array.layout);
-        let Some(bytes) = objects::get(&*store, &path).await? else {
+        let Some(bytes) = objects::get(&*assumed.store, &path).await? else {
             continue;
         };
         let Ok(stored) = serde_json::from_slice::<Value>(&bytes) else {
@@ -103,15 +137,5 @@ pub async fn restore_root(
             what: "is not what the recipe of the data set gives, while the root is broken too: nothing was written".into(),
         });
     }
-    let root = assumed.path(METADATA);
-    let Some(scenes) = agreed.filter(|n| *n > 0) else {
-        return Err(DatasetError::Damaged {
-            object: assumed.shown(&root),
-            what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
-        });
-    };
-    spec.scenes = scenes;
-    spec.check()?;
-    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec))).await?;
-    Dataset::open(store, prefix).await
+    Ok(agreed)
 }

@@ -326,7 +326,7 @@ impl Repairer {
             output: OutputSettings {
                 store: self.store.clone(),
                 dataset: self.dataset.clone(),
-                profile: profile_name(manifest.profile).to_owned(),
+                profile: profile_name(manifest.profile),
             },
         }))
     }
@@ -360,13 +360,11 @@ impl Repairer {
     }
 }
 
-/// What jobs call a profile.
-fn profile_name(profile: Profile) -> &'static str {
-    match profile {
-        Profile::SqrtU16 { .. } => "sqrt-u16",
-        Profile::PlainF32 => "plain-f32",
-        Profile::CountsU16 => "counts-u16",
-    }
+/// What jobs call a profile; one that has no name now is described.
+fn profile_name(profile: Profile) -> String {
+    let named = |name: &&str| Profile::parse(name) == Ok(profile);
+    let name = Profile::NAMES.into_iter().find(named);
+    name.map_or_else(|| profile.to_string(), str::to_owned)
 }
 
 /// An imported scene from its files.
