@@ -169,7 +169,7 @@ impl ReprocessSettings {
             return Err(SpecError::new(
                 "output.profile",
                 "\"counts-u16\" holds whole counts, but reprocess.sensor.poisson = false gives rates; use \"sqrt-u16\" \
-                 or \"plain-f32\"",
+                 or \"lossless\"",
             ));
         }
         Ok(())

@@ -23,11 +23,12 @@ pub(crate) struct ChunkCodec {
 }
 
 impl ChunkCodec {
-    /// Codec of an array's objects, or of the inner chunks of its shards.
+    /// Codec of an array's objects, or of the inner chunks of its shards, whose values are given in stored order: of
+    /// any order, only their number matters to it.
     pub fn new(layout: &Layout) -> Self {
         let shape = layout.inner.as_ref().unwrap_or(&layout.object_shape);
         Self::of_element(
-            &layout.chunk_codecs(),
+            &layout.stored_codecs(),
             std::iter::once(1).chain(shape.iter().copied()),
             layout.element,
             layout.quantity.name(),

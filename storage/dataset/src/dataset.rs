@@ -8,11 +8,12 @@ use object_store::path::Path;
 use serde_json::{Map, Value, json};
 
 use crate::codec::ChunkCodec;
+use crate::coding::decode_lines;
 use crate::error::DatasetError;
 use crate::layout::{Layout, Quantity};
-use crate::manifest::{ENCODER_VERSION, FORMAT_VERSION};
+use crate::manifest::{FORMAT_VERSION, encoder_of};
 use crate::objects;
-use crate::spec::{DatasetSpec, Profile};
+use crate::spec::DatasetSpec;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -20,6 +21,8 @@ pub struct Dataset {
     pub(crate) store: Arc<dyn ObjectStore>,
     pub(crate) prefix: Path,
     pub(crate) spec: DatasetSpec,
+    /// The layout's version, [`FORMAT_VERSION`] at the time of creation.
+    pub(crate) format: u32,
     pub(crate) arrays: Arc<[ArrayCodec]>,
 }
 
@@ -52,14 +55,16 @@ impl Dataset {
     ) -> Result<Self, DatasetError> {
         spec.check()?;
         let root = objects::path_of(&prefix, METADATA);
-        let stored = match objects::get(&*store, &root).await? {
+        let (stored, format) = match objects::get(&*store, &root).await? {
             Some(bytes) => parse_root(&bytes, &objects::shown(&*store, &root))?,
             None => {
-                let new = Self::assume(store.clone(), prefix.clone(), *spec);
+                let new = Self::assume(store.clone(), prefix.clone(), *spec, FORMAT_VERSION);
                 for array in new.arrays.iter() {
                     new.create_array_metadata(&array.layout).await?;
                 }
-                if objects::create(&*store, &root, pretty(&root_metadata(spec))).await? {
+                if objects::create(&*store, &root, pretty(&root_metadata(spec, FORMAT_VERSION)))
+                    .await?
+                {
                     return Ok(new);
                 }
                 // Another process was faster.
@@ -78,15 +83,15 @@ impl Dataset {
             });
         }
         if spec.scenes <= stored.scenes {
-            return Ok(Self::assume(store, prefix, stored));
+            return Ok(Self::assume(store, prefix, stored, format));
         }
-        let grown = Self::assume(store, prefix, *spec);
+        let grown = Self::assume(store, prefix, *spec, format);
         for array in grown.arrays.iter() {
             let path = grown.metadata_path(&array.layout);
             let bytes = pretty(&array.layout.metadata(spec.scenes));
             objects::overwrite(&*grown.store, &path, bytes).await?;
         }
-        objects::overwrite(&*grown.store, &root, pretty(&root_metadata(spec))).await?;
+        objects::overwrite(&*grown.store, &root, pretty(&root_metadata(spec, format))).await?;
         Ok(grown)
     }
 
@@ -102,8 +107,8 @@ impl Dataset {
                 prefix: objects::shown(&*store, &prefix),
             });
         };
-        let spec = parse_root(&bytes, &objects::shown(&*store, &root))?;
-        Ok(Self::assume(store, prefix, spec))
+        let (spec, format) = parse_root(&bytes, &objects::shown(&*store, &root))?;
+        Ok(Self::assume(store, prefix, spec, format))
     }
 
     /// The data set's properties as stored.
@@ -121,9 +126,14 @@ impl Dataset {
         self.shown(&self.prefix)
     }
 
-    pub(crate) fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: DatasetSpec) -> Self {
+    pub(crate) fn assume(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+        spec: DatasetSpec,
+        format: u32,
+    ) -> Self {
         let array = |quantity: Quantity| {
-            let layout = quantity.layout(&spec);
+            let layout = quantity.layout(&spec, format);
             let codec = ChunkCodec::new(&layout);
             ArrayCodec { layout, codec }
         };
@@ -131,6 +141,7 @@ impl Dataset {
             store,
             prefix,
             spec,
+            format,
             arrays: spec.quantities().into_iter().map(array).collect(),
         }
     }
@@ -208,64 +219,33 @@ pub(crate) fn pretty(value: &Value) -> Bytes {
 }
 
 /// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.
-pub(crate) fn root_metadata(spec: &DatasetSpec) -> Value {
+pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
     let arrays: Map<String, Value> = spec
         .quantities()
         .into_iter()
-        .map(|q| (q.name().to_string(), q.layout(spec).metadata(spec.scenes)))
+        .map(|q| {
+            let layout = q.layout(spec, format);
+            (q.name().to_string(), layout.metadata(spec.scenes))
+        })
         .collect();
-    let decode = match spec.profile {
-        Profile::SqrtU16 { delta } => json!([
-            "ds = xarray.open_zarr(location)  # i is the scene's index",
-            format!(
-                "q = ds['transient'][i].values.astype('float32') * numpy.float32({})",
-                delta / 2.0
-            ),
-            "h = q * q / ds['scale'][i].values  # radiance; q * q are photons; NaN where the scene is missing",
-            "# bins with code 65535 are saturated: their exact values stand in manifests/<i>.json, 'overflow'",
-            format!(
-                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
-                spec.spots
-            ),
-        ]),
-        Profile::CountsU16 => json!([
-            "ds = xarray.open_zarr(location)  # i is the scene's index",
-            "counts = ds['transient'][i].values  # photons",
-            "h = counts.astype('float32') / ds['scale'][i].values  # radiance; NaN where the scene is missing",
-            "# bins with code 65535 are saturated: their exact h stand in manifests/<i>.json, 'overflow'",
-            format!(
-                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
-                spec.spots
-            ),
-        ]),
-        Profile::PlainF32 => json!([
-            "ds = xarray.open_zarr(location)  # i is the scene's index",
-            "h = ds['transient'][i].values  # radiance",
-            "photons = h * ds['scale'][i].values  # NaN where the scene is missing",
-            "depth = ds['depth'][i].values  # z-depth in metres, not distance along the ray",
-            format!(
-                "lit = numpy.unpackbits(ds['visibility'][i].values, axis=0, bitorder='little', count={})  # 1 = lit",
-                spec.spots
-            ),
-        ]),
-    };
     json!({
         "zarr_format": 3,
         "node_type": "group",
         "attributes": {
-            "picofarm": {"format": FORMAT_VERSION, "encoder": ENCODER_VERSION, "spec": spec},
+            "picofarm": {"format": format, "encoder": encoder_of(format), "spec": spec},
             "gate": spec.gate,
             "bin": "bin b holds optical path lengths [start_m + b*bin_width_m, start_m + (b+1)*bin_width_m)",
             "speed_of_light_m_s": 299_792_458,
             "units": "lengths in metres, times as optical path in metres, images [row][column]",
             "visibility_polarity": "1 = lit",
-            "decode": decode,
+            "decode": decode_lines(spec),
         },
         "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": arrays},
     })
 }
 
-fn parse_root(bytes: &[u8], root: &str) -> Result<DatasetSpec, DatasetError> {
+/// The data set's properties and format.
+fn parse_root(bytes: &[u8], root: &str) -> Result<(DatasetSpec, u32), DatasetError> {
     let damaged = |what: String| DatasetError::Damaged {
         object: root.to_string(),
         what,
@@ -279,13 +259,16 @@ fn parse_root(bytes: &[u8], root: &str) -> Result<DatasetSpec, DatasetError> {
                 .into(),
         ));
     };
-    if format > u64::from(FORMAT_VERSION) {
-        return Err(damaged(format!(
-            "written in format {format}, this program knows formats up to {FORMAT_VERSION}: use a newer one"
-        )));
-    }
+    let format = match u32::try_from(format) {
+        Ok(format @ 1..=FORMAT_VERSION) => format,
+        _ => {
+            return Err(damaged(format!(
+                "written in format {format}, this program knows formats 1 to {FORMAT_VERSION}: use a newer one"
+            )));
+        }
+    };
     let spec: DatasetSpec = serde_json::from_value(ours["spec"].clone())
         .map_err(|e| damaged(format!("attributes.picofarm.spec: {e}")))?;
     spec.check()?;
-    Ok(spec)
+    Ok((spec, format))
 }

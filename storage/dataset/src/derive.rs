@@ -96,20 +96,13 @@ impl Dataset {
             subsets: &[],
             scale,
         };
-        assemble(
-            spec,
-            &self.arrays,
-            scene,
-            &content,
-            provenance,
-            |quantity| {
-                Ok(match quantity {
-                    Quantity::Intensity => intensity(transient, spec.gate.bins),
-                    Quantity::Scale => scale.to_ne_bytes().to_vec(),
-                    truth_of => truth.arrays[&truth_of].clone(),
-                })
-            },
-        )
+        assemble(self, scene, &content, provenance, |quantity| {
+            Ok(match quantity {
+                Quantity::Intensity => intensity(transient, spec.gate.bins),
+                Quantity::Scale => scale.to_ne_bytes().to_vec(),
+                truth_of => truth.arrays[&truth_of].clone(),
+            })
+        })
     }
 }
 

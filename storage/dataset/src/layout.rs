@@ -2,7 +2,8 @@
 
 use serde_json::{Value, json};
 
-use crate::spec::{DatasetSpec, Profile};
+use crate::coding::Coding;
+use crate::spec::DatasetSpec;
 
 /// Side of the transient's inner chunks in pixels (smaller where the image is smaller).
 pub const INNER_SIDE: u64 = 32;
@@ -101,7 +102,11 @@ pub(crate) struct Layout {
     pub object_shape: Vec<u64>,
     /// Shape of the shard's inner chunks, without the scene axis.
     pub inner: Option<Vec<u64>>,
+    /// Whether the values of an inner chunk are stored bin by bin.
+    pub bins_first: bool,
     dimensions: &'static [&'static str],
+    /// The filter of blosc.
+    shuffle: &'static str,
     fill_nan: bool,
     attributes: Value,
 }
@@ -170,21 +175,27 @@ impl Quantity {
         }
     }
 
-    pub(crate) fn layout(self, spec: &DatasetSpec) -> Layout {
+    /// Its array in a data set of the given format.
+    pub(crate) fn layout(self, spec: &DatasetSpec, format: u32) -> Layout {
         use Element::{F32, I16, U8, U16, U32};
         let (h, w) = (u64::from(spec.height), u64::from(spec.width));
         let (n, b) = (u64::from(spec.spots), u64::from(spec.gate.bins));
+        let coding = self.is_transient().then(|| Coding::of(self, spec, format));
+        let coded = || {
+            let coding = coding.as_ref().expect("made for every transient");
+            (coding.element, coding.attributes.clone())
+        };
         const IMAGE: &[&str] = &["scene", "row", "column"];
         let (element, shape, dimensions, attributes): (_, _, &'static [&'static str], _) =
             match self {
                 Self::Transient | Self::Transient4 | Self::Transient25 => {
                     let dims = &["scene", "row", "column", "bin"];
-                    let (element, attributes) = self.coding(spec);
+                    let (element, attributes) = coded();
                     (element, vec![h, w, b], dims, attributes)
                 }
                 Self::TransientSpots => {
                     let dims = &["scene", "spot", "row", "column", "bin"];
-                    let (element, attributes) = self.coding(spec);
+                    let (element, attributes) = coded();
                     (element, vec![n, h, w, b], dims, attributes)
                 }
                 Self::Intensity => {
@@ -253,8 +264,8 @@ impl Quantity {
                     (F32, vec![], &["scene"], a)
                 }
             };
-        let inner = self.is_transient().then(|| {
-            let inner = [1, h.min(INNER_SIDE), w.min(INNER_SIDE), b];
+        let inner = coding.as_ref().map(|coding| {
+            let inner = [1, h.min(INNER_SIDE), w.min(INNER_SIDE), coding.inner_bins];
             inner[4 - shape.len()..].to_vec()
         });
         let object_shape = match &inner {
@@ -275,61 +286,16 @@ impl Quantity {
             shape,
             object_shape,
             inner,
+            bins_first: coding.as_ref().is_some_and(|c| c.bins_first),
+            shuffle: match &coding {
+                Some(coding) => coding.shuffle(),
+                None if element.size() == 1 => "noshuffle",
+                None => "shuffle",
+            },
             dimensions,
             fill_nan,
             attributes,
         }
-    }
-}
-
-impl Quantity {
-    /// Element type and attributes of a transient.
-    fn coding(self, spec: &DatasetSpec) -> (Element, Value) {
-        let of = match self {
-            Self::Transient => "",
-            Self::TransientSpots => " of each spot alone",
-            _ => " of some of the spots",
-        };
-        let saturated = match self {
-            Self::Transient => "overflow".to_owned(),
-            _ => format!("subsets.{}.overflow", self.name()),
-        };
-        let (element, mut attributes) = match spec.profile {
-            Profile::SqrtU16 { delta } => (
-                Element::U16,
-                json!({
-                    "long_name": format!("transient histogram{of}, square-root code"),
-                    "delta": delta,
-                    "decode": format!("h = (q*{})**2 / scale in float32", delta / 2.0),
-                    "decoded_units": "1/(m2 sr), radiance per unit pulse energy in each bin",
-                    "saturated_code": crate::squareroot::SATURATED,
-                    "saturated": format!("exact values stand in manifests/<scene>.json, '{saturated}'"),
-                }),
-            ),
-            Profile::CountsU16 => (
-                Element::U16,
-                json!({
-                    "long_name": format!("photon counts{of}"),
-                    "units": "photons",
-                    "decode": "h = counts / scale in float32",
-                    "decoded_units": "1/(m2 sr), radiance per unit pulse energy in each bin",
-                    "saturated_code": crate::squareroot::SATURATED,
-                    "saturated": format!("exact values of h stand in manifests/<scene>.json, '{saturated}'"),
-                }),
-            ),
-            Profile::PlainF32 => (
-                Element::F32,
-                json!({
-                    "long_name": format!("transient histogram{of}"),
-                    "units": "1/(m2 sr)",
-                    "decode": "h = stored value",
-                }),
-            ),
-        };
-        if !self.spots_of_100().is_empty() {
-            attributes["spots"] = json!(self.spots_of_100());
-        }
-        (element, attributes)
     }
 }
 
@@ -351,18 +317,32 @@ impl Layout {
         )
     }
 
-    /// The codecs of an object, or of an inner chunk where there is a shard.
+    /// The codecs of an object, or of an inner chunk where there is a shard, in the array's order of axes.
     pub fn chunk_codecs(&self) -> Value {
+        let mut codecs = self.stored_codecs();
+        if let (true, Some(inner)) = (self.bins_first, &self.inner) {
+            // The bins' axis, the last one, comes before the rows'.
+            let axes = inner.len() + 1;
+            let order: Vec<usize> = (0..axes - 3)
+                .chain([axes - 1, axes - 3, axes - 2])
+                .collect();
+            let transpose = json!({"name": "transpose", "configuration": {"order": order}});
+            let codecs = codecs.as_array_mut().expect("a list of codecs");
+            codecs.insert(0, transpose);
+        }
+        codecs
+    }
+
+    /// The same for values that are in stored order already.
+    pub fn stored_codecs(&self) -> Value {
         let typesize = self.element.size();
         let bytes = match typesize {
             1 => json!({"name": "bytes"}),
             _ => json!({"name": "bytes", "configuration": {"endian": "little"}}),
         };
-        let blosc = |shuffle: &str| {
-            json!({"name": "blosc", "configuration": {
-                "cname": "zstd", "clevel": 3, "shuffle": shuffle, "typesize": typesize, "blocksize": 0,
-            }})
-        };
+        let blosc = json!({"name": "blosc", "configuration": {
+            "cname": "zstd", "clevel": 3, "shuffle": self.shuffle, "typesize": typesize, "blocksize": 0,
+        }});
         let crc = json!({"name": "crc32c"});
         match self.quantity {
             Quantity::Spots
@@ -370,11 +350,7 @@ impl Layout {
             | Quantity::Camera
             | Quantity::Laser
             | Quantity::Scale => json!([bytes, crc]),
-            quantity if quantity.is_transient() && self.element == Element::U16 => {
-                json!([bytes, blosc("bitshuffle"), crc])
-            }
-            _ if typesize == 1 => json!([bytes, blosc("noshuffle"), crc]),
-            _ => json!([bytes, blosc("shuffle"), crc]),
+            _ => json!([bytes, blosc, crc]),
         }
     }
 

@@ -5,6 +5,7 @@
 //! task, so whoever runs a task again writes the same bytes.
 
 mod codec;
+mod coding;
 mod collect;
 mod counts;
 mod dataset;
@@ -26,6 +27,7 @@ mod render_group;
 mod render_read;
 mod restore;
 mod root;
+mod rounding;
 mod shard;
 mod snapshot;
 mod spec;
@@ -33,7 +35,11 @@ mod splits;
 mod squareroot;
 mod store;
 mod summary;
+mod tiles;
+mod transient;
+mod values;
 mod verify;
+mod window;
 
 pub use collect::{Collection, MIN_GRACE, Orphan};
 pub use dataset::Dataset;
@@ -60,3 +66,4 @@ pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use store::{check_location, open_store, probe};
 pub use summary::Summary;
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};
+pub use transient::{CodedImage, TransientCodec};

@@ -11,11 +11,21 @@ use crate::record::Provenance;
 use crate::spec::Profile;
 use crate::squareroot::EncodeError;
 
-/// Version of the layout on disk.
-pub const FORMAT_VERSION: u32 = 1;
+/// Version of the layout on disk. Data sets of older formats stay in theirs: they are read, and scenes are added.
+///
+/// 1: histograms lie pixel by pixel in inner chunks of all bins. 2: bin by bin, in inner chunks of 128 bins.
+pub const FORMAT_VERSION: u32 = 2;
 
 /// Version of the bytes the encoder makes. Changes whenever the same record could give other bytes.
-pub const ENCODER_VERSION: &str = "encoder-1";
+pub const ENCODER_VERSION: &str = "encoder-2";
+
+/// The encoder named in the root of a data set of the given format: the first one that wrote it.
+pub(crate) fn encoder_of(format: u32) -> &'static str {
+    match format {
+        1 => "encoder-1",
+        _ => "encoder-2",
+    }
+}
 
 /// One object of a scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

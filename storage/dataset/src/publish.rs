@@ -28,7 +28,7 @@ impl Dataset {
         provenance: &Provenance,
     ) -> Result<EncodedScene, DatasetError> {
         self.check_scene(scene)?;
-        encode_scene(&self.spec, &self.arrays, scene, record, provenance)
+        encode_scene(self, scene, record, provenance)
     }
 
     /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal

@@ -1,24 +1,17 @@
 //! Reading published scenes back.
 
-use std::borrow::Cow;
 use std::ops::Range;
 
-use bytes::Bytes;
-use futures::TryStreamExt;
-use object_store::{ObjectStore, ObjectStoreExt};
-use rayon::prelude::*;
+use futures::{Stream, StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
 
-use crate::counts;
-use crate::dataset::{ArrayCodec, Dataset};
-use crate::encode::Tiles;
+use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::layout::{Element, Quantity};
 use crate::manifest::Manifest;
 use crate::objects;
 use crate::record::{Intrinsics, Spot};
-use crate::shard;
-use crate::spec::Profile;
-use crate::squareroot::SquareRoot;
+use crate::tiles::Part;
 
 /// A type in which an array may be stored.
 pub trait Stored: bytemuck::Pod + sealed::Stored {}
@@ -99,6 +92,23 @@ impl Dataset {
         scene: u64,
         quantity: Quantity,
     ) -> Result<Vec<f32>, DatasetError> {
+        let mut target = Vec::new();
+        self.read_histogram_into(scene, quantity, &mut target)
+            .await?;
+        Ok(target)
+    }
+
+    /// The same into `target`, which becomes as long as needed and is overwritten: whoever reads scene after scene is
+    /// spared a fresh 167 MB for each.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_histogram`]; what `target` holds then is worth nothing.
+    pub async fn read_histogram_into(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+        target: &mut Vec<f32>,
+    ) -> Result<(), DatasetError> {
         let array = self.array_of(quantity)?;
         if !quantity.is_transient() {
             let what = format!("{} is no transient; use read", quantity.name());
@@ -107,7 +117,43 @@ impl Dataset {
         let manifest = self.manifest(scene).await?;
         let path = self.path(&array.layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
-        self.decode_shard(&manifest, array, &bytes)
+        let len = array.layout.planes() * self.spec.transient_len();
+        if target.len() != len {
+            // Fresh pages come zeroed from the system; growing would touch them twice.
+            *target = vec![0.0; len];
+        }
+        self.decode_shard_into(&manifest, array, &bytes, target)
+    }
+
+    /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
+    /// training loops; a scene that cannot be read gives its error and the next one follows.
+    ///
+    /// # Panics
+    /// Outside of a tokio runtime.
+    pub fn read_transients(
+        &self,
+        scenes: Vec<u64>,
+        ahead: usize,
+    ) -> impl Stream<Item = (u64, Result<Vec<f32>, DatasetError>)> + use<> {
+        let dataset = self.clone();
+        stream::iter(scenes)
+            .map(move |scene| {
+                let dataset = dataset.clone();
+                async move { (scene, dataset.read_apart(scene).await) }
+            })
+            .buffered(ahead.max(1))
+    }
+
+    /// A scene's transient, decoded on a thread of its own.
+    async fn read_apart(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let manifest = self.manifest(scene).await?;
+        let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
+        let bytes = objects::require(&*self.store, &path).await?;
+        let decoded = tokio::task::spawn_blocking(move || {
+            self.decode_shard(&manifest, self.array(Quantity::Transient), &bytes)
+        });
+        let broken = |e| DatasetError::codec("cannot decode a scene", e);
+        decoded.await.map_err(broken)?
     }
 
     /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
@@ -121,24 +167,43 @@ impl Dataset {
         rows: Range<u32>,
         columns: Range<u32>,
     ) -> Result<Vec<f32>, DatasetError> {
+        self.read_transient_part(scene, rows, columns, 0..self.spec.gate.bins)
+            .await
+    }
+
+    /// The same of the given bins alone. Fetches and decodes only the inner chunks that it touches, of 32×32 pixels and
+    /// 128 bins (of all bins in data sets of format 1).
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where a range is empty or leaves the transient; those of [`Self::read_transient`].
+    pub async fn read_transient_part(
+        &self,
+        scene: u64,
+        rows: Range<u32>,
+        columns: Range<u32>,
+        bins: Range<u32>,
+    ) -> Result<Vec<f32>, DatasetError> {
         let limits = [
             ("rows", &rows, self.spec.height),
             ("columns", &columns, self.spec.width),
+            ("bins", &bins, self.spec.gate.bins),
         ];
         for (field, range, limit) in limits {
             if range.is_empty() || range.end > limit {
                 let what = format!(
-                    "expected a window within 0..{limit} that is not empty, found {range:?}"
+                    "expected a range within 0..{limit} that is not empty, found {range:?}"
                 );
                 return Err(DatasetError::invalid(field, what));
             }
         }
-        let window = [
-            rows.start as usize..rows.end as usize,
-            columns.start as usize..columns.end as usize,
-        ];
+        let of = |range: Range<u32>| range.start as usize..range.end as usize;
+        let part = Part {
+            rows: of(rows),
+            columns: of(columns),
+            bins: of(bins),
+        };
         let manifest = self.manifest(scene).await?;
-        self.read_window(&manifest, self.array(Quantity::Transient), window)
+        self.read_part(&manifest, self.array(Quantity::Transient), part)
             .await
     }
 
@@ -159,193 +224,12 @@ impl Dataset {
         let (height, width) = (self.spec.height as usize, self.spec.width as usize);
         let top = spot as usize * height;
         let manifest = self.manifest(scene).await?;
-        self.read_window(&manifest, array, [top..top + height, 0..width])
-            .await
-    }
-
-    /// A window of an array's rows, counted through all of its planes, and columns.
-    async fn read_window(
-        &self,
-        manifest: &Manifest,
-        array: &ArrayCodec,
-        window: [Range<usize>; 2],
-    ) -> Result<Vec<f32>, DatasetError> {
-        let tiles = Tiles::new(&self.spec, &array.layout);
-        let wanted: Vec<usize> = (0..tiles.count())
-            .filter(|tile| tiles.touches(*tile, &window[0], &window[1]))
-            .collect();
-        let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
-        self.decode_window(manifest, array, &tiles, chunks, window)
-    }
-
-    /// The coded bytes of the wanted tiles; `None` = all fill value.
-    async fn fetch_tiles(
-        &self,
-        manifest: &Manifest,
-        array: &ArrayCodec,
-        tiles: &Tiles,
-        wanted: &[usize],
-    ) -> Result<Vec<(usize, Option<Bytes>)>, DatasetError> {
-        let key = array.layout.key(manifest.scene);
-        let path = self.path(&key);
-        let damaged = |what: String| DatasetError::Damaged {
-            object: self.shown(&path),
-            what,
+        let part = Part {
+            rows: top..top + height,
+            columns: 0..width,
+            bins: 0..self.spec.gate.bins as usize,
         };
-        let entry = manifest
-            .object(&key)
-            .ok_or_else(|| damaged("the manifest does not list it".into()))?;
-        let tail = shard::index_len(tiles.count()) as u64;
-        let Some(start) = entry.size.checked_sub(tail) else {
-            return Err(damaged(format!(
-                "{} bytes are too few for a shard",
-                entry.size
-            )));
-        };
-        let fetch_error = |e| match e {
-            object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
-            e => DatasetError::store("read", self.shown(&path), e),
-        };
-        let index = self.store.get_range(&path, start..entry.size);
-        let index = index.await.map_err(fetch_error)?;
-        let index = shard::parse_index(&index, tiles.count(), entry.size)?;
-        let ranges: Vec<(usize, Range<u64>)> = wanted
-            .iter()
-            .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
-            .collect();
-        let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
-        let parts = self.store.get_ranges(&path, &only);
-        let parts = parts.await.map_err(fetch_error)?;
-        let mut found = ranges.iter().map(|(tile, _)| *tile).zip(parts).peekable();
-        Ok(wanted
-            .iter()
-            .map(|tile| {
-                (
-                    *tile,
-                    found.next_if(|(t, _)| t == tile).map(|(_, bytes)| bytes),
-                )
-            })
-            .collect())
-    }
-
-    /// h of a whole scene from the bytes of its shard.
-    pub(crate) fn decode_shard(
-        &self,
-        manifest: &Manifest,
-        array: &ArrayCodec,
-        bytes: &Bytes,
-    ) -> Result<Vec<f32>, DatasetError> {
-        let tiles = Tiles::new(&self.spec, &array.layout);
-        let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
-            let what = format!("{} bytes are too few", bytes.len());
-            return Err(DatasetError::codec("cannot read a shard's index", what));
-        };
-        let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
-        let chunks = index
-            .into_iter()
-            .map(|entry| entry.map(|r| bytes.slice(r.start as usize..r.end as usize)))
-            .enumerate()
-            .collect();
-        let rows = array.layout.planes() * self.spec.height as usize;
-        let image = [0..rows, 0..self.spec.width as usize];
-        self.decode_window(manifest, array, &tiles, chunks, image)
-    }
-
-    /// Decodes tiles into a window and applies the overflow list. Bands of tiles are decoded at once, each straight
-    /// into its rows of the window.
-    fn decode_window(
-        &self,
-        manifest: &Manifest,
-        array: &ArrayCodec,
-        tiles: &Tiles,
-        chunks: Vec<(usize, Option<Bytes>)>,
-        [rows, columns]: [Range<usize>; 2],
-    ) -> Result<Vec<f32>, DatasetError> {
-        let bins = self.spec.gate.bins as usize;
-        let row_len = columns.len() * bins;
-        let mut window = vec![0f32; rows.len() * row_len];
-        let mut bands = Vec::new();
-        let mut rest = &mut window[..];
-        let mut top = rows.start;
-        for chunks in chunks.chunk_by(|a, b| tiles.row_of(a.0) == tiles.row_of(b.0)) {
-            let band = tiles.rows_of(chunks[0].0);
-            let height = band.end.min(rows.end) - top;
-            let (target, below) = std::mem::take(&mut rest).split_at_mut(height * row_len);
-            bands.push((chunks, top..top + height, target));
-            rest = below;
-            top += height;
-        }
-        let saturated = bands
-            .into_par_iter()
-            .map(|(chunks, rows, target)| {
-                let window = Window {
-                    rows,
-                    columns: columns.clone(),
-                    target,
-                };
-                self.decode_band(manifest.scale, (array, tiles), chunks, window)
-            })
-            .collect::<Result<Vec<bool>, DatasetError>>()?;
-        for (index, value) in manifest.overflow_of(array.layout.quantity) {
-            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
-            let width = self.spec.width as usize;
-            let (row, column) = (pixel / width, pixel % width);
-            if rows.contains(&row) && columns.contains(&column) {
-                let at = (row - rows.start) * columns.len() + column - columns.start;
-                window[at * bins + bin] = *value;
-            }
-        }
-        if saturated.contains(&true) && window.iter().any(|h| h.is_infinite()) {
-            return Err(DatasetError::Damaged {
-                object: self.shown(&self.path(&Manifest::key(manifest.scene))),
-                what: "a saturated bin has no exact value in the overflow list".into(),
-            });
-        }
-        Ok(window)
-    }
-
-    /// Decodes a row of tiles into its part of a window; says whether a bin is saturated.
-    fn decode_band(
-        &self,
-        scale: f32,
-        (array, tiles): (&ArrayCodec, &Tiles),
-        chunks: &[(usize, Option<Bytes>)],
-        window: Window<'_>,
-    ) -> Result<bool, DatasetError> {
-        let bins = self.spec.gate.bins as usize;
-        let codec = &array.codec;
-        let mut saturated = false;
-        for (tile, bytes) in chunks {
-            // Without bytes the tile is all fill value, which the window holds already.
-            let Some(bytes) = bytes else { continue };
-            let raw = codec.decode(bytes)?;
-            for run in tiles
-                .runs(*tile)
-                .filter(|run| window.rows.contains(&run.row))
-            {
-                let from = run.column.max(window.columns.start);
-                let to = (run.column + run.columns).min(window.columns.end);
-                let len = (to - from) * bins;
-                let source = run.tile + (from - run.column) * bins;
-                let pixel = (run.row - window.rows.start) * window.columns.len() + from
-                    - window.columns.start;
-                let target = &mut window.target[pixel * bins..][..len];
-                match self.spec.profile {
-                    Profile::SqrtU16 { delta } => {
-                        let q = values::<u16>(&raw[source * 2..][..len * 2]);
-                        saturated |= SquareRoot::new(delta, scale).decode_run(&q, target);
-                    }
-                    Profile::CountsU16 => {
-                        let q = values::<u16>(&raw[source * 2..][..len * 2]);
-                        saturated |= counts::decode_run(scale, &q, target);
-                    }
-                    Profile::PlainF32 => {
-                        target.copy_from_slice(&values::<f32>(&raw[source * 4..][..len * 4]));
-                    }
-                }
-            }
-        }
-        Ok(saturated)
+        self.read_part(&manifest, array, part).await
     }
 
     /// The stored values of a quantity that is no transient, in the shape [`Quantity`] states.
@@ -431,20 +315,5 @@ impl Dataset {
             cx: v[2],
             cy: v[3],
         })
-    }
-}
-
-/// A part of the image being decoded into.
-struct Window<'a> {
-    rows: Range<usize>,
-    columns: Range<usize>,
-    target: &'a mut [f32],
-}
-
-/// Bytes as values, copied only where they are not aligned.
-fn values<T: bytemuck::Pod>(bytes: &[u8]) -> Cow<'_, [T]> {
-    match bytemuck::try_cast_slice(bytes) {
-        Ok(values) => Cow::Borrowed(values),
-        Err(_) => Cow::Owned(bytemuck::pod_collect_to_vec(bytes)),
     }
 }

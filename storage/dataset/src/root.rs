@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use crate::dataset::{Dataset, METADATA, pretty, root_metadata};
 use crate::error::DatasetError;
+use crate::manifest::FORMAT_VERSION;
 use crate::objects;
 use crate::recipe::Recipe;
 use crate::spec::{DatasetSpec, Gate, Profile, Subsets};
@@ -38,9 +39,9 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
             bin_width_m: 1.0,
             bins: 1,
         },
-        profile: Profile::PlainF32,
+        profile: Profile::LOSSLESS,
     };
-    let blind = Dataset::assume(store, prefix, anything);
+    let blind = Dataset::assume(store, prefix, anything, FORMAT_VERSION);
     let mut found = Remains::default();
     for scene in blind.scenes_present().await? {
         match blind.manifest(scene).await {
@@ -67,7 +68,7 @@ impl Dataset {
     pub async fn root_agrees(&self) -> Result<bool, DatasetError> {
         let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
         let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
-        Ok(stored == Some(root_metadata(&self.spec)))
+        Ok(stored == Some(root_metadata(&self.spec, self.format)))
     }
 }
 
@@ -83,7 +84,8 @@ pub async fn restore_root(
     spec: &DatasetSpec,
 ) -> Result<Dataset, DatasetError> {
     let mut spec = *spec;
-    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec);
+    let format = format_of(&store, &prefix, spec).await?;
+    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
     let mut agreed = None;
     for array in assumed.arrays.iter() {
         let path = assumed.metadata_path(&array.layout);
@@ -112,6 +114,28 @@ pub async fn restore_root(
     };
     spec.scenes = scenes;
     spec.check()?;
-    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec))).await?;
+    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec, format))).await?;
     Dataset::open(store, prefix).await
+}
+
+/// The format in which the arrays were laid out: that of the first transient whose metadata are those of one, else the
+/// newest. Formats differ in nothing but transients.
+async fn format_of(
+    store: &Arc<dyn ObjectStore>,
+    prefix: &Path,
+    spec: DatasetSpec,
+) -> Result<u32, DatasetError> {
+    for format in (1..=FORMAT_VERSION).rev() {
+        let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
+        let transients = assumed.arrays.iter().map(|array| &array.layout);
+        for layout in transients.filter(|layout| layout.quantity.is_transient()) {
+            let bytes = objects::get(&**store, &assumed.metadata_path(layout)).await?;
+            let stored: Option<Value> = bytes.and_then(|b| serde_json::from_slice(&b).ok());
+            let Some(stored) = stored else { continue };
+            if stored == layout.metadata(stored["shape"][0].as_u64().unwrap_or(0)) {
+                return Ok(format);
+            }
+        }
+    }
+    Ok(FORMAT_VERSION)
 }

@@ -23,11 +23,21 @@ pub enum Profile {
     /// Square-root code in u16: N = h·scale photons, q = round((2/Δ)·√N), decoded as N = (q·Δ/2)². The error
     /// stays below (Δ/2 + Δ²/16) standard deviations of the photon noise, σ = √max(N, 1).
     SqrtU16 {
-        /// Δ: a power of two from 1/16 to 2, so that decoding is exact in 32-bit floats.
+        /// Δ: 0.2 or a power of two from 1/16 to 2.
+        #[serde(serialize_with = "as_decimal")]
         delta: f32,
     },
-    /// 32-bit floats, lossless.
-    PlainF32,
+    /// 32-bit floats.
+    PlainF32 {
+        /// Largest rounding error in standard deviations of the photon noise: a power of two from 1/16 to 1, or 0 for
+        /// none.
+        #[serde(
+            default,
+            skip_serializing_if = "is_zero",
+            serialize_with = "as_decimal"
+        )]
+        round: f32,
+    },
     /// Whole photon counts in u16, lossless: N = h·scale, which must be whole; decoded as h = N/scale. What a sensor
     /// with photon noise gives.
     CountsU16,
@@ -35,8 +45,21 @@ pub enum Profile {
 
 impl Default for Profile {
     fn default() -> Self {
-        Self::SqrtU16 { delta: 0.25 }
+        Self::SqrtU16 { delta: 0.2 }
     }
+}
+
+/// The number with the digits of an f32: 0.2 and not 0.20000000298023224.
+pub(crate) fn decimal(x: f32) -> f64 {
+    x.to_string().parse().expect("floats are written as floats")
+}
+
+fn as_decimal<S: serde::Serializer>(x: &f32, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(decimal(*x))
+}
+
+fn is_zero(x: &f32) -> bool {
+    *x == 0.0
 }
 
 /// The properties of a data set.
@@ -120,6 +143,26 @@ impl From<Subsets> for Vec<u32> {
 }
 
 impl Profile {
+    /// The square-root code with Δ = 1: half the bytes, with an error still below the photon noise.
+    pub const COARSE: Self = Self::SqrtU16 { delta: 1.0 };
+    /// Floats rounded to a quarter of the photon noise.
+    pub const PLAIN: Self = Self::PlainF32 { round: 0.25 };
+    /// Floats as they are.
+    pub const LOSSLESS: Self = Self::PlainF32 { round: 0.0 };
+    /// What [`Self::parse`] takes.
+    pub const NAMES: [&str; 5] = ["sqrt-u16", "coarse", "plain-f32", "lossless", "counts-u16"];
+
+    /// What jobs call it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::SqrtU16 { delta: 1.0 } => "coarse",
+            Self::SqrtU16 { .. } => "sqrt-u16",
+            Self::PlainF32 { round: 0.0 } => "lossless",
+            Self::PlainF32 { .. } => "plain-f32",
+            Self::CountsU16 => "counts-u16",
+        }
+    }
+
     /// The profile that jobs call `name`.
     ///
     /// # Errors
@@ -127,11 +170,14 @@ impl Profile {
     pub fn parse(name: &str) -> Result<Self, String> {
         match name {
             "sqrt-u16" => Ok(Self::default()),
-            "plain-f32" => Ok(Self::PlainF32),
+            "coarse" => Ok(Self::COARSE),
+            "plain-f32" => Ok(Self::PLAIN),
+            "lossless" => Ok(Self::LOSSLESS),
             "counts-u16" => Ok(Self::CountsU16),
-            other => Err(format!(
-                "{other:?} is not one of \"sqrt-u16\", \"plain-f32\", \"counts-u16\""
-            )),
+            other => {
+                let names = Self::NAMES.map(|name| format!("{name:?}")).join(", ");
+                Err(format!("{other:?} is not one of {names}"))
+            }
         }
     }
 }
@@ -140,7 +186,8 @@ impl std::fmt::Display for Profile {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::SqrtU16 { delta } => write!(f, "sqrt-u16 with delta {delta}"),
-            Self::PlainF32 => write!(f, "plain-f32"),
+            Self::PlainF32 { round: 0.0 } => write!(f, "lossless"),
+            Self::PlainF32 { round } => write!(f, "plain-f32 rounded to {round} sigma"),
             Self::CountsU16 => write!(f, "counts-u16"),
         }
     }
@@ -196,11 +243,20 @@ impl DatasetSpec {
             ));
         }
         if let Profile::SqrtU16 { delta } = self.profile {
-            let known = [0.0625, 0.125, 0.25, 0.5, 1.0, 2.0];
+            let known = [0.0625, 0.125, 0.2, 0.25, 0.5, 1.0, 2.0];
             if !known.contains(&delta) {
                 return Err(DatasetError::invalid(
                     "spec.profile.delta",
                     format!("expected one of {known:?}, found {delta}"),
+                ));
+            }
+        }
+        if let Profile::PlainF32 { round } = self.profile {
+            let known = [0.0, 0.0625, 0.125, 0.25, 0.5, 1.0];
+            if !known.contains(&round) {
+                return Err(DatasetError::invalid(
+                    "spec.profile.round",
+                    format!("expected one of {known:?}, found {round}"),
                 ));
             }
         }

@@ -24,7 +24,7 @@ impl SquareRoot {
     }
 
     /// The code of h. `h` must be finite and not negative; [`SATURATED`] where 16 bits do not suffice
-    /// (above 6.7·10⁷ photons at Δ = 0.25).
+    /// (above 4.3·10⁷ photons at Δ = 0.2).
     #[inline]
     pub fn encode(self, h: f32) -> u16 {
         let q = (h * self.scale).sqrt() * (2.0 / self.delta) + 0.5;
@@ -118,6 +118,14 @@ pub(crate) struct ErrorSums {
 }
 
 impl ErrorSums {
+    /// A value of `n` photons that is stored as `stored`.
+    pub fn add_value(&mut self, n: f32, stored: f32) {
+        let square = (stored - n) * (stored - n) / n.max(1.0);
+        self.squares += f64::from(square);
+        self.worst = self.worst.max(square);
+        self.count += 1;
+    }
+
     /// `count` values without error.
     pub fn add_exact(&mut self, count: usize) {
         self.count += count as u64;
@@ -129,8 +137,10 @@ impl ErrorSums {
         self.count += other.count;
     }
 
-    pub fn finish(&self) -> EncodeError {
+    /// With `overflowed` values in the overflow list.
+    pub fn finish(&self, overflowed: usize) -> EncodeError {
         EncodeError {
+            overflowed: overflowed as u64,
             max_sigma: f64::from(self.worst).sqrt(),
             rms_sigma: (self.squares / self.count.max(1) as f64).sqrt(),
         }
@@ -144,6 +154,9 @@ pub struct EncodeError {
     pub max_sigma: f64,
     /// Root mean square over all bins.
     pub rms_sigma: f64,
+    /// Saturated bins: those in the overflow list.
+    #[serde(default)]
+    pub overflowed: u64,
 }
 
 /// The scale (photons per unit of h) at which the median over the lit pixels of the brightest bin is `photons`

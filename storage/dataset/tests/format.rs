@@ -66,7 +66,7 @@ async fn zarrs_reads_every_array_with_the_same_values() {
         );
     }
     let array = Array::open(files, "/transient").unwrap();
-    let code = SquareRoot::new(0.25, scene.scale);
+    let code = SquareRoot::new(0.2, scene.scale);
     let one = |i: u64| ArraySubset::new_with_ranges(&[i..i + 1, 0..36, 0..40, 0..24]);
     let q: Vec<u16> = array.retrieve_array_subset(&one(1)).unwrap();
     assert!(

@@ -75,7 +75,7 @@ fn open(folder: &Path, options: ImportOptions) -> Result<Source, ImportError> {
 }
 
 async fn published(source: &Source, index: u64, profile: Profile) -> Dataset {
-    let (store, _) = in_memory(&spec(Profile::PlainF32)).await;
+    let (store, _) = in_memory(&spec(Profile::LOSSLESS)).await;
     let spec = source.spec(profile);
     let dataset = Dataset::create_or_open(store, "sets/b".into(), &spec)
         .await
@@ -102,7 +102,7 @@ async fn platonerfs_captures_become_scenes_of_one_spot_or_one_scene_of_all() {
     let source = open(folder.path(), gate()).unwrap();
     assert_eq!((source.format(), source.scenes()), (Format::Platonerf, 3));
     assert_eq!(source.name(1), Some("chair/001"));
-    let dataset = published(&source, 1, Profile::PlainF32).await;
+    let dataset = published(&source, 1, Profile::LOSSLESS).await;
     assert_eq!(
         dataset.read_transient(1).await.unwrap(),
         as_f32(&wall(BEAMS[1]))
@@ -128,7 +128,7 @@ async fn platonerfs_captures_become_scenes_of_one_spot_or_one_scene_of_all() {
     };
     let source = open(folder.path(), sum).unwrap();
     assert_eq!((source.scenes(), source.name(0)), (1, Some("chair")));
-    let dataset = published(&source, 0, Profile::PlainF32).await;
+    let dataset = published(&source, 0, Profile::LOSSLESS).await;
     let mut expected = vec![0.0f32; SIDE * SIDE * BINS];
     for beam in BEAMS {
         expected

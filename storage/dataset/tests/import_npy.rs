@@ -72,8 +72,8 @@ async fn a_scene_is_read_and_found_again() {
     }
     let source = open(folder.path()).unwrap();
     assert_eq!((source.format(), source.scenes()), (Format::Npy, 2));
-    let (store, _) = in_memory(&spec(Profile::PlainF32)).await;
-    let dataset = Dataset::create_or_open(store, "sets/b".into(), &source.spec(Profile::PlainF32))
+    let (store, _) = in_memory(&spec(Profile::LOSSLESS)).await;
+    let dataset = Dataset::create_or_open(store, "sets/b".into(), &source.spec(Profile::LOSSLESS))
         .await
         .unwrap();
     for index in 0..2 {

@@ -30,7 +30,7 @@ async fn source(room: &Room) -> Dataset {
             bin_width_m: room.gate[1],
             bins: BINS as u32,
         },
-        profile: Profile::PlainF32,
+        profile: Profile::LOSSLESS,
     };
     let made = Scene::new(&spec, 1);
     let all: Vec<u32> = (0..100).collect();
@@ -101,7 +101,7 @@ async fn import(
     let source = Source::open(folder, None, options, None)?;
     let scene = import_scene(&source, 0)?;
     let store: Arc<dyn ObjectStore> = Arc::new(object_store::memory::InMemory::new());
-    let spec = source.spec(Profile::PlainF32);
+    let spec = source.spec(Profile::LOSSLESS);
     let dataset = Dataset::create_or_open(store, "b".into(), &spec).await?;
     let encoded = source.encode(&dataset, 0, &scene)?;
     dataset.publish_encoded(encoded).await?;

@@ -38,9 +38,9 @@ async fn another_specification_is_refused_with_the_field_and_both_values() {
             },
         ),
         (
-            "profile = sqrt-u16 with delta 0.25, but plain-f32",
+            "profile = sqrt-u16 with delta 0.2, but lossless",
             DatasetSpec {
-                profile: Profile::PlainF32,
+                profile: Profile::LOSSLESS,
                 ..spec
             },
         ),

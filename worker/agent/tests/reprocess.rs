@@ -49,7 +49,7 @@ impl Place {
         let profile = if sensor.poisson {
             "counts-u16"
         } else {
-            "plain-f32"
+            "lossless"
         };
         Self {
             settings: ReprocessSettings {
@@ -221,7 +221,7 @@ fn spec(spots: u32) -> DatasetSpec {
             bin_width_m: 0.002_398_34,
             bins: BINS,
         },
-        profile: Profile::PlainF32,
+        profile: Profile::LOSSLESS,
     }
 }
 

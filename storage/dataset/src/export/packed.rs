@@ -133,7 +133,7 @@ impl<'a> Export<'a> {
             self.put(&format!("{name}/{METADATA}"), pretty(metadata))
                 .await?;
         }
-        let mut root = root_metadata(&spec);
+        let mut root = root_metadata(&spec, self.source.format);
         let attributes = root["attributes"].as_object_mut().expect("just made");
         attributes.remove("picofarm");
         attributes.insert(
@@ -253,6 +253,9 @@ fn rename_manifests(value: &Value) -> Value {
     match value {
         Value::String(text) => {
             let text = text.replace("manifests/<i>.json", &now);
+            let read = "manifests/{i}.json').read_text())";
+            let there = format!("manifests/{{i // {PACK}}}.json').read_text())[i % {PACK}]");
+            let text = text.replace(read, &there);
             Value::String(text.replace("manifests/<scene>.json", &now))
         }
         Value::Array(all) => all.iter().map(rename_manifests).collect(),

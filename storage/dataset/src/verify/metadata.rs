@@ -33,7 +33,7 @@ impl Dataset {
 
     /// Keys and contents of the metadata that the specification asks for, the root's first.
     pub(crate) fn metadata(&self) -> Vec<(String, Value)> {
-        let root = crate::dataset::root_metadata(&self.spec);
+        let root = crate::dataset::root_metadata(&self.spec, self.format);
         let arrays = self.arrays.iter().map(|array| {
             let key = format!("{}/{METADATA}", array.layout.quantity.name());
             (key, array.layout.metadata(self.spec.scenes))

@@ -153,4 +153,4 @@ pub async fn in_memory(spec: &DatasetSpec) -> (Arc<dyn ObjectStore>, Dataset) {
     (store, dataset)
 }
 
-pub const PROFILES: [Profile; 2] = [Profile::SqrtU16 { delta: 0.25 }, Profile::PlainF32];
+pub const PROFILES: [Profile; 2] = [Profile::SqrtU16 { delta: 0.2 }, Profile::LOSSLESS];

@@ -326,7 +326,7 @@ impl Repairer {
             output: OutputSettings {
                 store: self.store.clone(),
                 dataset: self.dataset.clone(),
-                profile: profile_name(manifest.profile).to_owned(),
+                profile: manifest.profile.name().to_owned(),
             },
         }))
     }
@@ -357,15 +357,6 @@ impl Repairer {
                 other.kind()
             ))),
         }
-    }
-}
-
-/// What jobs call a profile.
-fn profile_name(profile: Profile) -> &'static str {
-    match profile {
-        Profile::SqrtU16 { .. } => "sqrt-u16",
-        Profile::PlainF32 => "plain-f32",
-        Profile::CountsU16 => "counts-u16",
     }
 }
 

@@ -86,7 +86,7 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
             output: OutputSettings {
                 store: "/s".into(),
                 dataset: "d".into(),
-                profile: "plain-f32".into(),
+                profile: "lossless".into(),
             },
         })),
     }

@@ -1,0 +1,175 @@
+//! What each profile promises: how far what is read may be from what was written, and that the manifest says so.
+
+mod common;
+
+use common::*;
+use picofarm_dataset::*;
+
+/// 300 bins: three inner chunks along the bins, the last one cut off.
+fn long(profile: Profile) -> DatasetSpec {
+    let small = spec(profile);
+    DatasetSpec {
+        gate: Gate {
+            bins: 300,
+            ..small.gate
+        },
+        ..small
+    }
+}
+
+#[tokio::test]
+async fn errors_stay_within_the_promise_and_the_manifest_states_them() {
+    // The square root's bound is Δ/2 + Δ²/16.
+    let promised = [
+        ("sqrt-u16", 0.1 + 0.0025),
+        ("coarse", 0.5 + 0.0625),
+        ("plain-f32", 0.25),
+        ("lossless", 0.0),
+    ];
+    for (name, bound) in promised {
+        let profile = Profile::parse(name).unwrap();
+        let spec = long(profile);
+        let (_, dataset) = in_memory(&spec).await;
+        let mut scene = Scene::new(&spec, 5);
+        let bright = 7_777;
+        scene.transient[bright] = 9.876_543e8 / scene.scale;
+        let manifest = dataset
+            .publish(0, &scene.record(), &provenance())
+            .await
+            .unwrap();
+        let h = dataset.read_transient(0).await.unwrap();
+        let overflows = matches!(profile, Profile::SqrtU16 { delta } if delta < 1.0);
+        let (mut worst, mut squares) = (0f64, 0f64);
+        for (at, (found, given)) in h.iter().zip(&scene.transient).enumerate() {
+            let n = f64::from(*given) * f64::from(scene.scale);
+            let error = f64::from(found - given) * f64::from(scene.scale) / n.max(1.0).sqrt();
+            // Listed exactly, whatever the code's error there.
+            if at == bright && overflows {
+                assert_eq!(found, given);
+            }
+            worst = worst.max(error.abs());
+            squares += error * error;
+        }
+        let rms = (squares / h.len() as f64).sqrt();
+        assert!(worst <= bound + 1e-4, "{name}: {worst}");
+        let error = manifest.error;
+        assert!(
+            (error.max_sigma - worst).abs() < 1e-3,
+            "{name}: {error:?}, found {worst}"
+        );
+        assert!(
+            (error.rms_sigma - rms).abs() < 1e-3,
+            "{name}: {error:?}, found {rms}"
+        );
+        assert_eq!(error.overflowed, u64::from(overflows), "{name}");
+        assert_eq!(manifest.overflow.len() as u64, error.overflowed);
+        assert_eq!(worst == 0.0, name == "lossless");
+        assert_eq!(dataset.manifest(0).await.unwrap().profile, profile);
+    }
+}
+
+#[tokio::test]
+async fn the_default_keeps_its_rms_whatever_the_scene() {
+    // Uniform in √N, the worst case: every bin has light. 0.2/√12 = 0.0577.
+    let spec = long(Profile::default());
+    let (_, dataset) = in_memory(&spec).await;
+    let mut scene = Scene::new(&spec, 6);
+    let mut random = Lcg(9);
+    scene.scale = 1.0;
+    for h in &mut scene.transient {
+        *h = (1.0 + 40.0 * random.next()).powi(2);
+    }
+    let encoded = dataset.encode(0, &scene.record(), &provenance());
+    let error = encoded.unwrap().manifest.error;
+    assert!((0.056..0.06).contains(&error.rms_sigma), "{error:?}");
+}
+
+#[tokio::test]
+async fn any_part_equals_the_same_part_of_the_whole() {
+    for profile in [Profile::default(), Profile::LOSSLESS, Profile::PLAIN] {
+        let spec = long(profile);
+        let (_, dataset) = in_memory(&spec).await;
+        let mut scene = Scene::new(&spec, 3);
+        let at = |row: u32, column: u32, bin: u32| ((row * 40 + column) * 300 + bin) as usize;
+        scene.transient[at(33, 39, 128)] = 3e9 / scene.scale;
+        dataset
+            .publish(0, &scene.record(), &provenance())
+            .await
+            .unwrap();
+        let whole = dataset.read_transient(0).await.unwrap();
+        for (rows, columns, bins) in [
+            (0..1, 0..1, 0..1),
+            (31..34, 30..40, 127..129),
+            (3..30, 5..20, 128..256),
+            (0..36, 32..40, 290..300),
+            (33..34, 39..40, 128..129),
+            (0..36, 0..40, 0..300),
+        ] {
+            let part = dataset
+                .read_transient_part(0, rows.clone(), columns.clone(), bins.clone())
+                .await
+                .unwrap();
+            let mut expected = Vec::new();
+            for row in rows {
+                for column in columns.clone() {
+                    let of = at(row, column, bins.start)..at(row, column, bins.end - 1) + 1;
+                    expected.extend_from_slice(&whole[of]);
+                }
+            }
+            assert_eq!(part, expected, "{profile}");
+        }
+        let mut again = vec![f32::NAN; whole.len()];
+        dataset
+            .read_histogram_into(0, Quantity::Transient, &mut again)
+            .await
+            .unwrap();
+        assert_eq!(again, whole);
+        let error = dataset.read_transient_part(0, 0..1, 0..1, 300..301).await;
+        assert!(error.unwrap_err().to_string().starts_with("bins: expected"));
+    }
+}
+
+#[tokio::test]
+async fn a_stream_of_scenes_keeps_their_order_and_outlives_a_missing_one() {
+    use futures::StreamExt;
+    let spec = spec(Profile::default());
+    let (_, dataset) = in_memory(&spec).await;
+    for i in [0, 1, 3] {
+        let scene = Scene::new(&spec, i);
+        dataset
+            .publish(i, &scene.record(), &provenance())
+            .await
+            .unwrap();
+    }
+    let read: Vec<_> = dataset
+        .read_transients(vec![3, 2, 0, 1, 3], 2)
+        .collect()
+        .await;
+    let order: Vec<u64> = read.iter().map(|(scene, _)| *scene).collect();
+    assert_eq!(order, [3, 2, 0, 1, 3]);
+    for (scene, h) in read {
+        match scene {
+            2 => assert!(matches!(
+                h,
+                Err(DatasetError::NotPublished { scene: 2, .. })
+            )),
+            _ => assert_eq!(h.unwrap(), dataset.read_transient(scene).await.unwrap()),
+        }
+    }
+}
+
+#[test]
+fn the_names_that_jobs_use_are_all_there_are() {
+    for name in Profile::NAMES {
+        Profile::parse(name).unwrap();
+    }
+    let error = Profile::parse("gzip").unwrap_err();
+    assert!(
+        error.contains("\"coarse\"") && error.contains("\"lossless\""),
+        "{error}"
+    );
+    let old: Profile = serde_json::from_str(r#"{"name": "plain-f32"}"#).unwrap();
+    assert_eq!(old, Profile::LOSSLESS);
+    let written = serde_json::to_string(&Profile::default()).unwrap();
+    assert_eq!(written, r#"{"name":"sqrt-u16","delta":0.2}"#);
+}
