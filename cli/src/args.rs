@@ -11,7 +11,9 @@ use std::{net::SocketAddr, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
-pub use data::{DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs};
+pub use data::{
+    BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs,
+};
 pub use guard::{Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
@@ -391,6 +393,8 @@ pub enum Bench {
     Queue(BenchQueue),
     /// Measure what looking after very many (simulated, tiny) scenes costs: list, verify, snapshot, gc
     Dataset(BenchDataset),
+    /// Measure storage on scenes of this renderer: size, error and speed of all profiles beside other formats, and reading
+    Store(BenchStore),
 }
 
 #[derive(Args)]

@@ -159,7 +159,7 @@ fn task_failed(error: TaskError) -> CliError {
     }
 }
 
-async fn open(place: &str) -> Result<Dataset> {
+pub async fn open(place: &str) -> Result<Dataset> {
     let (store, prefix) = open_store(place).map_err(failed)?;
     Dataset::open(store, prefix).await.map_err(failed)
 }

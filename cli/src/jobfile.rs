@@ -59,7 +59,7 @@ pub fn template(kind: JobKind) -> String {
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\
-         profile = \"sqrt-u16\"            # or: plain-f32\n\n\
+         profile = \"sqrt-u16\"            # or: coarse, plain-f32, lossless\n\n\
          [limits]\n\
          max_failures = 3          # a task's own failures before it is given up\n\
          max_crashes = 3           # losses of the worker under it before it is given up\n\

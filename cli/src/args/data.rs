@@ -62,7 +62,7 @@ pub struct DatasetReprocess {
     /// Drop the bins that --rebin leaves over at the end of the gate; otherwise it must divide the bins
     #[arg(long)]
     pub drop_left_over: bool,
-    /// Codec: counts-u16, sqrt-u16 or plain-f32 [default: counts-u16, with --no-poisson sqrt-u16]
+    /// Codec: counts-u16, sqrt-u16, coarse, plain-f32 or lossless [default: counts-u16, with --no-poisson sqrt-u16]
     #[arg(long, value_name = "NAME")]
     pub profile: Option<String>,
     /// Chooses another draw of the same noise
@@ -71,6 +71,37 @@ pub struct DatasetReprocess {
     /// Threads [default: all cores]
     #[arg(long)]
     pub threads: Option<usize>,
+}
+
+#[derive(Args)]
+pub struct BenchStore {
+    /// Folder or URL of a data set with the profile lossless to take scenes from, instead of rendering some
+    #[arg(long, value_name = "DATASET", conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
+    pub from: Option<String>,
+    /// Number of scenes
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=64))]
+    pub scenes: u64,
+    /// Image width and height in pixels
+    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(8..=1024))]
+    pub resolution: u32,
+    /// Camera paths per pixel for three bounces and more
+    #[arg(long, default_value_t = 32)]
+    pub samples: u32,
+    /// Seed of the rooms
+    #[arg(long, default_value_t = 11)]
+    pub seed: u64,
+    /// Render into this folder and keep it: the next run with it renders nothing [default: a folder that is removed after]
+    #[arg(long, value_name = "DIR")]
+    pub keep: Option<PathBuf>,
+    /// Only ways of storing whose name contains one of these texts
+    #[arg(long, value_delimiter = ',', value_name = "TEXT,…")]
+    pub only: Vec<String>,
+    /// Leave out how fast scenes are read
+    #[arg(long)]
+    pub no_reading: bool,
+    /// Draw size against error into this PNG
+    #[arg(long, value_name = "FILE")]
+    pub plot: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -122,7 +153,7 @@ pub struct DatasetImport {
     /// Import the scenes named in this file, one a line, in this order [default: all, by name]
     #[arg(long, value_name = "FILE")]
     pub list: Option<PathBuf>,
-    /// Codec: sqrt-u16, plain-f32 or counts-u16
+    /// Codec: sqrt-u16, coarse, plain-f32, lossless or counts-u16
     #[arg(long, default_value = "sqrt-u16", value_name = "NAME")]
     pub profile: String,
     #[command(flatten)]

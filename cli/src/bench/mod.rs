@@ -1,5 +1,5 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very many scenes
-//! cost.
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very
+//! many scenes cost; what storing histograms costs.
 
 mod axes;
 mod curve;
@@ -13,6 +13,7 @@ mod queue;
 mod report;
 mod scaling;
 mod scenes;
+mod store;
 mod tessellate;
 mod truth;
 
@@ -31,6 +32,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
     let args = match command {
         Command::Queue(args) => return queue::run(args, output, &stop).await,
         Command::Dataset(args) => return dataset::run(args, output, &stop).await,
+        Command::Store(args) => return store::run(args, settings, output, &stop).await,
         Command::Render(args) => args,
     };
     check(&args)?;

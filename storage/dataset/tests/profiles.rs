@@ -2,7 +2,14 @@
 
 mod common;
 
+use std::ops::Range;
+use std::sync::Arc;
+
+use common::tricky::Tricky;
 use common::*;
+use object_store::memory::InMemory;
+use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
 
 /// 300 bins: three inner chunks along the bins, the last one cut off.
@@ -127,6 +134,70 @@ async fn any_part_equals_the_same_part_of_the_whole() {
         let error = dataset.read_transient_part(0, 0..1, 0..1, 300..301).await;
         assert!(error.unwrap_err().to_string().starts_with("bins: expected"));
     }
+}
+
+/// Where the inner chunks of a shard lie, from its index.
+fn chunks_of(shard: &[u8], chunks: usize) -> Vec<Range<u64>> {
+    let index = &shard[shard.len() - 4 - chunks * 16..shard.len() - 4];
+    let number = |b: &[u8]| u64::from_le_bytes(b.try_into().unwrap());
+    let pairs = index.chunks_exact(16);
+    pairs
+        .map(|pair| (number(&pair[..8]), number(&pair[8..])))
+        .map(|(start, len)| start..start + len)
+        .collect()
+}
+
+#[tokio::test]
+async fn a_part_fetches_and_decodes_the_inner_chunks_it_touches_and_no_other() {
+    let spec = DatasetSpec {
+        height: 64,
+        width: 96,
+        ..long(Profile::default())
+    };
+    let memory = Arc::new(InMemory::new());
+    let store = Arc::new(Tricky::new(memory.clone()));
+    let dataset = Dataset::create_or_open(store.clone(), Path::from("sets/a"), &spec)
+        .await
+        .unwrap();
+    let scene = Scene::new(&spec, 3);
+    dataset
+        .publish(0, &scene.record(), &provenance())
+        .await
+        .unwrap();
+    let at = Path::from("sets/a/transient/c/0/0/0/0");
+    let shard = memory.get(&at).await.unwrap().bytes().await.unwrap();
+    // 2 by 3 tiles of 3 slabs.
+    let chunks = chunks_of(&shard, 18);
+    let whole = dataset.read_transient(0).await.unwrap();
+
+    // Rows of the lower tiles, columns of the second and third, bins of the second slab.
+    let needed = [(3 + 1) * 3 + 1, (3 + 2) * 3 + 1];
+    let mut damaged = vec![0xa5; shard.len()];
+    let index = shard.len() - 4 - 18 * 16;
+    damaged[index..].copy_from_slice(&shard[index..]);
+    for chunk in needed {
+        let at = chunks[chunk].start as usize..chunks[chunk].end as usize;
+        damaged[at.clone()].copy_from_slice(&shard[at]);
+    }
+    memory.put(&at, damaged.into()).await.unwrap();
+    store.got.lock().unwrap().clear();
+    let part = dataset.read_transient_part(0, 40..50, 60..70, 130..250);
+    let part = part.await.unwrap();
+    let first = (40 * 96 + 60) * 300 + 130;
+    assert_eq!(part[..120], whole[first..first + 120]);
+
+    let got = std::mem::take(&mut *store.got.lock().unwrap());
+    let mut got: Vec<Range<u64>> = got
+        .into_iter()
+        .filter(|(object, ..)| *object == at)
+        .map(|(_, start, end)| start..end)
+        .collect();
+    got.sort_by_key(|range| range.start);
+    let mut expected: Vec<_> = needed.iter().map(|c| chunks[*c].clone()).collect();
+    expected.push(index as u64..shard.len() as u64);
+    assert_eq!(got, expected);
+    let outside = dataset.read_transient_part(0, 40..50, 60..70, 127..250);
+    outside.await.unwrap_err();
 }
 
 #[tokio::test]

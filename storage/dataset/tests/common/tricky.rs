@@ -37,6 +37,8 @@ type Act = Box<dyn Fn(Moment, Path) -> BoxFuture<'static, ()> + Send + Sync>;
 /// The store. Gets, lists and the rest are those of the memory below.
 pub struct Tricky {
     pub memory: Arc<InMemory>,
+    /// What was got: object, first byte and end.
+    pub got: Mutex<Vec<(Path, u64, u64)>>,
     decide: Mutex<Decide>,
     act: Arc<Act>,
 }
@@ -45,6 +47,7 @@ impl Tricky {
     pub fn new(memory: Arc<InMemory>) -> Self {
         Self {
             memory,
+            got: Mutex::default(),
             decide: Mutex::new(Box::new(|_| Fate::Good)),
             act: Arc::new(Box::new(|_, _| Box::pin(async {}))),
         }
@@ -119,7 +122,10 @@ impl ObjectStore for Tricky {
         self.memory.put_multipart_opts(location, options).await
     }
     async fn get_opts(&self, location: &Path, options: GetOptions) -> Result<GetResult> {
-        self.memory.get_opts(location, options).await
+        let result = self.memory.get_opts(location, options).await?;
+        let got = (location.clone(), result.range.start, result.range.end);
+        self.got.lock().unwrap().push(got);
+        Ok(result)
     }
     fn delete_stream(
         &self,
