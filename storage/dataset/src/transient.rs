@@ -8,9 +8,9 @@ use crate::encode::encode_transient;
 use crate::error::DatasetError;
 use crate::layout::Quantity;
 use crate::manifest::FORMAT_VERSION;
-use crate::window::Decoding;
 use crate::spec::DatasetSpec;
 use crate::squareroot::EncodeError;
+use crate::window::Decoding;
 
 /// Codes the transients of data sets with these properties.
 #[derive(Debug)]

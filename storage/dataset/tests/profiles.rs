@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use common::tricky::Tricky;
 use common::*;
+use object_store::ObjectStoreExt;
 use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
 
 /// 300 bins: three inner chunks along the bins, the last one cut off.
