@@ -5,7 +5,7 @@ use std::ops::Range;
 use crate::layout::Layout;
 use crate::spec::DatasetSpec;
 
-/// Side of the blocks in which values are reordered: a block of each side stays in the first cache.
+/// Columns that are reordered at a time: their targets stay in the first cache.
 const BLOCK: usize = 32;
 
 /// The inner chunks of a transient: plane by plane, then by rows, columns and bins.
@@ -200,18 +200,14 @@ struct Matrix<'a, T> {
 impl<T: Copy> Matrix<'_, T> {
     /// Writes the given columns as rows of `stride` values, of which it fills the first ones with the given rows.
     fn transpose(&self, rows: Range<usize>, columns: Range<usize>, to: &mut [T], stride: usize) {
-        for r0 in rows.clone().step_by(BLOCK) {
-            let r1 = (r0 + BLOCK).min(rows.end);
-            for c0 in columns.clone().step_by(BLOCK) {
-                let c1 = (c0 + BLOCK).min(columns.end);
-                for c in c0..c1 {
-                    let at = (c - columns.start) * stride + r0 - rows.start;
-                    let target = &mut to[at..at + r1 - r0];
-                    let source = &self.values[r0 * self.stride + c..];
-                    for (t, s) in target.iter_mut().zip(source.iter().step_by(self.stride)) {
-                        *t = *s;
-                    }
-                }
+        // What is read lies side by side; what is written is the part that stays in the cache.
+        for c0 in columns.clone().step_by(BLOCK) {
+            let c1 = (c0 + BLOCK).min(columns.end);
+            let to = &mut to[(c0 - columns.start) * stride..];
+            for r in rows.clone() {
+                let source = &self.values[r * self.stride..][c0..c1];
+                let places = to[r - rows.start..].iter_mut().step_by(stride);
+                places.zip(source).for_each(|(to, from)| *to = *from);
             }
         }
     }

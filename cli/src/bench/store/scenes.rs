@@ -68,6 +68,7 @@ pub async fn source(
             dataset: "lossless".into(),
             profile: "lossless".into(),
         },
+        parts: 1,
     };
     std::fs::create_dir_all(dir).map_err(|e| io(dir.display(), &e))?;
     let dir = std::path::absolute(dir).map_err(|e| io(dir.display(), &e))?;

@@ -21,6 +21,9 @@ pub struct Variant {
     pack: Pack,
 }
 
+/// Chunks, and what is too bright for a code: (flat index, value).
+type Chunks = (Vec<Vec<u8>>, Vec<(u64, f32)>);
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Predict {
     No,
@@ -231,8 +234,7 @@ impl Variant {
         (x * x + 2.0 * self.offset * x) / scale
     }
 
-    /// Chunks, and what is too bright for a code.
-    pub fn encode(&self, sample: &Sample) -> Result<(Vec<Vec<u8>>, Vec<(u64, f32)>)> {
+    pub fn encode(&self, sample: &Sample) -> Result<Chunks> {
         let mut q = vec![0u16; sample.h.len()];
         let mut exact = Vec::new();
         for (at, (q, h)) in q.iter_mut().zip(&sample.h).enumerate() {
