@@ -42,7 +42,7 @@ fn shown(row: &Row) -> f64 {
 pub fn draw(report: &Report, path: &Path) -> Result<()> {
     let rows = &report.rows;
     let xs = rows.iter().map(|r| r.tb).chain([PROMISE.0]);
-    let ys = rows.iter().map(|r| shown(r)).chain([PROMISE.1]);
+    let ys = rows.iter().map(shown).chain([PROMISE.1]);
     let mut axes = Axes {
         canvas: Canvas::new(SIZE.0, SIZE.1, [255; 3]),
         left: LEFT,
