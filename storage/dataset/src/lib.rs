@@ -65,5 +65,5 @@ pub use spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use store::{check_location, open_store, probe};
 pub use summary::Summary;
-pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};
 pub use transient::{CodedImage, TransientCodec};
+pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Profile, Restored,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Restored,
     import::{Format, ImportOptions, Source, import_scene},
     open_store, remains, restore_root,
 };
