@@ -212,7 +212,7 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     let plain = |text: String| {
         text.replace(
             "dataset = \"rooms\"",
-            "dataset = \"rooms\"\nprofile = \"plain-f32\"",
+            "dataset = \"rooms\"\nprofile = \"lossless\"",
         )
     };
     let _worker = farm.worker("worker");

@@ -1,5 +1,5 @@
-//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what storing
-//! histograms costs, and looking after very many scenes.
+//! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very
+//! many scenes cost; what storing histograms costs.
 
 mod axes;
 mod curve;

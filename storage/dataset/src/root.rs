@@ -39,7 +39,7 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
             bin_width_m: 1.0,
             bins: 1,
         },
-        profile: Profile::default(),
+        profile: Profile::LOSSLESS,
     };
     let blind = Dataset::assume(store, prefix, anything, FORMAT_VERSION);
     let mut found = Remains::default();
@@ -84,40 +84,8 @@ pub async fn restore_root(
     spec: &DatasetSpec,
 ) -> Result<Dataset, DatasetError> {
     let mut spec = *spec;
-    let assume = |format| Dataset::assume(store.clone(), prefix.clone(), spec, format);
-    let (mut agreed, mut assumed) = (
-        scenes_of(&assume(FORMAT_VERSION)).await,
-        assume(FORMAT_VERSION),
-    );
-    for format in (1..FORMAT_VERSION).rev() {
-        // Perhaps it was written by an older program.
-        if agreed.is_err() {
-            let older = assume(format);
-            if let Ok(scenes) = scenes_of(&older).await {
-                (agreed, assumed) = (Ok(scenes), older);
-            }
-        }
-    }
-    let root = assumed.path(METADATA);
-    let Some(scenes) = agreed?.filter(|n| *n > 0) else {
-        return Err(DatasetError::Damaged {
-            object: assumed.shown(&root),
-            what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
-        });
-    };
-    spec.scenes = scenes;
-    spec.check()?;
-    objects::overwrite(
-        &*store,
-        &root,
-        pretty(&root_metadata(&spec, assumed.format)),
-    )
-    .await?;
-    Dataset::open(store, prefix).await
-}
-
-/// The number of scenes on which all array metadata that can be read agree; `None` where none can be read.
-async fn scenes_of(assumed: &Dataset) -> Result<Option<u64>, DatasetError> {
+    let format = format_of(&store, &prefix, spec).await?;
+    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
     let mut agreed = None;
     for array in assumed.arrays.iter() {
         let path = assumed.metadata_path(&array.layout);
@@ -137,5 +105,37 @@ async fn scenes_of(assumed: &Dataset) -> Result<Option<u64>, DatasetError> {
             what: "is not what the recipe of the data set gives, while the root is broken too: nothing was written".into(),
         });
     }
-    Ok(agreed)
+    let root = assumed.path(METADATA);
+    let Some(scenes) = agreed.filter(|n| *n > 0) else {
+        return Err(DatasetError::Damaged {
+            object: assumed.shown(&root),
+            what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
+        });
+    };
+    spec.scenes = scenes;
+    spec.check()?;
+    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec, format))).await?;
+    Dataset::open(store, prefix).await
+}
+
+/// The format in which the arrays were laid out: that of the first transient whose metadata are those of one, else the
+/// newest. Formats differ in nothing but transients.
+async fn format_of(
+    store: &Arc<dyn ObjectStore>,
+    prefix: &Path,
+    spec: DatasetSpec,
+) -> Result<u32, DatasetError> {
+    for format in (1..=FORMAT_VERSION).rev() {
+        let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
+        let transients = assumed.arrays.iter().map(|array| &array.layout);
+        for layout in transients.filter(|layout| layout.quantity.is_transient()) {
+            let bytes = objects::get(&**store, &assumed.metadata_path(layout)).await?;
+            let stored: Option<Value> = bytes.and_then(|b| serde_json::from_slice(&b).ok());
+            let Some(stored) = stored else { continue };
+            if stored == layout.metadata(stored["shape"][0].as_u64().unwrap_or(0)) {
+                return Ok(format);
+            }
+        }
+    }
+    Ok(FORMAT_VERSION)
 }

@@ -152,6 +152,17 @@ impl Profile {
     /// What [`Self::parse`] takes.
     pub const NAMES: [&str; 5] = ["sqrt-u16", "coarse", "plain-f32", "lossless", "counts-u16"];
 
+    /// What jobs call it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::SqrtU16 { delta: 1.0 } => "coarse",
+            Self::SqrtU16 { .. } => "sqrt-u16",
+            Self::PlainF32 { round: 0.0 } => "lossless",
+            Self::PlainF32 { .. } => "plain-f32",
+            Self::CountsU16 => "counts-u16",
+        }
+    }
+
     /// The profile that jobs call `name`.
     ///
     /// # Errors

@@ -140,7 +140,7 @@ impl ErrorSums {
     /// With `overflowed` values in the overflow list.
     pub fn finish(&self, overflowed: usize) -> EncodeError {
         EncodeError {
-            overflowed: overflowed as u64,
+            overflowed: Some(overflowed as u64),
             max_sigma: f64::from(self.worst).sqrt(),
             rms_sigma: (self.squares / self.count.max(1) as f64).sqrt(),
         }
@@ -154,9 +154,9 @@ pub struct EncodeError {
     pub max_sigma: f64,
     /// Root mean square over all bins.
     pub rms_sigma: f64,
-    /// Saturated bins: those in the overflow list.
-    #[serde(default)]
-    pub overflowed: u64,
+    /// Saturated bins: those in the overflow list. Manifests of encoder-1 do not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub overflowed: Option<u64>,
 }
 
 /// The scale (photons per unit of h) at which the median over the lit pixels of the brightest bin is `photons`

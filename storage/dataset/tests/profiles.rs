@@ -68,8 +68,8 @@ async fn errors_stay_within_the_promise_and_the_manifest_states_them() {
             (error.rms_sigma - rms).abs() < 1e-3,
             "{name}: {error:?}, found {rms}"
         );
-        assert_eq!(error.overflowed, u64::from(overflows), "{name}");
-        assert_eq!(manifest.overflow.len() as u64, error.overflowed);
+        assert_eq!(error.overflowed, Some(u64::from(overflows)), "{name}");
+        assert_eq!(Some(manifest.overflow.len() as u64), error.overflowed);
         assert_eq!(worst == 0.0, name == "lossless");
         assert_eq!(dataset.manifest(0).await.unwrap().profile, profile);
     }

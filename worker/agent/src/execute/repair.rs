@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Profile, Restored,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, Restored,
     import::{Format, ImportOptions, Source, import_scene},
     open_store, remains, restore_root,
 };
@@ -326,7 +326,7 @@ impl Repairer {
             output: OutputSettings {
                 store: self.store.clone(),
                 dataset: self.dataset.clone(),
-                profile: profile_name(manifest.profile),
+                profile: manifest.profile.name().to_owned(),
             },
         }))
     }
@@ -358,13 +358,6 @@ impl Repairer {
             ))),
         }
     }
-}
-
-/// What jobs call a profile; one that has no name now is described.
-fn profile_name(profile: Profile) -> String {
-    let named = |name: &&str| Profile::parse(name) == Ok(profile);
-    let name = Profile::NAMES.into_iter().find(named);
-    name.map_or_else(|| profile.to_string(), str::to_owned)
 }
 
 /// An imported scene from its files.
