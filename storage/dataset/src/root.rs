@@ -89,7 +89,7 @@ pub async fn restore_root(
     let mut agreed = None;
     for array in assumed.arrays.iter() {
         let path = assumed.metadata_path(&array.layout);
-        let Some(bytes) = objects::get(&*assumed.store, &path).await? else {
+        let Some(bytes) = objects::get(&*store, &path).await? else {
             continue;
         };
         let Ok(stored) = serde_json::from_slice::<Value>(&bytes) else {
