@@ -19,13 +19,25 @@ use crate::error::DatasetError;
 use crate::manifest::Manifest;
 use crate::objects;
 
-pub use packed::{Export, Exported};
 pub(crate) use sb3d::{ASIDE, Aside};
 
 use card::Row;
 
 /// Scenes in a tar file of [`ExportFormat::WebDataset`].
 const TAR: usize = 8;
+
+/// What was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Exported {
+    /// Scenes.
+    pub scenes: u64,
+    /// Files.
+    pub files: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// SHA-256 over the names and contents of the files, in the order in which they are written.
+    pub sha256: [u8; 32],
+}
 
 /// Layouts of an export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -75,7 +87,6 @@ pub struct Exporter<'a> {
     scenes: &'a [u64],
     out: Out<'a>,
     rows: Vec<Row>,
-    packed: Option<Export<'a>>,
 }
 
 /// Where files go, and what went there.
@@ -111,8 +122,11 @@ impl<'a> Exporter<'a> {
         store: &'a dyn ObjectStore,
         prefix: Path,
     ) -> Result<Self, DatasetError> {
-        // The checks of a packed export are those of all.
-        let packed = Export::new(source, scenes, store, prefix.clone())?;
+        if scenes.is_empty() {
+            let what = "expected at least one published scene, found none";
+            return Err(DatasetError::invalid("scenes", what));
+        }
+        packed::check(source)?;
         if format == ExportFormat::Sb3d {
             sb3d::check(source.spec())?;
         }
@@ -127,7 +141,6 @@ impl<'a> Exporter<'a> {
                 digest: Sha256::new(),
             },
             rows: Vec::new(),
-            packed: (format == ExportFormat::Zarr).then_some(packed),
         })
     }
 
@@ -149,8 +162,8 @@ impl<'a> Exporter<'a> {
         let of = |each: usize| k * each..self.scenes.len().min((k + 1) * each);
         match self.format {
             ExportFormat::Zarr => {
-                let packed = self.packed.as_mut().expect("made for this format");
-                for manifest in packed.pack(k).await? {
+                let scenes = &self.scenes[of(packed::PACK)];
+                for manifest in packed::pack(self.source, scenes, k, &mut self.out).await? {
                     let row = Row::new(self.rows.len(), &manifest, "");
                     self.rows.push(row);
                 }
@@ -200,13 +213,8 @@ impl<'a> Exporter<'a> {
         for (file, bytes) in card::files(name, self.format, self.source.spec(), &self.rows) {
             self.out.put(file, bytes.into()).await?;
         }
-        if let Some(packed) = self.packed {
-            let done = packed.finish().await?;
-            self.out.digest.update(done.sha256);
-            let all = &mut self.out.done;
-            all.scenes = done.scenes;
-            all.files += done.files;
-            all.bytes += done.bytes;
+        if self.format == ExportFormat::Zarr {
+            packed::finish(self.source, self.scenes, &mut self.out).await?;
         }
         self.out.done.sha256 = self.out.digest.finalize().into();
         Ok(self.out.done)

@@ -3,11 +3,9 @@
 
 use bytes::Bytes;
 use futures::{StreamExt, TryStreamExt, stream};
-use object_store::ObjectStore;
-use object_store::path::Path;
 use serde_json::{Map, Value, json};
-use sha2::{Digest, Sha256};
 
+use super::Out;
 use crate::codec::ChunkCodec;
 use crate::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
 use crate::error::DatasetError;
@@ -26,159 +24,100 @@ const CONCURRENCY: usize = 8;
 /// Name of the array of the scenes' indices in the source.
 const SOURCE_SCENE: &str = "source_scene";
 
-/// What was written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Exported {
-    /// Scenes.
-    pub scenes: u64,
-    /// Files.
-    pub files: u64,
-    /// Their bytes.
-    pub bytes: u64,
-    /// SHA-256 over the names and contents of the files, in the order in which they are written.
-    pub sha256: [u8; 32],
-}
-
-/// An export under way.
-pub struct Export<'a> {
-    source: &'a Dataset,
-    scenes: &'a [u64],
-    store: &'a dyn ObjectStore,
-    prefix: Path,
-    done: Exported,
-    digest: Sha256,
-}
-
-impl<'a> Export<'a> {
-    /// Packs the given scenes, in that order, into a new Zarr v3 group at `prefix`. Scene k of it is `scenes[k]`, which
-    /// its array `source_scene` tells. All objects are put create-only: run again after an interruption, it goes on.
-    ///
-    /// # Errors
-    /// [`DatasetError::Invalid`] where there are no scenes, or the source has a histogram for each spot (16 scenes of
-    /// these are too large for an object).
-    pub fn new(
-        source: &'a Dataset,
-        scenes: &'a [u64],
-        store: &'a dyn ObjectStore,
-        prefix: Path,
-    ) -> Result<Self, DatasetError> {
-        if scenes.is_empty() {
-            let what = "expected at least one published scene, found none";
-            return Err(DatasetError::invalid("scenes", what));
-        }
-        if source.spec.per_spot {
-            let what = "a histogram for each spot is too large to pack; reprocess the data set into one with the spots \
-                        you want to share, and export that";
-            return Err(DatasetError::invalid("spec.per_spot", what));
-        }
-        Ok(Self {
-            source,
-            scenes,
-            store,
-            prefix,
-            done: Exported::default(),
-            digest: Sha256::new(),
-        })
+/// The source can be packed.
+pub(super) fn check(source: &Dataset) -> Result<(), DatasetError> {
+    if source.spec.per_spot {
+        let what = "a histogram for each spot is too large to pack; reprocess the data set into one with the spots \
+                    you want to share, and export that";
+        return Err(DatasetError::invalid("spec.per_spot", what));
     }
+    Ok(())
+}
 
-    /// Writes the objects of pack `k`: one for each quantity, and the scenes' manifests, which it returns.
-    ///
-    /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`] naming the source's object at fault;
-    /// [`DatasetError::Conflict`] where the destination holds something else; [`DatasetError::Store`].
-    pub async fn pack(&mut self, k: usize) -> Result<Vec<Manifest>, DatasetError> {
-        let first = k * PACK;
-        let scenes = &self.scenes[first..self.scenes.len().min(first + PACK)];
-        let reads = scenes.iter().map(|scene| self.source.manifest(*scene));
-        let manifests: Vec<Manifest> = stream::iter(reads.collect::<Vec<_>>())
+/// Writes the objects of pack `k`, which holds `scenes`: one for each quantity, and the scenes' manifests, which it returns.
+pub(super) async fn pack(
+    source: &Dataset,
+    scenes: &[u64],
+    k: usize,
+    out: &mut Out<'_>,
+) -> Result<Vec<Manifest>, DatasetError> {
+    let reads = scenes.iter().map(|scene| source.manifest(*scene));
+    let manifests: Vec<Manifest> = stream::iter(reads.collect::<Vec<_>>())
+        .buffered(CONCURRENCY)
+        .try_collect()
+        .await?;
+    for array in source.arrays.iter() {
+        let reads = manifests.iter().map(|m| source.object(array, m));
+        let objects: Vec<Bytes> = stream::iter(reads.collect::<Vec<_>>())
             .buffered(CONCURRENCY)
             .try_collect()
             .await?;
-        for array in self.source.arrays.iter() {
-            let reads = manifests.iter().map(|m| self.source.object(array, m));
-            let objects: Vec<Bytes> = stream::iter(reads.collect::<Vec<_>>())
-                .buffered(CONCURRENCY)
-                .try_collect()
-                .await?;
-            let bytes = packed(&array.layout, &objects)?;
-            let zeros = "/0".repeat(array.layout.shape.len());
-            let key = format!("{}/c/{k}{zeros}", array.layout.quantity.name());
-            self.put(&key, bytes.into()).await?;
-        }
-        // Straight to text, as manifests are stored: by way of a Value, 32-bit floats would get the digits of 64 bits.
-        let mut text = serde_json::to_vec_pretty(&manifests).expect("manifests are plain data");
-        text.push(b'\n');
-        self.put(&format!("manifests/{k}.json"), text.into())
+        let bytes = packed(&array.layout, &objects)?;
+        let zeros = "/0".repeat(array.layout.shape.len());
+        let key = format!("{}/c/{k}{zeros}", array.layout.quantity.name());
+        out.put(&key, bytes.into()).await?;
+    }
+    // Straight to text, as manifests are stored: by way of a Value, 32-bit floats would get the digits of 64 bits.
+    let mut text = serde_json::to_vec_pretty(&manifests).expect("manifests are plain data");
+    text.push(b'\n');
+    out.put(&format!("manifests/{k}.json"), text.into()).await?;
+    out.done.scenes += scenes.len() as u64;
+    Ok(manifests)
+}
+
+/// Writes the metadata, the root's last: the group exists once all packs do.
+pub(super) async fn finish(
+    source: &Dataset,
+    scenes: &[u64],
+    out: &mut Out<'_>,
+) -> Result<(), DatasetError> {
+    let spec = DatasetSpec {
+        scenes: scenes.len() as u64,
+        ..source.spec
+    };
+    let mut all = Map::new();
+    for array in source.arrays.iter() {
+        let metadata = metadata(&array.layout, spec.scenes);
+        all.insert(array.layout.quantity.name().into(), metadata);
+    }
+    all.insert(SOURCE_SCENE.into(), put_source_scenes(scenes, out).await?);
+    for (name, metadata) in &all {
+        out.put(&format!("{name}/{METADATA}"), pretty(metadata))
             .await?;
-        self.done.scenes += scenes.len() as u64;
-        Ok(manifests)
     }
+    let mut root = root_metadata(&spec, source.format);
+    let attributes = root["attributes"].as_object_mut().expect("just made");
+    attributes.remove("picofarm");
+    attributes.insert(
+        "picofarm_export".into(),
+        json!({"format": EXPORT_VERSION, "scenes_a_file": PACK, "spec": spec}),
+    );
+    root["consolidated_metadata"]["metadata"] = Value::Object(all);
+    out.put(METADATA, pretty(&rename_manifests(&root))).await
+}
 
-    /// Writes the metadata, the root's last: the group exists once all packs do.
-    ///
-    /// # Errors
-    /// [`DatasetError::Conflict`], [`DatasetError::Store`].
-    pub async fn finish(mut self) -> Result<Exported, DatasetError> {
-        let spec = DatasetSpec {
-            scenes: self.scenes.len() as u64,
-            ..self.source.spec
-        };
-        let mut all = Map::new();
-        for array in self.source.arrays.iter() {
-            let metadata = metadata(&array.layout, spec.scenes);
-            all.insert(array.layout.quantity.name().into(), metadata);
-        }
-        all.insert(SOURCE_SCENE.into(), self.put_source_scenes().await?);
-        for (name, metadata) in &all {
-            self.put(&format!("{name}/{METADATA}"), pretty(metadata))
-                .await?;
-        }
-        let mut root = root_metadata(&spec, self.source.format);
-        let attributes = root["attributes"].as_object_mut().expect("just made");
-        attributes.remove("picofarm");
-        attributes.insert(
-            "picofarm_export".into(),
-            json!({"format": EXPORT_VERSION, "scenes_a_file": PACK, "spec": spec}),
-        );
-        root["consolidated_metadata"]["metadata"] = Value::Object(all);
-        self.put(METADATA, pretty(&rename_manifests(&root))).await?;
-        self.done.sha256 = self.digest.finalize().into();
-        Ok(self.done)
-    }
-
-    async fn put_source_scenes(&mut self) -> Result<Value, DatasetError> {
-        let codecs =
-            json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]);
-        let n = self.scenes.len() as u64;
-        // A data set has at most 2³² scenes.
-        let values: Vec<u32> = self.scenes.iter().map(|s| *s as u32).collect();
-        let codec = ChunkCodec::plain(&codecs, &[n], Element::U32);
-        let bytes = codec.encode(bytemuck::cast_slice(&values))?;
-        self.put(&format!("{SOURCE_SCENE}/c/0"), bytes.into())
-            .await?;
-        Ok(json!({
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": [n],
-            "data_type": Element::U32.name(),
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [n]}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": 0,
-            "codecs": codecs,
-            "attributes": {"long_name": "index of the scene in the data set that this was exported from"},
-            "dimension_names": ["scene"],
-        }))
-    }
-
-    async fn put(&mut self, key: &str, bytes: Bytes) -> Result<(), DatasetError> {
-        self.done.files += 1;
-        self.done.bytes += bytes.len() as u64;
-        self.digest.update(key);
-        self.digest.update([0]);
-        self.digest.update(Sha256::digest(&bytes));
-        let path = objects::path_of(&self.prefix, key);
-        objects::create_or_match(self.store, &path, bytes).await
-    }
+async fn put_source_scenes(scenes: &[u64], out: &mut Out<'_>) -> Result<Value, DatasetError> {
+    let codecs =
+        json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]);
+    let n = scenes.len() as u64;
+    // A data set has at most 2³² scenes.
+    let values: Vec<u32> = scenes.iter().map(|s| *s as u32).collect();
+    let codec = ChunkCodec::plain(&codecs, &[n], Element::U32);
+    let bytes = codec.encode(bytemuck::cast_slice(&values))?;
+    out.put(&format!("{SOURCE_SCENE}/c/0"), bytes.into())
+        .await?;
+    Ok(json!({
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": [n],
+        "data_type": Element::U32.name(),
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [n]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": 0,
+        "codecs": codecs,
+        "attributes": {"long_name": "index of the scene in the data set that this was exported from"},
+        "dimension_names": ["scene"],
+    }))
 }
 
 impl Dataset {
