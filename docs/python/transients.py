@@ -78,6 +78,8 @@ class Transients:
                  histogram="transient", crop=None, bins=None, arrays=ARRAYS):
         if scenes is not None and split is not None:
             raise ValueError("give scenes or split, not both")
+        if unknown := set(arrays) - set(ARRAYS):
+            raise ValueError(f"arrays: {sorted(unknown)} are not among {ARRAYS}")
         self.location, self.histogram, self.arrays = os.fspath(location), histogram, tuple(arrays)
         self.crop, self.bins = crop, bins
         self._opened = None
@@ -107,8 +109,6 @@ class Transients:
             "spots": lambda: group["spots"][scene],
             "intrinsics": lambda: group["intrinsics"][scene] - numpy.array([0, 0, columns.start, rows.start], "float32"),
         }
-        if unknown := set(self.arrays) - make.keys():
-            raise ValueError(f"arrays: {sorted(unknown)} are not among {ARRAYS}")
         return {"scene": scene, "scale": scale} | {name: make[name]() for name in self.arrays}
 
     def _lit(self, array, scene, rows, columns):

@@ -1,6 +1,7 @@
 //! Commands as a person types them, and what they answer.
 
 use std::{
+    ffi::OsStr,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -33,7 +34,12 @@ impl Cli {
 
     /// The command, to be started by the caller.
     pub fn command(&self, args: &[&str]) -> Command {
-        let mut command = Command::new(binary::picofarm());
+        self.other(binary::picofarm().as_ref(), args)
+    }
+
+    /// Another program in the same folder, with the same variables.
+    pub fn other(&self, program: &OsStr, args: &[&str]) -> Command {
+        let mut command = Command::new(program);
         for (name, _) in std::env::vars_os() {
             let name = name.to_string_lossy().into_owned();
             if name.starts_with("PICOFARM_") || name.starts_with("AWS_") {
@@ -53,6 +59,13 @@ impl Cli {
     /// Starts it and lets it run.
     pub fn start(&self, name: &str, args: &[&str]) -> Process {
         Process::start(name, self.command(args), &self.dir)
+    }
+
+    /// Runs another program to its end.
+    pub fn run_other(&self, program: &OsStr, args: &[&str]) -> Ended {
+        let mut ended = Process::start("program", self.other(program, args), &self.dir).end();
+        ended.what = format!("{} {}", program.display(), args.join(" "));
+        ended
     }
 
     /// Runs it to its end.

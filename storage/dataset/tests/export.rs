@@ -209,3 +209,27 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
         .unwrap();
     assert!(error.to_string().contains("per_spot"), "{error}");
 }
+
+#[tokio::test]
+async fn the_table_of_scenes_names_a_place_for_each_that_is_there_and_no_number() {
+    let folder = tempfile::tempdir().unwrap();
+    let (dataset, scenes) = source(folder.path(), Profile::default()).await;
+    for format in [
+        ExportFormat::Zarr,
+        ExportFormat::WebDataset,
+        ExportFormat::Hdf5,
+    ] {
+        let place = folder.path().join(format.name());
+        export_as(format, &dataset, &scenes, &place).await;
+        let table = std::fs::read_to_string(place.join("scenes.csv")).unwrap();
+        let mut lines = table
+            .lines()
+            .map(|line| line.split(',').collect::<Vec<_>>());
+        let column = lines.next().unwrap().iter().position(|c| *c == "file");
+        for line in lines {
+            let file = line[column.unwrap()];
+            assert!(!file.is_empty() && place.join(file).exists(), "{line:?}");
+            assert!(file.parse::<f64>().is_err(), "{file} is taken for a number");
+        }
+    }
+}

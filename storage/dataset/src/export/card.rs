@@ -29,7 +29,11 @@ const COLUMNS: [(&str, &str, &str); 7] = [
         "sc:Integer",
         "number of the scene in the data set that this was exported from",
     ),
-    ("file", "sc:Text", "file or folder that holds the scene"),
+    (
+        "file",
+        "sc:Text",
+        "file or folder that holds the scene, or its histogram where arrays have files of their own",
+    ),
     (
         "photons_per_unit",
         "sc:Float",
@@ -190,6 +194,7 @@ fn context() -> Value {
         "data": {"@id": "cr:data", "@type": "@json"},
         "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
         "dct": "http://purl.org/dc/terms/",
+        "equivalentProperty": "cr:equivalentProperty",
         "examples": {"@id": "cr:examples", "@type": "@json"},
         "extract": "cr:extract",
         "field": "cr:field",
@@ -209,6 +214,7 @@ fn context() -> Value {
         "regex": "cr:regex",
         "repeated": "cr:repeated",
         "replace": "cr:replace",
+        "samplingRate": "cr:samplingRate",
         "sc": "https://schema.org/",
         "separator": "cr:separator",
         "source": "cr:source",

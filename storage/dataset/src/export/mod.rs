@@ -16,6 +16,7 @@ use sha2::{Digest, Sha256};
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
+use crate::layout::Quantity;
 use crate::manifest::Manifest;
 use crate::objects;
 
@@ -163,8 +164,9 @@ impl<'a> Exporter<'a> {
         match self.format {
             ExportFormat::Zarr => {
                 let scenes = &self.scenes[of(packed::PACK)];
+                let file = self.source.array(Quantity::Transient).layout.key(k as u64);
                 for manifest in packed::pack(self.source, scenes, k, &mut self.out).await? {
-                    let row = Row::new(self.rows.len(), &manifest, "");
+                    let row = Row::new(self.rows.len(), &manifest, &file);
                     self.rows.push(row);
                 }
             }
@@ -175,7 +177,8 @@ impl<'a> Exporter<'a> {
                     self.out.put(&format!("{folder}/{name}"), bytes).await?;
                 }
                 let manifest = self.source.manifest(scene).await?;
-                self.note(&manifest, &folder);
+                // With the slash, or else readers of tables take it for a number.
+                self.note(&manifest, &format!("{folder}/"));
             }
             ExportFormat::Hdf5 => {
                 let scene = self.source.plain(self.scenes[k]).await?;

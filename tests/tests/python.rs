@@ -1,0 +1,163 @@
+//! The Python example of docs/python: it reads what the program reads, trains, and so do xarray and tensorstore, from a
+//! disk and from S3. Runs where `PICOFARM_PYTHON` names a Python with zarr, xarray, tensorstore, obstore and h5py.
+
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+};
+
+use picofarm_tests::{Cli, Ended, Farm, Job, s3::Server, store};
+use serde_json::Value;
+
+/// Scenes.
+const COUNT: u64 = 5;
+
+fn python(name: &str) -> Option<OsString> {
+    let python = std::env::var_os("PICOFARM_PYTHON");
+    if python.is_none() {
+        eprintln!(
+            "SKIPPED {name}: tests/run installs a Python with zarr, xarray, tensorstore, obstore and h5py, PICOFARM_PYTHON names it"
+        );
+    }
+    python
+}
+
+/// Runs a script of this repository to its successful end, where the variables of `cli` hold.
+fn run(python: &OsString, cli: &Cli, script: &str, args: &[&str]) -> Ended {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let script = folder.join(script).display().to_string();
+    // `-B`: nothing is left beside the scripts.
+    cli.run_other(python, &[&["-B", &script], args].concat())
+        .ok()
+}
+
+/// A farm with rooms of 32×32 pixels in its store, as rendered.
+fn rooms(name: &str) -> (Farm, PathBuf) {
+    let farm = Farm::start(name);
+    let job = Job {
+        resolution: 32,
+        ..Job::quick(&farm.store(), COUNT)
+    };
+    let text = job.toml().replace(
+        "dataset = \"rooms\"",
+        "dataset = \"rooms\"\nprofile = \"lossless\"",
+    );
+    std::fs::write(farm.scratch.join("rooms.toml"), text).unwrap();
+    let id = farm.json(&["job", "submit", "rooms.toml"])["job"]
+        .as_str()
+        .expect("a submission answers with a job")
+        .to_owned();
+    let _worker = farm.worker("renderer");
+    farm.until_ended(&id);
+    let place = job.place();
+    assert_eq!(store::finished(&place).len() as u64, COUNT);
+    (farm, place)
+}
+
+/// The same scenes in another profile, so bright that some bins saturate; and what the program itself reads of them.
+fn reprocess(farm: &Farm, source: &Path, target: &str, profile: &str) -> String {
+    let source = source.display().to_string();
+    let bright = ["--peak-photons", "100000"];
+    let noise: &[&str] = match profile {
+        "counts-u16" => &[],
+        _ => &["--no-poisson"],
+    };
+    let make = [
+        "dataset",
+        "reprocess",
+        &source,
+        target,
+        "--profile",
+        profile,
+    ];
+    farm.run(&[&make[..], &bright, noise].concat()).ok();
+    let exported = farm.scratch.join(&format!("hdf5-{profile}"));
+    let exported = exported.display().to_string();
+    farm.run(&["dataset", "export", target, &exported, "--format", "hdf5"])
+        .ok();
+    exported
+}
+
+/// Everything that the example does, at one place.
+fn everything(python: &OsString, farm: &Farm, source: &Path, place: &dyn Fn(&str) -> String) {
+    let cli = farm.cli();
+    for (profile, saturates) in [
+        ("sqrt-u16", true),
+        ("coarse", false),
+        ("plain-f32", false),
+        ("counts-u16", true),
+    ] {
+        let target = place(profile);
+        let exported = reprocess(farm, source, &target, profile);
+        let check = "tests/interop/check_transients.py";
+        let found = run(python, &cli, check, &[&target, &exported]).json();
+        assert_eq!(found["scenes"], COUNT);
+        assert_eq!(
+            found["saturated"].as_u64() > Some(0),
+            saturates,
+            "{profile}: {found}"
+        );
+    }
+    let target = place("sqrt-u16");
+    let readers = run(python, &cli, "docs/python/readers.py", &[&target, "1"]);
+    assert!(
+        readers.stdout.contains("all three agree"),
+        "{}",
+        readers.stdout
+    );
+    farm.run(&["dataset", "split", &target, "--counts", "3,1,1"])
+        .ok();
+    let train = |more: &[&str]| -> Value {
+        let args = [&[&*target, "--split", "train"], more].concat();
+        let ended = run(python, &cli, "docs/python/train.py", &args);
+        let result = ended.json();
+        let with = result["with"].as_str().unwrap();
+        assert!(ended.stdout.contains(&format!(
+            "training with {}",
+            ["numpy", "PyTorch"][usize::from(with == "torch")]
+        )));
+        assert_eq!(result["scenes"], 3, "{result}");
+        let loss = |name: &str| result[name].as_f64().expect("a number");
+        assert!(
+            loss("last_loss") < 0.8 * loss("first_loss"),
+            "it learns: {result}"
+        );
+        assert!((0.0..=1.0).contains(&loss("waiting")), "{result}");
+        result
+    };
+    train(&["--workers", "2"]);
+    assert_eq!(train(&["--workers", "0", "--numpy"])["with"], "numpy");
+}
+
+#[test]
+fn the_example_reads_what_the_program_reads_and_learns_from_a_disk() {
+    let Some(python) = python("python") else {
+        return;
+    };
+    let (farm, source) = rooms("python");
+    let place = |profile: &str| farm.store().join(profile).display().to_string();
+    everything(&python, &farm, &source, &place);
+    let target = place("sqrt-u16");
+    std::fs::remove_file(Path::new(&target).join("scale/c/4")).unwrap();
+    run(
+        &python,
+        &farm.cli(),
+        "tests/interop/check_refusals.py",
+        &[&target],
+    );
+}
+
+#[test]
+fn the_example_reads_what_the_program_reads_and_learns_from_s3() {
+    let Some(python) = python("python-s3") else {
+        return;
+    };
+    let Some(server) = Server::start("python-s3") else {
+        return;
+    };
+    let (farm, source) = rooms("python-s3-farm");
+    let farm = farm.reaching(&server);
+    let bucket = server.bucket();
+    let place = |profile: &str| format!("s3://{bucket}/deep/{profile}");
+    everything(&python, &farm, &source, &place);
+}
