@@ -82,6 +82,7 @@ fn start(cli: Cli) -> Result<()> {
 
 async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
     let settings = &resolved.settings;
+    picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
     match command {
         Command::Demo(args) => demo::demo(args, settings, output).await,
         Command::Up(args) => demo::up(args, settings, output).await,
@@ -120,7 +121,11 @@ fn show_settings(resolved: &Resolved, output: Output) {
         .sources
         .iter()
         .map(|(name, source)| {
-            let value = values[name].as_str().unwrap_or_default().to_owned();
+            let value = match &values[name] {
+                serde_json::Value::Null => String::new(),
+                serde_json::Value::String(text) => text.clone(),
+                other => other.to_string(),
+            };
             vec![(*name).to_owned(), value, source.clone()]
         })
         .collect();

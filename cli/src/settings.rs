@@ -7,6 +7,7 @@ use figment::{
     providers::{Env, Format, Serialized, Toml},
 };
 use picofarm_agent::Access;
+use picofarm_dataset::Bandwidth;
 use picofarm_proto::credentials::Secret;
 use serde::{Deserialize, Serialize};
 
@@ -33,6 +34,10 @@ pub struct Settings {
     pub key: Option<PathBuf>,
     /// File that holds the token.
     pub token_file: Option<PathBuf>,
+    /// What this process may send to object stores, megabytes a second.
+    pub store_upload_mb_s: Option<f64>,
+    /// What it may fetch from them, megabytes a second.
+    pub store_download_mb_s: Option<f64>,
 }
 
 /// The variable that holds the token itself. No setting and no argument: those are shown and kept.
@@ -58,6 +63,24 @@ impl Settings {
             token,
         })
     }
+
+    /// What this process may send to object stores and fetch from them.
+    ///
+    /// # Errors
+    /// A rate that is no positive number.
+    pub fn bandwidth(&self) -> Result<Bandwidth> {
+        let rate = |name: &str, mb_s: Option<f64>| match mb_s {
+            Some(mb_s) if !(mb_s.is_finite() && mb_s > 0.0) => Err(CliError::input(format!(
+                "settings: {name}: expected megabytes a second above 0, found {mb_s}"
+            ))
+            .hint("leave it out for no limit")),
+            other => Ok(other.map(|mb_s| mb_s * 1e6)),
+        };
+        Ok(Bandwidth {
+            upload: rate("store_upload_mb_s", self.store_upload_mb_s)?,
+            download: rate("store_download_mb_s", self.store_download_mb_s)?,
+        })
+    }
 }
 
 fn user_dir(variable: &str, fallback: &str) -> PathBuf {
@@ -78,6 +101,8 @@ impl Default for Settings {
             cert: None,
             key: None,
             token_file: None,
+            store_upload_mb_s: None,
+            store_download_mb_s: None,
         }
     }
 }
@@ -90,7 +115,7 @@ pub struct Resolved {
     pub token: bool,
 }
 
-const FIELDS: [&str; 7] = [
+const FIELDS: [&str; 9] = [
     "coordinator",
     "assets",
     "log",
@@ -98,6 +123,8 @@ const FIELDS: [&str; 7] = [
     "cert",
     "key",
     "token_file",
+    "store_upload_mb_s",
+    "store_download_mb_s",
 ];
 
 /// Resolves the settings.
@@ -126,7 +153,7 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
     }
     figment = figment.merge(Env::prefixed("PICOFARM_").only(&FIELDS));
     let shown = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
-    let flags: [(&str, Option<String>); 7] = [
+    let flags: [(&str, Option<String>); 9] = [
         ("coordinator", global.coordinator.clone()),
         ("assets", shown(&global.assets_dir)),
         ("log", global.log.clone()),
@@ -134,6 +161,8 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
         ("cert", shown(&global.cert)),
         ("key", shown(&global.key)),
         ("token_file", shown(&global.token_file)),
+        ("store_upload_mb_s", None),
+        ("store_download_mb_s", None),
     ];
     let mut sources = Vec::new();
     for (name, value) in flags {

@@ -42,7 +42,8 @@ impl Cli {
         let mut command = Command::new(program);
         for (name, _) in std::env::vars_os() {
             let name = name.to_string_lossy().into_owned();
-            if name.starts_with("PICOFARM_") || name.starts_with("AWS_") {
+            let stores = ["PICOFARM_", "AWS_", "GOOGLE_", "AZURE_"];
+            if stores.iter().any(|start| name.starts_with(start)) {
                 command.env_remove(name);
             }
         }

@@ -6,6 +6,7 @@
 
 pub mod binary;
 pub mod cli;
+pub mod cloud;
 pub mod cluster;
 pub mod farm;
 pub mod http;

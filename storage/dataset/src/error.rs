@@ -2,7 +2,7 @@
 
 use std::io;
 
-use crate::store::{Failure, io_hint};
+use crate::store::{Failure, Service, io_hint};
 
 /// An operation on a data set that failed.
 #[derive(Debug, thiserror::Error)]
@@ -162,10 +162,12 @@ impl DatasetError {
         object: impl ToString,
         source: object_store::Error,
     ) -> Self {
-        let Failure { account, hint } = Failure::of(&source);
+        let object = object.to_string();
+        let service = Service::of(&object).map(|(service, _)| service);
+        let Failure { account, hint } = Failure::of(&source, service);
         Self::Store {
             action,
-            object: object.to_string(),
+            object,
             hint,
             account,
         }

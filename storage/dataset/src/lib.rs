@@ -63,7 +63,7 @@ pub use root::{Remains, remains, restore_root};
 pub use snapshot::{Difference, Snapshot};
 pub use spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
-pub use store::{check_location, open_store, probe};
+pub use store::{Bandwidth, check_location, limit_bandwidth, open_store, probe};
 pub use summary::Summary;
 pub use transient::{CodedImage, TransientCodec};
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

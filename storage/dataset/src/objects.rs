@@ -33,6 +33,11 @@ pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
         format!("{}/{path}", root.trim_end_matches('/'))
     } else if let Some(bucket) = named("AmazonS3(") {
         format!("s3://{bucket}/{path}")
+    } else if let Some(bucket) = named("GoogleCloudStorage(") {
+        format!("gs://{bucket}/{path}")
+    } else if let Some(container) = named("MicrosoftAzure { account: ") {
+        let container = container.split_once("container: ").map_or("", |c| c.1);
+        format!("az://{}/{path}", container.trim_end_matches(" }"))
     } else {
         path.to_string()
     }

@@ -5,6 +5,8 @@ use std::io;
 use object_store::Error;
 use object_store::client::{HttpError, HttpErrorKind};
 
+use super::place::Service;
+
 /// An error of a store in words.
 pub(crate) struct Failure {
     /// What happened.
@@ -14,9 +16,10 @@ pub(crate) struct Failure {
 }
 
 impl Failure {
-    /// The account of an error of any store.
-    pub(crate) fn of(error: &Error) -> Self {
+    /// The account of an error of any store; of an object store's with its service.
+    pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
+        let service = service.unwrap_or(Service::S3);
         let Some(request) = chain.iter().find_map(|e| Request::parse(&e.to_string())) else {
             let io = chain.last().and_then(|e| e.downcast_ref::<io::Error>());
             return Self {
@@ -28,9 +31,9 @@ impl Failure {
         match http {
             Some(http) => {
                 let cause = chain.last().expect("it holds at least the error");
-                request.unanswered(http.kind(), &cause.to_string())
+                request.unanswered(service, http.kind(), &cause.to_string())
             }
-            None => request.refused(),
+            None => request.refused(service),
         }
     }
 }
@@ -39,7 +42,12 @@ impl Failure {
 pub(crate) fn no_bucket(error: &Error) -> bool {
     let requests = chain(error).into_iter();
     let mut requests = requests.filter_map(|e| Request::parse(&e.to_string()));
-    requests.any(|r| r.code.as_deref() == Some("NoSuchBucket"))
+    requests.any(|r| {
+        matches!(
+            r.code.as_deref(),
+            Some("NoSuchBucket" | "ContainerNotFound")
+        )
+    })
 }
 
 fn chain(error: &Error) -> Vec<&(dyn std::error::Error + 'static)> {
@@ -78,34 +86,38 @@ impl Request {
     }
 
     /// The server could not be asked.
-    fn unanswered(&self, kind: HttpErrorKind, cause: &str) -> Failure {
+    fn unanswered(&self, service: Service, kind: HttpErrorKind, cause: &str) -> Failure {
+        let hints = hints(service);
         let (what, hint) = match kind {
-            HttpErrorKind::Timeout => (
-                "did not answer in time",
-                "check that the server is well; AWS_TIMEOUT, e.g. 600s, gives slow lines more time",
-            ),
-            HttpErrorKind::Connect => (
-                "cannot be reached",
-                "check that the server runs, AWS_ENDPOINT_URL, and the network between",
-            ),
+            HttpErrorKind::Timeout => ("did not answer in time", hints.slow),
+            HttpErrorKind::Connect => ("cannot be reached", hints.away),
             _ => (
                 "broke off",
                 "check that the server is well, then run it again",
             ),
         };
-        let role = self.path.starts_with("latest/");
+        // Where machines of the services are told who they are.
+        let role = ["latest/", "computeMetadata/", "metadata/identity/"]
+            .iter()
+            .any(|start| self.path.starts_with(start));
         Failure {
             account: format!("{} {what}: {cause}", self.server),
-            hint: Some(if role { NO_CREDENTIALS } else { hint }),
+            hint: Some(if role { hints.anonymous } else { hint }),
         }
     }
 
     /// The server said no.
-    fn refused(&self) -> Failure {
+    fn refused(&self, service: Service) -> Failure {
         let hint = match (self.code.as_deref(), self.status) {
             (Some("NoSuchBucket"), _) => {
                 "the bucket does not exist: create it, or correct the store's URL"
             }
+            (Some("ContainerNotFound"), _) => {
+                "the container does not exist: create it, or correct the store's URL"
+            }
+            (_, Some(401 | 403)) if service != Service::S3 => hints(service).refused,
+            (_, Some(429 | 500..=599)) if service != Service::S3 => TROUBLE,
+            _ if service != Service::S3 => hints(service).strange,
             (Some("InvalidAccessKeyId"), _) => {
                 "the server does not know this key: check AWS_ACCESS_KEY_ID"
             }
@@ -125,15 +137,15 @@ impl Request {
             (Some("QuotaExceeded" | "QuotaExceededException"), _) | (_, Some(507)) => {
                 "the server is full: free some space, then run it again"
             }
-            (_, Some(401)) => "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+            (_, Some(401)) => hints(service).refused,
             // Some servers say so too of a bucket that does not exist.
             (_, Some(403)) => {
                 "no permission: AWS_ACCESS_KEY_ID needs leave to read, write, list and delete in this bucket; does the \
                  bucket exist?"
             }
-            (_, Some(429 | 500..=599)) => "the server is in trouble: try again later",
+            (_, Some(429 | 500..=599)) => TROUBLE,
             (None, _) => "this is not how S3 answers: check AWS_ENDPOINT_URL and AWS_REGION",
-            (Some(_), _) => "check AWS_ENDPOINT_URL, AWS_REGION and the store's URL",
+            (Some(_), _) => hints(service).strange,
         };
         let status = self.status.map_or("an error".into(), |s| s.to_string());
         let words = match (&self.code, &self.message) {
@@ -148,7 +160,46 @@ impl Request {
     }
 }
 
-const NO_CREDENTIALS: &str = "no credentials found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY; profiles in ~/.aws are not read";
+const TROUBLE: &str = "the server is in trouble: try again later";
+
+/// Hints that name a service's variables.
+struct Hints {
+    slow: &'static str,
+    away: &'static str,
+    anonymous: &'static str,
+    refused: &'static str,
+    strange: &'static str,
+}
+
+fn hints(service: Service) -> Hints {
+    match service {
+        Service::S3 => Hints {
+            slow: "check that the server is well; AWS_TIMEOUT, e.g. 600s, gives slow lines more time",
+            away: "check that the server runs, AWS_ENDPOINT_URL, and the network between",
+            anonymous: "no credentials found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY; profiles in ~/.aws are not read",
+            refused: "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+            strange: "check AWS_ENDPOINT_URL, AWS_REGION and the store's URL",
+        },
+        Service::Gcs => Hints {
+            slow: "check the line; GOOGLE_TIMEOUT, e.g. 600s, gives slow ones more time",
+            away: "check the network, and GOOGLE_BASE_URL if it is set",
+            anonymous: "no credentials found: set GOOGLE_APPLICATION_CREDENTIALS or GOOGLE_SERVICE_ACCOUNT to a file, or run \
+                        gcloud auth application-default login",
+            refused: "no permission: the account of GOOGLE_APPLICATION_CREDENTIALS or GOOGLE_SERVICE_ACCOUNT needs the role \
+                      Storage Object User in this bucket; does the bucket exist?",
+            strange: "check the store's URL, and GOOGLE_BASE_URL if it is set",
+        },
+        Service::Azure => Hints {
+            slow: "check the line; AZURE_TIMEOUT, e.g. 600s, gives slow ones more time",
+            away: "check the network, AZURE_STORAGE_ACCOUNT_NAME, and AZURE_STORAGE_ENDPOINT if it is set",
+            anonymous: "no credentials found: set AZURE_STORAGE_ACCOUNT_KEY, AZURE_STORAGE_SAS_TOKEN, or AZURE_CLIENT_ID, \
+                        AZURE_CLIENT_SECRET and AZURE_TENANT_ID",
+            refused: "no permission: check AZURE_STORAGE_ACCOUNT_KEY or AZURE_STORAGE_SAS_TOKEN; an identity needs the role \
+                      Storage Blob Data Contributor for this container",
+            strange: "check AZURE_STORAGE_ACCOUNT_NAME, the store's URL, and AZURE_STORAGE_ENDPOINT if it is set",
+        },
+    }
+}
 
 /// The text of the first XML element of this name, cut to a line.
 fn element(text: &str, name: &str) -> Option<String> {
@@ -196,7 +247,7 @@ mod tests {
                 source: Box::new(io::Error::from(kind)),
             }),
         };
-        let hint = |kind| Failure::of(&nested(kind)).hint.unwrap();
+        let hint = |kind| Failure::of(&nested(kind), None).hint.unwrap();
         assert!(hint(io::ErrorKind::StorageFull).starts_with("the disk is full: free some space"));
         assert!(hint(io::ErrorKind::ReadOnlyFilesystem).contains("mounted read-only"));
     }
@@ -213,7 +264,7 @@ mod tests {
             store: "S3",
             source: words.into(),
         };
-        let failure = Failure::of(&error);
+        let failure = Failure::of(&error, Some(Service::S3));
         assert_eq!(
             failure.account,
             "http://127.0.0.1:9 answered 400 InvalidToken: The token is malformed."

@@ -30,7 +30,7 @@ pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
         }
         Some((scheme, _)) => {
             return Err(unsupported(&format!(
-                "the scheme {scheme} is not supported; use a local path, a file:// URL or s3://bucket/prefix"
+                "the scheme {scheme} is not supported; use a local path, a file:// URL, s3://bucket/prefix, gs://bucket/prefix or az://container/prefix"
             )));
         }
     };

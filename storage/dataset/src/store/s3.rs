@@ -1,173 +1,57 @@
 //! S3 and servers that speak it: `s3://bucket/prefix`, told where and who by the usual `AWS_…` variables.
 
-use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::time::Duration;
+use object_store::ClientConfigKey;
+use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
 
-use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
-use object_store::limit::LimitStore;
-use object_store::path::Path;
-use object_store::{BackoffConfig, ClientConfigKey, ObjectStore, RetryConfig};
-
+use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, retries};
+use super::place::Place;
 use crate::error::DatasetError;
 
-/// Requests in flight for one opened store.
-const CONCURRENCY: usize = 32;
-/// A request's time limit. Long enough for a shard of some gigabytes over a fast line, or 20 MB over a slow one.
-const TIMEOUT: &str = "120s";
-/// Until a connection stands.
-const CONNECT_TIMEOUT: &str = "5s";
-/// Retries of one request; whoever asks decides what to do when they are used up.
-const RETRIES: usize = 6;
-/// No retry starts later than this after the first attempt.
-const RETRY_TIMEOUT: Duration = Duration::from_secs(20);
-
-/// A bucket and the prefix in it.
-#[derive(Debug, PartialEq)]
-pub(super) struct Place {
-    pub bucket: String,
-    pub prefix: Path,
-}
-
-impl Place {
-    /// `None` where `url` is not of S3.
-    ///
-    /// # Errors
-    /// [`DatasetError::UnsupportedStore`] where it is, but cannot be used; what could be a secret is not repeated.
-    pub(super) fn parse(url: &str) -> Result<Option<Self>, DatasetError> {
-        let Some(rest) = url.strip_prefix("s3://") else {
-            return Ok(None);
-        };
-        let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
-        let unsupported = |url: &str, what: String| DatasetError::UnsupportedStore {
-            url: url.into(),
-            what,
-        };
-        if bucket.contains(['@', ':']) {
-            return Err(unsupported(
-                "s3://…",
-                "expected s3://bucket/prefix without keys or host; they belong in AWS_ACCESS_KEY_ID, \
-                 AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL"
-                    .into(),
-            ));
-        }
-        let letters = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b"-._".contains(&b);
-        if !(3..=63).contains(&bucket.len()) || !bucket.bytes().all(letters) {
-            let what = format!(
-                "expected s3://bucket/prefix with a bucket name of 3 to 63 lower-case letters, digits, '-' and '.', \
-                 found {bucket:?}"
-            );
-            return Err(unsupported(url, what));
-        }
-        if prefix.contains(['?', '#']) {
-            return Err(unsupported(
-                url,
-                "expected a prefix without '?' and '#'".into(),
-            ));
-        }
-        let prefix = Path::parse(prefix.trim_end_matches('/'))
-            .map_err(|e| unsupported(url, format!("cannot be the prefix of object keys: {e}")))?;
-        Ok(Some(Self {
-            bucket: bucket.into(),
-            prefix,
-        }))
-    }
-}
-
-/// A client of the bucket, made from environment variables. Asks nothing of the server.
+/// A client of the bucket. Asks nothing of the server.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names the variable; values are not repeated.
-pub(super) fn connect(
-    place: &Place,
-    variables: impl Iterator<Item = (String, String)>,
-) -> Result<Arc<dyn ObjectStore>, DatasetError> {
-    let settings: BTreeMap<String, String> = variables
-        .filter(|(name, value)| name.starts_with("AWS_") && !value.is_empty())
-        .collect();
-    check(place, &settings)?;
+pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, DatasetError> {
+    check(place, settings)?;
+    let client = AmazonS3ConfigKey::Client;
     let mut builder = AmazonS3Builder::new()
         .with_config(client(ClientConfigKey::Timeout), TIMEOUT)
         .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT);
-    for (name, value) in &settings {
+    for (name, value) in settings.iter() {
         // Variables that it does not know are other programs'.
         if let Ok(key) = name.to_ascii_lowercase().parse() {
             builder = builder.with_config(key, value);
         }
     }
-    let s3 = builder
+    builder
         .with_bucket_name(&place.bucket)
         .with_conditional_put(S3ConditionalPut::ETagMatch)
         // Objects are deleted one by one, and not every server knows the request for many.
         .with_disable_bulk_delete(true)
-        .with_retry(RetryConfig {
-            backoff: BackoffConfig {
-                init_backoff: Duration::from_millis(200),
-                max_backoff: Duration::from_secs(5),
-                base: 2.0,
-            },
-            max_retries: RETRIES,
-            retry_timeout: RETRY_TIMEOUT,
-        })
+        .with_retry(retries())
         .build()
         .map_err(|_| {
-            settings_error(
-                place,
-                format!(
-                    "the variables {} do not go together; check each against the documentation of S3",
-                    settings.keys().map(String::as_str).collect::<Vec<_>>().join(", ")
-                ),
-            )
-        })?;
-    Ok(Arc::new(LimitStore::new(s3, CONCURRENCY)))
-}
-
-fn client(key: ClientConfigKey) -> AmazonS3ConfigKey {
-    AmazonS3ConfigKey::Client(key)
-}
-
-fn settings_error(place: &Place, what: String) -> DatasetError {
-    DatasetError::StoreSettings {
-        url: format!("s3://{}", place.bucket),
-        what,
-    }
+            place.settings_error(format!(
+                "the variables {} do not go together; check each against the documentation of S3",
+                settings.names()
+            ))
+        })
 }
 
 /// What would otherwise fail late and with words that name no variable.
-fn check(place: &Place, settings: &BTreeMap<String, String>) -> Result<(), DatasetError> {
-    let wrong = |what: &str| Err(settings_error(place, what.into()));
-    let has = |name: &str| settings.contains_key(name);
-    let is = |name: &str| {
-        let value = settings.get(name).map(|v| v.to_ascii_lowercase());
-        matches!(value.as_deref(), Some("true" | "1" | "yes" | "y" | "on"))
-    };
-    let endpoint = ["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]
-        .into_iter()
-        .find(|name| has(name));
+fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
+    let wrong = |what: &str| Err(place.settings_error(what));
+    let endpoint = settings.first(&["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]);
     if let Some(name) = endpoint {
-        let url = &settings[name];
-        let (scheme, rest) = url.split_once("://").unwrap_or_default();
-        if !matches!(scheme, "http" | "https") || rest.is_empty() || rest.starts_with(['/', ':']) {
-            return wrong(&format!(
-                "{name}: expected the server's URL, e.g. https://s3.example.org:8333"
-            ));
-        }
-        if rest.contains(['@', '?', '#']) {
-            return wrong(&format!(
-                "{name}: expected a URL without user, password or query; keys belong in AWS_ACCESS_KEY_ID and \
-                 AWS_SECRET_ACCESS_KEY"
-            ));
-        }
-        if scheme == "http" && !is("AWS_ALLOW_HTTP") {
-            return wrong(&format!(
-                "{name} is an http:// URL: use https://, or set AWS_ALLOW_HTTP=true if the network between is trusted"
-            ));
-        }
+        settings.check_server(place, name, "https://s3.example.org:8333")?;
     }
-    if is("AWS_SKIP_SIGNATURE") {
+    if settings.is("AWS_SKIP_SIGNATURE") {
         return Ok(());
     }
-    match (has("AWS_ACCESS_KEY_ID"), has("AWS_SECRET_ACCESS_KEY")) {
+    match (
+        settings.has("AWS_ACCESS_KEY_ID"),
+        settings.has("AWS_SECRET_ACCESS_KEY"),
+    ) {
         (true, true) => return Ok(()),
         (true, false) => {
             return wrong("AWS_ACCESS_KEY_ID is set, but AWS_SECRET_ACCESS_KEY is not");
@@ -177,10 +61,10 @@ fn check(place: &Place, settings: &BTreeMap<String, String>) -> Result<(), Datas
         }
         (false, false) => {}
     }
-    let role = has("AWS_WEB_IDENTITY_TOKEN_FILE") && has("AWS_ROLE_ARN")
-        || has("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI")
-        || has("AWS_CONTAINER_CREDENTIALS_FULL_URI")
-        || has("AWS_METADATA_ENDPOINT");
+    let role = settings.has("AWS_WEB_IDENTITY_TOKEN_FILE") && settings.has("AWS_ROLE_ARN")
+        || settings.has("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI")
+        || settings.has("AWS_CONTAINER_CREDENTIALS_FULL_URI")
+        || settings.has("AWS_METADATA_ENDPOINT");
     // Amazon's own machines have roles that no variable tells of; they are asked when a request is made.
     if role || endpoint.is_none() {
         return Ok(());
@@ -201,46 +85,15 @@ mod tests {
         Place::parse("s3://farm/sets").unwrap().unwrap()
     }
 
-    fn error(variables: &[(&str, &str)]) -> String {
+    fn connected(variables: &[(&str, &str)]) -> Result<AmazonS3, DatasetError> {
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
-        let text = connect(&place(), variables).unwrap_err().to_string();
+        connect(&place(), &Settings::of(&place(), variables))
+    }
+
+    fn error(variables: &[(&str, &str)]) -> String {
+        let text = connected(variables).unwrap_err().to_string();
         assert!(!text.contains(SECRET) && !text.contains("keyid"), "{text}");
         text
-    }
-
-    #[test]
-    fn a_url_is_a_bucket_and_a_prefix() {
-        for (url, bucket, prefix) in [
-            ("s3://farm", "farm", ""),
-            ("s3://farm/", "farm", ""),
-            ("s3://my.farm-1/a/b c/", "my.farm-1", "a/b c"),
-        ] {
-            let place = Place::parse(url).unwrap().unwrap();
-            assert_eq!((&*place.bucket, place.prefix.as_ref()), (bucket, prefix));
-        }
-        assert_eq!(Place::parse("/local/s3:/x").unwrap(), None);
-        for url in [
-            "s3://",
-            "s3:///x",
-            "s3://Farm/x",
-            "s3://ab/x",
-            "s3://farm/../x",
-            "s3://farm/x?y",
-        ] {
-            let text = Place::parse(url).unwrap_err().to_string();
-            assert!(text.contains(url) && text.contains("prefix"), "{text}");
-        }
-    }
-
-    #[test]
-    fn keys_in_a_url_are_refused_and_not_repeated() {
-        let url = format!("s3://keyid:{SECRET}@farm/x");
-        let text = Place::parse(&url).unwrap_err().to_string();
-        assert!(text.contains("AWS_SECRET_ACCESS_KEY"), "{text}");
-        assert!(
-            !text.contains("keyid") && !text.contains("Secret+Key"),
-            "{text}"
-        );
     }
 
     #[test]
@@ -286,14 +139,12 @@ mod tests {
             &[("AWS_METADATA_ENDPOINT", "http://127.0.0.1:2")],
         ];
         for kind in kinds {
-            let all = kind.iter().chain([&endpoint, &("AWS_ALLOW_HTTP", "true")]);
-            let store = connect(&place(), all.map(|(n, v)| ((*n).into(), (*v).into()))).unwrap();
-            let shown = format!("{store} {store:?}");
-            assert!(shown.contains("AmazonS3(farm)"), "{shown}");
-            assert!(!format!("{store}").contains(SECRET));
+            let all = [kind, &[endpoint, ("AWS_ALLOW_HTTP", "true")]].concat();
+            let store = connected(&all).unwrap();
+            assert_eq!(store.to_string(), "AmazonS3(farm)");
         }
         assert!(
-            connect(&place(), std::iter::empty()).is_ok(),
+            connected(&[]).is_ok(),
             "an instance's role is not told by variables"
         );
     }

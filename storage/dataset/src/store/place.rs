@@ -1,0 +1,190 @@
+//! URLs of object stores: a service, a bucket (Azure: container) and a prefix in it.
+
+use object_store::path::Path;
+
+use crate::error::DatasetError;
+
+/// Whose protocol an object store speaks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Service {
+    /// Amazon's, and servers that speak it.
+    S3,
+    /// Google Cloud Storage.
+    Gcs,
+    /// Azure Blob Storage.
+    Azure,
+}
+
+impl Service {
+    const ALL: [Self; 3] = [Self::S3, Self::Gcs, Self::Azure];
+
+    /// Of a URL, and what stands behind its scheme.
+    pub(crate) fn of(url: &str) -> Option<(Self, &str)> {
+        let (scheme, rest) = url.split_once("://")?;
+        let service = Self::ALL.into_iter().find(|s| s.scheme() == scheme)?;
+        Some((service, rest))
+    }
+
+    /// Of its URLs.
+    pub(crate) fn scheme(self) -> &'static str {
+        match self {
+            Self::S3 => "s3",
+            Self::Gcs => "gs",
+            Self::Azure => "az",
+        }
+    }
+
+    /// How the variables that tell of it begin.
+    pub(super) fn variables(self) -> &'static str {
+        match self {
+            Self::S3 => "AWS_",
+            Self::Gcs => "GOOGLE_",
+            Self::Azure => "AZURE_",
+        }
+    }
+
+    /// Where keys and addresses belong, which are no part of a URL.
+    fn secrets(self) -> &'static str {
+        match self {
+            Self::S3 => "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL",
+            Self::Gcs => {
+                "GOOGLE_APPLICATION_CREDENTIALS or GOOGLE_SERVICE_ACCOUNT, and GOOGLE_BASE_URL"
+            }
+            Self::Azure => {
+                "AZURE_STORAGE_ACCOUNT_NAME, AZURE_STORAGE_ACCOUNT_KEY and AZURE_STORAGE_ENDPOINT"
+            }
+        }
+    }
+}
+
+/// A bucket and the prefix in it.
+#[derive(Debug, PartialEq)]
+pub(super) struct Place {
+    pub service: Service,
+    pub bucket: String,
+    pub prefix: Path,
+}
+
+impl Place {
+    /// `None` where `url` is not of an object store.
+    ///
+    /// # Errors
+    /// [`DatasetError::UnsupportedStore`] where it is, but cannot be used; what could be a secret is not repeated.
+    pub(super) fn parse(url: &str) -> Result<Option<Self>, DatasetError> {
+        let Some((service, rest)) = Service::of(url) else {
+            return Ok(None);
+        };
+        let scheme = service.scheme();
+        let bucket_or = match service {
+            Service::Azure => "container",
+            _ => "bucket",
+        };
+        let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+        let unsupported = |url: &str, what: String| DatasetError::UnsupportedStore {
+            url: url.into(),
+            what,
+        };
+        if bucket.contains(['@', ':']) {
+            let what = format!(
+                "expected {scheme}://{bucket_or}/prefix without keys or host; they belong in {}",
+                service.secrets()
+            );
+            return Err(unsupported(&format!("{scheme}://…"), what));
+        }
+        let marks: &[u8] = match service {
+            Service::Azure => b"-$",
+            _ => b"-._",
+        };
+        let letters = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || marks.contains(&b);
+        if !(3..=63).contains(&bucket.len()) || !bucket.bytes().all(letters) {
+            let marks = match service {
+                Service::Azure => "and '-'",
+                _ => "'-' and '.'",
+            };
+            let what = format!(
+                "expected {scheme}://{bucket_or}/prefix with a {bucket_or} name of 3 to 63 lower-case letters, digits, \
+                 {marks}, found {bucket:?}"
+            );
+            return Err(unsupported(url, what));
+        }
+        if prefix.contains(['?', '#']) {
+            return Err(unsupported(
+                url,
+                "expected a prefix without '?' and '#'".into(),
+            ));
+        }
+        let prefix = Path::parse(prefix.trim_end_matches('/'))
+            .map_err(|e| unsupported(url, format!("cannot be the prefix of object keys: {e}")))?;
+        Ok(Some(Self {
+            service,
+            bucket: bucket.into(),
+            prefix,
+        }))
+    }
+
+    /// What its variables do not say, or say wrongly.
+    pub(super) fn settings_error(&self, what: impl Into<String>) -> DatasetError {
+        DatasetError::StoreSettings {
+            url: format!("{}://{}", self.service.scheme(), self.bucket),
+            what: what.into(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECRET: &str = "Very/Secret+Key";
+
+    #[test]
+    fn a_url_is_a_service_a_bucket_and_a_prefix() {
+        for (url, service, bucket, prefix) in [
+            ("s3://farm", Service::S3, "farm", ""),
+            ("s3://farm/", Service::S3, "farm", ""),
+            ("s3://my.farm-1/a/b c/", Service::S3, "my.farm-1", "a/b c"),
+            ("gs://farm_2/sets", Service::Gcs, "farm_2", "sets"),
+            ("az://farm/sets/deep", Service::Azure, "farm", "sets/deep"),
+        ] {
+            let place = Place::parse(url).unwrap().unwrap();
+            assert_eq!(
+                (place.service, &*place.bucket, place.prefix.as_ref()),
+                (service, bucket, prefix)
+            );
+        }
+        assert_eq!(Place::parse("/local/s3:/x").unwrap(), None);
+        assert_eq!(Place::parse("file:///gs").unwrap(), None);
+        for url in [
+            "s3://",
+            "s3:///x",
+            "s3://Farm/x",
+            "s3://ab/x",
+            "s3://farm/../x",
+            "s3://farm/x?y",
+            "gs://",
+            "gs://Farm/x",
+            "az://my.farm/x",
+            "az://farm/x#y",
+        ] {
+            let text = Place::parse(url).unwrap_err().to_string();
+            assert!(text.contains(url) && text.contains("prefix"), "{text}");
+        }
+    }
+
+    #[test]
+    fn keys_in_a_url_are_refused_and_not_repeated() {
+        for (scheme, variable) in [
+            ("s3", "AWS_SECRET_ACCESS_KEY"),
+            ("gs", "GOOGLE_APPLICATION_CREDENTIALS"),
+            ("az", "AZURE_STORAGE_ACCOUNT_KEY"),
+        ] {
+            let url = format!("{scheme}://keyid:{SECRET}@farm/x");
+            let text = Place::parse(&url).unwrap_err().to_string();
+            assert!(text.contains(variable), "{text}");
+            assert!(
+                !text.contains("keyid") && !text.contains("Secret+Key"),
+                "{text}"
+            );
+        }
+    }
+}
