@@ -22,7 +22,7 @@ def zarr_store(location):
 
 
 def with_zarr(location, i):
-    group = zarr.open_group(zarr_store(location), mode="r")
+    group = zarr.open_group(zarr_store(location), mode="r", zarr_format=3)
     return group["transient"][i], group["scale"][i]
 
 

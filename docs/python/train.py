@@ -30,6 +30,9 @@ class RandomCrops(Transients):
     def __init__(self, location, side, **rest):
         super().__init__(location, arrays=("transient", "depth"), **rest)
         self.side = side
+        smallest = min(self._open()[1]["depth"].shape[1:])
+        if not 0 < side <= smallest:
+            raise ValueError(f"crop {side}: expected 1 to {smallest} pixels")
 
     def __getitem__(self, index):
         rng = numpy.random.default_rng()

@@ -177,7 +177,7 @@ class Transients:
         """Opened on first use in each process: neither threads nor connections cross from one to another."""
         if self._opened is None:
             place = Place(self.location)
-            self._opened = os.getpid(), place, zarr.open_group(place.zarr_store(), mode="r")
+            self._opened = os.getpid(), place, zarr.open_group(place.zarr_store(), mode="r", zarr_format=3)
         process, place, group = self._opened
         if process != os.getpid():
             raise RuntimeError("this process is a fork: start workers with multiprocessing_context='spawn'")
