@@ -134,7 +134,7 @@ async fn local_stores_are_opened_from_paths_and_file_urls() {
             "s3://Bucket/a",
             "a bucket name of 3 to 63 lower-case letters",
         ),
-        ("gs://bucket/a", "the scheme gs is not supported"),
+        ("ftp://host/a", "the scheme ftp is not supported"),
         ("file://host/a", "expected file:///absolute/path"),
         ("", "expected a path, found nothing"),
     ] {

@@ -301,7 +301,7 @@ async fn a_store_of_another_kind_or_a_data_set_of_another_gate_fails_the_task() 
     place.spec.render.bins = 41;
     let gate = place.complaint(1).await;
     assert!(gate.contains("gate.bins"), "{gate}");
-    place.spec.output.store = "gs://bucket".into();
+    place.spec.output.store = "ftp://host".into();
     assert!(place.complaint(1).await.contains("the scheme gs"));
 }
 
