@@ -302,7 +302,7 @@ async fn a_store_of_another_kind_or_a_data_set_of_another_gate_fails_the_task() 
     let gate = place.complaint(1).await;
     assert!(gate.contains("gate.bins"), "{gate}");
     place.spec.output.store = "ftp://host".into();
-    assert!(place.complaint(1).await.contains("the scheme gs"));
+    assert!(place.complaint(1).await.contains("the scheme ftp"));
 }
 
 #[tokio::test]
