@@ -116,12 +116,18 @@ proptest! {
             let record = key.contains("/recipes/") || key.contains("/snapshots/");
             let options = VerifyOptions { complete: true, ..VerifyOptions::new(VerifyMode::Full) };
             let report = opened.verify_with(&options).await.unwrap();
-            let mut named = report.problems.iter().filter(|p| p.object == *key);
+            let mut told = report.problems.iter().filter(|p| p.object == *key);
             if record && harm == 2 {
-                assert_eq!(named.next(), None);
+                assert_eq!(told.next(), None);
                 return;
             }
-            let problem = named.next().unwrap_or_else(|| panic!("{key} in {report:?}"));
+            // gzip has bits that mean nothing: those of its date, and those after the end of its stream.
+            if key.contains("/snapshots/") && harm == 0 && report.problems.iter().all(|p| p.object != *key) {
+                let found = opened.snapshot("v1").await.unwrap();
+                assert_eq!(found, named(&dataset, "v1").await, "a bit that means something was not named");
+                return;
+            }
+            let problem = told.next().unwrap_or_else(|| panic!("{key} in {report:?}"));
             match problem.scene {
                 Some(scene) => {
                     let restored = opened.restore(encoded(&opened, scene), None).await.unwrap();
