@@ -29,7 +29,7 @@ pub fn describe(report: &Report) -> String {
         (Kind::Profile, "profiles"),
         (
             Kind::Candidate,
-            "candidates for the default, all opened by zarr-python and tensorstore",
+            "candidates for the default, of codecs that zarr-python and tensorstore have",
         ),
         (
             Kind::Unreadable,

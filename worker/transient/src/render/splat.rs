@@ -36,22 +36,27 @@ pub(super) struct Splats {
 
 impl Splats {
     pub fn new(frame: &Frame) -> Self {
-        let pixels = frame.width as usize * frame.height as usize;
-        let narrow = pixels * frame.film.slots;
+        let [sum, square, alternating] = Self::lengths(frame);
         Self {
-            sum: vec![0.0; pixels * frame.film.pixel()],
-            square: vec![0.0; narrow],
-            alternating: vec![0.0; if frame.split { narrow } else { 0 }],
+            sum: vec![0.0; sum],
+            square: vec![0.0; square],
+            alternating: vec![0.0; alternating],
             all: (0.0, 0.0),
             passes: 0,
         }
     }
 
+    /// Of the three sums.
+    fn lengths(frame: &Frame) -> [usize; 3] {
+        let pixels = frame.width as usize * frame.height as usize;
+        let narrow = pixels * frame.film.slots;
+        let alternating = if frame.split { narrow } else { 0 };
+        [pixels * frame.film.pixel(), narrow, alternating]
+    }
+
     /// Whether they were made for such an image.
     pub fn fits(&self, frame: &Frame) -> bool {
-        let new = Self::new(frame);
-        let lengths = |s: &Self| [s.sum.len(), s.square.len(), s.alternating.len()];
-        lengths(self) == lengths(&new)
+        [self.sum.len(), self.square.len(), self.alternating.len()] == Self::lengths(frame)
     }
 
     /// `wave` more passes; returns the rays traced.
