@@ -193,6 +193,9 @@ impl Core {
                     entry.stage.forget(range);
                 }
                 self.lease_over(range);
+                // Our own last task was reported while this one seemed to be in hand still, and the house that has it may
+                // have finished it before ours: then it falls to us to find that the stage is over.
+                self.perhaps_over(stage, now_ms);
             }
         }
         self.receive(news.taken, now_ms);

@@ -614,6 +614,65 @@ fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
     });
 }
 
+/// Found by chaos: a worker takes its lease along to another house and ends it there, before its former house, which does
+/// not know yet, commits the last task that it has itself.
+#[test]
+fn a_stage_is_over_although_its_last_house_believed_to_hold_a_lease_that_ended_elsewhere() {
+    block_on(async {
+        let Some(url) = testing::postgres().await else {
+            return;
+        };
+        let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
+        for name in ["a", "b"] {
+            catalogs.push(Arc::new(PostgresCatalog::open(&url, name).await.unwrap()));
+        }
+        let mut world = World::new(catalogs, Some(url)).await;
+        let job = world.jobs[0];
+        let first = async |world: &World| {
+            let catalog = &world.houses[0].catalog;
+            catalog.job(job).await.unwrap().unwrap().stages[0]
+        };
+        world.connect(0, 0).await;
+        world.connect(1, 0).await;
+        world.act(&Op::Credit(1)).await;
+        world.beat(0).await;
+        world.flush(0).await;
+        world.beat(1).await;
+        // The other worker does all there is but its last lease.
+        loop {
+            world.act(&Op::Credit(0)).await;
+            world.flush(0).await;
+            if first(&world).await.counts.pending == 0 {
+                break;
+            }
+            let lease = world.workers[0].leases[0].clone();
+            let session = world.workers[0].session.unwrap().1;
+            for index in lease.lo..lease.hi {
+                world.finish(0, session, &lease, index).await;
+            }
+        }
+        for (worker, house) in [(1, 1), (0, 0)] {
+            if house == 1 {
+                world.connect(1, 1).await;
+            }
+            let lease = world.workers[worker].leases[0].clone();
+            let session = world.workers[worker].session.unwrap().1;
+            for index in lease.lo..lease.hi {
+                world.finish(house, session, &lease, index).await;
+            }
+        }
+        let counts = first(&world).await.counts;
+        assert_eq!((counts.done, counts.leased), (TASKS, 0), "{counts:?}");
+        world.beat(0).await;
+        world.flush(0).await;
+        let state = first(&world).await.state;
+        assert_eq!(state, picofarm_proto::model::StageState::Done);
+        for house in &world.houses {
+            house.catalog.close().await;
+        }
+    });
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, max_shrink_iters: 200, ..ProptestConfig::default() })]
 
