@@ -1,0 +1,54 @@
+//! What can go wrong here.
+
+/// An error of the model runtime.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// A setting that cannot be used; says what was expected.
+    #[error("{field}: {what}")]
+    Invalid {
+        /// The setting.
+        field: String,
+        /// What is wrong, what was expected, how to mend it.
+        what: String,
+    },
+    /// Weights or a checkpoint that do not belong to this network, or are damaged.
+    #[error("{what}")]
+    Weights {
+        /// What is wrong, and with which tensor.
+        what: String,
+    },
+    /// A scene that could not be read.
+    #[error("scene {scene}: {source}")]
+    Scene {
+        /// Its index among the scenes given.
+        scene: usize,
+        /// Why.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// Training produced a number that is none.
+    #[error(
+        "step {step}: {what}; the last whole checkpoint is kept. Lower optimise.rate, or use precision = \"f32\""
+    )]
+    NotFinite {
+        /// Optimiser step, from 0.
+        step: u64,
+        /// Which quantity, and where it was first seen.
+        what: String,
+    },
+}
+
+impl ModelError {
+    /// An unusable setting.
+    pub fn invalid(field: impl Into<String>, what: impl Into<String>) -> Self {
+        Self::Invalid {
+            field: field.into(),
+            what: what.into(),
+        }
+    }
+
+    /// Unusable weights.
+    pub fn weights(what: impl Into<String>) -> Self {
+        Self::Weights { what: what.into() }
+    }
+}

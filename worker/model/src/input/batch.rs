@@ -1,0 +1,218 @@
+//! Visits to scenes, and batches of what was seen there.
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+use super::{DEPTH_SCALE_M, Question, ShadowVariant, Task, intensity, planes};
+use crate::{ModelError, net::Input, scene::Scene};
+
+/// How a scene is looked at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Visit {
+    /// The spot in question, where a network is asked spot by spot.
+    pub spot: usize,
+    /// Left and right change places.
+    pub flip_columns: bool,
+    /// Top and bottom change places.
+    pub flip_rows: bool,
+}
+
+/// What was seen and what is true: (N, channels, H, W) each.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Batch {
+    /// Scenes.
+    pub images: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// Dense channels.
+    pub dense: Vec<f32>,
+    /// Bins of the one-hot channels, -1 = none; empty where the network has none.
+    pub one_hot: Vec<i32>,
+    /// What the network should say.
+    pub target: Vec<f32>,
+}
+
+/// Adds a visit to a batch. `depth_m` is what two-bounce times follow from; the truth where it is none.
+///
+/// # Errors
+/// [`ModelError::Invalid`] where the scene has another size than the batch, or not what the question needs.
+pub fn example(
+    batch: &mut Batch,
+    question: &Question,
+    scene: &Scene,
+    depth_m: Option<&[f32]>,
+    visit: Visit,
+) -> Result<(), ModelError> {
+    check(batch, question, scene)?;
+    (batch.height, batch.width) = (scene.height, scene.width);
+    batch.images += 1;
+    let pixels = scene.pixels();
+    let (channels, _, _) = question.channels();
+    let at = batch.dense.len();
+    batch.dense.resize(at + channels * pixels, 0.0);
+    let dense = &mut batch.dense[at..];
+    let seen = if question.intensity_only {
+        intensity(scene, &mut dense[..pixels]);
+        1
+    } else {
+        let room = &mut dense[..question.bins * pixels];
+        planes(scene, question.bins, question.normalise, room);
+        question.bins
+    };
+    if question.by_spot() {
+        match question.variant {
+            ShadowVariant::Concat | ShadowVariant::Difference => {
+                let tof = match depth_m {
+                    Some(depth_m) => scene.tof_of(visit.spot, depth_m),
+                    None => scene.tof(visit.spot),
+                };
+                let bins = tof.iter().map(|t| bin(scene, question.bins, *t));
+                if question.variant == ShadowVariant::Concat {
+                    let from = batch.one_hot.len();
+                    batch.one_hot.extend(bins);
+                    flip(&mut batch.one_hot[from..], scene.width, visit);
+                } else {
+                    for (p, bin) in bins.enumerate() {
+                        if let Ok(b) = usize::try_from(bin) {
+                            let m = &mut dense[b * pixels + p];
+                            *m = (1.0 - *m).abs();
+                        }
+                    }
+                }
+            }
+            ShadowVariant::Index => {
+                let from = (seen + visit.spot) * pixels;
+                dense[from..from + pixels].fill(1.0);
+            }
+            ShadowVariant::All => {}
+        }
+    }
+    for plane in dense.chunks_exact_mut(pixels) {
+        flip(plane, scene.width, visit);
+    }
+    let at = batch.target.len();
+    match question.task {
+        Task::Tof => batch.target.extend(scene.depth_m.iter().map(depth_target)),
+        Task::Specular => {
+            let mirrors = scene.specular.iter().map(|s| f32::from(*s));
+            batch.target.extend(mirrors);
+        }
+        Task::Shadow => {
+            let spots = match question.by_spot() {
+                true => visit.spot..visit.spot + 1,
+                false => 0..question.spots,
+            };
+            let lit = &scene.lit[spots.start * pixels..spots.end * pixels];
+            batch.target.extend(lit.iter().map(|lit| f32::from(*lit)));
+        }
+    }
+    for plane in batch.target[at..].chunks_exact_mut(pixels) {
+        flip(plane, scene.width, visit);
+    }
+    Ok(())
+}
+
+/// What a depth network should say: z over [`DEPTH_SCALE_M`], within 0..1; 1 where nothing is seen.
+fn depth_target(z: &f32) -> f32 {
+    let scaled = z / DEPTH_SCALE_M;
+    if scaled.is_finite() {
+        scaled.clamp(0.0, 1.0)
+    } else {
+        1.0
+    }
+}
+
+/// The bin of a path length, -1 outside of the gate.
+fn bin(scene: &Scene, bins: usize, path_m: f32) -> i32 {
+    let stored = ((f64::from(path_m) - scene.first_m) / scene.bin_width_m).floor();
+    if !(stored >= 0.0 && stored < scene.bins as f64) {
+        return -1;
+    }
+    (stored as usize / (scene.bins / bins)) as i32
+}
+
+fn flip<T>(plane: &mut [T], width: usize, visit: Visit) {
+    if visit.flip_columns {
+        plane.chunks_exact_mut(width).for_each(<[T]>::reverse);
+    }
+    if visit.flip_rows {
+        plane.reverse();
+        plane.chunks_exact_mut(width).for_each(<[T]>::reverse);
+    }
+}
+
+fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelError> {
+    let pixels = scene.pixels();
+    let size = (scene.height, scene.width);
+    if batch.images > 0 && (batch.height, batch.width) != size {
+        let what = format!(
+            "one scene has {}×{} pixels, another {}×{}; a batch needs one size",
+            batch.height, batch.width, scene.height, scene.width
+        );
+        return Err(ModelError::invalid("source", what));
+    }
+    if scene.bins % question.bins != 0 {
+        let what = format!(
+            "{} does not divide the {} bins of the data set; give a divisor, or 0 for all",
+            question.bins, scene.bins
+        );
+        return Err(ModelError::invalid("input.bins", what));
+    }
+    let wanted = [
+        ("histogram", scene.histogram.len(), pixels * scene.bins),
+        ("depth", scene.depth_m.len(), pixels),
+        (
+            "specular mask",
+            scene.specular.len(),
+            match question.task {
+                Task::Specular => pixels,
+                _ => scene.specular.len(),
+            },
+        ),
+        (
+            "visibility",
+            scene.lit.len(),
+            match question.task {
+                Task::Shadow => pixels * question.spots,
+                _ => scene.lit.len(),
+            },
+        ),
+    ];
+    for (name, there, needed) in wanted {
+        if there != needed {
+            let what = format!(
+                "a scene's {name} has {there} values, not {needed}; scenes must have the same size and spots"
+            );
+            return Err(ModelError::invalid("source", what));
+        }
+    }
+    Ok(())
+}
+
+impl Batch {
+    /// On a device: what the network sees.
+    pub fn input(&self, device: &Device) -> Input {
+        let (n, h, w) = (self.images, self.height, self.width);
+        let channels = self.dense.len() / (n * h * w);
+        let dense = TensorData::new(self.dense.clone(), [n, channels, h, w]);
+        let one_hot = (!self.one_hot.is_empty()).then(|| {
+            let bins = TensorData::new(self.one_hot.clone(), [n, h, w]);
+            Tensor::<3, Int>::from_data(bins, device)
+        });
+        Input {
+            dense: Tensor::from_data(dense, device),
+            one_hot,
+        }
+    }
+
+    /// On a device: what it should say.
+    pub fn truth(&self, device: &Device) -> Tensor<4> {
+        let (n, h, w) = (self.images, self.height, self.width);
+        let channels = self.target.len() / (n * h * w);
+        Tensor::from_data(
+            TensorData::new(self.target.clone(), [n, channels, h, w]),
+            device,
+        )
+    }
+}

@@ -1,0 +1,143 @@
+//! From scenes to what networks see and what they should say: normalisation, rebinning, shadow transients, flips.
+//! Formulas are those of Shoot-Bounce-3D: section 4, appendices A.1 and B.
+
+mod batch;
+mod normalise;
+
+use serde::{Deserialize, Serialize};
+
+pub use batch::{Batch, Visit, example};
+pub use normalise::{intensity, planes};
+
+use crate::{ModelError, net::NetSpec};
+
+/// What a network learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Task {
+    /// Depth, from which two-bounce times follow.
+    Tof,
+    /// Which pixels a spot lights.
+    Shadow,
+    /// Which pixels are mirrors.
+    Specular,
+}
+
+/// How a shadow network is asked for a spot (A.1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ShadowVariant {
+    /// concat(m, H_i): the histogram and the spot's two-bounce times as a one-hot histogram.
+    #[default]
+    Concat,
+    /// |H_i − m|.
+    Difference,
+    /// m, and a plane for each spot, all ones for the spot in question.
+    Index,
+    /// m alone; one output a spot.
+    All,
+}
+
+/// How histograms are scaled (appendix B).
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Normalise {
+    /// (h − min)/(max − min) of each pixel; an all-equal histogram gives zeros.
+    #[default]
+    MinMax,
+    /// clip((log10(h + 1e-8) + 8)/(log10 h_max + 8), 0, 1), with the greatest value of the data set.
+    Log {
+        /// Greatest value in the data set.
+        greatest: f32,
+    },
+}
+
+/// Depths are divided by this, metres.
+pub const DEPTH_SCALE_M: f32 = 4.5;
+
+/// What is asked of a network, and how.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Question {
+    /// What.
+    pub task: Task,
+    /// For shadows: how.
+    #[serde(default)]
+    pub variant: ShadowVariant,
+    /// How histograms are scaled.
+    #[serde(default)]
+    pub normalise: Normalise,
+    /// Bins after rebinning: a divisor of the stored histogram's.
+    pub bins: usize,
+    /// The time-integrated image instead of histograms.
+    #[serde(default)]
+    pub intensity_only: bool,
+    /// Spots of each scene; for shadows.
+    #[serde(default)]
+    pub spots: usize,
+}
+
+impl Question {
+    /// Dense channels, one-hot channels, outputs of a network for it.
+    pub fn channels(&self) -> (usize, usize, usize) {
+        let seen = if self.intensity_only { 1 } else { self.bins };
+        match (self.task, self.variant) {
+            (Task::Tof | Task::Specular, _) | (Task::Shadow, ShadowVariant::Difference) => {
+                (seen, 0, 1)
+            }
+            (Task::Shadow, ShadowVariant::Concat) => (seen, self.bins, 1),
+            (Task::Shadow, ShadowVariant::Index) => (seen + self.spots, 0, 1),
+            (Task::Shadow, ShadowVariant::All) => (seen, 0, self.spots),
+        }
+    }
+
+    /// What a combined checkpoint of the released code calls the network for it.
+    pub fn part(&self) -> &'static str {
+        match self.task {
+            Task::Shadow => "shadow",
+            Task::Tof | Task::Specular => "depth",
+        }
+    }
+
+    /// Whether a scene is visited once for each spot.
+    pub fn by_spot(&self) -> bool {
+        self.task == Task::Shadow && self.variant != ShadowVariant::All
+    }
+
+    /// Whether mirrored scenes may be shown: not where spots are known by their number, because a mirrored spot is at
+    /// another spot's place.
+    pub fn may_flip(&self) -> bool {
+        let numbered = matches!(self.variant, ShadowVariant::Index | ShadowVariant::All);
+        self.task != Task::Shadow || !numbered
+    }
+
+    /// Checks it against itself and the network.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] naming the field.
+    pub fn check(&self, net: &NetSpec) -> Result<(), ModelError> {
+        if self.bins == 0 {
+            return Err(ModelError::invalid("input.bins", "0 bins; give at least 1"));
+        }
+        if self.task == Task::Shadow && self.spots == 0 {
+            let what = "the data set has no spots; shadows are asked spot by spot";
+            return Err(ModelError::invalid("shadow", what));
+        }
+        if self.task == Task::Shadow
+            && self.variant == ShadowVariant::Difference
+            && self.intensity_only
+        {
+            let what = "\"difference\" needs histograms; use \"index\" with input.intensity_only";
+            return Err(ModelError::invalid("shadow.variant", what));
+        }
+        let (dense, one_hot, outputs) = self.channels();
+        if (net.dense, net.one_hot, net.outputs) != (dense, one_hot, outputs) {
+            let what = format!(
+                "the network has {} + {} inputs and {} outputs, the task wants {dense} + {one_hot} and {outputs}",
+                net.dense, net.one_hot, net.outputs
+            );
+            return Err(ModelError::invalid("net", what));
+        }
+        Ok(())
+    }
+}

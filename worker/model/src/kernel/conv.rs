@@ -1,0 +1,366 @@
+//! Convolution and its input gradient: a shifted matrix product over padded bands, without im2col.
+//!
+//! A task is a band of rows and a group of output channels. It packs a chunk of input channels into padded
+//! planes that stay in the second-level cache and adds the chunk to its outputs, tile by tile: eight output
+//! channels by three units of sixteen pixels. Each output is one chain of fused multiply-adds over input
+//! channels, then taps, whatever the tile, chunk or task.
+
+use rayon::prelude::*;
+
+use super::plane::{Band, Grid, Unit, split};
+use super::simd::{Kernels, LANES, Lanes, Op, shifted};
+
+/// Input channels packed at a time.
+const CHUNK: usize = 32;
+/// Output channels of a block of packed weights.
+const BLOCK: usize = 8;
+/// Pixels of a band.
+const BAND: usize = 1024;
+
+/// A convolution of stride 1: input (images, inputs, height, width), output (images, outputs, height,
+/// width), weights (outputs, inputs, k, k), all contiguous in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConvShape {
+    /// Images in the batch.
+    pub images: usize,
+    /// Input channels.
+    pub inputs: usize,
+    /// Output channels.
+    pub outputs: usize,
+    /// Rows of a plane.
+    pub height: usize,
+    /// Pixels of a row.
+    pub width: usize,
+}
+
+impl ConvShape {
+    /// Values of the input.
+    pub fn input_len(&self) -> usize {
+        self.images * self.inputs * self.height * self.width
+    }
+
+    /// Values of the output.
+    pub fn output_len(&self) -> usize {
+        self.images * self.outputs * self.height * self.width
+    }
+
+    /// Values of the weights of a K×K kernel.
+    pub fn weight_len(&self, k: usize) -> usize {
+        self.outputs * self.inputs * k * k
+    }
+
+    /// The planes with the padding of a K×K kernel.
+    pub(super) fn grid(&self, k: usize) -> Grid {
+        Grid {
+            images: self.images,
+            height: self.height,
+            width: self.width,
+            pad: k / 2,
+        }
+    }
+
+    /// The same with input and output exchanged.
+    fn swapped(&self) -> Self {
+        Self {
+            inputs: self.outputs,
+            outputs: self.inputs,
+            ..*self
+        }
+    }
+}
+
+impl Kernels {
+    /// 3×3 convolution with zero padding 1: writes all of `out`.
+    pub fn conv3x3(self, s: &ConvShape, x: &[f32], w: &[f32], out: &mut [f32]) {
+        self.convolve::<3>(s, x, w, None, out);
+    }
+
+    /// Gradient of [`Kernels::conv3x3`] by its input, from `dy` (as the output): writes all of `dx`.
+    pub fn conv3x3_input_grad(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
+        self.input_grad::<3>(s, dy, w, dx);
+    }
+
+    /// 1×1 convolution with an optional bias (one value an output channel): writes all of `out`.
+    pub fn conv1x1(
+        self,
+        s: &ConvShape,
+        x: &[f32],
+        w: &[f32],
+        bias: Option<&[f32]>,
+        out: &mut [f32],
+    ) {
+        self.convolve::<1>(s, x, w, bias, out);
+    }
+
+    /// Gradient of [`Kernels::conv1x1`] by its input: writes all of `dx`.
+    pub fn conv1x1_input_grad(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
+        self.input_grad::<1>(s, dy, w, dx);
+    }
+
+    fn convolve<const K: usize>(
+        self,
+        s: &ConvShape,
+        x: &[f32],
+        w: &[f32],
+        bias: Option<&[f32]>,
+        out: &mut [f32],
+    ) {
+        assert_eq!(x.len(), s.input_len(), "input length");
+        assert_eq!(w.len(), s.weight_len(K), "weight length");
+        assert_eq!(out.len(), s.output_len(), "output length");
+        let packed = pack_weights(s, K * K, w);
+        self.product::<K>(s, x, &packed, bias, out);
+    }
+
+    fn input_grad<const K: usize>(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
+        assert_eq!(dy.len(), s.output_len(), "output gradient length");
+        assert_eq!(w.len(), s.weight_len(K), "weight length");
+        assert_eq!(dx.len(), s.input_len(), "input gradient length");
+        let packed = pack_transposed(s, K * K, w);
+        self.product::<K>(&s.swapped(), dy, &packed, None, dx);
+    }
+
+    /// The product with packed weights, `[outputs / 8][inputs][K·K][8]`.
+    fn product<const K: usize>(
+        self,
+        s: &ConvShape,
+        x: &[f32],
+        packed: &[f32],
+        bias: Option<&[f32]>,
+        out: &mut [f32],
+    ) {
+        if let Some(b) = bias {
+            assert_eq!(b.len(), s.outputs, "bias length");
+        }
+        let grid = s.grid(K);
+        let bands = grid.bands(BAND);
+        if bands.is_empty() || s.outputs == 0 {
+            return;
+        }
+        // How the work is shared out changes no bit.
+        let wanted = (4 * rayon::current_num_threads()).div_ceil(bands.len());
+        let blocks = s.outputs.div_ceil(BLOCK);
+        let group = blocks.div_ceil(wanted).max(blocks.min(2)) * BLOCK;
+        let groups = s.outputs.div_ceil(group);
+        let parts = split(grid, s.outputs, group, &bands, out);
+        parts
+            .into_par_iter()
+            .enumerate()
+            .for_each_init(Vec::new, |scratch, (i, mut pieces)| {
+                let band = &bands[i / groups];
+                let first = i % groups * group;
+                let channels = group.min(s.outputs - first);
+                let units = grid.units(band);
+                let plane = grid.packed_len(band);
+                scratch.resize(plane * CHUNK, 0.0);
+                let mut chunk = 0;
+                loop {
+                    let inputs = CHUNK.min(s.inputs - chunk);
+                    for c in 0..inputs {
+                        let image = |i: usize| {
+                            let at = (i * s.inputs + chunk + c) * grid.pixels();
+                            &x[at..at + grid.pixels()]
+                        };
+                        grid.pack(band, image, &mut scratch[c * plane..(c + 1) * plane]);
+                    }
+                    self.run(Chunk::<K> {
+                        x: scratch,
+                        inputs,
+                        plane,
+                        row: grid.stride(),
+                        units: &units,
+                        weights: &packed[(first / BLOCK * s.inputs + chunk) * K * K * BLOCK..],
+                        block: s.inputs * K * K * BLOCK,
+                        channels,
+                        bias: bias.map(|b| &b[first..]),
+                        fresh: chunk == 0,
+                        out: &mut pieces,
+                    });
+                    chunk += inputs;
+                    if chunk >= s.inputs {
+                        break;
+                    }
+                }
+            });
+    }
+}
+
+/// One chunk of input channels added to one task's outputs.
+struct Chunk<'a, 'b, const K: usize> {
+    x: &'a [f32],
+    inputs: usize,
+    plane: usize,
+    row: usize,
+    units: &'a [Unit],
+    weights: &'a [f32],
+    /// Distance of two blocks of weights.
+    block: usize,
+    channels: usize,
+    bias: Option<&'a [f32]>,
+    /// True for the first chunk: outputs start from the bias.
+    fresh: bool,
+    /// Image by image, channel by channel.
+    out: &'a mut [&'b mut [f32]],
+}
+
+impl<const K: usize> Op for Chunk<'_, '_, K> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(mut self) {
+        let mut u = 0;
+        while u < self.units.len() {
+            let left = self.units.len() - u;
+            if L::WIDE {
+                // Four units left go as two pairs.
+                let n = if left == 4 { 2 } else { left.min(3) };
+                for b in 0..self.channels.div_ceil(BLOCK) {
+                    match n {
+                        3 => self.tile::<L, 8, 3>(b, 0, u),
+                        2 => self.tile::<L, 8, 2>(b, 0, u),
+                        _ => self.tile::<L, 8, 1>(b, 0, u),
+                    }
+                }
+                u += n;
+            } else {
+                for b in 0..self.channels.div_ceil(BLOCK) {
+                    self.tile::<L, 4, 1>(b, 0, u);
+                    self.tile::<L, 4, 1>(b, 4, u);
+                }
+                u += 1;
+            }
+        }
+    }
+}
+
+impl<const K: usize> Chunk<'_, '_, K> {
+    /// One register tile: `M` channels from `half` on of block `b`, `V` units from `u` on.
+    #[inline(always)]
+    fn tile<L: Lanes, const M: usize, const V: usize>(&mut self, b: usize, half: usize, u: usize) {
+        let first = b * BLOCK + half;
+        let valid = M.min(self.channels.saturating_sub(first));
+        let mut acc = [[L::splat(0.0); V]; M];
+        if !self.fresh {
+            for (m, acc) in acc.iter_mut().enumerate().take(valid) {
+                for (v, acc) in acc.iter_mut().enumerate() {
+                    *acc = self.fetch(&self.units[u + v], first + m);
+                }
+            }
+        } else if let Some(bias) = self.bias {
+            for (m, acc) in acc.iter_mut().enumerate().take(valid) {
+                *acc = [L::splat(bias[first + m]); V];
+            }
+        }
+        let mut at = [0; V];
+        for (v, at) in at.iter_mut().enumerate() {
+            *at = self.units[u + v].at;
+        }
+        let acc = shifted::<L, M, V, K>(
+            self.x,
+            at,
+            (self.inputs, self.plane, self.row),
+            &self.weights[b * self.block + half..],
+            acc,
+        );
+        for m in 0..M {
+            if m < valid {
+                for v in 0..V {
+                    self.keep(acc[m][v], u + v, first + m);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn fetch<L: Lanes>(&self, unit: &Unit, channel: usize) -> L {
+        if let [run] = &unit.runs[..]
+            && run.len == LANES
+        {
+            return L::load(&self.out[run.image * self.channels + channel][run.pixel..]);
+        }
+        let mut t = [0.0; LANES];
+        for run in &unit.runs {
+            let from = &self.out[run.image * self.channels + channel];
+            t[run.lane..run.lane + run.len].copy_from_slice(&from[run.pixel..run.pixel + run.len]);
+        }
+        L::load(&t)
+    }
+
+    #[inline(always)]
+    fn keep<L: Lanes>(&mut self, lanes: L, u: usize, channel: usize) {
+        let unit = &self.units[u];
+        if let [run] = &unit.runs[..]
+            && run.len == LANES
+        {
+            let to = &mut self.out[run.image * self.channels + channel];
+            return lanes.store(&mut to[run.pixel..]);
+        }
+        let t = lanes.array();
+        for run in &unit.runs {
+            let to = &mut self.out[run.image * self.channels + channel];
+            to[run.pixel..run.pixel + run.len].copy_from_slice(&t[run.lane..run.lane + run.len]);
+        }
+    }
+}
+
+/// Weights as `[outputs / 8][inputs][taps][8]`, missing channels zero.
+fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Vec<f32> {
+    let depth = s.inputs * taps;
+    let mut packed = vec![0.0; s.outputs.div_ceil(BLOCK) * depth * BLOCK];
+    if depth == 0 {
+        return packed;
+    }
+    packed
+        .par_chunks_mut(depth * BLOCK)
+        .zip(w.par_chunks(depth * BLOCK))
+        .for_each(|(to, from)| {
+            if from.len() < depth * BLOCK {
+                for (m, row) in from.chunks_exact(depth).enumerate() {
+                    for (i, x) in row.iter().enumerate() {
+                        to[i * BLOCK + m] = *x;
+                    }
+                }
+                return;
+            }
+            for (i, to) in to.chunks_exact_mut(BLOCK).enumerate() {
+                for (m, to) in to.iter_mut().enumerate() {
+                    *to = from[m * depth + i];
+                }
+            }
+        });
+    packed
+}
+
+/// Weights of the input gradient, transposed and with the taps in reverse: `[inputs / 8][outputs][taps][8]`.
+fn pack_transposed(s: &ConvShape, taps: usize, w: &[f32]) -> Vec<f32> {
+    let depth = s.outputs * taps;
+    let mut packed = vec![0.0; s.inputs.div_ceil(BLOCK) * depth * BLOCK];
+    if depth == 0 {
+        return packed;
+    }
+    packed
+        .par_chunks_mut(depth * BLOCK)
+        .enumerate()
+        .for_each(|(b, to)| {
+            let first = b * BLOCK;
+            let valid = BLOCK.min(s.inputs - first);
+            for (o, to) in to.chunks_exact_mut(taps * BLOCK).enumerate() {
+                let at = (o * s.inputs + first) * taps;
+                let from = &w[at..at + valid * taps];
+                for (m, from) in from.chunks_exact(taps).enumerate() {
+                    for (t, x) in from.iter().rev().enumerate() {
+                        to[t * BLOCK + m] = *x;
+                    }
+                }
+            }
+        });
+    packed
+}
+
+/// The band of all rows of one image.
+pub(super) fn image_band(grid: Grid, image: usize) -> Band {
+    Band {
+        images: image..image + 1,
+        rows: 0..grid.height,
+    }
+}

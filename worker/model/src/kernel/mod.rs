@@ -1,0 +1,25 @@
+//! CPU kernels of the model runtime: 3×3 and 1×1 convolutions, batch norm with ReLU, pooling, AdamW, and
+//! the convolution over one-hot bins; all on `f32` slices in NCHW order.
+//!
+//! **The same bits everywhere**: every result is a fixed-order chain of fused multiply-adds or a fixed tree
+//! over a fixed number of virtual lanes; neither the number of threads nor the instruction set
+//! ([`Isa`]) changes a bit. The portable path uses [`f32::mul_add`], which is slow without hardware and equal.
+//!
+//! All functions are methods of [`Kernels`], which holds the instruction set. They panic where a slice's
+//! length disagrees with the shape: shapes are the caller's invariant.
+
+mod adam;
+mod conv;
+mod grad;
+mod norm;
+mod onehot;
+mod plane;
+mod pool;
+mod simd;
+
+pub use adam::AdamW;
+pub use conv::ConvShape;
+pub use norm::{BatchNorm, NormShape};
+pub use onehot::OneHotShape;
+pub use pool::PlaneShape;
+pub use simd::{Isa, Kernels};

@@ -1,0 +1,193 @@
+//! Planes with shared zero padding: bands of rows, the vector units that cover them, and their packing.
+//!
+//! A padded row holds one zero and then the row; its right neighbour is the next row's zero. Padded images
+//! follow each other with one zero row between them, so that a stencil tap is one constant offset in a
+//! whole band, and one unit of sixteen lanes may cover several short rows or images.
+
+use std::ops::Range;
+
+use super::simd::LANES;
+
+/// Images of one size and the padding of the stencil that runs over them (0 or 1).
+#[derive(Clone, Copy)]
+pub(super) struct Grid {
+    pub images: usize,
+    pub height: usize,
+    pub width: usize,
+    pub pad: usize,
+}
+
+/// Whole images, or some rows of one image.
+#[derive(Clone)]
+pub(super) struct Band {
+    pub images: Range<usize>,
+    pub rows: Range<usize>,
+}
+
+/// Sixteen neighbouring positions of a packed band and the pixels among them.
+pub(super) struct Unit {
+    /// Offset of the first tap of the first lane in a packed plane.
+    pub at: usize,
+    /// The pixels among the lanes.
+    pub runs: Vec<Run>,
+}
+
+/// Lanes that are neighbouring pixels.
+pub(super) struct Run {
+    pub lane: usize,
+    pub len: usize,
+    /// Image, counted in the band.
+    pub image: usize,
+    /// First pixel, counted in the band's rows of that image.
+    pub pixel: usize,
+}
+
+impl Grid {
+    /// Pixels of one image.
+    pub fn pixels(self) -> usize {
+        self.height * self.width
+    }
+
+    /// Length of a packed row.
+    pub fn stride(self) -> usize {
+        self.width + self.pad
+    }
+
+    /// Cuts all rows into bands of about `pixels` pixels.
+    pub fn bands(self, pixels: usize) -> Vec<Band> {
+        let all = self.pixels();
+        if all == 0 || self.images == 0 {
+            return Vec::new();
+        }
+        let mut bands = Vec::new();
+        if all <= pixels {
+            let whole = (pixels / all).min(self.images);
+            let count = self.images.div_ceil(whole);
+            let whole = self.images.div_ceil(count);
+            for first in (0..self.images).step_by(whole) {
+                bands.push(Band {
+                    images: first..(first + whole).min(self.images),
+                    rows: 0..self.height,
+                });
+            }
+            return bands;
+        }
+        let rows = (pixels / self.width).max(1);
+        let rows = self.height.div_ceil(self.height.div_ceil(rows));
+        for image in 0..self.images {
+            for first in (0..self.height).step_by(rows) {
+                bands.push(Band {
+                    images: image..image + 1,
+                    rows: first..(first + rows).min(self.height),
+                });
+            }
+        }
+        bands
+    }
+
+    /// Packed rows of a band, with the padding above and below.
+    fn packed_rows(self, band: &Band) -> usize {
+        band.images.len() * (band.rows.len() + self.pad) + self.pad
+    }
+
+    /// Length of one packed plane of a band, with room for the last unit's lanes.
+    pub fn packed_len(self, band: &Band) -> usize {
+        (self.packed_rows(band) * self.stride() + self.pad + LANES).next_multiple_of(LANES)
+    }
+
+    /// The units that cover a band: exact pieces of rows where the width allows it, else runs over the
+    /// packed plane that skip what padding they can.
+    pub fn units(self, band: &Band) -> Vec<Unit> {
+        let (h, w, stride) = (band.rows.len(), self.width, self.stride());
+        let mut units: Vec<Unit> = Vec::new();
+        let mut end = 0;
+        for image in 0..band.images.len() {
+            for y in 0..h {
+                let row = (image * (h + self.pad) + y) * stride;
+                let mut x = 0;
+                while x < w {
+                    let position = row + x;
+                    if position >= end {
+                        units.push(Unit {
+                            at: position,
+                            runs: Vec::new(),
+                        });
+                        end = position + LANES;
+                    }
+                    let len = (end - position).min(w - x);
+                    let unit = units.last_mut().expect("a unit was started");
+                    unit.runs.push(Run {
+                        lane: position - unit.at,
+                        len,
+                        image,
+                        pixel: y * w + x,
+                    });
+                    x += len;
+                }
+            }
+        }
+        units
+    }
+
+    /// Packs one plane of a band: `image(i)` is the plane of image `i`. `to` has [`Grid::packed_len`] values.
+    pub fn pack<'a>(self, band: &Band, image: impl Fn(usize) -> &'a [f32], to: &mut [f32]) {
+        let (w, stride, pad) = (self.width, self.stride(), self.pad);
+        let mut at = 0;
+        for i in band.images.clone() {
+            let plane = image(i);
+            if pad == 0 {
+                let from = &plane[band.rows.start * w..band.rows.end * w];
+                to[at..at + from.len()].copy_from_slice(from);
+                at += from.len();
+                continue;
+            }
+            let first = i == band.images.start;
+            let above = usize::from(first);
+            // The row above is packed for the first image only: later ones share the zero row before them.
+            for y in 1 - above..band.rows.len() + 2 {
+                let y = band.rows.start + y;
+                if y == 0 || y > self.height {
+                    to[at..at + stride].fill(0.0);
+                } else {
+                    to[at] = 0.0;
+                    to[at + 1..at + stride].copy_from_slice(&plane[(y - 1) * w..y * w]);
+                }
+                at += stride;
+            }
+        }
+        to[at..].fill(0.0);
+    }
+}
+
+/// Hands out the pieces of an NCHW tensor: `parts[band · groups + group]` gets, image by image of the band,
+/// the band's rows of each channel of the group.
+pub(super) fn split<'a>(
+    grid: Grid,
+    channels: usize,
+    group: usize,
+    bands: &[Band],
+    tensor: &'a mut [f32],
+) -> Vec<Vec<&'a mut [f32]>> {
+    let groups = channels.div_ceil(group);
+    let mut parts: Vec<Vec<&mut [f32]>> = Vec::new();
+    parts.resize_with(bands.len() * groups, Vec::new);
+    let mut first = 0;
+    let mut planes = tensor.chunks_exact_mut(grid.pixels().max(1));
+    for image in 0..grid.images {
+        while first < bands.len() && bands[first].images.end <= image {
+            first += 1;
+        }
+        for channel in 0..channels {
+            let mut rest = planes.next().expect("a plane for each image and channel");
+            for (i, band) in bands.iter().enumerate().skip(first) {
+                if band.images.start > image {
+                    break;
+                }
+                let (piece, tail) = rest.split_at_mut(band.rows.len() * grid.width);
+                parts[i * groups + channel / group].push(piece);
+                rest = tail;
+            }
+        }
+    }
+    parts
+}

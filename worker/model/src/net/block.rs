@@ -1,0 +1,162 @@
+//! What U-Nets are made of: convolution without bias, batch norm, ReLU (`cbr`), twice in a block.
+
+use burn::tensor::{Int, Tensor};
+
+use super::pass::{Norm, Pass};
+use crate::{
+    ops,
+    parameters::{Begin, Declarations, Id},
+};
+
+/// Declares a batch norm over `channels` by PyTorch's names.
+pub(super) fn norm(d: &mut Declarations, at: &str, channels: usize) -> Norm {
+    let one = |d: &mut Declarations, name: &str, value: f32, learned: bool| {
+        d.add(
+            format!("{at}.{name}"),
+            &[channels],
+            Begin::Constant(value),
+            learned,
+        )
+    };
+    Norm {
+        gamma: one(d, "weight", 1.0, true),
+        beta: one(d, "bias", 0.0, true),
+        mean: one(d, "running_mean", 0.0, false),
+        variance: one(d, "running_var", 1.0, false),
+        batches: d.add(
+            format!("{at}.num_batches_tracked"),
+            &[1],
+            Begin::Constant(0.0),
+            false,
+        ),
+    }
+}
+
+/// 3×3 convolution, batch norm, ReLU.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Cbr {
+    weight: Id,
+    /// Of one-hot channels after the dense ones, in the first layer only.
+    one_hot: Option<Id>,
+    norm: Norm,
+}
+
+impl Cbr {
+    /// Of `inputs` dense channels and `one_hot` others.
+    pub(super) fn declare(
+        d: &mut Declarations,
+        at: &str,
+        inputs: usize,
+        one_hot: usize,
+        outputs: usize,
+    ) -> Self {
+        let begin = Begin::FanIn((inputs + one_hot) * 9);
+        let name = format!("{at}.conv.weight");
+        let weight = d.add(name.clone(), &[outputs, inputs, 3, 3], begin, true);
+        let one_hot = (one_hot > 0).then(|| {
+            // PyTorch has one tensor for both; the two are joined where weights are written.
+            d.add(
+                format!("{name}{ONE_HOT}"),
+                &[outputs, one_hot, 3, 3],
+                begin,
+                true,
+            )
+        });
+        Self {
+            weight,
+            one_hot,
+            norm: norm(d, &format!("{at}.batchnorm"), outputs),
+        }
+    }
+
+    pub(super) fn forward(
+        &self,
+        pass: &mut Pass,
+        x: Tensor<4>,
+        one_hot: Option<&Tensor<3, Int>>,
+    ) -> Tensor<4> {
+        let mut y = ops::conv3x3(x, pass.get(self.weight));
+        if let (Some(id), Some(bins)) = (self.one_hot, one_hot) {
+            y = y + ops::one_hot_conv3x3(bins.clone(), pass.get(id));
+        }
+        pass.norm_relu(&self.norm, y)
+    }
+}
+
+/// Ends the names of weights that belong to one-hot channels.
+pub const ONE_HOT: &str = ".one_hot";
+
+/// Two [`Cbr`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Block([Cbr; 2]);
+
+impl Block {
+    /// In the encoder the first keeps at least half of the output's channels (released code: `DoubleConv`).
+    pub(super) fn encoder(
+        d: &mut Declarations,
+        at: &str,
+        inputs: usize,
+        one_hot: usize,
+        outputs: usize,
+    ) -> Self {
+        let between = (outputs / 2).max(inputs + one_hot);
+        Self::declare(d, at, inputs, one_hot, between, outputs)
+    }
+
+    /// In the decoder both have the output's channels.
+    pub(super) fn decoder(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
+        Self::declare(d, at, inputs, 0, outputs, outputs)
+    }
+
+    fn declare(
+        d: &mut Declarations,
+        at: &str,
+        inputs: usize,
+        one_hot: usize,
+        between: usize,
+        outputs: usize,
+    ) -> Self {
+        let name = |i| format!("{at}.basic_module.SingleConv{i}");
+        Self([
+            Cbr::declare(d, &name(1), inputs, one_hot, between),
+            Cbr::declare(d, &name(2), between, 0, outputs),
+        ])
+    }
+
+    pub(super) fn forward(
+        &self,
+        pass: &mut Pass,
+        x: Tensor<4>,
+        one_hot: Option<&Tensor<3, Int>>,
+    ) -> Tensor<4> {
+        let [first, second] = &self.0;
+        let x = first.forward(pass, x, one_hot);
+        second.forward(pass, x, None)
+    }
+}
+
+/// The last layer: 1×1 convolution with a bias.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Final {
+    weight: Id,
+    bias: Id,
+}
+
+impl Final {
+    pub(super) fn declare(d: &mut Declarations, inputs: usize, outputs: usize) -> Self {
+        let begin = Begin::FanIn(inputs);
+        Self {
+            weight: d.add(
+                "final_conv.weight".into(),
+                &[outputs, inputs, 1, 1],
+                begin,
+                true,
+            ),
+            bias: d.add("final_conv.bias".into(), &[outputs], begin, true),
+        }
+    }
+
+    pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
+        ops::conv1x1(x, pass.get(self.weight), pass.get(self.bias))
+    }
+}

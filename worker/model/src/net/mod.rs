@@ -1,0 +1,82 @@
+//! The networks: what they are made of, and passes through them.
+
+mod block;
+mod pass;
+mod spec;
+mod unet2d;
+
+use burn::tensor::Tensor;
+
+pub use block::ONE_HOT;
+pub use pass::{Input, MOMENTUM, Pass};
+pub use spec::{Architecture, NetSpec};
+
+use crate::{
+    ModelError,
+    parameters::{Declarations, Declared},
+};
+use unet2d::Unet2d;
+
+/// A network without its numbers.
+#[derive(Debug, Clone)]
+pub struct Net {
+    spec: NetSpec,
+    declared: Vec<Declared>,
+    body: Body,
+}
+
+#[derive(Debug, Clone)]
+enum Body {
+    Unet2d(Unet2d),
+}
+
+impl Net {
+    /// The network of a spec.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] naming the first field that cannot be used.
+    pub fn new(spec: NetSpec) -> Result<Self, ModelError> {
+        spec.check()?;
+        let mut declarations = Declarations::default();
+        let body = match spec.architecture {
+            Architecture::Unet2d => Body::Unet2d(Unet2d::declare(&mut declarations, &spec)),
+            Architecture::Unet25d => {
+                let what = "\"unet25d\" is not built yet; use \"unet2d\"";
+                return Err(ModelError::invalid("net.architecture", what));
+            }
+        };
+        Ok(Self {
+            spec,
+            declared: declarations.list,
+            body,
+        })
+    }
+
+    /// Its shape.
+    pub fn spec(&self) -> &NetSpec {
+        &self.spec
+    }
+
+    /// Its parameters.
+    pub fn declared(&self) -> &[Declared] {
+        &self.declared
+    }
+
+    /// (N, C, H, W) to (N, outputs, H, W): logits or depths, no activation.
+    ///
+    /// # Panics
+    /// Where the input has not the spec's channels, or H or W is no multiple of [`NetSpec::multiple`].
+    pub fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        let [_, channels, h, w] = input.dense.dims();
+        let multiple = self.spec.multiple();
+        assert_eq!(channels, self.spec.dense, "channels of the input");
+        assert!(
+            h % multiple == 0 && w % multiple == 0,
+            "{h}×{w} pixels must be multiples of {multiple}"
+        );
+        assert_eq!(input.one_hot.is_some(), self.spec.one_hot > 0);
+        match &self.body {
+            Body::Unet2d(net) => net.forward(pass, input),
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! What a network looks like: everything that decides its parameters, and nothing else.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// Which network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Architecture {
+    /// Bins are channels (Shoot-Bounce-3D, released code).
+    #[default]
+    Unet2d,
+    /// Time is a dimension of the encoder (Shoot-Bounce-3D, appendix).
+    Unet25d,
+}
+
+/// Shape of a network.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetSpec {
+    /// Which one.
+    pub architecture: Architecture,
+    /// Channels of the dense input: bins, and planes that say something else.
+    pub dense: usize,
+    /// Bins of the one-hot input; 0 where there is none.
+    pub one_hot: usize,
+    /// Channels of the output.
+    pub outputs: usize,
+    /// Channels of the first level; each further one has twice as many.
+    pub width: usize,
+    /// Levels of encoder and decoder, the bottleneck among them.
+    pub levels: usize,
+    /// Channels of a convolution before the first level (the appendix's form: 128); 0 = none (the released code's).
+    pub stem: usize,
+    /// Length of the time axis after the first projection, `Unet25d` only (the paper: 160).
+    pub time: usize,
+    /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub frozen: bool,
+}
+
+impl NetSpec {
+    /// The released depth network: 637 bins, 256×256 pixels, 356,404,556 parameters.
+    pub fn released(dense: usize, one_hot: usize, outputs: usize) -> Self {
+        Self {
+            architecture: Architecture::Unet2d,
+            dense,
+            one_hot,
+            outputs,
+            width: 128,
+            levels: 6,
+            stem: 0,
+            time: 160,
+            frozen: false,
+        }
+    }
+
+    /// Channels of each level, from the finest.
+    pub fn widths(&self) -> Vec<usize> {
+        (0..self.levels).map(|k| self.width << k).collect()
+    }
+
+    /// Width and height must be multiples of this.
+    pub fn multiple(&self) -> usize {
+        1 << (self.levels - 1)
+    }
+
+    /// Checks what can be built.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] naming the field.
+    pub fn check(&self) -> Result<(), ModelError> {
+        let within = |field: &str, value: usize, least: usize, most: usize| {
+            if (least..=most).contains(&value) {
+                return Ok(());
+            }
+            let what = format!("{value} lies outside {least}..={most}");
+            Err(ModelError::invalid(format!("net.{field}"), what))
+        };
+        within("dense", self.dense, 1, 16_384)?;
+        within("one_hot", self.one_hot, 0, 16_384)?;
+        within("outputs", self.outputs, 1, 1_024)?;
+        within("width", self.width, 1, 1_024)?;
+        within("levels", self.levels, 2, 8)?;
+        within("stem", self.stem, 0, 4_096)?;
+        if self.architecture == Architecture::Unet25d {
+            within("time", self.time, 1, 4_096)?;
+            let divisor = 1 << (self.levels - 1);
+            if self.time % divisor != 0 {
+                let what = format!(
+                    "{} must be a multiple of {divisor}: it is halved {} times (levels - 1)",
+                    self.time,
+                    self.levels - 1
+                );
+                return Err(ModelError::invalid("net.time_features", what));
+            }
+            if self.one_hot != 0 && self.one_hot != self.dense {
+                let what = "the two streams of a 2.5D U-Net must have the same bins";
+                return Err(ModelError::invalid("net.one_hot", what));
+            }
+            if self.stem != 0 {
+                return Err(ModelError::invalid("net.stem", "is for unet2d; remove it"));
+            }
+        }
+        Ok(())
+    }
+}

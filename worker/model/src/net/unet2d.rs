@@ -1,0 +1,107 @@
+//! The 2D U-Net of Shoot-Bounce-3D: bins are channels.
+
+use burn::tensor::Tensor;
+
+use super::{
+    block::{Block, Cbr, Final},
+    pass::{Input, Pass},
+    spec::NetSpec,
+};
+use crate::{ops, parameters::Declarations};
+
+/// Encoder blocks with max-pooling between them, decoder blocks over upsampled features beside the encoder's.
+#[derive(Debug, Clone)]
+pub(super) struct Unet2d {
+    stem: Option<Cbr>,
+    encoders: Vec<Block>,
+    frozen: bool,
+    decoder: Decoder,
+}
+
+/// The decoder.
+#[derive(Debug, Clone)]
+pub(super) struct Decoder {
+    blocks: Vec<Block>,
+    last: Final,
+}
+
+impl Unet2d {
+    pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        d.frozen = spec.frozen;
+        let stem =
+            (spec.stem > 0).then(|| Cbr::declare(d, "stem", spec.dense, spec.one_hot, spec.stem));
+        let (mut inputs, mut one_hot) = match stem {
+            Some(_) => (spec.stem, 0),
+            None => (spec.dense, spec.one_hot),
+        };
+        let mut encoders = Vec::new();
+        for (i, outputs) in spec.widths().into_iter().enumerate() {
+            let at = format!("encoders.{i}");
+            encoders.push(Block::encoder(d, &at, inputs, one_hot, outputs));
+            (inputs, one_hot) = (outputs, 0);
+        }
+        d.frozen = false;
+        Self {
+            stem,
+            encoders,
+            frozen: spec.frozen,
+            decoder: Decoder::declare(d, &spec.widths(), spec.outputs),
+        }
+    }
+
+    /// What the encoder gives at each level, from the finest.
+    pub(super) fn features(&self, pass: &mut Pass, input: Input) -> Vec<Tensor<4>> {
+        let Input { dense, one_hot } = input;
+        let mut one_hot = one_hot.as_ref();
+        let mut x = dense;
+        if let Some(stem) = &self.stem {
+            x = stem.forward(pass, x, one_hot.take());
+        }
+        let mut features = Vec::with_capacity(self.encoders.len());
+        for (i, block) in self.encoders.iter().enumerate() {
+            if i > 0 {
+                x = ops::max_pool(x);
+            }
+            x = block.forward(pass, x, one_hot.take());
+            features.push(x.clone());
+        }
+        features
+    }
+
+    pub(super) fn forward(&self, pass: &mut Pass, input: Input) -> Tensor<4> {
+        let features = match self.frozen {
+            true => pass.frozen(|pass| self.features(pass, input)),
+            false => self.features(pass, input),
+        };
+        self.decoder.forward(pass, features)
+    }
+}
+
+impl Decoder {
+    pub(super) fn declare(d: &mut Declarations, widths: &[usize], outputs: usize) -> Self {
+        let mut blocks = Vec::new();
+        for (i, level) in (0..widths.len() - 1).rev().enumerate() {
+            let (fine, coarse) = (widths[level], widths[level + 1]);
+            blocks.push(Block::decoder(
+                d,
+                &format!("decoders.{i}"),
+                fine + coarse,
+                fine,
+            ));
+        }
+        Self {
+            blocks,
+            last: Final::declare(d, widths[0], outputs),
+        }
+    }
+
+    /// From features at each level, from the finest.
+    pub(super) fn forward(&self, pass: &mut Pass, mut features: Vec<Tensor<4>>) -> Tensor<4> {
+        let mut x = features.pop().expect("there are at least two levels");
+        for block in &self.blocks {
+            let skip = features.pop().expect("as many levels as blocks and one");
+            x = block.forward(pass, ops::join_upsampled(skip, x), None);
+        }
+        self.last.forward(pass, x)
+    }
+}

@@ -1,0 +1,234 @@
+//! The kernels as operations of burn's CPU backend.
+
+use burn::{
+    backend::{
+        Backend, Flex, TensorMetadata, backend_extension,
+        tensor::{FloatTensor, IntTensor},
+    },
+    tensor::{Shape, TensorData},
+};
+
+use super::EPSILON;
+use crate::kernel::{AdamW, BatchNorm, ConvShape, Kernels, NormShape, OneHotShape, PlaneShape};
+
+/// Operations of networks; shapes as in [`super`].
+#[backend_extension(Flex, Autodiff)]
+pub trait NetOps: Backend {
+    fn conv3x3(x: FloatTensor<Self>, w: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn conv1x1(
+        x: FloatTensor<Self>,
+        w: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+    ) -> FloatTensor<Self>;
+    fn one_hot_conv3x3(bins: IntTensor<Self>, w: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn batch_norm_relu(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
+    fn norm_relu(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        mean: FloatTensor<Self>,
+        variance: FloatTensor<Self>,
+    ) -> FloatTensor<Self>;
+    fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn join_upsampled(skip: FloatTensor<Self>, x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn adamw(
+        p: FloatTensor<Self>,
+        g: FloatTensor<Self>,
+        m: FloatTensor<Self>,
+        v: FloatTensor<Self>,
+        settings: AdamW,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
+}
+
+/// A tensor of the CPU backend.
+pub(super) type Cpu = FloatTensor<Flex>;
+
+pub(super) fn dims<const D: usize>(x: &Cpu) -> [usize; D] {
+    x.shape().dims()
+}
+
+/// The values in order; copied only where they lie otherwise.
+pub(super) fn contiguous(x: Cpu) -> Cpu {
+    match x.as_slice::<f32>() {
+        Some(_) => x,
+        None => x.to_contiguous(),
+    }
+}
+
+pub(super) fn values(x: &Cpu) -> &[f32] {
+    x.as_slice()
+        .expect("made contiguous, and networks compute in f32")
+}
+
+pub(super) fn tensor<const D: usize>(values: Vec<f32>, dims: [usize; D]) -> Cpu {
+    Cpu::from_data(TensorData::new(values, Shape::from(dims)))
+}
+
+/// A tensor that `fill` writes all of.
+pub(super) fn made<const D: usize>(dims: [usize; D], fill: impl FnOnce(&mut [f32])) -> Cpu {
+    let mut out = vec![0.0; dims.iter().product()];
+    fill(&mut out);
+    tensor(out, dims)
+}
+
+pub(super) fn conv_shape(
+    [images, _, height, width]: [usize; 4],
+    inputs: usize,
+    outputs: usize,
+) -> ConvShape {
+    ConvShape {
+        images,
+        inputs,
+        outputs,
+        height,
+        width,
+    }
+}
+
+pub(super) fn norm_shape([images, channels, height, width]: [usize; 4]) -> NormShape {
+    NormShape {
+        images,
+        channels,
+        pixels: height * width,
+    }
+}
+
+pub(super) fn planes([n, c, height, width]: [usize; 4]) -> PlaneShape {
+    PlaneShape {
+        planes: n * c,
+        height,
+        width,
+    }
+}
+
+/// Bins as the kernels read them.
+pub(super) fn bins(bins: IntTensor<Flex>) -> Vec<u16> {
+    let data = bins.into_data();
+    data.iter::<i64>()
+        .map(|bin| u16::try_from(bin).unwrap_or(u16::MAX))
+        .collect()
+}
+
+pub(super) fn one_hot_shape([images, height, width]: [usize; 3], w: [usize; 4]) -> OneHotShape {
+    OneHotShape {
+        images,
+        bins: w[1],
+        outputs: w[0],
+        height,
+        width,
+    }
+}
+
+/// The same memory where nobody else looks at it.
+fn owned(x: Cpu) -> Vec<f32> {
+    let x = contiguous(x);
+    x.into_data()
+        .try_into_vec()
+        .expect("networks compute in f32")
+}
+
+impl NetOps for Flex {
+    fn conv3x3(x: Cpu, w: Cpu) -> Cpu {
+        let (x, w) = (contiguous(x), contiguous(w));
+        let ([n, c, h, wide], [o, ..]) = (dims(&x), dims::<4>(&w));
+        let s = conv_shape([n, c, h, wide], c, o);
+        made([n, o, h, wide], |out| {
+            Kernels::best().conv3x3(&s, values(&x), values(&w), out);
+        })
+    }
+
+    fn conv1x1(x: Cpu, w: Cpu, bias: Cpu) -> Cpu {
+        let (x, w, bias) = (contiguous(x), contiguous(w), contiguous(bias));
+        let ([n, c, h, wide], [o, ..]) = (dims(&x), dims::<4>(&w));
+        let s = conv_shape([n, c, h, wide], c, o);
+        made([n, o, h, wide], |out| {
+            let bias = Some(values(&bias));
+            Kernels::best().conv1x1(&s, values(&x), values(&w), bias, out);
+        })
+    }
+
+    fn one_hot_conv3x3(at: IntTensor<Self>, w: Cpu) -> Cpu {
+        let w = contiguous(w);
+        let [n, h, wide] = at.shape().dims();
+        let s = one_hot_shape([n, h, wide], dims(&w));
+        let bins = bins(at);
+        made([n, s.outputs, h, wide], |out| {
+            Kernels::best().onehot_conv3x3(&s, &bins, values(&w), out);
+        })
+    }
+
+    fn batch_norm_relu(x: Cpu, gamma: Cpu, beta: Cpu) -> (Cpu, Cpu, Cpu) {
+        let (x, gamma, beta) = (contiguous(x), contiguous(gamma), contiguous(beta));
+        let at = dims::<4>(&x);
+        let (mut mean, mut variance) = (vec![0.0; at[1]], vec![0.0; at[1]]);
+        let y = made(at, |y| {
+            Kernels::best().batch_norm_relu(
+                &norm_shape(at),
+                values(&x),
+                values(&gamma),
+                values(&beta),
+                EPSILON as f32,
+                y,
+                &mut mean,
+                &mut variance,
+            );
+        });
+        (y, tensor(mean, [at[1]]), tensor(variance, [at[1]]))
+    }
+
+    fn norm_relu(x: Cpu, gamma: Cpu, beta: Cpu, mean: Cpu, variance: Cpu) -> Cpu {
+        let x = contiguous(x);
+        let [gamma, beta, mean, variance] = [gamma, beta, mean, variance].map(contiguous);
+        let at = dims::<4>(&x);
+        let norm = BatchNorm {
+            gamma: values(&gamma),
+            beta: values(&beta),
+            mean: values(&mean),
+            var: values(&variance),
+            eps: EPSILON as f32,
+        };
+        made(at, |y| {
+            Kernels::best().norm_relu(&norm_shape(at), values(&x), &norm, y);
+        })
+    }
+
+    fn max_pool(x: Cpu) -> Cpu {
+        let x = contiguous(x);
+        let [n, c, h, w] = dims(&x);
+        let s = planes([n, c, h, w]);
+        let mut which = vec![0; s.halved().len()];
+        made([n, c, h / 2, w / 2], |y| {
+            Kernels::best().max_pool(&s, values(&x), y, &mut which);
+        })
+    }
+
+    fn join_upsampled(skip: Cpu, x: Cpu) -> Cpu {
+        let (skip, x) = (contiguous(skip), contiguous(x));
+        let ([n, c, h, w], small) = (dims(&skip), dims::<4>(&x));
+        let [_, d, ..] = small;
+        let s = planes([1, d, small[2], small[3]]);
+        made([n, c + d, h, w], |out| {
+            let images = out.chunks_exact_mut((c + d) * h * w);
+            let inputs = values(&skip)
+                .chunks_exact(c * h * w)
+                .zip(values(&x).chunks_exact(s.len()));
+            for (out, (skip, x)) in images.zip(inputs) {
+                let (first, rest) = out.split_at_mut(c * h * w);
+                first.copy_from_slice(skip);
+                Kernels::best().upsample(&s, x, rest);
+            }
+        })
+    }
+
+    fn adamw(p: Cpu, g: Cpu, m: Cpu, v: Cpu, settings: AdamW) -> (Cpu, Cpu, Cpu) {
+        let g = contiguous(g);
+        let (mut p, mut m, mut v) = (owned(p), owned(m), owned(v));
+        Kernels::best().adamw(&settings, &mut p, values(&g), &mut m, &mut v);
+        let at = [p.len()];
+        (tensor(p, at), tensor(m, at), tensor(v, at))
+    }
+}

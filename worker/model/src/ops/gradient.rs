@@ -1,0 +1,140 @@
+//! The gradients of the operations on the CPU, from the output's gradient and what the operation kept.
+
+use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
+
+use super::{
+    EPSILON,
+    cpu::{
+        Cpu, bins, contiguous, conv_shape, dims, made, norm_shape, one_hot_shape, planes, tensor,
+        values,
+    },
+};
+use crate::kernel::{BatchNorm, Kernels};
+
+/// By the input.
+pub(super) fn conv3x3_by_input(dy: Cpu, w: Cpu) -> Cpu {
+    let (dy, w) = (contiguous(dy), contiguous(w));
+    let ([n, o, h, wide], [_, c, ..]) = (dims(&dy), dims::<4>(&w));
+    let s = conv_shape([n, c, h, wide], c, o);
+    made([n, c, h, wide], |dx| {
+        Kernels::best().conv3x3_input_grad(&s, values(&dy), values(&w), dx);
+    })
+}
+
+/// By the weights.
+pub(super) fn conv3x3_by_weight(x: Cpu, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    let (at, [_, o, ..]) = (dims(&x), dims::<4>(&dy));
+    let s = conv_shape(at, at[1], o);
+    made([o, at[1], 3, 3], |dw| {
+        Kernels::best().conv3x3_weight_grad(&s, values(&x), values(&dy), dw);
+    })
+}
+
+/// By the input.
+pub(super) fn conv1x1_by_input(dy: Cpu, w: Cpu) -> Cpu {
+    let (dy, w) = (contiguous(dy), contiguous(w));
+    let ([n, o, h, wide], [_, c, ..]) = (dims(&dy), dims::<4>(&w));
+    let s = conv_shape([n, c, h, wide], c, o);
+    made([n, c, h, wide], |dx| {
+        Kernels::best().conv1x1_input_grad(&s, values(&dy), values(&w), dx);
+    })
+}
+
+/// By the weights.
+pub(super) fn conv1x1_by_weight(x: Cpu, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    let (at, [_, o, ..]) = (dims(&x), dims::<4>(&dy));
+    let s = conv_shape(at, at[1], o);
+    made([o, at[1], 1, 1], |dw| {
+        Kernels::best().conv1x1_weight_grad(&s, values(&x), values(&dy), dw);
+    })
+}
+
+/// By the bias.
+pub(super) fn conv1x1_by_bias(dy: Cpu) -> Cpu {
+    let dy = contiguous(dy);
+    let at = dims::<4>(&dy);
+    let s = conv_shape(at, 0, at[1]);
+    made([at[1]], |db| Kernels::best().bias_grad(&s, values(&dy), db))
+}
+
+/// By the weights, of which there are `channels` a pixel of the kernel.
+pub(super) fn one_hot_conv3x3_by_weight(at: IntTensor<Flex>, dy: Cpu, channels: usize) -> Cpu {
+    let dy = contiguous(dy);
+    let [_, o, ..] = dims::<4>(&dy);
+    let s = one_hot_shape(at.shape().dims(), [o, channels, 3, 3]);
+    let bins = bins(at);
+    made([o, channels, 3, 3], |dw| {
+        Kernels::best().onehot_conv3x3_weight_grad(&s, &bins, values(&dy), dw);
+    })
+}
+
+/// By input, scale and shift.
+pub(super) fn batch_norm_relu_grad(
+    x: Cpu,
+    gamma: Cpu,
+    beta: Cpu,
+    mean: Cpu,
+    variance: Cpu,
+    dy: Cpu,
+) -> (Cpu, Cpu, Cpu) {
+    let (x, dy, gamma, beta) = (
+        contiguous(x),
+        contiguous(dy),
+        contiguous(gamma),
+        contiguous(beta),
+    );
+    let at = dims::<4>(&x);
+    let norm = BatchNorm {
+        gamma: values(&gamma),
+        beta: values(&beta),
+        mean: values(&mean),
+        var: values(&variance),
+        eps: EPSILON as f32,
+    };
+    let (mut dgamma, mut dbeta) = (vec![0.0; at[1]], vec![0.0; at[1]]);
+    let dx = made(at, |dx| {
+        Kernels::best().batch_norm_relu_grad(
+            &norm_shape(at),
+            values(&x),
+            &norm,
+            values(&dy),
+            dx,
+            &mut dgamma,
+            &mut dbeta,
+        );
+    });
+    (dx, tensor(dgamma, [at[1]]), tensor(dbeta, [at[1]]))
+}
+
+/// By the input.
+pub(super) fn max_pool_grad(x: Cpu, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    let at = dims::<4>(&x);
+    let s = planes(at);
+    // Which pixel won is cheaper found again than kept.
+    let (mut y, mut which) = (vec![0.0; s.halved().len()], vec![0; s.halved().len()]);
+    Kernels::best().max_pool(&s, values(&x), &mut y, &mut which);
+    made(at, |dx| {
+        Kernels::best().max_pool_grad(&s, values(&dy), &which, dx);
+    })
+}
+
+/// By the first part, which has `c` channels, and by the second.
+pub(super) fn join_upsampled_grad(dy: Cpu, c: usize) -> (Cpu, Cpu) {
+    let dy = contiguous(dy);
+    let [n, both, h, w] = dims(&dy);
+    let d = both - c;
+    let s = planes([1, d, h / 2, w / 2]);
+    let mut dskip = Vec::with_capacity(n * c * h * w);
+    let dx = made([n, d, h / 2, w / 2], |dx| {
+        let images = values(&dy).chunks_exact(both * h * w);
+        for (dy, dx) in images.zip(dx.chunks_exact_mut(s.len())) {
+            let (first, rest) = dy.split_at(c * h * w);
+            dskip.extend_from_slice(first);
+            Kernels::best().upsample_grad(&s, rest, dx);
+        }
+    });
+    (tensor(dskip, [n, c, h, w]), dx)
+}

@@ -1,0 +1,90 @@
+//! The operations as compositions of burn's: for devices without kernels of ours, and to test the kernels against.
+
+use burn::tensor::{
+    Int, Tensor,
+    module::{self, batch_norm_train},
+    ops::{ConvOptions, InterpolateMode, InterpolateOptions, MaxPoolOptions},
+};
+
+use super::{EPSILON, Normalised};
+use crate::kernel::AdamW;
+
+/// See [`super::conv3x3`].
+pub fn conv3x3(x: Tensor<4>, w: Tensor<4>) -> Tensor<4> {
+    module::conv2d(x, w, None, ConvOptions::new([1, 1], [1, 1], [1, 1], 1))
+}
+
+/// See [`super::conv1x1`].
+pub fn conv1x1(x: Tensor<4>, w: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
+    module::conv2d(
+        x,
+        w,
+        Some(bias),
+        ConvOptions::new([1, 1], [0, 0], [1, 1], 1),
+    )
+}
+
+/// The one-hot tensor of `bins` (N, H, W): (N, B, H, W).
+pub fn one_hot(bins: Tensor<3, Int>, channels: usize) -> Tensor<4> {
+    let [n, h, w] = bins.dims();
+    let device = bins.device();
+    let channel =
+        Tensor::<1, Int>::arange(0..channels as i64, &device).reshape([1, channels, 1, 1]);
+    bins.reshape([n, 1, h, w])
+        .equal(channel.expand([n, channels, h, w]))
+        .float()
+}
+
+/// See [`super::one_hot_conv3x3`]: the dense form.
+pub fn one_hot_conv3x3(bins: Tensor<3, Int>, w: Tensor<4>) -> Tensor<4> {
+    let channels = w.dims()[1];
+    conv3x3(one_hot(bins, channels), w)
+}
+
+/// See [`super::batch_norm_relu`].
+pub fn batch_norm_relu(x: Tensor<4>, gamma: Tensor<1>, beta: Tensor<1>) -> Normalised {
+    let normed = batch_norm_train(x, gamma, beta, EPSILON);
+    Normalised {
+        y: burn::tensor::activation::relu(normed.output),
+        mean: normed.mean.inner(),
+        variance: normed.variance.inner(),
+    }
+}
+
+/// See [`super::norm_relu`].
+pub fn norm_relu(
+    x: Tensor<4>,
+    gamma: Tensor<1>,
+    beta: Tensor<1>,
+    mean: Tensor<1>,
+    variance: Tensor<1>,
+) -> Tensor<4> {
+    burn::tensor::activation::relu(module::batch_norm(x, gamma, beta, mean, variance, EPSILON))
+}
+
+/// See [`super::max_pool`].
+pub fn max_pool(x: Tensor<4>) -> Tensor<4> {
+    module::max_pool2d(x, MaxPoolOptions::new([2, 2]))
+}
+
+/// See [`super::join_upsampled`].
+pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
+    let options = InterpolateOptions::new(InterpolateMode::Nearest).with_scale_factor([2.0, 2.0]);
+    Tensor::cat(vec![skip, module::interpolate(x, options)], 1)
+}
+
+/// See [`super::adamw`].
+pub fn adamw(
+    a: AdamW,
+    parameter: Tensor<1>,
+    gradient: Tensor<1>,
+    [m, v]: [Tensor<1>; 2],
+) -> (Tensor<1>, [Tensor<1>; 2]) {
+    let m = m.mul_scalar(a.beta1) + gradient.clone().mul_scalar(1.0 - a.beta1);
+    let v = v.mul_scalar(a.beta2) + gradient.square().mul_scalar(1.0 - a.beta2);
+    let steps = i32::try_from(a.step).unwrap_or(i32::MAX);
+    let root = (v.clone() / (1.0 - a.beta2.powi(steps))).sqrt() + a.eps;
+    let step = (m.clone() / root).mul_scalar(a.rate / (1.0 - a.beta1.powi(steps)));
+    let parameter = parameter.mul_scalar(1.0 - a.rate * a.decay) - step;
+    (parameter, [m, v])
+}

@@ -1,0 +1,154 @@
+//! What training reads: a scene's histogram and what is known about it.
+
+use std::{
+    collections::HashMap,
+    error::Error,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+/// A scene. Images are row by row, from the top left.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Scene {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// Bins of the histogram.
+    pub bins: usize,
+    /// Path length at the beginning of the first bin, metres.
+    pub first_m: f64,
+    /// Width of a bin, metres of path.
+    pub bin_width_m: f64,
+    /// h: `[row][column][bin]`.
+    pub histogram: Vec<f32>,
+    /// z-depth, metres: `[row][column]`.
+    pub depth_m: Vec<f32>,
+    /// 1 where the first surface is a mirror: `[row][column]`.
+    pub specular: Vec<u8>,
+    /// Illumination spots L_i in camera coordinates, metres.
+    pub spots: Vec<[f32; 3]>,
+    /// 1 where a spot lights the point that is seen: `[spot][row][column]`.
+    pub lit: Vec<u8>,
+    /// Two-bounce path lengths, metres: `[spot][row][column]`; empty where they follow from depth and spots.
+    pub tof_m: Vec<f32>,
+    /// fx, fy, cx, cy in pixels.
+    pub intrinsics: [f64; 4],
+    /// Where the laser stands, camera coordinates, metres.
+    pub laser: [f32; 3],
+}
+
+/// Scenes that are read one by one, in any order, from several threads.
+pub trait Scenes: Send + Sync {
+    /// How many.
+    fn len(&self) -> usize;
+
+    /// Whether there are none.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// One of them.
+    ///
+    /// # Errors
+    /// Whatever keeps it from being read.
+    fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable>;
+}
+
+/// Why a scene could not be read.
+pub type Unreadable = Box<dyn Error + Send + Sync>;
+
+impl Scenes for Vec<Arc<Scene>> {
+    fn len(&self) -> usize {
+        self.as_slice().len()
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
+        Ok(Arc::clone(&self[index]))
+    }
+}
+
+/// Scenes that are kept in memory once they were read, as far as there is room.
+pub struct Kept {
+    scenes: Arc<dyn Scenes>,
+    kept: Mutex<(HashMap<usize, Arc<Scene>>, usize)>,
+    room: usize,
+}
+
+impl Kept {
+    /// With room for so many bytes.
+    pub fn new(scenes: Arc<dyn Scenes>, room: usize) -> Self {
+        Self {
+            scenes,
+            kept: Mutex::default(),
+            room,
+        }
+    }
+}
+
+impl Scenes for Kept {
+    fn len(&self) -> usize {
+        self.scenes.len()
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
+        let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(scene) = lock().0.get(&index) {
+            return Ok(Arc::clone(scene));
+        }
+        let scene = self.scenes.load(index)?;
+        let (kept, used) = &mut *lock();
+        if *used + scene.bytes() <= self.room && !kept.contains_key(&index) {
+            *used += scene.bytes();
+            kept.insert(index, Arc::clone(&scene));
+        }
+        Ok(scene)
+    }
+}
+
+impl Scene {
+    /// About how much memory it takes.
+    pub fn bytes(&self) -> usize {
+        let floats = self.histogram.len() + self.depth_m.len() + self.tof_m.len();
+        4 * floats + self.specular.len() + self.lit.len()
+    }
+
+    /// Pixels.
+    pub fn pixels(&self) -> usize {
+        self.height * self.width
+    }
+
+    /// Two-bounce path lengths of a spot, metres: `[row][column]`. Those that are stored, else from depth:
+    /// |L − x_l| + |x_p − L| + |x_p| (the camera is the origin).
+    pub fn tof(&self, spot: usize) -> Vec<f32> {
+        if self.tof_m.is_empty() {
+            return self.tof_of(spot, &self.depth_m);
+        }
+        let n = self.pixels();
+        self.tof_m[spot * n..(spot + 1) * n].to_vec()
+    }
+
+    /// The same from other depths: a network's.
+    pub fn tof_of(&self, spot: usize, depth_m: &[f32]) -> Vec<f32> {
+        let [fx, fy, cx, cy] = self.intrinsics;
+        let spot = self.spots[spot].map(f64::from);
+        let laser = self.laser.map(f64::from);
+        let distance = |a: [f64; 3], b: [f64; 3]| {
+            let d: f64 = (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
+            d.sqrt()
+        };
+        let to_spot = distance(spot, laser);
+        let pixels = depth_m.iter().enumerate();
+        pixels
+            .map(|(i, z)| {
+                let z = f64::from(*z);
+                let (u, v) = (i % self.width, i / self.width);
+                let x = [
+                    (u as f64 + 0.5 - cx) / fx * z,
+                    (v as f64 + 0.5 - cy) / fy * z,
+                    z,
+                ];
+                (to_spot + distance(x, spot) + distance(x, [0.0; 3])) as f32
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,88 @@
+//! Training: from scenes to weights.
+
+mod checkpoint;
+mod learner;
+mod load;
+mod loss;
+mod order;
+mod run;
+mod schedule;
+
+use serde::{Deserialize, Serialize};
+
+pub use learner::{Learner, predict};
+pub use load::Guide;
+pub use run::{Control, Ended, Event, Line, Position, Sources, Trained, Training};
+pub use schedule::{Pace, Schedule};
+
+use crate::{ModelError, input::Question, net::NetSpec};
+
+/// Everything that decides what a training gives, but the scenes and the weights it begins with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Plan {
+    /// What is asked.
+    pub question: Question,
+    /// The network that learns to answer.
+    pub net: NetSpec,
+    /// Times that each scene is visited.
+    pub epochs: u64,
+    /// Examples a batch.
+    pub batch: usize,
+    /// Batches a step.
+    pub accumulate: usize,
+    /// Greatest learning rate.
+    pub rate: f64,
+    /// Weight decay.
+    pub decay: f64,
+    /// How the rate moves.
+    pub schedule: Schedule,
+    /// Mirrored scenes are shown too, where the task allows it.
+    pub augment: bool,
+    /// Validations without improvement after which it ends; 0 = never.
+    pub early_stop: u64,
+    /// Of weights, order, spots and mirroring.
+    pub seed: u64,
+}
+
+impl Plan {
+    /// Batches of an epoch over so many scenes, those left over dropped.
+    pub fn batches(&self, scenes: usize) -> u64 {
+        let steps = scenes / (self.batch * self.accumulate);
+        (steps * self.accumulate) as u64
+    }
+
+    /// Steps of the whole training.
+    pub fn steps(&self, scenes: usize) -> u64 {
+        self.epochs * self.batches(scenes) / self.accumulate as u64
+    }
+
+    /// Checks it against itself and the number of scenes to learn from.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] naming the first field that cannot be used.
+    pub fn check(&self, scenes: usize) -> Result<(), ModelError> {
+        self.net.check()?;
+        self.question.check(&self.net)?;
+        if self.batch == 0 || self.accumulate == 0 || self.epochs == 0 {
+            let what = "epochs, batch and accumulate must be at least 1";
+            return Err(ModelError::invalid("optimise", what));
+        }
+        if self.batches(scenes) == 0 {
+            let what = format!(
+                "a step takes {} × {} scenes and there are {scenes} to learn from; make it smaller",
+                self.batch, self.accumulate
+            );
+            return Err(ModelError::invalid("optimise.batch", what));
+        }
+        if !(self.rate > 0.0 && self.rate.is_finite()) || !(self.decay >= 0.0 && self.decay < 1.0) {
+            let what = "rate must be positive, weight_decay in 0..1";
+            return Err(ModelError::invalid("optimise", what));
+        }
+        self.schedule.check(self.steps(scenes))
+    }
+
+    fn text(&self) -> String {
+        serde_json::to_string(self).expect("plain data")
+    }
+}

@@ -1,0 +1,394 @@
+//! A training from where it stands to its end.
+
+use std::{
+    sync::{Arc, mpsc::sync_channel},
+    thread,
+    time::{Duration, Instant},
+};
+
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    Plan, checkpoint,
+    learner::Learner,
+    load::{self, AHEAD, Guide},
+};
+use crate::{
+    ModelError,
+    input::Visit,
+    metric::{Metrics, Tally},
+    net::Net,
+    parameters::Parameters,
+    scene::Scenes,
+    weights,
+};
+
+/// Where a training stands, and what it has seen.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Position {
+    /// Whole epochs done.
+    pub epoch: u64,
+    /// Batches done of the next one.
+    pub batches: u64,
+    /// Sum of the losses of this epoch's steps.
+    pub losses: f64,
+    /// Steps of this epoch.
+    pub steps: u64,
+    /// The smallest validation loss so far.
+    pub best: Option<f64>,
+    /// Validations since then.
+    pub since_best: u64,
+    /// A line for each epoch done.
+    pub history: Vec<Line>,
+    /// It ended before its last epoch, because it no longer became better.
+    pub stopped_early: bool,
+}
+
+/// An epoch.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Line {
+    /// From 1.
+    pub epoch: u64,
+    /// Steps of the optimiser until then.
+    pub step: u64,
+    /// Mean loss of its steps.
+    pub loss: f64,
+    /// Learning rate of its last step.
+    pub rate: f64,
+    /// On the validation scenes, where there are any.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub validation: Option<Metrics>,
+}
+
+/// What happens.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    /// A step of the optimiser.
+    Step {
+        /// Steps done.
+        step: u64,
+        /// Steps of the whole training.
+        of: u64,
+        /// Epochs, the running one among them, from 1.
+        epoch: u64,
+        /// Its mean loss.
+        loss: f32,
+        /// Training examples a second, since this process took it up.
+        samples_per_s: f64,
+        /// Share of that time in which the network waited for data.
+        data_wait_share: f64,
+    },
+    /// An epoch is over.
+    Epoch(Line),
+}
+
+/// What shall happen next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Control {
+    /// Go on.
+    Continue,
+    /// Stop after this step.
+    Stop,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// Everything is done.
+    Finished,
+    /// It was asked to stop; it can go on from a checkpoint.
+    Stopped,
+}
+
+/// What it learns from, and beside what.
+pub struct Sources {
+    /// Scenes to learn from.
+    pub train: Arc<dyn Scenes>,
+    /// Scenes to look at after each epoch; may be none.
+    pub validation: Arc<dyn Scenes>,
+    /// For shadows: the network whose depths two-bounce times follow from. With it, one for the validation scenes.
+    pub guides: Option<[Guide; 2]>,
+}
+
+/// A training.
+pub struct Training {
+    plan: Plan,
+    learner: Learner,
+    position: Position,
+    sources: Sources,
+}
+
+/// What comes out.
+#[derive(Debug, Clone)]
+pub struct Trained {
+    /// Safetensors by PyTorch's names.
+    pub weights: Vec<u8>,
+    /// A line for each epoch.
+    pub history: Vec<Line>,
+    /// It ended before its last epoch.
+    pub stopped_early: bool,
+}
+
+impl Training {
+    /// A training at its beginning, from random weights or, with `from` (safetensors), from others. A frozen encoder
+    /// needs `from`; what `from` does not have of the rest begins at random.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] for a plan that cannot be used, [`ModelError::Weights`] where `from` is of another network.
+    pub fn start(
+        plan: Plan,
+        from: Option<&[u8]>,
+        sources: Sources,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        plan.check(sources.train.len())?;
+        let net = Net::new(plan.net.clone())?;
+        let mut parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
+        if plan.net.frozen && from.is_none() {
+            let what = "a frozen encoder is another network's; name the trained ToF network";
+            return Err(ModelError::invalid("specular.on", what));
+        }
+        if let Some(bytes) = from {
+            let (named, _) = weights::read(bytes)?;
+            let named = weights::from_torch(named, net.declared(), plan.question.part())?;
+            parameters = match plan.net.frozen {
+                false => Parameters::from_named(net.declared().to_vec(), named, device)?,
+                true => parameters.with_encoder_of(named, device)?,
+            };
+        }
+        let learner = Learner::new(net, parameters, plan.question.task, plan.decay);
+        Ok(Self {
+            plan,
+            learner,
+            position: Position::default(),
+            sources,
+        })
+    }
+
+    /// A training where a checkpoint of the same plan was made.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`] for a checkpoint that is damaged or of another plan; those of [`Self::start`].
+    pub fn resume(
+        plan: Plan,
+        checkpoint: &[u8],
+        sources: Sources,
+        device: &Device,
+    ) -> Result<Self, ModelError> {
+        plan.check(sources.train.len())?;
+        let net = Net::new(plan.net.clone())?;
+        let parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
+        let mut learner = Learner::new(net, parameters, plan.question.task, plan.decay);
+        let header = checkpoint::read(checkpoint, &mut learner, device)?;
+        if header.plan != plan.text() {
+            let what =
+                "the checkpoint was made with other settings; remove it, or train with those";
+            return Err(ModelError::weights(what));
+        }
+        Ok(Self {
+            plan,
+            learner,
+            position: header.position,
+            sources,
+        })
+    }
+
+    /// The training as bytes, to go on from.
+    pub fn checkpoint(&self) -> Vec<u8> {
+        checkpoint::write(&self.learner, &self.position, &self.plan.text())
+    }
+
+    /// Where it stands.
+    pub fn position(&self) -> &Position {
+        &self.position
+    }
+
+    /// The network and its numbers.
+    pub fn learner(&self) -> &Learner {
+        &self.learner
+    }
+
+    /// Steps of the whole training.
+    pub fn steps(&self) -> u64 {
+        self.plan.steps(self.sources.train.len())
+    }
+
+    /// Goes on until the end, or until `say` wants it to stop. `say` is given the training, so that it may take a
+    /// checkpoint of it.
+    ///
+    /// # Errors
+    /// [`ModelError::Scene`] where a scene cannot be read, [`ModelError::NotFinite`].
+    pub fn run(
+        &mut self,
+        say: &mut dyn FnMut(&Self, &Event) -> Control,
+    ) -> Result<Ended, ModelError> {
+        if self.is_over() {
+            return Ok(Ended::Finished);
+        }
+        let (plan, from) = (self.plan.clone(), self.position.clone());
+        let train = Arc::clone(&self.sources.train);
+        let guides = self.sources.guides.take();
+        let guide = guides.as_ref().map(|[of_training, _]| of_training);
+        let ended = thread::scope(|scope| {
+            let (to, ready) = sync_channel(AHEAD);
+            scope.spawn(move || load::ahead(&plan, guide, &*train, &from, &to));
+            let mut clock = Clock::new();
+            let next = || {
+                let since = Instant::now();
+                let batch = ready
+                    .recv()
+                    .expect("the loader sends a batch for each step, or an error");
+                batch.map(|batch| (batch, since.elapsed()))
+            };
+            self.learn(
+                &mut clock,
+                &next,
+                guides.as_ref().map(|[_, of_validation]| of_validation),
+                say,
+            )
+        });
+        self.sources.guides = guides;
+        ended
+    }
+
+    fn learn(
+        &mut self,
+        clock: &mut Clock,
+        next: &dyn Fn() -> Result<(crate::input::Batch, Duration), ModelError>,
+        guide: Option<&Guide>,
+        say: &mut dyn FnMut(&Self, &Event) -> Control,
+    ) -> Result<Ended, ModelError> {
+        let (of, per_epoch) = (self.steps(), self.plan.batches(self.sources.train.len()));
+        while !self.is_over() {
+            let mut batches = Vec::with_capacity(self.plan.accumulate);
+            for _ in 0..self.plan.accumulate {
+                let (batch, waited) = next()?;
+                clock.waited += waited;
+                clock.samples += batch.images;
+                batches.push(batch);
+            }
+            let pace = self
+                .plan
+                .schedule
+                .pace(self.learner.steps(), of, self.plan.rate);
+            let loss = self.learner.step(&batches, pace)?;
+            let position = &mut self.position;
+            position.batches += batches.len() as u64;
+            position.losses += f64::from(loss);
+            position.steps += 1;
+            let epoch = position.epoch + 1;
+            let mut events = vec![Event::Step {
+                step: self.learner.steps(),
+                of,
+                epoch,
+                loss,
+                samples_per_s: clock.samples as f64 / clock.began.elapsed().as_secs_f64(),
+                data_wait_share: clock.share(),
+            }];
+            if self.position.batches == per_epoch {
+                let since = Instant::now();
+                events.push(Event::Epoch(self.end_epoch(pace.rate, guide)?));
+                clock.began += since.elapsed();
+            }
+            for event in &events {
+                if say(self, event) == Control::Stop && !self.is_over() {
+                    return Ok(Ended::Stopped);
+                }
+            }
+        }
+        Ok(Ended::Finished)
+    }
+
+    fn is_over(&self) -> bool {
+        self.position.epoch == self.plan.epochs || self.position.stopped_early
+    }
+
+    fn end_epoch(&mut self, rate: f64, guide: Option<&Guide>) -> Result<Line, ModelError> {
+        let validation = match self.sources.validation.is_empty() {
+            true => None,
+            false => Some(self.validate(guide)?),
+        };
+        let position = &mut self.position;
+        let line = Line {
+            epoch: position.epoch + 1,
+            step: self.learner.steps(),
+            loss: position.losses / position.steps as f64,
+            rate,
+            validation,
+        };
+        position.history.push(line);
+        (position.losses, position.steps) = (0.0, 0);
+        position.epoch += 1;
+        position.batches = 0;
+        if let Some(loss) = validation.map(|m| m.loss()) {
+            if position.best.is_none_or(|best| loss < best) {
+                position.best = Some(loss);
+                position.since_best = 0;
+            } else {
+                position.since_best += 1;
+            }
+            let patience = self.plan.early_stop;
+            position.stopped_early = patience > 0 && position.since_best >= patience;
+        }
+        Ok(line)
+    }
+
+    /// Figures on the validation scenes, as they are; of each scene another spot, always the same.
+    fn validate(&self, guide: Option<&Guide>) -> Result<Metrics, ModelError> {
+        let scenes = &*self.sources.validation;
+        let mut tally = Tally::default();
+        let visits: Vec<(usize, Visit)> = (0..scenes.len())
+            .map(|index| {
+                let spot = match self.plan.question.by_spot() {
+                    true => index % self.plan.question.spots,
+                    false => 0,
+                };
+                (
+                    index,
+                    Visit {
+                        spot,
+                        ..Visit::default()
+                    },
+                )
+            })
+            .collect();
+        for visits in visits.chunks(self.plan.batch) {
+            let batch = load::batch(&self.plan, guide, scenes, visits)?;
+            let said = self.learner.predict(&batch);
+            tally.add(self.plan.question.task, &said, &batch.target);
+        }
+        Ok(tally.metrics(self.plan.question.task))
+    }
+
+    /// What came out.
+    pub fn finish(self) -> Trained {
+        let named = weights::to_torch(self.learner.parameters().to_named());
+        Trained {
+            weights: weights::write(&named, &Default::default()),
+            history: self.position.history,
+            stopped_early: self.position.stopped_early,
+        }
+    }
+}
+
+/// How long the network waited.
+struct Clock {
+    began: Instant,
+    waited: Duration,
+    samples: usize,
+}
+
+impl Clock {
+    fn new() -> Self {
+        Self {
+            began: Instant::now(),
+            waited: Duration::ZERO,
+            samples: 0,
+        }
+    }
+
+    fn share(&self) -> f64 {
+        self.waited.as_secs_f64() / self.began.elapsed().as_secs_f64().max(f64::MIN_POSITIVE)
+    }
+}

@@ -1,0 +1,94 @@
+//! Small scenes and plans.
+
+use std::sync::Arc;
+
+use picofarm_model::{
+    Random,
+    input::{Normalise, Question, ShadowVariant, Task},
+    net::{Architecture, NetSpec},
+    scene::Scene,
+    train::{Plan, Schedule, Sources},
+};
+
+/// A slanted wall whose two-bounce peaks lie where its depth says, with one mirror and half of it lit.
+pub fn scene(seed: u64) -> Arc<Scene> {
+    let (height, width, bins) = (8, 8, 16);
+    let mut random = Random::new(seed, &[9]);
+    let (near, slope) = (1.0 + 2.0 * random.unit(), random.unit() / 8.0);
+    let pixels = height * width;
+    let depth_m: Vec<f32> = (0..pixels)
+        .map(|p| near + slope * (p % width) as f32)
+        .collect();
+    let mut scene = Scene {
+        height,
+        width,
+        bins,
+        first_m: 1.0,
+        bin_width_m: 0.75,
+        specular: (0..pixels).map(|p| u8::from(p % width == 3)).collect(),
+        spots: vec![[-0.3, 0.0, near], [0.3, 0.0, near]],
+        lit: (0..2 * pixels)
+            .map(|p| u8::from((p % width < 4) == (p < pixels)))
+            .collect(),
+        intrinsics: [4.0, 4.0, 4.0, 4.0],
+        depth_m,
+        ..Scene::default()
+    };
+    let mut histogram = vec![0.0; pixels * bins];
+    for spot in 0..2 {
+        for (p, path) in scene.tof(spot).iter().enumerate() {
+            let bin = (f64::from(*path) - scene.first_m) / scene.bin_width_m;
+            let lit = f32::from(scene.lit[spot * pixels + p]);
+            histogram[p * bins + (bin as usize).min(bins - 1)] += 0.1 + lit;
+        }
+    }
+    scene.histogram = histogram;
+    Arc::new(scene)
+}
+
+pub fn scenes(from: u64, count: u64) -> Vec<Arc<Scene>> {
+    (from..from + count).map(scene).collect()
+}
+
+pub fn sources() -> Sources {
+    Sources {
+        train: Arc::new(scenes(0, 9)),
+        validation: Arc::new(scenes(100, 3)),
+        guides: None,
+    }
+}
+
+pub fn plan(task: Task, variant: ShadowVariant) -> Plan {
+    let question = Question {
+        task,
+        variant,
+        normalise: Normalise::MinMax,
+        bins: 16,
+        intensity_only: false,
+        spots: 2,
+    };
+    let (dense, one_hot, outputs) = question.channels();
+    Plan {
+        question,
+        net: NetSpec {
+            architecture: Architecture::Unet2d,
+            dense,
+            one_hot,
+            outputs,
+            width: 4,
+            levels: 3,
+            stem: 0,
+            time: 0,
+            frozen: false,
+        },
+        epochs: 3,
+        batch: 2,
+        accumulate: 2,
+        rate: 1e-2,
+        decay: 1e-3,
+        schedule: Schedule::Onecycle,
+        augment: true,
+        early_stop: 0,
+        seed: 5,
+    }
+}
