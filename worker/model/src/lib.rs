@@ -12,6 +12,7 @@ pub mod parameters;
 mod random;
 pub mod scene;
 pub mod train;
+pub mod trial;
 pub mod weights;
 
 pub use error::ModelError;

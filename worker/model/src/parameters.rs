@@ -142,7 +142,8 @@ impl Parameters {
         device: &Device,
     ) -> Result<Self, ModelError> {
         for (i, d) in self.declared.iter().enumerate() {
-            if !d.name.starts_with("encoders.") && !d.name.starts_with("stem.") {
+            let encoder = ["stem.", "encoders.", "time_projections."];
+            if !encoder.iter().any(|part| d.name.starts_with(part)) {
                 continue;
             }
             let found = named.remove(&d.name).filter(|(shape, _)| *shape == d.shape);

@@ -3,6 +3,7 @@
 mod block;
 mod pass;
 mod spec;
+mod unet25d;
 mod unet2d;
 
 use burn::tensor::Tensor;
@@ -16,6 +17,7 @@ use crate::{
     parameters::{Declarations, Declared},
 };
 use unet2d::Unet2d;
+use unet25d::Unet25d;
 
 /// A network without its numbers.
 #[derive(Debug, Clone)]
@@ -28,6 +30,7 @@ pub struct Net {
 #[derive(Debug, Clone)]
 enum Body {
     Unet2d(Unet2d),
+    Unet25d(Unet25d),
 }
 
 impl Net {
@@ -40,10 +43,7 @@ impl Net {
         let mut declarations = Declarations::default();
         let body = match spec.architecture {
             Architecture::Unet2d => Body::Unet2d(Unet2d::declare(&mut declarations, &spec)),
-            Architecture::Unet25d => {
-                let what = "\"unet25d\" is not built yet; use \"unet2d\"";
-                return Err(ModelError::invalid("net.architecture", what));
-            }
+            Architecture::Unet25d => Body::Unet25d(Unet25d::declare(&mut declarations, &spec)),
         };
         Ok(Self {
             spec,
@@ -77,6 +77,7 @@ impl Net {
         assert_eq!(input.one_hot.is_some(), self.spec.one_hot > 0);
         match &self.body {
             Body::Unet2d(net) => net.forward(pass, input),
+            Body::Unet25d(net) => net.forward(pass, input, self.spec.frozen),
         }
     }
 }

@@ -62,6 +62,11 @@ impl<'a> Pass<'a> {
         shaped(&self.declared[id.0], self.leaves[id.0].clone())
     }
 
+    /// A parameter as one row.
+    pub(super) fn flat(&self, id: Id) -> Tensor<1> {
+        self.leaves[id.0].clone()
+    }
+
     /// Batch norm and ReLU; in training by the batch's statistics, of which it keeps the running mean and the
     /// **unbiased** running variance, as PyTorch does.
     pub fn norm_relu(&mut self, norm: &Norm, x: Tensor<4>) -> Tensor<4> {

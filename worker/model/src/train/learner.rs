@@ -65,8 +65,15 @@ impl Learner {
         self.steps
     }
 
-    /// Loss of a batch and the gradient of every learned parameter, by declaration; moves the running statistics.
-    pub fn gradients(&mut self, batch: &Batch) -> (f32, Vec<Option<Tensor<1>>>) {
+    /// What the network said, loss, and the gradient of every learned parameter by declaration; moves the running
+    /// statistics.
+    pub(crate) fn gradients(&mut self, batch: &Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
+        let (output, loss, gradients) = self.backward(batch);
+        let said = output.into_data_as::<f32>();
+        (said.try_into_vec().expect("asked for f32"), loss, gradients)
+    }
+
+    fn backward(&mut self, batch: &Batch) -> (Tensor<4>, f32, Vec<Option<Tensor<1>>>) {
         let device = self.device.clone().autodiff();
         let leaves: Vec<Tensor<1>> = self
             .net
@@ -81,14 +88,14 @@ impl Learner {
         let mut pass = Pass::training(self.net.declared(), &leaves);
         let output = self.net.forward(&mut pass, batch.input(&device));
         let moved = pass.into_moved();
-        let loss = loss(self.task, output, batch.truth(&device));
+        let loss = loss(self.task, output.clone(), batch.truth(&device));
         let mut gradients = loss.backward();
         let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
         let of = of.collect();
         for (id, value) in moved {
             self.parameters.set(id, value);
         }
-        (loss.inner().into_scalar::<f32>(), of)
+        (output.inner(), loss.inner().into_scalar::<f32>(), of)
     }
 
     /// One step of the optimiser over batches, whose gradients are averaged. Returns the mean loss.
@@ -99,7 +106,7 @@ impl Learner {
         let mut sum: Vec<Option<Tensor<1>>> = Vec::new();
         let mut losses = 0.0;
         for (i, batch) in batches.iter().enumerate() {
-            let (loss, gradients) = self.gradients(batch);
+            let (_, loss, gradients) = self.backward(batch);
             if !loss.is_finite() {
                 return Err(self.not_finite(loss));
             }

@@ -1,0 +1,234 @@
+"""The networks of picofarm in PyTorch: the same numbers, and how long they take.
+
+usage: model_torch.py parity FILE...
+       model_torch.py bench FILE [--channels-last]
+
+FILE comes from `picofarm bench model --record FILE`: weights, a batch, and what picofarm made of them. `parity` computes
+the same and fails where outputs differ by more than 1e-4, a gradient by more than 1e-3 of its norm, or the losses of the
+steps of AdamW by more than 1e-3. `bench` takes steps when told to: it reads numbers of steps line by line and answers with
+seconds (`picofarm bench model --peer` does that between its own). Needs torch and safetensors.
+"""
+
+import json
+import sys
+import time
+
+import torch
+from safetensors import safe_open
+from torch import nn
+from torch.nn import functional as F
+
+
+class SingleConv(nn.Sequential):
+    def __init__(self, inputs, outputs, three=False):
+        super().__init__()
+        conv, norm = (nn.Conv3d, nn.BatchNorm3d) if three else (nn.Conv2d, nn.BatchNorm2d)
+        self.add_module("conv", conv(inputs, outputs, 3, padding=1, bias=False))
+        self.add_module("batchnorm", norm(outputs))
+        self.add_module("ReLU", nn.ReLU(inplace=True))
+
+
+class Block(nn.Module):
+    def __init__(self, inputs, outputs, encoder, three=False):
+        super().__init__()
+        between = max(outputs // 2, inputs) if encoder else outputs
+        self.basic_module = nn.Sequential()
+        self.basic_module.add_module("SingleConv1", SingleConv(inputs, between, three))
+        self.basic_module.add_module("SingleConv2", SingleConv(between, outputs, three))
+
+    def forward(self, x):
+        return self.basic_module(x)
+
+
+class Decoding(nn.Module):
+    """The 2D decoder that both networks have."""
+
+    def declare(self, widths, outputs):
+        pairs = list(zip(widths, widths[1:]))[::-1]
+        self.decoders = nn.ModuleList(Block(fine + coarse, fine, encoder=False) for fine, coarse in pairs)
+        self.final_conv = nn.Conv2d(widths[0], outputs, 1)
+
+    def decode(self, features):
+        x = features.pop()
+        for block in self.decoders:
+            skip = features.pop()
+            x = block(torch.cat((skip, F.interpolate(x, size=skip.shape[-2:], mode="nearest")), 1))
+        return self.final_conv(x)
+
+
+class Unet2d(Decoding):
+    def __init__(self, spec):
+        super().__init__()
+        inputs = spec["dense"] + spec["one_hot"]
+        widths = [spec["width"] << k for k in range(spec["levels"])]
+        self.stem = SingleConv(inputs, spec["stem"]) if spec["stem"] else None
+        inputs = spec["stem"] or inputs
+        self.encoders = nn.ModuleList()
+        for width in widths:
+            self.encoders.append(Block(inputs, width, encoder=True))
+            inputs = width
+        self.declare(widths, spec["outputs"])
+        self.frozen = spec.get("frozen", False)
+
+    def train(self, mode=True):
+        super().train(mode)
+        if self.frozen:
+            for part in (self.encoders, self.stem):
+                if part is not None:
+                    part.eval().requires_grad_(False)
+        return self
+
+    def forward(self, dense, one_hot=None):
+        x = dense if one_hot is None else torch.cat((dense, one_hot), 1)
+        if self.stem is not None:
+            x = self.stem(x)
+        features = []
+        for i, block in enumerate(self.encoders):
+            x = block(F.max_pool2d(x, 2) if i else x)
+            features.append(x)
+        return self.decode(features)
+
+
+class Unet25d(Decoding):
+    def __init__(self, spec):
+        super().__init__()
+        bins, time, levels = spec["dense"], spec["time"], spec["levels"]
+        streams = 2 if spec["one_hot"] else 1
+        widths = [spec["width"] << k for k in range(levels)]
+        self.time_projections = nn.ModuleList(nn.Conv2d(bins, time, 1) for _ in range(streams))
+        self.encoders = nn.ModuleList()
+        inputs = streams
+        for width in widths:
+            self.encoders.append(Block(inputs, width, encoder=True, three=True))
+            inputs = width
+        self.skip_projections = nn.ModuleList()
+        for k in range(levels):
+            sizes = [time >> k] + [s for s in spec_steps(time >> k)] + [1]
+            layers = []
+            for a, b in zip(sizes, sizes[1:]):
+                layers += [nn.Linear(a, b), nn.ReLU(inplace=True)]
+            self.skip_projections.append(nn.Sequential(*layers[:-1]))
+        self.declare(widths, spec["outputs"])
+
+    def forward(self, dense, one_hot=None):
+        streams = [dense] if one_hot is None else [dense, one_hot]
+        x = torch.stack([project(s) for project, s in zip(self.time_projections, streams)], 1)
+        features = []
+        for i, (block, skip) in enumerate(zip(self.encoders, self.skip_projections)):
+            x = block(F.max_pool3d(x, 2) if i else x)
+            features.append(skip(x.movedim(2, -1)).squeeze(-1))
+        return self.decode(features)
+
+
+def spec_steps(time):
+    """The widths between a level's time axis and one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 in the paper."""
+    power = 1 << (time - 1).bit_length() - 1 if time > 1 else 1
+    return [power] + ([32] if power > 32 else []) if time > 2 else []
+
+
+class Trial:
+    def __init__(self, path):
+        with safe_open(path, "pt") as file:
+            self.spec = json.loads(file.metadata()["trial"])
+            self.tensors = {name: file.get_tensor(name) for name in file.keys()}
+        net = self.spec["net"]
+        self.model = {"unet2d": Unet2d, "unet25d": Unet25d}[net["architecture"]](net)
+        self.reset()
+        self.dense, self.target = self.tensors["input/dense"], self.tensors["target"]
+        self.one_hot = None
+        if net["one_hot"]:
+            bins = self.tensors["input/one_hot"].long()
+            self.one_hot = (bins[:, None] == torch.arange(net["one_hot"])[:, None, None]).float()
+
+    def part(self, name):
+        return {k[len(name) + 1 :]: v for k, v in self.tensors.items() if k.startswith(name + "/")}
+
+    def reset(self):
+        state = self.part("weights")
+        for name in state:
+            if name.endswith("num_batches_tracked"):
+                state[name] = state[name].reshape(()).long()
+        self.model.load_state_dict(state)
+        self.model.train()
+        learned = [p for p in self.model.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.AdamW(learned, lr=self.spec["rate"], weight_decay=self.spec["decay"])
+
+    def loss(self):
+        output = self.model(self.dense, self.one_hot)
+        if self.spec["task"] == "tof":
+            return output, F.l1_loss(output, self.target)
+        return output, F.binary_cross_entropy_with_logits(output, self.target)
+
+    def step(self):
+        self.optimiser.zero_grad()
+        _, loss = self.loss()
+        loss.backward()
+        self.optimiser.step()
+        return loss.item()
+
+
+def parity(path):
+    trial = Trial(path)
+    trial.model.eval()
+    with torch.no_grad():
+        evaluated = trial.model(trial.dense, trial.one_hot)
+    trial.model.train()
+    output, loss = trial.loss()
+    loss.backward()
+    worst = ("", 0.0)
+    gradients = trial.part("gradient")
+    for name, parameter in trial.model.named_parameters():
+        if parameter.grad is None:
+            assert name not in gradients, f"{name} has no gradient here"
+            continue
+        theirs, ours = parameter.grad, gradients.pop(name)
+        off = ((theirs - ours).norm() / theirs.norm().clamp_min(1e-12)).item()
+        worst = max(worst, (name, off), key=lambda pair: pair[1])
+    state = {k: v.clone() for k, v in trial.model.state_dict().items()}
+    assert not gradients, f"gradients of {sorted(gradients)} are unknown here"
+    trial.reset()
+    ours = trial.tensors["losses"]
+    losses = torch.tensor([trial.step() for _ in ours])
+    figures = {
+        "output": (output - trial.tensors["output"]).abs().max().item(),
+        "evaluated": (evaluated - trial.tensors["evaluated"]).abs().max().item(),
+        "gradient": worst[1],
+        "losses": (losses - ours).abs().max().item(),
+        "statistics": max((state[k] - v).abs().max().item() for k, v in trial.part("after").items()),
+    }
+    limits = {"output": 1e-4, "evaluated": 1e-4, "gradient": 1e-3, "losses": 1e-3, "statistics": 1e-4}
+    parameters = sum(p.numel() for p in trial.model.parameters())
+    print(f"{path}: {trial.spec['task']}, {trial.spec['net']['architecture']}, {parameters} parameters, torch {torch.__version__}")
+    for name, value in figures.items():
+        verdict = "ok" if value <= limits[name] else "TOO FAR OFF"
+        more = f" ({worst[0]})" if name == "gradient" else ""
+        print(f"  {name:10} {value:.2e} of {limits[name]:.0e} allowed  {verdict}{more}")
+    print(f"  loss {losses[0]:.6f} to {losses[-1]:.6f} in {len(losses)} steps, ours {ours[0]:.6f} to {ours[-1]:.6f}")
+    return all(value <= limits[name] for name, value in figures.items())
+
+
+def bench(path, channels_last=False):
+    trial = Trial(path)
+    if channels_last:
+        trial.model = trial.model.to(memory_format=torch.channels_last)
+        trial.dense = trial.dense.to(memory_format=torch.channels_last)
+        trial.reset()
+    name = f"PyTorch {torch.__version__}" + (", channels last" if channels_last else "")
+    print(json.dumps({"tool": name, "threads": torch.get_num_threads()}), flush=True)
+    for line in sys.stdin:
+        begun = time.perf_counter()
+        for _ in range(int(line)):
+            trial.step()
+        print(time.perf_counter() - begun, flush=True)
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["parity", *paths] if paths:
+            sys.exit(0 if all([parity(path) for path in paths]) else 1)
+        case ["bench", path]:
+            bench(path)
+        case ["bench", path, "--channels-last"]:
+            bench(path, channels_last=True)
+        case _:
+            sys.exit(__doc__)

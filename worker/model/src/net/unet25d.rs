@@ -1,0 +1,223 @@
+//! The 2.5D U-Net of Shoot-Bounce-3D: time is a dimension of the encoder, the decoder is two-dimensional.
+//!
+//! Features lie as (N·T, C, H, W): an image for each moment. A 3×3×3 convolution is then a 3×3 convolution over the
+//! channels of three moments beside each other, batch norm over images is batch norm over time too, and a projection of
+//! time is a 1×1 convolution: everything runs on the operations of the 2D network.
+
+use burn::tensor::{Tensor, activation::relu};
+
+use super::{
+    block::norm,
+    pass::{Input, Norm, Pass},
+    spec::NetSpec,
+    unet2d::Decoder,
+};
+use crate::{
+    ops,
+    parameters::{Begin, Declarations, Id},
+};
+
+#[derive(Debug, Clone)]
+pub(super) struct Unet25d {
+    time: usize,
+    /// One for each stream: bins to moments.
+    projections: Vec<Linear>,
+    encoders: Vec<[Cbr; 2]>,
+    /// One for each level: moments to one.
+    skips: Vec<Vec<Linear>>,
+    decoder: Decoder,
+}
+
+/// Weights (outputs, inputs) and a bias.
+#[derive(Debug, Clone, Copy)]
+struct Linear {
+    weight: Id,
+    bias: Id,
+}
+
+/// 3×3×3 convolution without bias, batch norm, ReLU.
+#[derive(Debug, Clone, Copy)]
+struct Cbr {
+    weight: Id,
+    norm: Norm,
+}
+
+impl Unet25d {
+    pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        let streams = if spec.one_hot > 0 { 2 } else { 1 };
+        d.frozen = spec.frozen;
+        let projections = (0..streams)
+            .map(|s| {
+                let at = format!("time_projections.{s}");
+                Linear::declare(d, &at, &[spec.time, spec.dense, 1, 1])
+            })
+            .collect();
+        let mut inputs = streams;
+        let mut encoders = Vec::new();
+        for (i, outputs) in spec.widths().into_iter().enumerate() {
+            let at = |k| format!("encoders.{i}.basic_module.SingleConv{k}");
+            let between = (outputs / 2).max(inputs);
+            encoders.push([
+                Cbr::declare(d, &at(1), inputs, between),
+                Cbr::declare(d, &at(2), between, outputs),
+            ]);
+            inputs = outputs;
+        }
+        d.frozen = false;
+        let skips = (0..spec.levels)
+            .map(|level| {
+                let sizes = steps(spec.time >> level);
+                let pairs = sizes.iter().zip(&sizes[1..]).enumerate();
+                pairs
+                    .map(|(k, (from, to))| {
+                        // The activations between count as modules in PyTorch.
+                        let at = format!("skip_projections.{level}.{}", 2 * k);
+                        Linear::declare(d, &at, &[*to, *from])
+                    })
+                    .collect()
+            })
+            .collect();
+        Self {
+            time: spec.time,
+            projections,
+            encoders,
+            skips,
+            decoder: Decoder::declare(d, &spec.widths(), spec.outputs),
+        }
+    }
+
+    pub(super) fn forward(&self, pass: &mut Pass, input: Input, frozen: bool) -> Tensor<4> {
+        let features = match frozen {
+            true => pass.frozen(|pass| self.features(pass, input)),
+            false => self.features(pass, input),
+        };
+        let levels = features.into_iter().zip(&self.skips).enumerate();
+        let flat = levels
+            .map(|(level, (x, skip))| project(pass, x, self.time >> level, skip))
+            .collect();
+        self.decoder.forward(pass, flat)
+    }
+
+    /// What the encoder gives at each level, (N·T, C, H, W), from the finest.
+    fn features(&self, pass: &mut Pass, input: Input) -> Vec<Tensor<4>> {
+        let [n, bins, h, w] = input.dense.dims();
+        let mut streams = vec![input.dense];
+        if let Some(one_hot) = input.one_hot {
+            streams.push(ops::plain::one_hot(one_hot, bins));
+        }
+        let streams = streams.into_iter().zip(&self.projections);
+        let streams: Vec<Tensor<5>> = streams
+            .map(|(x, projection)| {
+                let x = projection.forward(pass, x);
+                x.reshape([n, self.time, 1, h, w])
+            })
+            .collect();
+        let channels = streams.len();
+        let mut x = Tensor::cat(streams, 2).reshape([n * self.time, channels, h, w]);
+        let mut features = Vec::new();
+        for (level, block) in self.encoders.iter().enumerate() {
+            if level > 0 {
+                x = halve_time(ops::max_pool(x));
+            }
+            for cbr in block {
+                x = cbr.forward(pass, x, self.time >> level);
+            }
+            features.push(x.clone());
+        }
+        features
+    }
+}
+
+/// The greater of each two moments.
+fn halve_time(x: Tensor<4>) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let pairs = x.reshape([images / 2, 2, c, h, w]);
+    pairs.max_dim(1).reshape([images / 2, c, h, w])
+}
+
+/// (N·T, C, H, W) to (N, C, H, W) through layers over time, with ReLU between them.
+fn project(pass: &Pass, x: Tensor<4>, time: usize, layers: &[Linear]) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let n = images / time;
+    let mut x = x.reshape([n, time, c * h, w]);
+    for (k, layer) in layers.iter().enumerate() {
+        if k > 0 {
+            x = relu(x);
+        }
+        x = layer.forward(pass, x);
+    }
+    x.reshape([n, c, h, w])
+}
+
+/// Sizes from a level's moments to one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 (the appendix), others alike: the
+/// greatest power of two below, 32 if that is greater, one.
+fn steps(time: usize) -> Vec<usize> {
+    let mut sizes = vec![time];
+    if time > 2 {
+        let power = (time - 1).ilog2();
+        sizes.push(1 << power);
+        if power > 5 {
+            sizes.push(32);
+        }
+    }
+    sizes.push(1);
+    sizes
+}
+
+impl Linear {
+    fn declare(d: &mut Declarations, at: &str, shape: &[usize]) -> Self {
+        let begin = Begin::FanIn(shape[1]);
+        Self {
+            weight: d.add(format!("{at}.weight"), shape, begin, true),
+            bias: d.add(format!("{at}.bias"), &shape[..1], begin, true),
+        }
+    }
+
+    /// Over channels.
+    fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
+        let bias: Tensor<1> = pass.get(self.bias);
+        let (outputs, inputs) = (bias.dims()[0], x.dims()[1]);
+        let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
+        ops::conv1x1(x, weight, bias)
+    }
+}
+
+impl Cbr {
+    fn declare(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
+        let begin = Begin::FanIn(inputs * 27);
+        let shape = [outputs, inputs, 3, 3, 3];
+        Self {
+            weight: d.add(format!("{at}.conv.weight"), &shape, begin, true),
+            norm: norm(d, &format!("{at}.batchnorm"), outputs),
+        }
+    }
+
+    fn forward(&self, pass: &mut Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
+        let [images, c, h, w] = x.dims();
+        let n = images / time;
+        let dark = Tensor::<5>::zeros([n, 1, c, h, w], &x.device());
+        let x = x.reshape([n, time, c, h, w]);
+        let padded = Tensor::cat(vec![dark.clone(), x, dark], 1);
+        let moments = (0..3).map(|k| padded.clone().narrow(1, k, time)).collect();
+        let beside = Tensor::cat(moments, 2).reshape([images, 3 * c, h, w]);
+        let weight: Tensor<5> = pass.get(self.weight);
+        let outputs = weight.dims()[0];
+        let weight = weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3]);
+        let y = ops::conv3x3(beside, weight);
+        pass.norm_relu(&self.norm, y)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::steps;
+
+    #[test]
+    fn the_papers_projections() {
+        assert_eq!(steps(160), [160, 128, 32, 1]);
+        assert_eq!(steps(80), [80, 64, 32, 1]);
+        assert_eq!(steps(40), [40, 32, 1]);
+        assert_eq!(steps(20), [20, 16, 1]);
+        assert_eq!((steps(1), steps(2), steps(3)), (vec![1, 1], vec![2, 1], vec![3, 2, 1]));
+    }
+}

@@ -1,0 +1,135 @@
+//! A network with random weights and data: to be measured, and compared with the same network in PyTorch
+//! (`tests/peers/model_torch.py`).
+
+use std::collections::BTreeMap;
+
+use burn::tensor::Device;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    ModelError, Random,
+    input::{Batch, Task},
+    net::{Net, NetSpec},
+    parameters::{Named, Parameters, download},
+    train::{Learner, Pace, predict},
+    weights,
+};
+
+/// What is tried.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Trial {
+    /// What the network learns: decides the loss.
+    pub task: Task,
+    /// The network.
+    pub net: NetSpec,
+    /// Examples a batch.
+    pub batch: usize,
+    /// Rows and columns.
+    pub side: usize,
+    /// Learning rate.
+    pub rate: f64,
+    /// Weight decay.
+    pub decay: f64,
+    /// Of weights and data.
+    pub seed: u64,
+}
+
+impl Trial {
+    /// The learner at its beginning, and the batch that it sees again and again.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] naming the field that cannot be used.
+    pub fn begin(&self, device: &Device) -> Result<(Learner, Batch), ModelError> {
+        let net = Net::new(self.net.clone())?;
+        let multiple = self.net.multiple();
+        if self.side == 0 || self.side % multiple != 0 || self.batch == 0 {
+            let what = format!("must be a multiple of {multiple}, and batch at least 1");
+            return Err(ModelError::invalid("side", what));
+        }
+        let parameters = Parameters::begin(net.declared().to_vec(), self.seed, device);
+        let learner = Learner::new(net, parameters, self.task, self.decay);
+        Ok((learner, self.data()))
+    }
+
+    fn data(&self) -> Batch {
+        let pixels = self.batch * self.side * self.side;
+        let mut random = Random::new(self.seed, &[4]);
+        // Like histograms: mostly small, with peaks.
+        let dense = (0..pixels * self.net.dense).map(|_| random.unit().powi(8));
+        let dense = dense.collect();
+        let one_hot = match self.net.one_hot {
+            0 => Vec::new(),
+            bins => (0..pixels).map(|_| random.below(bins as u64 + 1) as i32 - 1).collect(),
+        };
+        let target = (0..pixels * self.net.outputs).map(|_| match self.task {
+            Task::Tof => random.unit(),
+            Task::Shadow | Task::Specular => (random.bits() >> 63) as f32,
+        });
+        Batch {
+            images: self.batch,
+            height: self.side,
+            width: self.side,
+            dense,
+            one_hot,
+            target: target.collect(),
+        }
+    }
+
+    /// The pace of its steps.
+    pub fn pace(&self) -> Pace {
+        Pace {
+            rate: self.rate,
+            beta1: 0.9,
+        }
+    }
+
+    /// Everything that another implementation must reproduce, as safetensors by PyTorch's names: `weights/`, the batch
+    /// (`input/`, `target`), `output` of a training pass, its `gradient/` and running statistics
+    /// (`after/`), `evaluated` of an evaluation pass, and the `losses` of `steps` steps of AdamW.
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`]; [`ModelError::NotFinite`].
+    pub fn record(&self, steps: usize, device: &Device) -> Result<Vec<u8>, ModelError> {
+        let (mut learner, batch) = self.begin(device)?;
+        let mut named = Named::new();
+        let put = |named: &mut Named, at: &str, tensors: Named| {
+            for (name, value) in weights::to_torch(tensors) {
+                named.insert(format!("{at}/{name}"), value);
+            }
+        };
+        put(&mut named, "weights", learner.parameters().to_named());
+        let (n, s) = (self.batch, self.side);
+        let shape = |channels| vec![n, channels, s, s];
+        named.insert("input/dense".into(), (shape(self.net.dense), batch.dense.clone()));
+        if !batch.one_hot.is_empty() {
+            let bins = batch.one_hot.iter().map(|bin| *bin as f32).collect();
+            named.insert("input/one_hot".into(), (vec![n, s, s], bins));
+        }
+        named.insert("target".into(), (shape(self.net.outputs), batch.target.clone()));
+        let evaluated = predict(learner.net(), learner.parameters(), &batch);
+        named.insert("evaluated".into(), (shape(self.net.outputs), evaluated));
+        let (output, _, gradients) = learner.gradients(&batch);
+        named.insert("output".into(), (shape(self.net.outputs), output));
+        let each = learner.net().declared().iter().zip(&gradients);
+        let gradients = each.filter_map(|(d, g)| {
+            let values = download(g.as_ref()?);
+            Some((d.name.clone(), (d.shape.clone(), values)))
+        });
+        put(&mut named, "gradient", gradients.collect());
+        let after = learner.parameters().to_named().into_iter();
+        put(
+            &mut named,
+            "after",
+            after.filter(|(name, _)| name.contains("running_")).collect(),
+        );
+        // From the beginning again: the pass has moved the statistics.
+        let (mut learner, _) = self.begin(device)?;
+        let mut losses = Vec::with_capacity(steps);
+        for _ in 0..steps {
+            losses.push(learner.step(std::slice::from_ref(&batch), self.pace())?);
+        }
+        named.insert("losses".into(), (vec![steps], losses));
+        let text = serde_json::to_string(self).expect("plain data");
+        Ok(weights::write(&named, &BTreeMap::from([("trial".into(), text)])))
+    }
+}
