@@ -2,10 +2,13 @@
 //!
 //! Knows nothing of jobs, stores or leases: scenes come through [`scene::Scenes`], weights and checkpoints go as bytes.
 
+pub mod baseline;
 mod error;
+mod evaluate;
 pub mod input;
 mod kernel;
 pub mod metric;
+mod model;
 pub mod net;
 pub mod ops;
 pub mod parameters;
@@ -16,5 +19,10 @@ pub mod trial;
 pub mod weights;
 
 pub use error::ModelError;
+pub use evaluate::{Evaluated, answers, evaluate};
 pub use kernel::AdamW;
+pub use model::Model;
 pub use random::Random;
+
+/// Version of everything that decides the bytes of trained weights and the figures of evaluations.
+pub const VERSION: &str = "model-1";

@@ -59,7 +59,9 @@ impl Trial {
         let dense = dense.collect();
         let one_hot = match self.net.one_hot {
             0 => Vec::new(),
-            bins => (0..pixels).map(|_| random.below(bins as u64 + 1) as i32 - 1).collect(),
+            bins => (0..pixels)
+                .map(|_| random.below(bins as u64 + 1) as i32 - 1)
+                .collect(),
         };
         let target = (0..pixels * self.net.outputs).map(|_| match self.task {
             Task::Tof => random.unit(),
@@ -100,12 +102,18 @@ impl Trial {
         put(&mut named, "weights", learner.parameters().to_named());
         let (n, s) = (self.batch, self.side);
         let shape = |channels| vec![n, channels, s, s];
-        named.insert("input/dense".into(), (shape(self.net.dense), batch.dense.clone()));
+        named.insert(
+            "input/dense".into(),
+            (shape(self.net.dense), batch.dense.clone()),
+        );
         if !batch.one_hot.is_empty() {
             let bins = batch.one_hot.iter().map(|bin| *bin as f32).collect();
             named.insert("input/one_hot".into(), (vec![n, s, s], bins));
         }
-        named.insert("target".into(), (shape(self.net.outputs), batch.target.clone()));
+        named.insert(
+            "target".into(),
+            (shape(self.net.outputs), batch.target.clone()),
+        );
         let evaluated = predict(learner.net(), learner.parameters(), &batch);
         named.insert("evaluated".into(), (shape(self.net.outputs), evaluated));
         let (output, _, gradients) = learner.gradients(&batch);
@@ -120,7 +128,9 @@ impl Trial {
         put(
             &mut named,
             "after",
-            after.filter(|(name, _)| name.contains("running_")).collect(),
+            after
+                .filter(|(name, _)| name.contains("running_"))
+                .collect(),
         );
         // From the beginning again: the pass has moved the statistics.
         let (mut learner, _) = self.begin(device)?;
@@ -130,6 +140,56 @@ impl Trial {
         }
         named.insert("losses".into(), (vec![steps], losses));
         let text = serde_json::to_string(self).expect("plain data");
-        Ok(weights::write(&named, &BTreeMap::from([("trial".into(), text)])))
+        Ok(weights::write(
+            &named,
+            &BTreeMap::from([("trial".into(), text)]),
+        ))
     }
+
+    /// The slope of the loss along its own gradient g at the beginning: measured over ±`reach` · g/|g|, and expected: |g|.
+    /// In training the loss is that of a batch, so statistics follow the parameters.
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`].
+    pub fn slope(&self, reach: f32, device: &Device) -> Result<Slope, ModelError> {
+        let (mut learner, batch) = self.begin(device)?;
+        let (_, _, gradients) = learner.gradients(&batch);
+        let host: Vec<Option<Vec<f32>>> =
+            gradients.iter().map(|g| g.as_ref().map(download)).collect();
+        let squares = host
+            .iter()
+            .flatten()
+            .flatten()
+            .map(|g| f64::from(*g).powi(2));
+        let norm = squares.sum::<f64>().sqrt();
+        let mut losses = [0.0; 2];
+        for (loss, sign) in losses.iter_mut().zip([1.0, -1.0]) {
+            let (mut learner, _) = self.begin(device)?;
+            let mut moved = learner.parameters().to_named();
+            for (d, g) in learner.net().declared().iter().zip(&host) {
+                let Some(g) = g else { continue };
+                let (_, values) = moved.get_mut(&d.name).expect("declared");
+                for (value, g) in values.iter_mut().zip(g) {
+                    *value += (sign * f64::from(reach) * f64::from(*g) / norm) as f32;
+                }
+            }
+            let declared = learner.net().declared().to_vec();
+            let parameters = Parameters::from_named(declared, moved, device)?;
+            learner = Learner::new(learner.net().clone(), parameters, self.task, self.decay);
+            *loss = f64::from(learner.gradients(&batch).1);
+        }
+        Ok(Slope {
+            measured: (losses[0] - losses[1]) / (2.0 * f64::from(reach)),
+            expected: norm,
+        })
+    }
+}
+
+/// See [`Trial::slope`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Slope {
+    /// By finite differences.
+    pub measured: f64,
+    /// Length of the gradient.
+    pub expected: f64,
 }

@@ -4,11 +4,8 @@ use std::collections::{BTreeMap, HashMap};
 
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
-use crate::{
-    ModelError,
-    net::ONE_HOT,
-    parameters::{Declared, Named},
-};
+pub use crate::parameters::Named;
+use crate::{ModelError, net::ONE_HOT, parameters::Declared};
 
 /// Tensors as safetensors, in the order of their names, with metadata.
 pub fn write(named: &Named, metadata: &BTreeMap<String, String>) -> Vec<u8> {

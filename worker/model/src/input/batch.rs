@@ -129,7 +129,8 @@ fn bin(scene: &Scene, bins: usize, path_m: f32) -> i32 {
     if !(stored >= 0.0 && stored < scene.bins as f64) {
         return -1;
     }
-    (stored as usize / (scene.bins / bins)) as i32
+    let bin = stored as usize / (scene.bins / bins);
+    if bin < bins { bin as i32 } else { -1 }
 }
 
 fn flip<T>(plane: &mut [T], width: usize, visit: Visit) {
@@ -152,9 +153,9 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
         );
         return Err(ModelError::invalid("source", what));
     }
-    if scene.bins % question.bins != 0 {
+    if question.bins > scene.bins {
         let what = format!(
-            "{} does not divide the {} bins of the data set; give a divisor, or 0 for all",
+            "{} bins are asked of a data set with {}; give fewer, or 0 for all",
             question.bins, scene.bins
         );
         return Err(ModelError::invalid("input.bins", what));

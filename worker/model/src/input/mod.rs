@@ -67,7 +67,7 @@ pub struct Question {
     /// How histograms are scaled.
     #[serde(default)]
     pub normalise: Normalise,
-    /// Bins after rebinning: a divisor of the stored histogram's.
+    /// Bins after rebinning.
     pub bins: usize,
     /// The time-integrated image instead of histograms.
     #[serde(default)]

@@ -3,13 +3,14 @@
 use super::Normalise;
 use crate::scene::Scene;
 
-/// m of a scene, `[bin][row][column]`, with `bins` bins: adjacent ones are summed, then scaled.
+/// m of a scene, `[bin][row][column]`, with `bins` bins: adjacent ones are summed, those left over at the end dropped, then
+/// scaled.
 ///
 /// # Panics
-/// Where `bins` does not divide the scene's.
+/// Where the scene has fewer.
 pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
     let pixels = scene.pixels();
-    assert_eq!(scene.bins % bins, 0, "bins divide the stored bins");
+    assert!(bins <= scene.bins, "bins are summed, not divided");
     assert_eq!(out.len(), bins * pixels, "room for each bin of each pixel");
     let merged = scene.bins / bins;
     let mut pixel = vec![0.0f32; bins];

@@ -218,6 +218,9 @@ mod tests {
         assert_eq!(steps(80), [80, 64, 32, 1]);
         assert_eq!(steps(40), [40, 32, 1]);
         assert_eq!(steps(20), [20, 16, 1]);
-        assert_eq!((steps(1), steps(2), steps(3)), (vec![1, 1], vec![2, 1], vec![3, 2, 1]));
+        assert_eq!(
+            (steps(1), steps(2), steps(3)),
+            (vec![1, 1], vec![2, 1], vec![3, 2, 1])
+        );
     }
 }

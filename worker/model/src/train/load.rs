@@ -8,9 +8,8 @@ use std::{
 use super::{Plan, order, run::Position};
 use crate::{
     ModelError,
-    input::{Batch, DEPTH_SCALE_M, Question, Visit, example},
-    net::Net,
-    parameters::Parameters,
+    input::{Batch, Visit, example},
+    model::Model,
     scene::{Scene, Scenes},
 };
 
@@ -19,37 +18,26 @@ pub(super) const AHEAD: usize = 2;
 
 /// A depth network that two-bounce times follow from, instead of from the truth.
 pub struct Guide {
-    /// The network.
-    pub net: Net,
-    /// Its numbers.
-    pub parameters: Parameters,
-    /// How it is asked.
-    pub question: Question,
+    model: Arc<Model>,
     known: Mutex<HashMap<usize, Arc<Vec<f32>>>>,
 }
 
 impl Guide {
     /// A guide that has looked at nothing yet.
-    pub fn new(net: Net, parameters: Parameters, question: Question) -> Self {
+    pub fn new(model: Arc<Model>) -> Self {
         Self {
-            net,
-            parameters,
-            question,
+            model,
             known: Mutex::default(),
         }
     }
 
     /// Its depths of a scene, metres; each is asked for once.
-    pub(super) fn depth_m(&self, index: usize, scene: &Scene) -> Result<Arc<Vec<f32>>, ModelError> {
+    fn depth_m(&self, index: usize, scene: &Scene) -> Result<Arc<Vec<f32>>, ModelError> {
         let lock = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(known) = lock().get(&index) {
             return Ok(Arc::clone(known));
         }
-        let mut batch = Batch::default();
-        example(&mut batch, &self.question, scene, None, Visit::default())?;
-        let scaled = super::learner::predict(&self.net, &self.parameters, &batch);
-        let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * DEPTH_SCALE_M);
-        let depth = Arc::new(depth.collect());
+        let depth = Arc::new(self.model.depth_m(scene)?);
         lock().insert(index, Arc::clone(&depth));
         Ok(depth)
     }

@@ -18,6 +18,7 @@ use crate::{
     ModelError,
     input::Visit,
     metric::{Metrics, Tally},
+    model::{Model, PLAN},
     net::Net,
     parameters::Parameters,
     scene::Scenes,
@@ -107,8 +108,8 @@ pub struct Sources {
     pub train: Arc<dyn Scenes>,
     /// Scenes to look at after each epoch; may be none.
     pub validation: Arc<dyn Scenes>,
-    /// For shadows: the network whose depths two-bounce times follow from. With it, one for the validation scenes.
-    pub guides: Option<[Guide; 2]>,
+    /// For shadows: the depth network that two-bounce times follow from; the truth where there is none.
+    pub guide: Option<Arc<Model>>,
 }
 
 /// A training.
@@ -228,9 +229,10 @@ impl Training {
         }
         let (plan, from) = (self.plan.clone(), self.position.clone());
         let train = Arc::clone(&self.sources.train);
-        let guides = self.sources.guides.take();
-        let guide = guides.as_ref().map(|[of_training, _]| of_training);
-        let ended = thread::scope(|scope| {
+        // One for each set of scenes: what it knows of them is kept by their number.
+        let [guide, of_validation] = [(); 2].map(|()| self.sources.guide.clone().map(Guide::new));
+        let guide = guide.as_ref();
+        thread::scope(|scope| {
             let (to, ready) = sync_channel(AHEAD);
             scope.spawn(move || load::ahead(&plan, guide, &*train, &from, &to));
             let mut clock = Clock::new();
@@ -241,15 +243,8 @@ impl Training {
                     .expect("the loader sends a batch for each step, or an error");
                 batch.map(|batch| (batch, since.elapsed()))
             };
-            self.learn(
-                &mut clock,
-                &next,
-                guides.as_ref().map(|[_, of_validation]| of_validation),
-                say,
-            )
-        });
-        self.sources.guides = guides;
-        ended
+            self.learn(&mut clock, &next, of_validation.as_ref(), say)
+        })
     }
 
     fn learn(
@@ -365,7 +360,7 @@ impl Training {
     pub fn finish(self) -> Trained {
         let named = weights::to_torch(self.learner.parameters().to_named());
         Trained {
-            weights: weights::write(&named, &Default::default()),
+            weights: weights::write(&named, &[(PLAN.to_owned(), self.plan.text())].into()),
             history: self.position.history,
             stopped_early: self.position.stopped_early,
         }

@@ -54,7 +54,7 @@ pub fn sources() -> Sources {
     Sources {
         train: Arc::new(scenes(0, 9)),
         validation: Arc::new(scenes(100, 3)),
-        guides: None,
+        guide: None,
     }
 }
 

@@ -1,0 +1,118 @@
+//! Models before scenes that they have not seen: figures, beside those of trivial answers.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    ModelError,
+    baseline::DepthBaseline,
+    input::{Batch, DEPTH_SCALE_M, Task, Visit, example},
+    metric::{Metrics, Tally},
+    model::Model,
+    scene::{Scene, Scenes},
+};
+
+/// What an evaluation found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Evaluated {
+    /// Of all scenes together.
+    pub metrics: Metrics,
+    /// Of trivial answers, by name: `constant` and `peak` for depths, `all` and `none` for masks.
+    pub baselines: Vec<(String, Metrics)>,
+    /// Of each scene, in order.
+    pub scenes: Vec<Metrics>,
+    /// Examples: scenes, times spots where a network is asked spot by spot.
+    pub examples: u64,
+}
+
+/// Asks a model of every scene, spot by spot where it is a shadow network. `guide` is the model whose depths two-bounce
+/// times follow from (the truth's without it); `baseline` what depths are compared with. `tell` hears how many scenes are
+/// done of how many and says whether to go on; where it does not, there is no answer.
+///
+/// # Errors
+/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model.
+pub fn evaluate(
+    model: &Model,
+    guide: Option<&Model>,
+    baseline: Option<&DepthBaseline>,
+    scenes: &dyn Scenes,
+    tell: &mut dyn FnMut(usize, usize) -> bool,
+) -> Result<Option<Evaluated>, ModelError> {
+    let task = model.question().task;
+    let mut whole = Tally::default();
+    let mut trivial: Vec<(&str, Tally)> = match (task, baseline) {
+        (Task::Tof, Some(_)) => vec![("constant", Tally::default()), ("peak", Tally::default())],
+        (Task::Tof, None) => Vec::new(),
+        _ => vec![("all", Tally::default()), ("none", Tally::default())],
+    };
+    let (mut each, mut examples) = (Vec::with_capacity(scenes.len()), 0);
+    for index in 0..scenes.len() {
+        let scene = scenes.load(index).map_err(|source| ModelError::Scene {
+            scene: index,
+            source,
+        })?;
+        let mut tally = Tally::default();
+        answers(model, guide, &scene, &mut |said, batch| {
+            examples += batch.images as u64;
+            tally.add(task, said, &batch.target);
+            for (name, tally) in &mut trivial {
+                let len = batch.target.len();
+                let said: Vec<f32> = match (*name, baseline) {
+                    ("constant", Some(fit)) => vec![fit.constant_m as f32 / DEPTH_SCALE_M; len],
+                    ("peak", Some(fit)) => {
+                        let depth = fit.of_peaks(&scene);
+                        depth
+                            .iter()
+                            .map(|z| (z / DEPTH_SCALE_M).clamp(0.0, 1.0))
+                            .collect()
+                    }
+                    ("all", _) => vec![1.0; len],
+                    _ => vec![-1.0; len],
+                };
+                tally.add(task, &said, &batch.target);
+            }
+        })?;
+        each.push(tally.metrics(task));
+        whole.join(&tally);
+        if !tell(index + 1, scenes.len()) {
+            return Ok(None);
+        }
+    }
+    let named = trivial
+        .iter()
+        .map(|(name, tally)| ((*name).to_owned(), tally.metrics(task)));
+    Ok(Some(Evaluated {
+        metrics: whole.metrics(task),
+        baselines: named.collect(),
+        scenes: each,
+        examples,
+    }))
+}
+
+/// What a model says of a scene: once, or for each spot. Hears outputs (outputs, H, W) and what was asked.
+///
+/// # Errors
+/// [`ModelError::Invalid`] for a scene that does not fit the model.
+pub fn answers(
+    model: &Model,
+    guide: Option<&Model>,
+    scene: &Scene,
+    hear: &mut dyn FnMut(&[f32], &Batch),
+) -> Result<(), ModelError> {
+    let question = model.question();
+    let depth_m = guide.map(|guide| guide.depth_m(scene)).transpose()?;
+    let spots = if question.by_spot() {
+        question.spots
+    } else {
+        1
+    };
+    for spot in 0..spots {
+        let mut batch = Batch::default();
+        let visit = Visit {
+            spot,
+            ..Visit::default()
+        };
+        example(&mut batch, question, scene, depth_m.as_deref(), visit)?;
+        hear(&model.answer(&batch), &batch);
+    }
+    Ok(())
+}

@@ -1,0 +1,85 @@
+//! A trained network that can be asked: weights that say themselves what they are.
+
+use burn::tensor::Device;
+
+use crate::{
+    ModelError,
+    input::{Batch, DEPTH_SCALE_M, Question, Task, Visit, example},
+    net::Net,
+    parameters::Parameters,
+    scene::Scene,
+    train::{Plan, predict},
+    weights,
+};
+
+/// A trained network.
+#[derive(Debug, Clone)]
+pub struct Model {
+    plan: Plan,
+    net: Net,
+    parameters: Parameters,
+}
+
+/// Name of the entry in the weights' metadata that says what they are: the [`Plan`] as JSON.
+pub const PLAN: &str = "plan";
+
+impl Model {
+    /// From what [`crate::train::Training::finish`] gave.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`] where the bytes are damaged or do not say what they are.
+    pub fn read(bytes: &[u8], device: &Device) -> Result<Self, ModelError> {
+        let (named, metadata) = weights::read(bytes)?;
+        let plan = metadata.get(PLAN).ok_or_else(|| {
+            ModelError::weights(
+                "the weights do not say what network they are of: no \"plan\" in their metadata",
+            )
+        })?;
+        let plan: Plan = serde_json::from_str(plan)
+            .map_err(|e| ModelError::weights(format!("the weights' plan: {e}")))?;
+        let net = Net::new(plan.net.clone())?;
+        let named = weights::from_torch(named, net.declared(), plan.question.part())?;
+        let parameters = Parameters::from_named(net.declared().to_vec(), named, device)?;
+        Ok(Self {
+            plan,
+            net,
+            parameters,
+        })
+    }
+
+    /// How it was trained, and what it is asked.
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// What it is asked.
+    pub fn question(&self) -> &Question {
+        &self.plan.question
+    }
+
+    /// Number of learned values.
+    pub fn learned(&self) -> usize {
+        self.parameters.learned()
+    }
+
+    /// What it says of a batch: (N, outputs, H, W), row by row.
+    pub fn answer(&self, batch: &Batch) -> Vec<f32> {
+        predict(&self.net, &self.parameters, batch)
+    }
+
+    /// Depths of a scene, metres: `[row][column]`.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] where it is no depth network, or the scene does not fit it.
+    pub fn depth_m(&self, scene: &Scene) -> Result<Vec<f32>, ModelError> {
+        if self.question().task != Task::Tof {
+            let what = "two-bounce times follow from depths; this model predicts none";
+            return Err(ModelError::invalid("shadow.tof", what));
+        }
+        let mut batch = Batch::default();
+        example(&mut batch, self.question(), scene, None, Visit::default())?;
+        let scaled = self.answer(&batch);
+        let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * DEPTH_SCALE_M);
+        Ok(depth.collect())
+    }
+}

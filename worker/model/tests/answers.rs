@@ -1,0 +1,219 @@
+//! Trained networks before other scenes: they beat trivial answers, and say what they are.
+
+mod common;
+
+use std::sync::Arc;
+
+use burn::tensor::Device;
+use common::{plan, scenes, sources};
+use picofarm_model::{
+    Evaluated, Model, Random, answers,
+    baseline::DepthBaseline,
+    evaluate,
+    input::{ShadowVariant, Task},
+    metric::Metrics,
+    net::{Architecture, NetSpec},
+    scene::{Kept, Scenes},
+    train::{Control, Plan, Sources, Trained, Training},
+    trial::Trial,
+    weights,
+};
+
+fn trained(plan: &Plan, sources: Sources) -> Trained {
+    let mut training = Training::start(plan.clone(), None, sources, &Device::flex()).unwrap();
+    training.run(&mut |_, _| Control::Continue).unwrap();
+    training.finish()
+}
+
+fn evaluated(model: &Model, guide: Option<&Model>) -> Evaluated {
+    let baseline = DepthBaseline::fit(&scenes(0, 40), 40).unwrap();
+    evaluate(
+        model,
+        guide,
+        Some(&baseline),
+        &scenes(500, 6),
+        &mut |_, _| true,
+    )
+    .unwrap()
+    .unwrap()
+}
+
+#[test]
+fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_all() {
+    let device = Device::flex();
+    let many = || Sources {
+        train: Arc::new(Kept::new(Arc::new(scenes(0, 40)), usize::MAX)),
+        ..sources()
+    };
+    let depth = Plan {
+        epochs: 25,
+        ..plan(Task::Tof, ShadowVariant::Concat)
+    };
+    let tof = trained(&depth, many());
+    let tof = Arc::new(Model::read(&tof.weights, &device).unwrap());
+    let found = evaluated(&tof, None);
+    let of = |name: &str| {
+        found
+            .baselines
+            .iter()
+            .find(|(n, _)| n == name)
+            .unwrap()
+            .1
+            .loss()
+    };
+    assert!(found.metrics.loss() < 0.5 * of("constant"), "{found:?}");
+    assert_eq!(found.scenes.len(), 6);
+
+    let shadow = Plan {
+        epochs: 25,
+        ..plan(Task::Shadow, ShadowVariant::Concat)
+    };
+    let guided = Sources {
+        guide: Some(Arc::clone(&tof)),
+        ..many()
+    };
+    let shadow = trained(&shadow, guided);
+    let shadow = Model::read(&shadow.weights, &device).unwrap();
+    let found = evaluated(&shadow, Some(&tof));
+    let Metrics::Mask { iou, .. } = found.metrics else {
+        panic!("a mask")
+    };
+    let Metrics::Mask { iou: all, .. } = found.baselines[0].1 else {
+        panic!("a mask")
+    };
+    assert_eq!((found.examples, &*found.baselines[0].0), (12, "all"));
+    assert!(iou > all + 0.1, "{iou} and {all}");
+}
+
+#[test]
+fn the_peak_is_a_better_depth_than_a_constant_where_peaks_follow_depths() {
+    let scenes = scenes(0, 20);
+    let fit = DepthBaseline::fit(&scenes, 20).unwrap();
+    let error = |depth: &dyn Fn(&picofarm_model::scene::Scene) -> Vec<f32>| -> f32 {
+        scenes
+            .iter()
+            .flat_map(|s| depth(s).into_iter().zip(s.depth_m.clone()))
+            .map(|(a, b)| (a - b).abs())
+            .sum()
+    };
+    let constant = error(&|s| vec![fit.constant_m as f32; s.pixels()]);
+    assert!(error(&|s| fit.of_peaks(s)) < 0.8 * constant);
+}
+
+#[test]
+fn weights_go_out_by_pytorchs_names_and_come_back_the_same() {
+    let device = Device::flex();
+    let plan = plan(Task::Shadow, ShadowVariant::Concat);
+    let trained = trained(&plan, sources());
+    let (named, _) = weights::read(&trained.weights).unwrap();
+    let first = &named["encoders.0.basic_module.SingleConv1.conv.weight"];
+    assert_eq!(
+        first.0,
+        [32, 32, 3, 3],
+        "one-hot channels are beside the dense ones"
+    );
+    let model = Model::read(&trained.weights, &device).unwrap();
+    assert_eq!(model.plan(), &plan);
+    let again = Training::start(plan, Some(&trained.weights), sources(), &device).unwrap();
+    assert_eq!(again.finish().weights, trained.weights);
+}
+
+#[test]
+fn the_layout_of_released_checkpoints_is_read_wrapped_or_combined() {
+    let device = Device::flex();
+    let plan = plan(Task::Tof, ShadowVariant::Concat);
+    let trained = trained(&plan, sources());
+    let (named, _) = weights::read(&trained.weights).unwrap();
+    for prefix in ["module.", "depth_model.", "module.depth_model."] {
+        let mut state: weights::Named = named
+            .iter()
+            .map(|(name, value)| (format!("{prefix}{name}"), value.clone()))
+            .collect();
+        if prefix.contains("depth_model") {
+            state.insert("shadow_model.final_conv.bias".into(), (vec![1], vec![0.5]));
+        }
+        let bytes = weights::write(&state, &Default::default());
+        let again = Training::start(plan.clone(), Some(&bytes), sources(), &device).unwrap();
+        assert_eq!(again.finish().weights, trained.weights, "{prefix}");
+    }
+    let mut missing = named.clone();
+    missing.remove("final_conv.bias");
+    let bytes = weights::write(&missing, &Default::default());
+    let error = Training::start(plan, Some(&bytes), sources(), &device).map(|_| ());
+    assert!(
+        error
+            .unwrap_err()
+            .to_string()
+            .contains("\"final_conv.bias\" is missing")
+    );
+}
+
+#[test]
+fn the_released_network_has_the_published_number_of_parameters() {
+    for (one_hot, published) in [(0, 356_404_556), (637, 368_095_417)] {
+        let net = picofarm_model::net::Net::new(NetSpec::released(637, one_hot, 1)).unwrap();
+        let learned = net.declared().iter().filter(|d| d.learned);
+        let count: usize = learned.map(picofarm_model::parameters::Declared::len).sum();
+        assert_eq!(count, published);
+    }
+}
+
+/// The loss along the gradient: (L(p + εg) − L(p − εg)) / 2ε = |g|², for every network.
+#[test]
+fn gradients_are_the_slopes_of_the_loss() {
+    let device = Device::flex();
+    for (task, architecture, one_hot) in [
+        (Task::Tof, Architecture::Unet2d, 0),
+        (Task::Shadow, Architecture::Unet2d, 6),
+        (Task::Specular, Architecture::Unet25d, 0),
+        (Task::Shadow, Architecture::Unet25d, 6),
+    ] {
+        let net = NetSpec {
+            architecture,
+            width: 4,
+            levels: 2,
+            time: 4,
+            ..NetSpec::released(6, one_hot, 1)
+        };
+        let trial = Trial {
+            task,
+            net,
+            batch: 3,
+            side: 8,
+            rate: 1e-3,
+            decay: 0.0,
+            seed: 2,
+        };
+        let slope = trial.slope(1e-3, &device).unwrap();
+        let off = (slope.measured - slope.expected).abs() / slope.expected;
+        assert!(off < 0.02, "{task:?} {architecture:?}: {slope:?}");
+    }
+}
+
+#[test]
+fn a_scene_is_asked_spot_by_spot() {
+    let plan = Plan {
+        epochs: 1,
+        ..plan(Task::Shadow, ShadowVariant::Concat)
+    };
+    let model = Model::read(&trained(&plan, sources()).weights, &Device::flex()).unwrap();
+    let mut asked = 0;
+    let scene = scenes(7, 1).load(0).unwrap();
+    answers(&model, None, &scene, &mut |said, batch| {
+        asked += 1;
+        assert_eq!((said.len(), batch.target.len()), (64, 64));
+    })
+    .unwrap();
+    assert_eq!(asked, 2);
+}
+
+#[test]
+fn random_numbers_are_uniform_and_permutations_whole() {
+    let mut random = Random::new(1, &[]);
+    let mean: f32 = (0..10_000).map(|_| random.unit()).sum::<f32>() / 1e4;
+    assert!((mean - 0.5).abs() < 0.02, "{mean}");
+    let mut order = random.permutation(1_000);
+    assert_ne!(order, (0..1_000).collect::<Vec<_>>());
+    order.sort_unstable();
+    assert_eq!(order, (0..1_000).collect::<Vec<_>>());
+}
