@@ -4,6 +4,7 @@ mod data;
 mod guard;
 mod integrity;
 mod job;
+mod network;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -17,6 +18,7 @@ pub use data::{
 pub use guard::{Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
+pub use network::{BenchModel, Kind, Learns};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
@@ -395,6 +397,8 @@ pub enum Bench {
     Dataset(BenchDataset),
     /// Measure storage on scenes of this renderer: size, error and speed of all profiles beside other formats, and reading
     Store(BenchStore),
+    /// Measure a training step of a network on the CPU, beside other forms and other programs
+    Model(BenchModel),
 }
 
 #[derive(Args)]

@@ -1,5 +1,6 @@
 //! `picofarm bench …`: how long a render takes on this machine, and how wrong it is; what the scheduler bears; what very
-//! many scenes cost; what storing histograms costs.
+//! many scenes cost; what storing histograms costs; what a
+//! training step takes.
 
 mod axes;
 mod curve;
@@ -7,6 +8,7 @@ mod dataset;
 mod deviation;
 mod ladder;
 mod measure;
+mod model;
 mod peer;
 mod plot;
 mod queue;
@@ -33,11 +35,18 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Queue(args) => return queue::run(args, output, &stop).await,
         Command::Dataset(args) => return dataset::run(args, output, &stop).await,
         Command::Store(args) => return store::run(args, settings, output, &stop).await,
+        Command::Model(args) => {
+            return blocking(move || model::run(&args, output, &stop)).await;
+        }
         Command::Render(args) => args,
     };
     check(&args)?;
     let assets = settings.assets.clone();
-    tokio::task::spawn_blocking(move || render(&args, &assets, output, &stop))
+    blocking(move || render(&args, &assets, output, &stop)).await
+}
+
+async fn blocking(work: impl FnOnce() -> Result<()> + Send + 'static) -> Result<()> {
+    tokio::task::spawn_blocking(work)
         .await
         .map_err(|e| CliError::new(Code::Failed, format!("the benchmark broke: {e}")))?
 }

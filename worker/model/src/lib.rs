@@ -26,3 +26,8 @@ pub use random::Random;
 
 /// Version of everything that decides the bytes of trained weights and the figures of evaluations.
 pub const VERSION: &str = "model-1";
+
+/// The CPU.
+pub fn cpu() -> burn::tensor::Device {
+    burn::tensor::Device::flex()
+}

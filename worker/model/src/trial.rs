@@ -51,6 +51,38 @@ impl Trial {
         Ok((learner, self.data()))
     }
 
+    /// The same with the one-hot channels as dense ones, and the same numbers: what the gather is compared with.
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`].
+    pub fn dense(&self, device: &Device) -> Result<(Learner, Batch), ModelError> {
+        let (gather, mut batch) = self.begin(device)?;
+        let spec = NetSpec {
+            dense: self.net.dense + self.net.one_hot,
+            one_hot: 0,
+            ..self.net.clone()
+        };
+        let net = Net::new(spec)?;
+        let named = weights::to_torch(gather.parameters().to_named());
+        let parameters = Parameters::from_named(net.declared().to_vec(), named, device)?;
+        let pixels = self.side * self.side;
+        let mut wide = Vec::new();
+        let images = batch.dense.chunks_exact(self.net.dense * pixels);
+        for (image, bins) in images.zip(batch.one_hot.chunks_exact(pixels)) {
+            wide.extend_from_slice(image);
+            let at = wide.len();
+            wide.resize(at + self.net.one_hot * pixels, 0.0);
+            for (p, bin) in bins.iter().enumerate() {
+                if let Ok(bin) = usize::try_from(*bin) {
+                    wide[at + bin * pixels + p] = 1.0;
+                }
+            }
+        }
+        (batch.dense, batch.one_hot) = (wide, Vec::new());
+        let learner = Learner::new(net, parameters, self.task, self.decay);
+        Ok((learner, batch))
+    }
+
     fn data(&self) -> Batch {
         let pixels = self.batch * self.side * self.side;
         let mut random = Random::new(self.seed, &[4]);

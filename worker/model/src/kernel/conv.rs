@@ -8,12 +8,14 @@
 use rayon::prelude::*;
 
 use super::plane::{Band, Grid, Unit, split};
+use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, shifted};
+use super::winograd;
 
 /// Input channels packed at a time.
 const CHUNK: usize = 32;
 /// Output channels of a block of packed weights.
-const BLOCK: usize = 8;
+pub(super) const BLOCK: usize = 8;
 /// Pixels of a band.
 const BAND: usize = 1024;
 
@@ -109,15 +111,23 @@ impl Kernels {
         assert_eq!(w.len(), s.weight_len(K), "weight length");
         assert_eq!(out.len(), s.output_len(), "output length");
         let packed = pack_weights(s, K * K, w);
-        self.product::<K>(s, x, &packed, bias, out);
+        if K == 3 && winograd::pays(s) {
+            self.winograd(s, x, &packed, out);
+        } else {
+            self.product::<K>(s, x, &packed, bias, out);
+        }
     }
 
     fn input_grad<const K: usize>(self, s: &ConvShape, dy: &[f32], w: &[f32], dx: &mut [f32]) {
         assert_eq!(dy.len(), s.output_len(), "output gradient length");
         assert_eq!(w.len(), s.weight_len(K), "weight length");
         assert_eq!(dx.len(), s.input_len(), "input gradient length");
-        let packed = pack_transposed(s, K * K, w);
-        self.product::<K>(&s.swapped(), dy, &packed, None, dx);
+        let packed = pack_transposed::<K>(s, w);
+        if K == 3 && winograd::pays(&s.swapped()) {
+            self.winograd(&s.swapped(), dy, &packed, dx);
+        } else {
+            self.product::<K>(&s.swapped(), dy, &packed, None, dx);
+        }
     }
 
     /// The product with packed weights, `[outputs / 8][inputs][K·K][8]`.
@@ -143,28 +153,40 @@ impl Kernels {
         let group = blocks.div_ceil(wanted).max(blocks.min(2)) * BLOCK;
         let groups = s.outputs.div_ceil(group);
         let parts = split(grid, s.outputs, group, &bands, out);
+        let input = Input { s, grid, x };
+        // Where several tasks share a band, it is packed once before.
+        let shared = (groups > 1).then(|| input.pack_all(&bands));
+        let lens: Vec<usize> = bands
+            .iter()
+            .map(|b| grid.packed_len(b) * s.inputs)
+            .collect();
         parts
             .into_par_iter()
             .enumerate()
-            .for_each_init(Vec::new, |scratch, (i, mut pieces)| {
+            .for_each(|(i, mut pieces)| {
                 let band = &bands[i / groups];
                 let first = i % groups * group;
                 let channels = group.min(s.outputs - first);
                 let units = grid.units(band);
                 let plane = grid.packed_len(band);
-                scratch.resize(plane * CHUNK, 0.0);
+                let mut own = Scratch::take(if groups > 1 { 0 } else { plane * CHUNK });
                 let mut chunk = 0;
                 loop {
                     let inputs = CHUNK.min(s.inputs - chunk);
-                    for c in 0..inputs {
-                        let image = |i: usize| {
-                            let at = (i * s.inputs + chunk + c) * grid.pixels();
-                            &x[at..at + grid.pixels()]
-                        };
-                        grid.pack(band, image, &mut scratch[c * plane..(c + 1) * plane]);
-                    }
+                    let x = match &shared {
+                        Some(all) => {
+                            let start: usize = lens[..i / groups].iter().sum();
+                            &all[start + chunk * plane..][..inputs * plane]
+                        }
+                        None => {
+                            for (c, to) in own.chunks_exact_mut(plane).take(inputs).enumerate() {
+                                input.pack(band, chunk + c, to);
+                            }
+                            &own[..]
+                        }
+                    };
                     self.run(Chunk::<K> {
-                        x: scratch,
+                        x,
                         inputs,
                         plane,
                         row: grid.stride(),
@@ -182,6 +204,41 @@ impl Kernels {
                     }
                 }
             });
+    }
+}
+
+/// The input of a convolution, to be packed.
+struct Input<'a> {
+    s: &'a ConvShape,
+    grid: Grid,
+    x: &'a [f32],
+}
+
+impl Input<'_> {
+    /// Packs one channel of a band.
+    fn pack(&self, band: &Band, channel: usize, to: &mut [f32]) {
+        let image = |i: usize| {
+            let at = (i * self.s.inputs + channel) * self.grid.pixels();
+            &self.x[at..at + self.grid.pixels()]
+        };
+        self.grid.pack(band, image, to);
+    }
+
+    /// All bands, each `[channel][packed plane]`.
+    fn pack_all(&self, bands: &[Band]) -> Scratch {
+        let each = |band: &Band| self.grid.packed_len(band);
+        let total = bands.iter().map(each).sum::<usize>() * self.s.inputs;
+        let mut all = Scratch::take(total);
+        let mut rest = &mut all[..];
+        for band in bands {
+            let (part, tail) = rest.split_at_mut(each(band) * self.s.inputs);
+            part.par_chunks_exact_mut(each(band))
+                .with_min_len(8)
+                .enumerate()
+                .for_each(|(c, to)| self.pack(band, c, to));
+            rest = tail;
+        }
+        all
     }
 }
 
@@ -262,11 +319,9 @@ impl<const K: usize> Chunk<'_, '_, K> {
             &self.weights[b * self.block + half..],
             acc,
         );
-        for m in 0..M {
-            if m < valid {
-                for v in 0..V {
-                    self.keep(acc[m][v], u + v, first + m);
-                }
+        for (m, acc) in acc.iter().enumerate().take(valid) {
+            for (v, acc) in acc.iter().enumerate() {
+                self.keep(*acc, u + v, first + m);
             }
         }
     }
@@ -304,9 +359,9 @@ impl<const K: usize> Chunk<'_, '_, K> {
 }
 
 /// Weights as `[outputs / 8][inputs][taps][8]`, missing channels zero.
-fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Vec<f32> {
+fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Scratch {
     let depth = s.inputs * taps;
-    let mut packed = vec![0.0; s.outputs.div_ceil(BLOCK) * depth * BLOCK];
+    let mut packed = Scratch::take(s.outputs.div_ceil(BLOCK) * depth * BLOCK);
     if depth == 0 {
         return packed;
     }
@@ -314,42 +369,58 @@ fn pack_weights(s: &ConvShape, taps: usize, w: &[f32]) -> Vec<f32> {
         .par_chunks_mut(depth * BLOCK)
         .zip(w.par_chunks(depth * BLOCK))
         .for_each(|(to, from)| {
-            if from.len() < depth * BLOCK {
-                for (m, row) in from.chunks_exact(depth).enumerate() {
-                    for (i, x) in row.iter().enumerate() {
-                        to[i * BLOCK + m] = *x;
-                    }
-                }
-                return;
-            }
+            // Rows that are missing repeat the first one and are cleared after.
+            let rows: [&[f32]; BLOCK] = std::array::from_fn(|m| {
+                let m = if m * depth < from.len() { m } else { 0 };
+                &from[m * depth..][..depth]
+            });
             for (i, to) in to.chunks_exact_mut(BLOCK).enumerate() {
-                for (m, to) in to.iter_mut().enumerate() {
-                    *to = from[m * depth + i];
+                for (to, row) in to.iter_mut().zip(rows) {
+                    *to = row[i];
                 }
+            }
+            let valid = from.len() / depth;
+            if valid < BLOCK {
+                to.chunks_exact_mut(BLOCK)
+                    .for_each(|to| to[valid..].fill(0.0));
             }
         });
     packed
 }
 
 /// Weights of the input gradient, transposed and with the taps in reverse: `[inputs / 8][outputs][taps][8]`.
-fn pack_transposed(s: &ConvShape, taps: usize, w: &[f32]) -> Vec<f32> {
+fn pack_transposed<const K: usize>(s: &ConvShape, w: &[f32]) -> Scratch {
+    let taps = K * K;
     let depth = s.outputs * taps;
-    let mut packed = vec![0.0; s.inputs.div_ceil(BLOCK) * depth * BLOCK];
+    let mut packed = Scratch::take(s.inputs.div_ceil(BLOCK) * depth * BLOCK);
     if depth == 0 {
         return packed;
     }
+    // Four blocks at a time: longer pieces of each output's weights.
     packed
-        .par_chunks_mut(depth * BLOCK)
+        .par_chunks_mut(4 * depth * BLOCK)
         .enumerate()
-        .for_each(|(b, to)| {
-            let first = b * BLOCK;
-            let valid = BLOCK.min(s.inputs - first);
-            for (o, to) in to.chunks_exact_mut(taps * BLOCK).enumerate() {
-                let at = (o * s.inputs + first) * taps;
-                let from = &w[at..at + valid * taps];
-                for (m, from) in from.chunks_exact(taps).enumerate() {
-                    for (t, x) in from.iter().rev().enumerate() {
-                        to[t * BLOCK + m] = *x;
+        .for_each(|(four, to)| {
+            for o in 0..s.outputs {
+                for (b, to) in to.chunks_exact_mut(depth * BLOCK).enumerate() {
+                    let first = (4 * four + b) * BLOCK;
+                    let valid = BLOCK.min(s.inputs - first);
+                    let to = &mut to[o * taps * BLOCK..][..taps * BLOCK];
+                    let from = &w[(o * s.inputs + first) * taps..][..valid * taps];
+                    if valid == BLOCK {
+                        let from = &from[..BLOCK * taps];
+                        for t in 0..taps {
+                            for m in 0..BLOCK {
+                                to[(taps - 1 - t) * BLOCK + m] = from[m * taps + t];
+                            }
+                        }
+                        continue;
+                    }
+                    to.fill(0.0);
+                    for (m, from) in from.chunks_exact(taps).enumerate() {
+                        for (t, x) in from.iter().rev().enumerate() {
+                            to[t * BLOCK + m] = *x;
+                        }
                     }
                 }
             }

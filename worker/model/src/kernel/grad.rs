@@ -9,7 +9,9 @@ use rayon::prelude::*;
 
 use super::conv::{ConvShape, image_band};
 use super::plane::{Band, Grid};
+use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, Positions, outer};
+use super::winograd_grad;
 
 /// Least pixels of one chain, in whole rows.
 const BLOCK_PIXELS: usize = 128;
@@ -52,6 +54,9 @@ impl Kernels {
         if s.input_len() == 0 || s.output_len() == 0 {
             dw.fill(0.0);
             return;
+        }
+        if K == 3 && winograd_grad::pays(s) {
+            return self.winograd_weight_grad(s, x, dy, dw);
         }
         let grid = s.grid(K);
         let wide = if s.outputs > LANES { 2 * LANES } else { LANES };
@@ -107,8 +112,8 @@ impl Kernels {
         pixels: usize,
         from: &[f32],
         wide: usize,
-    ) -> Vec<f32> {
-        let mut to = vec![0.0; channels.div_ceil(wide) * images * pixels * wide];
+    ) -> Scratch {
+        let mut to = Scratch::take(channels.div_ceil(wide) * images * pixels * wide);
         to.par_chunks_mut(pixels * wide)
             .enumerate()
             .for_each(|(i, to)| {
@@ -232,6 +237,7 @@ impl<const K: usize> Op for Blocks<'_, K> {
                 row: self.row,
                 step,
                 wide,
+                apart: LANES,
             };
             let g = &self.g[y * self.width * wide..];
             for (x, sums) in self
@@ -243,16 +249,16 @@ impl<const K: usize> Op for Blocks<'_, K> {
                 if L::WIDE {
                     let at = [0, triple, 2 * triple];
                     if wide == LANES {
-                        add(outer::<L, 1, 3>(x, at, g, s), sums, wide);
+                        add(outer::<L, 1, 3, 3>(x, at, g, s), sums, wide);
                     } else {
-                        add(outer::<L, 2, 3>(x, at, g, s), sums, wide);
+                        add(outer::<L, 2, 3, 3>(x, at, g, s), sums, wide);
                     }
                 } else {
                     for r in 0..3 {
                         for v in 0..wide / LANES {
                             let sums = &mut sums[3 * r * wide + v * LANES..];
                             add(
-                                outer::<L, 1, 1>(x, [r * triple], &g[v * LANES..], s),
+                                outer::<L, 1, 1, 3>(x, [r * triple], &g[v * LANES..], s),
                                 sums,
                                 wide,
                             );
@@ -316,12 +322,23 @@ impl Op for Transpose<'_> {
 
     #[inline(always)]
     fn run<L: Lanes>(self) {
-        for start in (0..self.pixels).step_by(LANES) {
-            let n = LANES.min(self.pixels - start);
-            for (c, plane) in self.from.chunks_exact(self.pixels).enumerate() {
-                let to = &mut self.to[start * self.wide + c..];
-                for (i, x) in plane[start..start + n].iter().enumerate() {
-                    to[i * self.wide] = *x;
+        let (pixels, wide) = (self.pixels, self.wide);
+        let channels = self.from.len() / pixels;
+        for start in (0..pixels).step_by(LANES) {
+            let n = LANES.min(pixels - start);
+            for first in (0..wide).step_by(LANES) {
+                let mut rows = [L::splat(0.0); LANES];
+                for (i, row) in rows.iter_mut().enumerate() {
+                    if first + i < channels {
+                        let at = (first + i) * pixels + start;
+                        *row = L::load_part(&self.from[at..at + n], 0.0);
+                    }
+                }
+                let rows = L::transpose(rows);
+                for (i, row) in rows.iter().enumerate() {
+                    if i < n {
+                        row.store(&mut self.to[(start + i) * wide + first..]);
+                    }
                 }
             }
         }

@@ -15,7 +15,10 @@ mod norm;
 mod onehot;
 mod plane;
 mod pool;
+mod scratch;
 mod simd;
+mod winograd;
+mod winograd_grad;
 
 pub use adam::AdamW;
 pub use conv::ConvShape;
@@ -23,3 +26,6 @@ pub use norm::{BatchNorm, NormShape};
 pub use onehot::OneHotShape;
 pub use pool::PlaneShape;
 pub use simd::{Isa, Kernels};
+
+#[cfg(test)]
+mod tests;

@@ -98,7 +98,16 @@ impl Grid {
     /// The units that cover a band: exact pieces of rows where the width allows it, else runs over the
     /// packed plane that skip what padding they can.
     pub fn units(self, band: &Band) -> Vec<Unit> {
-        let (h, w, stride) = (band.rows.len(), self.width, self.stride());
+        self.cover(band, self.stride())
+    }
+
+    /// The units that cover a band of planes whose rows have no padding.
+    pub fn units_unpadded(self, band: &Band) -> Vec<Unit> {
+        self.cover(band, self.width)
+    }
+
+    fn cover(self, band: &Band, stride: usize) -> Vec<Unit> {
+        let (h, w) = (band.rows.len(), self.width);
         let mut units: Vec<Unit> = Vec::new();
         let mut end = 0;
         for image in 0..band.images.len() {
@@ -150,12 +159,24 @@ impl Grid {
                     to[at..at + stride].fill(0.0);
                 } else {
                     to[at] = 0.0;
-                    to[at + 1..at + stride].copy_from_slice(&plane[(y - 1) * w..y * w]);
+                    copy(&plane[(y - 1) * w..y * w], &mut to[at + 1..at + stride]);
                 }
                 at += stride;
             }
         }
         to[at..].fill(0.0);
+    }
+}
+
+/// Copies a row; short ones without a call.
+#[inline(always)]
+fn copy(from: &[f32], to: &mut [f32]) {
+    if from.len().is_multiple_of(8) {
+        for (from, to) in from.chunks_exact(8).zip(to.chunks_exact_mut(8)) {
+            to.copy_from_slice(from);
+        }
+    } else {
+        to.copy_from_slice(from);
     }
 }
 

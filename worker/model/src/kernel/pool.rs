@@ -202,10 +202,13 @@ impl Op for Unpool<'_> {
             }
             let pairs = top.chunks_exact_mut(2).zip(bottom.chunks_exact_mut(2));
             for ((dy, which), (t, b)) in dy.iter().zip(which).zip(pairs) {
-                t[0] = if *which == 0 { *dy } else { 0.0 };
-                t[1] = if *which == 1 { *dy } else { 0.0 };
-                b[0] = if *which == 2 { *dy } else { 0.0 };
-                b[1] = if *which == 3 { *dy } else { 0.0 };
+                // All bits or none: the compiler makes vectors of this, not of a choice.
+                let of =
+                    |i: u8| f32::from_bits(dy.to_bits() & u32::from(*which == i).wrapping_neg());
+                t[0] = of(0);
+                t[1] = of(1);
+                b[0] = of(2);
+                b[1] = of(3);
             }
         }
         self.dx[done..].fill(0.0);

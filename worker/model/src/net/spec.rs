@@ -66,6 +66,34 @@ impl NetSpec {
         1 << (self.levels - 1)
     }
 
+    /// Multiply-adds of a pass forward over an image of `side`² pixels, one-hot channels counted as dense ones; of the 2D
+    /// network.
+    pub fn multiply_adds(&self, side: usize) -> Option<f64> {
+        if self.architecture != Architecture::Unet2d {
+            return None;
+        }
+        let of = |inputs: usize, outputs: usize, level: usize| {
+            let pixels = (side >> level).pow(2);
+            (9 * inputs * outputs * pixels) as f64
+        };
+        let mut inputs = self.dense + self.one_hot;
+        let mut sum = 0.0;
+        if self.stem > 0 {
+            sum += of(inputs, self.stem, 0);
+            inputs = self.stem;
+        }
+        let widths = self.widths();
+        for (level, width) in widths.iter().enumerate() {
+            let between = inputs.max(width / 2);
+            sum += of(inputs, between, level) + of(between, *width, level);
+            inputs = *width;
+        }
+        for (level, pair) in widths.windows(2).enumerate() {
+            sum += of(pair[0] + pair[1], pair[0], level) + of(pair[0], pair[0], level);
+        }
+        Some(sum + (self.width * self.outputs * side * side) as f64)
+    }
+
     /// Checks what can be built.
     ///
     /// # Errors
@@ -104,5 +132,22 @@ impl NetSpec {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::NetSpec;
+
+    #[test]
+    fn the_released_networks_take_half_and_one_and_a_quarter_million_million_multiply_adds() {
+        let tera = |one_hot| {
+            NetSpec::released(637, one_hot, 1)
+                .multiply_adds(256)
+                .unwrap()
+                / 1e12
+        };
+        assert!((tera(0) - 0.517).abs() < 1e-3, "{}", tera(0));
+        assert!((tera(637) - 1.283).abs() < 1e-3, "{}", tera(637));
     }
 }
