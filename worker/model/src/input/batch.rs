@@ -206,14 +206,4 @@ impl Batch {
             one_hot,
         }
     }
-
-    /// On a device: what it should say.
-    pub fn truth(&self, device: &Device) -> Tensor<4> {
-        let (n, h, w) = (self.images, self.height, self.width);
-        let channels = self.target.len() / (n * h * w);
-        Tensor::from_data(
-            TensorData::new(self.target.clone(), [n, channels, h, w]),
-            device,
-        )
-    }
 }

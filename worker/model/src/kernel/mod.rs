@@ -3,7 +3,7 @@
 //!
 //! **The same bits everywhere**: every result is a fixed-order chain of fused multiply-adds or a fixed tree
 //! over a fixed number of virtual lanes; neither the number of threads nor the instruction set
-//! ([`Isa`]) changes a bit. The portable path uses [`f32::mul_add`], which is slow without hardware and equal.
+//! ([`simd::Isa`]) changes a bit. The portable path uses [`f32::mul_add`], which is slow without hardware and equal.
 //!
 //! All functions are methods of [`Kernels`], which holds the instruction set. They panic where a slice's
 //! length disagrees with the shape: shapes are the caller's invariant.
@@ -25,7 +25,7 @@ pub use conv::ConvShape;
 pub use norm::{BatchNorm, NormShape};
 pub use onehot::OneHotShape;
 pub use pool::PlaneShape;
-pub use simd::{Isa, Kernels};
+pub use simd::Kernels;
 
 #[cfg(test)]
 mod tests;

@@ -88,14 +88,14 @@ impl Learner {
         let mut pass = Pass::training(self.net.declared(), &leaves);
         let output = self.net.forward(&mut pass, batch.input(&device));
         let moved = pass.into_moved();
-        let loss = loss(self.task, output.clone(), batch.truth(&device));
-        let mut gradients = loss.backward();
+        let (loss, root) = loss(self.task, output.clone(), &batch.target);
+        let mut gradients = root.backward();
         let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
         let of = of.collect();
         for (id, value) in moved {
             self.parameters.set(id, value);
         }
-        (output.inner(), loss.inner().into_scalar::<f32>(), of)
+        (output.inner(), loss, of)
     }
 
     /// One step of the optimiser over batches, whose gradients are averaged. Returns the mean loss.

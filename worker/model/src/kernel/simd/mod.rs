@@ -66,11 +66,6 @@ impl Kernels {
         there.then_some(Self(isa))
     }
 
-    /// The instruction set in use.
-    pub fn isa(self) -> Isa {
-        self.0
-    }
-
     /// Runs an operation on this instruction set.
     pub(super) fn run<O: Op>(self, op: O) -> O::Out {
         match self.0 {
