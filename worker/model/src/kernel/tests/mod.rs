@@ -1,7 +1,7 @@
 //! Laws of the kernels: one set of bits on every instruction set and number of threads, and agreement with
 //! plain sums in `f64`.
 
-use super::*;
+use super::{simd::Isa, *};
 
 mod conv;
 mod norm;
