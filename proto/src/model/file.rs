@@ -424,7 +424,7 @@ fn name_instance(stage: &mut Map<String, Value>, values: &str) {
     }
 }
 
-fn substitute(into: &mut Value, mark: &str, value: &Value) {
+pub(super) fn substitute(into: &mut Value, mark: &str, value: &Value) {
     match into {
         Value::String(text) if text == mark => *into = value.clone(),
         Value::String(text) => *text = text.replace(mark, &plain(value)),
@@ -435,7 +435,7 @@ fn substitute(into: &mut Value, mark: &str, value: &Value) {
 }
 
 /// A value as text inside a text.
-fn plain(value: &Value) -> String {
+pub(super) fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
         other => other.to_string(),

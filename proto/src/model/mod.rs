@@ -9,6 +9,7 @@ pub mod lease;
 pub mod log;
 pub mod render;
 pub mod reprocess;
+mod scale;
 pub mod sensor;
 pub mod status;
 pub mod task;
@@ -24,6 +25,7 @@ pub use render::{
     Budget, Choice, PartTask, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource,
 };
 pub use reprocess::{Histogram, ReprocessSettings, ReprocessTask, SourceSettings};
+pub use scale::scaled;
 pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};
 pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
