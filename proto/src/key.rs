@@ -90,6 +90,19 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
             "count": task.count,
             "settings": serde_json::to_value(&task.export).expect("settings are plain data"),
         }),
+        TaskSpec::Train(task) => serde_json::json!({
+            "stage": "train",
+            "source": source(&task.source),
+            "count": task.count,
+            "model": task.train.model,
+            "settings": task.train.shaping(),
+        }),
+        TaskSpec::Evaluate(task) => serde_json::json!({
+            "stage": "evaluate",
+            "source": source(&task.source),
+            "count": task.count,
+            "settings": serde_json::to_value(&task.evaluate).expect("settings are plain data"),
+        }),
     };
     StageKey(Sha256::digest(canonical(description).as_bytes()).into())
 }

@@ -16,12 +16,15 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{
+    evaluate::{EvaluateSettings, EvaluateTask},
     generate::{GenerateSettings, GenerateTask},
     import::{ImportSettings, ImportTask},
     job::{JobSpec, Limits, MAX_STAGES, OutputSettings, Resources, SpecError, StageSpec},
+    refer,
     render::{PartTask, RenderSettings, RenderTask, SceneSource},
     reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
     task::{ExportSettings, ExportTask, SplitTask, TaskSpec},
+    train::{TrainSettings, TrainTask},
 };
 use crate::split::SplitSettings;
 
@@ -69,6 +72,8 @@ struct StageText {
     export: Option<ExportSettings>,
     generate: Option<GenerateSettings>,
     import: Option<ImportSettings>,
+    train: Option<TrainSettings>,
+    evaluate: Option<EvaluateSettings>,
     output: Option<OutputSettings>,
     parts: Option<u32>,
     #[serde(default)]
@@ -249,6 +254,7 @@ impl JobSpec {
                     stage.needs.push(maker.name.clone());
                 }
             }
+            refer::link(stage, before)?;
         }
         Ok(())
     }
@@ -288,6 +294,8 @@ impl StageText {
             ("reprocess", "reprocess", self.reprocess.is_some()),
             ("split", "split", self.split.is_some()),
             ("export", "export", self.export.is_some()),
+            ("train", "train", self.train.is_some()),
+            ("evaluate", "evaluate", self.evaluate.is_some()),
         ];
         for (field, of, given) in given {
             if given && of != like && of != kind {
@@ -302,7 +310,10 @@ impl StageText {
             let what = format!("is not for kind = {kind:?}, which makes no data set; remove it");
             return Err(SpecError::new("output", what));
         }
-        let reads = matches!(like, "reprocess" | "split" | "export");
+        let reads = matches!(
+            like,
+            "reprocess" | "split" | "export" | "train" | "evaluate"
+        );
         if !reads && (self.source.is_some() || self.count.is_some()) {
             let what = format!("is not for kind = {kind:?}, which reads no data set; remove it");
             return Err(SpecError::new("source", what));
@@ -348,11 +359,22 @@ impl StageText {
                 count,
                 export: self.export.ok_or_else(|| missing("export"))?,
             }),
+            "train" => TaskSpec::Train(TrainTask {
+                source: source?,
+                count,
+                train: self.train.ok_or_else(|| missing("train"))?,
+            }),
+            "evaluate" => TaskSpec::Evaluate(EvaluateTask {
+                source: source?,
+                count,
+                evaluate: self.evaluate.ok_or_else(|| missing("evaluate"))?,
+            }),
             other => {
                 return Err(SpecError::new(
                     "kind",
                     format!(
-                        "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\""
+                        "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\", \
+                         \"train\", \"evaluate\""
                     ),
                 ));
             }

@@ -9,6 +9,8 @@ use super::{file::JobText, render::RenderTask, reprocess::SourceSettings, task::
 
 /// Most tasks in one job.
 pub const MAX_TASKS: u64 = 100_000_000;
+/// Folder of a store in which trained models are kept.
+pub const MODELS: &str = "models";
 /// Most stages in one job.
 pub const MAX_STAGES: usize = 1_000;
 
@@ -155,6 +157,11 @@ impl OutputSettings {
                     "{dataset:?} must be a plain folder name of letters, digits, '-', '_' and '.'"
                 ),
             ));
+        }
+        if dataset == MODELS {
+            let what =
+                format!("{dataset:?} is where a store keeps trained models; choose another name");
+            return Err(SpecError::new("output.dataset", what));
         }
         Ok(())
     }
@@ -311,7 +318,10 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.scenes.count,
             TaskSpec::Import(task) => task.import.count,
             TaskSpec::Reprocess(task) => task.count,
-            TaskSpec::Split(_) | TaskSpec::Export(_) => 1,
+            TaskSpec::Split(_)
+            | TaskSpec::Export(_)
+            | TaskSpec::Train(_)
+            | TaskSpec::Evaluate(_) => 1,
         }
     }
 
@@ -344,6 +354,8 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.check(),
             TaskSpec::Import(task) => task.check(),
             TaskSpec::Reprocess(task) => task.check(),
+            TaskSpec::Train(task) => task.check(),
+            TaskSpec::Evaluate(task) => task.check(),
             TaskSpec::Split(task) => {
                 check_source(&task.source)?;
                 check_count("count", task.count)?;
@@ -404,6 +416,39 @@ impl StageSpec {
                 return Err(SpecError::new("needs", what));
             }
         }
+        self.check_models(before, after)
+    }
+
+    /// Checks that models are trained once, and before they are read.
+    fn check_models(&self, before: &[Self], after: &[Self]) -> Result<(), SpecError> {
+        if let Some(model) = self.task.trains()
+            && let Some(other) = before.iter().find(|s| s.task.trains() == Some(model))
+        {
+            let what = format!(
+                "{:?} is what stage {:?} trains; give each model its own name",
+                model.1, other.name
+            );
+            return Err(SpecError::new("train.model", what));
+        }
+        let Some(source) = self.task.reads() else {
+            return Ok(());
+        };
+        for (field, model) in self.task.models() {
+            let trains = |s: &&Self| s.task.trains() == Some((&source.store, model));
+            if let Some(other) = after.iter().find(trains) {
+                let what = format!(
+                    "{model:?} is trained by stage {:?}; put that before",
+                    other.name
+                );
+                return Err(SpecError::new(field, what));
+            }
+            if let Some(other) = before.iter().find(trains)
+                && !self.needs.contains(&other.name)
+            {
+                let what = format!("lacks {:?}, which trains {model:?}", other.name);
+                return Err(SpecError::new("needs", what));
+            }
+        }
         Ok(())
     }
 
@@ -421,7 +466,7 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.check_places(),
             TaskSpec::Import(task) => task.check_places(),
             TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
-            TaskSpec::Split(_) => Ok(()),
+            TaskSpec::Split(_) | TaskSpec::Train(_) | TaskSpec::Evaluate(_) => Ok(()),
             TaskSpec::Export(task) => place("export.dest", &task.export.dest),
         }
     }

@@ -1,5 +1,6 @@
 //! The checked model: what the coordinator and the agent reason about. Wire types convert into these.
 
+pub mod evaluate;
 pub mod explain;
 pub mod file;
 mod generate;
@@ -7,6 +8,7 @@ mod import;
 pub mod job;
 pub mod lease;
 pub mod log;
+mod refer;
 pub mod render;
 pub mod reprocess;
 mod scale;
@@ -14,7 +16,9 @@ pub mod sensor;
 pub mod status;
 pub mod task;
 mod text;
+pub mod train;
 
+pub use evaluate::{EvaluateSettings, EvaluateTask};
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use generate::{GenerateSettings, GenerateTask};
 pub use import::{ImportSettings, ImportTask};
@@ -33,3 +37,4 @@ pub use status::{
 };
 pub use task::{ExportSettings, ExportTask, SplitTask, TaskSpec};
 pub use text::parse_share;
+pub use train::{TrainSettings, TrainTask};

@@ -3,10 +3,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
+    evaluate::EvaluateTask,
     generate::GenerateTask,
     import::ImportTask,
     render::{PartTask, RenderTask},
     reprocess::{ReprocessTask, SourceSettings},
+    train::TrainTask,
 };
 use crate::split::SplitSettings;
 
@@ -29,6 +31,10 @@ pub enum TaskSpec {
     Split(SplitTask),
     /// A data set is packed for sharing: one task.
     Export(ExportTask),
+    /// A network learns from a data set: one task.
+    Train(TrainTask),
+    /// Models meet scenes that they have not seen: one task.
+    Evaluate(EvaluateTask),
 }
 
 /// Dividing a data set.
@@ -78,6 +84,8 @@ impl TaskSpec {
             Self::Reprocess(_) => "reprocess",
             Self::Split(_) => "split",
             Self::Export(_) => "export",
+            Self::Train(_) => "train",
+            Self::Evaluate(_) => "evaluate",
         }
     }
 
@@ -91,6 +99,8 @@ impl TaskSpec {
             Self::Reprocess(task) => &task.reprocess.version,
             Self::Split(_) => SPLIT_VERSION,
             Self::Export(_) => EXPORT_VERSION,
+            Self::Train(task) => &task.train.version,
+            Self::Evaluate(task) => &task.evaluate.version,
         }
     }
 
@@ -101,6 +111,8 @@ impl TaskSpec {
             Self::Reprocess(task) => Some(&task.source),
             Self::Split(task) => Some(&task.source),
             Self::Export(task) => Some(&task.source),
+            Self::Train(task) => Some(&task.source),
+            Self::Evaluate(task) => Some(&task.source),
         }
     }
 
@@ -110,8 +122,48 @@ impl TaskSpec {
             Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Import(task) => Some((&task.output.store, &task.output.dataset)),
-            Self::Part(_) | Self::Generate(_) | Self::Split(_) | Self::Export(_) => None,
+            Self::Part(_)
+            | Self::Generate(_)
+            | Self::Split(_)
+            | Self::Export(_)
+            | Self::Train(_)
+            | Self::Evaluate(_) => None,
         }
+    }
+
+    /// The model that is trained: store and name.
+    pub fn trains(&self) -> Option<(&String, &String)> {
+        match self {
+            Self::Train(task) => Some((&task.source.store, &task.train.model)),
+            _ => None,
+        }
+    }
+
+    /// The models that are read, from the store of [`Self::reads`]: field and name.
+    pub fn models(&self) -> Vec<(&'static str, &String)> {
+        match self {
+            Self::Train(task) => task.train.models(),
+            Self::Evaluate(task) => {
+                let models = task.evaluate.models.iter();
+                models.map(|m| ("evaluate.models", m)).collect()
+            }
+            _ => Vec::new(),
+        }
+    }
+
+    /// The split of the data set of [`Self::reads`] that is read.
+    pub fn split(&self) -> Option<&String> {
+        match self {
+            Self::Train(task) => Some(&task.train.split),
+            Self::Evaluate(task) => Some(&task.evaluate.split),
+            _ => None,
+        }
+    }
+
+    /// Whether its tasks, when they are stopped, keep what they have done, and whoever runs them next goes on from there.
+    /// They may run for days: none is run twice at a time, and a worker that shall end does not finish them first.
+    pub fn resumes(&self) -> bool {
+        matches!(self, Self::Train(_))
     }
 
     /// The rendering, where it is one or a part of one.
@@ -130,6 +182,8 @@ impl TaskSpec {
             Self::Reprocess(task) => Some((&mut task.source, &mut task.count)),
             Self::Split(task) => Some((&mut task.source, &mut task.count)),
             Self::Export(task) => Some((&mut task.source, &mut task.count)),
+            Self::Train(task) => Some((&mut task.source, &mut task.count)),
+            Self::Evaluate(task) => Some((&mut task.source, &mut task.count)),
         }
     }
 }

@@ -8,7 +8,9 @@ use std::{
 use picofarm_proto::{
     ids::{Epoch, HouseId, Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::{StageKey, stage_key},
-    model::{EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec},
+    model::{
+        EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec, job::MODELS,
+    },
 };
 
 /// One submission.
@@ -132,6 +134,14 @@ impl ResultSet {
                 format!("{}/split/{}", task.source.dataset, task.split.name),
             ),
             TaskSpec::Export(task) => (task.export.dest.clone(), "/export".into()),
+            TaskSpec::Train(task) => (
+                task.source.store.clone(),
+                format!("{MODELS}/{}", task.train.model),
+            ),
+            TaskSpec::Evaluate(task) => (
+                task.source.store.clone(),
+                format!("{}/evaluate", task.source.dataset),
+            ),
         };
         Self {
             store,

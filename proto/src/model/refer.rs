@@ -1,0 +1,90 @@
+//! What training and evaluation refer to in stages before them: models, which a stage's name may stand for, and splits.
+//!
+//! A name is first that of a model that some stage before trains, then that of a stage: so a job that was read once, and
+//! names models only, means the same when it is read again.
+
+use super::{
+    job::{SpecError, StageSpec},
+    task::TaskSpec,
+};
+
+/// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models or split it
+/// reads.
+///
+/// # Errors
+/// A name that stands for several models where one is wanted, or for a stage that trains none.
+pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
+    let Some(source) = stage.task.reads().cloned() else {
+        return Ok(());
+    };
+    let at = |field: &str| format!("stage.{}.{field}", stage.name);
+    match &mut stage.task {
+        TaskSpec::Train(task) => {
+            for (field, name) in task.train.models_mut() {
+                let mut found =
+                    named(name, before, &source.store).map_err(|e| SpecError::new(at(field), e))?;
+                if found.len() > 1 {
+                    let what = format!(
+                        "{name:?} stands for {} models; name one stage, as \"{}\"",
+                        found.len(),
+                        found[0].0
+                    );
+                    return Err(SpecError::new(at(field), what));
+                }
+                if let Some((_, model)) = found.pop() {
+                    *name = model;
+                }
+            }
+        }
+        TaskSpec::Evaluate(task) => {
+            let mut models: Vec<String> = Vec::new();
+            for name in &task.evaluate.models {
+                let found = named(name, before, &source.store)
+                    .map_err(|e| SpecError::new(at("evaluate.models"), e))?;
+                match found.is_empty() {
+                    true => models.push(name.clone()),
+                    false => models.extend(found.into_iter().map(|(_, model)| model)),
+                }
+            }
+            task.evaluate.models = models;
+        }
+        _ => return Ok(()),
+    }
+    let task = &stage.task;
+    let models = task.models();
+    let wanted = before.iter().filter(|s| match &s.task {
+        TaskSpec::Split(split) => split.source == source && task.split() == Some(&split.split.name),
+        other => other.trains().is_some_and(|(store, model)| {
+            *store == source.store && models.iter().any(|(_, name)| *name == model)
+        }),
+    });
+    let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
+    for name in wanted {
+        if !stage.needs.contains(&name) {
+            stage.needs.push(name);
+        }
+    }
+    Ok(())
+}
+
+/// The stages that train what `name` stands for, each with its model; none where it is a model that exists already.
+fn named(name: &str, before: &[StageSpec], store: &str) -> Result<Vec<(String, String)>, String> {
+    let trained = |s: &&StageSpec| s.task.trains().is_some_and(|(_, model)| model == name);
+    if before.iter().any(|s| trained(&s)) {
+        return Ok(Vec::new());
+    }
+    let instance = format!("{name}[");
+    let stages = before
+        .iter()
+        .filter(|s| s.name == name || s.name.starts_with(&instance));
+    stages
+        .map(|stage| match stage.task.trains() {
+            Some((place, model)) if place == store => Ok((stage.name.clone(), model.clone())),
+            Some((place, _)) => Err(format!(
+                "{:?} keeps its model in {place}, but models are looked for in the store of the data set, {store}",
+                stage.name
+            )),
+            None => Err(format!("{:?} is a stage that trains no model", stage.name)),
+        })
+        .collect()
+}

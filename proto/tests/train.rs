@@ -1,0 +1,307 @@
+//! Training and evaluation in job files: defaults, what stands for models, what names a result, and what is refused.
+
+use picofarm_proto::{
+    key::stage_key,
+    model::{
+        Histogram, JobSpec, StageSpec, TaskSpec, TrainSettings,
+        train::{Architecture, Normalise, Precision, Schedule, ShadowVariant, Target},
+    },
+    wire,
+};
+
+const DATA: &str = "[[stage]]\nscenes = { kind = \"primitive\", count = 9 }\n\
+                    output = { store = \"/s\", dataset = \"rooms\" }\n\
+                    [[stage]]\nkind = \"split\"\nsource = \"render\"\nsplit = { fractions = [0.5, 0.3, 0.2] }\n";
+
+fn read(stages: &str) -> Result<JobSpec, toml::de::Error> {
+    toml::from_str(&format!("name = \"n\"\n{DATA}{stages}"))
+}
+
+fn good(stages: &str) -> JobSpec {
+    let spec = read(stages).unwrap();
+    spec.check().unwrap();
+    spec.check_places().unwrap();
+    spec
+}
+
+fn refused(stages: &str) -> String {
+    match read(stages) {
+        Err(error) => error.to_string(),
+        Ok(spec) => spec.check().unwrap_err().to_string(),
+    }
+}
+
+fn train(name: &str, settings: &str) -> String {
+    format!(
+        "[[stage]]\nname = \"{name}\"\nkind = \"train\"\nsource = \"render\"\ntrain = {{ {settings} }}\n"
+    )
+}
+
+fn evaluate(settings: &str) -> String {
+    format!("[[stage]]\nkind = \"evaluate\"\nsource = \"render\"\nevaluate = {{ {settings} }}\n")
+}
+
+fn settings(stage: &StageSpec) -> &TrainSettings {
+    match &stage.task {
+        TaskSpec::Train(task) => &task.train,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn what_is_left_out_is_as_in_the_paper() {
+    let spec = good(&train("tof", "task = \"tof\", model = \"m\""));
+    let s = settings(&spec.stages[2]);
+    assert_eq!((s.task, &*s.split, s.scenes), (Target::Tof, "default", 0));
+    assert_eq!(
+        (s.histogram, s.augment, s.seed),
+        (Histogram::Transient, true, 0)
+    );
+    assert_eq!((s.input.normalise, s.input.bins), (Normalise::Minmax, 0));
+    assert_eq!(s.net.architecture, Architecture::Unet2d);
+    assert_eq!((s.net.width, s.net.levels, s.net.stem), (128, 6, 0));
+    assert_eq!(
+        (s.shadow.variant, &*s.shadow.tof),
+        (ShadowVariant::Concat, "truth")
+    );
+    let o = &s.optimise;
+    assert_eq!((o.epochs, o.batch, o.accumulate), (200, 32, 1));
+    assert_eq!((o.rate, o.weight_decay), (1e-2, 1e-3));
+    assert_eq!(
+        (o.schedule, o.precision),
+        (Schedule::Onecycle, Precision::F32)
+    );
+    assert_eq!((o.early_stop, s.checkpoint_minutes), (0, 10.0));
+}
+
+#[test]
+fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
+    let stages = train("tof", "task = \"tof\", model = \"first\"")
+        + &train(
+            "shadow",
+            "task = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
+        )
+        + &train(
+            "mirror",
+            "task = \"specular\", model = \"m\", specular = { on = \"first\" }",
+        )
+        + &train(
+            "other",
+            "task = \"tof\", model = \"o\", split = \"half\", from = \"from-last-year\"",
+        );
+    let spec = good(&stages);
+    let [_, _, tof, shadow, mirror, other] = &spec.stages[..] else {
+        panic!("{spec:?}");
+    };
+    assert_eq!(tof.needs, ["render", "split"]);
+    assert_eq!(tof.tasks(), 1);
+    assert_eq!(settings(shadow).shadow.tof, "first");
+    assert_eq!(shadow.needs, ["render", "split", "tof"]);
+    assert_eq!(mirror.needs, ["render", "split", "tof"]);
+    assert_eq!(settings(other).from, "from-last-year");
+    assert_eq!(other.needs, ["render"]);
+    // On the wire and in the catalog it means the same.
+    let again = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
+    assert_eq!(again, spec);
+}
+
+#[test]
+fn a_model_called_like_a_stage_goes_before_the_stage() {
+    let stages = train("a", "task = \"tof\", model = \"b\"")
+        + &train("b", "task = \"tof\", model = \"c\"")
+        + &train("d", "task = \"tof\", model = \"d\", from = \"a\"");
+    let mut spec = good(&stages);
+    assert_eq!(settings(&spec.stages[4]).from, "b");
+    assert_eq!(spec.stages[4].needs, ["render", "split", "a"]);
+    let before = spec.clone();
+    spec.resolve().unwrap();
+    assert_eq!(spec, before);
+}
+
+#[test]
+fn a_matrix_goes_over_any_field_and_its_models_are_evaluated_together() {
+    let sweep = "[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\n\
+                 matrix = { lr = [0.01, 0.001], width = [8] }\n\
+                 train = { task = \"tof\", model = \"tof-{lr}\", net = { width = \"{width}\", levels = 3 }, \
+                 optimise = { rate = \"{lr}\" } }\n";
+    let spec = good(&(sweep.to_owned() + &evaluate("models = [\"tof\", \"old\"]")));
+    let [_, _, one, two, evaluation] = &spec.stages[..] else {
+        panic!("{spec:?}");
+    };
+    assert_eq!(one.name, "tof[0.01,8]");
+    assert_eq!(
+        (settings(one).optimise.rate, settings(two).optimise.rate),
+        (0.01, 0.001)
+    );
+    assert_eq!(
+        (settings(two).net.width, &*settings(two).model),
+        (8, "tof-0.001")
+    );
+    let TaskSpec::Evaluate(task) = &evaluation.task else {
+        panic!("{evaluation:?}");
+    };
+    assert_eq!(task.evaluate.models, ["tof-0.01", "tof-0.001", "old"]);
+    assert_eq!(
+        (&*task.evaluate.side, task.evaluate.histogram),
+        ("test", None)
+    );
+    assert_eq!(
+        evaluation.needs,
+        ["render", "split", "tof[0.01,8]", "tof[0.001,8]"]
+    );
+    let one_of_many = train(
+        "s",
+        "task = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
+    );
+    let said = refused(&(sweep.to_owned() + &one_of_many));
+    assert!(said.contains("stands for 2 models"), "{said}");
+}
+
+#[test]
+fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
+    let key = |settings: &str| {
+        let text = format!("task = \"shadow\", model = \"m\"{settings}");
+        stage_key(&good(&train("t", &text)).stages[2])
+    };
+    let plain = key("");
+    assert_eq!(key(", checkpoint_minutes = 1.0"), plain);
+    assert_eq!(key(", optimise = { rate = 0.01 }, seed = 0"), plain);
+    for other in [
+        ", seed = 1",
+        ", scenes = 3",
+        ", augment = false",
+        ", histogram = \"transient_25\"",
+        ", input = { bins = 64 }",
+        ", input = { normalise = \"log\", max = 3.0 }",
+        ", net = { width = 64 }",
+        ", net = { stem = 128 }",
+        ", shadow = { variant = \"index\" }",
+        ", shadow = { tof = \"x\" }",
+        ", optimise = { epochs = 1 }",
+        ", optimise = { precision = \"bf16\" }",
+        ", from = \"x\"",
+        ", version = \"x\"",
+        ", split = \"x\"",
+    ] {
+        assert_ne!(key(other), plain, "{other}");
+    }
+    let other_name = good(&train("t", "task = \"shadow\", model = \"n\""));
+    assert_ne!(stage_key(&other_name.stages[2]), plain);
+}
+
+#[test]
+fn an_unusable_field_is_named() {
+    for (settings, field, part) in [
+        ("task = \"depth\", model = \"m\"", "", "`tof`, `shadow`"),
+        ("task = \"tof\"", "", "missing field `model`"),
+        ("task = \"tof\", model = \"a/b\"", "train.model", "letters"),
+        ("task = \"tof\", model = \"m\", colour = 1", "", "colour"),
+        (
+            "task = \"tof\", model = \"m\", net = { depth = 3 }",
+            "",
+            "depth",
+        ),
+        (
+            "task = \"tof\", model = \"m\", net = { levels = 0 }",
+            "train.net.levels",
+            "1..=8",
+        ),
+        (
+            "task = \"tof\", model = \"m\", net = { time_features = 8 }",
+            "train.net.time_features",
+            "unet25d",
+        ),
+        (
+            "task = \"tof\", model = \"m\", net = { architecture = \"unet25d\", levels = 4, time_features = 100 }",
+            "train.net.time_features",
+            "multiple of 8",
+        ),
+        (
+            "task = \"tof\", model = \"m\", optimise = { batch = 32, accumulate = 5 }",
+            "train.optimise.accumulate",
+            "does not divide",
+        ),
+        (
+            "task = \"tof\", model = \"m\", optimise = { rate = 0.0 }",
+            "train.optimise.rate",
+            "0..=10",
+        ),
+        (
+            "task = \"tof\", model = \"m\", shadow = { tof = \"x\" }",
+            "train.shadow",
+            "remove",
+        ),
+        (
+            "task = \"tof\", model = \"m\", specular = { on = \"x\" }",
+            "train.specular",
+            "remove",
+        ),
+        (
+            "task = \"tof\", model = \"m\", from = \"m\"",
+            "train.from",
+            "itself",
+        ),
+        (
+            "task = \"tof\", model = \"m\", spots = [1]",
+            "train.spots",
+            "transient_spots",
+        ),
+        (
+            "task = \"tof\", model = \"m\", split = \"a b\"",
+            "train.split",
+            "letters",
+        ),
+        (
+            "task = \"tof\", model = \"m\", from = \"render\"",
+            "from",
+            "trains no model",
+        ),
+        (
+            "task = \"tof\", model = \"m\", checkpoint_minutes = 0.0",
+            "train.checkpoint_minutes",
+            "0.01",
+        ),
+        (
+            "task = \"tof\", model = \"m\", input = { bins = 4, intensity_only = true }",
+            "train.input.bins",
+            "remove",
+        ),
+        (
+            "task = \"tof\", model = \"m\", input = { max = 4.0 }",
+            "train.input.max",
+            "log",
+        ),
+    ] {
+        let said = refused(&train("t", settings));
+        assert!(
+            said.contains(field) && said.contains(part),
+            "{settings}: {said}"
+        );
+    }
+    for (settings, part) in [
+        ("models = []", "evaluate.models"),
+        ("models = [\"a\", \"a\"]", "evaluate.models[1]"),
+        ("models = [\"a\"], side = \"tests\"", "evaluate.side"),
+        ("models = [\"a\"], spots = [1]", "evaluate.spots"),
+    ] {
+        let said = refused(&evaluate(settings));
+        assert!(said.contains(part), "{settings}: {said}");
+    }
+    let twice =
+        train("a", "task = \"tof\", model = \"m\"") + &train("b", "task = \"tof\", model = \"m\"");
+    assert!(refused(&twice).contains("stage \"a\" trains"));
+    let late = train("a", "task = \"tof\", model = \"a\", from = \"z\"")
+        + &train("b", "task = \"tof\", model = \"z\"");
+    assert!(refused(&late).contains("put that before"));
+    let folder = "[[stage]]\nname = \"x\"\nscenes = { kind = \"primitive\", count = 9 }\n\
+                  output = { store = \"/s\", dataset = \"models\" }\n";
+    assert!(refused(folder).contains("output.dataset"));
+}
+
+#[test]
+fn settings_without_their_kind_are_refused() {
+    let said = refused(
+        "[[stage]]\nkind = \"split\"\nsource = \"render\"\nsplit = { fractions = [1.0, 0.0, 0.0] }\ntrain = { task = \"tof\", model = \"m\" }\n",
+    );
+    assert!(said.contains("belongs to kind = \"train\""), "{said}");
+}
