@@ -152,8 +152,12 @@ impl Pace {
             true => "scenes",
             false => "tasks",
         };
+        let at = match &s.running[..] {
+            [only] if !only.text.is_empty() => format!(", {}", only.text),
+            _ => String::new(),
+        };
         let message = format!(
-            "{}/{} {what}{reused}{dead}, {} worker{}{eta}",
+            "{}/{} {what}{reused}{dead}, {} worker{}{at}{eta}",
             s.tasks.done,
             s.tasks.total,
             s.workers,

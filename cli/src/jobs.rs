@@ -352,11 +352,15 @@ pub fn describe(s: &JobStatus) -> String {
             _ => String::new(),
         };
         text += &format!(
-            "  {of}task {} on {}: {:.0} % after {}\n",
+            "  {of}task {} on {}: {:.0} % after {}{}\n",
             r.index,
             r.worker,
             r.fraction * 100.0,
-            duration(r.seconds)
+            duration(r.seconds),
+            match &*r.text {
+                "" => String::new(),
+                text => format!(": {text}"),
+            }
         );
     }
     for stage in &s.spec.stages {

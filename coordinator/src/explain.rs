@@ -22,6 +22,19 @@ pub struct Candidate {
     pub quarantined: bool,
 }
 
+/// How a task runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Runs {
+    /// Its worker's name.
+    pub worker: String,
+    /// Share done in [0, 1].
+    pub fraction: f32,
+    /// What it is at, in its own words; empty = nothing to say.
+    pub text: String,
+    /// Unix time at which it was first heard of, milliseconds.
+    pub since_ms: i64,
+}
+
 /// What decides whether a job's tasks run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobFacts {
@@ -62,8 +75,8 @@ pub struct TaskFacts {
     pub limits: Limits,
     /// Who committed its result under another job: that job and its name, and the line of its history.
     pub elsewhere: Option<(JobId, String, Event)>,
-    /// Where a worker has reported on it: the worker's name, share done, and since when (Unix milliseconds).
-    pub running: Option<(String, f32, i64)>,
+    /// Where a worker has reported on it: how it runs.
+    pub running: Option<Runs>,
     /// Unix time, milliseconds.
     pub now_ms: i64,
 }
@@ -356,11 +369,16 @@ fn pending(facts: &TaskFacts, last_error: &str) -> String {
 }
 
 fn leased(facts: &TaskFacts) -> String {
-    if let Some((worker, fraction, since_ms)) = &facts.running {
+    if let Some(running) = &facts.running {
+        let at = match &*running.text {
+            "" => String::new(),
+            text => format!(" ({text})"),
+        };
         return format!(
-            "runs on {worker} for {}: {:.0} % done",
-            span(facts.now_ms - since_ms),
-            f64::from(*fraction) * 100.0
+            "runs on {} for {}: {:.0} % done{at}",
+            running.worker,
+            span(facts.now_ms - running.since_ms),
+            f64::from(running.fraction) * 100.0
         );
     }
     let granted = facts

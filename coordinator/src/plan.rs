@@ -191,6 +191,8 @@ fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
             "render" | "part" => ("render.renderer", "renderer"),
             "generate" => ("generate.version", "scene generator"),
             "import" => ("import.version", "importer"),
+            "train" => ("train.version", "training's code"),
+            "evaluate" => ("evaluate.version", "networks' code"),
             _ => ("reprocess.version", "sensor model"),
         };
         return Err(SpecError::new(

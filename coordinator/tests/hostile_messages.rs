@@ -223,12 +223,15 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
         hello.held = held;
         Say::Hello(hello)
     });
-    let progress =
-        (lease(), number(), any::<f32>()).prop_map(|(lease, index, fraction)| wire::TaskProgress {
+    let progress = (lease(), number(), any::<(f32, String, f64)>()).prop_map(
+        |(lease, index, (fraction, text, figure))| wire::TaskProgress {
+            figures: [(text.clone(), figure)].into(),
+            text,
             lease,
             index,
             fraction,
-        });
+        },
+    );
     let beat = (leases(), vec(progress, 0..4))
         .prop_map(|(leases, progress)| Say::Heartbeat(wire::Heartbeat { leases, progress }));
     let done = (

@@ -6,7 +6,7 @@ use picofarm_proto::{
 };
 
 use super::{Core, StageEntry, WorkerEntry};
-use crate::explain::Candidate;
+use crate::explain::{Candidate, Runs};
 
 /// What the house knows at this moment.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,8 +30,8 @@ pub(crate) struct JobLook {
     pub ahead: Vec<JobId>,
     /// Workers connected to other houses.
     pub elsewhere: u32,
-    /// Of the task asked for, where a worker here has reported on it: its worker's name, share done, and since when.
-    pub running: Option<(String, f32, i64)>,
+    /// Of the task asked for, where a worker here has reported on it: how it runs.
+    pub running: Option<Runs>,
 }
 
 impl Core {
@@ -146,14 +146,15 @@ impl Core {
         }
     }
 
-    fn runs(&self, entry: &StageEntry, task: u64) -> Option<(String, f32, i64)> {
+    fn runs(&self, entry: &StageEntry, task: u64) -> Option<Runs> {
         entry.stage.leased().find_map(|(range, lease)| {
             let progress = self.progress.get(&range.id)?.get(&task)?;
-            Some((
-                self.name_of(lease.worker),
-                progress.fraction,
-                progress.since_ms,
-            ))
+            Some(Runs {
+                worker: self.name_of(lease.worker),
+                fraction: progress.fraction,
+                text: progress.at.text.clone(),
+                since_ms: progress.since_ms,
+            })
         })
     }
 

@@ -192,6 +192,8 @@ impl Core {
                     index: *index,
                     worker: self.name_of(lease.worker),
                     fraction: progress.fraction,
+                    text: progress.at.text.clone(),
+                    figures: progress.at.figures.clone(),
                     seconds: (now_ms - progress.since_ms).max(0) as f64 / 1000.0,
                 }));
             }

@@ -3,7 +3,7 @@
 use picofarm_catalog::{Exception, Mark, Range, RangeState};
 use picofarm_proto::{
     ids::{Incarnation, LeaseRef, RangeId, WorkerId},
-    model::{EventKind, Failure, FailureKind, LogAllowance, TaskProgress},
+    model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
 use super::{About, Core, Progress, Say, SessionId};
@@ -82,16 +82,12 @@ impl Core {
             if held.is_err() {
                 continue;
             }
-            self.progress
-                .entry(report.lease.range)
-                .or_default()
+            let tasks = self.progress.entry(report.lease.range).or_default();
+            let task = tasks
                 .entry(report.index)
-                .or_insert(Progress {
-                    fraction: 0.0,
-                    since_ms: now_ms,
-                    log: LogAllowance::default(),
-                })
-                .fraction = report.fraction;
+                .or_insert_with(|| Progress::since(now_ms));
+            task.fraction = report.fraction;
+            task.at = report.at.clone();
         }
         let ttl_ms = self.settings.lease_ms;
         self.say.push((

@@ -1,6 +1,6 @@
 //! What tasks log on their workers, as lines of their history.
 
-use picofarm_proto::model::{EventKind, LogAllowance, TaskLog};
+use picofarm_proto::model::{EventKind, TaskLog};
 
 use super::{About, Core, Progress, SessionId};
 
@@ -23,11 +23,9 @@ impl Core {
         let worker = self.session_name(session);
         for line in &log.lines {
             let in_hand = self.progress.entry(range).or_default();
-            let task = in_hand.entry(log.index).or_insert(Progress {
-                fraction: 0.0,
-                since_ms: now_ms,
-                log: LogAllowance::default(),
-            });
+            let task = in_hand
+                .entry(log.index)
+                .or_insert_with(|| Progress::since(now_ms));
             if !task.log.take(line.text.len()) {
                 return;
             }

@@ -26,7 +26,7 @@ use picofarm_catalog::{
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::StageKey,
-    model::{Abilities, EventKind, Lease, LogAllowance, StageSpec},
+    model::{Abilities, EventKind, Lease, LogAllowance, StageSpec, TaskAt},
 };
 use uuid::Uuid;
 
@@ -149,12 +149,26 @@ impl WorkerEntry {
     }
 }
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Progress {
     fraction: f32,
+    /// What it is at, in its worker's words.
+    at: TaskAt,
     since_ms: i64,
     /// What its worker may still say in its name.
     log: LogAllowance,
+}
+
+impl Progress {
+    /// Of a task that has just begun.
+    fn since(since_ms: i64) -> Self {
+        Self {
+            fraction: 0.0,
+            at: TaskAt::default(),
+            since_ms,
+            log: LogAllowance::default(),
+        }
+    }
 }
 
 pub(crate) struct Core {

@@ -48,6 +48,8 @@ impl Core {
             .iter()
             .filter(|(_, e)| !e.job.paused && e.free == Some(0))
             .filter(|(_, e)| e.stage.pending_tasks() == 0 && e.stage.leased_tasks() > 0)
+            // Half of such a task's work would be in vain, and it has been saved on the way.
+            .filter(|(id, e)| !e.spec(**id).task.resumes())
             .map(|(id, _)| *id)
             .collect();
         stages.sort_by_cached_key(|id| self.rank(*id));

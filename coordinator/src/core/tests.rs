@@ -15,7 +15,7 @@ use picofarm_proto::{
     ids::{HouseId, Incarnation, JobId, WorkerId},
     key::task_key,
     model::{
-        Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskProgress,
+        Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskAt, TaskProgress,
         WorkerHello,
     },
 };
@@ -383,6 +383,7 @@ impl World {
                         lease: l.lease,
                         index: l.lo,
                         fraction: 0.5,
+                        at: TaskAt::default(),
                     });
                     let progress: Vec<_> = progress.collect();
                     self.houses[h]

@@ -283,8 +283,16 @@ fn each_run_of_a_task_but_the_first_has_its_cause() {
         ]
     );
     assert_eq!((told.failures, told.crashes), (2, 1));
-    facts.running = Some(("d".into(), 0.4, NOW - 3_000));
-    assert_eq!(task(facts).words, "runs on d for 3 s: 40 % done");
+    facts.running = Some(Runs {
+        worker: "d".into(),
+        fraction: 0.4,
+        text: "epoch 3/200".into(),
+        since_ms: NOW - 3_000,
+    });
+    assert_eq!(
+        task(facts).words,
+        "runs on d for 3 s: 40 % done (epoch 3/200)"
+    );
 }
 
 #[test]

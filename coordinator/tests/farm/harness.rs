@@ -314,6 +314,7 @@ impl Worker {
                     lease: Some(leases[0].lease.into()),
                     index,
                     fraction: 0.5,
+                    ..wire::TaskProgress::default()
                 })
                 .into_iter()
                 .collect(),

@@ -5,8 +5,8 @@ use crate::{
     ids::{Epoch, LeaseRef},
     key::{StageKey, TaskKey},
     model::{
-        Abilities, Failure, FailureKind, Finished, Lease, LogLevel, LogLine, TaskLog, TaskProgress,
-        WorkerHello, log,
+        Abilities, Failure, FailureKind, Finished, Lease, LogLevel, LogLine, TaskAt, TaskLog,
+        TaskProgress, WorkerHello, log,
     },
     wire,
 };
@@ -280,6 +280,11 @@ impl TryFrom<wire::TaskProgress> for TaskProgress {
             lease: lease_ref(w.lease)?,
             index: w.index,
             fraction: w.fraction.clamp(0.0, 1.0),
+            at: TaskAt {
+                text: w.text,
+                figures: w.figures.into_iter().collect(),
+            }
+            .limited(),
         })
     }
 }
@@ -290,6 +295,8 @@ impl From<TaskProgress> for wire::TaskProgress {
             lease: Some(m.lease.into()),
             index: m.index,
             fraction: m.fraction,
+            text: m.at.text,
+            figures: m.at.figures.into_iter().collect(),
         }
     }
 }

@@ -127,6 +127,8 @@ impl From<JobStatus> for wire::JobStatus {
                     worker: r.worker,
                     fraction: r.fraction,
                     seconds: r.seconds,
+                    text: r.text,
+                    figures: r.figures.into_iter().collect(),
                 })
                 .collect(),
             workers: m.workers,
@@ -163,6 +165,8 @@ impl TryFrom<wire::JobStatus> for JobStatus {
                     worker: r.worker,
                     fraction: r.fraction,
                     seconds: r.seconds,
+                    text: r.text,
+                    figures: r.figures.into_iter().collect(),
                 })
                 .collect(),
             workers: w.workers,

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::log::printable;
 use crate::{
     ids::{Incarnation, JobId, LeaseRef, WorkerId},
     key::{StageKey, TaskKey},
@@ -115,7 +116,7 @@ pub struct Failure {
 }
 
 /// How far a running task is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TaskProgress {
     /// Its lease.
     pub lease: LeaseRef,
@@ -123,4 +124,35 @@ pub struct TaskProgress {
     pub index: u64,
     /// Share done in [0, 1].
     pub fraction: f32,
+    /// What it is at.
+    pub at: TaskAt,
+}
+
+/// What a running task is at: its own words and figures.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TaskAt {
+    /// For people; empty = nothing to say.
+    pub text: String,
+    /// For programs: loss, samples_per_s, …
+    pub figures: BTreeMap<String, f64>,
+}
+
+impl TaskAt {
+    /// Bytes of the text.
+    const TEXT: usize = 256;
+    /// Figures.
+    const FIGURES: usize = 16;
+    /// Bytes of a figure's name.
+    const NAME: usize = 32;
+
+    /// As much of it as a message may carry, as it is sent with each heartbeat, in a text that a terminal only shows.
+    #[must_use]
+    pub fn limited(self) -> Self {
+        let figures = self.figures.into_iter();
+        let usable = |(name, value): &(String, f64)| name.len() <= Self::NAME && value.is_finite();
+        Self {
+            text: printable(&self.text[..self.text.floor_char_boundary(Self::TEXT)]),
+            figures: figures.filter(usable).take(Self::FIGURES).collect(),
+        }
+    }
 }

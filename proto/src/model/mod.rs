@@ -23,7 +23,9 @@ pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, Ta
 pub use generate::{GenerateSettings, GenerateTask};
 pub use import::{ImportSettings, ImportTask};
 pub use job::{JobSpec, Limits, OutputSettings, Resources, SpecError, StageSpec, check_label};
-pub use lease::{Abilities, Failure, FailureKind, Finished, Lease, TaskProgress, WorkerHello};
+pub use lease::{
+    Abilities, Failure, FailureKind, Finished, Lease, TaskAt, TaskProgress, WorkerHello,
+};
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
 pub use render::{
     Budget, Choice, PartTask, RenderSettings, RenderTask, SceneFile, SceneKind, SceneSource,

@@ -1,5 +1,7 @@
 //! What people are told about jobs. Every count is derived from ranges and outputs.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 
 use crate::{ids::JobId, model::JobSpec};
@@ -88,6 +90,12 @@ pub struct RunningTask {
     pub fraction: f32,
     /// Seconds since the worker began it.
     pub seconds: f64,
+    /// What it is at, in its own words.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub text: String,
+    /// The same as figures: loss, samples_per_s, …
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub figures: BTreeMap<String, f64>,
 }
 
 /// A job as people see it.

@@ -37,6 +37,8 @@ const FINISH_WITHIN: Duration = Duration::from_millis(1500);
 const LONGEST_TASK: Duration = Duration::from_secs(30 * 86_400);
 /// How long a task may take to stop before the worker leaves without it.
 const STOP_WITHIN: Duration = Duration::from_secs(10);
+/// The same of a task that keeps what it has done: some gigabytes may go to a store that is far.
+const SAVE_WITHIN: Duration = Duration::from_secs(300);
 /// How long the last words may wait for their acknowledgement.
 const GOODBYE_WITHIN: Duration = Duration::from_secs(3);
 /// A session that lasted this long was a good one: the next reconnect begins with a short wait.
@@ -344,8 +346,12 @@ impl Agent {
             let text = format!("no answer to heartbeats for {:.1} s", silent.as_secs_f64());
             return self.lost(now, LinkError::Down(text));
         }
-        let fraction = self.control.as_ref().map_or(0.0, |c| c.fraction());
-        session.send(self.desk.heartbeat(now, fraction));
+        let (fraction, at) = self
+            .control
+            .as_ref()
+            .map(|c| c.progress())
+            .unwrap_or_default();
+        session.send(self.desk.heartbeat(now, fraction, at));
         *next_beat = now + welcome.heartbeat;
         Ok(())
     }
@@ -489,7 +495,12 @@ impl Agent {
         let nearly_done = self
             .remaining(now)
             .is_some_and(|left| left <= FINISH_WITHIN);
+        let saves = self
+            .desk
+            .in_hand()
+            .is_some_and(|hand| hand.task.spec.task.resumes());
         let stop_at = match haste {
+            Haste::Finish if saves => now,
             Haste::Finish => now + LONGEST_TASK,
             Haste::Stop if nearly_done => now + FINISH_WITHIN,
             Haste::Stop => now,
@@ -501,16 +512,20 @@ impl Agent {
             "shutting down"
         );
         self.desk.release_waiting(SHUTDOWN);
-        let fraction = self.control.as_ref().map_or(0.0, |c| c.fraction());
+        let (fraction, at) = self
+            .control
+            .as_ref()
+            .map(|c| c.progress())
+            .unwrap_or_default();
         if let Link::Up { session, .. } = &self.link {
-            for message in self.desk.withdraw(now, fraction) {
+            for message in self.desk.withdraw(now, fraction, at) {
                 session.send(message);
             }
         }
         self.leaving = Some(Leaving {
             haste,
             stop_at,
-            give_up: stop_at + STOP_WITHIN,
+            give_up: stop_at + if saves { SAVE_WITHIN } else { STOP_WITHIN },
             released: false,
         });
     }

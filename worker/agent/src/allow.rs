@@ -62,7 +62,11 @@ impl StorePrefixes {
             TaskSpec::Generate(task) => self.allowed("generate.dest", &task.generate.dest),
             TaskSpec::Import(task) => self.allowed("import.folder", &task.import.folder),
             TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
-            TaskSpec::Reprocess(_) | TaskSpec::Split(_) => Ok(()),
+            // Models lie in the source's store, and are put there.
+            TaskSpec::Reprocess(_)
+            | TaskSpec::Split(_)
+            | TaskSpec::Train(_)
+            | TaskSpec::Evaluate(_) => Ok(()),
         }
     }
 

@@ -20,7 +20,7 @@ use std::{
     collections::BTreeMap,
     fmt,
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, AtomicU32, Ordering},
     },
 };
@@ -28,7 +28,7 @@ use std::{
 use picofarm_proto::{
     ids::JobId,
     key::{StageKey, TaskKey, task_key},
-    model::StageSpec,
+    model::{StageSpec, TaskAt},
 };
 
 pub use generate::generator_version;
@@ -108,6 +108,7 @@ pub trait Executor: Send + Sync + 'static {
 pub struct Control {
     /// Bits of an f32 in [0, 1]: for non-negative floats the order of the bits is that of the values.
     fraction: AtomicU32,
+    at: Mutex<TaskAt>,
     stop: AtomicBool,
 }
 
@@ -120,6 +121,24 @@ impl Control {
             self.fraction.fetch_max(bits, Ordering::Relaxed);
         }
         !self.stopped()
+    }
+
+    /// Says what the task is at: in words, and in figures with names.
+    pub fn say(&self, text: String, figures: &[(&str, f64)]) {
+        let figures = figures
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), *value));
+        let at = TaskAt {
+            text,
+            figures: figures.collect(),
+        };
+        *self.at.lock().expect("no panic while locked") = at.limited();
+    }
+
+    /// How far the task is, and what it is at.
+    pub fn progress(&self) -> (f32, TaskAt) {
+        let at = self.at.lock().expect("no panic while locked").clone();
+        (self.fraction(), at)
     }
 
     /// Share done in [0, 1].

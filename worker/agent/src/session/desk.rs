@@ -10,7 +10,7 @@ use std::{
 use picofarm_proto::{
     ids::{JobId, LeaseRef},
     key::StageKey,
-    model::{Failure, FailureKind, Finished, Lease, StageSpec, TaskProgress},
+    model::{Failure, FailureKind, Finished, Lease, StageSpec, TaskAt, TaskProgress},
 };
 
 use super::{
@@ -395,11 +395,11 @@ impl Desk {
 
     /// Takes back what was asked for: the credit, and a heartbeat whose answer shows that no lease is under way
     /// any more.
-    pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32) -> Vec<Outgoing> {
+    pub(crate) fn withdraw(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Vec<Outgoing> {
         if !self.asked {
             return Vec::new();
         }
-        let heartbeat = self.heartbeat(now, fraction);
+        let heartbeat = self.heartbeat(now, fraction, at);
         if let Some(beat) = self.beats.back_mut() {
             beat.withdrawal = true;
         }
@@ -412,7 +412,7 @@ impl Desk {
     }
 
     /// The heartbeat to send now.
-    pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32) -> Outgoing {
+    pub(crate) fn heartbeat(&mut self, now: Instant, fraction: f32, at: TaskAt) -> Outgoing {
         let leases = self.held();
         self.beats.push_back(Beat {
             sent: now,
@@ -427,6 +427,7 @@ impl Desk {
                 lease: t.lease,
                 index: t.task.index,
                 fraction,
+                at: at.clone(),
             })
             .collect();
         Outgoing::Heartbeat { leases, progress }

@@ -10,7 +10,7 @@ use picofarm_proto::{
     key::StageKey,
     model::{
         Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
-        TaskSpec,
+        TaskAt, TaskSpec,
     },
 };
 use proptest::prelude::*;
@@ -154,7 +154,7 @@ proptest! {
                 }
                 Step::Wait(ms) => now += Duration::from_millis(ms),
                 Step::Heartbeat => {
-                    let Outgoing::Heartbeat { leases, progress } = desk.heartbeat(now, 0.5) else {
+                    let Outgoing::Heartbeat { leases, progress } = desk.heartbeat(now, 0.5, TaskAt::default()) else {
                         unreachable!()
                     };
                     prop_assert!(progress.iter().all(|p| leases.contains(&p.lease)));
