@@ -26,6 +26,7 @@ use object_store::{Error, ObjectMeta, ObjectStoreExt};
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::manifest::Manifest;
+use crate::models::Models;
 use crate::objects;
 use crate::parts::part_scene;
 use crate::store::{PROBE, leftovers, probe_leftovers};
@@ -43,7 +44,8 @@ pub struct Orphan {
     pub object: String,
     /// Its size.
     pub bytes: u64,
-    /// The scene it would belong to; `None` for parts on their way and what a killed probe or a killed local write left.
+    /// The scene it would belong to; `None` for parts on their way, models, and what a killed probe or a killed local write
+    /// left.
     pub scene: Option<u64>,
 }
 
@@ -55,6 +57,10 @@ impl Orphan {
             Some(_) => "its scene has no manifest: left by a killed worker",
             None if name.starts_with(PROBE) => "left by a killed probe of the store",
             None if name.contains('#') => "unfinished file of a killed write",
+            None if name.ends_with(".ckpt") => "checkpoint of a training that nobody goes on with",
+            None if !name.ends_with(".zst") => {
+                "its model has no manifest that names it: left by a killed worker"
+            }
             None => "part of a scene that nobody joined",
         }
     }
@@ -91,7 +97,8 @@ enum Found {
 impl Dataset {
     /// Finds what belongs to no published scene nor to one that a snapshot names, and was last written `grace` ago or
     /// earlier: objects of scenes without a manifest, parts of scenes that nobody joined, and what killed probes and
-    /// killed local writes left. Deletes it if `delete` says so. Never touches
+    /// killed local writes left; and of the store's models, checkpoints that nobody goes on with and objects that no
+    /// manifest names. Deletes it if `delete` says so. Never touches
     /// an object that a manifest names, or that it does not know. With less than [`MIN_GRACE`] no worker may be writing
     /// to this data set.
     ///
@@ -117,6 +124,12 @@ impl Dataset {
                 Some(orphan) => report.orphans.push(orphan),
                 None => report.published += 1,
             }
+        }
+        if let Some(store) = self.parent() {
+            let models = Models::new(self.store.clone(), &store);
+            report
+                .orphans
+                .extend(models.collect(limit, grace, delete).await?);
         }
         report.orphans.sort_by(|a, b| a.object.cmp(&b.object));
         Ok(report)

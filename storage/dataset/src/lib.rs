@@ -17,6 +17,7 @@ pub mod import;
 mod layout;
 mod listing;
 mod manifest;
+mod models;
 mod objects;
 mod parts;
 mod publish;
@@ -50,6 +51,9 @@ pub use export::{ExportFormat, Exported, Exporter};
 pub use layout::{INNER_SIDE, Quantity};
 pub use manifest::{
     ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
+};
+pub use models::{
+    Checkpoint, Evaluation, Lineage, MODELS, ModelManifest, Models, NewModel, Published, SplitUsed,
 };
 pub use objects::publish_files;
 pub use parts::PartName;

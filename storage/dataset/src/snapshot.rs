@@ -254,6 +254,34 @@ impl Dataset {
         })
     }
 
+    /// [`Snapshot::id`] of these scenes alone, ascending: pins every byte of them. Their objects are not looked at.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`] names a scene that is not there; [`DatasetError::Store`].
+    pub async fn pin(&self, scenes: &[u64]) -> Result<String, DatasetError> {
+        let look = |scene: u64| -> BoxFuture<'_, Result<[u8; 32], DatasetError>> {
+            async move {
+                let path = self.path(&Manifest::key(scene));
+                match objects::get(&*self.store, &path).await? {
+                    Some(bytes) => Ok(Sha256::digest(&bytes).into()),
+                    None => Err(DatasetError::NotPublished {
+                        scene,
+                        object: self.shown(&path),
+                    }),
+                }
+            }
+            .boxed()
+        };
+        let looks = stream::iter(scenes.iter().map(|scene| look(*scene))).buffered(CONCURRENCY);
+        let manifests: Vec<[u8; 32]> = looks.try_collect().await?;
+        let mut hash = Sha256::new();
+        for (scene, manifest) in scenes.iter().zip(manifests) {
+            hash.update(scene.to_le_bytes());
+            hash.update(manifest);
+        }
+        Ok(hex::encode(hash.finalize()))
+    }
+
     /// Stores a snapshot create-only under its name; gives its size. `None`: one with the same id has this name already.
     ///
     /// # Errors

@@ -1,0 +1,122 @@
+//! What nobody needs of a store's models: checkpoints of trainings that nobody goes on with, and objects that no
+//! manifest names.
+//!
+//! A checkpoint is never a result: whoever misses one trains again from the one before, or from the beginning. Objects are
+//! guarded as a scene's are: the manifest is looked at right before one is deleted and once more right after, and the
+//! publisher looks after its objects when its manifest stands.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use object_store::ObjectMeta;
+use object_store::path::Path;
+
+use super::{Models, object_folder};
+use crate::collect::Orphan;
+use crate::error::DatasetError;
+use crate::objects;
+use crate::store::leftovers;
+
+impl Models {
+    /// Finds what nobody needs and was last written at `limit` or earlier, `grace` before now: checkpoints of trainings
+    /// all of whose checkpoints are that old, objects that no manifest names, and unfinished files of killed writes.
+    /// Deletes it if `delete` says so.
+    pub(crate) async fn collect(
+        &self,
+        limit: SystemTime,
+        grace: Duration,
+        delete: bool,
+    ) -> Result<Vec<Orphan>, DatasetError> {
+        let mut found = Vec::new();
+        let old = |object: &ObjectMeta| SystemTime::from(object.last_modified) <= limit;
+        for name in self.names().await? {
+            let mut trainings: BTreeMap<String, Vec<ObjectMeta>> = BTreeMap::new();
+            for checkpoint in self.checkpoints(&name).await? {
+                let training = trainings.entry(checkpoint.training_key).or_default();
+                training.push(checkpoint.object);
+            }
+            for objects in trainings.into_values().filter(|all| all.iter().all(old)) {
+                for object in objects {
+                    if delete {
+                        self.delete(&object.location).await?;
+                    }
+                    found.push(self.orphan(&object));
+                }
+            }
+            let folder = self.folder.clone().join(&*name);
+            for object in self.list(&folder).await? {
+                let Some(key) = key_below(&folder, &object.location) else {
+                    continue;
+                };
+                if object_folder(&key).is_some()
+                    && old(&object)
+                    && !self.names_object(&name, &key).await?
+                    && (!delete || self.delete_object(&name, &key, &object.location).await?)
+                {
+                    found.push(self.orphan(&object));
+                }
+            }
+        }
+        let here = objects::folder(&*self.store, &self.folder);
+        if let Some(here) = here.filter(|here| here.is_dir()) {
+            for (path, bytes) in leftovers(&here, grace)? {
+                if delete {
+                    match std::fs::remove_file(&path) {
+                        Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                            return Err(DatasetError::io("delete", &path, e));
+                        }
+                        _ => {}
+                    }
+                }
+                found.push(Orphan {
+                    object: path.display().to_string(),
+                    bytes,
+                    scene: None,
+                });
+            }
+        }
+        Ok(found)
+    }
+
+    /// `false` if a manifest names it by now.
+    async fn delete_object(
+        &self,
+        name: &str,
+        key: &str,
+        path: &Path,
+    ) -> Result<bool, DatasetError> {
+        let Some(bytes): Option<Bytes> = objects::get(&*self.store, path).await? else {
+            return Ok(false);
+        };
+        if self.names_object(name, key).await? {
+            return Ok(false);
+        }
+        self.delete(path).await?;
+        if self.names_object(name, key).await? {
+            objects::create_or_match(&*self.store, path, bytes).await?;
+            return Ok(false);
+        }
+        Ok(true)
+    }
+
+    /// Whether the model's manifest names an object. A manifest that cannot be read may name anything.
+    async fn names_object(&self, name: &str, key: &str) -> Result<bool, DatasetError> {
+        let manifest = self.look(name).await?;
+        Ok(manifest.is_some_and(|m| m.objects.iter().any(|object| object.key == key)))
+    }
+
+    fn orphan(&self, object: &ObjectMeta) -> Orphan {
+        Orphan {
+            object: self.shown(&object.location),
+            bytes: object.size,
+            scene: None,
+        }
+    }
+}
+
+fn key_below(folder: &Path, path: &Path) -> Option<String> {
+    let parts: Vec<_> = path.prefix_match(folder)?.collect();
+    let parts: Vec<&str> = parts.iter().map(AsRef::as_ref).collect();
+    Some(parts.join("/"))
+}

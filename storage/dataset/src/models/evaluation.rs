@@ -1,0 +1,106 @@
+//! What evaluations found, beside the model: `models/<name>/evaluations/<key>.json`, create-only.
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::{Models, SplitUsed, check_name};
+use crate::error::DatasetError;
+use crate::objects;
+
+/// A model's figures on scenes. A pure function of model, scenes and code.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// Key of the evaluation: model, scenes and code.
+    pub key: String,
+    /// The model.
+    pub model: String,
+    /// SHA-256 of its manifest, hexadecimal.
+    pub model_sha256: String,
+    /// Folder of the data set in the same store.
+    pub dataset: String,
+    /// [`crate::Snapshot::id`] of the scenes.
+    pub data: String,
+    /// The split.
+    pub split: SplitUsed,
+    /// The side.
+    pub side: String,
+    /// Number of scenes.
+    pub scenes: u64,
+    /// Name of the histogram that the model saw.
+    pub histogram: String,
+    /// Version of networks and metrics.
+    pub code: String,
+    /// The figures.
+    pub metrics: Value,
+}
+
+impl Evaluation {
+    /// Its bytes as they lie in the store.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut sorted = self.clone();
+        sorted.metrics.sort_all_objects();
+        let mut bytes = serde_json::to_vec_pretty(&sorted)
+            .expect("an evaluation has only string keys and finite numbers");
+        bytes.push(b'\n');
+        bytes
+    }
+}
+
+impl Models {
+    /// Stores an evaluation. `false` where it was there: then that one stands, even if a graphics processor came to
+    /// slightly other figures.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn put_evaluation(&self, evaluation: &Evaluation) -> Result<bool, DatasetError> {
+        check_name(&evaluation.model)?;
+        let path = self.path(&evaluation.model, &key(&evaluation.key));
+        objects::create(&*self.store, &path, Bytes::from(evaluation.to_bytes())).await
+    }
+
+    /// An evaluation of this key.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn evaluation(
+        &self,
+        model: &str,
+        evaluation: &str,
+    ) -> Result<Option<Evaluation>, DatasetError> {
+        let path = self.path(model, &key(evaluation));
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        let parsed = serde_json::from_slice(&bytes).map_err(|e| DatasetError::Damaged {
+            object: self.shown(&path),
+            what: format!("not an evaluation: {e}"),
+        });
+        parsed.map(Some)
+    }
+
+    /// The evaluations of a model, by key.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn evaluations(&self, model: &str) -> Result<Vec<Evaluation>, DatasetError> {
+        let mut found = Vec::new();
+        for object in self.list(&self.path(model, FOLDER)).await? {
+            let name = object
+                .location
+                .filename()
+                .and_then(|n| n.strip_suffix(".json"));
+            if let Some(name) = name {
+                found.extend(self.evaluation(model, name).await?);
+            }
+        }
+        found.sort_by(|a, b| a.key.cmp(&b.key));
+        Ok(found)
+    }
+}
+
+const FOLDER: &str = "evaluations";
+
+fn key(evaluation: &str) -> String {
+    format!("{FOLDER}/{evaluation}.json")
+}

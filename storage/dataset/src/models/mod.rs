@@ -1,0 +1,339 @@
+//! Trained models: `models/<name>/` in a store, beside its data sets and not within one. A model outlives the data set
+//! that it learnt from and meets others, reprocessed or rendered later, which lie in the same store: so its name means the
+//! same to all of them.
+//!
+//! A model is published as scenes are: objects first, in a folder named after their content, then `manifest.json`,
+//! create-only. Trainings of other settings, killed half-way under the same name, leave objects in other folders and
+//! checkpoints under other keys: they are in nobody's way, and [`crate::Dataset::collect`] deletes them in the end.
+
+mod checkpoint;
+mod collect;
+mod evaluation;
+mod manifest;
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures::TryStreamExt;
+use object_store::path::Path;
+use object_store::{Error, ObjectStore, ObjectStoreExt};
+
+use crate::error::DatasetError;
+use crate::manifest::{ObjectEntry, sha256_hex};
+use crate::objects;
+
+pub use checkpoint::Checkpoint;
+pub use evaluation::Evaluation;
+pub use manifest::{Lineage, ModelManifest, SplitUsed};
+
+/// The folder of models in a store; no data set has this name.
+pub const MODELS: &str = "models";
+/// The object that makes a model one.
+const MANIFEST: &str = "manifest.json";
+
+/// The models of a store. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Models {
+    store: Arc<dyn ObjectStore>,
+    folder: Path,
+}
+
+/// What is to be published.
+#[derive(Debug, Clone)]
+pub struct NewModel {
+    /// Its manifest; format, objects and checksum are filled in.
+    pub manifest: ModelManifest,
+    /// Its objects: `weights.safetensors`, `history.jsonl`, …
+    pub objects: Vec<(String, Bytes)>,
+}
+
+/// A published model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Published {
+    /// Its manifest, as it lies in the store.
+    pub manifest: ModelManifest,
+    /// Another run of the same training was faster, and came to other bits (as graphics processors do): they stand.
+    pub adopted: bool,
+}
+
+impl Models {
+    /// The models of the store at `prefix`.
+    pub fn new(store: Arc<dyn ObjectStore>, prefix: &Path) -> Self {
+        Self {
+            store,
+            folder: prefix.clone().join(MODELS),
+        }
+    }
+
+    /// Where a model lies, for a message.
+    pub fn place(&self, name: &str) -> String {
+        objects::shown(&*self.store, &self.folder.clone().join(name))
+    }
+
+    /// The names of the models, ascending; of those that are still trained, too.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn names(&self) -> Result<Vec<String>, DatasetError> {
+        let listed = self.store.list_with_delimiter(Some(&self.folder)).await;
+        let listed = listed.map_err(|e| self.failed("list", &self.folder, e))?;
+        let folders = listed.common_prefixes.iter();
+        let mut names: Vec<String> = folders
+            .filter_map(|path| path.filename().map(str::to_owned))
+            .collect();
+        names.sort();
+        Ok(names)
+    }
+
+    /// The manifest of a model; `None` where there is none of this name, or it is still trained.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn look(&self, name: &str) -> Result<Option<ModelManifest>, DatasetError> {
+        let path = self.path(name, MANIFEST);
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        ModelManifest::parse(&bytes, name, &self.shown(&path)).map(Some)
+    }
+
+    /// The manifest of a model that must be there.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] says which there are; those of [`Self::look`].
+    pub async fn manifest(&self, name: &str) -> Result<ModelManifest, DatasetError> {
+        check_name(name)?;
+        if let Some(manifest) = self.look(name).await? {
+            return Ok(manifest);
+        }
+        let mut there = Vec::new();
+        let mut unfinished = false;
+        for other in self.names().await? {
+            match objects::size(&*self.store, &self.path(&other, MANIFEST)).await? {
+                Some(_) => there.push(other),
+                None => unfinished |= other == name,
+            }
+        }
+        let place = objects::shown(&*self.store, &self.folder);
+        let there = match there.is_empty() {
+            true => "none".to_owned(),
+            false => there.join(", "),
+        };
+        let what = match unfinished {
+            true => {
+                format!("{name:?} in {place} is not trained to its end yet; finished are: {there}")
+            }
+            false => format!("{place} holds no {name:?}; there are: {there}"),
+        };
+        Err(DatasetError::invalid("model", what))
+    }
+
+    /// The manifest of a model that this very training has published, after checking that each of its objects exists with
+    /// the stated size; `None` where it is not published.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the name is another training's; [`DatasetError::Damaged`] where an object is missing
+    /// or has another size; [`DatasetError::Store`].
+    pub async fn finished(
+        &self,
+        name: &str,
+        training_key: &str,
+    ) -> Result<Option<ModelManifest>, DatasetError> {
+        check_name(name)?;
+        let Some(manifest) = self.look(name).await? else {
+            return Ok(None);
+        };
+        self.check_owner(&manifest, training_key)?;
+        for object in &manifest.objects {
+            let path = self.path(name, &object.key);
+            let what = match objects::size(&*self.store, &path).await? {
+                Some(size) if size == object.size => continue,
+                Some(size) => format!("expected {} bytes, found {size}", object.size),
+                None => "the object is missing".into(),
+            };
+            let object = self.shown(&path);
+            return Err(DatasetError::Damaged { object, what });
+        }
+        Ok(Some(manifest))
+    }
+
+    /// Publishes a model: objects first, the manifest last, all create-only; what exists with equal bytes counts as
+    /// written. Where another run of the same training came to other bits and was faster, its model stands, unless
+    /// `exact` asks for an error.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] for a name that cannot be used or is another training's;
+    /// [`DatasetError::Conflict`] with `exact`, for other bits; [`DatasetError::Store`].
+    pub async fn publish(&self, model: NewModel, exact: bool) -> Result<Published, DatasetError> {
+        let NewModel { manifest, objects } = model;
+        let name = manifest.name.clone();
+        check_name(&name)?;
+        let entries: Vec<ObjectEntry> = objects
+            .iter()
+            .map(|(file, bytes)| entry(file, bytes))
+            .collect();
+        let folder = content(&manifest.training_key, &entries);
+        let in_folder = |entry: ObjectEntry| ObjectEntry {
+            key: format!("{folder}/{}", entry.key),
+            ..entry
+        };
+        let entries = entries.into_iter().map(in_folder).collect();
+        let manifest = manifest.with_objects(entries);
+        let bytes: Vec<Bytes> = objects.into_iter().map(|(_, bytes)| bytes).collect();
+        self.put_objects(&manifest, &bytes).await?;
+        let path = self.path(&name, MANIFEST);
+        let ours = manifest.to_bytes();
+        if !objects::create(&*self.store, &path, ours.clone().into()).await? {
+            let stored = objects::require(&*self.store, &path).await?;
+            if stored != ours {
+                return self.other_bits(&manifest, &stored, exact).await;
+            }
+        }
+        // A collector may have taken an object before there was a manifest to protect it.
+        self.put_objects(&manifest, &bytes).await?;
+        Ok(Published {
+            manifest,
+            adopted: false,
+        })
+    }
+
+    /// Somebody else's manifest stands under the name: that of the same training, or of another.
+    async fn other_bits(
+        &self,
+        ours: &ModelManifest,
+        stored: &[u8],
+        exact: bool,
+    ) -> Result<Published, DatasetError> {
+        let path = self.path(&ours.name, MANIFEST);
+        let theirs = ModelManifest::parse(stored, &ours.name, &self.shown(&path))?;
+        let same = self.check_owner(&theirs, &ours.training_key);
+        if same.is_ok() && exact {
+            return Err(DatasetError::Conflict {
+                object: self.shown(&path),
+                stored: sha256_hex(stored),
+                ours: sha256_hex(&ours.to_bytes()),
+            });
+        }
+        // Ours are in nobody's way, but of no use either.
+        let named = |key: &str| theirs.objects.iter().any(|object| object.key == key);
+        for object in ours.objects.iter().filter(|object| !named(&object.key)) {
+            self.delete(&self.path(&ours.name, &object.key)).await?;
+        }
+        same?;
+        Ok(Published {
+            manifest: theirs,
+            adopted: true,
+        })
+    }
+
+    /// The bytes of one of a model's objects, by its file name, checked against the manifest.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn read(&self, manifest: &ModelManifest, file: &str) -> Result<Bytes, DatasetError> {
+        let Some(object) = manifest.object(file) else {
+            return Err(DatasetError::Damaged {
+                object: self.shown(&self.path(&manifest.name, MANIFEST)),
+                what: format!("names no {file}"),
+            });
+        };
+        let path = self.path(&manifest.name, &object.key);
+        let bytes = objects::require(&*self.store, &path).await?;
+        match sha256_hex(&bytes) == object.sha256 {
+            true => Ok(bytes),
+            false => Err(DatasetError::Damaged {
+                object: self.shown(&path),
+                what: "its SHA-256 is not the manifest's".into(),
+            }),
+        }
+    }
+
+    async fn put_objects(
+        &self,
+        manifest: &ModelManifest,
+        bytes: &[Bytes],
+    ) -> Result<(), DatasetError> {
+        for (object, bytes) in manifest.objects.iter().zip(bytes) {
+            let path = self.path(&manifest.name, &object.key);
+            if objects::size(&*self.store, &path).await? != Some(object.size) {
+                objects::create_or_match(&*self.store, &path, bytes.clone()).await?;
+            }
+        }
+        Ok(())
+    }
+
+    fn check_owner(&self, found: &ModelManifest, training_key: &str) -> Result<(), DatasetError> {
+        if found.training_key == training_key {
+            return Ok(());
+        }
+        let what = format!(
+            "{} holds the model of another training (key {}, this one's is {training_key}); choose another name, or delete \
+             that folder if nothing needs it",
+            self.place(&found.name),
+            found.training_key
+        );
+        Err(DatasetError::invalid("model", what))
+    }
+
+    async fn delete(&self, path: &Path) -> Result<(), DatasetError> {
+        match self.store.delete(path).await {
+            Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
+            Err(e) => Err(self.failed("delete", path, e)),
+        }
+    }
+
+    /// Everything in a folder of a model.
+    async fn list(&self, folder: &Path) -> Result<Vec<object_store::ObjectMeta>, DatasetError> {
+        let listed = self.store.list(Some(folder)).try_collect().await;
+        listed.map_err(|e| self.failed("list", folder, e))
+    }
+
+    fn path(&self, name: &str, key: &str) -> Path {
+        objects::path_of(&self.folder.clone().join(name), key)
+    }
+
+    fn shown(&self, path: &Path) -> String {
+        objects::shown(&*self.store, path)
+    }
+
+    fn failed(&self, action: &'static str, path: &Path, error: Error) -> DatasetError {
+        DatasetError::store(action, self.shown(path), error)
+    }
+}
+
+fn entry(file: &str, bytes: &Bytes) -> ObjectEntry {
+    ObjectEntry {
+        key: file.to_owned(),
+        size: bytes.len() as u64,
+        sha256: sha256_hex(bytes),
+    }
+}
+
+/// The folder of objects: 16 hexadecimal digits that follow from the training and from their bytes.
+fn content(training_key: &str, entries: &[ObjectEntry]) -> String {
+    let mut text = training_key.to_owned();
+    for entry in entries {
+        text += &format!("\n{} {}", entry.key, entry.sha256);
+    }
+    let mut name = sha256_hex(text.as_bytes());
+    name.truncate(16);
+    name
+}
+
+/// Whether an object's key below a model is that of one of its objects, and in which folder.
+fn object_folder(key: &str) -> Option<&str> {
+    let (folder, file) = key.split_once('/')?;
+    let hex = folder.len() == 16 && folder.bytes().all(|b| b.is_ascii_hexdigit());
+    (hex && !file.contains('/')).then_some(folder)
+}
+
+fn check_name(name: &str) -> Result<(), DatasetError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if (1..=128).contains(&name.len()) && !name.starts_with('.') && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!(
+        "{name:?} must be up to 128 letters, digits, '-', '_' and '.', and not begin with '.'"
+    );
+    Err(DatasetError::invalid("model", what))
+}

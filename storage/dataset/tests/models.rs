@@ -1,0 +1,352 @@
+//! Models at rest: what is published stays, whatever killed trainings left beside it; checkpoints that are torn or
+//! damaged are passed over; and collection takes only what nobody needs.
+
+mod common;
+
+use std::{path::PathBuf, sync::Arc, time::Duration};
+
+use bytes::Bytes;
+use futures::executor::block_on;
+use object_store::{ObjectStore, memory::InMemory, path::Path};
+use picofarm_dataset::*;
+use proptest::prelude::*;
+use serde_json::json;
+
+const NOW: Duration = Duration::ZERO;
+
+fn local() -> (tempfile::TempDir, Models) {
+    let dir = tempfile::tempdir().unwrap();
+    let (store, prefix) = open_store(dir.path().to_str().unwrap()).unwrap();
+    (dir, Models::new(store, &prefix))
+}
+
+fn model(name: &str, key: &str, weights: &'static [u8]) -> NewModel {
+    let lineage = Lineage {
+        dataset: "rooms".into(),
+        seed: 7,
+        ..Lineage::default()
+    };
+    let settings = json!({"task": "tof", "seed": 7});
+    let metrics = json!({"mae_m": 0.02, "loss": 0.01});
+    NewModel {
+        manifest: ModelManifest::new(name, "tof", key, settings, lineage, metrics),
+        objects: vec![
+            ("weights.safetensors".into(), Bytes::from_static(weights)),
+            ("history.jsonl".into(), Bytes::from_static(b"{}\n")),
+        ],
+    }
+}
+
+fn files(dir: &std::path::Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![dir.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => found.push(path),
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[tokio::test]
+async fn a_model_comes_back_as_it_was_published_and_twice_is_once() {
+    let (dir, models) = local();
+    assert_eq!(models.finished("m", "k").await.unwrap(), None);
+    let first = models.publish(model("m", "k", b"w"), false).await.unwrap();
+    let before = files(dir.path());
+    let again = models.publish(model("m", "k", b"w"), true).await.unwrap();
+    assert_eq!((&again.manifest, again.adopted), (&first.manifest, false));
+    assert_eq!(files(dir.path()), before);
+    let found = models.finished("m", "k").await.unwrap().unwrap();
+    assert_eq!(found, first.manifest);
+    assert_eq!(found.lineage.seed, 7);
+    assert_eq!(found.total_bytes(), 4);
+    let weights = models.read(&found, "weights.safetensors").await.unwrap();
+    assert_eq!(&weights[..], b"w");
+    assert_eq!(models.names().await.unwrap(), ["m"]);
+    let manifest = std::fs::read(dir.path().join("models/m/manifest.json")).unwrap();
+    assert_eq!(found.sha256(), sha256_hex(&manifest));
+}
+
+#[tokio::test]
+async fn a_name_is_one_trainings_and_its_other_bits_are_adopted_or_an_alarm() {
+    let (dir, models) = local();
+    let first = models.publish(model("m", "k", b"w"), false).await.unwrap();
+    let before = files(dir.path());
+    let other = models.publish(model("m", "other", b"x"), false).await;
+    let said = other.unwrap_err().to_string();
+    assert!(said.contains("choose another name"), "{said}");
+    assert!(models.finished("m", "other").await.is_err());
+    let bits = models.publish(model("m", "k", b"x"), false).await.unwrap();
+    assert_eq!((bits.manifest, bits.adopted), (first.manifest, true));
+    let exact = models.publish(model("m", "k", b"x"), true).await;
+    assert!(
+        matches!(exact, Err(DatasetError::Conflict { .. })),
+        "{exact:?}"
+    );
+    // Nothing of the losers stays but, after the alarm, what proves it.
+    let mut after = files(dir.path());
+    after.retain(|path| !before.contains(path));
+    assert_eq!(after.len(), 2, "{after:?}");
+}
+
+#[tokio::test]
+async fn what_a_killed_training_left_is_in_nobodys_way() {
+    let (dir, models) = local();
+    // Objects of other settings and of the same, without a manifest; a manifest's unfinished file.
+    models
+        .publish(model("m", "other", b"x"), false)
+        .await
+        .unwrap();
+    models.publish(model("n", "k", b"w"), false).await.unwrap();
+    for name in ["m", "n"] {
+        std::fs::remove_file(dir.path().join(format!("models/{name}/manifest.json"))).unwrap();
+    }
+    models
+        .put_checkpoint("m", "other", 5, Bytes::from_static(b"5"))
+        .await
+        .unwrap();
+    std::fs::write(dir.path().join("models/m/manifest.json#1"), b"{").unwrap();
+    assert_eq!(models.newest_checkpoint("m", "k").await.unwrap(), None);
+    for name in ["m", "n"] {
+        let published = models.publish(model(name, "k", b"w"), true).await.unwrap();
+        assert!(!published.adopted);
+        assert!(models.finished(name, "k").await.unwrap().is_some());
+    }
+}
+
+#[tokio::test]
+async fn a_missing_object_is_named_and_publishing_again_puts_it_back() {
+    let (dir, models) = local();
+    let found = models
+        .publish(model("m", "k", b"w"), false)
+        .await
+        .unwrap()
+        .manifest;
+    let object = found.object("weights.safetensors").unwrap();
+    let path = dir.path().join("models/m").join(&object.key);
+    std::fs::remove_file(&path).unwrap();
+    let said = models.finished("m", "k").await.unwrap_err().to_string();
+    assert!(said.contains("weights.safetensors"), "{said}");
+    models.publish(model("m", "k", b"w"), true).await.unwrap();
+    assert!(models.finished("m", "k").await.unwrap().is_some());
+    std::fs::write(&path, b"v").unwrap();
+    assert!(models.read(&found, "weights.safetensors").await.is_err());
+    let manifest = dir.path().join("models/m/manifest.json");
+    let text = std::fs::read_to_string(&manifest).unwrap();
+    std::fs::write(&manifest, text.replace("0.02", "0.01")).unwrap();
+    assert!(matches!(
+        models.look("m").await,
+        Err(DatasetError::Damaged { .. })
+    ));
+}
+
+#[tokio::test]
+async fn who_asks_for_a_model_that_is_not_there_hears_which_are() {
+    let (_dir, models) = local();
+    let said = models.manifest("m").await.unwrap_err().to_string();
+    assert!(said.contains("there are: none"), "{said}");
+    models.publish(model("a", "k", b"w"), false).await.unwrap();
+    models
+        .put_checkpoint("m", "k", 5, Bytes::from_static(b"5"))
+        .await
+        .unwrap();
+    let said = models.manifest("x").await.unwrap_err().to_string();
+    assert!(said.contains("no \"x\"; there are: a"), "{said}");
+    let said = models.manifest("m").await.unwrap_err().to_string();
+    assert!(said.contains("not trained to its end"), "{said}");
+    assert!(models.manifest("../m").await.is_err());
+}
+
+#[tokio::test]
+async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
+    let (dir, models) = local();
+    for step in [10, 20, 30, 1_000_000_000_000] {
+        let content = Bytes::from(format!("at {step}"));
+        models
+            .put_checkpoint("m", "k", step, content)
+            .await
+            .unwrap();
+    }
+    models
+        .put_checkpoint("m", "other", 1, Bytes::new())
+        .await
+        .unwrap();
+    let steps: Vec<u64> = models
+        .checkpoints("m")
+        .await
+        .unwrap()
+        .iter()
+        .map(|c| c.step)
+        .collect();
+    assert_eq!(steps, [30, 1_000_000_000_000, 1]);
+    // A worker that was slow takes nothing away from one that is further.
+    models
+        .put_checkpoint("m", "k", 25, Bytes::new())
+        .await
+        .unwrap();
+    let newest = models.newest_checkpoint("m", "k").await.unwrap().unwrap();
+    assert_eq!(
+        (newest.0, &newest.1[..]),
+        (1_000_000_000_000, &b"at 1000000000000"[..])
+    );
+    models.delete_checkpoints("m", "k").await.unwrap();
+    assert_eq!(models.newest_checkpoint("m", "k").await.unwrap(), None);
+    let left = files(dir.path());
+    assert_eq!(left.len(), 1, "{left:?}");
+}
+
+#[tokio::test]
+async fn a_damaged_checkpoint_is_replaced_and_a_whole_one_stands() {
+    let (dir, models) = local();
+    let put =
+        |content: &'static [u8]| models.put_checkpoint("m", "k", 7, Bytes::from_static(content));
+    put(b"first").await.unwrap();
+    put(b"other").await.unwrap();
+    assert_eq!(
+        models.newest_checkpoint("m", "k").await.unwrap().unwrap().1,
+        "first"
+    );
+    let path = files(dir.path()).pop().unwrap();
+    std::fs::write(path, b"torn").unwrap();
+    put(b"other").await.unwrap();
+    assert_eq!(
+        models.newest_checkpoint("m", "k").await.unwrap().unwrap().1,
+        "other"
+    );
+}
+
+#[tokio::test]
+async fn collection_takes_what_nobody_needs_and_leaves_the_rest() {
+    let dir = tempfile::tempdir().unwrap();
+    let (store, prefix) = open_store(dir.path().to_str().unwrap()).unwrap();
+    let models = Models::new(store.clone(), &prefix);
+    let spec = common::spec(Profile::LOSSLESS);
+    let dataset = Dataset::create_or_open(store, prefix.join("rooms"), &spec)
+        .await
+        .unwrap();
+    models.publish(model("m", "k", b"w"), false).await.unwrap();
+    models
+        .publish(model("gone", "k", b"w"), false)
+        .await
+        .unwrap();
+    std::fs::remove_file(dir.path().join("models/gone/manifest.json")).unwrap();
+    models
+        .put_checkpoint("m", "old", 7, Bytes::new())
+        .await
+        .unwrap();
+    std::fs::write(dir.path().join("models/m/notes.txt"), b"mine").unwrap();
+    let young = dataset.collect(MIN_GRACE, true).await.unwrap();
+    assert_eq!(young.orphans, []);
+    let found = dataset.collect(NOW, false).await.unwrap();
+    assert_eq!(found.orphans.len(), 3);
+    assert_eq!(
+        found
+            .orphans
+            .iter()
+            .filter(|o| o.why().starts_with("checkpoint"))
+            .count(),
+        1
+    );
+    assert_eq!(
+        found
+            .orphans
+            .iter()
+            .filter(|o| o.why().contains("its model"))
+            .count(),
+        2
+    );
+    dataset.collect(NOW, true).await.unwrap();
+    assert!(models.finished("m", "k").await.unwrap().is_some());
+    assert_eq!(models.checkpoints("m").await.unwrap(), []);
+    assert!(dir.path().join("models/m/notes.txt").exists());
+    assert_eq!(dataset.collect(NOW, true).await.unwrap().orphans, []);
+}
+
+#[tokio::test]
+async fn an_evaluation_stands_beside_its_model() {
+    let (_dir, models) = local();
+    let evaluation = Evaluation {
+        key: "ab".into(),
+        model: "m".into(),
+        model_sha256: "cd".into(),
+        dataset: "rooms".into(),
+        data: "ef".into(),
+        split: SplitUsed::default(),
+        side: "test".into(),
+        scenes: 3,
+        histogram: "transient".into(),
+        code: "v".into(),
+        metrics: json!({"mae_m": 0.5}),
+    };
+    assert!(models.put_evaluation(&evaluation).await.unwrap());
+    assert!(!models.put_evaluation(&evaluation).await.unwrap());
+    assert_eq!(models.evaluations("m").await.unwrap(), [evaluation]);
+}
+
+#[tokio::test]
+async fn a_pin_is_the_id_of_a_snapshot_of_the_scenes() {
+    let spec = common::spec(Profile::LOSSLESS);
+    let (_, dataset) = common::in_memory(&spec).await;
+    for scene in [0, 2, 3] {
+        let made = common::Scene::new(&spec, scene);
+        dataset
+            .publish(scene, &made.record(), &common::provenance())
+            .await
+            .unwrap();
+    }
+    let all = dataset.present(&|_, _| {}).await.unwrap();
+    assert_eq!(dataset.pin(&[0, 2, 3]).await.unwrap(), all.id());
+    assert_ne!(dataset.pin(&[0, 3]).await.unwrap(), all.id());
+    let missing = dataset.pin(&[0, 1]).await.unwrap_err().to_string();
+    assert!(missing.contains("scene 1"), "{missing}");
+}
+
+/// What happens to the files of checkpoints.
+#[derive(Debug, Clone)]
+enum Harm {
+    None,
+    Cut(prop::sample::Index),
+    Flip(prop::sample::Index, u8),
+}
+
+fn harm() -> impl Strategy<Value = Harm> {
+    prop_oneof![
+        Just(Harm::None),
+        any::<prop::sample::Index>().prop_map(Harm::Cut),
+        (any::<prop::sample::Index>(), 1..=255u8).prop_map(|(at, bits)| Harm::Flip(at, bits)),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    #[test]
+    fn the_newest_checkpoint_that_is_whole_is_found_whatever_became_of_the_others(
+        steps in prop::collection::btree_map(0u64..1000, (prop::collection::vec(any::<u8>(), 0..40), harm()), 1..5),
+    ) {
+        let store: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
+        // Written by workers that did not know of each other: each into a store of its own, so that none tidies up.
+        let mut expected = None;
+        for (step, (content, harm)) in &steps {
+            let own: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
+            let models = Models::new(own.clone(), &Path::from("s"));
+            block_on(models.put_checkpoint("m", "k", *step, content.clone().into())).unwrap();
+            let path = Path::from(format!("s/models/m/checkpoints/k/{step:012}.ckpt"));
+            let mut bytes = block_on(async { own.get_opts(&path, Default::default()).await.unwrap().bytes().await }).unwrap().to_vec();
+            match harm {
+                Harm::None => expected = Some((*step, Bytes::from(content.clone()))),
+                Harm::Cut(at) => { let at = at.index(bytes.len()); bytes.truncate(at); }
+                Harm::Flip(at, bits) => { let at = at.index(bytes.len()); bytes[at] ^= bits; }
+            }
+            block_on(store.put_opts(&path, bytes.into(), Default::default())).unwrap();
+        }
+        let models = Models::new(store, &Path::from("s"));
+        prop_assert_eq!(block_on(models.newest_checkpoint("m", "k")).unwrap(), expected);
+    }
+}
