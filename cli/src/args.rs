@@ -5,6 +5,7 @@ mod guard;
 mod integrity;
 mod job;
 mod network;
+mod model;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -19,6 +20,7 @@ pub use guard::{Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
 pub use network::{BenchModel, Kind, Learns};
+pub use model::Model;
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.
@@ -122,6 +124,9 @@ pub enum Command {
     /// Look at data sets, check them, and make others of them
     #[command(subcommand)]
     Dataset(Dataset),
+    /// Look at trained models, and take their weights out
+    #[command(subcommand)]
+    Model(Model),
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),

@@ -1,4 +1,4 @@
-//! Job files: the commented template, reading, and resolving what a submission must pin (furniture,
+//! Job files: reading, and resolving what a submission must pin (furniture,
 //! scene files' content, renderer version, absolute store).
 
 use std::path::{Component, Path, PathBuf};
@@ -10,98 +10,9 @@ use picofarm_proto::{
 };
 
 use crate::{
-    args::JobKind,
     assets,
     error::{CliError, Code, Result, io},
 };
-
-/// A job file to start from.
-pub fn template(kind: JobKind) -> String {
-    let scenes = match kind {
-        JobKind::Graph => return graph(),
-        JobKind::Furnished => {
-            "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
-             count = 8\n\
-             seed = 1                  # scene i derives its own seed from (seed, i)\n\
-             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
-             fov_deg = 90.0            # horizontal field of view\n\
-             assets = \"auto\"           # sweethome3d where installed, else parametric\n\
-             min_specular = 1          # mirrors a room at least\n"
-        }
-        JobKind::Primitive => {
-            "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
-             count = 8\n\
-             seed = 1                  # scene i derives its own seed from (seed, i)\n\
-             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
-             fov_deg = 90.0            # horizontal field of view; jittered by scene\n"
-        }
-        JobKind::Files => {
-            "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\
-             files = [\"scene.glb\"]     # relative to this file\n\
-             spots = 25                # for files that bring no laser\n"
-        }
-    };
-    format!(
-        "# A picofarm job. `picofarm job plan FILE` says what it would run; `picofarm job submit FILE` runs it.\n\
-         name = \"rooms\"\n\
-         # parts = 8               # heavy scenes: each divided among so many tasks, and joined; the same bytes\n\n\
-         [scenes]\n{scenes}\n\
-         [render]\n\
-         resolution = 256          # pixels, square\n\
-         gate_start_m = 1.0        # start of the time gate, metres of optical path\n\
-         bin_width_m = 0.0384      # metres of optical path (128 ps)\n\
-         bins = 637\n\
-         samples = 32              # camera paths per pixel; or: error = \"10%\"\n\
-         max_bounces = 0           # 0 = until the gate ends\n\
-         # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
-         # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
-         # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
-         [output]\n\
-         store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
-         dataset = \"rooms\"\n\
-         profile = \"sqrt-u16\"            # or: coarse, plain-f32, lossless\n\n\
-         [limits]\n\
-         max_failures = 3          # a task's own failures before it is given up\n\
-         max_crashes = 3           # losses of the worker under it before it is given up\n\
-         # max_workers = 8         # workers that may run the job at a time\n\
-         # deadline = \"2027-01-31T18:00:00Z\"   # what is not done by then is cancelled\n\n\
-         # [resources]             # what a worker must have\n\
-         # cores = 8\n\
-         # memory_gib = 16\n\
-         # labels = [\"fast\"]       # of `picofarm worker --label`\n"
-    )
-}
-
-/// A job of several stages.
-fn graph() -> String {
-    "# A picofarm job of several stages. `picofarm job plan FILE` says what it would run.\n\
-     name = \"noisy rooms\"\n\
-     priority = 0              # jobs of a higher priority get workers first\n\n\
-     [[stage]]                 # kind = \"render\" unless it says another\n\
-     name = \"render\"\n\
-     scenes = { kind = \"primitive\", count = 8, seed = 1, spots = 25 }\n\
-     render = { resolution = 64, samples = 16 }\n\
-     output = { store = \"picofarm-data/store\", dataset = \"clean\" }\n\n\
-     [[stage]]                 # one stage for each value of the matrix; {dark} stands for it\n\
-     name = \"noise\"\n\
-     kind = \"reprocess\"\n\
-     source = \"render\"         # a stage that makes a data set, or { store = \"…\", dataset = \"…\" }\n\
-     matrix = { dark = [0.0, 0.5] }\n\
-     reprocess = { seed = 1, sensor = { dark_per_bin = \"{dark}\" } }\n\
-     output = { store = \"picofarm-data/store\", dataset = \"noisy-{dark}\", profile = \"counts-u16\" }\n\n\
-     [[stage]]\n\
-     name = \"split\"\n\
-     kind = \"split\"\n\
-     source = \"noise[0.5]\"     # it begins when that stage is done\n\
-     split = { fractions = [0.5, 0.25, 0.25] }\n\n\
-     [[stage]]\n\
-     name = \"export\"\n\
-     kind = \"export\"\n\
-     source = \"noise[0.5]\"\n\
-     needs = [\"split\"]\n\
-     export = { dest = \"picofarm-data/export\", scenes = \"split:train\" }\n"
-        .to_owned()
-}
 
 /// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
 #[cfg(test)]
@@ -205,6 +116,15 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
                     .map_err(|e| named(CliError::input(e.to_string())))?;
             }
             TaskSpec::Split(_) => {}
+            TaskSpec::Train(task) => {
+                let version = picofarm_agent::model_version();
+                pin(&mut task.train.version, version, "train.version").map_err(named)?;
+            }
+            TaskSpec::Evaluate(task) => {
+                let version = picofarm_agent::model_version();
+                let asked = &mut task.evaluate.version;
+                pin(asked, version, "evaluate.version").map_err(named)?;
+            }
             TaskSpec::Export(task) => {
                 task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
                 picofarm_dataset::ExportFormat::parse(&task.export.format)
@@ -326,6 +246,7 @@ fn absolute(base: &Path, path: &str) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{args::JobKind, template::template};
 
     fn written(dir: &Path, text: &str) -> PathBuf {
         let path = dir.join("job.toml");
@@ -346,6 +267,7 @@ mod tests {
             JobKind::Primitive,
             JobKind::Files,
             JobKind::Graph,
+            JobKind::Train,
         ] {
             let path = written(dir.path(), &template(kind));
             let spec = read(&path, dir.path()).unwrap();
@@ -441,7 +363,8 @@ mod tests {
                 Just(JobKind::Furnished),
                 Just(JobKind::Primitive),
                 Just(JobKind::Files),
-                Just(JobKind::Graph)
+                Just(JobKind::Graph),
+                Just(JobKind::Train)
             ]
         }
 

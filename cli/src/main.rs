@@ -15,6 +15,7 @@ mod groups;
 mod jobfile;
 mod jobs;
 mod local;
+mod model;
 mod output;
 mod picture;
 mod render;
@@ -24,6 +25,7 @@ mod sense;
 mod settings;
 mod signals;
 mod tail;
+mod template;
 mod token;
 mod traces;
 
@@ -96,6 +98,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
             verbose,
         } => tail::events(follow, last, verbose, settings, output).await,
         Command::Dataset(command) => dataset::run(command, settings, output).await,
+        Command::Model(command) => model::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
         Command::Assets(command) => assets::run(command, settings, output).await,

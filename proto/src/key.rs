@@ -1,14 +1,14 @@
 //! Names of results. A stage key hashes everything that shapes the outputs of a job's tasks; a task key
 //! adds the task's index. Equal key, equal bytes: resume, reuse and reprocessing all rest on this.
 
-use std::fmt;
+use std::{collections::BTreeMap, fmt};
 
 use sha2::{Digest, Sha256};
 
 use crate::{
     model::{
-        JobSpec, RenderTask, ReprocessSettings, SceneKind, SceneSource, SourceSettings, StageSpec,
-        TaskSpec,
+        Histogram, JobSpec, RenderTask, ReprocessSettings, SceneKind, SceneSource, SourceSettings,
+        StageSpec, TaskSpec, TrainSettings,
         task::{EXPORT_VERSION, SPLIT_VERSION},
     },
     split::SplitSettings,
@@ -179,6 +179,49 @@ pub fn split_key(settings: &SplitSettings, source: &StageKey, scenes: u64) -> Ta
         "settings": serde_json::to_value(settings).expect("settings are plain data"),
         "source": source.to_string(),
         "scenes": scenes,
+    });
+    TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// Names what a training makes: settings and code, the scenes learnt from and validated on by what pins their bytes, in
+/// order, and the models that it builds on (by field: SHA-256 of the manifest). No name and no place counts.
+pub fn training_key(
+    settings: &TrainSettings,
+    [training, validation]: [&str; 2],
+    models: &BTreeMap<&str, String>,
+) -> TaskKey {
+    let mut shaping = settings.clone();
+    shaping.split = String::new();
+    shaping.scenes = 0;
+    for (_, name) in shaping.models_mut() {
+        *name = "model".into();
+    }
+    let description = serde_json::json!({
+        "task": "train",
+        "settings": shaping.shaping(),
+        "training": training,
+        "validation": validation,
+        "models": models,
+    });
+    TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the scenes' bytes, in
+/// order, the histogram and the code.
+pub fn evaluation_key(
+    model_sha256: &str,
+    data: &str,
+    histogram: Histogram,
+    spots: &[u32],
+    version: &str,
+) -> TaskKey {
+    let description = serde_json::json!({
+        "task": "evaluate",
+        "model": model_sha256,
+        "data": data,
+        "histogram": histogram,
+        "spots": spots,
+        "version": version,
     });
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }

@@ -123,4 +123,6 @@ pub enum JobKind {
     Files,
     /// Stages that need each other: render, two sensors, split, export
     Graph,
+    /// Render small rooms, train three networks on them, and evaluate them
+    Train,
 }

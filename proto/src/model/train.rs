@@ -329,7 +329,7 @@ impl TrainSettings {
     }
 
     /// The same, to be filled in.
-    pub(super) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+    pub(crate) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
         let mut models = Vec::new();
         if self.shadow.tof != TRUTH {
             models.push(("train.shadow.tof", &mut self.shadow.tof));

@@ -254,7 +254,8 @@ impl Dataset {
         })
     }
 
-    /// [`Snapshot::id`] of these scenes alone, ascending: pins every byte of them. Their objects are not looked at.
+    /// What pins every byte of these scenes, and their order: [`Snapshot::id`] of them alone, if they are ascending. Their
+    /// objects are not looked at.
     ///
     /// # Errors
     /// [`DatasetError::NotPublished`] names a scene that is not there; [`DatasetError::Store`].

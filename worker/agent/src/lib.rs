@@ -18,7 +18,7 @@ pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
 pub use execute::{
     TaskExecutor, check_memory, generator_version, import_options, import_version, memory_mib,
-    render_bytes, renderer_version, strategy, strategy_names,
+    model_version, render_bytes, renderer_version, strategy, strategy_names,
 };
 pub use execute::{export, repair, reprocess, split};
 pub use log::task_logs;

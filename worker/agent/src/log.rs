@@ -26,9 +26,10 @@ use tracing_subscriber::{
 };
 
 /// Whose lines belong to a task, from INFO upwards. Libraries' do not: nobody knows what they tell.
-const OURS: [&str; 4] = [
+const OURS: [&str; 5] = [
     "picofarm_agent",
     "picofarm_dataset",
+    "picofarm_model",
     "picofarm_scene",
     "picofarm_transient",
 ];

@@ -1,5 +1,7 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
+mod evaluate;
+mod examples;
 pub mod export;
 mod generate;
 mod import;
@@ -15,6 +17,7 @@ mod scenes;
 pub mod split;
 mod subsets;
 mod tasks;
+mod train;
 
 use std::{
     collections::BTreeMap,
@@ -38,6 +41,7 @@ pub use render::renderer_version;
 pub(crate) use runner::Runner;
 pub use subsets::{strategy, strategy_names};
 pub use tasks::TaskExecutor;
+pub use train::model_version;
 
 /// One task to run.
 #[derive(Debug, Clone)]

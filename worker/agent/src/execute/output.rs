@@ -9,8 +9,8 @@ use std::{
 
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Profile, Subsets, open_store,
-    probe,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Models, Profile, Subsets,
+    open_store, probe,
 };
 use picofarm_proto::{key::TaskKey, model::RenderTask, trace};
 use sha2::{Digest, Sha256};
@@ -48,6 +48,17 @@ impl Stores {
             noted: Mutex::default(),
             patience,
         }
+    }
+
+    /// What reaches stores, for threads other than the executor's.
+    pub(super) fn runtime(&self) -> &Handle {
+        &self.runtime
+    }
+
+    /// The models of a store, to read and to write. The first use of a location proves that it is safe.
+    pub(super) fn models(&self, location: &str, control: &Control) -> Result<Models, TaskError> {
+        let (store, prefix) = self.probed(location, control)?;
+        Ok(Models::new(store, &prefix))
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.

@@ -307,7 +307,7 @@ pub fn target_spec(
     })
 }
 
-fn quantity(histogram: Histogram) -> Quantity {
+pub(super) fn quantity(histogram: Histogram) -> Quantity {
     match histogram {
         Histogram::Transient => Quantity::Transient,
         Histogram::Transient4 => Quantity::Transient4,

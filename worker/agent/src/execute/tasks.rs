@@ -10,8 +10,8 @@ use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
 
 use super::{
-    Control, Executor, Output, Task, TaskError, export, generate, import, output::Stores, parts,
-    render, reprocess, scenes, split,
+    Control, Executor, Output, Task, TaskError, evaluate, export, generate, import, output::Stores,
+    parts, render, reprocess, scenes, split, train,
 };
 
 /// How long a finished scene waits for a store that is full or away before its task is handed back.
@@ -46,6 +46,8 @@ impl Executor for TaskExecutor {
             ("reprocess", reprocess::sensor_version()),
             ("split", SPLIT_VERSION.to_owned()),
             ("export", EXPORT_VERSION.to_owned()),
+            ("train", train::model_version()),
+            ("evaluate", train::model_version()),
         ]
         .map(|(kind, version)| (kind.to_owned(), version))
         .into()
@@ -72,6 +74,8 @@ impl Executor for TaskExecutor {
                 run.map(|split| Output::from(&split))
             }
             TaskSpec::Export(spec) => export::run(stores, spec, control),
+            TaskSpec::Train(spec) => train::run(stores, spec, task.spec.force, control),
+            TaskSpec::Evaluate(spec) => evaluate::run(stores, spec, control),
         }
     }
 }

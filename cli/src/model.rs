@@ -1,0 +1,197 @@
+//! `picofarm model …`: the models that a store keeps.
+
+use std::{
+    io::{ErrorKind, Write},
+    path::Path,
+};
+
+use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, open_store};
+use serde_json::{Value, json};
+
+use crate::{
+    args::Model as Command,
+    dataset::failed,
+    error::{CliError, Result, io},
+    output::{Output, bytes, table},
+};
+
+/// The object of a model that holds its weights.
+const WEIGHTS: &str = "weights.safetensors";
+
+pub async fn run(command: Command, output: Output) -> Result<()> {
+    match command {
+        Command::List { store } => list(&store, output).await,
+        Command::Show { store, name } => show(&store, &name, output).await,
+        Command::Export { store, name, out } => {
+            let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
+            export(&store, &name, &out, output).await
+        }
+    }
+}
+
+fn open(store: &str) -> Result<Models> {
+    let (store, prefix) = open_store(store).map_err(failed)?;
+    Ok(Models::new(store, &prefix))
+}
+
+async fn list(store: &str, output: Output) -> Result<()> {
+    let models = open(store)?;
+    let mut found = Vec::new();
+    for name in models.names().await.map_err(failed)? {
+        let manifest = models.look(&name).await.map_err(failed)?;
+        let checkpoints = models.checkpoints(&name).await.map_err(failed)?;
+        // A folder may hold evaluations, notes or a killed training's objects alone.
+        if manifest.is_some() || !checkpoints.is_empty() {
+            found.push((name, manifest, furthest(&checkpoints)));
+        }
+    }
+    let document: Vec<Value> = found
+        .iter()
+        .map(|(name, manifest, step)| match manifest {
+            Some(m) => json!({"name": name, "finished": true, "kind": m.kind, "metrics": m.metrics,
+                              "dataset": m.lineage.dataset, "bytes": m.total_bytes(), "code": m.lineage.code}),
+            None => json!({"name": name, "finished": false, "step": step}),
+        })
+        .collect();
+    output.result(&document, || {
+        if found.is_empty() {
+            return format!("{store} holds no models\n");
+        }
+        let header = ["name", "predicts", "trained on", "size", "figures"];
+        let header = header.map(str::to_owned).to_vec();
+        let rows = found.iter().map(|(name, manifest, step)| match manifest {
+            Some(m) => vec![
+                name.clone(),
+                m.kind.clone(),
+                m.lineage.dataset.clone(),
+                bytes(m.total_bytes()),
+                figures(&m.metrics),
+            ],
+            None => vec![
+                name.clone(),
+                "-".into(),
+                "-".into(),
+                "-".into(),
+                format!(
+                    "not finished: a checkpoint after {} steps",
+                    step.unwrap_or(0)
+                ),
+            ],
+        });
+        table(&[header].into_iter().chain(rows).collect::<Vec<_>>())
+    });
+    Ok(())
+}
+
+async fn show(store: &str, name: &str, output: Output) -> Result<()> {
+    let models = open(store)?;
+    let manifest = models.manifest(name).await.map_err(failed)?;
+    let evaluations = models.evaluations(name).await.map_err(failed)?;
+    let facts = json!({
+        "place": models.place(name), "manifest": manifest, "manifest_sha256": manifest.sha256(),
+        "evaluations": evaluations,
+    });
+    output.result(&facts, || {
+        described(&models.place(name), &manifest, &evaluations)
+    });
+    Ok(())
+}
+
+fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) -> String {
+    let from = &manifest.lineage;
+    let row = |name: &str, value: String| vec![name.to_owned(), value];
+    let mut rows = vec![
+        row("model", place.to_owned()),
+        row("predicts", manifest.kind.clone()),
+        row("manifest", format!("SHA-256 {}", manifest.sha256())),
+        row("training key", manifest.training_key.clone()),
+        row("code", from.code.clone()),
+        row("seed", from.seed.to_string()),
+        row(
+            "data",
+            format!(
+                "{}, {} scenes learnt from and {} validated on, id {}",
+                from.dataset, from.training_scenes, from.validation_scenes, from.data
+            ),
+        ),
+        row(
+            "split",
+            format!(
+                "{} version {} (SHA-256 {})",
+                from.split.name, from.split.version, from.split.sha256
+            ),
+        ),
+    ];
+    for (name, sha256) in &from.models {
+        rows.push(row("builds on", format!("{name} (SHA-256 {sha256})")));
+    }
+    for object in &manifest.objects {
+        rows.push(row(
+            "object",
+            format!("{}, {}", object.key, bytes(object.size)),
+        ));
+    }
+    for (name, value) in manifest.settings.as_object().into_iter().flatten() {
+        rows.push(row(name, plain(value)));
+    }
+    for (name, value) in manifest.metrics.as_object().into_iter().flatten() {
+        rows.push(row(name, plain(value)));
+    }
+    let mut text = table(&rows);
+    for e in evaluations {
+        text += &format!(
+            "\non {} {} scenes of {} ({}, {}): {}\n",
+            e.scenes,
+            e.side,
+            e.dataset,
+            e.histogram,
+            e.code,
+            figures(&e.metrics)
+        );
+    }
+    text
+}
+
+async fn export(store: &str, name: &str, out: &Path, output: Output) -> Result<()> {
+    let models = open(store)?;
+    let manifest = models.manifest(name).await.map_err(failed)?;
+    let weights = models.read(&manifest, WEIGHTS).await.map_err(failed)?;
+    let failed = |e: std::io::Error| match e.kind() {
+        ErrorKind::AlreadyExists => CliError::input(format!("{} exists already", out.display()))
+            .hint("name another file with --out, or remove that one"),
+        _ => io(out.display(), &e),
+    };
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new("."));
+    // Whole or not at all, and never over another file.
+    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(failed)?;
+    file.write_all(&weights).map_err(failed)?;
+    file.as_file().sync_all().map_err(failed)?;
+    file.persist_noclobber(out).map_err(|e| failed(e.error))?;
+    let facts = json!({"model": name, "file": out, "bytes": weights.len(),
+                       "sha256": manifest.object(WEIGHTS).map(|o| &o.sha256)});
+    output.result(&facts, || {
+        format!("{}: {}", out.display(), bytes(weights.len() as u64))
+    });
+    Ok(())
+}
+
+/// Most steps that any training under the name has saved.
+fn furthest(checkpoints: &[Checkpoint]) -> Option<u64> {
+    checkpoints.iter().map(|c| c.step).max()
+}
+
+/// The plain numbers of a model's figures, in a line.
+fn figures(metrics: &Value) -> String {
+    let numbers = metrics.as_object().into_iter().flatten();
+    let numbers = numbers.filter_map(|(name, value)| Some((name, value.as_f64()?)));
+    let text: Vec<String> = numbers.map(|(name, x)| format!("{name} {x:.4}")).collect();
+    text.join(", ")
+}
+
+fn plain(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,154 @@
+//! Commented job files to start from, one for each kind of job.
+
+use crate::args::JobKind;
+
+/// A job file to start from.
+pub fn template(kind: JobKind) -> String {
+    let scenes = match kind {
+        JobKind::Graph => return graph(),
+        JobKind::Train => return training(),
+        JobKind::Furnished => {
+            "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
+             count = 8\n\
+             seed = 1                  # scene i derives its own seed from (seed, i)\n\
+             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             fov_deg = 90.0            # horizontal field of view\n\
+             assets = \"auto\"           # sweethome3d where installed, else parametric\n\
+             min_specular = 1          # mirrors a room at least\n"
+        }
+        JobKind::Primitive => {
+            "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
+             count = 8\n\
+             seed = 1                  # scene i derives its own seed from (seed, i)\n\
+             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             fov_deg = 90.0            # horizontal field of view; jittered by scene\n"
+        }
+        JobKind::Files => {
+            "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\
+             files = [\"scene.glb\"]     # relative to this file\n\
+             spots = 25                # for files that bring no laser\n"
+        }
+    };
+    format!(
+        "# A picofarm job. `picofarm job plan FILE` says what it would run; `picofarm job submit FILE` runs it.\n\
+         name = \"rooms\"\n\
+         # parts = 8               # heavy scenes: each divided among so many tasks, and joined; the same bytes\n\n\
+         [scenes]\n{scenes}\n\
+         [render]\n\
+         resolution = 256          # pixels, square\n\
+         gate_start_m = 1.0        # start of the time gate, metres of optical path\n\
+         bin_width_m = 0.0384      # metres of optical path (128 ps)\n\
+         bins = 637\n\
+         samples = 32              # camera paths per pixel; or: error = \"10%\"\n\
+         max_bounces = 0           # 0 = until the gate ends\n\
+         # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
+         # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
+         # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
+         [output]\n\
+         store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
+         dataset = \"rooms\"\n\
+         profile = \"sqrt-u16\"            # or: coarse, plain-f32, lossless\n\n\
+         [limits]\n\
+         max_failures = 3          # a task's own failures before it is given up\n\
+         max_crashes = 3           # losses of the worker under it before it is given up\n\
+         # max_workers = 8         # workers that may run the job at a time\n\
+         # deadline = \"2027-01-31T18:00:00Z\"   # what is not done by then is cancelled\n\n\
+         # [resources]             # what a worker must have\n\
+         # cores = 8\n\
+         # memory_gib = 16\n\
+         # labels = [\"fast\"]       # of `picofarm worker --label`\n"
+    )
+}
+
+/// A job of several stages.
+fn graph() -> String {
+    "# A picofarm job of several stages. `picofarm job plan FILE` says what it would run.\n\
+     name = \"noisy rooms\"\n\
+     priority = 0              # jobs of a higher priority get workers first\n\n\
+     [[stage]]                 # kind = \"render\" unless it says another\n\
+     name = \"render\"\n\
+     scenes = { kind = \"primitive\", count = 8, seed = 1, spots = 25 }\n\
+     render = { resolution = 64, samples = 16 }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"clean\" }\n\n\
+     [[stage]]                 # one stage for each value of the matrix; {dark} stands for it\n\
+     name = \"noise\"\n\
+     kind = \"reprocess\"\n\
+     source = \"render\"         # a stage that makes a data set, or { store = \"…\", dataset = \"…\" }\n\
+     matrix = { dark = [0.0, 0.5] }\n\
+     reprocess = { seed = 1, sensor = { dark_per_bin = \"{dark}\" } }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"noisy-{dark}\", profile = \"counts-u16\" }\n\n\
+     [[stage]]\n\
+     name = \"split\"\n\
+     kind = \"split\"\n\
+     source = \"noise[0.5]\"     # it begins when that stage is done\n\
+     split = { fractions = [0.5, 0.25, 0.25] }\n\n\
+     [[stage]]\n\
+     name = \"export\"\n\
+     kind = \"export\"\n\
+     source = \"noise[0.5]\"\n\
+     needs = [\"split\"]\n\
+     export = { dest = \"picofarm-data/export\", scenes = \"split:train\" }\n"
+        .to_owned()
+}
+
+/// A job that makes its data and trains on them: minutes on a laptop.
+fn training() -> String {
+    "# A picofarm job that renders small rooms and trains networks on them: an hour on two cores, without a GPU. The same file\n\
+     # with furnished rooms, resolution = 256, [scenes] count = 97432 and the defaults of `net` and `optimise` is the paper's.\n\
+     name = \"learning\"\n\n\
+     [limits]\n\
+     max_crashes = 100         # a training goes on from its last checkpoint, however often its worker is lost\n\n\
+     [[stage]]\n\
+     name = \"render\"\n\
+     scenes = { kind = \"primitive\", count = 120, seed = 1, spots = 25 }\n\
+     render = { resolution = 32, samples = 8, bins = 160, bin_width_m = 0.1536 }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"small-rooms\" }\n\n\
+     [[stage]]\n\
+     name = \"split\"\n\
+     kind = \"split\"\n\
+     source = \"render\"\n\
+     split = { fractions = [0.8, 0.1, 0.1] }\n\n\
+     [[stage]]                 # depth, from the time that two-bounce light needs\n\
+     name = \"tof\"\n\
+     kind = \"train\"\n\
+     source = \"render\"         # it needs the split of that name too: split = \"default\"\n\
+     # resources = { gpus = 1 } # only on workers that have one\n\
+     [stage.train]\n\
+     task = \"tof\"              # or: shadow, specular\n\
+     model = \"tof\"             # kept in the store; `picofarm model show STORE tof`\n\
+     # scenes = 64             # learn from fewer\n\
+     # histogram = \"transient_4\"\n\
+     input = { bins = 40 }     # sums of adjacent bins; 0 = all. normalise = \"minmax\" or \"log\"\n\
+     net = { architecture = \"unet2d\", width = 16, levels = 3 }\n\
+     optimise = { epochs = 30, batch = 8, rate = 1e-2, schedule = \"onecycle\" }\n\
+     seed = 1\n\
+     checkpoint_minutes = 1.0  # lost at most when a worker dies\n\n\
+     [[stage]]                 # which pixels each spot lights, with two-bounce times from the predicted depth\n\
+     name = \"shadow\"\n\
+     kind = \"train\"\n\
+     source = \"render\"\n\
+     [stage.train]\n\
+     task = \"shadow\"\n\
+     model = \"shadow\"\n\
+     shadow = { variant = \"concat\", tof = \"tof\" }   # a stage or a model; or: truth\n\
+     input = { bins = 40 }\n\
+     net = { width = 16, levels = 3 }\n\
+     optimise = { epochs = 30, batch = 8 }\n\n\
+     [[stage]]                 # mirrors, from the frozen features of the depth network\n\
+     name = \"mirrors\"\n\
+     kind = \"train\"\n\
+     source = \"render\"\n\
+     [stage.train]\n\
+     task = \"specular\"\n\
+     model = \"mirrors\"\n\
+     specular = { on = \"tof\" }\n\
+     input = { bins = 40 }\n\
+     net = { width = 16, levels = 3 }\n\
+     optimise = { epochs = 30, batch = 8 }\n\n\
+     [[stage]]\n\
+     name = \"evaluate\"\n\
+     kind = \"evaluate\"\n\
+     source = \"render\"\n\
+     evaluate = { models = [\"tof\", \"shadow\", \"mirrors\"], side = \"test\" }\n"
+        .to_owned()
+}
