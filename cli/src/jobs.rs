@@ -184,7 +184,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
 fn init(file: &Path, kind: JobKind, output: Output) -> Result<()> {
     use std::io::Write;
     std::fs::File::create_new(file)
-        .and_then(|mut f| f.write_all(template::template(kind).as_bytes()))
+        .and_then(|mut f| f.write_all(crate::template::template(kind).as_bytes()))
         .map_err(|e| match e.kind() {
             std::io::ErrorKind::AlreadyExists => {
                 CliError::input(format!("{} exists and is left as it is", file.display()))
