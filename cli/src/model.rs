@@ -181,11 +181,22 @@ fn furthest(checkpoints: &[Checkpoint]) -> Option<u64> {
     checkpoints.iter().map(|c| c.step).max()
 }
 
-/// The plain numbers of a model's figures, in a line.
+/// The numbers of a model's figures, in a line.
 fn figures(metrics: &Value) -> String {
-    let numbers = metrics.as_object().into_iter().flatten();
-    let numbers = numbers.filter_map(|(name, value)| Some((name, value.as_f64()?)));
-    let text: Vec<String> = numbers.map(|(name, x)| format!("{name} {x:.4}")).collect();
+    let mut text = Vec::new();
+    for (name, value) in metrics.as_object().into_iter().flatten() {
+        match value {
+            Value::Object(_) => text.push(format!("{name}: {}", figures(value))),
+            _ => text.extend(value.as_f64().map(|x| {
+                let whole = x == x.trunc() && x.abs() >= 2.0;
+                if whole {
+                    format!("{name} {x}")
+                } else {
+                    format!("{name} {x:.4}")
+                }
+            })),
+        }
+    }
     text.join(", ")
 }
 

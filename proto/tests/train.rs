@@ -204,7 +204,7 @@ fn an_unusable_field_is_named() {
         (
             "task = \"tof\", model = \"m\", net = { levels = 0 }",
             "train.net.levels",
-            "1..=8",
+            "2..=8",
         ),
         (
             "task = \"tof\", model = \"m\", net = { time_features = 8 }",
@@ -262,8 +262,8 @@ fn an_unusable_field_is_named() {
             "0.01",
         ),
         (
-            "task = \"tof\", model = \"m\", input = { bins = 4, intensity_only = true }",
-            "train.input.bins",
+            "task = \"specular\", model = \"m\", specular = { on = \"x\" }, from = \"y\"",
+            "train.from",
             "remove",
         ),
         (

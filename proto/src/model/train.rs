@@ -56,7 +56,8 @@ pub struct TrainSettings {
     /// Steps, rates and precision.
     #[serde(default)]
     pub optimise: OptimiseSettings,
-    /// Scenes are flipped at random, left to right, together with their spots.
+    /// Scenes are flipped at random, in both directions, together with their spots; not where a shadow network knows spots by
+    /// their number (`index`, `all`), since a flipped spot is at another one's place.
     #[serde(default = "yes")]
     pub augment: bool,
     /// Seed of weights, order of scenes, spots and flips.
@@ -106,7 +107,7 @@ pub struct InputSettings {
     /// read once for it.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub max: f64,
-    /// Bins of the input: adjacent bins are summed, the last ones dropped that make no whole sum. 0 = all of the data set.
+    /// Bins of the input: adjacent bins are summed to so many, which must divide those of the data set. 0 = all.
     pub bins: u32,
     /// The sum over bins alone: a picture instead of a histogram.
     pub intensity_only: bool,

@@ -29,7 +29,15 @@ fn model(name: &str, key: &str, weights: &'static [u8]) -> NewModel {
     let settings = json!({"task": "tof", "seed": 7});
     let metrics = json!({"mae_m": 0.02, "loss": 0.01});
     NewModel {
-        manifest: ModelManifest::new(name, "tof", key, settings, lineage, metrics),
+        manifest: ModelManifest {
+            name: name.into(),
+            kind: "tof".into(),
+            training_key: key.into(),
+            settings,
+            lineage,
+            metrics,
+            ..ModelManifest::default()
+        },
         objects: vec![
             ("weights.safetensors".into(), Bytes::from_static(weights)),
             ("history.jsonl".into(), Bytes::from_static(b"{}\n")),

@@ -160,8 +160,8 @@ impl Place {
     fn training(&self, more: serde_json::Value) -> StageSpec {
         let mut settings = json!({
             "task": "tof", "model": "m", "version": model_version(), "seed": 5,
-            "net": {"width": 2, "levels": 2}, "optimise": {"epochs": 4, "batch": 2},
-            // A checkpoint after (nearly) each step.
+            "net": {"width": 2, "levels": 2}, "optimise": {"epochs": 40, "batch": 2},
+            // A checkpoint each 600 ms.
             "checkpoint_minutes": 0.01,
         });
         for (name, value) in more.as_object().unwrap() {
@@ -264,13 +264,14 @@ async fn a_model_is_trained_once_and_says_where_it_comes_from() {
     let (fraction, at) = control.progress();
     assert_eq!(fraction, 1.0);
     assert!(
-        at.text.starts_with("epoch 4/4, loss ") && at.text.ends_with(" samples/s"),
+        at.text.starts_with("epoch 40/40, loss ") && at.text.ends_with(" samples/s"),
         "{at:?}"
     );
     assert!(
         at.figures["loss"].is_finite() && at.figures["steps"] > 0.0,
         "{at:?}"
     );
+    assert!(at.figures["validation_loss"] > 0.0, "{at:?}");
     let models = place.models();
     let manifest = models.manifest("m").await.unwrap();
     assert_eq!(manifest.sha256(), output.manifest_sha256);
@@ -350,6 +351,12 @@ async fn models_build_on_models_of_the_store() {
     assert_eq!(mirrors.lineage.models["m"], tof.sha256());
     let shadows = json!({"task": "shadow", "model": "sh", "shadow": {"tof": "m"}, "histogram": "transient_spots", "spots": [1]});
     run(place.training(shadows)).await.unwrap();
+    run(place.evaluation(json!({"models": ["s", "sh"]})))
+        .await
+        .unwrap();
+    let found = models.evaluations("sh").await.unwrap();
+    assert_eq!(found[0].histogram, "transient_spots");
+    assert!(found[0].metrics["iou"].is_number() && found[0].metrics["all"]["iou"].is_number());
     let more = json!({"model": "n", "from": "m", "scenes": 2});
     run(place.training(more)).await.unwrap();
     assert_eq!(
@@ -416,6 +423,11 @@ async fn an_evaluation_is_kept_beside_each_model_and_made_once() {
     };
     assert_eq!((&*evaluation.side, evaluation.scenes), ("test", 1));
     assert_eq!(evaluation.histogram, "transient");
+    let figures = &evaluation.metrics;
+    assert!(
+        figures["mae_m"].is_number() && figures["constant"]["mae_m"].is_number(),
+        "{figures}"
+    );
     let again = run(place.evaluation(json!({}))).await.unwrap();
     assert_eq!(
         (again.adopted, again.manifest_sha256),

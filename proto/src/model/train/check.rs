@@ -50,6 +50,10 @@ impl TrainSettings {
                 format!("is not for task = {:?}; remove it", self.task.name()),
             );
         }
+        if !self.specular.on.is_empty() && !self.from.is_empty() {
+            let what = "is not for a network on the features of another (train.specular.on); remove one of them";
+            return fail("from", what.into());
+        }
         if self.shadow.tof.is_empty() {
             let what = "is empty; give \"truth\" or a trained ToF model".into();
             return fail("shadow.tof", what);
@@ -78,10 +82,6 @@ impl InputSettings {
         if self.bins > 65_536 {
             return fail("bins", format!("{} lies outside 0..=65536", self.bins));
         }
-        if self.intensity_only && self.bins > 0 {
-            let what = "is not for intensity_only, which has no bins; remove one of them".into();
-            return fail("bins", what);
-        }
         Ok(())
     }
 }
@@ -92,7 +92,7 @@ impl NetSettings {
             |field: &str, what: String| Err(SpecError::new(format!("train.net.{field}"), what));
         let limits = [
             ("width", self.width, 1, 1024),
-            ("levels", self.levels, 1, 8),
+            ("levels", self.levels, 2, 8),
             ("stem", self.stem, 0, 4096),
             ("time_features", self.time_features, 0, 4096),
         ];
@@ -150,10 +150,10 @@ impl OptimiseSettings {
                 format!("{} lies outside 0..=10, 0 not included", self.rate),
             );
         }
-        if !(0.0..=10.0).contains(&self.weight_decay) {
+        if !(0.0..1.0).contains(&self.weight_decay) {
             return fail(
                 "weight_decay",
-                format!("{} lies outside 0..=10", self.weight_decay),
+                format!("{} lies outside 0..1, 1 not included", self.weight_decay),
             );
         }
         Ok(())

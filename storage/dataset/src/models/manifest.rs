@@ -12,7 +12,7 @@ use crate::manifest::{ObjectEntry, sha256_hex, unseal};
 const FORMAT: u32 = 1;
 
 /// What a trained model is. A pure function of its training, where that is one: no times, no machine.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ModelManifest {
     /// Version of this form.
     pub format: u32,
@@ -24,6 +24,8 @@ pub struct ModelManifest {
     pub training_key: String,
     /// What was asked for, as `train` in a job file.
     pub settings: Value,
+    /// What the model runtime made of it: network, input and gate, all that it takes to ask the model.
+    pub plan: Value,
     /// Where it comes from.
     pub lineage: Lineage,
     /// How good it is: figures of the validation scenes at its end, and what else the training says of itself.
@@ -68,28 +70,6 @@ pub struct SplitUsed {
 }
 
 impl ModelManifest {
-    /// A manifest of no objects yet.
-    pub fn new(
-        name: impl Into<String>,
-        kind: impl Into<String>,
-        training_key: impl Into<String>,
-        settings: Value,
-        lineage: Lineage,
-        metrics: Value,
-    ) -> Self {
-        Self {
-            format: FORMAT,
-            name: name.into(),
-            kind: kind.into(),
-            training_key: training_key.into(),
-            settings,
-            lineage,
-            metrics,
-            objects: Vec::new(),
-            checksum: None,
-        }
-    }
-
     /// The same with objects, and the checksum that belongs to it.
     #[must_use]
     pub(super) fn with_objects(mut self, objects: Vec<ObjectEntry>) -> Self {
@@ -97,6 +77,7 @@ impl ModelManifest {
         self.objects = objects;
         // A feature of serde_json, which any crate may switch on, decides on the order of members otherwise.
         self.settings.sort_all_objects();
+        self.plan.sort_all_objects();
         self.metrics.sort_all_objects();
         self.checksum = None;
         self.checksum = Some(sha256_hex(&self.to_bytes()));

@@ -1,10 +1,12 @@
 //! Evaluation: one task in which trained models meet scenes that they have not seen. What it finds lies beside each model;
 //! a model that has met these scenes before is not asked again.
 
-use picofarm_dataset::{Evaluation, sha256_hex};
+mod figures;
+
+use picofarm_dataset::{Dataset, Evaluation, Models, SplitUsed, sha256_hex};
 use picofarm_proto::{
     key::evaluation_key,
-    model::{EvaluateTask, Histogram, TrainSettings},
+    model::{EvaluateTask, Histogram, TrainSettings, train::TRUTH},
 };
 use tracing::info;
 
@@ -12,7 +14,7 @@ use super::{
     Control, Output, TaskError,
     examples::{Examples, first, sides},
     output::Stores,
-    train::{at, check_version, of_model, pin, read_model},
+    train::{Known, at, check_version, pin},
 };
 
 /// Evaluates the models that `task` names.
@@ -34,68 +36,20 @@ pub(super) fn run(
     let sides = sides(stores, &dataset, split, [&*settings.side], control)?;
     let [mut scenes] = sides.scenes;
     first(&mut scenes, settings.scenes, "evaluate.scenes")?;
-    let data = pin(stores, &dataset, &scenes, control)?;
+    let exam = Exam {
+        data: pin(stores, &dataset, &scenes, control)?,
+        stores,
+        task,
+        dataset,
+        models,
+        split: sides.split,
+        scenes,
+    };
     let (mut documents, mut computed) = (Vec::new(), false);
-    for (done, name) in settings.models.iter().enumerate() {
-        let field = format!("evaluate.models[{done}]");
-        let (manifest, model) =
-            read_model(stores, &models, name, control).map_err(|e| at(&field, e))?;
-        let (histogram, spots) = match settings.histogram {
-            Some(histogram) => (histogram, settings.spots.clone()),
-            None => trained_on(&manifest.settings).map_err(|what| {
-                TaskError::User(format!(
-                    "{field}: the settings of {name:?} are not known: {what}"
-                ))
-            })?,
-        };
-        let (sha256, version) = (manifest.sha256(), &settings.version);
-        let key = evaluation_key(&sha256, &data, histogram, &spots, version).to_string();
-        let found = stores.wait(control, models.evaluation(name, &key))?;
-        let evaluation = match found {
-            Some(found) => found,
-            None => {
-                computed = true;
-                let examples = Examples::new(
-                    stores,
-                    &dataset,
-                    (histogram, &spots),
-                    scenes.clone(),
-                    "evaluate",
-                )?;
-                let count = settings.models.len();
-                let mut tell = |scene: usize, of: usize| {
-                    let share = (done as f32 + scene as f32 / of as f32) / count as f32;
-                    let text = format!("{name} ({} of {count}): scene {scene}/{of}", done + 1);
-                    control.say(text, &[]);
-                    control.at(share * 0.99)
-                };
-                let metrics = picofarm_model::evaluate(&model, &*examples, &mut tell)
-                    .map_err(of_model)?
-                    .ok_or(TaskError::Stopped)?;
-                info!("{name}: {metrics}");
-                let made = Evaluation {
-                    key: key.clone(),
-                    model: name.clone(),
-                    model_sha256: sha256,
-                    dataset: place.dataset.clone(),
-                    data: data.clone(),
-                    split: sides.split.clone(),
-                    side: settings.side.clone(),
-                    scenes: scenes.len() as u64,
-                    histogram: histogram.name().to_owned(),
-                    code: version.clone(),
-                    metrics,
-                };
-                match stores.patiently(control, async || models.put_evaluation(&made).await)? {
-                    true => made,
-                    // Somebody else was faster, and what stands is what counts.
-                    false => stores
-                        .wait(control, models.evaluation(name, &key))?
-                        .unwrap_or(made),
-                }
-            }
-        };
-        documents.extend(evaluation.to_bytes());
+    for which in 0..settings.models.len() {
+        let (found, new) = exam.of(which, control)?;
+        computed |= new;
+        documents.extend(found.to_bytes());
     }
     control.at(1.0);
     Ok(Output {
@@ -105,13 +59,107 @@ pub(super) fn run(
     })
 }
 
-/// The histogram that a model was trained on, and which spots of it.
-fn trained_on(settings: &serde_json::Value) -> Result<(Histogram, Vec<u32>), String> {
+/// Scenes that models meet.
+struct Exam<'a> {
+    stores: &'a Stores,
+    task: &'a EvaluateTask,
+    dataset: Dataset,
+    models: Models,
+    split: SplitUsed,
+    scenes: Vec<u64>,
+    /// What pins their bytes.
+    data: String,
+}
+
+impl Exam<'_> {
+    /// What one of the models has found or finds now; and whether it is new.
+    fn of(&self, which: usize, control: &Control) -> Result<(Evaluation, bool), TaskError> {
+        let (stores, models, settings) = (self.stores, &self.models, &self.task.evaluate);
+        let name = &settings.models[which];
+        let field = format!("evaluate.models[{which}]");
+        let spec = self.dataset.spec();
+        let model = Known::read(stores, models, (&field, name), spec, control)?;
+        let trained = trained(&model.manifest.settings).map_err(|what| {
+            TaskError::User(format!(
+                "{field}: the settings of {name:?} are not known: {what}"
+            ))
+        })?;
+        let (histogram, spots) = match settings.histogram {
+            Some(histogram) => (histogram, settings.spots.clone()),
+            None => (trained.histogram, trained.spots),
+        };
+        let (sha256, version) = (model.manifest.sha256(), &settings.version);
+        let key = evaluation_key(&sha256, &self.data, histogram, &spots, version).to_string();
+        if let Some(found) = stores.wait(control, models.evaluation(name, &key))? {
+            return Ok((found, false));
+        }
+        let guide = match &*trained.shadow.tof {
+            TRUTH => None,
+            tof => {
+                let field = format!("{field}: its two-bounce times");
+                Some(Known::read(stores, models, (&field, tof), spec, control)?)
+            }
+        };
+        let metrics = self.ask(which, &model, guide.as_ref(), (histogram, &spots), control)?;
+        info!("{name}: {metrics}");
+        let made = Evaluation {
+            key: key.clone(),
+            model: name.clone(),
+            model_sha256: sha256,
+            dataset: self.task.source.dataset.clone(),
+            data: self.data.clone(),
+            split: self.split.clone(),
+            side: settings.side.clone(),
+            scenes: self.scenes.len() as u64,
+            histogram: histogram.name().to_owned(),
+            code: version.clone(),
+            metrics,
+        };
+        if stores.patiently(control, async || models.put_evaluation(&made).await)? {
+            return Ok((made, true));
+        }
+        // Somebody else was faster, and what stands is what counts.
+        let stands = stores.wait(control, models.evaluation(name, &key))?;
+        Ok((stands.unwrap_or(made), true))
+    }
+
+    /// Shows every scene to a model.
+    fn ask(
+        &self,
+        which: usize,
+        model: &Known,
+        guide: Option<&Known>,
+        histogram: (Histogram, &[u32]),
+        control: &Control,
+    ) -> Result<serde_json::Value, TaskError> {
+        let scenes = self.scenes.clone();
+        let examples = Examples::new(self.stores, &self.dataset, histogram, scenes, "evaluate")?;
+        if model.question.spots > 0 && model.question.spots != examples.spots() {
+            return Err(TaskError::User(format!(
+                "evaluate.models[{which}]: {:?} was trained on histograms of {} spots, these are of {}",
+                model.manifest.name,
+                model.question.spots,
+                examples.spots()
+            )));
+        }
+        let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
+        figures::of(model, guide, &*examples, &mut |scene, of| {
+            let share = (which as f32 + scene as f32 / of as f32) / count as f32;
+            control.say(
+                format!("{name} ({} of {count}): scene {scene}/{of}", which + 1),
+                &[],
+            );
+            control.at(share * 0.99)
+        })
+    }
+}
+
+/// The settings that a model was trained with.
+fn trained(settings: &serde_json::Value) -> Result<TrainSettings, String> {
     let mut settings = settings.clone();
-    // The manifest tells the name apart from the settings.
+    // The manifest tells the name apart from them.
     if let Some(table) = settings.as_object_mut() {
         table.insert("model".into(), "model".into());
     }
-    let settings: TrainSettings = serde_json::from_value(settings).map_err(|e| e.to_string())?;
-    Ok((settings.histogram, settings.spots))
+    serde_json::from_value(settings).map_err(|e| e.to_string())
 }

@@ -1,6 +1,9 @@
 //! The scenes of a data set as networks meet them: a histogram, and the truth of the spots that made it.
 
-use std::sync::Arc;
+use std::{
+    collections::HashMap,
+    sync::{Arc, Mutex},
+};
 
 use picofarm_dataset::{Dataset, DatasetError, Quantity, SplitUsed, Spot, sha256_hex};
 use picofarm_model::scene::{Scene, Scenes};
@@ -11,10 +14,13 @@ use picofarm_proto::{
 use picofarm_transient::sensor::Multiplex;
 use tokio::runtime::Handle;
 
-use super::{Control, TaskError, output::Stores, reprocess::quantity};
+use super::{Control, TaskError, memory::memory_mib, output::Stores, reprocess::quantity};
 
 /// A beam whose path from the laser is longer than the straight line by more than this, in metres, met a mirror.
 const STRAIGHT_M: f32 = 1e-3;
+
+/// One part of so many of the memory holds scenes; training and validation have one each.
+const KEPT_SHARE: u64 = 6;
 
 /// Scenes of a data set, in an order.
 pub(super) struct Examples {
@@ -24,6 +30,25 @@ pub(super) struct Examples {
     /// The spots whose light the histogram holds; `None` = all.
     spots: Option<Vec<u32>>,
     scenes: Vec<u64>,
+    kept: Mutex<Kept>,
+}
+
+/// Scenes that stay in memory, as many as there is room for. The order in which a training visits them is random, so that
+/// no choice would be better than the first ones.
+struct Kept {
+    scenes: HashMap<usize, Arc<Scene>>,
+    /// Bytes left.
+    room: usize,
+}
+
+impl Kept {
+    fn keep(&mut self, index: usize, scene: &Arc<Scene>) {
+        let values = scene.histogram.len() + scene.depth_m.len() + scene.tof_m.len();
+        let bytes = 4 * values + scene.specular.len() + scene.lit.len();
+        if bytes <= self.room && self.scenes.insert(index, scene.clone()).is_none() {
+            self.room -= bytes;
+        }
+    }
 }
 
 /// The sides of a split that were asked for, each in the split's order.
@@ -76,7 +101,17 @@ impl Examples {
                 _ => Some(quantity.spots_of_100().to_vec()),
             },
             scenes,
+            kept: Mutex::new(Kept {
+                scenes: HashMap::new(),
+                room: (memory_mib() / KEPT_SHARE) as usize * (1 << 20),
+            }),
         }))
+    }
+
+    /// Spots whose light the histogram holds.
+    pub(super) fn spots(&self) -> usize {
+        let all = self.dataset.spec().spots as usize;
+        self.spots.as_ref().map_or(all, Vec::len)
     }
 
     async fn histogram(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
@@ -151,8 +186,14 @@ impl Scenes for Examples {
         self.scenes.len()
     }
 
-    fn load(&self, index: usize) -> Result<Scene, Box<dyn std::error::Error + Send + Sync>> {
-        Ok(self.runtime.block_on(self.scene(self.scenes[index]))?)
+    fn load(&self, index: usize) -> Result<Arc<Scene>, Box<dyn std::error::Error + Send + Sync>> {
+        let kept = || self.kept.lock().expect("no panic while locked");
+        if let Some(scene) = kept().scenes.get(&index) {
+            return Ok(scene.clone());
+        }
+        let scene = Arc::new(self.runtime.block_on(self.scene(self.scenes[index]))?);
+        kept().keep(index, &scene);
+        Ok(scene)
     }
 }
 

@@ -9,18 +9,31 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bytes::Bytes;
-use picofarm_dataset::{Dataset, DatasetError, Lineage, ModelManifest, Models, NewModel};
-use picofarm_model::{Built, Ended, ModelError, Plan, Training, scene::Scenes};
+use burn::tensor::Device;
+use picofarm_dataset::{
+    Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel,
+};
+use picofarm_model::{
+    ModelError,
+    scene::Scenes,
+    train::{Ended, Line, Plan, Sources, Trained, Training},
+};
 use picofarm_proto::{
     key::training_key,
-    model::{TrainSettings, TrainTask, train::Normalise},
+    model::{
+        TrainSettings, TrainTask,
+        train::{Normalise, Target},
+    },
 };
+use serde_json::{Value, json};
 use tracing::{info, warn};
 
 mod along;
+mod known;
+mod plan;
 
 use along::{Saver, Teller};
+pub(super) use known::Known;
 
 use super::{
     Control, Output, TaskError,
@@ -30,9 +43,12 @@ use super::{
 
 /// Name of the object that holds a model's weights.
 pub(super) const WEIGHTS: &str = "weights.safetensors";
+/// Version of networks, training and metrics: another one whenever the same training could give other bits.
+const VERSION: &str = "model-1";
+
 /// Version of networks, training and metrics.
 pub fn model_version() -> String {
-    picofarm_model::VERSION.to_owned()
+    VERSION.to_owned()
 }
 
 /// Trains what `task` names; with `force` although it is there.
@@ -51,20 +67,25 @@ pub(super) fn run(
         stores.wait(control, models.delete_checkpoints(name, key))?;
         return Ok(output(&manifest, true));
     }
-    let trained = lesson.train(stores, control)?;
+    let plan = lesson.plan(control)?;
+    let asked = known::asked(&plan, &lesson.spec);
+    let trained = lesson.train(plan, stores, control)?;
+    let metrics = metrics(&trained);
     let new = NewModel {
-        manifest: ModelManifest::new(
-            name,
-            task.train.task.name(),
-            key,
-            lesson.settings(),
-            lesson.lineage.clone(),
-            trained.metrics.clone(),
-        ),
+        manifest: ModelManifest {
+            name: name.clone(),
+            kind: task.train.task.name().to_owned(),
+            training_key: key.clone(),
+            settings: task.train.shaping(),
+            plan: asked,
+            lineage: lesson.lineage.clone(),
+            metrics: metrics.clone(),
+            ..ModelManifest::default()
+        },
         objects: vec![
             (WEIGHTS.into(), trained.weights.into()),
-            ("history.jsonl".into(), trained.history.into_bytes().into()),
-            ("metrics.json".into(), pretty(&trained.metrics).into()),
+            ("history.jsonl".into(), lines(&trained.history).into()),
+            ("metrics.json".into(), pretty(&metrics).into()),
         ],
     };
     let published = stores.patiently(control, async || models.publish(new.clone(), force).await)?;
@@ -76,10 +97,12 @@ pub(super) fn run(
 /// Everything that a training is made of.
 struct Lesson<'a> {
     task: &'a TrainTask,
+    spec: DatasetSpec,
     models: Models,
     training: Arc<Examples>,
     validation: Arc<Examples>,
-    built: BTreeMap<&'static str, Arc<Built>>,
+    /// The models that it builds on, by field.
+    built: BTreeMap<&'static str, Known>,
     lineage: Lineage,
     key: String,
 }
@@ -103,15 +126,15 @@ impl<'a> Lesson<'a> {
                 settings.split
             )));
         }
-        let (built, sha256) = read_models(stores, &models, settings, control)?;
+        let spec = *dataset.spec();
+        let built = read_models(stores, &models, settings, &spec, control)?;
         let pin = |scenes: &[u64]| pin(stores, &dataset, scenes, control);
         let pins = [pin(&training)?, pin(&validation)?];
         let mut used: Vec<u64> = training.iter().chain(&validation).copied().collect();
         used.sort_unstable();
-        let by_field: BTreeMap<&str, String> = sha256
-            .iter()
-            .map(|(field, _, sha)| (*field, sha.clone()))
-            .collect();
+        let manifests = built.iter().map(|(field, known)| (*field, &known.manifest));
+        let by_field = manifests.clone().map(|(field, m)| (field, m.sha256()));
+        let by_field: BTreeMap<&str, String> = by_field.collect();
         let key = training_key(settings, [&pins[0], &pins[1]], &by_field).to_string();
         let lineage = Lineage {
             dataset: place.dataset.clone(),
@@ -121,15 +144,15 @@ impl<'a> Lesson<'a> {
             validation_scenes: validation.len() as u64,
             code: settings.version.clone(),
             seed: settings.seed,
-            models: sha256
-                .into_iter()
-                .map(|(_, name, sha)| (name, sha))
+            models: manifests
+                .map(|(_, m)| (m.name.clone(), m.sha256()))
                 .collect(),
         };
         let histogram = (settings.histogram, &*settings.spots);
         let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
         Ok(Self {
             task,
+            spec,
             models,
             training: examples(training)?,
             validation: examples(validation)?,
@@ -139,72 +162,95 @@ impl<'a> Lesson<'a> {
         })
     }
 
-    /// What was asked for, as the manifest tells it.
-    fn settings(&self) -> serde_json::Value {
-        self.task.train.shaping()
-    }
-
+    /// What the model runtime is asked.
     fn plan(&self, control: &Control) -> Result<Plan, TaskError> {
         let settings = &self.task.train;
-        let max = match (settings.input.normalise, settings.input.max) {
+        let greatest = match (settings.input.normalise, settings.input.max) {
             (Normalise::Log, 0.0) => largest_bin(&*self.training, control)?,
             (_, max) => max as f32,
         };
-        let model = |field: &str| self.built.get(field).cloned();
-        Ok(Plan {
-            settings: settings.shaping(),
-            tof: model("train.shadow.tof"),
-            on: model("train.specular.on"),
-            from: model("train.from"),
-            max,
-        })
+        let plan = plan::plan(settings, &self.spec, self.training.spots(), greatest)?;
+        if let Some(on) = self.built.get("train.specular.on") {
+            plan::check_on(&plan, on)?;
+        }
+        Ok(plan)
     }
 
-    fn train(
-        &self,
-        stores: &Stores,
-        control: &Control,
-    ) -> Result<picofarm_model::Trained, TaskError> {
+    fn train(&self, plan: Plan, stores: &Stores, control: &Control) -> Result<Trained, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
-        let plan = self.plan(control)?;
-        let (train, validate) = (self.training.clone(), self.validation.clone());
+        let device = device();
+        let guides = match self.built.get("train.shadow.tof") {
+            None => None,
+            Some(tof) => Some([tof.guide(&device)?, tof.guide(&device)?]),
+        };
+        let sources = Sources {
+            train: self.training.clone(),
+            validation: self.validation.clone(),
+            guides,
+        };
+        let from = ["train.from", "train.specular.on"];
+        let from = from.iter().find_map(|field| self.built.get(*field));
+        let from = from.map(|known| &known.weights[..]);
         let newest = stores.wait(control, self.models.newest_checkpoint(name, key))?;
         let mut training = match newest {
-            None => Training::start(plan, train, validate),
+            None => Training::start(plan, from, sources, &device),
             Some((step, content)) => {
                 info!("goes on from the checkpoint after {step} steps");
-                Training::resume(plan, train, validate, &content)
+                Training::resume(plan, &content, sources, &device)
             }
         }
         .map_err(of_model)?;
         let mut saver = Saver::new(stores, &self.models, name, key);
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
+        let mut saved = Instant::now();
         let mut teller = Teller::new(control, self.task.train.optimise.epochs);
-        loop {
-            let due = Instant::now() + every;
-            let ended = training.run(&mut |event| {
-                teller.hear(&event);
-                match (control.stopped(), Instant::now() >= due) {
-                    (true, _) => picofarm_model::Control::Stop,
-                    (false, true) => picofarm_model::Control::Checkpoint,
-                    (false, false) => picofarm_model::Control::Continue,
-                }
-            });
-            match ended.map_err(of_model)? {
-                Ended::Finished => break,
-                Ended::Paused => {
-                    let content = Bytes::from(training.checkpoint());
-                    saver.save(training.step(), content);
-                    if control.stopped() {
-                        saver.last();
-                        return Err(TaskError::Stopped);
-                    }
-                }
+        let ended = training.run(&mut |training, event| {
+            teller.hear(event);
+            if control.stopped() {
+                return picofarm_model::train::Control::Stop;
+            }
+            if saved.elapsed() >= every {
+                saver.save(training.learner().steps(), training.checkpoint().into());
+                saved = Instant::now();
+            }
+            picofarm_model::train::Control::Continue
+        });
+        match ended.map_err(of_model)? {
+            Ended::Finished => {
+                saver.last();
+                Ok(training.finish())
+            }
+            Ended::Stopped => {
+                saver.save(training.learner().steps(), training.checkpoint().into());
+                saver.last();
+                Err(TaskError::Stopped)
             }
         }
-        saver.last();
-        training.finish().map_err(of_model)
     }
+}
+
+/// What computes here.
+pub(super) fn device() -> Device {
+    Device::flex()
+}
+
+/// How good a trained network is, and how it came to that.
+fn metrics(trained: &Trained) -> Value {
+    let last = trained.history.last();
+    let mut metrics = json!({
+        "epochs": trained.history.len(),
+        "steps": last.map(|line| line.step),
+        "stopped_early": trained.stopped_early,
+        "loss": last.map(|line| line.loss),
+    });
+    metrics["validation"] = json!(last.and_then(|line| line.validation));
+    metrics
+}
+
+/// A line of JSON for each epoch.
+fn lines(history: &[Line]) -> Vec<u8> {
+    let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
+    history.iter().map(line).collect::<String>().into_bytes()
 }
 
 /// The model if this very training has published it.
@@ -227,52 +273,30 @@ fn finished(
     stores.wait(control, looked).map_err(|e| at("train", e))
 }
 
-/// The models that a training builds on: ready to be used, by field; and field, name and SHA-256 of the manifest.
-type Read = (
-    BTreeMap<&'static str, Arc<Built>>,
-    Vec<(&'static str, String, String)>,
-);
-
+/// The models that a training builds on, by field.
 fn read_models(
     stores: &Stores,
     models: &Models,
     settings: &TrainSettings,
+    spec: &DatasetSpec,
     control: &Control,
-) -> Result<Read, TaskError> {
-    let (mut built, mut sha256) = (BTreeMap::new(), Vec::new());
+) -> Result<BTreeMap<&'static str, Known>, TaskError> {
+    let mut built = BTreeMap::new();
     for (field, name) in settings.models() {
-        let (manifest, model) =
-            read_model(stores, models, name, control).map_err(|e| at(field, e))?;
-        let wants_tof = field != "train.from";
-        let wanted = if wants_tof {
-            "tof"
-        } else {
-            settings.task.name()
+        let known = Known::read(stores, models, (field, name), spec, control)?;
+        let wanted = match field {
+            "train.from" => settings.task.name(),
+            _ => Target::Tof.name(),
         };
-        if manifest.kind != wanted {
+        if known.manifest.kind != wanted {
             return Err(TaskError::User(format!(
                 "{field}: {name:?} predicts {:?}, but one that predicts {wanted:?} is needed",
-                manifest.kind
+                known.manifest.kind
             )));
         }
-        sha256.push((field, name.clone(), manifest.sha256()));
-        built.insert(field, Arc::new(model));
+        built.insert(field, known);
     }
-    Ok((built, sha256))
-}
-
-/// A model from a store, ready to be used.
-pub(super) fn read_model(
-    stores: &Stores,
-    models: &Models,
-    name: &str,
-    control: &Control,
-) -> Result<(ModelManifest, Built), TaskError> {
-    let manifest = stores.wait(control, models.manifest(name))?;
-    let weights = stores.wait(control, models.read(&manifest, WEIGHTS))?;
-    let settings = manifest.settings.clone();
-    let weights = weights.to_vec();
-    Ok((manifest, Built { settings, weights }))
+    Ok(built)
 }
 
 /// What pins the bytes of scenes, in this order.
@@ -356,7 +380,7 @@ fn output(manifest: &ModelManifest, adopted: bool) -> Output {
     }
 }
 
-fn pretty(value: &serde_json::Value) -> Vec<u8> {
+fn pretty(value: &Value) -> Vec<u8> {
     let mut value = value.clone();
     value.sort_all_objects();
     let mut bytes = serde_json::to_vec_pretty(&value).expect("figures are plain data");

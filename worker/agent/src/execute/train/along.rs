@@ -4,7 +4,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use picofarm_dataset::{DatasetError, Models};
-use picofarm_model::Event;
+use picofarm_model::{
+    metric::Metrics,
+    train::{Event, Line},
+};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
@@ -70,16 +73,18 @@ impl<'a> Saver<'a> {
 pub(super) struct Teller<'a> {
     control: &'a Control,
     epochs: u32,
-    told: u32,
+    told: u64,
+    /// The latest figure of the validation scenes: MAE in metres, or one less IoU.
+    validation: Option<(&'static str, f64)>,
 }
 
 impl<'a> Teller<'a> {
     pub(super) fn new(control: &'a Control, epochs: u32) -> Self {
-        let told = 0;
         Self {
             control,
             epochs,
-            told,
+            told: 0,
+            validation: None,
         }
     }
 
@@ -93,31 +98,49 @@ impl<'a> Teller<'a> {
                 samples_per_s,
                 data_wait_share,
             } => {
-                let fraction = *step as f32 / (*of).max(1) as f32;
-                self.control.at(fraction * TRAINED);
+                self.control
+                    .at(*step as f32 / (*of).max(1) as f32 * TRAINED);
                 let text = format!(
-                    "epoch {}/{}, loss {loss:.4}, {samples_per_s:.1} samples/s",
-                    (epoch + 1).min(self.epochs),
+                    "epoch {epoch}/{}, loss {loss:.4}, {samples_per_s:.1} samples/s",
                     self.epochs
                 );
                 let figures = [
                     ("step", *step as f64),
                     ("steps", *of as f64),
-                    ("epoch", f64::from(*epoch)),
+                    ("epoch", *epoch as f64),
                     ("loss", f64::from(*loss)),
-                    ("samples_per_s", f64::from(*samples_per_s)),
-                    ("data_wait_share", f64::from(*data_wait_share)),
+                    ("samples_per_s", *samples_per_s),
+                    ("data_wait_share", *data_wait_share),
                 ];
+                let figures: Vec<(&str, f64)> =
+                    figures.into_iter().chain(self.validation).collect();
                 self.control.say(text, &figures);
             }
-            Event::Validated { epoch, metrics } => {
+            Event::Epoch(line) => {
+                self.validation = line
+                    .validation
+                    .map(|found| ("validation_loss", found.loss()));
                 // All of few epochs, every so many of many, and the last.
-                let between = self.epochs.div_ceil(LINES);
-                if *epoch >= self.told + between || *epoch == self.epochs {
-                    self.told = *epoch;
-                    info!("epoch {epoch}/{}: {metrics}", self.epochs);
+                let between = u64::from(self.epochs.div_ceil(LINES));
+                if line.epoch >= self.told + between || line.epoch == u64::from(self.epochs) {
+                    self.told = line.epoch;
+                    info!("epoch {}/{}: {}", line.epoch, self.epochs, told(line));
                 }
             }
+        }
+    }
+}
+
+/// An epoch for people.
+fn told(line: &Line) -> String {
+    let loss = format!("loss {:.4}", line.loss);
+    match line.validation {
+        None => loss,
+        Some(Metrics::Depth { mae_m, rmse_m }) => {
+            format!("{loss}; validation MAE {mae_m:.4} m, RMSE {rmse_m:.4} m")
+        }
+        Some(Metrics::Mask { mae, iou, f1 }) => {
+            format!("{loss}; validation IoU {iou:.4}, MAE {mae:.4}, F1 {f1:.4}")
         }
     }
 }
