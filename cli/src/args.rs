@@ -4,8 +4,8 @@ mod data;
 mod guard;
 mod integrity;
 mod job;
-mod network;
 mod model;
+mod network;
 mod render;
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -19,8 +19,8 @@ pub use data::{
 pub use guard::{Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
-pub use network::{BenchModel, Kind, Learns};
 pub use model::Model;
+pub use network::{BenchModel, Kind, Learns};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 
 /// Render farm for time-resolved lidar histograms.

@@ -206,11 +206,11 @@ pub fn training_key(
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
-/// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the scenes' bytes, in
-/// order, the histogram and the code.
+/// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the bytes of the scenes
+/// and of those that plain answers are fitted to, in order, the histogram and the code.
 pub fn evaluation_key(
     model_sha256: &str,
-    data: &str,
+    data: [&str; 2],
     histogram: Histogram,
     spots: &[u32],
     version: &str,

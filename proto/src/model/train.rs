@@ -107,7 +107,7 @@ pub struct InputSettings {
     /// read once for it.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub max: f64,
-    /// Bins of the input: adjacent bins are summed to so many, which must divide those of the data set. 0 = all.
+    /// Bins of the input: adjacent bins are summed to so many, those left over at the end dropped. 0 = all.
     pub bins: u32,
     /// The sum over bins alone: a picture instead of a histogram.
     pub intensity_only: bool,

@@ -356,7 +356,10 @@ async fn models_build_on_models_of_the_store() {
         .unwrap();
     let found = models.evaluations("sh").await.unwrap();
     assert_eq!(found[0].histogram, "transient_spots");
-    assert!(found[0].metrics["iou"].is_number() && found[0].metrics["all"]["iou"].is_number());
+    assert!(
+        found[0].metrics["iou"].is_number()
+            && found[0].metrics["baselines"]["all"]["iou"].is_number()
+    );
     let more = json!({"model": "n", "from": "m", "scenes": 2});
     run(place.training(more)).await.unwrap();
     assert_eq!(
@@ -367,6 +370,10 @@ async fn models_build_on_models_of_the_store() {
         (
             json!({"task": "shadow", "model": "x", "shadow": {"tof": "s"}}),
             "train.shadow.tof: \"s\" predicts \"specular\"",
+        ),
+        (
+            json!({"task": "specular", "model": "x", "specular": {"on": "m"}, "net": {"width": 4, "levels": 2}}),
+            "train.net.width: is 4, but 2",
         ),
         (
             json!({"task": "shadow", "model": "x", "from": "m"}),
@@ -395,6 +402,16 @@ async fn what_cannot_be_trained_is_refused_by_name() {
             "train.spots: 2",
         ),
         (json!({"version": "other"}), "train.version"),
+        (json!({"input": {"bins": 9}}), "train.input.bins: 9 is more"),
+        (
+            json!({"net": {"width": 2, "levels": 5}}),
+            "train.net.levels",
+        ),
+        (json!({"optimise": {"batch": 9}}), "optimise.batch"),
+        (
+            json!({"optimise": {"precision": "bf16"}}),
+            "train.optimise.precision",
+        ),
         (
             json!({"split": "lone", "optimise": {"early_stop": 3}}),
             "train.optimise.early_stop",
@@ -425,7 +442,7 @@ async fn an_evaluation_is_kept_beside_each_model_and_made_once() {
     assert_eq!(evaluation.histogram, "transient");
     let figures = &evaluation.metrics;
     assert!(
-        figures["mae_m"].is_number() && figures["constant"]["mae_m"].is_number(),
+        figures["mae_m"].is_number() && figures["baselines"]["constant"]["mae_m"].is_number(),
         "{figures}"
     );
     let again = run(place.evaluation(json!({}))).await.unwrap();

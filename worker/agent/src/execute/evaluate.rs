@@ -1,21 +1,24 @@
 //! Evaluation: one task in which trained models meet scenes that they have not seen. What it finds lies beside each model;
 //! a model that has met these scenes before is not asked again.
 
-mod figures;
-
 use picofarm_dataset::{Dataset, Evaluation, Models, SplitUsed, sha256_hex};
+use picofarm_model::{baseline::DepthBaseline, evaluate, input::Task};
 use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateTask, Histogram, TrainSettings, train::TRUTH},
 };
+use serde_json::json;
 use tracing::info;
 
 use super::{
     Control, Output, TaskError,
     examples::{Examples, first, sides},
     output::Stores,
-    train::{Known, at, check_version, pin},
+    train::{Known, at, check_version, of_model, pin},
 };
+
+/// Training scenes that depths without a network are fitted to, at most.
+const BASELINE: usize = 64;
 
 /// Evaluates the models that `task` names.
 pub(super) fn run(
@@ -33,11 +36,14 @@ pub(super) fn run(
         .models(&place.store, control)
         .map_err(|e| at("source.store", e))?;
     let split = ("evaluate.split", &*settings.split);
-    let sides = sides(stores, &dataset, split, [&*settings.side], control)?;
-    let [mut scenes] = sides.scenes;
+    let sides = sides(stores, &dataset, split, [&*settings.side, "train"], control)?;
+    let [mut scenes, mut known] = sides.scenes;
     first(&mut scenes, settings.scenes, "evaluate.scenes")?;
+    known.truncate(BASELINE);
     let exam = Exam {
         data: pin(stores, &dataset, &scenes, control)?,
+        known_data: pin(stores, &dataset, &known, control)?,
+        known,
         stores,
         task,
         dataset,
@@ -69,6 +75,9 @@ struct Exam<'a> {
     scenes: Vec<u64>,
     /// What pins their bytes.
     data: String,
+    /// Training scenes that the depths which need no model are fitted to, and what pins their bytes.
+    known: Vec<u64>,
+    known_data: String,
 }
 
 impl Exam<'_> {
@@ -89,7 +98,8 @@ impl Exam<'_> {
             None => (trained.histogram, trained.spots),
         };
         let (sha256, version) = (model.manifest.sha256(), &settings.version);
-        let key = evaluation_key(&sha256, &self.data, histogram, &spots, version).to_string();
+        let data = [&*self.data, &self.known_data];
+        let key = evaluation_key(&sha256, data, histogram, &spots, version).to_string();
         if let Some(found) = stores.wait(control, models.evaluation(name, &key))? {
             return Ok((found, false));
         }
@@ -101,7 +111,7 @@ impl Exam<'_> {
             }
         };
         let metrics = self.ask(which, &model, guide.as_ref(), (histogram, &spots), control)?;
-        info!("{name}: {metrics}");
+        info!("{name}: {}", told(&metrics));
         let made = Evaluation {
             key: key.clone(),
             model: name.clone(),
@@ -134,24 +144,59 @@ impl Exam<'_> {
     ) -> Result<serde_json::Value, TaskError> {
         let scenes = self.scenes.clone();
         let examples = Examples::new(self.stores, &self.dataset, histogram, scenes, "evaluate")?;
-        if model.question.spots > 0 && model.question.spots != examples.spots() {
+        let spots = model.model.question().spots;
+        if spots > 0 && spots != examples.spots() {
             return Err(TaskError::User(format!(
-                "evaluate.models[{which}]: {:?} was trained on histograms of {} spots, these are of {}",
+                "evaluate.models[{which}]: {:?} was trained on histograms of {spots} spots, these are of {}",
                 model.manifest.name,
-                model.question.spots,
                 examples.spots()
             )));
         }
+        let baseline = match model.model.question().task {
+            Task::Tof => {
+                let known = self.known.clone();
+                let known =
+                    Examples::new(self.stores, &self.dataset, histogram, known, "evaluate")?;
+                Some(DepthBaseline::fit(&*known, BASELINE).map_err(of_model)?)
+            }
+            Task::Shadow | Task::Specular => None,
+        };
         let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
-        figures::of(model, guide, &*examples, &mut |scene, of| {
+        let mut tell = |scene: usize, of: usize| {
             let share = (which as f32 + scene as f32 / of as f32) / count as f32;
-            control.say(
-                format!("{name} ({} of {count}): scene {scene}/{of}", which + 1),
-                &[],
-            );
+            let text = format!("{name} ({} of {count}): scene {scene}/{of}", which + 1);
+            control.say(text, &[]);
             control.at(share * 0.99)
-        })
+        };
+        let guide = guide.map(|guide| &*guide.model);
+        let found = evaluate(
+            &model.model,
+            guide,
+            baseline.as_ref(),
+            &*examples,
+            &mut tell,
+        )
+        .map_err(of_model)?
+        .ok_or(TaskError::Stopped)?;
+        let baselines = found
+            .baselines
+            .iter()
+            .map(|(name, m)| (name.clone(), json!(m)));
+        let mut metrics = json!(found.metrics);
+        metrics["baselines"] = baselines.collect();
+        metrics["examples"] = json!(found.examples);
+        metrics["by_scene"] = json!(found.scenes);
+        metrics["by_scene_index"] = json!(self.scenes);
+        Ok(metrics)
     }
+}
+
+/// The figures of all scenes together, for people.
+fn told(metrics: &serde_json::Value) -> String {
+    let all = metrics.as_object().into_iter().flatten();
+    let numbers = all.filter(|(name, _)| *name != "examples");
+    let numbers = numbers.filter_map(|(name, x)| Some(format!("{name} {:.4}", x.as_f64()?)));
+    numbers.collect::<Vec<_>>().join(", ")
 }
 
 /// The settings that a model was trained with.

@@ -9,7 +9,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use burn::tensor::Device;
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel,
 };
@@ -43,12 +42,9 @@ use super::{
 
 /// Name of the object that holds a model's weights.
 pub(super) const WEIGHTS: &str = "weights.safetensors";
-/// Version of networks, training and metrics: another one whenever the same training could give other bits.
-const VERSION: &str = "model-1";
-
 /// Version of networks, training and metrics.
 pub fn model_version() -> String {
-    VERSION.to_owned()
+    picofarm_model::VERSION.to_owned()
 }
 
 /// Trains what `task` names; with `force` although it is there.
@@ -178,15 +174,12 @@ impl<'a> Lesson<'a> {
 
     fn train(&self, plan: Plan, stores: &Stores, control: &Control) -> Result<Trained, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
-        let device = device();
-        let guides = match self.built.get("train.shadow.tof") {
-            None => None,
-            Some(tof) => Some([tof.guide(&device)?, tof.guide(&device)?]),
-        };
+        let device = picofarm_model::cpu();
+        let guide = self.built.get("train.shadow.tof");
         let sources = Sources {
             train: self.training.clone(),
             validation: self.validation.clone(),
-            guides,
+            guide: guide.map(|tof| tof.model.clone()),
         };
         let from = ["train.from", "train.specular.on"];
         let from = from.iter().find_map(|field| self.built.get(*field));
@@ -227,11 +220,6 @@ impl<'a> Lesson<'a> {
             }
         }
     }
-}
-
-/// What computes here.
-pub(super) fn device() -> Device {
-    Device::flex()
 }
 
 /// How good a trained network is, and how it came to that.

@@ -1,41 +1,35 @@
 //! Trained models, read from a store and made ready.
 
-use burn::tensor::Device;
+use std::sync::Arc;
+
 use bytes::Bytes;
 use picofarm_dataset::{DatasetSpec, Gate, ModelManifest, Models};
-use picofarm_model::{
-    input::Question,
-    net::{Net, NetSpec},
-    parameters::Parameters,
-    train::{Guide, Plan},
-    weights,
-};
+use picofarm_model::{Model, train::Plan};
 use serde::{Deserialize, Serialize};
 
 use super::{WEIGHTS, at, of_model};
 use crate::execute::{Control, TaskError, output::Stores};
 
-/// A model as it lies in a store.
+/// A model from a store.
 pub(in crate::execute) struct Known {
     pub(in crate::execute) manifest: ModelManifest,
-    pub(in crate::execute) question: Question,
-    pub(in crate::execute) net: NetSpec,
+    pub(in crate::execute) model: Arc<Model>,
     pub(super) weights: Bytes,
 }
 
-/// What a manifest holds of a model for those who ask it.
+/// What a manifest holds of a model for those who want to know before they read its weights.
 #[derive(Serialize, Deserialize)]
 struct Asked {
-    question: Question,
-    net: NetSpec,
+    /// The plan, which the weights hold too.
+    plan: Plan,
+    /// The bins of the histograms that it knows.
     gate: Gate,
 }
 
-/// What a manifest holds of a model for those who ask it.
+/// What a manifest holds of a model.
 pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
     let asked = Asked {
-        question: plan.question.clone(),
-        net: plan.net.clone(),
+        plan: plan.clone(),
         gate: spec.gate,
     };
     serde_json::to_value(asked).expect("plain data")
@@ -56,11 +50,7 @@ impl Known {
         let manifest = stores.wait(control, models.manifest(name));
         let manifest = manifest.map_err(|e| at(field, e))?;
         let asked = serde_json::from_value(manifest.plan.clone());
-        let Asked {
-            question,
-            net,
-            gate,
-        } = asked.map_err(|e| {
+        let Asked { gate, .. } = asked.map_err(|e| {
             TaskError::User(format!(
                 "{field}: {name:?} was made by {}, and this version does not know how to ask it: {e}",
                 manifest.lineage.code
@@ -80,32 +70,12 @@ impl Known {
             )));
         }
         let weights = stores.wait(control, models.read(&manifest, WEIGHTS));
+        let weights = weights.map_err(|e| at(field, e))?;
+        let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
         Ok(Self {
-            weights: weights.map_err(|e| at(field, e))?,
+            model: Arc::new(model),
+            weights,
             manifest,
-            question,
-            net,
         })
-    }
-
-    /// The network and its numbers.
-    pub(in crate::execute) fn ready(
-        &self,
-        device: &Device,
-    ) -> Result<(Net, Parameters), TaskError> {
-        let ready = || {
-            let net = Net::new(self.net.clone())?;
-            let (named, _) = weights::read(&self.weights)?;
-            let named = weights::from_torch(named, net.declared(), self.question.part())?;
-            let parameters = Parameters::from_named(net.declared().to_vec(), named, device)?;
-            Ok((net, parameters))
-        };
-        ready().map_err(of_model)
-    }
-
-    /// As what two-bounce times follow from.
-    pub(super) fn guide(&self, device: &Device) -> Result<Guide, TaskError> {
-        let (net, parameters) = self.ready(device)?;
-        Ok(Guide::new(net, parameters, self.question.clone()))
     }
 }

@@ -31,13 +31,10 @@ pub(super) fn plan(
         0 => spec.gate.bins,
         bins => bins,
     };
-    if !spec.gate.bins.is_multiple_of(bins) {
-        let near = (1..=spec.gate.bins).filter(|d| spec.gate.bins.is_multiple_of(*d));
-        let near: Vec<String> = near.map(|d| d.to_string()).collect();
+    if bins > spec.gate.bins {
         let what = format!(
-            "{bins} does not divide the data set's {} bins; choose one of {}",
-            spec.gate.bins,
-            near.join(", ")
+            "{bins} is more than the data set's {} bins; give fewer, or 0 for all",
+            spec.gate.bins
         );
         return Err(user("input.bins", what));
     }
@@ -118,8 +115,8 @@ pub(super) fn plan(
 
 /// Refuses a network on the features of another that sees something else, or has another shape.
 pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
-    let (ours, theirs) = (&plan.question, &on.question);
-    let (net, under) = (&plan.net, &on.net);
+    let (ours, theirs) = (&plan.question, on.model.question());
+    let (net, under) = (&plan.net, &on.model.plan().net);
     let text = |value: &dyn std::fmt::Debug| format!("{value:?}");
     for (field, ours, theirs) in [
         ("input.bins", text(&ours.bins), text(&theirs.bins)),
