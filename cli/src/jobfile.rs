@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 use picofarm_dataset::import::Source;
 use picofarm_proto::{
     key::render_stage_key,
-    model::{ImportTask, JobSpec, RenderTask, SceneKind, TaskSpec},
+    model::{ImportTask, JobSpec, RenderTask, SceneKind, TaskSpec, scaled},
 };
 
 use crate::{
@@ -17,7 +17,7 @@ use crate::{
 /// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
 #[cfg(test)]
 fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
-    checked(read_uncounted(path, asset_dir)?, path)
+    checked(read_uncounted(path, None, asset_dir)?, path)
 }
 
 fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
@@ -26,12 +26,21 @@ fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
     Ok(spec)
 }
 
-fn read_uncounted(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
+fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
     let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
-    let spec: JobSpec = toml::from_str(&text).map_err(|e| {
+    let failed = |e: &dyn std::fmt::Display| {
         CliError::input(format!("{}: {}", path.display(), e.to_string().trim_end()))
             .hint("`picofarm job init` writes a job file with every field explained")
-    })?;
+    };
+    // Read as it stands where it may be, because then errors name the line.
+    let table: toml::Table = toml::from_str(&text).map_err(|e| failed(&e))?;
+    let spec: JobSpec = if scale.is_some() || table.contains_key("scale") {
+        let value = serde_json::to_value(&table).map_err(|e| failed(&e))?;
+        let value = scaled(value, scale).map_err(|e| failed(&e))?;
+        serde_json::from_value(value).map_err(|e| failed(&e))?
+    } else {
+        toml::from_str(&text).map_err(|e| failed(&e))?
+    };
     let base = path
         .parent()
         .filter(|p| !p.as_os_str().is_empty())
@@ -43,12 +52,12 @@ fn read_uncounted(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
 }
 
 /// Reads a job file and pins everything a submission needs. The number of scenes of data sets that exist, where the file
-/// does not say it, is asked of their stores.
+/// does not say it, is asked of their stores. Of a file that has several sizes, `scale` is meant.
 ///
 /// # Errors
 /// Input errors that name the file, the field and what was expected; a data set that cannot be opened.
-pub async fn read_counted(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
-    let mut spec = read_uncounted(path, asset_dir)?;
+pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
+    let mut spec = read_uncounted(path, scale, asset_dir)?;
     for stage in &mut spec.stages {
         if let Some((source, count)) = stage.task.reads_mut()
             && *count == 0
@@ -274,6 +283,29 @@ mod tests {
             let store = spec.stages[0].task.writes().unwrap().0;
             assert!(Path::new(store).is_absolute());
         }
+    }
+
+    #[test]
+    fn every_experiment_is_a_job_at_both_sizes() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/experiments");
+        let mut files = 0;
+        for file in std::fs::read_dir(&folder).unwrap() {
+            let path = file.unwrap().path();
+            for scale in ["mini", "paper"] {
+                // Rooms of furniture need its assets; their kind is all that differs.
+                let text = std::fs::read_to_string(&path).unwrap();
+                let dir = tempfile::tempdir().unwrap();
+                let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
+                let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
+                let spec = checked(spec, &path).unwrap();
+                assert!(
+                    spec.stages.iter().any(|s| s.task.kind() == "evaluate"),
+                    "{path:?}"
+                );
+            }
+            files += 1;
+        }
+        assert!(files >= 8);
     }
 
     #[test]

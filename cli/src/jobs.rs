@@ -25,14 +25,17 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         return init(file, *kind, output);
     }
     let spec = match &command {
-        Job::Plan { file } => Some(jobfile::read_counted(file, &settings.assets).await?),
+        Job::Plan { file, scale } => {
+            Some(jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?)
+        }
         Job::Submit {
             file,
+            scale,
             force,
             from_stage,
             ..
         } => {
-            let mut spec = jobfile::read_counted(file, &settings.assets).await?;
+            let mut spec = jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?;
             force_stages(&mut spec, *force, from_stage.as_deref())?;
             Some(spec)
         }

@@ -19,11 +19,17 @@ pub enum Job {
     Plan {
         /// The job file
         file: PathBuf,
+        /// Which of the sizes that the file has: the values of its [scale.NAME]
+        #[arg(long, value_name = "NAME")]
+        scale: Option<String>,
     },
     /// Submit a job file; the same file again answers with the same job
     Submit {
         /// The job file
         file: PathBuf,
+        /// Which of the sizes that the file has: the values of its [scale.NAME]
+        #[arg(long, value_name = "NAME")]
+        scale: Option<String>,
         /// Follow the job until it ends
         #[arg(long)]
         watch: bool,

@@ -114,7 +114,7 @@ const AGAIN: &str = "run the same command again to go on; mended scenes stay men
 
 async fn hints(args: &DatasetRepair, settings: &Settings) -> Result<Hints> {
     let job = match &args.job {
-        Some(file) => Some(jobfile::read_counted(file, &settings.assets).await?),
+        Some(file) => Some(jobfile::read_counted(file, None, &settings.assets).await?),
         None => None,
     };
     let source = args.source.as_deref().map(store_and_folder).transpose()?;

@@ -1,7 +1,7 @@
 //! One job file, several sizes: `[scale.NAME]` gives values, and anywhere else in the file the text `"{side}"` stands for the
 //! value of `side`, and `{side}` inside a text for its text. `--scale NAME` chooses.
 
-use serde_json::{Map, Value};
+use serde_json::Value;
 
 use super::{
     file::{plain, substitute},
@@ -18,7 +18,9 @@ pub fn scaled(mut job: Value, scale: Option<&str>) -> Result<Value, SpecError> {
     let (scales, scale) = match (scales, scale) {
         (None, None) => return Ok(job),
         (None, Some(name)) => {
-            return fail(format!("the job file has no [scale.{name}]; leave --scale away"));
+            return fail(format!(
+                "the job file has no [scale.{name}]; leave --scale away"
+            ));
         }
         (Some(Value::Object(scales)), scale) => (scales, scale),
         (Some(_), _) => return fail("must be tables, e.g. [scale.mini]".into()),
@@ -31,12 +33,17 @@ pub fn scaled(mut job: Value, scale: Option<&str>) -> Result<Value, SpecError> {
         ));
     };
     let Some(values) = scales.get(scale).and_then(Value::as_object) else {
-        return fail(format!("there is no [scale.{scale}], only {}", names.join(", ")));
+        return fail(format!(
+            "there is no [scale.{scale}], only {}",
+            names.join(", ")
+        ));
     };
     for (name, other) in &scales {
-        let has = |key| other.as_object().is_some_and(|o: &Map<_, _>| o.contains_key(key));
-        if let Some(key) = values.keys().find(|key| !has(key)) {
-            return fail(format!("[scale.{name}] has no {key:?}, which [scale.{scale}] has"));
+        let missing = |key: &&String| other.get(key.as_str()).is_none();
+        if let Some(key) = values.keys().find(missing) {
+            return fail(format!(
+                "[scale.{name}] has no {key:?}, which [scale.{scale}] has"
+            ));
         }
     }
     for (name, value) in values {
@@ -85,9 +92,15 @@ mod tests {
             error(job(), None),
             "scale: the job file has several sizes; choose one: --scale mini | paper"
         );
-        assert_eq!(error(job(), Some("huge")), "scale: there is no [scale.huge], only mini, paper");
+        assert_eq!(
+            error(job(), Some("huge")),
+            "scale: there is no [scale.huge], only mini, paper"
+        );
         let mut partly = job();
-        partly["scale"]["paper"].as_object_mut().unwrap().remove("kind");
+        partly["scale"]["paper"]
+            .as_object_mut()
+            .unwrap()
+            .remove("kind");
         assert_eq!(
             error(partly, Some("mini")),
             "scale: [scale.paper] has no \"kind\", which [scale.mini] has"
@@ -96,6 +109,9 @@ mod tests {
             error(json!({ "name": "x" }), Some("mini")),
             "scale: the job file has no [scale.mini]; leave --scale away"
         );
-        assert_eq!(scaled(json!({ "name": "x" }), None).unwrap(), json!({ "name": "x" }));
+        assert_eq!(
+            scaled(json!({ "name": "x" }), None).unwrap(),
+            json!({ "name": "x" })
+        );
     }
 }

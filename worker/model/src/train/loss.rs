@@ -83,7 +83,10 @@ mod tests {
             let theirs = on_device(task, x.clone(), tensor(truth));
             let by = x.grad(&theirs.backward()).unwrap().into_data_as::<f32>();
             let theirs = theirs.inner().into_scalar::<f32>();
-            assert!((loss - theirs).abs() < 1e-5 * theirs, "{task:?}: {loss} and {theirs}");
+            assert!(
+                (loss - theirs).abs() < 1e-5 * theirs,
+                "{task:?}: {loss} and {theirs}"
+            );
             for (a, b) in gradient.iter().zip(by.iter::<f32>()) {
                 assert!((a - b).abs() < 1e-6, "{task:?}: {a} and {b}");
             }
