@@ -213,13 +213,18 @@ impl Core {
             dead: false,
             last_error: String::new(),
         };
+        let mut backoff = self.settings.backoff;
+        if kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
+            // It goes on from where it was saved, so losing workers again and again is no sign that it never ends.
+            backoff.most_ms = backoff.first_ms;
+        }
         let verdict = budget::charge(
             entry.exceptions.get(&task),
             fresh,
             kind,
             message,
             &entry.job.spec.limits,
-            &self.settings.backoff,
+            &backoff,
             now_ms,
         );
         if kind != FailureKind::Interrupted

@@ -16,6 +16,9 @@ use crate::{
 /// Batches that wait for the network.
 pub(super) const AHEAD: usize = 2;
 
+/// Depths that a guide keeps: 1 GiB of them.
+const MOST_KNOWN: usize = 1 << 28;
+
 /// A depth network that two-bounce times follow from, instead of from the truth.
 pub struct Guide {
     model: Arc<Model>,
@@ -31,14 +34,17 @@ impl Guide {
         }
     }
 
-    /// Its depths of a scene, metres; each is asked for once.
+    /// Its depths of a scene, metres; asked for once, while there is room to keep them.
     fn depth_m(&self, index: usize, scene: &Scene) -> Result<Arc<Vec<f32>>, ModelError> {
         let lock = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(known) = lock().get(&index) {
             return Ok(Arc::clone(known));
         }
         let depth = Arc::new(self.model.depth_m(scene)?);
-        lock().insert(index, Arc::clone(&depth));
+        let mut known = lock();
+        if (known.len() + 1) * depth.len() <= MOST_KNOWN {
+            known.insert(index, Arc::clone(&depth));
+        }
         Ok(depth)
     }
 }

@@ -1,0 +1,101 @@
+//! Training as a task: killed at any instant, gone on with by another worker, and the weights are those of a training that
+//! nobody disturbed, bit for bit.
+
+use std::{fs, path::Path, thread::sleep, time::Duration};
+
+use picofarm_tests::{Farm, rng::Rng, store};
+
+/// Kills of workers while they train.
+const KILLS: u64 = 20;
+
+fn job(store: &Path) -> String {
+    format!(
+        r#"
+name = "learning"
+[limits]
+max_crashes = 1000
+[[stage]]
+name = "rooms"
+scenes = {{ kind = "primitive", count = 16, seed = 3, spots = 4 }}
+render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
+output = {{ store = {store:?}, dataset = "rooms" }}
+[[stage]]
+kind = "split"
+source = "rooms"
+split = {{ counts = [12, 2, 2] }}
+[[stage]]
+name = "tof"
+kind = "train"
+source = "rooms"
+[stage.train]
+task = "tof"
+model = "tof"
+net = {{ width = 8, levels = 3 }}
+optimise = {{ epochs = 1000, batch = 4 }}
+checkpoint_minutes = 0.01
+[[stage]]
+name = "shadow"
+kind = "train"
+source = "rooms"
+[stage.train]
+task = "shadow"
+model = "shadow"
+shadow = {{ tof = "tof" }}
+net = {{ width = 4, levels = 2 }}
+optimise = {{ epochs = 20, batch = 4 }}
+[[stage]]
+kind = "evaluate"
+source = "rooms"
+evaluate = {{ models = ["tof", "shadow"] }}
+"#
+    )
+}
+
+fn submit(farm: &Farm, name: &str) -> String {
+    let file = farm.store().with_file_name(format!("{name}.toml"));
+    fs::write(&file, job(&farm.store())).unwrap();
+    let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    answer["job"].as_str().expect("a submission answers with a job").to_owned()
+}
+
+#[test]
+fn a_training_whose_workers_are_killed_20_times_gives_the_weights_of_one_that_was_not() {
+    let calm = Farm::with_lease("training-calm", 2.0);
+    let id = submit(&calm, "calm");
+    let _worker = calm.worker("calm");
+    assert_eq!(calm.until_ended(&id)["state"], "done");
+
+    let farm = Farm::with_lease("training-killed", 2.0);
+    let id = submit(&farm, "killed");
+    let mut rng = Rng::new(11);
+    let (mut kills, mut resumed) = (0, 0);
+    for round in 0..10 * KILLS {
+        let mut worker = farm.worker(&format!("worker-{round}"));
+        if kills == KILLS || farm.status(&id)["state"] != "active" {
+            break;
+        }
+        // Into the training, and then some.
+        let begun = std::time::Instant::now();
+        while worker.runs() && !worker.stderr().contains("task starts") {
+            sleep(Duration::from_millis(20));
+            assert!(begun.elapsed() < Duration::from_secs(120), "{}", worker.stderr());
+        }
+        sleep(Duration::from_millis(300 + rng.number() % 900));
+        let said = worker.stderr();
+        resumed += u32::from(said.contains("goes on from the checkpoint"));
+        kills += u64::from(said.contains("stage=\"tof\"") || said.contains("goes on from"));
+        worker.kill();
+    }
+    assert!(resumed > 0, "no training went on from a checkpoint");
+    let _last = farm.worker("last");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    let models = |farm: &Farm| {
+        let mut hashes = store::hashes(&farm.store().join("models"));
+        hashes.retain(|key, _| !key.contains("checkpoints"));
+        hashes
+    };
+    let there = models(&farm);
+    assert!(there.keys().any(|key| key.contains("weights.safetensors")), "{there:?}");
+    assert_eq!(there, models(&calm), "after {kills} kills, {resumed} resumptions");
+    eprintln!("{kills} kills, {resumed} resumptions");
+}
