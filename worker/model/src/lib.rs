@@ -13,6 +13,7 @@ pub mod net;
 pub mod ops;
 pub mod parameters;
 mod random;
+pub mod report;
 pub mod scene;
 pub mod train;
 pub mod trial;

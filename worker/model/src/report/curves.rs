@@ -1,0 +1,101 @@
+//! Curves: training loss and validation figure over epochs.
+
+use super::{
+    Group, Report, Summary,
+    chart::{Axis, Series, chart, legend},
+    number::short,
+    summary::TASKS,
+    table::{error_name, task_name},
+};
+use crate::{
+    input::{DEPTH_SCALE_M, Task},
+    metric::Metrics,
+    train::Line,
+};
+
+/// Charts of all tasks.
+pub(super) fn curves(report: &Report, summary: &Summary) -> String {
+    let mut out = String::new();
+    for task in TASKS {
+        let groups: Vec<&Group> = summary.groups.iter().filter(|g| g.task == task).collect();
+        if groups.is_empty() {
+            continue;
+        }
+        let of = |value: &dyn Fn(&Line) -> f64| series(report, &groups, value);
+        let scale = f64::from(DEPTH_SCALE_M);
+        let (loss, label) = match task {
+            Task::Tof => (of(&|line| line.loss * scale), "training L1 (m)"),
+            Task::Shadow | Task::Specular => {
+                (of(&|line| line.loss), "training cross-entropy (nats)")
+            }
+        };
+        let seen = of(&|line| line.validation.as_ref().map_or(f64::NAN, Metrics::loss));
+        let name = task_name(task);
+        let validation = format!("validation {}", error_name(task));
+        out.push_str("<div class=\"charts\">");
+        out.push_str(&over_epochs(
+            &format!("{name}: training loss"),
+            label,
+            &loss,
+        ));
+        out.push_str(&over_epochs(
+            &format!("{name}: validation"),
+            &validation,
+            &seen,
+        ));
+        out.push_str("</div>");
+        out.push_str(&legend(
+            groups.iter().enumerate().map(|(i, g)| (i, &*g.label)),
+        ));
+    }
+    out
+}
+
+fn over_epochs(title: &str, label: &str, series: &[Series]) -> String {
+    let values = || series.iter().flat_map(|s| &s.points).map(|p| p.1);
+    let log = wide(values());
+    let x = Axis {
+        label: "epoch",
+        log: false,
+        zero: true,
+        write: short,
+    };
+    let y = Axis {
+        label,
+        log,
+        zero: true,
+        write: short,
+    };
+    chart(title, &x, &y, series)
+}
+
+/// Whether values are all positive and lie so far apart that small ones would vanish.
+fn wide(values: impl Iterator<Item = f64>) -> bool {
+    let (mut low, mut high) = (f64::INFINITY, 0f64);
+    for v in values.filter(|v| v.is_finite()) {
+        (low, high) = (low.min(v), high.max(v));
+    }
+    low > 0.0 && high > 5.0 * low
+}
+
+/// A line for each model, in its experiment's colour.
+fn series(report: &Report, groups: &[&Group], value: &dyn Fn(&Line) -> f64) -> Vec<Series> {
+    let mut out = Vec::new();
+    for (style, group) in groups.iter().enumerate() {
+        for model in &group.models {
+            let entry = &report.models[*model];
+            let points = entry
+                .history
+                .iter()
+                .map(|line| (line.epoch as f64, value(line), 0.0));
+            out.push(Series {
+                label: entry.name.clone(),
+                style,
+                points: points.collect(),
+                joined: true,
+                marks: false,
+            });
+        }
+    }
+    out
+}

@@ -1,0 +1,65 @@
+//! What Shoot-Bounce-3D published, experiment by experiment.
+
+use serde::Serialize;
+
+use super::{Bounces, Entry};
+use crate::{
+    input::{ShadowVariant, Task},
+    net::Architecture,
+};
+
+/// A published figure; what was not published is none.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Published {
+    /// Which experiment it is of.
+    pub experiment: &'static str,
+    /// Mean absolute error: of depth in metres, of masks as a share.
+    pub mae: Option<f64>,
+    /// Intersection over union, of masks.
+    pub iou: Option<f64>,
+}
+
+impl Published {
+    /// Less is better: MAE of depth, or one less IoU.
+    pub(super) fn loss(&self) -> Option<f64> {
+        self.iou.map_or(self.mae, |iou| Some(1.0 - iou))
+    }
+}
+
+/// What has to be said beside them.
+pub(super) const NOTE: &str = "Published figures are of Shoot-Bounce-3D: 25 spots, rooms of 256 × 256 pixels and 637 bins, \
+    87,688 scenes to learn from, full networks. Runs with smaller images, networks or data sets cannot be compared with them \
+    in level, only in order.";
+
+/// The published figure of the experiment that a model repeats, where it is one of the paper's.
+pub fn published(entry: &Entry) -> Option<Published> {
+    let question = &entry.plan.question;
+    if entry.plan.net.architecture != Architecture::Unet2d || entry.data.noise {
+        return None;
+    }
+    let two = entry.data.bounces == Bounces::Two;
+    let concat = question.variant == ShadowVariant::Concat;
+    let (experiment, mae, iou) = match (question.task, question.intensity_only, two) {
+        (_, true, true) => return None,
+        (Task::Tof, true, _) => ("A.3 intensity only", Some(0.174), None),
+        (Task::Specular, true, _) => ("A.3 intensity only", None, Some(0.703)),
+        (Task::Shadow, true, _) => ("A.3 intensity only", None, Some(0.700)),
+        (Task::Tof, _, true) => ("A.4 two bounces only", Some(0.0255), None),
+        (Task::Tof, ..) => ("all bounces", Some(0.0228), None),
+        (Task::Specular, _, true) => ("A.4 two bounces only", None, Some(0.767)),
+        (Task::Specular, ..) => ("all bounces", None, Some(0.865)),
+        (Task::Shadow, _, true) if concat => ("A.4 two bounces only", None, Some(0.964)),
+        (Task::Shadow, _, true) => return None,
+        (Task::Shadow, ..) => match question.variant {
+            ShadowVariant::Concat => ("A.1 concat", Some(0.0186), Some(0.959)),
+            ShadowVariant::Difference => ("A.1 difference", Some(0.0231), Some(0.950)),
+            ShadowVariant::Index => ("A.1 index", Some(0.0896), Some(0.799)),
+            ShadowVariant::All => ("A.1 all at once", Some(0.0984), Some(0.788)),
+        },
+    };
+    Some(Published {
+        experiment,
+        mae,
+        iou,
+    })
+}

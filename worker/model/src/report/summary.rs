@@ -1,0 +1,393 @@
+//! What models say together: seeds of one experiment as mean and spread, the order of experiments, error against the
+//! number of scenes; and all of it as JSON.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::{
+    Data, Entry, Published, Report, Speed,
+    paper::{self, published},
+};
+use crate::{Evaluated, input::Task, metric::Metrics, train::Line, train::Plan};
+
+/// Figures by name: `mae_m` and `rmse_m` of depths in metres; `iou`, `mae` and `f1` of masks.
+pub type Figures = BTreeMap<&'static str, Spread>;
+
+/// A figure of several runs.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Standard deviation over n - 1; none of a single run.
+    pub deviation: Option<f64>,
+    /// Runs.
+    pub runs: usize,
+}
+
+/// An experiment: models that differ in nothing but the seed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Group {
+    /// What its models' names have in common.
+    pub label: String,
+    /// What is learned.
+    pub task: Task,
+    /// Its models, as indices into the report's.
+    pub models: Vec<usize>,
+    /// Their seeds.
+    pub seeds: Vec<u64>,
+    /// Figures of those that were evaluated; empty where none was.
+    pub figures: Figures,
+    /// Figures of trivial answers on the same scenes, by their name.
+    pub baselines: BTreeMap<String, Figures>,
+    /// The trivial answer that errs least, and this experiment's error over its: depth MAE, or 1 - IoU.
+    pub beside_best_baseline: Option<(String, f64)>,
+    /// Error of single scenes: what 10, 50 and 90 % of them stay below.
+    pub scene_errors: Option<[f64; 3]>,
+    /// What was published of the same experiment.
+    pub published: Option<Published>,
+    /// Training examples a second.
+    pub samples_per_s: Option<Spread>,
+    /// Error of those that were evaluated: depth MAE in metres, or 1 - IoU.
+    pub error: Option<Spread>,
+}
+
+/// Whether experiments stand in the order that was published.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Order {
+    /// Of this task.
+    pub task: Task,
+    /// Pairs of experiments that have a figure here and a published one.
+    pub pairs: usize,
+    /// Those in the published order.
+    pub kept: usize,
+    /// The others: what is better here, and than what.
+    pub turned: Vec<[String; 2]>,
+    /// Pairs whose figures lie closer together than their seeds' spread (√(s₁² + s₂²)).
+    pub close: usize,
+}
+
+/// Models that differ in nothing but the number of scenes to learn from (and the seed).
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Scaling {
+    /// What their names have in common.
+    pub label: String,
+    /// What is learned.
+    pub task: Task,
+    /// Number of scenes and error, ascending.
+    pub points: Vec<(u64, Spread)>,
+}
+
+/// All of that.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Experiments, by task, then in the report's order.
+    pub groups: Vec<Group>,
+    /// Order of experiments, where there are two to compare.
+    pub orders: Vec<Order>,
+    /// Error against number of scenes.
+    pub scalings: Vec<Scaling>,
+}
+
+pub(super) const TASKS: [Task; 3] = [Task::Tof, Task::Shadow, Task::Specular];
+
+impl Spread {
+    /// Of values; none of no values.
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
+        (!values.is_empty()).then(|| Self {
+            mean,
+            deviation: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()),
+            runs: values.len(),
+        })
+    }
+}
+
+/// What the models of a report say together.
+pub fn summary(report: &Report) -> Summary {
+    let mut groups = Vec::new();
+    for task in TASKS {
+        let same = partition(&report.models, task, |e| {
+            (unseeded(e), e.data.clone(), e.conditions.clone())
+        });
+        groups.extend(same.into_iter().map(|models| group(report, task, models)));
+    }
+    tell_apart(report, &mut groups);
+    let orders = TASKS
+        .into_iter()
+        .filter_map(|task| order(report, task, &groups));
+    Summary {
+        orders: orders.collect(),
+        scalings: scalings(report, &groups),
+        groups,
+    }
+}
+
+/// Experiments whose names say the same are called after their first model.
+fn tell_apart(report: &Report, groups: &mut [Group]) {
+    let labels: Vec<String> = groups.iter().map(|g| g.label.clone()).collect();
+    for group in groups {
+        if group.models.len() > 1 && labels.iter().filter(|l| **l == group.label).count() > 1 {
+            group.label = format!("{} …", report.models[group.models[0]].name);
+        }
+    }
+}
+
+/// Models of a task that have the same key, in order.
+fn partition<K: PartialEq>(
+    models: &[Entry],
+    task: Task,
+    key: impl Fn(&Entry) -> K,
+) -> Vec<Vec<usize>> {
+    let mut out: Vec<(K, Vec<usize>)> = Vec::new();
+    for (index, entry) in models.iter().enumerate() {
+        if entry.plan.question.task != task {
+            continue;
+        }
+        let key = key(entry);
+        match out.iter_mut().find(|(k, _)| *k == key) {
+            Some((_, of)) => of.push(index),
+            None => out.push((key, vec![index])),
+        }
+    }
+    out.into_iter().map(|(_, of)| of).collect()
+}
+
+fn unseeded(entry: &Entry) -> Plan {
+    Plan {
+        seed: 0,
+        ..entry.plan.clone()
+    }
+}
+
+fn group(report: &Report, task: Task, models: Vec<usize>) -> Group {
+    let of = || models.iter().map(|i| &report.models[*i]);
+    let evaluated: Vec<&Evaluated> = of().filter_map(|e| e.evaluated.as_ref()).collect();
+    let mut trivial: BTreeMap<String, Vec<Metrics>> = BTreeMap::new();
+    for (name, metrics) in evaluated.iter().flat_map(|e| &e.baselines) {
+        trivial.entry(name.clone()).or_default().push(*metrics);
+    }
+    let errors: Vec<f64> = evaluated.iter().map(|e| e.metrics.loss()).collect();
+    let error = Spread::of(&errors);
+    let of_trivial =
+        |all: &[Metrics]| Spread::of(&all.iter().map(Metrics::loss).collect::<Vec<_>>());
+    let best = trivial
+        .iter()
+        .filter_map(|(name, all)| Some((name.clone(), of_trivial(all)?.mean)))
+        .filter(|(_, loss)| *loss > 0.0)
+        .min_by(|a, b| a.1.total_cmp(&b.1));
+    let mut scenes: Vec<f64> = evaluated
+        .iter()
+        .flat_map(|e| e.scenes.iter().map(Metrics::loss))
+        .filter(|e| e.is_finite())
+        .collect();
+    scenes.sort_unstable_by(f64::total_cmp);
+    let quantile = |q: f64| scenes[(q * (scenes.len() - 1) as f64).round() as usize];
+    let names: Vec<&str> = of().map(|e| &*e.name).collect();
+    let speeds: Vec<f64> = of()
+        .filter_map(|e| e.speed.map(|s| s.samples_per_s))
+        .collect();
+    let metrics: Vec<Metrics> = evaluated.iter().map(|e| e.metrics).collect();
+    Group {
+        label: common(&names),
+        task,
+        seeds: of().map(|e| e.plan.seed).collect(),
+        figures: figures(&metrics),
+        baselines: trivial
+            .iter()
+            .map(|(name, all)| (name.clone(), figures(all)))
+            .collect(),
+        beside_best_baseline: best
+            .zip(error)
+            .map(|((name, loss), e)| (name, e.mean / loss)),
+        scene_errors: (!scenes.is_empty()).then(|| [0.1, 0.5, 0.9].map(quantile)),
+        published: of().next().and_then(published),
+        samples_per_s: Spread::of(&speeds),
+        error,
+        models,
+    }
+}
+
+/// Each figure of several runs.
+fn figures(of: &[Metrics]) -> Figures {
+    let mut each: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
+    for metrics in of {
+        let named: &[(&'static str, f64)] = &match *metrics {
+            Metrics::Depth { mae_m, rmse_m } => vec![("mae_m", mae_m), ("rmse_m", rmse_m)],
+            Metrics::Mask { mae, iou, f1 } => vec![("mae", mae), ("iou", iou), ("f1", f1)],
+        };
+        for (name, value) in named {
+            each.entry(name).or_default().push(*value);
+        }
+    }
+    let spreads = each
+        .into_iter()
+        .filter_map(|(name, values)| Some((name, Spread::of(&values)?)));
+    spreads.collect()
+}
+
+/// The words that names begin with together, without what only counts them.
+fn common(names: &[&str]) -> String {
+    let Some((first, others)) = names.split_first() else {
+        return String::new();
+    };
+    if others.is_empty() {
+        return (*first).to_owned();
+    }
+    let apart = |c: char| matches!(c, '-' | '_' | '.' | '/' | ' ' | '=' | '#' | ',');
+    let words =
+        |name: &str| -> Vec<String> { name.split_inclusive(apart).map(str::to_owned).collect() };
+    let mut shared = words(first);
+    for other in others {
+        let equal = shared
+            .iter()
+            .zip(words(other))
+            .take_while(|(a, b)| *a == b)
+            .count();
+        shared.truncate(equal);
+    }
+    let text = shared.concat();
+    let text = text.trim_end_matches(apart);
+    let text = text
+        .strip_suffix("seed")
+        .map_or(text, |t| t.trim_end_matches(apart));
+    if text.is_empty() {
+        return format!("{first} …");
+    }
+    text.to_owned()
+}
+
+fn order(report: &Report, task: Task, groups: &[Group]) -> Option<Order> {
+    let known: Vec<(&Group, Spread, f64)> = groups
+        .iter()
+        .filter(|g| g.task == task)
+        .filter_map(|g| Some((g, g.error?, g.published?.loss()?)))
+        .collect();
+    let mut out = Order {
+        task,
+        pairs: 0,
+        kept: 0,
+        turned: Vec::new(),
+        close: 0,
+    };
+    let scenes = |g: &Group| report.models[g.models[0]].data.scenes;
+    for (i, a) in known.iter().enumerate() {
+        for b in &known[i + 1..] {
+            if a.2 == b.2 || scenes(a.0) != scenes(b.0) {
+                continue;
+            }
+            let (better, worse) = if a.1.mean <= b.1.mean { (a, b) } else { (b, a) };
+            let variance = |s: Spread| s.deviation.map_or(0.0, |d| d * d);
+            let spread = (variance(a.1) + variance(b.1)).sqrt();
+            out.pairs += 1;
+            out.close += usize::from((a.1.mean - b.1.mean).abs() <= spread);
+            if better.2 < worse.2 {
+                out.kept += 1;
+            } else {
+                out.turned
+                    .push([better.0.label.clone(), worse.0.label.clone()]);
+            }
+        }
+    }
+    (out.pairs > 0).then_some(out)
+}
+
+fn scalings(report: &Report, groups: &[Group]) -> Vec<Scaling> {
+    let mut out = Vec::new();
+    for task in TASKS {
+        let same = partition(&report.models, task, |e| {
+            let data = Data {
+                scenes: None,
+                ..e.data.clone()
+            };
+            (unseeded(e), data, e.conditions.clone())
+        });
+        for models in same {
+            let of = groups.iter().filter(|g| models.contains(&g.models[0]));
+            let points =
+                of.filter_map(|g| Some((report.models[g.models[0]].data.scenes?, g.error?)));
+            let mut points: Vec<_> = points.collect();
+            points.sort_unstable_by_key(|(scenes, _)| *scenes);
+            let names: Vec<&str> = models.iter().map(|i| &*report.models[*i].name).collect();
+            if points.len() > 1 {
+                out.push(Scaling {
+                    label: common(&names),
+                    task,
+                    points,
+                });
+            }
+        }
+    }
+    out
+}
+
+#[derive(Serialize)]
+struct Document<'a> {
+    format: &'static str,
+    title: &'a str,
+    date: &'a str,
+    note: &'static str,
+    #[serde(flatten)]
+    summary: Summary,
+    models: Vec<Said<'a>>,
+}
+
+#[derive(Serialize)]
+struct Said<'a> {
+    name: &'a str,
+    plan: &'a Plan,
+    data: &'a Data,
+    conditions: BTreeMap<&'a str, &'a str>,
+    parameters: u64,
+    multiply_adds: Option<f64>,
+    history: &'a [Line],
+    evaluated: &'a Option<Evaluated>,
+    speed: &'a Option<Speed>,
+    lineage: BTreeMap<&'a str, &'a str>,
+    pictures: Vec<Example<'a>>,
+}
+
+#[derive(Serialize)]
+struct Example<'a> {
+    label: &'a str,
+    metrics: &'a Metrics,
+}
+
+/// The report as JSON: everything that is told of the models, the pictures' figures without their pixels, and
+/// [`summary`]. A figure that is no number is null.
+pub fn json(report: &Report) -> String {
+    let document = Document {
+        format: "picofarm-model-report-1",
+        title: &report.title,
+        date: &report.date,
+        note: paper::NOTE,
+        summary: summary(report),
+        models: report.models.iter().map(said).collect(),
+    };
+    serde_json::to_string_pretty(&document).expect("plain data")
+}
+
+fn said(entry: &Entry) -> Said<'_> {
+    Said {
+        name: &entry.name,
+        plan: &entry.plan,
+        data: &entry.data,
+        conditions: entry.conditions.iter().map(|(k, v)| (&**k, &**v)).collect(),
+        parameters: entry.parameters,
+        multiply_adds: entry.multiply_adds,
+        history: &entry.history,
+        evaluated: &entry.evaluated,
+        speed: &entry.speed,
+        lineage: entry.lineage.iter().map(|(k, v)| (&**k, &**v)).collect(),
+        pictures: entry
+            .pictures
+            .iter()
+            .map(|p| Example {
+                label: &p.label,
+                metrics: &p.metrics,
+            })
+            .collect(),
+    }
+}

@@ -1,0 +1,295 @@
+//! The table of figures: each experiment beside trivial answers and what was published.
+
+use std::fmt::Write;
+
+use super::{
+    Group, Order, Published, Report, Spread, Summary,
+    number::{digits, metres, share, thousands},
+    paper,
+    summary::{Figures, TASKS},
+    text::Safe,
+};
+use crate::{
+    input::{ShadowVariant, Task},
+    net::Architecture,
+};
+
+/// What a task is called.
+pub(super) fn task_name(task: Task) -> &'static str {
+    match task {
+        Task::Tof => "Depth",
+        Task::Shadow => "Shadows",
+        Task::Specular => "Mirrors",
+    }
+}
+
+/// What errors of a task are, with their unit.
+pub(super) fn error_name(task: Task) -> &'static str {
+    match task {
+        Task::Tof => "depth MAE (m)",
+        Task::Shadow | Task::Specular => "1 − IoU",
+    }
+}
+
+/// Columns of a task's figures: name, heading.
+fn columns(task: Task) -> &'static [(&'static str, &'static str)] {
+    match task {
+        Task::Tof => &[("mae_m", "MAE (m)"), ("rmse_m", "RMSE (m)")],
+        Task::Shadow | Task::Specular => &[("iou", "IoU"), ("mae", "MAE"), ("f1", "F1")],
+    }
+}
+
+/// A figure as it is written in its column.
+fn write(task: Task, value: f64) -> String {
+    match task {
+        Task::Tof => metres(value),
+        Task::Shadow | Task::Specular => share(value),
+    }
+}
+
+/// Mean ± spread.
+pub(super) fn spread(task: Task, figure: Spread) -> String {
+    let mean = write(task, figure.mean);
+    match figure.deviation {
+        Some(deviation) if task == Task::Tof => format!("{mean} ± {}", digits(deviation, 2)),
+        Some(deviation) => format!("{mean} ± {}", share(deviation)),
+        None => mean,
+    }
+}
+
+/// All tables.
+pub(super) fn tables(report: &Report, summary: &Summary) -> String {
+    let mut out = String::new();
+    let missing = report
+        .models
+        .iter()
+        .filter(|m| m.evaluated.is_none())
+        .count();
+    match (missing, report.models.len()) {
+        (_, 0) => out.push_str("<p class=\"none\">There are no models in this report.</p>"),
+        (0, _) => {}
+        (n, all) if n == all => {
+            out.push_str("<p class=\"warn\">No model of this report was evaluated: there are no figures on scenes that \
+                they have not seen.</p>");
+        }
+        (n, all) => {
+            let _ = write!(
+                out,
+                "<p class=\"warn\">{n} of {all} models were not evaluated.</p>"
+            );
+        }
+    }
+    for task in TASKS {
+        let groups: Vec<&Group> = summary.groups.iter().filter(|g| g.task == task).collect();
+        if !groups.is_empty() {
+            let _ = write!(out, "<h3>{}</h3>", task_name(task));
+            out.push_str(&table(report, task, &groups));
+            for order in summary.orders.iter().filter(|o| o.task == task) {
+                out.push_str(&ordered(order));
+            }
+        }
+    }
+    if summary.groups.iter().any(|g| g.published.is_some()) {
+        let _ = write!(out, "<p class=\"note\">{}</p>", Safe(paper::NOTE));
+    }
+    out
+}
+
+/// The table of one task.
+pub(super) fn table(report: &Report, task: Task, groups: &[&Group]) -> String {
+    let mut trivial: Vec<&String> = groups.iter().flat_map(|g| g.baselines.keys()).collect();
+    trivial.sort_unstable();
+    trivial.dedup();
+    let published = groups.iter().any(|g| g.published.is_some());
+    let main = columns(task)[0].0;
+    let mut out = String::from(
+        "<div class=\"wide\"><table class=\"figures\"><thead><tr><th>experiment</th><th>seeds</th>",
+    );
+    for (_, heading) in columns(task) {
+        let _ = write!(out, "<th class=\"n\">{heading}</th>");
+    }
+    let _ = write!(
+        out,
+        "<th class=\"n\" title=\"what 10, 50 and 90 % of single scenes stay below\">scenes’ {}<br>10 · 50 · 90 %</th>",
+        error_name(task)
+    );
+    for name in &trivial {
+        let _ = write!(
+            out,
+            "<th class=\"n base\">{}:<br>{}</th>",
+            Safe(name),
+            columns(task)[0].1
+        );
+    }
+    out.push_str("<th class=\"n\" title=\"error over that of the best trivial answer\">error ÷ best<br>trivial</th>");
+    if published {
+        let _ = write!(
+            out,
+            "<th class=\"n paper\">published:<br>{}</th>",
+            columns(task)[0].1
+        );
+    }
+    out.push_str("</tr></thead><tbody>");
+    for group in groups {
+        row(&mut out, report, group, main, &trivial, published);
+    }
+    out + "</tbody></table></div>"
+}
+
+fn row(
+    out: &mut String,
+    report: &Report,
+    group: &Group,
+    main: &str,
+    trivial: &[&String],
+    with_published: bool,
+) {
+    let task = group.task;
+    let _ = write!(
+        out,
+        "<tr><th scope=\"row\">{}<small>{}</small></th><td>{}</td>",
+        Safe(&group.label),
+        Safe(sees(report, group)),
+        seeds(&group.seeds)
+    );
+    let cell = |figures: Option<&Figures>, name: &str| {
+        let figure = figures.and_then(|f| f.get(name));
+        figure.map_or_else(|| "–".to_owned(), |f| spread(task, *f))
+    };
+    if group.figures.is_empty() {
+        let _ = write!(
+            out,
+            "<td class=\"none\" colspan=\"{}\">not evaluated</td>",
+            columns(task).len() + 1
+        );
+    } else {
+        for (name, _) in columns(task) {
+            let class = if *name == main { "n main" } else { "n" };
+            let _ = write!(
+                out,
+                "<td class=\"{class}\">{}</td>",
+                cell(Some(&group.figures), name)
+            );
+        }
+        let errors = group
+            .scene_errors
+            .map_or_else(|| "–".to_owned(), |e| e.map(|e| digits(e, 2)).join(" · "));
+        let _ = write!(out, "<td class=\"n\">{errors}</td>");
+    }
+    for name in trivial {
+        let _ = write!(
+            out,
+            "<td class=\"n base\">{}</td>",
+            cell(group.baselines.get(*name), main)
+        );
+    }
+    let beside = match &group.beside_best_baseline {
+        Some((name, ratio)) => format!("{} <small>{}</small>", digits(*ratio, 2), Safe(name)),
+        None => "–".to_owned(),
+    };
+    let _ = write!(out, "<td class=\"n\">{beside}</td>");
+    if with_published {
+        let _ = write!(
+            out,
+            "<td class=\"n paper\">{}</td>",
+            shown(task, group.published)
+        );
+    }
+    out.push_str("</tr>");
+}
+
+fn shown(task: Task, published: Option<Published>) -> String {
+    let Some(published) = published else {
+        return "–".to_owned();
+    };
+    let figures = match (task, published.mae, published.iou) {
+        (Task::Tof, Some(mae), _) => mae.to_string(),
+        (_, mae, Some(iou)) => {
+            let mae = mae.map_or_else(String::new, |mae| format!(", MAE {mae}"));
+            format!("{iou:.3}{mae}")
+        }
+        _ => "–".to_owned(),
+    };
+    format!("{figures}<small>{}</small>", Safe(published.experiment))
+}
+
+fn seeds(seeds: &[u64]) -> String {
+    match seeds {
+        [one] => format!("1 <small>(seed {one})</small>"),
+        more => {
+            let list: Vec<String> = more.iter().map(u64::to_string).collect();
+            format!("{} <small>({})</small>", more.len(), list.join(", "))
+        }
+    }
+}
+
+/// What an experiment is, in a line.
+pub(super) fn sees(report: &Report, group: &Group) -> String {
+    let entry = &report.models[group.models[0]];
+    let (question, net) = (&entry.plan.question, &entry.plan.net);
+    let mut words = vec![match question.intensity_only {
+        true => "intensity only".to_owned(),
+        false => format!("{} bins", question.bins),
+    }];
+    if question.task == Task::Shadow {
+        let variant = match question.variant {
+            ShadowVariant::Concat => "concat",
+            ShadowVariant::Difference => "difference",
+            ShadowVariant::Index => "index",
+            ShadowVariant::All => "all spots at once",
+        };
+        words.extend([variant.to_owned(), format!("{} spots", question.spots)]);
+    }
+    if entry.data.bounces == super::Bounces::Two {
+        words.push("two bounces only".to_owned());
+    }
+    if entry.data.noise {
+        words.push("photon noise".to_owned());
+    }
+    let architecture = match net.architecture {
+        Architecture::Unet2d => "2D U-Net",
+        Architecture::Unet25d => "2.5D U-Net",
+    };
+    let stem = if net.stem > 0 {
+        format!(", stem {}", net.stem)
+    } else {
+        String::new()
+    };
+    let frozen = if net.frozen { ", frozen encoder" } else { "" };
+    words.push(format!(
+        "{architecture} {}×{} levels{stem}{frozen}",
+        net.width, net.levels
+    ));
+    words.extend(
+        entry
+            .data
+            .scenes
+            .map(|n| format!("{} scenes", thousands(n))),
+    );
+    words.extend(entry.conditions.iter().map(|(k, v)| format!("{k}: {v}")));
+    words.join(" · ")
+}
+
+fn ordered(order: &Order) -> String {
+    let mut out = format!(
+        "<p>Order: {} of {} pairs of experiments stand as published",
+        order.kept, order.pairs
+    );
+    if order.close > 0 {
+        let _ = write!(
+            out,
+            "; {} lie closer together than their seeds’ spread",
+            order.close
+        );
+    }
+    out.push('.');
+    for [better, worse] in &order.turned {
+        let _ = write!(
+            out,
+            " Not as published: <b>{}</b> is better than <b>{}</b>.",
+            Safe(better),
+            Safe(worse)
+        );
+    }
+    out + "</p>"
+}

@@ -1,0 +1,49 @@
+//! Text from outside, made harmless.
+
+use std::fmt::{self, Display, Write};
+
+/// Displays with everything escaped that HTML would understand; control characters become U+FFFD.
+pub(super) struct Safe<T>(pub T);
+
+impl<T: Display> Display for Safe<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(Escape(f), "{}", self.0)
+    }
+}
+
+struct Escape<'a, 'b>(&'a mut fmt::Formatter<'b>);
+
+impl Write for Escape<'_, '_> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        for c in text.chars() {
+            match c {
+                '&' => self.0.write_str("&amp;")?,
+                '<' => self.0.write_str("&lt;")?,
+                '>' => self.0.write_str("&gt;")?,
+                '"' => self.0.write_str("&quot;")?,
+                '\'' => self.0.write_str("&#39;")?,
+                '\n' | '\t' => self.0.write_char(c)?,
+                c if c.is_control() => self.0.write_char('\u{fffd}')?,
+                c => self.0.write_char(c)?,
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::Safe;
+
+    proptest! {
+        #[test]
+        fn nothing_that_is_escaped_opens_a_tag_or_ends_an_attribute(text in "\\PC*[<>&\"']\\PC*") {
+            let safe = Safe(&text).to_string();
+            prop_assert!(!safe.contains(['<', '>', '"', '\'']));
+            let back = safe.replace("&lt;", "<").replace("&gt;", ">").replace("&quot;", "\"");
+            prop_assert_eq!(back.replace("&#39;", "'").replace("&amp;", "&"), text);
+        }
+    }
+}
