@@ -38,7 +38,10 @@ fn pictures_show_what_the_figures_are_of() {
         for (picture, scene) in entry.pictures.iter().zip([0, 2]) {
             let held_out = Arc::clone(&scenes(200, 3)[scene]);
             match task {
-                Task::Tof => assert_eq!(picture.truth.values(), held_out.depth_m),
+                Task::Tof => {
+                    let both = picture.truth.values().iter().zip(&held_out.depth_m);
+                    assert!(both.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
+                }
                 Task::Specular | Task::Shadow => {
                     let said = picture.said.values();
                     assert!(said.iter().all(|p| (0.0..=1.0).contains(p)));

@@ -37,7 +37,7 @@ pub(super) const COLOURS: usize = 8;
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 270.0;
 const LEFT: f64 = 62.0;
-const RIGHT: f64 = 12.0;
+const RIGHT: f64 = 22.0;
 const TOP: f64 = 28.0;
 const BOTTOM: f64 = 44.0;
 
@@ -51,17 +51,26 @@ pub(super) fn chart(title: &str, x: &Axis, y: &Axis, series: &[Series]) -> Strin
     let across = Scale::over(points().filter(drawn).map(|p| p.0), x.log);
     let ends = points().filter(drawn).flat_map(|p| {
         let spread = if p.2.is_finite() { p.2 } else { 0.0 };
-        [p.1 - spread, p.1, p.1 + spread]
+        let low = p.1 - spread;
+        [
+            if y.zero && p.1 >= 0.0 {
+                low.max(0.0)
+            } else {
+                low
+            },
+            p.1,
+            p.1 + spread,
+        ]
     });
     let up = Scale::over(ends, y.log);
     let (Some(mut across), Some(mut up)) = (across, up) else {
         return format!("<p class=\"none\">{}: no values to draw.</p>", Safe(title));
     };
     if x.zero {
-        across = across.from(0.0);
+        across = across.from_zero();
     }
     if y.zero {
-        up = up.from(0.0);
+        up = up.from_zero();
     }
     let at_x = |v: f64| across.at(v).map(|at| LEFT + at * (WIDTH - LEFT - RIGHT));
     let at_y = |v: f64| {
@@ -152,8 +161,10 @@ fn draw(
     if series.marks || alone {
         for point in &series.points {
             let Some((px, py)) = at(point) else { continue };
-            let ends = (at_y(point.1 - point.2), at_y(point.1 + point.2));
-            if let (true, (Some(low), Some(high))) = (point.2 > 0.0, ends) {
+            // What reaches below the axis ends there.
+            let low = at_y(point.1 - point.2).unwrap_or(HEIGHT - BOTTOM);
+            let high = at_y(point.1 + point.2);
+            if let (true, Some(high)) = (point.2 > 0.0, high) {
                 let _ = write!(
                     out,
                     "<path class=\"bar\" d=\"M{px:.1} {low:.1}V{high:.1}\"/>"

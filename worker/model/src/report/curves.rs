@@ -58,7 +58,13 @@ fn over_epochs(title: &str, label: &str, series: &[Series]) -> String {
         label: "epoch",
         log: false,
         zero: true,
-        write: short,
+        write: |v| {
+            if v.fract() == 0.0 {
+                short(v)
+            } else {
+                String::new()
+            }
+        },
     };
     let y = Axis {
         label,

@@ -22,24 +22,25 @@ pub(super) fn maps(report: &Report) -> String {
     if with.is_empty() {
         return "<p class=\"none\">There are no example pictures in this report.</p>".to_owned();
     }
-    with.into_iter().map(of_model).collect()
+    let of_depth = with.iter().filter(|m| m.plan.question.task == Task::Tof);
+    let depths = depths(of_depth.flat_map(|m| &m.pictures));
+    with.into_iter().map(|m| of_model(m, &depths)).collect()
 }
 
-/// Ends of the colour scales of a model's pictures, metres.
+/// Ends of the colour scales of all depth pictures, metres: models can be compared by their colours.
 struct Depths {
     low: f64,
     high: f64,
     error: f64,
 }
 
-fn of_model(entry: &Entry) -> String {
+fn of_model(entry: &Entry, depths: &Depths) -> String {
     let task = entry.plan.question.task;
     let mut out = format!(
         "<section class=\"maps\"><h3>{} <small>{}</small></h3><div class=\"rows\">",
         Safe(&entry.name),
         task_name(task)
     );
-    let depths = depths(&entry.pictures);
     for picture in &entry.pictures {
         let [truth, said, error] = match task {
             Task::Tof => {
@@ -95,7 +96,7 @@ fn of_model(entry: &Entry) -> String {
     out
 }
 
-fn depths(pictures: &[Picture]) -> Depths {
+fn depths<'a>(pictures: impl Iterator<Item = &'a Picture>) -> Depths {
     let finite = |plane: &Plane| -> Vec<f64> {
         let values = plane.values().iter().map(|v| f64::from(*v));
         values.filter(|v| v.is_finite()).collect()

@@ -70,7 +70,7 @@ pub struct Entry {
     /// How fast it was trained, where that is known.
     #[serde(default)]
     pub speed: Option<Speed>,
-    /// Where it comes from, line by line: data version, code, worker, digests.
+    /// Where it comes from, by name: data version, code, worker, digests. A name stands for itself once.
     #[serde(default)]
     pub lineage: Vec<(String, String)>,
     /// Examples; [`pictures`] makes them.

@@ -46,6 +46,18 @@ pub(super) fn prefixed(value: f64) -> String {
     short((value * 100.0).round() / 100.0)
 }
 
+/// The same without the zeros that say nothing: 20 M.
+pub(super) fn prefixed_short(value: f64) -> String {
+    let text = prefixed(value);
+    match text.split_once(' ') {
+        Some((number, prefix)) if number.contains('.') => {
+            let number = number.trim_end_matches('0').trim_end_matches('.');
+            format!("{number} {prefix}")
+        }
+        _ => text,
+    }
+}
+
 /// Seconds as hours and minutes.
 pub(super) fn duration(seconds: f64) -> String {
     if !(seconds.is_finite() && seconds >= 0.0) {
@@ -121,6 +133,10 @@ mod tests {
         assert_eq!(said, ["950", "1.23 k", "356 M", "1.28 T"]);
         let said = [2.0, 130.0, 7_500.0, 300_000.0].map(duration);
         assert_eq!(said, ["2.00 s", "2 min", "2 h 05 min", "3 d 11 h"]);
+        assert_eq!(
+            [2e7, 1.5e3, 20.0].map(prefixed_short),
+            ["20 M", "1.5 k", "20"]
+        );
         assert_eq!(thousands(87_688), "87,688");
     }
 }

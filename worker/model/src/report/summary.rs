@@ -34,7 +34,7 @@ pub struct Group {
     pub task: Task,
     /// Its models, as indices into the report's.
     pub models: Vec<usize>,
-    /// Their seeds.
+    /// Their seeds, each once.
     pub seeds: Vec<u64>,
     /// Figures of those that were evaluated; empty where none was.
     pub figures: Figures,
@@ -185,6 +185,9 @@ fn group(report: &Report, task: Task, models: Vec<usize>) -> Group {
         .collect();
     scenes.sort_unstable_by(f64::total_cmp);
     let quantile = |q: f64| scenes[(q * (scenes.len() - 1) as f64).round() as usize];
+    let mut seeds: Vec<u64> = of().map(|e| e.plan.seed).collect();
+    seeds.sort_unstable();
+    seeds.dedup();
     let names: Vec<&str> = of().map(|e| &*e.name).collect();
     let speeds: Vec<f64> = of()
         .filter_map(|e| e.speed.map(|s| s.samples_per_s))
@@ -193,7 +196,7 @@ fn group(report: &Report, task: Task, models: Vec<usize>) -> Group {
     Group {
         label: common(&names),
         task,
-        seeds: of().map(|e| e.plan.seed).collect(),
+        seeds,
         figures: figures(&metrics),
         baselines: trivial
             .iter()
@@ -339,13 +342,13 @@ struct Said<'a> {
     name: &'a str,
     plan: &'a Plan,
     data: &'a Data,
-    conditions: BTreeMap<&'a str, &'a str>,
+    conditions: &'a [(String, String)],
     parameters: u64,
     multiply_adds: Option<f64>,
     history: &'a [Line],
     evaluated: &'a Option<Evaluated>,
     speed: &'a Option<Speed>,
-    lineage: BTreeMap<&'a str, &'a str>,
+    lineage: &'a [(String, String)],
     pictures: Vec<Example<'a>>,
 }
 
@@ -374,13 +377,13 @@ fn said(entry: &Entry) -> Said<'_> {
         name: &entry.name,
         plan: &entry.plan,
         data: &entry.data,
-        conditions: entry.conditions.iter().map(|(k, v)| (&**k, &**v)).collect(),
+        conditions: &entry.conditions,
         parameters: entry.parameters,
         multiply_adds: entry.multiply_adds,
         history: &entry.history,
         evaluated: &entry.evaluated,
         speed: &entry.speed,
-        lineage: entry.lineage.iter().map(|(k, v)| (&**k, &**v)).collect(),
+        lineage: &entry.lineage,
         pictures: entry
             .pictures
             .iter()

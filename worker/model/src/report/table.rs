@@ -75,7 +75,7 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
         (n, all) => {
             let _ = write!(
                 out,
-                "<p class=\"warn\">{n} of {all} models were not evaluated.</p>"
+                "<p class=\"warn\">Not evaluated: {n} of {all} models.</p>"
             );
         }
     }
@@ -108,11 +108,13 @@ pub(super) fn table(report: &Report, task: Task, groups: &[&Group]) -> String {
     for (_, heading) in columns(task) {
         let _ = write!(out, "<th class=\"n\">{heading}</th>");
     }
-    let _ = write!(
-        out,
-        "<th class=\"n\" title=\"what 10, 50 and 90 % of single scenes stay below\">scenes’ {}<br>10 · 50 · 90 %</th>",
-        error_name(task)
-    );
+    if published {
+        let _ = write!(
+            out,
+            "<th class=\"n paper\">published<br>{}</th>",
+            columns(task)[0].1
+        );
+    }
     for name in &trivial {
         let _ = write!(
             out,
@@ -121,14 +123,12 @@ pub(super) fn table(report: &Report, task: Task, groups: &[&Group]) -> String {
             columns(task)[0].1
         );
     }
-    out.push_str("<th class=\"n\" title=\"error over that of the best trivial answer\">error ÷ best<br>trivial</th>");
-    if published {
-        let _ = write!(
-            out,
-            "<th class=\"n paper\">published:<br>{}</th>",
-            columns(task)[0].1
-        );
-    }
+    let _ = write!(
+        out,
+        "<th class=\"n\" title=\"error over that of the best trivial answer\">error ÷<br>best trivial</th>\
+         <th class=\"n\" title=\"what 10, 50 and 90 % of single scenes stay below\">{} of scenes<br>10 · 50 · 90 %</th>",
+        error_name(task)
+    );
     out.push_str("</tr></thead><tbody>");
     for group in groups {
         row(&mut out, report, group, main, &trivial, published);
@@ -150,7 +150,7 @@ fn row(
         "<tr><th scope=\"row\">{}<small>{}</small></th><td>{}</td>",
         Safe(&group.label),
         Safe(sees(report, group)),
-        seeds(&group.seeds)
+        seeds(group)
     );
     let cell = |figures: Option<&Figures>, name: &str| {
         let figure = figures.and_then(|f| f.get(name));
@@ -160,41 +160,38 @@ fn row(
         let _ = write!(
             out,
             "<td class=\"none\" colspan=\"{}\">not evaluated</td>",
-            columns(task).len() + 1
+            columns(task).len()
         );
     } else {
         for (name, _) in columns(task) {
             let class = if *name == main { "n main" } else { "n" };
-            let _ = write!(
-                out,
-                "<td class=\"{class}\">{}</td>",
-                cell(Some(&group.figures), name)
-            );
+            let figure = cell(Some(&group.figures), name);
+            let _ = write!(out, "<td class=\"{class}\">{figure}</td>");
         }
-        let errors = group
-            .scene_errors
-            .map_or_else(|| "–".to_owned(), |e| e.map(|e| digits(e, 2)).join(" · "));
-        let _ = write!(out, "<td class=\"n\">{errors}</td>");
+    }
+    if with_published {
+        let published = shown(task, group.published);
+        let _ = write!(out, "<td class=\"n paper\">{published}</td>");
     }
     for name in trivial {
-        let _ = write!(
-            out,
-            "<td class=\"n base\">{}</td>",
-            cell(group.baselines.get(*name), main)
-        );
+        let figure = cell(group.baselines.get(*name), main);
+        // The same scenes give trivial answers the same figures.
+        let figure = figure
+            .trim_end_matches(" ± 0")
+            .trim_end_matches(" ± 0.0000");
+        let _ = write!(out, "<td class=\"n base\">{figure}</td>");
     }
+    let none = || "–".to_owned();
     let beside = match &group.beside_best_baseline {
-        Some((name, ratio)) => format!("{} <small>{}</small>", digits(*ratio, 2), Safe(name)),
-        None => "–".to_owned(),
+        Some((name, ratio)) => format!("{}<small>of {}</small>", digits(*ratio, 2), Safe(name)),
+        None => none(),
     };
-    let _ = write!(out, "<td class=\"n\">{beside}</td>");
-    if with_published {
-        let _ = write!(
-            out,
-            "<td class=\"n paper\">{}</td>",
-            shown(task, group.published)
-        );
-    }
+    let errors = group.scene_errors;
+    let errors = errors.map_or_else(none, |e| e.map(|e| digits(e, 2)).join(" · "));
+    let _ = write!(
+        out,
+        "<td class=\"n\">{beside}</td><td class=\"n\">{errors}</td>"
+    );
     out.push_str("</tr>");
 }
 
@@ -205,7 +202,7 @@ fn shown(task: Task, published: Option<Published>) -> String {
     let figures = match (task, published.mae, published.iou) {
         (Task::Tof, Some(mae), _) => mae.to_string(),
         (_, mae, Some(iou)) => {
-            let mae = mae.map_or_else(String::new, |mae| format!(", MAE {mae}"));
+            let mae = mae.map_or_else(String::new, |mae| format!("<small>MAE {mae}</small>"));
             format!("{iou:.3}{mae}")
         }
         _ => "–".to_owned(),
@@ -213,14 +210,14 @@ fn shown(task: Task, published: Option<Published>) -> String {
     format!("{figures}<small>{}</small>", Safe(published.experiment))
 }
 
-fn seeds(seeds: &[u64]) -> String {
-    match seeds {
-        [one] => format!("1 <small>(seed {one})</small>"),
-        more => {
-            let list: Vec<String> = more.iter().map(u64::to_string).collect();
-            format!("{} <small>({})</small>", more.len(), list.join(", "))
-        }
-    }
+fn seeds(group: &Group) -> String {
+    let count = group.seeds.len();
+    let list: Vec<String> = group.seeds.iter().map(u64::to_string).collect();
+    let again = match group.models.len() {
+        runs if runs > count => format!("; {runs} runs"),
+        _ => String::new(),
+    };
+    format!("{count} <small>({}{again})</small>", list.join(", "))
 }
 
 /// What an experiment is, in a line.
@@ -257,7 +254,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
     };
     let frozen = if net.frozen { ", frozen encoder" } else { "" };
     words.push(format!(
-        "{architecture} {}×{} levels{stem}{frozen}",
+        "{architecture}, width {}, {} levels{stem}{frozen}",
         net.width, net.levels
     ));
     words.extend(
@@ -276,20 +273,19 @@ fn ordered(order: &Order) -> String {
         order.kept, order.pairs
     );
     if order.close > 0 {
-        let _ = write!(
-            out,
-            "; {} lie closer together than their seeds’ spread",
-            order.close
-        );
+        let _ = write!(out, "; within the spread of their seeds: {}", order.close);
     }
     out.push('.');
-    for [better, worse] in &order.turned {
-        let _ = write!(
-            out,
-            " Not as published: <b>{}</b> is better than <b>{}</b>.",
+    let turned = order.turned.iter().map(|[better, worse]| {
+        format!(
+            "<b>{}</b> is better than <b>{}</b>",
             Safe(better),
             Safe(worse)
-        );
+        )
+    });
+    let turned: Vec<String> = turned.collect();
+    if !turned.is_empty() {
+        let _ = write!(out, " Not as published: {}.", turned.join("; "));
     }
     out + "</p>"
 }

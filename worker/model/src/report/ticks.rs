@@ -40,10 +40,11 @@ impl Scale {
         })
     }
 
-    /// The same axis with this value on it, and no rim below it.
-    pub(super) fn from(mut self, value: f64) -> Self {
-        if !self.log {
-            self.low = value.min(self.high - 1e-9);
+    /// The same axis from 0 on, where it is not logarithmic and nothing lies below.
+    pub(super) fn from_zero(mut self) -> Self {
+        let rim = (self.high - self.low) * 0.06 / 1.12;
+        if !self.log && self.low + 1.001 * rim >= 0.0 {
+            self.low = 0.0;
         }
         self
     }

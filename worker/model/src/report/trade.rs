@@ -5,7 +5,7 @@ use std::fmt::Write;
 use super::{
     Entry, Group, Report, Scaling, Spread, Summary,
     chart::{Axis, Series, chart, legend},
-    number::{digits, duration, prefixed, short, thousands},
+    number::{digits, duration, prefixed, prefixed_short, short, thousands},
     summary::TASKS,
     table::{error_name, spread, task_name},
     text::Safe,
@@ -42,7 +42,7 @@ pub(super) fn speed(report: &Report, summary: &Summary) -> String {
             out.push_str(&both_log(
                 &title,
                 label,
-                prefixed,
+                prefixed_short,
                 error_name(task),
                 &points,
             ));
