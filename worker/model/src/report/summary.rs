@@ -61,7 +61,7 @@ pub struct Order {
     pub pairs: usize,
     /// Those in the published order.
     pub kept: usize,
-    /// The others: what is better here, and than what.
+    /// Those in the other: what is better here, and than what. Equal figures are in neither.
     pub turned: Vec<[String; 2]>,
     /// Pairs whose figures lie closer together than their seeds' spread (√(s₁² + s₂²)).
     pub close: usize,
@@ -267,6 +267,7 @@ fn order(report: &Report, task: Task, groups: &[Group]) -> Option<Order> {
         .iter()
         .filter(|g| g.task == task)
         .filter_map(|g| Some((g, g.error?, g.published?.loss()?)))
+        .filter(|(_, error, _)| error.mean.is_finite())
         .collect();
     let mut out = Order {
         task,
@@ -285,12 +286,15 @@ fn order(report: &Report, task: Task, groups: &[Group]) -> Option<Order> {
             let variance = |s: Spread| s.deviation.map_or(0.0, |d| d * d);
             let spread = (variance(a.1) + variance(b.1)).sqrt();
             out.pairs += 1;
-            out.close += usize::from((a.1.mean - b.1.mean).abs() <= spread);
+            out.close += usize::from(worse.1.mean - better.1.mean <= spread);
+            if better.1.mean == worse.1.mean {
+                continue;
+            }
             if better.2 < worse.2 {
                 out.kept += 1;
             } else {
-                out.turned
-                    .push([better.0.label.clone(), worse.0.label.clone()]);
+                let pair = [better.0.label.clone(), worse.0.label.clone()];
+                out.turned.push(pair);
             }
         }
     }

@@ -272,6 +272,8 @@ fn the_order_of_experiments_is_compared_with_the_published_one() {
     assert_eq!((turned.pairs, turned.kept), (3, 2));
     assert_eq!(turned.turned, [["difference", "concat"]]);
     assert_eq!(of(0.905).close, 1);
+    let equal = of(0.6);
+    assert_eq!((equal.kept, equal.turned.len(), equal.close), (2, 0, 1));
 }
 
 #[test]
