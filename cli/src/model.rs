@@ -1,5 +1,7 @@
 //! `picofarm model …`: the models that a store keeps.
 
+mod report;
+
 use std::{
     io::{ErrorKind, Write},
     path::Path,
@@ -26,6 +28,13 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
             export(&store, &name, &out, output).await
         }
+        Command::Report {
+            store,
+            names,
+            out,
+            title,
+            pictures,
+        } => report::run(&store, &names, (&out, title), pictures, output).await,
     }
 }
 

@@ -55,7 +55,10 @@ fn submit(farm: &Farm, name: &str) -> String {
     let file = farm.store().with_file_name(format!("{name}.toml"));
     fs::write(&file, job(&farm.store())).unwrap();
     let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
-    answer["job"].as_str().expect("a submission answers with a job").to_owned()
+    answer["job"]
+        .as_str()
+        .expect("a submission answers with a job")
+        .to_owned()
 }
 
 #[test]
@@ -78,7 +81,11 @@ fn a_training_whose_workers_are_killed_20_times_gives_the_weights_of_one_that_wa
         let begun = std::time::Instant::now();
         while worker.runs() && !worker.stderr().contains("task starts") {
             sleep(Duration::from_millis(20));
-            assert!(begun.elapsed() < Duration::from_secs(120), "{}", worker.stderr());
+            assert!(
+                begun.elapsed() < Duration::from_secs(120),
+                "{}",
+                worker.stderr()
+            );
         }
         sleep(Duration::from_millis(300 + rng.number() % 900));
         let said = worker.stderr();
@@ -95,7 +102,14 @@ fn a_training_whose_workers_are_killed_20_times_gives_the_weights_of_one_that_wa
         hashes
     };
     let there = models(&farm);
-    assert!(there.keys().any(|key| key.contains("weights.safetensors")), "{there:?}");
-    assert_eq!(there, models(&calm), "after {kills} kills, {resumed} resumptions");
+    assert!(
+        there.keys().any(|key| key.contains("weights.safetensors")),
+        "{there:?}"
+    );
+    assert_eq!(
+        there,
+        models(&calm),
+        "after {kills} kills, {resumed} resumptions"
+    );
     eprintln!("{kills} kills, {resumed} resumptions");
 }

@@ -20,5 +20,5 @@ pub use execute::{
     TaskExecutor, check_memory, generator_version, import_options, import_version, memory_mib,
     model_version, render_bytes, renderer_version, strategy, strategy_names,
 };
-pub use execute::{export, repair, reprocess, split};
+pub use execute::{export, gallery, repair, reprocess, split};
 pub use log::task_logs;

@@ -200,7 +200,7 @@ fn told(metrics: &serde_json::Value) -> String {
 }
 
 /// The settings that a model was trained with.
-fn trained(settings: &serde_json::Value) -> Result<TrainSettings, String> {
+pub(super) fn trained(settings: &serde_json::Value) -> Result<TrainSettings, String> {
     let mut settings = settings.clone();
     // The manifest tells the name apart from them.
     if let Some(table) = settings.as_object_mut() {

@@ -3,6 +3,7 @@
 mod evaluate;
 mod examples;
 pub mod export;
+pub mod gallery;
 mod generate;
 mod import;
 mod memory;
