@@ -67,10 +67,10 @@ pub(super) fn chart(title: &str, x: &Axis, y: &Axis, series: &[Series]) -> Strin
         return format!("<p class=\"none\">{}: no values to draw.</p>", Safe(title));
     };
     if x.zero {
-        across = across.from_zero();
+        across = across.with_zero();
     }
     if y.zero {
-        up = up.from_zero();
+        up = up.with_zero();
     }
     let at_x = |v: f64| across.at(v).map(|at| LEFT + at * (WIDTH - LEFT - RIGHT));
     let at_y = |v: f64| {

@@ -41,7 +41,7 @@ impl Scale {
     }
 
     /// The same axis from 0 on, where it is not logarithmic and nothing lies below.
-    pub(super) fn from_zero(mut self) -> Self {
+    pub(super) fn with_zero(mut self) -> Self {
         let rim = (self.high - self.low) * 0.06 / 1.12;
         if !self.log && self.low + 1.001 * rim >= 0.0 {
             self.low = 0.0;

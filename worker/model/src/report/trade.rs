@@ -11,6 +11,9 @@ use super::{
     text::Safe,
 };
 
+/// What a panel shows of an experiment.
+type Across<'a> = &'a dyn Fn(&Group) -> Option<f64>;
+
 /// Speed against error.
 pub(super) fn speed(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
@@ -20,7 +23,7 @@ pub(super) fn speed(report: &Report, summary: &Summary) -> String {
             continue;
         }
         let first = |g: &Group| -> &Entry { &report.models[g.models[0]] };
-        let panels: [(&str, &dyn Fn(&Group) -> Option<f64>); 3] = [
+        let panels: [(&str, Across); 3] = [
             ("samples/s in training", &|g| Some(g.samples_per_s?.mean)),
             ("parameters", &|g| Some(first(g).parameters as f64)),
             ("multiply-adds an image", &|g| first(g).multiply_adds),
