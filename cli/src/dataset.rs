@@ -139,7 +139,7 @@ fn store_and_folder(place: &str) -> Result<(String, String)> {
 }
 
 /// What the failure of a task means for a command that runs it here.
-fn task_failed(error: TaskError) -> CliError {
+pub fn task_failed(error: TaskError) -> CliError {
     let (code, hint) = match &error {
         TaskError::User(_) => (Code::Input, None),
         TaskError::Crash(_) => (Code::Failed, None),

@@ -73,7 +73,8 @@ fn cycle(step: u64, steps: u64, rate: f64) -> Pace {
     let top = WARM_UP * steps as f64 - 1.0;
     let end = steps as f64 - 1.0;
     if step <= top {
-        let at = step / top;
+        // Of a run of 100 steps the first is the top.
+        let at = if top > 0.0 { step / top } else { 1.0 };
         return Pace {
             rate: between(first, rate, at),
             beta1: between(fast, slow, at),
@@ -110,7 +111,7 @@ mod tests {
 
     #[test]
     fn a_fitted_cycle_ends_near_zero_and_short_runs_have_one_too() {
-        for steps in [1, 2, 5, 99, 1_000] {
+        for steps in [1, 2, 5, 99, 100, 101, 1_000] {
             for step in 0..steps {
                 let pace = Schedule::Onecycle.pace(step, steps, 1e-2);
                 assert!(
