@@ -42,7 +42,7 @@ impl Trial {
     pub fn begin(&self, device: &Device) -> Result<(Learner, Batch), ModelError> {
         let net = Net::new(self.net.clone())?;
         let multiple = self.net.multiple();
-        if self.side == 0 || self.side % multiple != 0 || self.batch == 0 {
+        if self.side == 0 || !self.side.is_multiple_of(multiple) || self.batch == 0 {
             let what = format!("must be a multiple of {multiple}, and batch at least 1");
             return Err(ModelError::invalid("side", what));
         }

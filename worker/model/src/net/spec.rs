@@ -115,7 +115,7 @@ impl NetSpec {
         if self.architecture == Architecture::Unet25d {
             within("time", self.time, 1, 4_096)?;
             let divisor = 1 << (self.levels - 1);
-            if self.time % divisor != 0 {
+            if !self.time.is_multiple_of(divisor) {
                 let what = format!(
                     "{} must be a multiple of {divisor}: it is halved {} times (levels - 1)",
                     self.time,

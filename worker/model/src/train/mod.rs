@@ -75,7 +75,8 @@ impl Plan {
             );
             return Err(ModelError::invalid("optimise.batch", what));
         }
-        if !(self.rate > 0.0 && self.rate.is_finite()) || !(self.decay >= 0.0 && self.decay < 1.0) {
+        let positive = self.rate > 0.0 && self.rate.is_finite();
+        if !positive || !(0.0..1.0).contains(&self.decay) {
             let what = "rate must be positive, weight_decay in 0..1";
             return Err(ModelError::invalid("optimise", what));
         }
