@@ -1,12 +1,18 @@
 //! Training as a task: killed at any instant, gone on with by another worker, and the weights are those of a training that
 //! nobody disturbed, bit for bit.
+//!
+//! The short form runs with all tests. The long one: `PICOFARM_KILLS=20 tests/run -E 'binary(training)'`.
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
 use picofarm_tests::{Farm, rng::Rng, store};
 
 /// Kills of workers while they train.
-const KILLS: u64 = 20;
+fn kills_wanted() -> u64 {
+    std::env::var("PICOFARM_KILLS").map_or(6, |n| {
+        n.parse().expect("PICOFARM_KILLS is a number of kills")
+    })
+}
 
 fn job(store: &Path) -> String {
     format!(
@@ -31,7 +37,7 @@ source = "rooms"
 task = "tof"
 model = "tof"
 net = {{ width = 8, levels = 3 }}
-optimise = {{ epochs = 1000, batch = 4 }}
+optimise = {{ epochs = 600, batch = 4 }}
 checkpoint_minutes = 0.01
 [[stage]]
 name = "shadow"
@@ -62,7 +68,8 @@ fn submit(farm: &Farm, name: &str) -> String {
 }
 
 #[test]
-fn a_training_whose_workers_are_killed_20_times_gives_the_weights_of_one_that_was_not() {
+fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_that_was_not() {
+    let wanted = kills_wanted();
     let calm = Farm::with_lease("training-calm", 2.0);
     let id = submit(&calm, "calm");
     let _worker = calm.worker("calm");
@@ -72,9 +79,9 @@ fn a_training_whose_workers_are_killed_20_times_gives_the_weights_of_one_that_wa
     let id = submit(&farm, "killed");
     let mut rng = Rng::new(11);
     let (mut kills, mut resumed) = (0, 0);
-    for round in 0..10 * KILLS {
+    for round in 0..10 * wanted {
         let mut worker = farm.worker(&format!("worker-{round}"));
-        if kills == KILLS || farm.status(&id)["state"] != "active" {
+        if kills == wanted || farm.status(&id)["state"] != "active" {
             break;
         }
         // Into the training, and then some.
