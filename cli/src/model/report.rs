@@ -1,15 +1,16 @@
 //! `picofarm model report`: a page about trained models.
 
-use std::{fs, path::Path, sync::Arc, time::SystemTime};
+use std::{collections::BTreeMap, fs, path::Path, sync::Arc, time::SystemTime};
 
 use picofarm_agent::{Control, gallery::Gallery};
 use picofarm_dataset::{Evaluation, ModelManifest, Models};
 use picofarm_model::{
     Evaluated, Model,
+    metric::Metrics,
     report::{Data, Entry, Report, Speed, html, json},
     train::Line,
 };
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::runtime::Handle;
 
 use super::{WEIGHTS, open};
@@ -133,11 +134,24 @@ async fn entry(store: &str, models: &Models, name: &str, pictures: usize) -> Res
         .map_err(|e| broken(format!("history.jsonl: {e}")))?;
     entry.evaluated = evaluation
         .as_ref()
-        .map(|e| serde_json::from_value::<Evaluated>(e.metrics.clone()))
+        .map(|e| evaluated(&e.metrics))
         .transpose()
         .map_err(|e| broken(format!("its evaluation: {e}")))?;
     describe(&mut entry, &manifest, evaluation.as_ref());
     Ok(entry)
+}
+
+/// An evaluation's figures as they lie in the store: those of all scenes, beside them those of trivial answers, by name, and
+/// of each scene.
+fn evaluated(found: &Value) -> serde_json::Result<Evaluated> {
+    let part = |name: &str| found.get(name).cloned().unwrap_or_default();
+    let baselines: BTreeMap<String, Metrics> = serde_json::from_value(part("baselines"))?;
+    Ok(Evaluated {
+        metrics: serde_json::from_value(found.clone())?,
+        baselines: baselines.into_iter().collect(),
+        scenes: serde_json::from_value(part("by_scene"))?,
+        examples: serde_json::from_value(part("examples"))?,
+    })
 }
 
 /// Where it comes from.
@@ -166,12 +180,7 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
     if setting("/from").is_some() {
         entry.conditions.push(("begins".into(), "trained".into()));
     }
-    let number = |name: &str| {
-        manifest
-            .metrics
-            .get(name)
-            .and_then(serde_json::Value::as_f64)
-    };
+    let number = |name: &str| manifest.metrics.get(name).and_then(Value::as_f64);
     entry.speed = number("samples_per_s").map(|samples_per_s| Speed {
         samples_per_s,
         seconds: number("seconds"),
