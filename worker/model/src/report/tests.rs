@@ -165,8 +165,10 @@ fn the_json_says_everything() {
             rmse_m: f64::NAN,
         },
     }];
-    let said: Value =
+    let mut said: Value =
         serde_json::from_str(&json(&report(vec![one, depth("tof-2", 2, 0.375)]))).unwrap();
+    // Whether a map keeps its order is a feature that other crates of the workspace decide.
+    said.sort_all_objects();
     insta::assert_json_snapshot!(said);
 }
 
