@@ -7,7 +7,7 @@ use picofarm_dataset::{Evaluation, ModelManifest, Models};
 use picofarm_model::{
     Evaluated, Model,
     metric::Metrics,
-    report::{Data, Entry, Report, Speed, html, json},
+    report::{Data, Entry, Report, html, json},
     train::Line,
 };
 use serde_json::{Value, json};
@@ -180,11 +180,6 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
     if setting("/from").is_some() {
         entry.conditions.push(("begins".into(), "trained".into()));
     }
-    let number = |name: &str| manifest.metrics.get(name).and_then(Value::as_f64);
-    entry.speed = number("samples_per_s").map(|samples_per_s| Speed {
-        samples_per_s,
-        seconds: number("seconds"),
-    });
     let line = |name: &str, value: String| (name.to_owned(), value);
     entry.lineage = vec![
         line("data", format!("{} ({})", from.dataset, from.data)),
