@@ -134,6 +134,11 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
                 let asked = &mut task.evaluate.version;
                 pin(asked, version, "evaluate.version").map_err(named)?;
             }
+            TaskSpec::Promote(task) => {
+                let version = picofarm_agent::model_version();
+                let asked = &mut task.promote.version;
+                pin(asked, version, "promote.version").map_err(named)?;
+            }
             TaskSpec::Export(task) => {
                 task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
                 picofarm_dataset::ExportFormat::parse(&task.export.format)

@@ -90,18 +90,29 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
             "count": task.count,
             "settings": serde_json::to_value(&task.export).expect("settings are plain data"),
         }),
-        TaskSpec::Train(task) => serde_json::json!({
-            "stage": "train",
-            "source": source(&task.source),
-            "count": task.count,
-            "model": task.train.model,
-            "settings": task.train.shaping(),
-        }),
+        TaskSpec::Train(task) => {
+            let mut description = serde_json::json!({
+                "stage": "train",
+                "source": source(&task.source),
+                "count": task.count,
+                "model": task.train.model,
+                "settings": task.train.shaping(),
+            });
+            if let Some(trial) = &task.train.trial {
+                description["trial"] = serde_json::to_value(trial).expect("plain data");
+            }
+            description
+        }
         TaskSpec::Evaluate(task) => serde_json::json!({
             "stage": "evaluate",
             "source": source(&task.source),
             "count": task.count,
             "settings": serde_json::to_value(&task.evaluate).expect("settings are plain data"),
+        }),
+        TaskSpec::Promote(task) => serde_json::json!({
+            "stage": "promote",
+            "source": source(&task.source),
+            "settings": serde_json::to_value(&task.promote).expect("settings are plain data"),
         }),
     };
     StageKey(Sha256::digest(canonical(description).as_bytes()).into())

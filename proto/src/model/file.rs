@@ -10,7 +10,8 @@
 //!
 //! `matrix = { dark = [0.0, 0.1], bins = [1, 4] }` makes a stage for each combination of values. Anywhere in the stage,
 //! the text `"{dark}"` stands for the value, and `{dark}` inside a text for its text. An instance is called
-//! `name[0.1,4]`, values in the order of the parameters' names; `needs = ["name"]` means all of them.
+//! `name[0.1,4]`, values in the order of the parameters' names; `needs = ["name"]` means all of them. `[stage.sweep]` does
+//! the like for trainings among which the best is wanted ([`super::sweep`]).
 
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -23,6 +24,7 @@ use super::{
     refer,
     render::{PartTask, RenderSettings, RenderTask, SceneSource},
     reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
+    sweep::{self, PromoteSettings, PromoteTask},
     task::{ExportSettings, ExportTask, SplitTask, TaskSpec},
     train::{TrainSettings, TrainTask},
 };
@@ -74,6 +76,7 @@ struct StageText {
     import: Option<ImportSettings>,
     train: Option<TrainSettings>,
     evaluate: Option<EvaluateSettings>,
+    promote: Option<PromoteSettings>,
     output: Option<OutputSettings>,
     parts: Option<u32>,
     #[serde(default)]
@@ -155,7 +158,9 @@ impl TryFrom<JobText> for JobSpec {
             for (i, stage) in text.stage.into_iter().enumerate() {
                 for instance in instances(stage)? {
                     let at = |e: SpecError| SpecError::new(format!("stage[{i}]"), e.to_string());
-                    stages.push(StageSpec::try_from(instance).map_err(at)?);
+                    for stage in sweep::trials(instance)? {
+                        stages.push(StageSpec::try_from(stage).map_err(at)?);
+                    }
                 }
                 if stages.len() > MAX_STAGES {
                     let what = format!("there are more than {MAX_STAGES}; make the matrix smaller");
@@ -296,6 +301,7 @@ impl StageText {
             ("export", "export", self.export.is_some()),
             ("train", "train", self.train.is_some()),
             ("evaluate", "evaluate", self.evaluate.is_some()),
+            ("promote", "promote", self.promote.is_some()),
         ];
         for (field, of, given) in given {
             if given && of != like && of != kind {
@@ -312,7 +318,7 @@ impl StageText {
         }
         let reads = matches!(
             like,
-            "reprocess" | "split" | "export" | "train" | "evaluate"
+            "reprocess" | "split" | "export" | "train" | "evaluate" | "promote"
         );
         if !reads && (self.source.is_some() || self.count.is_some()) {
             let what = format!("is not for kind = {kind:?}, which reads no data set; remove it");
@@ -369,12 +375,17 @@ impl StageText {
                 count,
                 evaluate: self.evaluate.ok_or_else(|| missing("evaluate"))?,
             }),
+            "promote" => TaskSpec::Promote(PromoteTask {
+                source: source?,
+                count,
+                promote: self.promote.ok_or_else(|| missing("promote"))?,
+            }),
             other => {
                 return Err(SpecError::new(
                     "kind",
                     format!(
                         "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\", \
-                         \"train\", \"evaluate\""
+                         \"train\", \"evaluate\", \"promote\""
                     ),
                 ));
             }

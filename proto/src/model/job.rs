@@ -321,7 +321,8 @@ impl StageSpec {
             TaskSpec::Split(_)
             | TaskSpec::Export(_)
             | TaskSpec::Train(_)
-            | TaskSpec::Evaluate(_) => 1,
+            | TaskSpec::Evaluate(_)
+            | TaskSpec::Promote(_) => 1,
         }
     }
 
@@ -356,6 +357,7 @@ impl StageSpec {
             TaskSpec::Reprocess(task) => task.check(),
             TaskSpec::Train(task) => task.check(),
             TaskSpec::Evaluate(task) => task.check(),
+            TaskSpec::Promote(task) => task.check(),
             TaskSpec::Split(task) => {
                 check_source(&task.source)?;
                 check_count("count", task.count)?;
@@ -466,7 +468,10 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.check_places(),
             TaskSpec::Import(task) => task.check_places(),
             TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
-            TaskSpec::Split(_) | TaskSpec::Train(_) | TaskSpec::Evaluate(_) => Ok(()),
+            TaskSpec::Split(_)
+            | TaskSpec::Train(_)
+            | TaskSpec::Evaluate(_)
+            | TaskSpec::Promote(_) => Ok(()),
             TaskSpec::Export(task) => place("export.dest", &task.export.dest),
         }
     }

@@ -14,6 +14,7 @@ pub mod reprocess;
 mod scale;
 pub mod sensor;
 pub mod status;
+pub mod sweep;
 pub mod task;
 mod text;
 pub mod train;
@@ -37,6 +38,7 @@ pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,
 };
+pub use sweep::{Halving, PromoteSettings, PromoteTask, Trial};
 pub use task::{ExportSettings, ExportTask, SplitTask, TaskSpec};
 pub use text::parse_share;
 pub use train::{TrainSettings, TrainTask};

@@ -37,16 +37,14 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
             }
         }
         TaskSpec::Evaluate(task) => {
-            let mut models: Vec<String> = Vec::new();
-            for name in &task.evaluate.models {
-                let found = named(name, before, &source.store)
-                    .map_err(|e| SpecError::new(at("evaluate.models"), e))?;
-                match found.is_empty() {
-                    true => models.push(name.clone()),
-                    false => models.extend(found.into_iter().map(|(_, model)| model)),
-                }
-            }
-            task.evaluate.models = models;
+            let models = &mut task.evaluate.models;
+            all(models, before, &source.store)
+                .map_err(|e| SpecError::new(at("evaluate.models"), e))?;
+        }
+        TaskSpec::Promote(task) => {
+            let models = &mut task.promote.among;
+            all(models, before, &source.store)
+                .map_err(|e| SpecError::new(at("promote.among"), e))?;
         }
         _ => return Ok(()),
     }
@@ -64,6 +62,20 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
             stage.needs.push(name);
         }
     }
+    Ok(())
+}
+
+/// Puts all models that each name stands for in its place.
+fn all(names: &mut Vec<String>, before: &[StageSpec], store: &str) -> Result<(), String> {
+    let mut models = Vec::with_capacity(names.len());
+    for name in names.drain(..) {
+        let found = named(&name, before, store)?;
+        match found.is_empty() {
+            true => models.push(name),
+            false => models.extend(found.into_iter().map(|(_, model)| model)),
+        }
+    }
+    *names = models;
     Ok(())
 }
 

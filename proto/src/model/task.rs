@@ -8,6 +8,7 @@ use super::{
     import::ImportTask,
     render::{PartTask, RenderTask},
     reprocess::{ReprocessTask, SourceSettings},
+    sweep::PromoteTask,
     train::TrainTask,
 };
 use crate::split::SplitSettings;
@@ -35,6 +36,8 @@ pub enum TaskSpec {
     Train(TrainTask),
     /// Models meet scenes that they have not seen: one task.
     Evaluate(EvaluateTask),
+    /// The best of several models gets a name: one task.
+    Promote(PromoteTask),
 }
 
 /// Dividing a data set.
@@ -86,6 +89,7 @@ impl TaskSpec {
             Self::Export(_) => "export",
             Self::Train(_) => "train",
             Self::Evaluate(_) => "evaluate",
+            Self::Promote(_) => "promote",
         }
     }
 
@@ -101,6 +105,7 @@ impl TaskSpec {
             Self::Export(_) => EXPORT_VERSION,
             Self::Train(task) => &task.train.version,
             Self::Evaluate(task) => &task.evaluate.version,
+            Self::Promote(task) => &task.promote.version,
         }
     }
 
@@ -113,6 +118,7 @@ impl TaskSpec {
             Self::Export(task) => Some(&task.source),
             Self::Train(task) => Some(&task.source),
             Self::Evaluate(task) => Some(&task.source),
+            Self::Promote(task) => Some(&task.source),
         }
     }
 
@@ -127,14 +133,16 @@ impl TaskSpec {
             | Self::Split(_)
             | Self::Export(_)
             | Self::Train(_)
-            | Self::Evaluate(_) => None,
+            | Self::Evaluate(_)
+            | Self::Promote(_) => None,
         }
     }
 
-    /// The model that is trained: store and name.
+    /// The model that is made: store and name.
     pub fn trains(&self) -> Option<(&String, &String)> {
         match self {
             Self::Train(task) => Some((&task.source.store, &task.train.model)),
+            Self::Promote(task) => Some((&task.source.store, &task.promote.model)),
             _ => None,
         }
     }
@@ -146,6 +154,10 @@ impl TaskSpec {
             Self::Evaluate(task) => {
                 let models = task.evaluate.models.iter();
                 models.map(|m| ("evaluate.models", m)).collect()
+            }
+            Self::Promote(task) => {
+                let models = task.promote.among.iter();
+                models.map(|m| ("promote.among", m)).collect()
             }
             _ => Vec::new(),
         }
@@ -184,6 +196,7 @@ impl TaskSpec {
             Self::Export(task) => Some((&mut task.source, &mut task.count)),
             Self::Train(task) => Some((&mut task.source, &mut task.count)),
             Self::Evaluate(task) => Some((&mut task.source, &mut task.count)),
+            Self::Promote(task) => Some((&mut task.source, &mut task.count)),
         }
     }
 }

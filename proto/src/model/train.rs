@@ -3,7 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::reprocess::{Histogram, SourceSettings};
+use super::{
+    reprocess::{Histogram, SourceSettings},
+    sweep::Trial,
+};
 
 mod check;
 
@@ -69,6 +72,9 @@ pub struct TrainSettings {
     /// Minutes between checkpoints: as much is lost at most when a worker dies. Changes no result.
     #[serde(default = "ten")]
     pub checkpoint_minutes: f64,
+    /// What makes it a trial of a sweep; written by `[stage.sweep]`, not by hand.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trial: Option<Trial>,
     /// Version of networks and training, part of every task key; filled in at submission where left out.
     #[serde(default)]
     pub version: String,
@@ -305,12 +311,14 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 impl TrainSettings {
-    /// What of them decides the bytes of the model: all but its name and how often it is saved on the way.
+    /// What of them decides the bytes of the model: all but its name, how often it is saved on the way, and whether it is
+    /// one of a sweep.
     pub fn shaping(&self) -> serde_json::Value {
         let mut settings = serde_json::to_value(self).expect("settings are plain data");
         let table = settings.as_object_mut().expect("settings are a table");
         table.remove("model");
         table.remove("checkpoint_minutes");
+        table.remove("trial");
         settings
     }
 

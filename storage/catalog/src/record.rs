@@ -138,6 +138,10 @@ impl ResultSet {
                 task.source.store.clone(),
                 format!("{MODELS}/{}", task.train.model),
             ),
+            TaskSpec::Promote(task) => (
+                task.source.store.clone(),
+                format!("{MODELS}/{}", task.promote.model),
+            ),
             TaskSpec::Evaluate(task) => (
                 task.source.store.clone(),
                 format!("{}/evaluate", task.source.dataset),

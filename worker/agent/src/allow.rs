@@ -66,7 +66,8 @@ impl StorePrefixes {
             TaskSpec::Reprocess(_)
             | TaskSpec::Split(_)
             | TaskSpec::Train(_)
-            | TaskSpec::Evaluate(_) => Ok(()),
+            | TaskSpec::Evaluate(_)
+            | TaskSpec::Promote(_) => Ok(()),
         }
     }
 

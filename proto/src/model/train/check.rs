@@ -58,6 +58,9 @@ impl TrainSettings {
             let what = "is empty; give \"truth\" or a trained ToF model".into();
             return fail("shadow.tof", what);
         }
+        if let Some(trial) = &self.trial {
+            trial.check()?;
+        }
         self.input.check()?;
         self.net.check()?;
         self.optimise.check()?;

@@ -1,0 +1,258 @@
+//! Sweeps in job files: what they stand for, what is drawn, when trials are asked, and what is refused.
+
+use picofarm_proto::{
+    key::stage_key,
+    model::{Halving, JobSpec, StageSpec, TaskSpec, TrainSettings, Trial},
+    wire,
+};
+use proptest::prelude::*;
+
+const DATA: &str = "[[stage]]\nscenes = { kind = \"primitive\", count = 9 }\n\
+                    output = { store = \"/s\", dataset = \"rooms\" }\n\
+                    [[stage]]\nkind = \"split\"\nsource = \"render\"\nsplit = { fractions = [0.5, 0.3, 0.2] }\n";
+
+fn job(sweep: &str, train: &str, rest: &str) -> Result<JobSpec, toml::de::Error> {
+    toml::from_str(&format!(
+        "name = \"n\"\n{DATA}[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\nsweep = {{ {sweep} }}\n\
+         train = {{ task = \"tof\", {train} }}\n{rest}"
+    ))
+}
+
+const TRAIN: &str = "model = \"depth\", net = { width = \"{width}\", levels = 3 }, optimise = { rate = \"{lr}\", epochs = 27 }";
+
+fn good(sweep: &str) -> JobSpec {
+    let spec = job(sweep, TRAIN, "").unwrap();
+    spec.check().unwrap();
+    spec.check_places().unwrap();
+    spec
+}
+
+fn refused(sweep: &str, train: &str) -> String {
+    match job(sweep, train, "") {
+        Err(error) => error.to_string(),
+        Ok(spec) => spec.check().unwrap_err().to_string(),
+    }
+}
+
+fn settings(stage: &StageSpec) -> &TrainSettings {
+    match &stage.task {
+        TaskSpec::Train(task) => &task.train,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn trial(stage: &StageSpec) -> &Trial {
+    settings(stage).trial.as_ref().unwrap()
+}
+
+fn trials(spec: &JobSpec) -> Vec<&StageSpec> {
+    let trains = |s: &&StageSpec| matches!(s.task, TaskSpec::Train(_));
+    spec.stages.iter().filter(trains).collect()
+}
+
+#[test]
+fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
+    let sweep = "over = { lr = [0.01, 0.001], width = [8, 16, 32] }, halving = { first = 3 }";
+    let evaluate =
+        "[[stage]]\nkind = \"evaluate\"\nsource = \"render\"\nevaluate = { models = [\"tof\"] }\n";
+    let spec = job(sweep, TRAIN, evaluate).unwrap();
+    spec.check().unwrap();
+    let names: Vec<&str> = spec.stages.iter().map(|s| &*s.name).collect();
+    assert_eq!(
+        names,
+        [
+            "render", "split", "tof.0", "tof.1", "tof.2", "tof.3", "tof.4", "tof.5", "tof",
+            "evaluate"
+        ]
+    );
+    let fourth = settings(&spec.stages[6]);
+    assert_eq!(
+        (&*fourth.model, fourth.optimise.rate, fourth.net.width),
+        ("depth.4", 0.001, 16)
+    );
+    let of = trial(&spec.stages[6]);
+    assert_eq!((&*of.sweep, of.index), ("depth", 4));
+    assert_eq!(
+        serde_json::to_string(&of.values).unwrap(),
+        r#"{"lr":0.001,"width":16}"#
+    );
+    assert_eq!(of.halving.unwrap().factor, 3);
+    let TaskSpec::Promote(best) = &spec.stages[8].task else {
+        panic!("{:?}", spec.stages[8]);
+    };
+    assert_eq!(best.promote.model, "depth");
+    assert_eq!(best.promote.among.len(), 6);
+    assert_eq!(
+        spec.stages[8].needs,
+        [
+            "render", "tof.0", "tof.1", "tof.2", "tof.3", "tof.4", "tof.5"
+        ]
+    );
+    // The best of them is what a stage after them means.
+    assert_eq!(spec.stages[9].needs, ["render", "split", "tof"]);
+    let TaskSpec::Evaluate(evaluate) = &spec.stages[9].task else {
+        panic!("{:?}", spec.stages[9]);
+    };
+    assert_eq!(evaluate.evaluate.models, ["depth"]);
+    // On the wire and in the catalog it means the same.
+    let again = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
+    assert_eq!(again, spec);
+}
+
+#[test]
+fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
+    let over = "over = { lr = { log = [1e-4, 1e-1] }, width = { int = [4, 7] }, decay = { range = [0, 0.5] }, p = [\"f32\"] }";
+    let train = "model = \"d\", net = { width = \"{width}\", levels = 3 }, \
+                 optimise = { rate = \"{lr}\", weight_decay = \"{decay}\", precision = \"{p}\" }";
+    let few = job(&format!("trials = 20, seed = 4, {over}"), train, "").unwrap();
+    let many = job(&format!("trials = 60, seed = 4, {over}"), train, "").unwrap();
+    few.check().unwrap();
+    let of = |spec: &JobSpec| -> Vec<TrainSettings> {
+        trials(spec).iter().map(|s| settings(s).clone()).collect()
+    };
+    assert_eq!(of(&few)[..], of(&many)[..20]);
+    let keys = |spec: &JobSpec| -> Vec<_> { trials(spec).iter().map(|s| stage_key(s)).collect() };
+    assert_eq!(keys(&few)[..], keys(&many)[..20]);
+    let (mut low, mut widths) = (0, std::collections::BTreeSet::new());
+    for settings in of(&many) {
+        let o = &settings.optimise;
+        assert!((1e-4..=1e-1).contains(&o.rate) && (0.0..=0.5).contains(&o.weight_decay));
+        assert!((4..=7).contains(&settings.net.width));
+        low += usize::from(o.rate < 10f64.powf(-2.5));
+        widths.insert(settings.net.width);
+    }
+    // Half of all draws lie in the lower half of the orders of magnitude.
+    assert!((15..=45).contains(&low), "{low}");
+    assert_eq!(widths.len(), 4);
+    let other = job(&format!("trials = 20, seed = 5, {over}"), train, "").unwrap();
+    assert_ne!(
+        trial(trials(&other)[0]).values,
+        trial(trials(&few)[0]).values
+    );
+    // The same on every machine.
+    let first: Vec<String> = of(&few)[..3]
+        .iter()
+        .map(|s| {
+            format!(
+                "{} {} {}",
+                s.optimise.rate, s.net.width, s.optimise.weight_decay
+            )
+        })
+        .collect();
+    insta::assert_debug_snapshot!(first);
+}
+
+#[test]
+fn what_a_trial_computes_does_not_depend_on_the_sweep_but_its_task_does() {
+    let spec = good("over = { lr = [0.01], width = [8] }, halving = { first = 3 }");
+    let stage = trials(&spec)[0];
+    let mut plain = stage.clone();
+    let TaskSpec::Train(task) = &mut plain.task else {
+        panic!()
+    };
+    task.train.trial = None;
+    assert_eq!(settings(stage).shaping(), task.train.shaping());
+    assert_ne!(stage_key(stage), stage_key(&plain));
+    // Resources do not set sweeps apart, ranges do.
+    let id = |sweep: &str| trial(trials(&good(sweep))[0]).id.clone();
+    assert_ne!(
+        id("over = { lr = [0.01], width = [8] }"),
+        id("over = { lr = [0.02], width = [8] }")
+    );
+}
+
+#[test]
+fn a_matrix_goes_over_sweeps_and_each_has_its_best() {
+    let spec: JobSpec = toml::from_str(&format!(
+        "name = \"n\"\n{DATA}[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\nmatrix = {{ seed = [1, 2] }}\n\
+         sweep = {{ over = {{ lr = [0.1, 0.2] }} }}\n\
+         train = {{ task = \"tof\", model = \"d-{{seed}}\", seed = \"{{seed}}\", optimise = {{ rate = \"{{lr}}\" }} }}\n"
+    ))
+    .unwrap();
+    spec.check().unwrap();
+    let names: Vec<&str> = spec.stages[2..].iter().map(|s| &*s.name).collect();
+    assert_eq!(
+        names,
+        [
+            "tof[1].0", "tof[1].1", "tof[1]", "tof[2].0", "tof[2].1", "tof[2]"
+        ]
+    );
+}
+
+#[test]
+fn a_sweep_that_cannot_be_says_why() {
+    let over = "lr = [0.1], width = [8]";
+    for (sweep, train, said) in [
+        ("over = {}", TRAIN, "stage.sweep.over: names no parameter"),
+        (
+            "over = { lr = [], width = [8] }",
+            TRAIN,
+            "stage.sweep.over.lr: lists no value",
+        ),
+        (
+            "over = { lr = { log = [0, 1] }, width = [8] }",
+            TRAIN,
+            "stage.sweep.over.lr: 0 must lie above 0 and below 1",
+        ),
+        (
+            "over = { lr = { log = [0.1, 1] }, width = [8] }",
+            TRAIN,
+            "stage.sweep.over.lr: is an interval: say how many trials",
+        ),
+        (
+            "over = { lr = { lin = [0.1, 1] }, width = [8] }",
+            TRAIN,
+            "stage.sweep: ",
+        ),
+        (
+            &format!("over = {{ {over}, depth = [3] }}"),
+            TRAIN,
+            "stage.sweep.over.depth: nothing in the stage says \"{depth}\"",
+        ),
+        (
+            &format!("over = {{ {over} }}, halving = {{ first = 0 }}"),
+            TRAIN,
+            "stage.sweep.halving.first: must be at least 1 epoch",
+        ),
+        (
+            &format!("over = {{ {over} }}, halving = {{ first = 1, factor = 1 }}"),
+            TRAIN,
+            "stage.sweep.halving.factor: must be at least 2",
+        ),
+        (
+            &format!("trials = 1000, over = {{ {over} }}"),
+            TRAIN,
+            "stage.sweep.trials: 1000 are more than 999",
+        ),
+        (
+            &format!("over = {{ {over} }}"),
+            "net = { width = 8 }",
+            "stage.train.model: is missing",
+        ),
+    ] {
+        let error = refused(sweep, train);
+        assert!(error.contains(said), "{sweep}: {error}");
+    }
+    let render = "name = \"n\"\n[[stage]]\nsweep = { over = { n = [1] } }\nscenes = { kind = \"primitive\", count = \"{n}\" }\n\
+                  output = { store = \"/s\", dataset = \"rooms\" }\n";
+    let error = toml::from_str::<JobSpec>(render).unwrap_err().to_string();
+    assert!(
+        error.contains("stage.sweep: belongs to kind = \"train\""),
+        "{error}"
+    );
+}
+
+proptest! {
+    #[test]
+    fn rungs_lie_at_powers_of_the_factor_before_the_end(first in 1u32..6, factor in 2u32..5, of in 1u64..200) {
+        let halving = Halving { first, factor };
+        let mut rungs = Vec::new();
+        let mut rung = u64::from(first);
+        while rung < of {
+            rungs.push(rung);
+            rung *= u64::from(factor);
+        }
+        let found: Vec<u64> = (0..=of + 1).filter(|e| halving.is_rung(*e, of)).collect();
+        prop_assert_eq!(found, rungs);
+    }
+}
