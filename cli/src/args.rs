@@ -7,6 +7,7 @@ mod job;
 mod model;
 mod network;
 mod render;
+mod sweep;
 
 use std::{net::SocketAddr, path::PathBuf};
 
@@ -22,6 +23,7 @@ pub use job::{Job, JobKind};
 pub use model::Model;
 pub use network::{BenchModel, Kind, Learns};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
+pub use sweep::{Sweep, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -127,6 +129,9 @@ pub enum Command {
     /// Look at trained models, and take their weights out
     #[command(subcommand)]
     Model(Model),
+    /// Look at sweeps: how their trials fare, which is the best
+    #[command(subcommand)]
+    Sweep(Sweep),
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),

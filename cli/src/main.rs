@@ -24,6 +24,7 @@ mod scene;
 mod sense;
 mod settings;
 mod signals;
+mod sweep;
 mod tail;
 mod template;
 mod token;
@@ -99,6 +100,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         } => tail::events(follow, last, verbose, settings, output).await,
         Command::Dataset(command) => dataset::run(command, settings, output).await,
         Command::Model(command) => model::run(command, output).await,
+        Command::Sweep(command) => sweep::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
         Command::Assets(command) => assets::run(command, settings, output).await,

@@ -38,7 +38,7 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
     }
 }
 
-fn open(store: &str) -> Result<Models> {
+pub(crate) fn open(store: &str) -> Result<Models> {
     let (store, prefix) = open_store(store).map_err(failed)?;
     Ok(Models::new(store, &prefix))
 }

@@ -171,6 +171,9 @@ pub struct PromoteSettings {
     pub model: String,
     /// The models among which it is chosen, or stages that train them. Trials that stopped on their way are passed over.
     pub among: Vec<String>,
+    /// Models that were never made are passed over, too.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tolerate_missing: bool,
     /// Version of networks and training, part of every task key; filled in at submission where left out.
     #[serde(default)]
     pub version: String,
@@ -210,8 +213,10 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
         return Ok(vec![stage]);
     };
     let fail = |field: &str, what: String| Err(SpecError::new(format!("stage.{field}"), what));
+    // Where a store lies does not count, only what lies in it.
+    let source = stage.get("source").map(|s| s.get("dataset").unwrap_or(s));
     let described = json!([
-        stage["source"],
+        source,
         stage["train"],
         sweep["over"],
         sweep["seed"],
@@ -271,11 +276,15 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     }
     promote.insert("name".into(), json!(name));
     promote.insert("kind".into(), json!("promote"));
+    let tolerant = stage.get("tolerate_dead") == Some(&json!(true));
     let named = match sweep.promote.is_empty() {
         true => model,
         false => sweep.promote,
     };
-    promote.insert("promote".into(), json!({ "model": named, "among": models }));
+    promote.insert(
+        "promote".into(),
+        json!({ "model": named, "among": models, "tolerate_missing": tolerant }),
+    );
     stages.push(Value::Object(promote));
     Ok(stages)
 }
@@ -380,7 +389,7 @@ impl Values {
     /// every machine.
     fn at(&self, bits: u64) -> Value {
         let share = (bits >> 11) as f64 / (1u64 << 53) as f64;
-        let whole = |n: u64| (u128::from(bits) * u128::from(n) >> 64) as u64;
+        let whole = |n: u64| ((u128::from(bits) * u128::from(n)) >> 64) as u64;
         let four = |x: f64, [a, b]: [f64; 2]| {
             let rounded: f64 = format!("{x:.3e}").parse().expect("a number");
             json!(rounded.clamp(a, b))

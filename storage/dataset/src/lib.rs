@@ -53,7 +53,8 @@ pub use manifest::{
     ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
 };
 pub use models::{
-    Checkpoint, Evaluation, Lineage, MODELS, ModelManifest, Models, NewModel, Published, SplitUsed,
+    Checkpoint, Evaluation, Lineage, MODELS, ModelManifest, Models, NewModel, Promoted, Published,
+    Rung, SplitUsed, TrialEnd, TrialRecord,
 };
 pub use objects::publish_files;
 pub use parts::PartName;

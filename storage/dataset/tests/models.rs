@@ -22,6 +22,7 @@ fn local() -> (tempfile::TempDir, Models) {
 
 fn model(name: &str, key: &str, weights: &'static [u8]) -> NewModel {
     let lineage = Lineage {
+        promoted: None,
         dataset: "rooms".into(),
         seed: 7,
         ..Lineage::default()

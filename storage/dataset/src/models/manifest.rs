@@ -56,6 +56,25 @@ pub struct Lineage {
     pub seed: u64,
     /// Models that it builds on: name, and SHA-256 of the manifest.
     pub models: BTreeMap<String, String>,
+    /// Where it is another model's copy under a name of its own: how it was chosen.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub promoted: Option<Promoted>,
+}
+
+/// How a model was chosen among others.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Promoted {
+    /// The model.
+    pub model: String,
+    /// SHA-256 of its manifest, hexadecimal.
+    pub manifest_sha256: String,
+    /// Its values where it was a trial, by the parameters' names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub values: BTreeMap<String, Value>,
+    /// Models that came to their end, itself among them.
+    pub finished: u64,
+    /// Models that were begun.
+    pub begun: u64,
 }
 
 /// A split as it was used.

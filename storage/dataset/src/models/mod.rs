@@ -10,6 +10,7 @@ mod checkpoint;
 mod collect;
 mod evaluation;
 mod manifest;
+mod sweep;
 
 use std::sync::Arc;
 
@@ -24,7 +25,8 @@ use crate::objects;
 
 pub use checkpoint::Checkpoint;
 pub use evaluation::Evaluation;
-pub use manifest::{Lineage, ModelManifest, SplitUsed};
+pub use manifest::{Lineage, ModelManifest, Promoted, SplitUsed};
+pub use sweep::{Rung, TrialEnd, TrialRecord};
 
 /// The folder of models in a store; no data set has this name.
 pub const MODELS: &str = "models";

@@ -9,6 +9,7 @@ mod import;
 mod memory;
 mod output;
 mod parts;
+mod promote;
 mod recipe;
 mod render;
 pub mod repair;

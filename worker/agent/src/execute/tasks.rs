@@ -11,7 +11,7 @@ use tokio::runtime::Handle;
 
 use super::{
     Control, Executor, Output, Task, TaskError, evaluate, export, generate, import, output::Stores,
-    parts, render, reprocess, scenes, split, train,
+    parts, promote, render, reprocess, scenes, split, train,
 };
 
 /// How long a finished scene waits for a store that is full or away before its task is handed back.
@@ -48,6 +48,7 @@ impl Executor for TaskExecutor {
             ("export", EXPORT_VERSION.to_owned()),
             ("train", train::model_version()),
             ("evaluate", train::model_version()),
+            ("promote", train::model_version()),
         ]
         .map(|(kind, version)| (kind.to_owned(), version))
         .into()
@@ -76,6 +77,7 @@ impl Executor for TaskExecutor {
             TaskSpec::Export(spec) => export::run(stores, spec, control),
             TaskSpec::Train(spec) => train::run(stores, spec, task.spec.force, control),
             TaskSpec::Evaluate(spec) => evaluate::run(stores, spec, control),
+            TaskSpec::Promote(spec) => promote::run(stores, spec, control),
         }
     }
 }

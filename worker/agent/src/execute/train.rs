@@ -10,12 +10,13 @@ use std::{
 };
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel,
+    Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel, Published,
+    TrialEnd,
 };
 use picofarm_model::{
     ModelError,
     scene::Scenes,
-    train::{Ended, Line, Plan, Sources, Trained, Training},
+    train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
 use picofarm_proto::{
     key::training_key,
@@ -30,9 +31,11 @@ use tracing::{info, warn};
 mod along;
 mod known;
 mod plan;
+mod trial;
 
 use along::{Saver, Teller};
 pub(super) use known::Known;
+use trial::{Course, Left};
 
 use super::{
     Control, Output, TaskError,
@@ -57,37 +60,21 @@ pub(super) fn run(
     task.check().map_err(|e| TaskError::User(e.to_string()))?;
     check_version("train", &task.train.version)?;
     let lesson = Lesson::of(stores, task, control)?;
-    let (models, name, key) = (&lesson.models, &task.train.model, &lesson.key);
-    if !force && let Some(manifest) = finished(stores, models, name, key, control)? {
-        // Whoever published it may have died before this.
-        stores.wait(control, models.delete_checkpoints(name, key))?;
-        return Ok(output(&manifest, true));
-    }
-    let plan = lesson.plan(control)?;
-    let asked = known::asked(&plan, &lesson.spec);
-    let trained = lesson.train(plan, stores, control)?;
-    let metrics = metrics(&trained);
-    let new = NewModel {
-        manifest: ModelManifest {
-            name: name.clone(),
-            kind: task.train.task.name().to_owned(),
-            training_key: key.clone(),
-            settings: task.train.shaping(),
-            plan: asked,
-            lineage: lesson.lineage.clone(),
-            metrics: metrics.clone(),
-            ..ModelManifest::default()
-        },
-        objects: vec![
-            (WEIGHTS.into(), trained.weights.into()),
-            ("history.jsonl".into(), lines(&trained.history).into()),
-            ("metrics.json".into(), pretty(&metrics).into()),
-        ],
+    let Some(trial) = &task.train.trial else {
+        let published = match lesson.learn(stores, force, None, control)? {
+            Ok(published) => published,
+            Err(_) => unreachable!("only trials are left before their end"),
+        };
+        return Ok(output(&published.manifest, published.adopted));
     };
-    let published = stores.patiently(control, async || models.publish(new.clone(), force).await)?;
-    stores.wait(control, models.delete_checkpoints(name, key))?;
-    control.at(1.0);
-    Ok(output(&published.manifest, published.adopted))
+    let mut course = Course::of(stores, &lesson, trial)?;
+    if let Some(ended) = course.ended(force, control)? {
+        return Ok(trial::adopted(&ended));
+    }
+    match lesson.learn(stores, force, Some(&course), control)? {
+        Ok(published) => course.finished(&published.manifest, published.adopted, control),
+        Err(left) => course.left(left, control),
+    }
 }
 
 /// Everything that a training is made of.
@@ -143,6 +130,7 @@ impl<'a> Lesson<'a> {
             models: manifests
                 .map(|(_, m)| (m.name.clone(), m.sha256()))
                 .collect(),
+            promoted: None,
         };
         let histogram = (settings.histogram, &*settings.spots);
         let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
@@ -172,7 +160,74 @@ impl<'a> Lesson<'a> {
         Ok(plan)
     }
 
-    fn train(&self, plan: Plan, stores: &Stores, control: &Control) -> Result<Trained, TaskError> {
+    fn settings(&self) -> &TrainSettings {
+        &self.task.train
+    }
+
+    fn split(&self) -> &str {
+        &self.task.train.split
+    }
+
+    fn validation_is_empty(&self) -> bool {
+        self.validation.is_empty()
+    }
+
+    /// Adopts the model that this very training has published before, or trains and publishes.
+    fn learn(
+        &self,
+        stores: &Stores,
+        force: bool,
+        course: Option<&Course<'_>>,
+        control: &Control,
+    ) -> Result<Result<Published, Left>, TaskError> {
+        let (models, name, key) = (&self.models, &self.task.train.model, &self.key);
+        if !force && let Some(manifest) = finished(stores, models, name, key, control)? {
+            // Whoever published it may have died before this.
+            stores.wait(control, models.delete_checkpoints(name, key))?;
+            return Ok(Ok(Published {
+                manifest,
+                adopted: true,
+            }));
+        }
+        let plan = self.plan(control)?;
+        let asked = known::asked(&plan, &self.spec);
+        let trained = match self.train(plan, stores, course, control)? {
+            Ok(trained) => trained,
+            Err(left) => return Ok(Err(left)),
+        };
+        let metrics = metrics(&trained);
+        let new = NewModel {
+            manifest: ModelManifest {
+                name: name.clone(),
+                kind: self.task.train.task.name().to_owned(),
+                training_key: key.clone(),
+                settings: self.task.train.shaping(),
+                plan: asked,
+                lineage: self.lineage.clone(),
+                metrics: metrics.clone(),
+                ..ModelManifest::default()
+            },
+            objects: vec![
+                (WEIGHTS.into(), trained.weights.into()),
+                (trial::HISTORY.into(), lines(&trained.history).into()),
+                ("metrics.json".into(), pretty(&metrics).into()),
+            ],
+        };
+        let published =
+            stores.patiently(control, async || models.publish(new.clone(), force).await)?;
+        stores.wait(control, models.delete_checkpoints(name, key))?;
+        control.at(1.0);
+        Ok(Ok(published))
+    }
+
+    /// Trains; a trial may be left before its end.
+    fn train(
+        &self,
+        plan: Plan,
+        stores: &Stores,
+        course: Option<&Course<'_>>,
+        control: &Control,
+    ) -> Result<Result<Trained, Left>, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
         let device = picofarm_model::cpu();
         let guide = self.built.get("train.shadow.tof");
@@ -196,27 +251,59 @@ impl<'a> Lesson<'a> {
         let mut saver = Saver::new(stores, &self.models, name, key);
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
         let mut saved = Instant::now();
-        let mut teller = Teller::new(control, self.task.train.optimise.epochs);
-        let ended = training.run(&mut |training, event| {
-            teller.hear(event);
-            if control.stopped() {
-                return picofarm_model::train::Control::Stop;
-            }
-            if saved.elapsed() >= every {
-                saver.save(training.learner().steps(), training.checkpoint().into());
-                saved = Instant::now();
-            }
-            picofarm_model::train::Control::Continue
-        });
-        match ended.map_err(of_model)? {
-            Ended::Finished => {
+        let epochs = self.task.train.optimise.epochs;
+        let mut teller = Teller::new(control, epochs);
+        // What the trial is told at its latest rung.
+        let mut told = Ok(true);
+        let mut ask = |line: &Line| {
+            told = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));
+            matches!(told, Ok(true))
+        };
+        // It may have been stopped right at a rung.
+        let position = training.position();
+        let at_rung = position.history.last().filter(|_| position.batches == 0);
+        let ended = match at_rung.copied().is_none_or(|line| ask(&line)) {
+            false => Ok(Ended::Stopped),
+            true => training.run(&mut |training, event| {
+                teller.hear(event);
+                if let Event::Epoch(line) = event
+                    && !ask(line)
+                {
+                    return picofarm_model::train::Control::Stop;
+                }
+                if control.stopped() {
+                    return picofarm_model::train::Control::Stop;
+                }
+                if saved.elapsed() >= every {
+                    saver.save(training.learner().steps(), training.checkpoint().into());
+                    saved = Instant::now();
+                }
+                picofarm_model::train::Control::Continue
+            }),
+        };
+        let left = |training: &Training, end| Left {
+            end,
+            history: training.position().history.clone(),
+        };
+        match ended {
+            Err(error @ ModelError::NotFinite { .. }) if course.is_some() => {
                 saver.last();
-                Ok(training.finish())
+                Ok(Err(left(&training, TrialEnd::Diverged(error.to_string()))))
             }
-            Ended::Stopped => {
+            Err(error) => Err(of_model(error)),
+            Ok(Ended::Finished) => {
+                saver.last();
+                Ok(Ok(training.finish()))
+            }
+            Ok(Ended::Stopped) if matches!(told, Ok(false)) => {
+                saver.last();
+                Ok(Err(left(&training, TrialEnd::Pruned)))
+            }
+            Ok(Ended::Stopped) => {
                 saver.save(training.learner().steps(), training.checkpoint().into());
                 saver.last();
-                Err(TaskError::Stopped)
+                // Where the store was away at a rung, the trial goes on from there.
+                told.and(Err(TaskError::Stopped))
             }
         }
     }
@@ -239,6 +326,14 @@ fn metrics(trained: &Trained) -> Value {
 fn lines(history: &[Line]) -> Vec<u8> {
     let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
     history.iter().map(line).collect::<String>().into_bytes()
+}
+
+/// The epochs of `history.jsonl`.
+pub(super) fn lines_of(history: &[u8]) -> Result<Vec<Line>, String> {
+    let text = String::from_utf8_lossy(history);
+    let lines = text.lines().map(serde_json::from_str);
+    let lines: Result<_, _> = lines.collect();
+    lines.map_err(|e| format!("history.jsonl: {e}"))
 }
 
 /// The model if this very training has published it.

@@ -20,6 +20,7 @@ mod tests;
 mod text;
 mod ticks;
 mod trade;
+pub mod trials;
 
 use serde::{Deserialize, Serialize};
 

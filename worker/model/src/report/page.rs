@@ -3,7 +3,7 @@
 use super::{Report, curves, made, maps, summary::summary, table, text::Safe, trade};
 
 /// How it looks: light and dark, on screen and on paper.
-const STYLE: &str = include_str!("page.css");
+pub(super) const STYLE: &str = include_str!("page.css");
 
 /// The report as one HTML page that needs nothing beside it: no script, no other file, no network.
 pub fn html(report: &Report) -> String {

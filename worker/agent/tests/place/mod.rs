@@ -1,0 +1,269 @@
+//! A store with a small data set to learn from, made up and not rendered; and a worker for one task.
+#![allow(dead_code, reason = "each test binary uses its own part")]
+
+use std::{collections::BTreeMap, path::PathBuf, sync::Arc, time::Duration};
+
+use picofarm_agent::{
+    Control, Executor, Output, Task, TaskError, TaskExecutor, model_version, split::Splitter,
+};
+use picofarm_dataset::*;
+use picofarm_proto::{
+    ids::JobId,
+    key::{TaskKey, stage_key},
+    model::{
+        EvaluateSettings, EvaluateTask, SourceSettings, StageSpec, TaskSpec, TrainSettings,
+        TrainTask,
+    },
+    split::{Parts, SplitSettings},
+};
+use serde_json::json;
+use tempfile::TempDir;
+use tokio::runtime::Handle;
+use uuid::Uuid;
+
+pub const SIDE: u32 = 8;
+pub const BINS: u32 = 8;
+pub const SCENES: u64 = 8;
+
+/// Files by their path.
+pub type Files = BTreeMap<PathBuf, Vec<u8>>;
+
+/// A store with a small data set, split.
+pub struct Place {
+    pub dir: TempDir,
+}
+
+impl Place {
+    pub async fn new() -> Self {
+        let place = Self {
+            dir: tempfile::tempdir().unwrap(),
+        };
+        for scene in 0..SCENES {
+            place.publish(scene).await;
+        }
+        place.split("default", Parts::Counts([5, 2, 1])).await;
+        place
+    }
+
+    pub fn store(&self) -> String {
+        self.dir.path().to_str().unwrap().to_owned()
+    }
+
+    pub async fn publish(&self, scene: u64) {
+        let spec = DatasetSpec {
+            scenes: SCENES,
+            height: SIDE,
+            width: SIDE,
+            spots: 2,
+            subsets: Subsets::NONE,
+            per_spot: true,
+            gate: Gate {
+                start_m: 1.0,
+                bin_width_m: 1.5,
+                bins: BINS,
+            },
+            profile: Profile::LOSSLESS,
+        };
+        let pixels = (SIDE * SIDE) as usize;
+        let depth: Vec<f32> = (0..pixels)
+            .map(|p| 1.0 + ((p as u64 * 7 + scene * 3) % 5) as f32 * 0.5)
+            .collect();
+        // The nearer, the earlier.
+        let light = |spot: usize| -> Vec<f32> {
+            let mut h = vec![0.01; pixels * BINS as usize];
+            for (p, z) in depth.iter().enumerate() {
+                h[p * BINS as usize + (*z * 2.0) as usize] = (1 + spot) as f32 / z;
+            }
+            h
+        };
+        let each = [light(0), light(1)];
+        let transient: Vec<f32> = each[0].iter().zip(&each[1]).map(|(a, b)| a + b).collect();
+        let spots: Vec<_> = (0..2)
+            .map(|s| {
+                Some(Spot {
+                    position: [s as f32 - 0.5, 0.0, 3.0],
+                    normal: [0.0, 0.0, -1.0],
+                    path_m: (0.25f32 + 9.0).sqrt(),
+                })
+            })
+            .collect();
+        let record = SceneRecord {
+            transient: &transient,
+            subsets: &[SubsetRecord {
+                quantity: Quantity::TransientSpots,
+                planes: each.iter().map(Vec::as_slice).collect(),
+            }],
+            depth: &depth,
+            range: &depth,
+            normal: &vec![0.5; pixels * 3],
+            instance: &vec![1; pixels],
+            label: &vec![1; pixels],
+            specular: &(0..pixels)
+                .map(|p| u8::from(p % 5 == 0))
+                .collect::<Vec<_>>(),
+            visibility: &(0..pixels * 2)
+                .map(|i| u8::from(i % 3 > 0))
+                .collect::<Vec<_>>(),
+            rgb: &vec![0.25; pixels * 3],
+            spots: &spots,
+            intrinsics: Intrinsics {
+                fx: 4.0,
+                fy: 4.0,
+                cx: 4.0,
+                cy: 4.0,
+            },
+            camera: [[1.0; 4]; 4],
+            laser: [0.0; 3],
+            scale: 400.0,
+        };
+        let provenance = Provenance {
+            task_key: TaskKey([scene as u8 + 1; 32]).to_string(),
+            renderer: "transient-1".into(),
+            seed: 7,
+            plan: json!({}),
+        };
+        let (store, prefix) = open_store(&self.store()).unwrap();
+        let dataset = Dataset::create_or_open(store, prefix.join("rooms"), &spec)
+            .await
+            .unwrap();
+        dataset.publish(scene, &record, &provenance).await.unwrap();
+    }
+
+    pub async fn split(&self, name: &str, parts: Parts) {
+        let (store, name) = (self.store(), name.to_owned());
+        let splitter = Splitter::new(Handle::current());
+        let run = move || {
+            let settings = SplitSettings {
+                name,
+                seed: 3,
+                parts,
+            };
+            splitter.run(&settings, &store, "rooms", &Control::default())
+        };
+        tokio::task::spawn_blocking(run).await.unwrap().unwrap();
+    }
+
+    pub fn models(&self) -> Models {
+        let (store, prefix) = open_store(&self.store()).unwrap();
+        Models::new(store, &prefix)
+    }
+
+    pub fn source(&self) -> SourceSettings {
+        SourceSettings {
+            store: self.store(),
+            dataset: "rooms".into(),
+        }
+    }
+
+    pub fn training(&self, more: serde_json::Value) -> StageSpec {
+        let mut settings = json!({
+            "task": "tof", "model": "m", "version": model_version(), "seed": 5,
+            "net": {"width": 2, "levels": 2}, "optimise": {"epochs": 40, "batch": 2},
+            // A checkpoint each 600 ms.
+            "checkpoint_minutes": 0.01,
+        });
+        for (name, value) in more.as_object().unwrap() {
+            settings[name] = value.clone();
+        }
+        let train: TrainSettings = serde_json::from_value(settings).unwrap();
+        StageSpec::new(TaskSpec::Train(TrainTask {
+            source: self.source(),
+            count: SCENES,
+            train,
+        }))
+    }
+
+    pub fn evaluation(&self, more: serde_json::Value) -> StageSpec {
+        let mut settings = json!({"models": ["m"], "version": model_version()});
+        for (name, value) in more.as_object().unwrap() {
+            settings[name] = value.clone();
+        }
+        let evaluate: EvaluateSettings = serde_json::from_value(settings).unwrap();
+        StageSpec::new(TaskSpec::Evaluate(EvaluateTask {
+            source: self.source(),
+            count: SCENES,
+            evaluate,
+        }))
+    }
+
+    pub fn files(&self, folder: &str) -> Files {
+        let root = self.dir.path().join(folder);
+        let (mut found, mut folders) = (BTreeMap::new(), vec![root.clone()]);
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).into_iter().flatten() {
+                let path = entry.unwrap().path();
+                match path.is_dir() {
+                    true => folders.push(path),
+                    false => {
+                        let bytes = std::fs::read(&path).unwrap();
+                        found.insert(path.strip_prefix(&root).unwrap().to_path_buf(), bytes);
+                    }
+                }
+            }
+        }
+        found
+    }
+}
+
+/// Fails for files that are not in both, or not equal; it does not print their bytes.
+pub fn assert_same(ours: &Files, theirs: &Files) {
+    let names = |files: &Files| files.keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(ours), names(theirs));
+    for (name, bytes) in ours {
+        let text =
+            |bytes: &[u8]| String::from_utf8_lossy(&bytes[..bytes.len().min(4000)]).into_owned();
+        assert!(
+            theirs[name] == *bytes,
+            "{}: {}\n{}",
+            name.display(),
+            text(bytes),
+            text(&theirs[name])
+        );
+    }
+}
+
+/// Runs a stage's only task on a worker of its own.
+pub async fn run_with(stage: StageSpec, control: Arc<Control>) -> Result<Output, TaskError> {
+    let task = Task {
+        job: JobId::from_uuid(Uuid::nil()),
+        stage: stage_key(&stage),
+        spec: Arc::new(stage),
+        index: 0,
+    };
+    let runtime = Handle::current();
+    let work = move || {
+        let executor = TaskExecutor::new(&[], runtime);
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(2)
+            .build()
+            .unwrap();
+        pool.install(|| executor.run(&task, &control))
+    };
+    tokio::task::spawn_blocking(work).await.unwrap()
+}
+
+pub async fn run(stage: StageSpec) -> Result<Output, TaskError> {
+    run_with(stage, Arc::default()).await
+}
+
+pub async fn refused(stage: StageSpec) -> String {
+    match run(stage).await {
+        Err(TaskError::User(text)) => text,
+        other => panic!("expected a user's error, found {other:?}"),
+    }
+}
+
+/// Runs it, and stops it when it has said that it is past `share`; `false` if it was done before that.
+pub async fn run_until(stage: StageSpec, share: f32) -> bool {
+    let control = Arc::new(Control::default());
+    let (watched, stage) = (control.clone(), tokio::spawn(run_with(stage, control)));
+    while !stage.is_finished() && watched.fraction() < share {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    watched.stop();
+    match stage.await.unwrap() {
+        Ok(_) => false,
+        Err(TaskError::Stopped) => true,
+        Err(other) => panic!("{other}"),
+    }
+}
