@@ -282,6 +282,7 @@ mod tests {
             JobKind::Files,
             JobKind::Graph,
             JobKind::Train,
+            JobKind::Sweep,
         ] {
             let path = written(dir.path(), &template(kind));
             let spec = read(&path, dir.path()).unwrap();
@@ -401,7 +402,8 @@ mod tests {
                 Just(JobKind::Primitive),
                 Just(JobKind::Files),
                 Just(JobKind::Graph),
-                Just(JobKind::Train)
+                Just(JobKind::Train),
+                Just(JobKind::Sweep)
             ]
         }
 

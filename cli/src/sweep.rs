@@ -52,7 +52,7 @@ fn status(sweep: &Sweep, output: Output) {
 fn best(which: &WhichSweep, sweep: &Sweep, output: Output) -> Result<()> {
     let Some(best) = sweep.best() else {
         let what = format!("no trial of {:?} has come to its end yet", sweep.name);
-        return Err(CliError::new(Code::Failed, what).hint(format!("{}", sweep.told())));
+        return Err(CliError::new(Code::Failed, what).hint(sweep.told()));
     };
     output.result(best, || {
         let values = best.values.iter();

@@ -7,6 +7,7 @@ pub fn template(kind: JobKind) -> String {
     let scenes = match kind {
         JobKind::Graph => return graph(),
         JobKind::Train => return training(),
+        JobKind::Sweep => return sweep(),
         JobKind::Furnished => {
             "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
              count = 8\n\
@@ -150,5 +151,46 @@ fn training() -> String {
      kind = \"evaluate\"\n\
      source = \"render\"\n\
      evaluate = { models = [\"tof\", \"shadow\", \"mirrors\"], side = \"test\" }\n"
+        .to_owned()
+}
+
+fn sweep() -> String {
+    "# A picofarm job that looks for the settings with which a network learns best: half an hour on two cores.\n\
+     # `picofarm sweep status STORE depth` says how trials fare, `sweep report` makes a page of it.\n\
+     name = \"sweep\"\n\n\
+     [limits]\n\
+     max_crashes = 100         # a trial goes on from its last checkpoint, however often its worker is lost\n\n\
+     [[stage]]\n\
+     name = \"render\"\n\
+     scenes = { kind = \"primitive\", count = 120, seed = 1, spots = 25 }\n\
+     render = { resolution = 32, samples = 8, bins = 40, bin_width_m = 0.6144 }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"coarse-rooms\" }\n\n\
+     [[stage]]\n\
+     name = \"split\"\n\
+     kind = \"split\"\n\
+     source = \"render\"\n\
+     split = { fractions = [0.8, 0.1, 0.1] }   # trials are compared on the validation scenes\n\n\
+     [[stage]]\n\
+     name = \"tof\"\n\
+     kind = \"train\"\n\
+     source = \"render\"\n\
+     [stage.sweep]\n\
+     trials = 27               # drawn at random; left away: each combination, where all parameters are lists\n\
+     seed = 1                  # of the draws; more trials later are further ones\n\
+     halving = { first = 2, factor = 3 }   # after 2, 6, 18 epochs only the best third goes on; left away: all do\n\
+     [stage.sweep.over]        # a parameter stands anywhere in the stage as \"{name}\"\n\
+     lr = { log = [1e-4, 1e-1] }           # or: range = [a, b], int = [a, b], or a list of values\n\
+     decay = { log = [1e-5, 1e-1] }\n\
+     width = [8, 12, 16]\n\
+     [stage.train]\n\
+     task = \"tof\"\n\
+     model = \"depth\"           # trials are depth.0, depth.1, …; the best of them becomes depth\n\
+     net = { width = \"{width}\", levels = 3 }\n\
+     optimise = { epochs = 54, batch = 8, rate = \"{lr}\", weight_decay = \"{decay}\" }\n\n\
+     [[stage]]\n\
+     name = \"evaluate\"\n\
+     kind = \"evaluate\"\n\
+     source = \"render\"\n\
+     evaluate = { models = [\"tof\"], side = \"test\" }\n"
         .to_owned()
 }

@@ -131,4 +131,6 @@ pub enum JobKind {
     Graph,
     /// Render small rooms, train three networks on them, and evaluate them
     Train,
+    /// Render small rooms, and look for the settings with which a network learns best
+    Sweep,
 }
