@@ -21,7 +21,7 @@ pub use guard::{Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind};
 pub use model::Model;
-pub use network::{BenchModel, Kind, Learns};
+pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
 pub use sweep::{Sweep, WhichSweep};
 

@@ -27,6 +27,9 @@ pub struct BenchModel {
     /// Moments after the projection of time (unet2.5d)
     #[arg(long, default_value_t = 32)]
     pub time: u64,
+    /// Numbers in which convolutions are computed
+    #[arg(long, value_enum, default_value_t = Numbers::F32)]
+    pub precision: Numbers,
     /// Rows and columns of the images
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub side: u64,
@@ -58,6 +61,15 @@ pub enum Learns {
     Shadow,
     /// Mirrors from histograms
     Specular,
+}
+
+/// Numbers in which convolutions are computed.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Numbers {
+    /// 32 bits
+    F32,
+    /// Rounded to bfloat16
+    Bf16,
 }
 
 /// A network.

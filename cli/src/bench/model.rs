@@ -11,7 +11,7 @@ use std::{
 use picofarm_model::{
     ModelError,
     input::{Batch, Task},
-    net::{Architecture, NetSpec},
+    net::{Architecture, NetSpec, Precision},
     train::Learner,
     trial::Trial,
 };
@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args::{BenchModel, Kind, Learns},
+    args::{BenchModel, Kind, Learns, Numbers},
     error::{CliError, Code, Result, io},
     output::{Output, bytes, table},
 };
@@ -182,6 +182,10 @@ fn trial(args: &BenchModel) -> Trial {
             stem: args.stem as usize,
             time: args.time as usize,
             frozen: false,
+            precision: match args.precision {
+                Numbers::F32 => Precision::F32,
+                Numbers::Bf16 => Precision::Bf16,
+            },
         },
         batch: args.batch as usize,
         side: args.side as usize,

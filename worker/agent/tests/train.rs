@@ -167,10 +167,6 @@ async fn what_cannot_be_trained_is_refused_by_name() {
         ),
         (json!({"optimise": {"batch": 9}}), "optimise.batch"),
         (
-            json!({"optimise": {"precision": "bf16"}}),
-            "train.optimise.precision",
-        ),
-        (
             json!({"split": "lone", "optimise": {"early_stop": 3}}),
             "train.optimise.early_stop",
         ),

@@ -75,10 +75,11 @@ impl Cbr {
         x: Tensor<4>,
         one_hot: Option<&Tensor<3, Int>>,
     ) -> Tensor<4> {
-        let mut y = ops::conv3x3(x, pass.get(self.weight));
+        let mut y = ops::conv3x3(pass.lower(x), pass.lower(pass.get(self.weight)));
         if let (Some(id), Some(bins)) = (self.one_hot, one_hot) {
-            y = y + ops::one_hot_conv3x3(bins.clone(), pass.get(id));
+            y = y + ops::one_hot_conv3x3(bins.clone(), pass.lower(pass.get(id)));
         }
+        let y = pass.raise(y);
         pass.norm_relu(&self.norm, y)
     }
 }
@@ -157,6 +158,7 @@ impl Final {
     }
 
     pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
-        ops::conv1x1(x, pass.get(self.weight), pass.get(self.bias))
+        let [x, weight] = [x, pass.get(self.weight)].map(|t| pass.lower(t));
+        pass.raise(ops::conv1x1(x, weight, pass.lower(pass.get(self.bias))))
     }
 }

@@ -10,7 +10,7 @@ use burn::tensor::Tensor;
 
 pub use block::ONE_HOT;
 pub use pass::{Input, MOMENTUM, Pass};
-pub use spec::{Architecture, NetSpec};
+pub use spec::{Architecture, NetSpec, Precision};
 
 use crate::{
     ModelError,
@@ -75,6 +75,7 @@ impl Net {
             "{h}×{w} pixels must be multiples of {multiple}"
         );
         assert_eq!(input.one_hot.is_some(), self.spec.one_hot > 0);
+        pass.compute_in(self.spec.precision);
         match &self.body {
             Body::Unet2d(net) => net.forward(pass, input),
             Body::Unet25d(net) => net.forward(pass, input, self.spec.frozen),

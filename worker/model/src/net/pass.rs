@@ -2,6 +2,7 @@
 
 use burn::tensor::{Int, Tensor};
 
+use super::Precision;
 use crate::{
     ops::{self, Normalised},
     parameters::{Declared, Id, Parameters, shaped},
@@ -24,6 +25,7 @@ pub struct Pass<'a> {
     declared: &'a [Declared],
     leaves: &'a [Tensor<1>],
     training: bool,
+    precision: Precision,
     /// Statistics after this batch.
     moved: Vec<(Id, Tensor<1>)>,
 }
@@ -35,6 +37,7 @@ impl<'a> Pass<'a> {
             declared,
             leaves,
             training: true,
+            precision: Precision::F32,
             moved: Vec::new(),
         }
     }
@@ -45,7 +48,29 @@ impl<'a> Pass<'a> {
             declared: parameters.declared(),
             leaves: parameters.values(),
             training: false,
+            precision: Precision::F32,
             moved: Vec::new(),
+        }
+    }
+
+    /// Numbers in which convolutions are computed from now on.
+    pub(super) fn compute_in(&mut self, precision: Precision) {
+        self.precision = precision;
+    }
+
+    /// A number as convolutions take it.
+    pub(super) fn lower<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        match self.precision {
+            Precision::F32 => x,
+            Precision::Bf16 => ops::to_bf16(x),
+        }
+    }
+
+    /// What a convolution gave, as all else takes it.
+    pub(super) fn raise<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        match self.precision {
+            Precision::F32 => x,
+            Precision::Bf16 => ops::from_bf16(x),
         }
     }
 

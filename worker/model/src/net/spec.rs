@@ -15,6 +15,26 @@ pub enum Architecture {
     Unet25d,
 }
 
+/// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
+/// losses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 32 bits.
+    #[default]
+    F32,
+    /// Inputs, weights and outputs, and their gradients, are rounded to bfloat16 (PyTorch's autocast). On a processor this
+    /// is rounding alone, no faster than f32: products and sums have 32 bits there as on tensor cores.
+    Bf16,
+}
+
+impl Precision {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+    fn is_f32(&self) -> bool {
+        *self == Self::F32
+    }
+}
+
 /// Shape of a network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -38,6 +58,9 @@ pub struct NetSpec {
     /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
+    /// Numbers in which convolutions are computed.
+    #[serde(default, skip_serializing_if = "Precision::is_f32")]
+    pub precision: Precision,
 }
 
 impl NetSpec {
@@ -53,6 +76,7 @@ impl NetSpec {
             stem: 0,
             time: 160,
             frozen: false,
+            precision: Precision::F32,
         }
     }
 

@@ -178,7 +178,11 @@ impl Linear {
         let bias: Tensor<1> = pass.get(self.bias);
         let (outputs, inputs) = (bias.dims()[0], x.dims()[1]);
         let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
-        ops::conv1x1(x, weight, bias)
+        pass.raise(ops::conv1x1(
+            pass.lower(x),
+            pass.lower(weight),
+            pass.lower(bias),
+        ))
     }
 }
 
@@ -203,7 +207,7 @@ impl Cbr {
         let weight: Tensor<5> = pass.get(self.weight);
         let outputs = weight.dims()[0];
         let weight = weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3]);
-        let y = ops::conv3x3(beside, weight);
+        let y = pass.raise(ops::conv3x3(pass.lower(beside), pass.lower(weight)));
         pass.norm_relu(&self.norm, y)
     }
 }

@@ -9,7 +9,7 @@ pub mod plain;
 
 use burn::{
     backend::{Dispatch, DispatchDevice},
-    tensor::{Device, Int, Tensor},
+    tensor::{Device, FloatDType, Int, Tensor},
 };
 
 use crate::kernel::AdamW;
@@ -25,6 +25,25 @@ pub fn has_kernels(device: &Device) -> bool {
         DispatchDevice::Autodiff(inner) => matches!(&**inner, DispatchDevice::Flex(_)),
         #[allow(unreachable_patterns, reason = "with CUDA there are more devices")]
         _ => false,
+    }
+}
+
+/// What a convolution in bfloat16 is given: rounded to it, and its gradient too. Our kernels compute on with 32 bits, which
+/// hold such numbers exactly; on other devices the tensor itself is bfloat16.
+pub fn to_bf16<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    let kernels = has_kernels(&x.device());
+    let rounded = x.cast(FloatDType::BF16);
+    match kernels {
+        true => rounded.cast(FloatDType::F32),
+        false => rounded,
+    }
+}
+
+/// What a convolution in bfloat16 gives, rounded to it, as 32 bits.
+pub fn from_bf16<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    match has_kernels(&x.device()) {
+        true => to_bf16(x),
+        false => x.cast(FloatDType::F32),
     }
 }
 

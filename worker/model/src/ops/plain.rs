@@ -38,7 +38,8 @@ pub fn one_hot(bins: Tensor<3, Int>, channels: usize) -> Tensor<4> {
 /// See [`super::one_hot_conv3x3`]: the dense form.
 pub fn one_hot_conv3x3(bins: Tensor<3, Int>, w: Tensor<4>) -> Tensor<4> {
     let channels = w.dims()[1];
-    conv3x3(one_hot(bins, channels), w)
+    let dense = one_hot(bins, channels).cast(w.dtype());
+    conv3x3(dense, w)
 }
 
 /// See [`super::batch_norm_relu`].

@@ -34,6 +34,7 @@ fn entry(name: &str, task: Task, variant: ShadowVariant, seed: u64, metrics: Met
         stem: 0,
         time: 0,
         frozen: false,
+        precision: crate::net::Precision::F32,
     };
     let trivial = |metrics: &Metrics| match metrics {
         Metrics::Depth { .. } => vec![

@@ -80,6 +80,7 @@ pub fn plan(task: Task, variant: ShadowVariant) -> Plan {
             stem: 0,
             time: 0,
             frozen: false,
+            precision: picofarm_model::net::Precision::F32,
         },
         epochs: 3,
         batch: 2,

@@ -38,11 +38,6 @@ pub(super) fn plan(
         );
         return Err(user("input.bins", what));
     }
-    if optimise.precision == Precision::Bf16 {
-        let what =
-            "\"bf16\" is not for workers that train on a processor, as this one does; use \"f32\"";
-        return Err(user("optimise.precision", what.into()));
-    }
     let question = Question {
         task: match settings.task {
             Target::Tof => input::Task::Tof,
@@ -81,6 +76,10 @@ pub(super) fn plan(
         stem: wanted.stem as usize,
         time: wanted.time_features as usize,
         frozen: !settings.specular.on.is_empty(),
+        precision: match optimise.precision {
+            Precision::F32 => net::Precision::F32,
+            Precision::Bf16 => net::Precision::Bf16,
+        },
     };
     let multiple = net.multiple() as u32;
     if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
