@@ -179,6 +179,7 @@ def rounding(trial):
     for bf16 in (False, True):
         trial.bf16 = bf16
         trial.reset()
+        trial.optimiser.zero_grad()
         trial.loss()[1].backward()
         gradients.append(torch.cat([p.grad.flatten() for p in trial.model.parameters() if p.grad is not None]))
     return ((gradients[1] - gradients[0]).norm() / gradients[0].norm()).item()
