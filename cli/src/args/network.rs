@@ -27,6 +27,9 @@ pub struct BenchModel {
     /// Moments after the projection of time (unet2.5d)
     #[arg(long, default_value_t = 32)]
     pub time: u64,
+    /// On the graphics processor (a build with --features cuda)
+    #[arg(long)]
+    pub gpu: bool,
     /// Numbers in which convolutions are computed
     #[arg(long, value_enum, default_value_t = Numbers::F32)]
     pub precision: Numbers,

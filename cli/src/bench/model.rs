@@ -35,6 +35,8 @@ struct Report {
     /// Multiply-adds of a pass forward, a sample; the one-hot channels counted as if they were dense.
     multiply_adds: Option<f64>,
     threads: usize,
+    /// On a graphics processor; threads do not count then.
+    gpu: bool,
     forms: Vec<Form>,
     /// The largest difference between the outputs of the gather and the dense form.
     forms_differ: Option<f64>,
@@ -55,7 +57,10 @@ struct Form {
 
 pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Result<()> {
     let trial = trial(args);
-    let device = picofarm_model::cpu();
+    let device = match args.gpu {
+        true => picofarm_model::gpu().map_err(of_model)?,
+        false => picofarm_model::cpu(),
+    };
     if let Some(path) = &args.record {
         let record = trial.record(RECORDED, &device).map_err(of_model)?;
         fs::write(path, record).map_err(|e| io(format!("--record {}", path.display()), &e))?;
@@ -134,6 +139,7 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         parameters,
         multiply_adds: trial.net.multiply_adds(trial.side),
         threads: rayon::current_num_threads(),
+        gpu: args.gpu,
         forms: names
             .into_iter()
             .enumerate()
@@ -233,7 +239,11 @@ fn text(report: &Report) -> String {
             macs / 1e9
         );
     }
-    out += &format!(", {} threads\n\n{}", report.threads, table(&rows));
+    let on = match report.gpu {
+        true => "graphics processor".to_owned(),
+        false => format!("{} threads", report.threads),
+    };
+    out += &format!(", {on}\n\n{}", table(&rows));
     if let Some(differ) = report.forms_differ {
         out += &format!("\nlargest difference between gather and dense form: {differ:.1e}");
     }

@@ -75,7 +75,10 @@ impl Executor for TaskExecutor {
                 run.map(|split| Output::from(&split))
             }
             TaskSpec::Export(spec) => export::run(stores, spec, control),
-            TaskSpec::Train(spec) => train::run(stores, spec, task.spec.force, control),
+            TaskSpec::Train(spec) => {
+                let gpus = task.spec.resources.gpus;
+                train::run(stores, spec, (task.spec.force, gpus), control)
+            }
             TaskSpec::Evaluate(spec) => evaluate::run(stores, spec, control),
             TaskSpec::Promote(spec) => promote::run(stores, spec, control),
         }

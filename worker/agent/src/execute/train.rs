@@ -14,7 +14,7 @@ use picofarm_dataset::{
     TrialEnd,
 };
 use picofarm_model::{
-    ModelError,
+    Device, ModelError,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
@@ -50,16 +50,19 @@ pub fn model_version() -> String {
     picofarm_model::VERSION.to_owned()
 }
 
-/// Trains what `task` names; with `force` although it is there.
+/// Trains what `task` names; with `force` although it is there, and on a graphics processor where the job asks for `gpus`.
 pub(super) fn run(
     stores: &Stores,
     task: &TrainTask,
-    force: bool,
+    (force, gpus): (bool, u32),
     control: &Control,
 ) -> Result<Output, TaskError> {
     task.check().map_err(|e| TaskError::User(e.to_string()))?;
     check_version("train", &task.train.version)?;
-    let lesson = Lesson::of(stores, task, control)?;
+    let lesson = Lesson {
+        gpus,
+        ..Lesson::of(stores, task, control)?
+    };
     let Some(trial) = &task.train.trial else {
         let published = match lesson.learn(stores, force, None, control)? {
             Ok(published) => published,
@@ -88,6 +91,8 @@ struct Lesson<'a> {
     built: BTreeMap<&'static str, Known>,
     lineage: Lineage,
     key: String,
+    /// Graphics processors that the job asks for.
+    gpus: u32,
 }
 
 impl<'a> Lesson<'a> {
@@ -143,7 +148,25 @@ impl<'a> Lesson<'a> {
             built,
             lineage,
             key,
+            gpus: 0,
         })
+    }
+
+    /// Where it is computed. A program without graphics processors trains on its processor, and says so.
+    fn device(&self) -> Result<Device, TaskError> {
+        if self.gpus == 0 {
+            return Ok(picofarm_model::cpu());
+        }
+        match picofarm_model::gpu() {
+            Err(error) if picofarm_model::HAS_GPUS => {
+                Err(TaskError::Interrupted(error.to_string()))
+            }
+            Err(error) => {
+                warn!(%error, "trains on the processor");
+                Ok(picofarm_model::cpu())
+            }
+            Ok(device) => Ok(device),
+        }
     }
 
     /// What the model runtime is asked.
@@ -229,7 +252,7 @@ impl<'a> Lesson<'a> {
         control: &Control,
     ) -> Result<Result<Trained, Left>, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
-        let device = picofarm_model::cpu();
+        let device = self.device()?;
         let guide = self.built.get("train.shadow.tof");
         let sources = Sources {
             train: self.training.clone(),
