@@ -134,6 +134,20 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
     for (name, sha256) in &from.models {
         rows.push(row("builds on", format!("{name} (SHA-256 {sha256})")));
     }
+    if let Some(promoted) = &from.promoted {
+        let values = promoted.values.iter();
+        let values: Vec<String> = values.map(|(n, v)| format!("{n} = {}", plain(v))).collect();
+        rows.push(row(
+            "promoted",
+            format!(
+                "{}, the best of {} that came to their end, of {}; {}",
+                promoted.model,
+                promoted.finished,
+                promoted.begun,
+                values.join(", ")
+            ),
+        ));
+    }
     for object in &manifest.objects {
         rows.push(row(
             "object",

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     chart::{Axis, Series, chart, legend},
-    number::short,
+    number::{digits, short},
     page::STYLE,
     text::Safe,
 };
@@ -137,7 +137,7 @@ impl Sweep {
                 "; best {} ({} {})",
                 best.model,
                 self.error,
-                short(best.loss.unwrap_or(f64::NAN))
+                digits(best.loss.unwrap_or(f64::NAN), 4)
             );
         }
         text
@@ -212,7 +212,9 @@ fn table(sweep: &Sweep) -> String {
             let value = trial.value(name).map_or_else(|| "–".into(), Value::text);
             let _ = write!(out, "<td class=\"n\">{}</td>", Safe(value));
         }
-        let loss = trial.loss.map_or_else(|| "–".into(), short);
+        let loss = trial
+            .loss
+            .map_or_else(|| "–".into(), |loss| digits(loss, 4));
         let why = match trial.why.is_empty() {
             true => String::new(),
             false => format!(": {}", trial.why),
@@ -245,7 +247,8 @@ fn curves(sweep: &Sweep) -> String {
     let losses = lines.iter().flat_map(|s| &s.points).map(|p| p.1);
     let label = format!("validation {}", sweep.error);
     let y = axis(&label, far_apart(losses));
-    drawn(&chart("Validation error", &x, &y, &lines), sweep)
+    let chart = chart("Validation error", &x, &y, &lines);
+    drawn(&format!("<div class=\"charts\">{chart}</div>"), sweep)
 }
 
 fn parameters(sweep: &Sweep) -> String {
@@ -371,7 +374,7 @@ mod tests {
         assert_eq!(sweep.best().map(|t| t.index), Some(2));
         assert_eq!(
             sweep.told(),
-            "4 trials: 2 finished, 1 stopped, 1 diverged; best <m>.2 (MAE (m) 0.25)"
+            "4 trials: 2 finished, 1 stopped, 1 diverged; best <m>.2 (MAE (m) 0.2500)"
         );
     }
 
