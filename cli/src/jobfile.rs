@@ -317,10 +317,9 @@ mod tests {
                 let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
                 let spec = checked(spec, &path).unwrap();
-                assert!(
-                    spec.stages.iter().any(|s| s.task.kind() == "evaluate"),
-                    "{path:?}"
-                );
+                let kinds: Vec<&str> = spec.stages.iter().map(|s| s.task.kind()).collect();
+                assert!(kinds.contains(&"evaluate"), "{path:?}");
+                assert_eq!(kinds.last(), Some(&"report"), "{path:?}");
             }
             files += 1;
         }

@@ -137,6 +137,45 @@ async fn what_is_missing_or_changed_is_found_out_and_mended() {
 }
 
 #[tokio::test]
+async fn a_check_names_what_is_broken_and_what_is_missing() {
+    let folder = tempfile::tempdir().unwrap();
+    let there = open(folder.path(), &spec(3)).await.unwrap();
+    publish(&there, 0, "k").await;
+    publish(&there, 1, "k").await;
+    let check = async |mode, complete| there.verify(mode, complete, &|_, _| {}).await.unwrap();
+    let whole = check(VerifyMode::Full, false).await;
+    assert!(whole.is_sound(), "{:?}", whole.problems);
+    assert_eq!((whole.scenes, whole.objects), (2, 6));
+    let lit = folder.path().join("lit/c/0/0/0/0");
+    let mut bytes = std::fs::read(&lit).unwrap();
+    bytes[20] ^= 1;
+    std::fs::write(&lit, bytes).unwrap();
+    assert!(check(VerifyMode::Fast, false).await.is_sound());
+    std::fs::remove_file(folder.path().join("depth/c/1/0/0")).unwrap();
+    std::fs::write(folder.path().join("specular/zarr.json"), "{}").unwrap();
+    std::fs::write(folder.path().join("manifests/2.json"), "{}").unwrap();
+    let found = check(VerifyMode::Full, false).await;
+    let told: Vec<(Option<u64>, &str)> = found
+        .problems
+        .iter()
+        .map(|p| (p.scene, p.fault.kind()))
+        .collect();
+    assert_eq!(
+        told,
+        [
+            (Some(1), "missing"),
+            (Some(0), "wrong_hash"),
+            (Some(2), "bad_manifest"),
+            (None, "bad_metadata")
+        ]
+    );
+    std::fs::remove_file(folder.path().join("manifests/2.json")).unwrap();
+    let found = check(VerifyMode::Fast, true).await;
+    let missing = found.problems.iter().filter(|p| p.scene == Some(2));
+    assert_eq!(missing.count(), 1);
+}
+
+#[tokio::test]
 async fn a_group_grows_with_its_source_and_its_form_stays() {
     let folder = tempfile::tempdir().unwrap();
     let small = open(folder.path(), &spec(2)).await.unwrap();

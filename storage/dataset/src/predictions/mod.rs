@@ -6,6 +6,7 @@
 
 mod array;
 mod manifest;
+mod verify;
 
 use std::sync::Arc;
 
@@ -133,6 +134,23 @@ impl Predictions {
         };
         let spec = parse_root(&bytes, &objects::shown(&*store, &root))?;
         Ok(Self::assume(store, prefix, spec))
+    }
+
+    /// The same, or `None` where none lie at `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn find(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+    ) -> Result<Option<Self>, DatasetError> {
+        let root = objects::path_of(&prefix, METADATA);
+        let bytes = objects::get(&*store, &root).await?;
+        let parsed = bytes.and_then(|bytes| serde_json::from_slice::<Value>(&bytes).ok());
+        match parsed.is_some_and(|root| is_predictions(&root)) {
+            true => Self::open(store, prefix).await.map(Some),
+            false => Ok(None),
+        }
     }
 
     fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: PredictionSpec) -> Self {
