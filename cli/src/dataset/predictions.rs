@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::{
     failed,
-    verify::{Late, broken_by, mode, problems_json},
+    verify::{Late, broken_by, mode, problems_json_by},
 };
 use crate::{
     args::{DatasetShow, DatasetVerify},
@@ -128,7 +128,7 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     let report = report.map_err(failed)?;
     let facts = json!({
         "predictions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
-        "bytes": report.bytes, "problems": problems_json(&report.problems, mend),
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, mend),
     });
     if report.is_sound() {
         output.result(&facts, || {

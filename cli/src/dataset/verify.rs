@@ -109,7 +109,7 @@ pub fn mode(fast: bool) -> VerifyMode {
 pub fn tell(place: &str, how: &How<'_>, report: &Verification, output: Output) -> Result<()> {
     let facts = json!({
         "dataset": place, "fast": how.fast, "snapshot": how.snapshot.map(|s| &s.name), "scenes": report.scenes,
-        "objects": report.objects, "bytes": report.bytes, "problems": problems_json(&report.problems, Problem::mend),
+        "objects": report.objects, "bytes": report.bytes, "problems": problems_json(&report.problems),
         "unpublished": report.unpublished, "unfinished": report.unfinished,
     });
     if report.is_sound() {
@@ -178,7 +178,12 @@ pub fn broken_by(
     }
 }
 
-pub fn problems_json(problems: &[Problem], mend: fn(&Problem) -> &'static str) -> Vec<Value> {
+pub fn problems_json(problems: &[Problem]) -> Vec<Value> {
+    problems_json_by(problems, Problem::mend)
+}
+
+/// The same where they are mended otherwise.
+pub fn problems_json_by(problems: &[Problem], mend: fn(&Problem) -> &'static str) -> Vec<Value> {
     problems
         .iter()
         .map(|p| {
