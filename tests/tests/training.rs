@@ -53,6 +53,14 @@ optimise = {{ epochs = 20, batch = 4 }}
 kind = "evaluate"
 source = "rooms"
 evaluate = {{ models = ["tof", "shadow"] }}
+[[stage]]
+kind = "infer"
+source = "rooms"
+infer = {{ models = ["tof", "shadow"] }}
+output = {{ store = {store:?}, dataset = "seen" }}
+[[stage]]
+kind = "report"
+report = {{ name = "all", models = ["tof", "shadow"] }}
 "#
     )
 }
@@ -103,20 +111,24 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     assert!(resumed > 0, "no training went on from a checkpoint");
     let _last = farm.worker("last");
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    let models = |farm: &Farm| {
-        let mut hashes = store::hashes(&farm.store().join("models"));
-        hashes.retain(|key, _| !key.contains("checkpoints"));
-        hashes
-    };
-    let there = models(&farm);
-    assert!(
-        there.keys().any(|key| key.contains("weights.safetensors")),
-        "{there:?}"
-    );
-    assert_eq!(
-        there,
-        models(&calm),
-        "after {kills} kills, {resumed} resumptions"
-    );
+    // What was learnt, and what follows from it.
+    for (folder, part) in [
+        ("models", "weights.safetensors"),
+        ("seen", "manifests/15.json"),
+        ("reports", "report.html"),
+    ] {
+        let made = |farm: &Farm| {
+            let mut hashes = store::hashes(&farm.store().join(folder));
+            hashes.retain(|key, _| !key.contains("checkpoints"));
+            hashes
+        };
+        let there = made(&farm);
+        assert!(there.keys().any(|key| key.contains(part)), "{there:?}");
+        assert_eq!(
+            there,
+            made(&calm),
+            "after {kills} kills, {resumed} resumptions"
+        );
+    }
     eprintln!("{kills} kills, {resumed} resumptions");
 }
