@@ -131,4 +131,27 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
         );
     }
     eprintln!("{kills} kills, {resumed} resumptions");
+    predictions_can_be_looked_at(&calm);
+}
+
+fn predictions_can_be_looked_at(farm: &Farm) {
+    let seen = farm.store().join("seen");
+    let at = seen.to_str().unwrap();
+    let there = farm.json(&["dataset", "info", at]);
+    assert_eq!(
+        (&there["scenes"], &there["spec"]["depth"]),
+        (&16.into(), &true.into())
+    );
+    let from = farm.json(&["dataset", "show", at, "3"]);
+    assert_eq!(from["manifest"]["two_bounce_times"]["model"]["name"], "tof");
+    let whole = farm.json(&["dataset", "verify", "--complete", at]);
+    assert_eq!(
+        (&whole["scenes"], &whole["objects"]),
+        (&16.into(), &32.into())
+    );
+    fs::remove_file(seen.join("lit/c/3/0/0/0")).unwrap();
+    farm.run(&["dataset", "verify", "--fast", at])
+        .fails(6, &["lit/c/3/0/0/0: missing", "force = true"]);
+    farm.run(&["dataset", "picture", at, "--out", at])
+        .fails(3, &["what models predict"]);
 }
