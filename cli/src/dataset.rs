@@ -3,6 +3,7 @@
 pub mod export;
 pub mod gc;
 pub mod import;
+mod predictions;
 pub mod repair;
 pub mod reprocess;
 pub mod show;
@@ -28,6 +29,9 @@ use crate::{
 pub async fn run(command: Command, settings: &Settings, output: Output) -> Result<()> {
     match command {
         Command::Info { dataset } => {
+            if let Some(there) = predictions::find(&dataset).await? {
+                return predictions::info(&dataset, &there, output).await;
+            }
             let info = open(&dataset).await?.info().await.map_err(failed)?;
             output.result(&info_json(&dataset, &info), || describe(&dataset, &info));
             Ok(())

@@ -139,6 +139,19 @@ fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> 
                 let asked = &mut task.promote.version;
                 pin(asked, version, "promote.version").map_err(named)?;
             }
+            TaskSpec::Infer(task) => {
+                task.output.store =
+                    store(base, &task.output.store, "output.store").map_err(named)?;
+                let version = picofarm_agent::infer_version();
+                let asked = &mut task.infer.version;
+                pin(asked, version, "infer.version").map_err(named)?;
+            }
+            TaskSpec::Report(task) => {
+                let report = &mut task.report;
+                report.store = store(base, &report.store, "report.store").map_err(named)?;
+                let version = picofarm_agent::model_version();
+                pin(&mut report.version, version, "report.version").map_err(named)?;
+            }
             TaskSpec::Export(task) => {
                 task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
                 picofarm_dataset::ExportFormat::parse(&task.export.format)
@@ -304,10 +317,9 @@ mod tests {
                 let path = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
                 let spec = checked(spec, &path).unwrap();
-                assert!(
-                    spec.stages.iter().any(|s| s.task.kind() == "evaluate"),
-                    "{path:?}"
-                );
+                let kinds: Vec<&str> = spec.stages.iter().map(|s| s.task.kind()).collect();
+                assert!(kinds.contains(&"evaluate"), "{path:?}");
+                assert_eq!(kinds.last(), Some(&"report"), "{path:?}");
             }
             files += 1;
         }

@@ -150,7 +150,17 @@ fn training() -> String {
      name = \"evaluate\"\n\
      kind = \"evaluate\"\n\
      source = \"render\"\n\
-     evaluate = { models = [\"tof\", \"shadow\", \"mirrors\"], side = \"test\" }\n"
+     evaluate = { models = [\"tof\", \"shadow\", \"mirrors\"], side = \"test\" }\n\n\
+     [[stage]]                 # what they see in every room, beside the data set: depth, lit, specular\n\
+     name = \"predict\"\n\
+     kind = \"infer\"\n\
+     source = \"render\"\n\
+     infer = { models = [\"tof\", \"shadow\", \"mirrors\"] }   # at most one of each kind\n\
+     output = { store = \"picofarm-data/store\", dataset = \"small-rooms-predicted\" }\n\n\
+     [[stage]]                 # a page about them: picofarm-data/store/reports/learning/report.html\n\
+     name = \"report\"\n\
+     kind = \"report\"\n\
+     report = { name = \"learning\", models = [\"tof\", \"shadow\", \"mirrors\"], pictures = 2 }\n"
         .to_owned()
 }
 

@@ -193,6 +193,8 @@ fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
             "import" => ("import.version", "importer"),
             "train" => ("train.version", "training's code"),
             "evaluate" => ("evaluate.version", "networks' code"),
+            "infer" => ("infer.version", "networks' code"),
+            "report" => ("report.version", "networks' code"),
             _ => ("reprocess.version", "sensor model"),
         };
         return Err(SpecError::new(

@@ -7,8 +7,8 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     model::{
-        Histogram, JobSpec, RenderTask, ReprocessSettings, SceneKind, SceneSource, SourceSettings,
-        StageSpec, TaskSpec, TrainSettings,
+        Histogram, JobSpec, RenderTask, ReportSettings, ReprocessSettings, SceneKind, SceneSource,
+        SourceSettings, StageSpec, TaskSpec, TrainSettings,
         task::{EXPORT_VERSION, SPLIT_VERSION},
     },
     split::SplitSettings,
@@ -113,6 +113,15 @@ pub fn stage_key(stage: &StageSpec) -> StageKey {
             "stage": "promote",
             "source": source(&task.source),
             "settings": serde_json::to_value(&task.promote).expect("settings are plain data"),
+        }),
+        TaskSpec::Infer(task) => serde_json::json!({
+            "stage": "infer",
+            "source": source(&task.source),
+            "settings": serde_json::to_value(&task.infer).expect("settings are plain data"),
+        }),
+        TaskSpec::Report(task) => serde_json::json!({
+            "stage": "report",
+            "settings": serde_json::to_value(&task.report).expect("settings are plain data"),
         }),
     };
     StageKey(Sha256::digest(canonical(description).as_bytes()).into())
@@ -233,6 +242,37 @@ pub fn evaluation_key(
         "histogram": histogram,
         "spots": spots,
         "version": version,
+    });
+    TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// Names what models predict of one scene: the scene by the SHA-256 of its manifest, each kind of model by that of its
+/// manifest and the histogram that it sees, what two-bounce times follow from, and the code.
+pub fn inference_key(
+    scene_sha256: &str,
+    models: &BTreeMap<&str, (String, Histogram, Vec<u32>)>,
+    times: &str,
+    version: &str,
+) -> TaskKey {
+    let description = serde_json::json!({
+        "task": "infer",
+        "scene": scene_sha256,
+        "models": models,
+        "times": times,
+        "version": version,
+    });
+    TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
+}
+
+/// Names a report: its settings but for name and place, the models and their evaluations by what pins them, in order, and the
+/// code.
+pub fn report_key(settings: &ReportSettings, models: &[String]) -> TaskKey {
+    let description = serde_json::json!({
+        "task": "report",
+        "title": settings.title,
+        "pictures": settings.pictures,
+        "version": settings.version,
+        "models": models,
     });
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }

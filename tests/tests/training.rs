@@ -53,6 +53,14 @@ optimise = {{ epochs = 20, batch = 4 }}
 kind = "evaluate"
 source = "rooms"
 evaluate = {{ models = ["tof", "shadow"] }}
+[[stage]]
+kind = "infer"
+source = "rooms"
+infer = {{ models = ["tof", "shadow"] }}
+output = {{ store = {store:?}, dataset = "seen" }}
+[[stage]]
+kind = "report"
+report = {{ name = "all", models = ["tof", "shadow"] }}
 "#
     )
 }
@@ -103,20 +111,47 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     assert!(resumed > 0, "no training went on from a checkpoint");
     let _last = farm.worker("last");
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    let models = |farm: &Farm| {
-        let mut hashes = store::hashes(&farm.store().join("models"));
-        hashes.retain(|key, _| !key.contains("checkpoints"));
-        hashes
-    };
-    let there = models(&farm);
-    assert!(
-        there.keys().any(|key| key.contains("weights.safetensors")),
-        "{there:?}"
-    );
-    assert_eq!(
-        there,
-        models(&calm),
-        "after {kills} kills, {resumed} resumptions"
-    );
+    // What was learnt, and what follows from it.
+    for (folder, part) in [
+        ("models", "weights.safetensors"),
+        ("seen", "manifests/15.json"),
+        ("reports", "report.html"),
+    ] {
+        let made = |farm: &Farm| {
+            let mut hashes = store::hashes(&farm.store().join(folder));
+            hashes.retain(|key, _| !key.contains("checkpoints"));
+            hashes
+        };
+        let there = made(&farm);
+        assert!(there.keys().any(|key| key.contains(part)), "{there:?}");
+        assert_eq!(
+            there,
+            made(&calm),
+            "after {kills} kills, {resumed} resumptions"
+        );
+    }
     eprintln!("{kills} kills, {resumed} resumptions");
+    predictions_can_be_looked_at(&calm);
+}
+
+fn predictions_can_be_looked_at(farm: &Farm) {
+    let seen = farm.store().join("seen");
+    let at = seen.to_str().unwrap();
+    let there = farm.json(&["dataset", "info", at]);
+    assert_eq!(
+        (&there["scenes"], &there["spec"]["depth"]),
+        (&16.into(), &true.into())
+    );
+    let from = farm.json(&["dataset", "show", at, "3"]);
+    assert_eq!(from["manifest"]["two_bounce_times"]["model"]["name"], "tof");
+    let whole = farm.json(&["dataset", "verify", "--complete", at]);
+    assert_eq!(
+        (&whole["scenes"], &whole["objects"]),
+        (&16.into(), &32.into())
+    );
+    fs::remove_file(seen.join("lit/c/3/0/0/0")).unwrap();
+    farm.run(&["dataset", "verify", "--fast", at])
+        .fails(6, &["lit/c/3/0/0/0: missing", "force = true"]);
+    farm.run(&["dataset", "picture", at, "--out", at])
+        .fails(3, &["what models predict"]);
 }

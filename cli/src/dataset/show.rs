@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use super::{failed, open};
+use super::{failed, open, predictions};
 use crate::{
     args::DatasetShow,
     error::Result,
@@ -10,6 +10,9 @@ use crate::{
 };
 
 pub async fn run(args: &DatasetShow, output: Output) -> Result<()> {
+    if let Some(there) = predictions::find(&args.dataset).await? {
+        return predictions::show(args, &there, output).await;
+    }
     let dataset = open(&args.dataset).await?;
     let manifest = dataset.manifest(args.scene).await.map_err(failed)?;
     let made = &manifest.provenance;

@@ -8,7 +8,7 @@ use std::{
 use picofarm_dataset::{Dataset, Problem, Snapshot, Verification, VerifyMode, VerifyOptions};
 use serde_json::{Value, json};
 
-use super::{failed, open};
+use super::{failed, open, predictions};
 use crate::{
     args::DatasetVerify,
     error::{CliError, Code, Result},
@@ -19,6 +19,9 @@ use crate::{
 const SHOWN: usize = 20;
 
 pub async fn run(args: &DatasetVerify, output: Output) -> Result<()> {
+    if let Some(there) = predictions::find(&args.dataset).await? {
+        return predictions::verify(args, &there, output).await;
+    }
     let dataset = open(&args.dataset).await?;
     let snapshot = match &args.snapshot {
         Some(name) => Some(dataset.snapshot(name).await.map_err(failed)?),
@@ -133,11 +136,20 @@ pub fn tell(place: &str, how: &How<'_>, report: &Verification, output: Output) -
 
 /// What is broken, as an error.
 pub fn broken(place: &str, problems: &[Problem]) -> CliError {
+    broken_by(place, problems, Problem::mend)
+}
+
+/// The same where it is mended otherwise.
+pub fn broken_by(
+    place: &str,
+    problems: &[Problem],
+    mended_by: fn(&Problem) -> &'static str,
+) -> CliError {
     let mut shown = Vec::new();
     let mut last = "";
     for problem in problems.iter().take(SHOWN) {
         let scene = problem.scene.map(|s| format!("scene {s}: "));
-        let mend = problem.mend();
+        let mend = mended_by(problem);
         let how = match mend == last {
             true => String::new(),
             false => format!("\n    mend: {mend}"),
@@ -157,7 +169,7 @@ pub fn broken(place: &str, problems: &[Problem]) -> CliError {
             shown.join("\n  ")
         ),
     );
-    let mendable = |p: &Problem| p.mend().starts_with("dataset repair");
+    let mendable = |p: &Problem| mended_by(p).starts_with("dataset repair");
     match problems.iter().any(mendable) {
         true => error.hint(format!(
             "picofarm dataset repair {place} makes the broken scenes again, and only those"
@@ -167,12 +179,17 @@ pub fn broken(place: &str, problems: &[Problem]) -> CliError {
 }
 
 pub fn problems_json(problems: &[Problem]) -> Vec<Value> {
+    problems_json_by(problems, Problem::mend)
+}
+
+/// The same where they are mended otherwise.
+pub fn problems_json_by(problems: &[Problem], mend: fn(&Problem) -> &'static str) -> Vec<Value> {
     problems
         .iter()
         .map(|p| {
             json!({
                 "object": p.object, "scene": p.scene, "fault": p.fault.kind(), "what": p.fault.to_string(),
-                "mend": p.mend(),
+                "mend": mend(p),
             })
         })
         .collect()

@@ -9,8 +9,8 @@ use super::{
 };
 use crate::split::SIDES;
 
-/// Most models in one evaluation.
-const MAX_MODELS: usize = 1_000;
+/// Most models in one evaluation, or in one report.
+pub(super) const MAX_MODELS: usize = 1_000;
 
 /// Evaluating models: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -20,9 +20,11 @@ use super::{
     evaluate::{EvaluateSettings, EvaluateTask},
     generate::{GenerateSettings, GenerateTask},
     import::{ImportSettings, ImportTask},
+    infer::{InferSettings, InferTask},
     job::{JobSpec, Limits, MAX_STAGES, OutputSettings, Resources, SpecError, StageSpec},
     refer,
     render::{PartTask, RenderSettings, RenderTask, SceneSource},
+    report::{ReportSettings, ReportTask},
     reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
     sweep::{self, PromoteSettings, PromoteTask},
     task::{ExportSettings, ExportTask, SplitTask, TaskSpec},
@@ -77,6 +79,8 @@ struct StageText {
     train: Option<TrainSettings>,
     evaluate: Option<EvaluateSettings>,
     promote: Option<PromoteSettings>,
+    infer: Option<InferSettings>,
+    report: Option<ReportSettings>,
     output: Option<OutputSettings>,
     parts: Option<u32>,
     #[serde(default)]
@@ -231,11 +235,12 @@ impl JobSpec {
             }
             stage.needs = needs;
             let Some((source, count)) = stage.task.reads_mut() else {
+                refer::link(stage, before)?;
                 continue;
             };
             if source.store.is_empty() && !source.dataset.is_empty() {
                 let named = before.iter().find(|s| s.name == source.dataset);
-                let Some((store, dataset)) = named.and_then(|s| s.task.writes()) else {
+                let Some((store, dataset)) = named.and_then(|s| s.task.makes()) else {
                     return Err(SpecError::new(
                         format!("stage.{}.source", stage.name),
                         format!(
@@ -302,6 +307,8 @@ impl StageText {
             ("train", "train", self.train.is_some()),
             ("evaluate", "evaluate", self.evaluate.is_some()),
             ("promote", "promote", self.promote.is_some()),
+            ("infer", "infer", self.infer.is_some()),
+            ("report", "report", self.report.is_some()),
         ];
         for (field, of, given) in given {
             if given && of != like && of != kind {
@@ -311,14 +318,14 @@ impl StageText {
         }
         let missing =
             |field: &str| SpecError::new(field, format!("is missing; kind = {kind:?} needs it"));
-        let makes = matches!(like, "render" | "reprocess" | "import");
+        let makes = matches!(like, "render" | "reprocess" | "import" | "infer");
         if self.output.is_some() && !makes {
             let what = format!("is not for kind = {kind:?}, which makes no data set; remove it");
             return Err(SpecError::new("output", what));
         }
         let reads = matches!(
             like,
-            "reprocess" | "split" | "export" | "train" | "evaluate" | "promote"
+            "reprocess" | "split" | "export" | "train" | "evaluate" | "promote" | "infer"
         );
         if !reads && (self.source.is_some() || self.count.is_some()) {
             let what = format!("is not for kind = {kind:?}, which reads no data set; remove it");
@@ -380,12 +387,21 @@ impl StageText {
                 count,
                 promote: self.promote.ok_or_else(|| missing("promote"))?,
             }),
+            "infer" => TaskSpec::Infer(InferTask {
+                source: source?,
+                count,
+                infer: self.infer.ok_or_else(|| missing("infer"))?,
+                output: output?,
+            }),
+            "report" => TaskSpec::Report(ReportTask {
+                report: self.report.ok_or_else(|| missing("report"))?,
+            }),
             other => {
                 return Err(SpecError::new(
                     "kind",
                     format!(
                         "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\", \
-                         \"train\", \"evaluate\", \"promote\""
+                         \"train\", \"evaluate\", \"promote\", \"infer\", \"report\""
                     ),
                 ));
             }

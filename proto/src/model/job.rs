@@ -1,7 +1,7 @@
 //! A job: a graph of stages, each of them many tasks of one kind. The TOML job file has exactly these fields; see
 //! [`JobSpec::check`] for their limits, and [`super::file`] for what may be left out or written shorter.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -11,6 +11,8 @@ use super::{file::JobText, render::RenderTask, reprocess::SourceSettings, task::
 pub const MAX_TASKS: u64 = 100_000_000;
 /// Folder of a store in which trained models are kept.
 pub const MODELS: &str = "models";
+/// Folder of a store in which reports about them are kept.
+pub const REPORTS: &str = "reports";
 /// Most stages in one job.
 pub const MAX_STAGES: usize = 1_000;
 
@@ -136,7 +138,7 @@ pub struct OutputSettings {
     pub profile: String,
 }
 
-fn default_profile() -> String {
+pub(super) fn default_profile() -> String {
     "sqrt-u16".into()
 }
 
@@ -158,9 +160,13 @@ impl OutputSettings {
                 ),
             ));
         }
-        if dataset == MODELS {
-            let what =
-                format!("{dataset:?} is where a store keeps trained models; choose another name");
+        let kept = match &**dataset {
+            MODELS => Some("trained models"),
+            REPORTS => Some("reports about models"),
+            _ => None,
+        };
+        if let Some(kept) = kept {
+            let what = format!("{dataset:?} is where a store keeps {kept}; choose another name");
             return Err(SpecError::new("output.dataset", what));
         }
         Ok(())
@@ -318,11 +324,13 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.scenes.count,
             TaskSpec::Import(task) => task.import.count,
             TaskSpec::Reprocess(task) => task.count,
+            TaskSpec::Infer(task) => task.count,
             TaskSpec::Split(_)
             | TaskSpec::Export(_)
             | TaskSpec::Train(_)
             | TaskSpec::Evaluate(_)
-            | TaskSpec::Promote(_) => 1,
+            | TaskSpec::Promote(_)
+            | TaskSpec::Report(_) => 1,
         }
     }
 
@@ -358,6 +366,8 @@ impl StageSpec {
             TaskSpec::Train(task) => task.check(),
             TaskSpec::Evaluate(task) => task.check(),
             TaskSpec::Promote(task) => task.check(),
+            TaskSpec::Infer(task) => task.check(),
+            TaskSpec::Report(task) => task.check(),
             TaskSpec::Split(task) => {
                 check_source(&task.source)?;
                 check_count("count", task.count)?;
@@ -406,7 +416,17 @@ impl StageSpec {
             return Err(SpecError::new("output.dataset", what));
         }
         if let Some(source) = self.task.reads() {
-            let makes = |s: &&Self| s.task.writes() == Some((&source.store, &source.dataset));
+            let place = Some((&source.store, &source.dataset));
+            let predicts = |s: &&Self| s.task.makes().is_none() && s.task.writes() == place;
+            if let Some(other) = before.iter().find(predicts) {
+                let what = format!(
+                    "{:?} is where stage {:?} puts what models predict of scenes, which is no data set; name the stage that \
+                     makes the scenes",
+                    source.dataset, other.name
+                );
+                return Err(SpecError::new("source.dataset", what));
+            }
+            let makes = |s: &&Self| s.task.makes() == place;
             if let Some(other) = after.iter().find(makes) {
                 let what = format!("is made by stage {:?}; put that before", other.name);
                 return Err(SpecError::new("source", what));
@@ -432,11 +452,20 @@ impl StageSpec {
             );
             return Err(SpecError::new("train.model", what));
         }
-        let Some(source) = self.task.reads() else {
+        if let Some(place) = self.task.reports()
+            && let Some(other) = before.iter().find(|s| s.task.reports() == Some(place))
+        {
+            let what = format!(
+                "{:?} is stage {:?}'s report; give each its own name",
+                place.1, other.name
+            );
+            return Err(SpecError::new("report.name", what));
+        }
+        let Some(store) = self.task.shelf() else {
             return Ok(());
         };
         for (field, model) in self.task.models() {
-            let trains = |s: &&Self| s.task.trains() == Some((&source.store, model));
+            let trains = |s: &&Self| s.task.trains() == Some((store, model));
             if let Some(other) = after.iter().find(trains) {
                 let what = format!(
                     "{model:?} is trained by stage {:?}; put that before",
@@ -449,6 +478,29 @@ impl StageSpec {
             {
                 let what = format!("lacks {:?}, which trains {model:?}", other.name);
                 return Err(SpecError::new("needs", what));
+            }
+        }
+        self.check_kinds(store, before)
+    }
+
+    /// Checks that no two models of an inference, as far as stages before it train them, predict the same.
+    fn check_kinds(&self, store: &String, before: &[Self]) -> Result<(), SpecError> {
+        let TaskSpec::Infer(task) = &self.task else {
+            return Ok(());
+        };
+        let mut kinds = BTreeMap::new();
+        for model in &task.infer.models {
+            let trains = |s: &&Self| s.task.trains() == Some((store, model));
+            let Some(TaskSpec::Train(trained)) = before.iter().find(trains).map(|s| &s.task) else {
+                continue;
+            };
+            let kind = trained.train.task.name();
+            if let Some(other) = kinds.insert(kind, model) {
+                let what = format!(
+                    "{other:?} and {model:?} both predict {kind:?}; name one of each kind, and give the other a stage of \
+                     its own"
+                );
+                return Err(SpecError::new("infer.models", what));
             }
         }
         Ok(())
@@ -468,6 +520,8 @@ impl StageSpec {
             TaskSpec::Generate(task) => task.check_places(),
             TaskSpec::Import(task) => task.check_places(),
             TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
+            TaskSpec::Infer(task) => place("output.store", &task.output.store),
+            TaskSpec::Report(task) => task.check_places(),
             TaskSpec::Split(_)
             | TaskSpec::Train(_)
             | TaskSpec::Evaluate(_)

@@ -1,4 +1,5 @@
-//! What training and evaluation refer to in stages before them: models, which a stage's name may stand for, and splits.
+//! What stages refer to in those before them: models, which the name of a stage that trains them may stand for, splits, and
+//! evaluations.
 //!
 //! A name is first that of a model that some stage before trains, then that of a stage: so a job that was read once, and
 //! names models only, means the same when it is read again.
@@ -8,21 +9,27 @@ use super::{
     task::TaskSpec,
 };
 
-/// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models or split it
-/// reads.
+/// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models, split or
+/// evaluations it reads.
 ///
 /// # Errors
 /// A name that stands for several models where one is wanted, or for a stage that trains none.
 pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
-    let Some(source) = stage.task.reads().cloned() else {
+    if let TaskSpec::Report(task) = &mut stage.task
+        && task.report.store.is_empty()
+    {
+        task.report.store = shelf(&task.report.models, before);
+    }
+    let Some(store) = stage.task.shelf().cloned() else {
         return Ok(());
     };
+    let source = stage.task.reads().cloned();
     let at = |field: &str| format!("stage.{}.{field}", stage.name);
     match &mut stage.task {
         TaskSpec::Train(task) => {
             for (field, name) in task.train.models_mut() {
                 let mut found =
-                    named(name, before, &source.store).map_err(|e| SpecError::new(at(field), e))?;
+                    named(name, before, &store).map_err(|e| SpecError::new(at(field), e))?;
                 if found.len() > 1 {
                     let what = format!(
                         "{name:?} stands for {} models; name one stage, as \"{}\"",
@@ -38,23 +45,38 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
         }
         TaskSpec::Evaluate(task) => {
             let models = &mut task.evaluate.models;
-            all(models, before, &source.store)
-                .map_err(|e| SpecError::new(at("evaluate.models"), e))?;
+            all(models, before, &store).map_err(|e| SpecError::new(at("evaluate.models"), e))?;
         }
         TaskSpec::Promote(task) => {
             let models = &mut task.promote.among;
-            all(models, before, &source.store)
-                .map_err(|e| SpecError::new(at("promote.among"), e))?;
+            all(models, before, &store).map_err(|e| SpecError::new(at("promote.among"), e))?;
+        }
+        TaskSpec::Infer(task) => {
+            let models = &mut task.infer.models;
+            all(models, before, &store).map_err(|e| SpecError::new(at("infer.models"), e))?;
+        }
+        TaskSpec::Report(task) => {
+            let models = &mut task.report.models;
+            all(models, before, &store).map_err(|e| SpecError::new(at("report.models"), e))?;
         }
         _ => return Ok(()),
     }
     let task = &stage.task;
     let models = task.models();
+    let read = |name: &String| models.iter().any(|(_, model)| *model == name);
     let wanted = before.iter().filter(|s| match &s.task {
-        TaskSpec::Split(split) => split.source == source && task.split() == Some(&split.split.name),
-        other => other.trains().is_some_and(|(store, model)| {
-            *store == source.store && models.iter().any(|(_, name)| *name == model)
-        }),
+        TaskSpec::Split(split) => {
+            Some(&split.source) == source.as_ref() && task.split() == Some(&split.split.name)
+        }
+        // A report tells what evaluations of its models found.
+        TaskSpec::Evaluate(other) => {
+            task.reports().is_some()
+                && other.source.store == store
+                && other.evaluate.models.iter().any(read)
+        }
+        other => other
+            .trains()
+            .is_some_and(|(place, model)| *place == store && read(model)),
     });
     let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
     for name in wanted {
@@ -77,6 +99,22 @@ fn all(names: &mut Vec<String>, before: &[StageSpec], store: &str) -> Result<(),
     }
     *names = models;
     Ok(())
+}
+
+/// The store in which the first stage that trains one of `names` keeps it; empty where none does.
+fn shelf(names: &[String], before: &[StageSpec]) -> String {
+    let meant = |stage: &&StageSpec| {
+        stage.task.trains().is_some_and(|(_, model)| {
+            let base = stage.name.split('[').next();
+            let is = |name: &String| name == model || *name == stage.name || Some(&**name) == base;
+            names.iter().any(is)
+        })
+    };
+    let found = before.iter().find(meant);
+    found
+        .and_then(|stage| stage.task.shelf())
+        .cloned()
+        .unwrap_or_default()
 }
 
 /// The stages that train what `name` stands for, each with its model; none where it is a model that exists already.

@@ -6,7 +6,9 @@ use super::{
     evaluate::EvaluateTask,
     generate::GenerateTask,
     import::ImportTask,
+    infer::InferTask,
     render::{PartTask, RenderTask},
+    report::ReportTask,
     reprocess::{ReprocessTask, SourceSettings},
     sweep::PromoteTask,
     train::TrainTask,
@@ -38,6 +40,10 @@ pub enum TaskSpec {
     Evaluate(EvaluateTask),
     /// The best of several models gets a name: one task.
     Promote(PromoteTask),
+    /// Models say what they see in scenes: one task each.
+    Infer(InferTask),
+    /// What models came to, as a page: one task.
+    Report(ReportTask),
 }
 
 /// Dividing a data set.
@@ -90,6 +96,8 @@ impl TaskSpec {
             Self::Train(_) => "train",
             Self::Evaluate(_) => "evaluate",
             Self::Promote(_) => "promote",
+            Self::Infer(_) => "infer",
+            Self::Report(_) => "report",
         }
     }
 
@@ -106,35 +114,52 @@ impl TaskSpec {
             Self::Train(task) => &task.train.version,
             Self::Evaluate(task) => &task.evaluate.version,
             Self::Promote(task) => &task.promote.version,
+            Self::Infer(task) => &task.infer.version,
+            Self::Report(task) => &task.report.version,
         }
     }
 
     /// The data set that is read.
     pub fn reads(&self) -> Option<&SourceSettings> {
         match self {
-            Self::Render(_) | Self::Part(_) | Self::Generate(_) | Self::Import(_) => None,
+            Self::Render(_)
+            | Self::Part(_)
+            | Self::Generate(_)
+            | Self::Import(_)
+            | Self::Report(_) => None,
             Self::Reprocess(task) => Some(&task.source),
             Self::Split(task) => Some(&task.source),
             Self::Export(task) => Some(&task.source),
             Self::Train(task) => Some(&task.source),
             Self::Evaluate(task) => Some(&task.source),
             Self::Promote(task) => Some(&task.source),
+            Self::Infer(task) => Some(&task.source),
         }
     }
 
-    /// The data set that scenes are put into: store and folder.
+    /// Where something of each scene is put: store and folder, of a data set or of predictions.
     pub fn writes(&self) -> Option<(&String, &String)> {
         match self {
             Self::Render(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Reprocess(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Import(task) => Some((&task.output.store, &task.output.dataset)),
+            Self::Infer(task) => Some((&task.output.store, &task.output.dataset)),
             Self::Part(_)
             | Self::Generate(_)
             | Self::Split(_)
             | Self::Export(_)
             | Self::Train(_)
             | Self::Evaluate(_)
-            | Self::Promote(_) => None,
+            | Self::Promote(_)
+            | Self::Report(_) => None,
+        }
+    }
+
+    /// The data set that scenes are put into: store and folder.
+    pub fn makes(&self) -> Option<(&String, &String)> {
+        match self {
+            Self::Infer(_) => None,
+            other => other.writes(),
         }
     }
 
@@ -147,7 +172,23 @@ impl TaskSpec {
         }
     }
 
-    /// The models that are read, from the store of [`Self::reads`]: field and name.
+    /// The report that is made: store and name.
+    pub fn reports(&self) -> Option<(&String, &String)> {
+        match self {
+            Self::Report(task) => Some((&task.report.store, &task.report.name)),
+            _ => None,
+        }
+    }
+
+    /// The store that keeps the models which are read or trained.
+    pub fn shelf(&self) -> Option<&String> {
+        match self {
+            Self::Report(task) => Some(&task.report.store),
+            other => other.reads().map(|source| &source.store),
+        }
+    }
+
+    /// The models that are read, from the store of [`Self::shelf`]: field and name.
     pub fn models(&self) -> Vec<(&'static str, &String)> {
         match self {
             Self::Train(task) => task.train.models(),
@@ -158,6 +199,14 @@ impl TaskSpec {
             Self::Promote(task) => {
                 let models = task.promote.among.iter();
                 models.map(|m| ("promote.among", m)).collect()
+            }
+            Self::Infer(task) => {
+                let models = task.infer.models.iter();
+                models.map(|m| ("infer.models", m)).collect()
+            }
+            Self::Report(task) => {
+                let models = task.report.models.iter();
+                models.map(|m| ("report.models", m)).collect()
             }
             _ => Vec::new(),
         }
@@ -190,13 +239,18 @@ impl TaskSpec {
     /// The data set that is read, and the number of its scenes; to be filled in.
     pub fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
         match self {
-            Self::Render(_) | Self::Part(_) | Self::Generate(_) | Self::Import(_) => None,
+            Self::Render(_)
+            | Self::Part(_)
+            | Self::Generate(_)
+            | Self::Import(_)
+            | Self::Report(_) => None,
             Self::Reprocess(task) => Some((&mut task.source, &mut task.count)),
             Self::Split(task) => Some((&mut task.source, &mut task.count)),
             Self::Export(task) => Some((&mut task.source, &mut task.count)),
             Self::Train(task) => Some((&mut task.source, &mut task.count)),
             Self::Evaluate(task) => Some((&mut task.source, &mut task.count)),
             Self::Promote(task) => Some((&mut task.source, &mut task.count)),
+            Self::Infer(task) => Some((&mut task.source, &mut task.count)),
         }
     }
 }

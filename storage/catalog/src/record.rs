@@ -9,7 +9,8 @@ use picofarm_proto::{
     ids::{Epoch, HouseId, Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::{StageKey, stage_key},
     model::{
-        EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec, job::MODELS,
+        EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec,
+        job::{MODELS, REPORTS},
     },
 };
 
@@ -145,6 +146,11 @@ impl ResultSet {
             TaskSpec::Evaluate(task) => (
                 task.source.store.clone(),
                 format!("{}/evaluate", task.source.dataset),
+            ),
+            TaskSpec::Infer(task) => (task.output.store.clone(), task.output.dataset.clone()),
+            TaskSpec::Report(task) => (
+                task.report.store.clone(),
+                format!("{REPORTS}/{}", task.report.name),
             ),
         };
         Self {

@@ -10,9 +10,11 @@ use serde_json::{Map, Value, json};
 use crate::codec::ChunkCodec;
 use crate::coding::decode_lines;
 use crate::error::DatasetError;
+use crate::group::create_metadata;
 use crate::layout::{Layout, Quantity};
 use crate::manifest::{FORMAT_VERSION, encoder_of};
 use crate::objects;
+use crate::predictions::is_predictions;
 use crate::spec::DatasetSpec;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
@@ -184,31 +186,13 @@ impl Dataset {
         })
     }
 
-    /// Writes an array's metadata while there is no root. What an interrupted creation left is adopted if it
-    /// differs at most in the number of scenes.
+    /// Writes an array's metadata while there is no root.
     async fn create_array_metadata(&self, layout: &Layout) -> Result<(), DatasetError> {
         let path = self.metadata_path(layout);
-        let ours = layout.metadata(self.spec.scenes);
-        if objects::create(&*self.store, &path, pretty(&ours)).await? {
-            return Ok(());
-        }
-        let stored = objects::require(&*self.store, &path).await?;
-        let mut stored: Value = serde_json::from_slice(&stored).unwrap_or(Value::Null);
-        let scenes = stored["shape"][0].as_u64().unwrap_or(0);
-        if scenes > 0 {
-            stored["shape"][0] = json!(self.spec.scenes);
-        }
-        if stored != ours {
-            return Err(DatasetError::Damaged {
-                object: self.shown(&path),
-                what: "left by the interrupted creation of another data set; remove it, or use an empty location"
-                    .into(),
-            });
-        }
-        if scenes < self.spec.scenes {
-            objects::overwrite(&*self.store, &path, pretty(&ours)).await?;
-        }
-        Ok(())
+        create_metadata(&*self.store, &path, self.spec.scenes, |n| {
+            layout.metadata(n)
+        })
+        .await
     }
 }
 
@@ -245,13 +229,18 @@ pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
 }
 
 /// The data set's properties and format.
-fn parse_root(bytes: &[u8], root: &str) -> Result<(DatasetSpec, u32), DatasetError> {
+fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetError> {
     let damaged = |what: String| DatasetError::Damaged {
-        object: root.to_string(),
+        object: object.to_string(),
         what,
     };
     let root: Value = serde_json::from_slice(bytes)
         .map_err(|e| damaged(format!("not JSON ({e}), so no Zarr group")))?;
+    if is_predictions(&root) {
+        let what = "holds what models predict of the scenes of a data set, and is no data set itself; its manifests name the one \
+                    that it is about";
+        return Err(DatasetError::invalid(object, what));
+    }
     let ours = &root["attributes"]["picofarm"];
     let Some(format) = ours["format"].as_u64() else {
         return Err(damaged(

@@ -335,23 +335,20 @@ impl Layout {
 
     /// The same for values that are in stored order already.
     pub fn stored_codecs(&self) -> Value {
-        let typesize = self.element.size();
-        let bytes = match typesize {
-            1 => json!({"name": "bytes"}),
-            _ => json!({"name": "bytes", "configuration": {"endian": "little"}}),
-        };
-        let blosc = json!({"name": "blosc", "configuration": {
-            "cname": "zstd", "clevel": 3, "shuffle": self.shuffle, "typesize": typesize, "blocksize": 0,
-        }});
-        let crc = json!({"name": "crc32c"});
-        match self.quantity {
+        let mut codecs = image_codecs(self.element, self.shuffle);
+        let few = matches!(
+            self.quantity,
             Quantity::Spots
-            | Quantity::Intrinsics
-            | Quantity::Camera
-            | Quantity::Laser
-            | Quantity::Scale => json!([bytes, crc]),
-            _ => json!([bytes, blosc, crc]),
+                | Quantity::Intrinsics
+                | Quantity::Camera
+                | Quantity::Laser
+                | Quantity::Scale
+        );
+        if few {
+            let codecs = codecs.as_array_mut().expect("a list of codecs");
+            codecs.remove(1);
         }
+        codecs
     }
 
     pub fn fill_value(&self) -> Value {
@@ -389,6 +386,19 @@ impl Layout {
             "dimension_names": self.dimensions,
         })
     }
+}
+
+/// The codecs of images: values as bytes, compressed, with a checksum.
+pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
+    let typesize = element.size();
+    let bytes = match typesize {
+        1 => json!({"name": "bytes"}),
+        _ => json!({"name": "bytes", "configuration": {"endian": "little"}}),
+    };
+    let blosc = json!({"name": "blosc", "configuration": {
+        "cname": "zstd", "clevel": 3, "shuffle": shuffle, "typesize": typesize, "blocksize": 0,
+    }});
+    json!([bytes, blosc, {"name": "crc32c"}])
 }
 
 /// The codecs of a shard's index.

@@ -13,6 +13,7 @@ mod derive;
 mod encode;
 mod error;
 mod export;
+mod group;
 pub mod import;
 mod layout;
 mod listing;
@@ -20,12 +21,14 @@ mod manifest;
 mod models;
 mod objects;
 mod parts;
+mod predictions;
 mod publish;
 mod read;
 mod recipe;
 mod record;
 mod render_group;
 mod render_read;
+mod reports;
 mod restore;
 mod root;
 mod rounding;
@@ -58,11 +61,16 @@ pub use models::{
 };
 pub use objects::publish_files;
 pub use parts::PartName;
+pub use predictions::{
+    EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,
+    SceneUsed, TimesUsed,
+};
 pub use read::Stored;
 pub use recipe::Recipe;
 pub use record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use render_group::{RenderArray, write_render_group};
 pub use render_read::RenderGroup;
+pub use reports::{REPORTS, ReportManifest, ReportedModel, Reports};
 pub use restore::Restored;
 pub use root::{Remains, remains, restore_root};
 pub use snapshot::{Difference, Snapshot};

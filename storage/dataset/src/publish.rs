@@ -13,7 +13,7 @@ use crate::objects;
 use crate::record::{Provenance, SceneRecord};
 
 /// Requests in flight for one scene.
-const CONCURRENCY: usize = 8;
+pub(crate) const CONCURRENCY: usize = 8;
 
 impl Dataset {
     /// Codes a scene on rayon's threads. Pure and blocking: from async code, call it through `spawn_blocking` and
@@ -43,9 +43,7 @@ impl Dataset {
         let EncodedScene { manifest, bytes } = scene;
         let paths = manifest.objects.iter().map(|object| self.path(&object.key));
         let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
-        let put = |(path, bytes)| objects::create_or_match(&*self.store, path, bytes);
-        let puts: Vec<_> = objects.iter().map(|(p, b)| put((p, b.clone()))).collect();
-        all(puts).await?;
+        put_all(&*self.store, &objects).await?;
         let path = self.path(&Manifest::key(manifest.scene));
         let put_manifest =
             objects::create_or_match(&*self.store, &path, manifest.to_bytes().into());
@@ -59,18 +57,7 @@ impl Dataset {
             }
             Err(error) => return Err(error),
         };
-        // A collector may have taken an object before there was a manifest to protect it: what a killed worker had
-        // left and was found equal above, or what this process wrote before it stood still for long.
-        let again: Vec<_> = objects
-            .iter()
-            .map(|(path, bytes)| async move {
-                match objects::size(&*self.store, path).await? {
-                    Some(_) => Ok(()),
-                    None => put((path, bytes.clone())).await,
-                }
-            })
-            .collect();
-        all(again).await?;
+        put_again(&*self.store, &objects).await?;
         Ok(manifest)
     }
 
@@ -121,6 +108,37 @@ impl Dataset {
     }
 }
 
+/// Puts objects create-only, some at a time; those that exist must have equal bytes.
+pub(crate) async fn put_all(
+    store: &dyn ObjectStore,
+    objects: &[(Path, Bytes)],
+) -> Result<(), DatasetError> {
+    let put = |(path, bytes): &(Path, Bytes)| {
+        let (path, bytes) = (path.clone(), bytes.clone());
+        async move { objects::create_or_match(store, &path, bytes).await }
+    };
+    all(objects.iter().map(put).collect()).await
+}
+
+/// The same for those that are gone when the manifest stands. A collector may have taken an object before there was a
+/// manifest to protect it: what a killed worker had left and was found equal, or what this process wrote before it stood
+/// still for long.
+pub(crate) async fn put_again(
+    store: &dyn ObjectStore,
+    objects: &[(Path, Bytes)],
+) -> Result<(), DatasetError> {
+    let again = |(path, bytes): &(Path, Bytes)| {
+        let (path, bytes) = (path.clone(), bytes.clone());
+        async move {
+            match objects::size(store, &path).await? {
+                Some(_) => Ok(()),
+                None => objects::create_or_match(store, &path, bytes).await,
+            }
+        }
+    };
+    all(objects.iter().map(again).collect()).await
+}
+
 /// Waits for all, some at a time; the first error ends it.
 async fn all(
     requests: Vec<impl Future<Output = Result<(), DatasetError>>>,
@@ -130,7 +148,7 @@ async fn all(
     Ok(())
 }
 
-async fn check_size(
+pub(crate) async fn check_size(
     store: &dyn ObjectStore,
     path: Path,
     expected: u64,

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use futures::{Stream, StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
+use object_store::path::Path;
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
@@ -32,6 +33,27 @@ macro_rules! stored {
 }
 stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
 
+/// The scenes that have a manifest in a folder, ascending.
+pub(crate) async fn scenes_in(
+    store: &dyn ObjectStore,
+    folder: &Path,
+) -> Result<Vec<u64>, DatasetError> {
+    let mut scenes: Vec<u64> = store
+        .list(Some(folder))
+        .try_filter_map(|object| async move {
+            let name = object
+                .location
+                .filename()
+                .and_then(|n| n.strip_suffix(".json"));
+            Ok(name.and_then(|n| n.parse::<u64>().ok()))
+        })
+        .try_collect()
+        .await
+        .map_err(|e| DatasetError::store("list", objects::shown(store, folder), e))?;
+    scenes.sort_unstable();
+    Ok(scenes)
+}
+
 impl Dataset {
     /// The manifest of a published scene (its objects are not looked at; see [`Self::published`]).
     ///
@@ -54,22 +76,8 @@ impl Dataset {
     /// # Errors
     /// [`DatasetError::Store`].
     pub async fn scenes_present(&self) -> Result<Vec<u64>, DatasetError> {
-        let folder = self.path("manifests");
-        let mut scenes: Vec<u64> = self
-            .store
-            .list(Some(&folder))
-            .try_filter_map(|object| async move {
-                let name = object
-                    .location
-                    .filename()
-                    .and_then(|n| n.strip_suffix(".json"));
-                Ok(name.and_then(|n| n.parse::<u64>().ok()))
-            })
-            .try_collect()
-            .await
-            .map_err(|e| DatasetError::store("list", self.shown(&folder), e))?;
+        let mut scenes = scenes_in(&*self.store, &self.path("manifests")).await?;
         scenes.retain(|scene| *scene < self.spec.scenes);
-        scenes.sort_unstable();
         Ok(scenes)
     }
 

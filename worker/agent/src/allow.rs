@@ -62,10 +62,12 @@ impl StorePrefixes {
             TaskSpec::Generate(task) => self.allowed("generate.dest", &task.generate.dest),
             TaskSpec::Import(task) => self.allowed("import.folder", &task.import.folder),
             TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
+            TaskSpec::Report(task) => self.allowed("report.store", &task.report.store),
             // Models lie in the source's store, and are put there.
             TaskSpec::Reprocess(_)
             | TaskSpec::Split(_)
             | TaskSpec::Train(_)
+            | TaskSpec::Infer(_)
             | TaskSpec::Evaluate(_)
             | TaskSpec::Promote(_) => Ok(()),
         }

@@ -17,8 +17,8 @@ pub use agent::{run, run_with};
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
 pub use execute::{
-    TaskExecutor, check_memory, generator_version, import_options, import_version, memory_mib,
-    model_version, render_bytes, renderer_version, strategy, strategy_names,
+    TaskExecutor, check_memory, generator_version, import_options, import_version, infer_version,
+    memory_mib, model_version, render_bytes, renderer_version, strategy, strategy_names,
 };
-pub use execute::{export, gallery, repair, reprocess, split};
+pub use execute::{export, repair, report, reprocess, split};
 pub use log::task_logs;

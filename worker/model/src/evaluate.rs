@@ -98,8 +98,23 @@ pub fn answers(
     scene: &Scene,
     hear: &mut dyn FnMut(&[f32], &Batch),
 ) -> Result<(), ModelError> {
-    let question = model.question();
     let depth_m = guide.map(|guide| guide.depth_m(scene)).transpose()?;
+    answers_at(model, depth_m.as_deref(), scene, &mut |said, batch| {
+        hear(said, batch);
+        true
+    })
+    .map(drop)
+}
+
+/// The same where the depths that two-bounce times follow from are known, and `hear` says whether to go on; `false` where it
+/// did not.
+fn answers_at(
+    model: &Model,
+    depth_m: Option<&[f32]>,
+    scene: &Scene,
+    hear: &mut dyn FnMut(&[f32], &Batch) -> bool,
+) -> Result<bool, ModelError> {
+    let question = model.question();
     let spots = if question.by_spot() {
         question.spots
     } else {
@@ -111,8 +126,59 @@ pub fn answers(
             spot,
             ..Visit::default()
         };
-        example(&mut batch, question, scene, depth_m.as_deref(), visit)?;
-        hear(&model.answer(&batch), &batch);
+        example(&mut batch, question, scene, depth_m, visit)?;
+        if !hear(&model.answer(&batch), &batch) {
+            return Ok(false);
+        }
     }
-    Ok(())
+    Ok(true)
+}
+
+/// The masks that a model says of a scene: probabilities times 255, rounded, `[row][column]` of mirrors,
+/// `[spot][row][column]` of light. `depth_m` is what two-bounce times follow from (the truth without it). `tell` hears how
+/// many visits are done of how many and says whether to go on; where it does not, there is no answer.
+///
+/// # Errors
+/// [`ModelError::Invalid`] for a depth network, and for a scene that does not fit the model.
+pub fn masks(
+    model: &Model,
+    depth_m: Option<&[f32]>,
+    scene: &Scene,
+    tell: &mut dyn FnMut(usize, usize) -> bool,
+) -> Result<Option<Vec<u8>>, ModelError> {
+    let question = model.question();
+    if question.task == Task::Tof {
+        return Err(ModelError::invalid(
+            "models",
+            "a depth network says no mask",
+        ));
+    }
+    let visits = match question.by_spot() {
+        true => question.spots,
+        false => 1,
+    };
+    let (mut masks, mut done) = (Vec::new(), 0);
+    let whole = answers_at(model, depth_m, scene, &mut |said, _| {
+        masks.extend(said.iter().map(|logit| probability(*logit)));
+        done += 1;
+        tell(done, visits)
+    })?;
+    Ok(whole.then_some(masks))
+}
+
+/// 1/(1 + e^−x) times 255, rounded; 0 where x is no number.
+fn probability(logit: f32) -> u8 {
+    // Casting saturates, and NaN becomes 0.
+    (255.0 / (1.0 + libm::exp(-f64::from(logit)))).round() as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::probability;
+
+    #[test]
+    fn probabilities_of_logits_fill_a_byte() {
+        let said = [f32::NEG_INFINITY, -100.0, -1.0, 0.0, 1.0, 100.0, f32::NAN].map(probability);
+        assert_eq!(said, [0, 0, 69, 128, 186, 255, 0]);
+    }
 }

@@ -22,7 +22,7 @@ pub mod weights;
 /// Where networks are computed.
 pub use burn::tensor::Device;
 pub use error::ModelError;
-pub use evaluate::{Evaluated, answers, evaluate};
+pub use evaluate::{Evaluated, answers, evaluate, masks};
 pub use kernel::AdamW;
 pub use model::Model;
 pub use random::Random;

@@ -68,7 +68,7 @@ impl Dataset {
     }
 }
 
-fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
+pub(crate) fn metadata_fault(bytes: &[u8], expected: &Value) -> Option<Fault> {
     let stored: Value = match serde_json::from_slice(bytes) {
         Ok(stored) => stored,
         Err(e) => return Some(Fault::BadMetadata(format!("not JSON: {e}"))),

@@ -20,6 +20,7 @@ use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
 use crate::objects;
 use crate::snapshot::Snapshot;
 
+pub(crate) use metadata::metadata_fault;
 pub use report::{Fault, Problem, Verification, VerifyMode};
 
 /// Manifests read at a time.

@@ -114,6 +114,12 @@ impl Examples {
         self.spots.as_ref().map_or(all, Vec::len)
     }
 
+    /// Which of the data set's they are.
+    pub(super) fn spot_numbers(&self) -> Vec<u32> {
+        let all = || (0..self.dataset.spec().spots).collect();
+        self.spots.clone().unwrap_or_else(all)
+    }
+
     async fn histogram(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
         let Some(spots) = self
             .spots

@@ -1,6 +1,6 @@
 //! Pictures of what trained models say, for people: of scenes that they were evaluated on.
 
-use std::time::Duration;
+use std::sync::Arc;
 
 use picofarm_dataset::Evaluation;
 use picofarm_model::{
@@ -8,7 +8,6 @@ use picofarm_model::{
     report::{Picture, pictures},
 };
 use picofarm_proto::model::{Histogram, train::TRUTH};
-use tokio::runtime::Handle;
 
 use super::{
     Control, TaskError,
@@ -18,68 +17,50 @@ use super::{
     train::{Known, of_model},
 };
 
-/// Makes pictures.
-pub struct Gallery {
-    stores: Stores,
-}
-
 /// A model's pictures, and the size of its scenes.
-#[derive(Debug)]
-pub struct Shown {
+pub(super) struct Shown {
     /// The model, as it lies in the store.
-    pub model: Model,
+    pub(super) model: Arc<Model>,
     /// Rows of its scenes' images.
-    pub side: usize,
+    pub(super) side: usize,
     /// What it says.
-    pub pictures: Vec<Picture>,
+    pub(super) pictures: Vec<Picture>,
 }
 
-impl Gallery {
-    /// Stores are reached through `runtime`, which must not be a thread that calls this.
-    pub fn new(runtime: Handle) -> Self {
-        Self {
-            stores: Stores::new(runtime, Duration::ZERO),
-        }
-    }
-
-    /// What a model says of the first `count` scenes that it was evaluated on.
-    ///
-    /// # Errors
-    /// [`TaskError::User`] where the model, its data set or its split is not there any more.
-    pub fn show(
-        &self,
-        store: &str,
-        evaluation: &Evaluation,
-        count: usize,
-        control: &Control,
-    ) -> Result<Shown, TaskError> {
-        let stores = &self.stores;
-        let dataset = stores.open_source(store, &evaluation.dataset, control)?;
-        let models = stores.models(store, control)?;
-        let split = ("report", &*evaluation.split.name);
-        let found = sides(stores, &dataset, split, [&*evaluation.side], control)?;
-        let [mut scenes] = found.scenes;
-        scenes.truncate(count);
-        let read =
-            |name: &str| Known::read(stores, &models, ("report", name), dataset.spec(), control);
-        let known = read(&evaluation.model)?;
-        let settings = trained(&known.manifest.settings).map_err(|what| {
-            TaskError::User(format!("{}: its settings: {what}", evaluation.model))
-        })?;
-        let guide = match &*settings.shadow.tof {
-            TRUTH => None,
-            tof => Some(read(tof)?),
-        };
-        let histogram = Histogram::parse(&evaluation.histogram).map_err(TaskError::User)?;
-        let indices: Vec<usize> = (0..scenes.len()).collect();
-        let histogram = (histogram, &*settings.spots);
-        let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?;
-        let guide = guide.as_ref().map(|guide| &*guide.model);
-        let pictures = pictures(&known.model, guide, &*examples, &indices, 2).map_err(of_model)?;
-        Ok(Shown {
-            side: dataset.spec().height as usize,
-            model: Model::clone(&known.model),
-            pictures,
-        })
-    }
+/// What a model says of the first `count` scenes that it was evaluated on.
+///
+/// # Errors
+/// [`TaskError::User`] where the model, its data set or its split is not there any more.
+pub(super) fn show(
+    stores: &Stores,
+    store: &str,
+    evaluation: &Evaluation,
+    count: usize,
+    control: &Control,
+) -> Result<Shown, TaskError> {
+    let dataset = stores.open_source(store, &evaluation.dataset, control)?;
+    let models = stores.source_models(store)?;
+    let split = ("report", &*evaluation.split.name);
+    let found = sides(stores, &dataset, split, [&*evaluation.side], control)?;
+    let [mut scenes] = found.scenes;
+    scenes.truncate(count);
+    let read = |name: &str| Known::read(stores, &models, ("report", name), dataset.spec(), control);
+    let known = read(&evaluation.model)?;
+    let settings = trained(&known.manifest.settings)
+        .map_err(|what| TaskError::User(format!("{}: its settings: {what}", evaluation.model)))?;
+    let guide = match &*settings.shadow.tof {
+        TRUTH => None,
+        tof => Some(read(tof)?),
+    };
+    let histogram = Histogram::parse(&evaluation.histogram).map_err(TaskError::User)?;
+    let indices: Vec<usize> = (0..scenes.len()).collect();
+    let histogram = (histogram, &*settings.spots);
+    let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?;
+    let guide = guide.as_ref().map(|guide| &*guide.model);
+    let pictures = pictures(&known.model, guide, &*examples, &indices, 2).map_err(of_model)?;
+    Ok(Shown {
+        side: dataset.spec().height as usize,
+        model: known.model,
+        pictures,
+    })
 }

@@ -3,9 +3,10 @@
 mod evaluate;
 mod examples;
 pub mod export;
-pub mod gallery;
+mod gallery;
 mod generate;
 mod import;
+mod infer;
 mod memory;
 mod output;
 mod parts;
@@ -13,6 +14,7 @@ mod promote;
 mod recipe;
 mod render;
 pub mod repair;
+pub mod report;
 pub mod reprocess;
 mod runner;
 mod scenes;
@@ -38,6 +40,7 @@ use picofarm_proto::{
 
 pub use generate::generator_version;
 pub use import::{import_options, import_version};
+pub use infer::infer_version;
 pub use memory::{check_memory, memory_mib, render_bytes};
 pub use render::renderer_version;
 pub(crate) use runner::Runner;

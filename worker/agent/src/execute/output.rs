@@ -88,17 +88,25 @@ impl Stores {
         dataset: &str,
         control: &Control,
     ) -> Result<Dataset, TaskError> {
-        let known = || self.sources.lock().expect("no panic while locked");
-        let place = known().get(location).cloned();
-        let (store, prefix) = match place {
-            Some(place) => place,
-            None => {
-                let place = open_store(location).map_err(of_dataset)?;
-                known().insert(location.to_owned(), place.clone());
-                place
-            }
-        };
+        let (store, prefix) = self.source(location)?;
         self.wait(control, Dataset::open(store, prefix.join(dataset)))
+    }
+
+    /// The models of a store, to read only; asks of it nothing else.
+    pub(super) fn source_models(&self, location: &str) -> Result<Models, TaskError> {
+        let (store, prefix) = self.source(location)?;
+        Ok(Models::new(store, &prefix))
+    }
+
+    /// A place to read from.
+    fn source(&self, location: &str) -> Result<Place, TaskError> {
+        let known = || self.sources.lock().expect("no panic while locked");
+        if let Some(place) = known().get(location) {
+            return Ok(place.clone());
+        }
+        let place = open_store(location).map_err(of_dataset)?;
+        known().insert(location.to_owned(), place.clone());
+        Ok(place)
     }
 
     /// Stores a recipe where there is none yet; one of all scenes is looked for once.

@@ -221,7 +221,7 @@ fn open_source(
 }
 
 /// The source's manifest of a scene; see the head of this file for what it means where there is none.
-fn source_manifest(
+pub(super) fn source_manifest(
     stores: &Stores,
     source: &Dataset,
     index: u64,

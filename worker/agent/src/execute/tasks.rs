@@ -10,8 +10,8 @@ use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
 
 use super::{
-    Control, Executor, Output, Task, TaskError, evaluate, export, generate, import, output::Stores,
-    parts, promote, render, reprocess, scenes, split, train,
+    Control, Executor, Output, Task, TaskError, evaluate, export, generate, import, infer,
+    output::Stores, parts, promote, render, report, reprocess, scenes, split, train,
 };
 
 /// How long a finished scene waits for a store that is full or away before its task is handed back.
@@ -22,6 +22,7 @@ pub struct TaskExecutor {
     libraries: Vec<AssetLibrary>,
     stores: Stores,
     sources: import::Sources,
+    minds: infer::Minds,
 }
 
 impl TaskExecutor {
@@ -32,6 +33,7 @@ impl TaskExecutor {
             libraries: scenes::find_libraries(asset_dirs),
             stores: Stores::new(runtime, STORE_PATIENCE),
             sources: import::Sources::default(),
+            minds: infer::Minds::default(),
         }
     }
 }
@@ -49,6 +51,8 @@ impl Executor for TaskExecutor {
             ("train", train::model_version()),
             ("evaluate", train::model_version()),
             ("promote", train::model_version()),
+            ("infer", infer::infer_version()),
+            ("report", train::model_version()),
         ]
         .map(|(kind, version)| (kind.to_owned(), version))
         .into()
@@ -81,6 +85,11 @@ impl Executor for TaskExecutor {
             }
             TaskSpec::Evaluate(spec) => evaluate::run(stores, spec, control),
             TaskSpec::Promote(spec) => promote::run(stores, spec, control),
+            TaskSpec::Infer(spec) => {
+                let force = task.spec.force;
+                infer::run(stores, &self.minds, spec, force, task.index, control)
+            }
+            TaskSpec::Report(spec) => report::run(stores, spec, task.spec.force, control),
         }
     }
 }

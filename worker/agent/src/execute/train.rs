@@ -34,7 +34,7 @@ mod plan;
 mod trial;
 
 use along::{Saver, Teller};
-pub(super) use known::Known;
+pub(super) use known::{Known, Met};
 use trial::{Course, Left};
 
 use super::{

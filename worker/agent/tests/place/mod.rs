@@ -4,15 +4,16 @@
 use std::{collections::BTreeMap, path::PathBuf, sync::Arc, time::Duration};
 
 use picofarm_agent::{
-    Control, Executor, Output, Task, TaskError, TaskExecutor, model_version, split::Splitter,
+    Control, Executor, Output, Task, TaskError, TaskExecutor, infer_version, model_version,
+    split::Splitter,
 };
 use picofarm_dataset::*;
 use picofarm_proto::{
     ids::JobId,
     key::{TaskKey, stage_key},
     model::{
-        EvaluateSettings, EvaluateTask, SourceSettings, StageSpec, TaskSpec, TrainSettings,
-        TrainTask,
+        EvaluateSettings, EvaluateTask, InferTask, ReportTask, SourceSettings, StageSpec, TaskSpec,
+        TrainSettings, TrainTask,
     },
     split::{Parts, SplitSettings},
 };
@@ -39,7 +40,7 @@ impl Place {
             dir: tempfile::tempdir().unwrap(),
         };
         for scene in 0..SCENES {
-            place.publish(scene).await;
+            place.publish("rooms", scene, [SIDE, BINS]).await;
         }
         place.split("default", Parts::Counts([5, 2, 1])).await;
         place
@@ -49,30 +50,31 @@ impl Place {
         self.dir.path().to_str().unwrap().to_owned()
     }
 
-    pub async fn publish(&self, scene: u64) {
+    /// Publishes a scene of images with so many rows and columns, and histograms with so many bins (8 at least).
+    pub async fn publish(&self, dataset: &str, scene: u64, [side, bins]: [u32; 2]) {
         let spec = DatasetSpec {
             scenes: SCENES,
-            height: SIDE,
-            width: SIDE,
+            height: side,
+            width: side,
             spots: 2,
             subsets: Subsets::NONE,
             per_spot: true,
             gate: Gate {
                 start_m: 1.0,
                 bin_width_m: 1.5,
-                bins: BINS,
+                bins,
             },
             profile: Profile::LOSSLESS,
         };
-        let pixels = (SIDE * SIDE) as usize;
+        let pixels = (side * side) as usize;
         let depth: Vec<f32> = (0..pixels)
             .map(|p| 1.0 + ((p as u64 * 7 + scene * 3) % 5) as f32 * 0.5)
             .collect();
         // The nearer, the earlier.
         let light = |spot: usize| -> Vec<f32> {
-            let mut h = vec![0.01; pixels * BINS as usize];
+            let mut h = vec![0.01; pixels * bins as usize];
             for (p, z) in depth.iter().enumerate() {
-                h[p * BINS as usize + (*z * 2.0) as usize] = (1 + spot) as f32 / z;
+                h[p * bins as usize + (*z * 2.0) as usize] = (1 + spot) as f32 / z;
             }
             h
         };
@@ -123,10 +125,10 @@ impl Place {
             plan: json!({}),
         };
         let (store, prefix) = open_store(&self.store()).unwrap();
-        let dataset = Dataset::create_or_open(store, prefix.join("rooms"), &spec)
+        let rooms = Dataset::create_or_open(store, prefix.join(dataset), &spec)
             .await
             .unwrap();
-        dataset.publish(scene, &record, &provenance).await.unwrap();
+        rooms.publish(scene, &record, &provenance).await.unwrap();
     }
 
     pub async fn split(&self, name: &str, parts: Parts) {
@@ -186,6 +188,41 @@ impl Place {
         }))
     }
 
+    pub fn inference(&self, more: serde_json::Value) -> StageSpec {
+        let mut settings = json!({"models": ["m", "sh", "s"], "version": infer_version()});
+        for (name, value) in more.as_object().unwrap() {
+            settings[name] = value.clone();
+        }
+        StageSpec::new(TaskSpec::Infer(InferTask {
+            source: self.source(),
+            count: SCENES,
+            infer: serde_json::from_value(settings).unwrap(),
+            output: serde_json::from_value(json!({"store": self.store(), "dataset": "seen"}))
+                .unwrap(),
+        }))
+    }
+
+    pub fn report(&self, more: serde_json::Value) -> StageSpec {
+        let mut settings = json!({"name": "main", "models": ["m"], "store": self.store(), "version": model_version()});
+        for (name, value) in more.as_object().unwrap() {
+            settings[name] = value.clone();
+        }
+        let report = serde_json::from_value(settings).unwrap();
+        StageSpec::new(TaskSpec::Report(ReportTask { report }))
+    }
+
+    /// Trains a network of each kind: `m`, `sh` on its depths, `s` on its features.
+    pub async fn train_all(&self) {
+        let short = json!({"epochs": 10, "batch": 2});
+        for settings in [
+            json!({"optimise": short}),
+            json!({"task": "shadow", "model": "sh", "shadow": {"tof": "m"}, "optimise": short}),
+            json!({"task": "specular", "model": "s", "specular": {"on": "m"}, "optimise": short}),
+        ] {
+            run(self.training(settings)).await.unwrap();
+        }
+    }
+
     pub fn files(&self, folder: &str) -> Files {
         let root = self.dir.path().join(folder);
         let (mut found, mut folders) = (BTreeMap::new(), vec![root.clone()]);
@@ -224,11 +261,20 @@ pub fn assert_same(ours: &Files, theirs: &Files) {
 
 /// Runs a stage's only task on a worker of its own.
 pub async fn run_with(stage: StageSpec, control: Arc<Control>) -> Result<Output, TaskError> {
+    run_at(stage, 0, control).await
+}
+
+/// Runs one of a stage's tasks on a worker of its own.
+pub async fn run_at(
+    stage: StageSpec,
+    index: u64,
+    control: Arc<Control>,
+) -> Result<Output, TaskError> {
     let task = Task {
         job: JobId::from_uuid(Uuid::nil()),
         stage: stage_key(&stage),
         spec: Arc::new(stage),
-        index: 0,
+        index,
     };
     let runtime = Handle::current();
     let work = move || {

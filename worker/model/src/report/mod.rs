@@ -37,7 +37,7 @@ pub use summary::{Group, Order, Scaling, Spread, Summary, json, summary};
 pub struct Report {
     /// Its title.
     pub title: String,
-    /// When it was made, as it shall stand there.
+    /// When it was made, as it shall stand there; empty = not said.
     pub date: String,
     /// Models, in the order in which they shall appear.
     pub models: Vec<Entry>,

@@ -33,14 +33,18 @@ pub fn html(report: &Report) -> String {
         .map(|(id, name, body)| format!("<section id=\"{id}\"><h2>{name}</h2>{body}</section>\n"));
     let bodies: String = bodies.collect();
     let title = Safe(&report.title);
-    let (date, models) = (Safe(&report.date), report.models.len());
+    let date = match &*report.date {
+        "" => String::new(),
+        date => format!("{} · ", Safe(date)),
+    };
+    let models = report.models.len();
     let experiments = summary.groups.len();
     let plural = |n: usize| if n == 1 { "" } else { "s" };
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
          <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
          <title>{title}</title>\n<style>{STYLE}</style></head>\n<body>\
-         <header><h1>{title}</h1><p class=\"note\">{date} · {models} model{}, {experiments} experiment{}</p>\
+         <header><h1>{title}</h1><p class=\"note\">{date}{models} model{}, {experiments} experiment{}</p>\
          <nav>{links}</nav></header>\n<main>{bodies}</main></body></html>\n",
         plural(models),
         plural(experiments)

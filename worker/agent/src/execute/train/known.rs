@@ -35,12 +35,18 @@ pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
     serde_json::to_value(asked).expect("plain data")
 }
 
-impl Known {
-    /// Reads a model, which must have been trained on histograms like those of `spec`.
+/// A model of a store that fits a data set; its weights are not read yet.
+pub(in crate::execute) struct Met {
+    pub(in crate::execute) manifest: ModelManifest,
+    pub(in crate::execute) plan: Plan,
+}
+
+impl Met {
+    /// Looks at a model, which must have been trained on histograms like those of `spec` and take images of that size.
     ///
     /// # Errors
-    /// [`TaskError::User`] at `field` where there is none of this name, or it was trained on other bins.
-    pub(in crate::execute) fn read(
+    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    pub(in crate::execute) fn look(
         stores: &Stores,
         models: &Models,
         (field, name): (&str, &str),
@@ -50,7 +56,7 @@ impl Known {
         let manifest = stores.wait(control, models.manifest(name));
         let manifest = manifest.map_err(|e| at(field, e))?;
         let asked = serde_json::from_value(manifest.plan.clone());
-        let Asked { gate, .. } = asked.map_err(|e| {
+        let Asked { plan, gate } = asked.map_err(|e| {
             TaskError::User(format!(
                 "{field}: {name:?} was made by {}, and this version does not know how to ask it: {e}",
                 manifest.lineage.code
@@ -69,13 +75,60 @@ impl Known {
                 shown(&spec.gate)
             )));
         }
-        let weights = stores.wait(control, models.read(&manifest, WEIGHTS));
-        let weights = weights.map_err(|e| at(field, e))?;
+        let multiple = plan.net.multiple() as u32;
+        if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
+            return Err(TaskError::User(format!(
+                "{field}: {name:?} takes images whose sides are multiples of {multiple}; the data set has {}x{} pixels",
+                spec.width, spec.height
+            )));
+        }
+        Ok(Self { manifest, plan })
+    }
+
+    /// Its weights.
+    fn weights(
+        &self,
+        stores: &Stores,
+        models: &Models,
+        field: &str,
+        control: &Control,
+    ) -> Result<Bytes, TaskError> {
+        let weights = stores.wait(control, models.read(&self.manifest, WEIGHTS));
+        weights.map_err(|e| at(field, e))
+    }
+
+    /// The model, ready to be asked.
+    pub(in crate::execute) fn model(
+        &self,
+        stores: &Stores,
+        models: &Models,
+        field: &str,
+        control: &Control,
+    ) -> Result<Model, TaskError> {
+        let weights = self.weights(stores, models, field, control)?;
+        Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)
+    }
+}
+
+impl Known {
+    /// Reads a model; see [`Met::look`].
+    ///
+    /// # Errors
+    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    pub(in crate::execute) fn read(
+        stores: &Stores,
+        models: &Models,
+        (field, name): (&str, &str),
+        spec: &DatasetSpec,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let met = Met::look(stores, models, (field, name), spec, control)?;
+        let weights = met.weights(stores, models, field, control)?;
         let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
         Ok(Self {
             model: Arc::new(model),
             weights,
-            manifest,
+            manifest: met.manifest,
         })
     }
 }

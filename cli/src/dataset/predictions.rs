@@ -1,0 +1,164 @@
+//! `picofarm dataset info|show|verify` of what models predict.
+
+use picofarm_dataset::{
+    ModelUsed, PredictionManifest, PredictionSpec, Predictions, Problem, TimesUsed, open_store,
+};
+use serde_json::json;
+
+use super::{
+    failed,
+    verify::{Late, broken_by, mode, problems_json_by},
+};
+use crate::{
+    args::{DatasetShow, DatasetVerify},
+    error::{CliError, Result},
+    output::{Output, bytes, table},
+};
+
+/// The predictions at a place, if it holds some.
+pub async fn find(place: &str) -> Result<Option<Predictions>> {
+    let (store, prefix) = open_store(place).map_err(failed)?;
+    Predictions::find(store, prefix).await.map_err(failed)
+}
+
+/// What there is of them.
+pub async fn info(place: &str, there: &Predictions, output: Output) -> Result<()> {
+    let present = there.scenes_present().await.map_err(failed)?;
+    let spec = there.spec();
+    let facts = json!({"predictions": place, "spec": spec, "scenes": present.len()});
+    output.result(&facts, || {
+        format!(
+            "{place}: what models predict ({}) of {} of {} scenes, {}x{} pixels\n",
+            arrays(spec).join(", "),
+            present.len(),
+            spec.scenes,
+            spec.width,
+            spec.height
+        )
+    });
+    Ok(())
+}
+
+fn arrays(spec: &PredictionSpec) -> Vec<String> {
+    let mut names = Vec::new();
+    if spec.depth {
+        names.push("depth".to_owned());
+    }
+    match spec.spots.len() {
+        0 => {}
+        1 => names.push("lit by 1 spot".into()),
+        n => names.push(format!("lit by each of {n} spots")),
+    }
+    if spec.specular {
+        names.push("specular".into());
+    }
+    names
+}
+
+/// Where one scene's come from.
+pub async fn show(args: &DatasetShow, there: &Predictions, output: Output) -> Result<()> {
+    let manifest = there.manifest(args.scene).await.map_err(failed)?;
+    let facts = json!({
+        "predictions": args.dataset, "scene": args.scene, "kind": "infer", "manifest": manifest,
+        "manifest_sha256": manifest.sha256(), "bytes": manifest.total_bytes(),
+    });
+    output.result(&facts, || described(&manifest));
+    Ok(())
+}
+
+fn described(manifest: &PredictionManifest) -> String {
+    let row = |name: &str, value: String| vec![name.to_owned(), value];
+    let used = |model: &ModelUsed| {
+        format!(
+            "{} (SHA-256 {}), shown {}",
+            model.name, model.manifest_sha256, model.histogram
+        )
+    };
+    let source = &manifest.source;
+    let mut rows = vec![
+        row("scene", manifest.scene.to_string()),
+        row("made by", "infer".into()),
+        row("task key", manifest.task_key.clone()),
+        row("code", manifest.code.clone()),
+        row("manifest", format!("SHA-256 {}", manifest.sha256())),
+        row(
+            "objects",
+            format!(
+                "{}, {}",
+                manifest.objects.len(),
+                bytes(manifest.total_bytes())
+            ),
+        ),
+        row(
+            "seen",
+            format!(
+                "scene {} of {} (SHA-256 {})",
+                manifest.scene, source.dataset, source.manifest_sha256
+            ),
+        ),
+    ];
+    for (kind, model) in &manifest.models {
+        rows.push(row(kind, used(model)));
+    }
+    match &manifest.two_bounce_times {
+        None => {}
+        Some(TimesUsed::Truth) => rows.push(row("two-bounce times", "of the truth".into())),
+        Some(TimesUsed::Model(model)) => {
+            rows.push(row("two-bounce times", format!("of {}", used(model))));
+        }
+    }
+    table(&rows)
+}
+
+/// Whether they are whole.
+///
+/// # Errors
+/// Exit code 6 naming what is broken.
+pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -> Result<()> {
+    if args.snapshot.is_some() {
+        return Err(CliError::input(format!(
+            "{}: predictions have no snapshots; leave --snapshot away",
+            args.dataset
+        )));
+    }
+    let late = Late::new("scenes checked", output);
+    let watch = |done, of| late.at(done, of);
+    let report = there.verify(mode(args.fast), args.complete, &watch).await;
+    late.finish();
+    let report = report.map_err(failed)?;
+    let facts = json!({
+        "predictions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, mend),
+    });
+    if report.is_sound() {
+        output.result(&facts, || {
+            let depth = match args.fast {
+                true => "whole by manifests and sizes",
+                false => "whole",
+            };
+            format!(
+                "{} scenes, {} objects, {}: {depth}",
+                report.scenes,
+                report.objects,
+                bytes(report.bytes)
+            )
+        });
+        return Ok(());
+    }
+    if output.json {
+        output.result(&facts, String::new);
+    }
+    Err(broken_by(&args.dataset, &report.problems, mend))
+}
+
+/// How it is mended.
+fn mend(problem: &Problem) -> &'static str {
+    match problem.scene {
+        Some(_) => {
+            "delete it where it is there, and run its stage again with `force = true`: the same bytes are predicted"
+        }
+        None => {
+            "delete it and the group's own zarr.json, and run its stage again with `force = true`: both are written anew"
+        }
+    }
+}

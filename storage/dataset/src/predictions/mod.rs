@@ -1,0 +1,395 @@
+//! What models predict of scenes: a Zarr v3 group of its own in a store, beside the data set whose scenes they saw, with the
+//! same number of scenes, one object a scene and array: `depth`, `lit`, `specular`, as far as there are models for them.
+//!
+//! A scene's predictions are published as scenes are: objects first, `manifests/<scene>.json` last, all create-only and pure
+//! functions of the task.
+
+mod array;
+mod manifest;
+mod verify;
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
+use object_store::path::Path;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use crate::dataset::{METADATA, pretty};
+use crate::error::DatasetError;
+use crate::group::create_metadata;
+use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::objects;
+use crate::publish::{CONCURRENCY, check_size, put_again, put_all};
+use crate::read::scenes_in;
+use array::{Plate, plates};
+use manifest::FORMAT;
+
+pub use manifest::{ModelUsed, PredictionManifest, SceneUsed, TimesUsed};
+
+/// What is predicted of how many scenes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PredictionSpec {
+    /// Scenes that there is room for.
+    pub scenes: u64,
+    /// Rows.
+    pub height: u32,
+    /// Columns.
+    pub width: u32,
+    /// Whether depth is.
+    pub depth: bool,
+    /// Which of the source's spots have masks, in the order of `lit`; none = no masks.
+    pub spots: Vec<u32>,
+    /// Whether mirrors are.
+    pub specular: bool,
+}
+
+/// What is predicted of one scene: as much as the group has arrays for.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Predicted {
+    /// z-depth, metres: `[row][column]`.
+    pub depth_m: Vec<f32>,
+    /// Probability times 255 that a spot lights what is seen: `[spot][row][column]`.
+    pub lit: Vec<u8>,
+    /// Probability times 255 of a mirror: `[row][column]`.
+    pub specular: Vec<u8>,
+}
+
+/// Predictions of one scene, ready to be published.
+#[derive(Debug, Clone)]
+pub struct EncodedPredictions {
+    /// Their manifest.
+    pub manifest: PredictionManifest,
+    bytes: Vec<Bytes>,
+}
+
+/// Predictions in a store. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Predictions {
+    store: Arc<dyn ObjectStore>,
+    prefix: Path,
+    spec: PredictionSpec,
+    plates: Arc<[Plate]>,
+}
+
+impl Predictions {
+    /// Creates the group at `prefix`, or opens it if it is there; it grows to `spec.scenes` as data sets do.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where something else lies there; [`DatasetError::SpecMismatch`]; [`DatasetError::Store`].
+    pub async fn create_or_open(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+        spec: &PredictionSpec,
+    ) -> Result<Self, DatasetError> {
+        let asked = Self::assume(store.clone(), prefix.clone(), spec.clone());
+        let root = asked.path(METADATA);
+        let stored = match objects::get(&*store, &root).await? {
+            Some(bytes) => parse_root(&bytes, &asked.shown(&root))?,
+            None => {
+                for plate in asked.plates.iter() {
+                    let path = asked.metadata_path(plate);
+                    create_metadata(&*store, &path, spec.scenes, |n| plate.metadata(n)).await?;
+                }
+                if objects::create(&*store, &root, pretty(&asked.root())).await? {
+                    return Ok(asked);
+                }
+                // Another worker was faster.
+                let bytes = objects::require(&*store, &root).await?;
+                parse_root(&bytes, &asked.shown(&root))?
+            }
+        };
+        if let Some((field, stored, asked)) = difference(&stored, spec) {
+            return Err(DatasetError::SpecMismatch {
+                prefix: objects::shown(&*store, &prefix),
+                field: field.into(),
+                stored,
+                asked,
+            });
+        }
+        if spec.scenes <= stored.scenes {
+            return Ok(Self::assume(store, prefix, stored));
+        }
+        for plate in asked.plates.iter() {
+            let bytes = pretty(&plate.metadata(spec.scenes));
+            objects::overwrite(&*store, &asked.metadata_path(plate), bytes).await?;
+        }
+        objects::overwrite(&*store, &root, pretty(&asked.root())).await?;
+        Ok(asked)
+    }
+
+    /// Opens the group at `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::NoDataset`]; [`DatasetError::Invalid`] where something else lies there; [`DatasetError::Store`].
+    pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+        let root = objects::path_of(&prefix, METADATA);
+        let Some(bytes) = objects::get(&*store, &root).await? else {
+            return Err(DatasetError::NoDataset {
+                prefix: objects::shown(&*store, &prefix),
+            });
+        };
+        let spec = parse_root(&bytes, &objects::shown(&*store, &root))?;
+        Ok(Self::assume(store, prefix, spec))
+    }
+
+    /// The same, or `None` where none lie at `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn find(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+    ) -> Result<Option<Self>, DatasetError> {
+        let root = objects::path_of(&prefix, METADATA);
+        let bytes = objects::get(&*store, &root).await?;
+        let parsed = bytes.and_then(|bytes| serde_json::from_slice::<Value>(&bytes).ok());
+        match parsed.is_some_and(|root| is_predictions(&root)) {
+            true => Self::open(store, prefix).await.map(Some),
+            false => Ok(None),
+        }
+    }
+
+    fn assume(store: Arc<dyn ObjectStore>, prefix: Path, spec: PredictionSpec) -> Self {
+        Self {
+            store,
+            prefix,
+            plates: plates(&spec).into(),
+            spec,
+        }
+    }
+
+    /// What is predicted.
+    pub fn spec(&self) -> &PredictionSpec {
+        &self.spec
+    }
+
+    /// Where it lies, for a message.
+    pub fn place(&self) -> String {
+        self.shown(&self.prefix)
+    }
+
+    /// The scenes whose predictions are published, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn scenes_present(&self) -> Result<Vec<u64>, DatasetError> {
+        scenes_in(&*self.store, &self.path("manifests")).await
+    }
+
+    /// The manifest of a scene's predictions.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn manifest(&self, scene: u64) -> Result<PredictionManifest, DatasetError> {
+        let path = self.path(&Manifest::key(scene));
+        match objects::get(&*self.store, &path).await? {
+            Some(bytes) => PredictionManifest::parse(&bytes, scene, &self.shown(&path)),
+            None => Err(DatasetError::NotPublished {
+                scene,
+                object: self.shown(&path),
+            }),
+        }
+    }
+
+    /// The manifest of a scene that this very task has published, after checking that each of its objects exists with the
+    /// stated size; `None` where it is not published.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where another task has published it; [`DatasetError::Damaged`] where an object is missing or
+    /// has another size (publishing again restores it); [`DatasetError::Store`].
+    pub async fn finished(
+        &self,
+        scene: u64,
+        task_key: &str,
+    ) -> Result<Option<PredictionManifest>, DatasetError> {
+        let manifest = match self.manifest(scene).await {
+            Ok(manifest) => manifest,
+            Err(DatasetError::NotPublished { .. }) => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        if manifest.task_key != task_key {
+            let what = format!(
+                "{} holds what other models predict of scene {scene}, or of another form of it (task key {}, this task's is \
+                 {task_key}); choose another folder",
+                self.place(),
+                manifest.task_key
+            );
+            return Err(DatasetError::invalid("output.dataset", what));
+        }
+        let sizes = manifest.objects.iter();
+        let mut checks =
+            stream::iter(sizes.map(|o| check_size(&*self.store, self.path(&o.key), o.size)))
+                .buffer_unordered(CONCURRENCY);
+        while checks.try_next().await?.is_some() {}
+        drop(checks);
+        Ok(Some(manifest))
+    }
+
+    /// Codes what is predicted of the scene that `manifest` names; its format, objects and checksum are filled in.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the values are not those of the group's arrays;
+    /// [`DatasetError::SceneOutOfRange`].
+    pub fn encode(
+        &self,
+        manifest: PredictionManifest,
+        predicted: &Predicted,
+    ) -> Result<EncodedPredictions, DatasetError> {
+        let scene = manifest.scene;
+        if scene >= self.spec.scenes {
+            return Err(DatasetError::SceneOutOfRange {
+                scene,
+                scenes: self.spec.scenes,
+            });
+        }
+        let (mut objects, mut bytes) = (Vec::new(), Vec::new());
+        for plate in self.plates.iter() {
+            let values: &[u8] = match plate.name {
+                "depth" => bytemuck::cast_slice(&predicted.depth_m),
+                "lit" => &predicted.lit,
+                _ => &predicted.specular,
+            };
+            if values.len() != plate.bytes() {
+                let what = format!(
+                    "{} bytes of values, expected {}",
+                    values.len(),
+                    plate.bytes()
+                );
+                return Err(DatasetError::invalid(plate.name, what));
+            }
+            let coded = plate.codec.encode(values)?;
+            objects.push(ObjectEntry {
+                key: plate.key(scene),
+                size: coded.len() as u64,
+                sha256: sha256_hex(&coded),
+            });
+            bytes.push(Bytes::from(coded));
+        }
+        let manifest = PredictionManifest {
+            format: FORMAT,
+            objects,
+            ..manifest
+        };
+        Ok(EncodedPredictions {
+            manifest: manifest.sealed(),
+            bytes,
+        })
+    }
+
+    /// Publishes coded predictions, as [`crate::Dataset::publish_encoded`] does scenes.
+    ///
+    /// # Errors
+    /// [`DatasetError::Conflict`] where an object exists with other bytes; [`DatasetError::Store`].
+    pub async fn publish(&self, encoded: &EncodedPredictions) -> Result<(), DatasetError> {
+        let manifest = &encoded.manifest;
+        let paths = manifest.objects.iter().map(|o| self.path(&o.key));
+        let all: Vec<(Path, Bytes)> = paths.zip(encoded.bytes.iter().cloned()).collect();
+        put_all(&*self.store, &all).await?;
+        let path = self.path(&Manifest::key(manifest.scene));
+        objects::create_or_match(&*self.store, &path, manifest.to_bytes().into()).await?;
+        put_again(&*self.store, &all).await
+    }
+
+    /// What is predicted of a scene, checked against its manifest.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    pub async fn read(&self, scene: u64) -> Result<Predicted, DatasetError> {
+        let manifest = self.manifest(scene).await?;
+        let mut predicted = Predicted::default();
+        for plate in self.plates.iter() {
+            let path = self.path(&plate.key(scene));
+            let bytes = objects::require(&*self.store, &path).await?;
+            let hash = sha256_hex(&bytes);
+            let stated = |o: &&ObjectEntry| o.key == plate.key(scene) && o.sha256 == hash;
+            if manifest.objects.iter().find(stated).is_none() {
+                return Err(DatasetError::Damaged {
+                    object: self.shown(&path),
+                    what: "its SHA-256 is not the manifest's".into(),
+                });
+            }
+            let values = plate.codec.decode(&bytes)?;
+            match plate.name {
+                "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),
+                "lit" => predicted.lit = values,
+                _ => predicted.specular = values,
+            }
+        }
+        Ok(predicted)
+    }
+
+    fn root(&self) -> Value {
+        let arrays = self.plates.iter();
+        let arrays: Map<String, Value> = arrays
+            .map(|plate| (plate.name.to_owned(), plate.metadata(self.spec.scenes)))
+            .collect();
+        json!({
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": {
+                "picofarm": {"predictions": FORMAT, "spec": self.spec},
+                "made_of": "manifests/<scene>.json names the scene and the models",
+            },
+            "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": arrays},
+        })
+    }
+
+    fn metadata_path(&self, plate: &Plate) -> Path {
+        self.path(&format!("{}/{METADATA}", plate.name))
+    }
+
+    fn path(&self, key: &str) -> Path {
+        objects::path_of(&self.prefix, key)
+    }
+
+    fn shown(&self, path: &Path) -> String {
+        objects::shown(&*self.store, path)
+    }
+}
+
+/// The first field in which two differ that have to be the same, and its values.
+fn difference(
+    stored: &PredictionSpec,
+    asked: &PredictionSpec,
+) -> Option<(&'static str, String, String)> {
+    let text = |value: &dyn std::fmt::Debug| format!("{value:?}");
+    [
+        ("height", text(&stored.height), text(&asked.height)),
+        ("width", text(&stored.width), text(&asked.width)),
+        ("depth", text(&stored.depth), text(&asked.depth)),
+        ("spots", text(&stored.spots), text(&asked.spots)),
+        ("specular", text(&stored.specular), text(&asked.specular)),
+    ]
+    .into_iter()
+    .find(|(_, stored, asked)| stored != asked)
+}
+
+/// Whether a group's root is that of predictions.
+pub(crate) fn is_predictions(root: &Value) -> bool {
+    root["attributes"]["picofarm"]["predictions"].is_u64()
+}
+
+fn parse_root(bytes: &[u8], object: &str) -> Result<PredictionSpec, DatasetError> {
+    let root: Value = serde_json::from_slice(bytes).map_err(|e| DatasetError::Damaged {
+        object: object.to_owned(),
+        what: format!("not JSON ({e}), so no Zarr group"),
+    })?;
+    let ours = &root["attributes"]["picofarm"];
+    let other = |what: String| Err(DatasetError::invalid(object, what));
+    match ours["predictions"].as_u64() {
+        Some(format) if format > u64::from(FORMAT) => other(format!(
+            "written in format {format}, this program knows formats up to {FORMAT}: use a newer one"
+        )),
+        Some(_) => serde_json::from_value(ours["spec"].clone()).map_err(|e| DatasetError::Damaged {
+            object: object.to_owned(),
+            what: format!("attributes.picofarm.spec: {e}"),
+        }),
+        None => other(
+            "is a data set or another Zarr group, and not predictions; choose another folder for what models predict".into(),
+        ),
+    }
+}
