@@ -25,16 +25,18 @@ use picofarm_proto::{
         train::{Normalise, Target},
     },
 };
-use serde_json::{Value, json};
 use tracing::{info, warn};
 
 mod along;
 mod known;
 mod plan;
+mod results;
 mod trial;
 
 use along::{Saver, Teller};
 pub(super) use known::{Known, Met};
+pub(super) use results::WEIGHTS;
+use results::{lines, metrics, output, pretty};
 use trial::{Course, Left};
 
 use super::{
@@ -43,8 +45,6 @@ use super::{
     output::{Stores, of_dataset},
 };
 
-/// Name of the object that holds a model's weights.
-pub(super) const WEIGHTS: &str = "weights.safetensors";
 /// Version of networks, training and metrics.
 pub fn model_version() -> String {
     picofarm_model::VERSION.to_owned()
@@ -332,33 +332,6 @@ impl<'a> Lesson<'a> {
     }
 }
 
-/// How good a trained network is, and how it came to that.
-fn metrics(trained: &Trained) -> Value {
-    let last = trained.history.last();
-    let mut metrics = json!({
-        "epochs": trained.history.len(),
-        "steps": last.map(|line| line.step),
-        "stopped_early": trained.stopped_early,
-        "loss": last.map(|line| line.loss),
-    });
-    metrics["validation"] = json!(last.and_then(|line| line.validation));
-    metrics
-}
-
-/// A line of JSON for each epoch.
-fn lines(history: &[Line]) -> Vec<u8> {
-    let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
-    history.iter().map(line).collect::<String>().into_bytes()
-}
-
-/// The epochs of `history.jsonl`.
-pub(super) fn lines_of(history: &[u8]) -> Result<Vec<Line>, String> {
-    let text = String::from_utf8_lossy(history);
-    let lines = text.lines().map(serde_json::from_str);
-    let lines: Result<_, _> = lines.collect();
-    lines.map_err(|e| format!("history.jsonl: {e}"))
-}
-
 /// The model if this very training has published it.
 fn finished(
     stores: &Stores,
@@ -476,20 +449,4 @@ pub(super) fn at(field: &str, error: TaskError) -> TaskError {
         TaskError::User(text) => TaskError::User(format!("{field}: {text}")),
         other => other,
     }
-}
-
-fn output(manifest: &ModelManifest, adopted: bool) -> Output {
-    Output {
-        manifest_sha256: manifest.sha256(),
-        bytes: manifest.total_bytes(),
-        adopted,
-    }
-}
-
-fn pretty(value: &Value) -> Vec<u8> {
-    let mut value = value.clone();
-    value.sort_all_objects();
-    let mut bytes = serde_json::to_vec_pretty(&value).expect("figures are plain data");
-    bytes.push(b'\n');
-    bytes
 }

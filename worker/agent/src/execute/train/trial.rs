@@ -7,7 +7,7 @@ use picofarm_proto::model::Trial;
 use serde_json::Value;
 use tracing::info;
 
-use super::{Lesson, lines_of};
+use super::{Lesson, results::lines_of};
 use crate::execute::{Control, Output, TaskError, output::Stores};
 
 /// Name of the object that holds a model's epochs.
