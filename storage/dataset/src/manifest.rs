@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
 
 use crate::error::DatasetError;
@@ -174,6 +174,39 @@ pub(crate) fn unseal(sealed: &[u8], checksum: &str) -> Result<Vec<u8>, String> {
             "its content has the checksum {found}, but says {checksum}: the object was changed"
         )),
     }
+}
+
+/// Reads a document of ours whose last member is its `checksum`, as [`seal`] writes it: `what` it is, in words, and the newest
+/// `format` of it that this program knows.
+pub(crate) fn read_sealed<T: DeserializeOwned>(
+    bytes: &[u8],
+    what: &str,
+    format: u32,
+    object: &str,
+) -> Result<T, DatasetError> {
+    /// What every such document has.
+    #[derive(Deserialize)]
+    struct Head {
+        format: u32,
+        checksum: Option<String>,
+    }
+    let damaged = |what: String| DatasetError::Damaged {
+        object: object.to_owned(),
+        what,
+    };
+    let not = |e: serde_json::Error| damaged(format!("not {what}: {e}"));
+    let head: Head = serde_json::from_slice(bytes).map_err(not)?;
+    if head.format > format {
+        return Err(damaged(format!(
+            "written in format {}, this program knows formats up to {format}: use a newer one",
+            head.format
+        )));
+    }
+    let Some(checksum) = &head.checksum else {
+        return Err(damaged("has no checksum: the object was changed".into()));
+    };
+    unseal(bytes, checksum).map_err(damaged)?;
+    serde_json::from_slice(bytes).map_err(not)
 }
 
 const END: &[u8] = b"\n}\n";

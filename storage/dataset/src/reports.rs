@@ -9,7 +9,7 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, sha256_hex, unseal};
+use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
 use crate::objects;
 use crate::publish::check_size;
 
@@ -78,23 +78,7 @@ impl ReportManifest {
     }
 
     fn parse(bytes: &[u8], object: &str) -> Result<Self, DatasetError> {
-        let damaged = |what: String| DatasetError::Damaged {
-            object: object.to_owned(),
-            what,
-        };
-        let manifest: Self = serde_json::from_slice(bytes)
-            .map_err(|e| damaged(format!("not a report's manifest: {e}")))?;
-        if manifest.format > FORMAT {
-            return Err(damaged(format!(
-                "written in format {}, this program knows formats up to {FORMAT}: use a newer one",
-                manifest.format
-            )));
-        }
-        let Some(checksum) = &manifest.checksum else {
-            return Err(damaged("has no checksum: the object was changed".into()));
-        };
-        unseal(bytes, checksum).map_err(damaged)?;
-        Ok(manifest)
+        read_sealed(bytes, "a report's manifest", FORMAT, object)
     }
 }
 

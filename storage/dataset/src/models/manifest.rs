@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, sha256_hex, unseal};
+use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
 /// Version of manifests of models.
 const FORMAT: u32 = 1;
@@ -128,25 +128,13 @@ impl ModelManifest {
     }
 
     pub(super) fn parse(bytes: &[u8], name: &str, object: &str) -> Result<Self, DatasetError> {
-        let damaged = |what: String| DatasetError::Damaged {
-            object: object.to_owned(),
-            what,
-        };
-        let manifest: Self = serde_json::from_slice(bytes)
-            .map_err(|e| damaged(format!("not a model's manifest: {e}")))?;
-        if manifest.format > FORMAT {
-            return Err(damaged(format!(
-                "written in format {}, this program knows formats up to {FORMAT}: use a newer one",
-                manifest.format
-            )));
-        }
+        let manifest: Self = read_sealed(bytes, "a model's manifest", FORMAT, object)?;
         if manifest.name != name {
-            return Err(damaged(format!("is that of the model {:?}", manifest.name)));
+            return Err(DatasetError::Damaged {
+                object: object.to_owned(),
+                what: format!("is that of the model {:?}", manifest.name),
+            });
         }
-        let Some(checksum) = &manifest.checksum else {
-            return Err(damaged("has no checksum: the object was changed".into()));
-        };
-        unseal(bytes, checksum).map_err(damaged)?;
         Ok(manifest)
     }
 }

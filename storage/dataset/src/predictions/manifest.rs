@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, sha256_hex, unseal};
+use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
 /// Version of groups of predictions and of their manifests.
 pub(super) const FORMAT: u32 = 1;
@@ -96,28 +96,13 @@ impl PredictionManifest {
     }
 
     pub(super) fn parse(bytes: &[u8], scene: u64, object: &str) -> Result<Self, DatasetError> {
-        let damaged = |what: String| DatasetError::Damaged {
-            object: object.to_owned(),
-            what,
-        };
-        let manifest: Self = serde_json::from_slice(bytes)
-            .map_err(|e| damaged(format!("not a manifest of predictions: {e}")))?;
-        if manifest.format > FORMAT {
-            return Err(damaged(format!(
-                "written in format {}, this program knows formats up to {FORMAT}: use a newer one",
-                manifest.format
-            )));
-        }
+        let manifest: Self = read_sealed(bytes, "a manifest of predictions", FORMAT, object)?;
         if manifest.scene != scene {
-            return Err(damaged(format!(
-                "holds scene {}, not {scene}",
-                manifest.scene
-            )));
+            return Err(DatasetError::Damaged {
+                object: object.to_owned(),
+                what: format!("holds scene {}, not {scene}", manifest.scene),
+            });
         }
-        let Some(checksum) = &manifest.checksum else {
-            return Err(damaged("has no checksum: the object was changed".into()));
-        };
-        unseal(bytes, checksum).map_err(damaged)?;
         Ok(manifest)
     }
 }
