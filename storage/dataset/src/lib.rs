@@ -57,7 +57,7 @@ pub use manifest::{
 };
 pub use models::{
     Checkpoint, Evaluation, Lineage, MODELS, ModelManifest, Models, NewModel, Promoted, Published,
-    Rung, SplitUsed, TrialEnd, TrialRecord,
+    Rung, SplitUsed, TrainingSpeed, TrialEnd, TrialRecord,
 };
 pub use objects::publish_files;
 pub use parts::PartName;

@@ -10,6 +10,7 @@ mod checkpoint;
 mod collect;
 mod evaluation;
 mod manifest;
+mod speed;
 mod sweep;
 
 use std::sync::Arc;
@@ -26,6 +27,7 @@ use crate::objects;
 pub use checkpoint::Checkpoint;
 pub use evaluation::Evaluation;
 pub use manifest::{Lineage, ModelManifest, Promoted, SplitUsed};
+pub use speed::TrainingSpeed;
 pub use sweep::{Rung, TrialEnd, TrialRecord};
 
 /// The folder of models in a store; no data set has this name.

@@ -73,6 +73,10 @@ pub(super) fn run(
         objects.push((file.to_owned(), bytes));
     }
     let trial = trial_of(stores, &models, &chosen.name, control)?;
+    let speed = stores.wait(control, models.speed(&chosen.name, &chosen.training_key))?;
+    if let Some(speed) = speed {
+        stores.wait(control, models.put_speed(&settings.model, &speed))?;
+    }
     let mut manifest = chosen.clone();
     manifest.name.clone_from(&settings.model);
     manifest.lineage.promoted = Some(Promoted {

@@ -1,16 +1,18 @@
 //! Reports: what a store holds of models, collected for a page; and the task that keeps such a page in the store.
 //!
-//! The page of a task is a pure function of models and evaluations, so it bears no date.
+//! The page of a task is a pure function of what the store holds: models, evaluations, and how fast trainings were. It bears no
+//! date.
 
 use std::{collections::BTreeMap, time::Duration};
 
 use picofarm_dataset::{
     DatasetError, Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports,
+    TrainingSpeed,
 };
 use picofarm_model::{
     Evaluated, Model,
     metric::Metrics,
-    report::{Data, Entry, Report, html, json},
+    report::{Data, Entry, Report, Speed, html, json},
     train::Line,
 };
 use picofarm_proto::{
@@ -82,7 +84,8 @@ pub(super) fn run(
     let told: Vec<ReportedModel> = subjects.iter().map(Subject::told).collect();
     let pins = told.iter().map(|model| {
         let evaluation = model.evaluation.as_deref().unwrap_or_default();
-        format!("{} {evaluation}", model.manifest_sha256)
+        let speed = model.speed.as_deref().unwrap_or_default();
+        format!("{} {evaluation} {speed}", model.manifest_sha256)
     });
     let key = report_key(settings, &pins.collect::<Vec<_>>()).to_string();
     let finished = match force {
@@ -162,6 +165,7 @@ struct Subject {
     manifest: ModelManifest,
     /// That of its evaluations which met the most scenes.
     evaluation: Option<Evaluation>,
+    speed: Option<TrainingSpeed>,
 }
 
 impl Subject {
@@ -175,7 +179,9 @@ impl Subject {
         let mut evaluations = stores.wait(control, models.evaluations(name))?;
         let sha256 = manifest.sha256();
         evaluations.retain(|e| e.model_sha256 == sha256);
+        let speed = stores.wait(control, models.speed(name, &manifest.training_key))?;
         Ok(Self {
+            speed,
             evaluation: evaluations.into_iter().max_by_key(|e| e.scenes),
             manifest,
         })
@@ -186,6 +192,7 @@ impl Subject {
             name: self.manifest.name.clone(),
             manifest_sha256: self.manifest.sha256(),
             evaluation: self.evaluation.as_ref().map(|e| e.key.clone()),
+            speed: self.speed.as_ref().map(TrainingSpeed::sha256),
         }
     }
 
@@ -225,6 +232,10 @@ impl Subject {
         entry.evaluated = found
             .transpose()
             .map_err(|e| broken(format!("its evaluation: {e}")))?;
+        entry.speed = self.speed.as_ref().map(|speed| Speed {
+            samples_per_s: speed.samples_per_s,
+            seconds: None,
+        });
         describe(&mut entry, manifest, self.evaluation.as_ref());
         Ok(entry)
     }

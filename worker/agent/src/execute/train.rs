@@ -11,7 +11,7 @@ use std::{
 
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel, Published,
-    TrialEnd,
+    TrainingSpeed, TrialEnd,
 };
 use picofarm_model::{
     Device, ModelError,
@@ -173,7 +173,7 @@ impl<'a> Lesson<'a> {
     fn plan(&self, control: &Control) -> Result<Plan, TaskError> {
         let settings = &self.task.train;
         let greatest = match (settings.input.normalise, settings.input.max) {
-            (Normalise::Log, 0.0) => largest_bin(&*self.training, control)?,
+            (Normalise::Log, 0.0) => plan::largest_bin(&*self.training, control)?,
             (_, max) => max as f32,
         };
         let plan = plan::plan(settings, &self.spec, self.training.spots(), greatest)?;
@@ -241,6 +241,26 @@ impl<'a> Lesson<'a> {
         stores.wait(control, models.delete_checkpoints(name, key))?;
         control.at(1.0);
         Ok(Ok(published))
+    }
+
+    /// Tells how fast it was. Nobody misses it where the store does not take it.
+    fn tell_speed(
+        &self,
+        stores: &Stores,
+        (samples_per_s, data_wait_share): (f64, f64),
+        control: &Control,
+    ) {
+        let speed = TrainingSpeed {
+            training_key: self.key.clone(),
+            samples_per_s,
+            data_wait_share,
+            threads: rayon::current_num_threads(),
+            gpu: self.gpus > 0 && picofarm_model::HAS_GPUS,
+        };
+        let put = self.models.put_speed(&self.task.train.model, &speed);
+        if let Err(error) = stores.wait(control, put) {
+            warn!(%error, "how fast the training was is not kept");
+        }
     }
 
     /// Trains; a trial may be left before its end.
@@ -316,6 +336,9 @@ impl<'a> Lesson<'a> {
             Err(error) => Err(of_model(error)),
             Ok(Ended::Finished) => {
                 saver.last();
+                if let Some(pace) = teller.pace() {
+                    self.tell_speed(stores, pace, control);
+                }
                 Ok(Ok(training.finish()))
             }
             Ok(Ended::Stopped) if matches!(told, Ok(false)) => {
@@ -399,36 +422,6 @@ pub(super) fn check_version(of: &str, asked: &str) -> Result<(), TaskError> {
         "{of}.version: the job asks for {asked:?}, this worker's networks are {ours:?}; submit the job again with this \
          version, or run workers of the other one"
     )))
-}
-
-/// The largest bin of all scenes.
-fn largest_bin(scenes: &dyn Scenes, control: &Control) -> Result<f32, TaskError> {
-    let mut max = 0.0f32;
-    for index in 0..scenes.len() {
-        control.say(
-            format!(
-                "looks for the largest bin: scene {index} of {}",
-                scenes.len()
-            ),
-            &[],
-        );
-        if control.stopped() {
-            return Err(TaskError::Stopped);
-        }
-        let scene = scenes.load(index).map_err(|source| {
-            of_model(ModelError::Scene {
-                scene: index,
-                source,
-            })
-        })?;
-        max = scene.histogram.iter().copied().fold(max, f32::max);
-    }
-    match max > 0.0 {
-        true => Ok(max),
-        false => Err(TaskError::User(
-            "train.input.normalise: \"log\" needs light, but every bin of every training scene is 0".into(),
-        )),
-    }
 }
 
 /// Who is to blame for a training's error.

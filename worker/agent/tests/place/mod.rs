@@ -223,12 +223,16 @@ impl Place {
         }
     }
 
+    /// What lies in a folder of the store, but for how fast trainings were.
     pub fn files(&self, folder: &str) -> Files {
         let root = self.dir.path().join(folder);
         let (mut found, mut folders) = (BTreeMap::new(), vec![root.clone()]);
         while let Some(folder) = folders.pop() {
             for entry in std::fs::read_dir(folder).into_iter().flatten() {
                 let path = entry.unwrap().path();
+                if path.ends_with("speed.json") {
+                    continue;
+                }
                 match path.is_dir() {
                     true => folders.push(path),
                     false => {

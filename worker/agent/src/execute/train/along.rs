@@ -76,6 +76,8 @@ pub(super) struct Teller<'a> {
     told: u64,
     /// The latest figure of the validation scenes: MAE in metres, or one less IoU.
     validation: Option<(&'static str, f64)>,
+    /// Training examples a second, and share of the time in which the network waited for data.
+    pace: Option<(f64, f64)>,
 }
 
 impl<'a> Teller<'a> {
@@ -85,7 +87,13 @@ impl<'a> Teller<'a> {
             epochs,
             told: 0,
             validation: None,
+            pace: None,
         }
+    }
+
+    /// Training examples a second, and the share of waiting for data, as last heard.
+    pub(super) fn pace(&self) -> Option<(f64, f64)> {
+        self.pace
     }
 
     pub(super) fn hear(&mut self, event: &Event) {
@@ -100,6 +108,7 @@ impl<'a> Teller<'a> {
             } => {
                 self.control
                     .at(*step as f32 / (*of).max(1) as f32 * TRAINED);
+                self.pace = Some((*samples_per_s, *data_wait_share));
                 let text = format!(
                     "epoch {epoch}/{}, loss {loss:.4}, {samples_per_s:.1} samples/s",
                     self.epochs

@@ -2,8 +2,10 @@
 
 use picofarm_dataset::DatasetSpec;
 use picofarm_model::{
+    ModelError,
     input::{self, Question},
     net::{self, NetSpec},
+    scene::Scenes,
     train::{self, Plan},
 };
 use picofarm_proto::model::{
@@ -11,8 +13,8 @@ use picofarm_proto::model::{
     train::{Architecture, Normalise, Precision, Schedule, ShadowVariant, Target},
 };
 
-use super::known::Known;
-use crate::execute::TaskError;
+use super::{known::Known, of_model};
+use crate::execute::{Control, TaskError};
 
 /// What is asked of a network over scenes of a data set, `spots` of which made the histogram. `greatest` is the largest
 /// bin, for the logarithm.
@@ -147,4 +149,34 @@ pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
         }
     }
     Ok(())
+}
+
+/// The largest bin of all scenes.
+pub(super) fn largest_bin(scenes: &dyn Scenes, control: &Control) -> Result<f32, TaskError> {
+    let mut max = 0.0f32;
+    for index in 0..scenes.len() {
+        control.say(
+            format!(
+                "looks for the largest bin: scene {index} of {}",
+                scenes.len()
+            ),
+            &[],
+        );
+        if control.stopped() {
+            return Err(TaskError::Stopped);
+        }
+        let scene = scenes.load(index).map_err(|source| {
+            of_model(ModelError::Scene {
+                scene: index,
+                source,
+            })
+        })?;
+        max = scene.histogram.iter().copied().fold(max, f32::max);
+    }
+    match max > 0.0 {
+        true => Ok(max),
+        false => Err(TaskError::User(
+            "train.input.normalise: \"log\" needs light, but every bin of every training scene is 0".into(),
+        )),
+    }
 }

@@ -1,0 +1,73 @@
+//! How fast a model was trained: `models/<name>/speed.json`, create-only. A time belongs to a machine and a model's bytes to
+//! none, so it lies beside the manifest and not in it, and nobody misses it where it is not there.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Models, check_name};
+use crate::error::DatasetError;
+use crate::manifest::sha256_hex;
+use crate::objects;
+
+const FILE: &str = "speed.json";
+
+/// How fast a model was trained, by the worker that ended it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrainingSpeed {
+    /// Key of the training.
+    pub training_key: String,
+    /// Training examples a second, validation not among the time.
+    pub samples_per_s: f64,
+    /// Share of that time in which the network waited for data.
+    pub data_wait_share: f64,
+    /// Threads of the worker.
+    pub threads: usize,
+    /// Whether it was computed on a graphics processor.
+    pub gpu: bool,
+}
+
+impl TrainingSpeed {
+    /// SHA-256 of its bytes, hexadecimal.
+    pub fn sha256(&self) -> String {
+        sha256_hex(&self.to_bytes())
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = serde_json::to_vec_pretty(self).expect("finite numbers");
+        bytes.push(b'\n');
+        bytes
+    }
+}
+
+impl Models {
+    /// Stores how fast a model was trained; what was told before stands.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn put_speed(&self, name: &str, speed: &TrainingSpeed) -> Result<(), DatasetError> {
+        check_name(name)?;
+        let path = self.path(name, FILE);
+        objects::create(&*self.store, &path, speed.to_bytes().into()).await?;
+        Ok(())
+    }
+
+    /// How fast a model was trained, if it was told of this training.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`], [`DatasetError::Damaged`].
+    pub async fn speed(
+        &self,
+        name: &str,
+        training_key: &str,
+    ) -> Result<Option<TrainingSpeed>, DatasetError> {
+        let path = self.path(name, FILE);
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        let speed: TrainingSpeed =
+            serde_json::from_slice(&bytes).map_err(|e| DatasetError::Damaged {
+                object: self.shown(&path),
+                what: format!("does not tell how fast a training was: {e}"),
+            })?;
+        Ok(Some(speed).filter(|speed| speed.training_key == training_key))
+    }
+}
