@@ -130,10 +130,10 @@ impl Slurm {
     /// When it is not there.
     pub fn start_again(&self, element: &str) {
         self.until_state(element, "PENDING");
-        self.run(
-            "scontrol",
-            &["update", &format!("JobId={element}"), "StartTime=now"],
-        );
+        // Its credential was revoked within this second, and slurmd knows seconds only: one made in the same second is
+        // refused as that of a job "already killed", and Slurm gives the job up.
+        let start = ["update", &format!("JobId={element}"), "StartTime=now+2"];
+        self.run("scontrol", &start);
     }
 
     /// Cuts a node off: Slurm's processes on it are gone, the worker goes on.
