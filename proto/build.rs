@@ -2,6 +2,7 @@
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let files = [
+        "picofarm/v1/audit.proto",
         "picofarm/v1/job.proto",
         "picofarm/v1/explain.proto",
         "picofarm/v1/jobs_service.proto",

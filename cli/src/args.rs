@@ -6,23 +6,25 @@ mod integrity;
 mod job;
 mod model;
 mod network;
+mod ranges;
 mod render;
+mod secrets;
 mod sweep;
 
-use std::{net::SocketAddr, path::PathBuf};
+use std::{ffi::OsString, net::SocketAddr, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use picofarm_coordinator::CatalogPlace;
 
 pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs,
 };
-pub use guard::{Guard, Token};
+pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
-pub use job::{Job, JobKind};
+pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
-pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender};
+pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use sweep::{Sweep, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.
@@ -33,6 +35,31 @@ pub struct Cli {
     pub global: Global,
     #[command(subcommand)]
     pub command: Command,
+}
+
+/// The command line. `-1` is a value wherever one is expected, and refused as that, rather than an unknown option.
+pub fn command() -> clap::Command {
+    fn numbers(command: clap::Command) -> clap::Command {
+        command
+            .mut_args(|arg| match arg.get_action().takes_values() {
+                true => arg.allow_negative_numbers(true),
+                false => arg,
+            })
+            .mut_subcommands(numbers)
+    }
+    numbers(Cli::command())
+}
+
+/// Reads a command line.
+///
+/// # Errors
+/// What is wrong with it, without the secrets that URLs in it may hold.
+pub fn parse(words: impl IntoIterator<Item = OsString>) -> Result<Cli, clap::Error> {
+    let mut command = command();
+    let cli = command
+        .try_get_matches_from_mut(words)
+        .and_then(|mut given| Cli::from_arg_matches_mut(&mut given));
+    cli.map_err(|e| secrets::hidden(e.format(&mut command)))
 }
 
 const EXIT_CODES: &str = "\
@@ -48,6 +75,7 @@ Exit codes:
   130  interrupted";
 
 #[derive(Args, Clone)]
+#[command(next_help_heading = "Global options")]
 pub struct Global {
     /// Print machine-readable JSON (one document; one a line where a command streams)
     #[arg(long, global = true)]
@@ -88,8 +116,7 @@ impl Command {
             Self::Worker(worker) => (&worker.traces, "picofarm-worker"),
             _ => return None,
         };
-        let url = traces.otlp.as_deref().filter(|url| !url.trim().is_empty());
-        url.map(|url| (url, service))
+        traces.given().map(|url| (url, service))
     }
 }
 
@@ -103,6 +130,9 @@ pub enum Command {
     Coordinator(Coordinator),
     /// Run a worker
     Worker(Worker),
+    /// The process of a worker that `up` or `demo` starts
+    #[command(hide = true)]
+    LocalWorker,
     /// Write, plan, submit and follow jobs
     #[command(subcommand)]
     Job(Job),
@@ -117,7 +147,7 @@ pub enum Command {
         #[arg(long, short)]
         follow: bool,
         /// The last N lines before now
-        #[arg(long, default_value_t = 100, value_name = "N")]
+        #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
         last: u32,
         /// What tasks logged on their workers, too
         #[arg(long, short)]
@@ -138,6 +168,8 @@ pub enum Command {
     /// Say who may use a coordinator
     #[command(subcommand)]
     Token(Token),
+    /// Show who submitted, stopped, held, retried or drained what, or tried to; for administrators
+    Audit(Audit),
     /// Furniture for generated rooms
     #[command(subcommand)]
     Assets(Assets),
@@ -161,22 +193,22 @@ pub struct Demo {
     #[arg(long, default_value = "picofarm-demo", value_name = "DIR")]
     pub dir: PathBuf,
     /// Number of scenes
-    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 8, value_parser = ranges::scenes)]
     pub scenes: u64,
     /// Image width and height in pixels
-    #[arg(long, default_value_t = 256, value_name = "PX")]
+    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: u32,
     /// Laser spots: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25)]
+    #[arg(long, default_value_t = 25, value_parser = ranges::spots)]
     pub spots: u32,
     /// Seed of the data set
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
     pub seed: u64,
     /// Workers to start; they share the cores [default: 2, or 1 on a single core]
-    #[arg(long)]
+    #[arg(long, value_parser = ranges::workers)]
     pub workers: Option<usize>,
     /// Camera paths per pixel for three bounces and more
-    #[arg(long, default_value_t = 12)]
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u32).range(2..=1_048_576))]
     pub samples: u32,
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
@@ -193,8 +225,8 @@ pub struct Up {
     /// Address to listen on
     #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
     pub listen: SocketAddr,
-    /// Workers to start; they share the cores [default: 1]
-    #[arg(long, default_value_t = 1)]
+    /// Workers to start; they share the cores
+    #[arg(long, default_value_t = 1, value_parser = ranges::workers)]
     pub workers: usize,
     #[command(flatten)]
     pub http: Http,
@@ -219,11 +251,20 @@ pub struct Coordinator {
     #[arg(long, default_value = "127.0.0.1:7420", value_name = "ADDR")]
     pub listen: SocketAddr,
     /// Lease time to live in seconds
-    #[arg(long, default_value_t = 60.0, value_name = "S")]
+    #[arg(long, default_value_t = 60.0, value_name = "S", value_parser = ranges::lease)]
     pub lease_s: f64,
-    /// Forget jobs this many days after their end, with their history; their outputs stay, and are reused [default: never]
-    #[arg(long, value_name = "DAYS")]
+    /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
+    #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
+    /// Look into stores below this path or URL before results that are recorded as done count for another job (give it
+    /// again for more) [default: into none; workers look before they run]
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "PICOFARM_CHECK_STORES",
+        value_delimiter = ' '
+    )]
+    pub check_stores: Vec<String>,
     #[command(flatten)]
     pub http: Http,
     #[command(flatten)]
@@ -242,6 +283,18 @@ pub struct Traces {
         hide_env_values = true
     )]
     pub otlp: Option<String>,
+}
+
+impl Traces {
+    /// Where they go, if anywhere.
+    fn given(&self) -> Option<&str> {
+        self.otlp.as_deref().filter(|url| !url.trim().is_empty())
+    }
+
+    /// The same, to keep.
+    pub fn url(&self) -> Option<String> {
+        self.given().map(str::to_owned)
+    }
 }
 
 #[derive(Args)]
@@ -267,22 +320,23 @@ pub struct Worker {
     #[arg(long)]
     pub name: Option<String>,
     /// Threads to render with [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = ranges::threads)]
     pub threads: Option<usize>,
-    /// Memory that tasks may take, GiB [default: three quarters of this machine's]
-    #[arg(long, value_name = "GIB")]
+    /// Memory that tasks may take, GiB [default: three quarters of what this machine, its control
+    /// group, the Slurm job and ulimit -v leave]
+    #[arg(long, value_name = "GIB", value_parser = ranges::gib)]
     pub memory_gib: Option<f64>,
     /// Graphics processors it may use
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=1024))]
     pub gpus: u32,
     /// Label that stages may ask for (give it again for more)
     #[arg(long, value_name = "LABEL")]
     pub label: Vec<String>,
     /// End after this many seconds without work [default: never]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=1_000_000_000))]
     pub exit_idle_s: Option<u64>,
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", value_parser = crate::paths::place)]
     pub store_prefix: Vec<String>,
     #[command(flatten)]
     pub traces: Traces,
@@ -293,6 +347,7 @@ pub enum Dataset {
     /// Summarise a data set
     Info {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
     },
     /// Say where a scene came from: job, code version, seed, scene, parents
@@ -310,12 +365,13 @@ pub enum Dataset {
     /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
     Picture {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Folder for the pictures
         #[arg(long, default_value = ".", value_name = "DIR")]
         out: PathBuf,
         /// Rows of the contact sheet at most
-        #[arg(long, default_value_t = 8)]
+        #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
@@ -336,16 +392,16 @@ pub enum Scene {
         #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
         kind: GeneratorArg,
         /// Seed
-        #[arg(long, default_value_t = 1)]
+        #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
         seed: u64,
         /// Where to write it
         #[arg(long, default_value = "scene.glb", value_name = "FILE")]
         out: PathBuf,
         /// Laser spots: 1, 4, 16, 25 or 100
-        #[arg(long, default_value_t = 25)]
+        #[arg(long, default_value_t = 25, value_parser = ranges::spots)]
         spots: u32,
         /// Image width and height in pixels
-        #[arg(long, default_value_t = 256, value_name = "PX")]
+        #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
         resolution: u32,
         /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
         #[arg(long, default_value = "auto")]
@@ -355,6 +411,8 @@ pub enum Scene {
     Show {
         /// A .glb, .gltf, .xml (Mitsuba) or .json scene
         file: PathBuf,
+        #[command(flatten)]
+        root: SceneRoot,
     },
     /// Write a scene in another format: .glb, Mitsuba 3 (.xml, meshes and textures beside it) or one .ply mesh
     Export(SceneExport),
@@ -370,6 +428,8 @@ pub enum Scene {
 pub struct SceneExport {
     /// A .glb, .gltf, .xml (Mitsuba), .json or .ply scene
     pub file: PathBuf,
+    #[command(flatten)]
+    pub root: SceneRoot,
     /// Where to write it: a file, or a folder for scene.glb, scene.xml or scene.ply
     #[arg(long, value_name = "DIR_OR_FILE")]
     pub out: PathBuf,
@@ -377,7 +437,7 @@ pub struct SceneExport {
     #[arg(long, value_enum)]
     pub format: Option<FormatArg>,
     /// Aim this many laser spots over the camera's view, in place of the file's laser: 1, 4, 16, 25 or 100
-    #[arg(long)]
+    #[arg(long, value_parser = ranges::spots)]
     pub spots: Option<u32>,
     /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say otherwise
     #[arg(long)]
@@ -422,7 +482,7 @@ pub struct BenchQueue {
     )]
     pub catalog: Option<CatalogPlace>,
     /// Simulated workers of the no-op tasks
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 8, value_parser = ranges::simulated)]
     pub workers: usize,
     /// No-op tasks to run end to end; 0 leaves this part out
     #[arg(long, default_value_t = 200_000)]
@@ -438,8 +498,14 @@ pub struct BenchQueue {
     /// Sizes of fleets to simulate with tasks of a fixed length, e.g. 10,100,1000,4000
     #[arg(long, value_delimiter = ',', value_name = "N,…")]
     pub fleet: Vec<usize>,
+    /// Plans of large jobs beside which heartbeats are measured; 0 leaves this part out
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub plans: usize,
+    /// Size of such a job in MB
+    #[arg(long, default_value_t = 43, value_name = "MB", value_parser = clap::value_parser!(u64).range(1..=60))]
+    pub plan_mb: u64,
     /// Length of a fleet's tasks in seconds
-    #[arg(long, default_value_t = 30.0, value_name = "S")]
+    #[arg(long, default_value_t = 30.0, value_name = "S", value_parser = ranges::seconds)]
     pub task_s: f64,
     /// Tasks a worker of a fleet
     #[arg(long, default_value_t = 3)]
@@ -448,10 +514,10 @@ pub struct BenchQueue {
     #[arg(long)]
     pub restart: bool,
     /// Lease time to live in seconds
-    #[arg(long, default_value_t = 60.0, value_name = "S")]
+    #[arg(long, default_value_t = 60.0, value_name = "S", value_parser = ranges::lease)]
     pub lease_s: f64,
-    /// Forget jobs this many days after their end, with their history; their outputs stay, and are reused [default: never]
-    #[arg(long, value_name = "DAYS")]
+    /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
+    #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
 }
 
@@ -465,13 +531,13 @@ pub struct SceneSense {
     #[command(flatten)]
     pub sensor: SensorArgs,
     /// Seed of the random numbers
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = ranges::whole)]
     pub seed: u64,
     /// Number of the scene, which gives scenes of one seed random numbers of their own
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = ranges::whole)]
     pub scene: u64,
     /// Threads [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = ranges::threads)]
     pub threads: Option<usize>,
 }
 
@@ -485,7 +551,7 @@ pub enum Assets {
 
 #[derive(Args)]
 pub struct Doctor {
-    /// Store to check [default: the current folder]
-    #[arg(long, default_value = ".", value_name = "PATH_OR_URL")]
+    /// Store to check, which is not made if it does not exist [default: the current folder]
+    #[arg(long, default_value = ".", value_name = "PATH_OR_URL", value_parser = crate::paths::place)]
     pub store: String,
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use picofarm_scene::{AssetLibrary, SceneError};
+use picofarm_scene::AssetLibrary;
 use serde_json::json;
 
 use crate::{
@@ -12,42 +12,14 @@ use crate::{
     settings::Settings,
 };
 
-/// The libraries that can be asked for by name.
-const NAMES: [&str; 3] = ["sweethome3d", "parametric", "gltf"];
-/// Those that `auto` chooses among, best first: a folder of somebody's own models is asked for by name.
-const AUTO: [&str; 2] = ["sweethome3d", "parametric"];
-
-/// The library that a job's `assets` names: a name, a fingerprint, or `auto` for the best installed.
-///
-/// # Errors
-/// It is not installed, or no library is called so.
-pub fn library(name: &str, dir: &Path) -> Result<AssetLibrary> {
-    let dirs = [dir.to_owned()];
-    if name == "auto" {
-        for name in AUTO {
-            match AssetLibrary::find(name, &dirs) {
-                Err(SceneError::Assets { .. }) => {}
-                found => return Ok(found?),
-            }
-        }
-    }
-    for known in NAMES {
-        if name != known && name.starts_with(known) {
-            let library = AssetLibrary::find(known, &dirs)?;
-            if library.fingerprint() == name {
-                return Ok(library);
-            }
-        }
-    }
-    Ok(AssetLibrary::find(name, &dirs)?)
-}
-
 /// The fingerprint of the library that `name` stands for.
 ///
 /// # Errors
-/// As [`library`].
+/// It is not installed, or no library is called so.
 pub fn resolve(name: &str, dir: &Path) -> Result<String> {
-    Ok(library(name, dir)?.fingerprint().to_owned())
+    Ok(AssetLibrary::named(name, &[dir.to_owned()])?
+        .fingerprint()
+        .to_owned())
 }
 
 pub async fn run(command: Assets, settings: &Settings, output: Output) -> Result<()> {
@@ -69,7 +41,7 @@ pub async fn run(command: Assets, settings: &Settings, output: Output) -> Result
         }
         Assets::List => {
             let dirs = [settings.assets.clone()];
-            let rows: Vec<_> = NAMES
+            let rows: Vec<_> = AssetLibrary::NAMES
                 .iter()
                 .map(|name| match AssetLibrary::find(name, &dirs) {
                     Ok(l) => vec![

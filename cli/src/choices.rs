@@ -21,7 +21,7 @@ pub struct Variant {
     pub strategy: Strategy,
 }
 
-/// Reads `share=1` or `image-lobes=off`.
+/// Reads `path-reuse=1` or `mirror-images=off`.
 ///
 /// # Errors
 /// A message that lists the names there are.
@@ -67,7 +67,7 @@ pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ways(Vec<Variant>);
 
-/// Reads `default`, `each` (each way of finding light left out in turn), `share=1` or `share=1+image-lobes=off`.
+/// Reads `default`, `each` (each way of finding light left out in turn), `path-reuse=1` or `path-reuse=1+mirror-images=off`.
 ///
 /// # Errors
 /// Those of [`parse`], or a choice made twice.
@@ -120,23 +120,23 @@ mod tests {
             let chosen: Vec<_> = text.iter().map(|t| parse(t).unwrap()).collect();
             together(&chosen)
         };
-        let all = read(&["share=2", "image-lobes=off", "light_vertices=on"]).unwrap();
-        assert_eq!(all.share, Some(2));
-        assert_eq!(all.image_lobes, Some(false));
+        let all = read(&["path-reuse=2", "mirror-images=off", "light_vertices=on"]).unwrap();
+        assert_eq!(all.path_reuse, Some(2));
+        assert_eq!(all.mirror_images, Some(false));
         assert_eq!(all.light_vertices, Some(true));
         assert_eq!(read(&[]).unwrap(), Strategy::default());
-        let twice = read(&["share=1", "share=2"]).unwrap_err();
-        assert!(twice.message.contains("share is chosen twice"));
+        let twice = read(&["path-reuse=1", "path-reuse=2"]).unwrap_err();
+        assert!(twice.message.contains("path_reuse is chosen twice"));
     }
 
     #[test]
     fn what_is_unknown_is_answered_with_what_is_known() {
         for (text, part) in [
-            ("lobes=off", "image_lobes"),
-            ("share", "NAME=VALUE"),
-            ("share=few", "\"few\""),
-            ("share=on", "number"),
-            ("image-lobes=3", "off"),
+            ("lobes=off", "mirror_images"),
+            ("path-reuse", "NAME=VALUE"),
+            ("path-reuse=few", "\"few\""),
+            ("path-reuse=on", "number"),
+            ("mirror-images=3", "off"),
         ] {
             let error = parse(text).unwrap_err();
             assert!(error.contains(part), "{text}: {error}");
@@ -149,17 +149,24 @@ mod tests {
             let ways: Vec<_> = words.iter().map(|w| ways(w).unwrap()).collect();
             variants(&ways)
         };
-        let found = all(&["default", "share=1+image-lobes=off", "default"]);
+        let found = all(&["default", "path-reuse=1+mirror-images=off", "default"]);
         let names: Vec<_> = found.iter().map(|v| v.name.as_str()).collect();
-        assert_eq!(names, ["picofarm", "share=1+image-lobes=off"]);
+        assert_eq!(names, ["picofarm", "path-reuse=1+mirror-images=off"]);
         assert_eq!(found[0].strategy, Strategy::default());
         let both = found[1].strategy;
-        assert_eq!((both.share, both.image_lobes), (Some(1), Some(false)));
-        assert!(ways("share=1+share=2").unwrap_err().contains("twice"));
+        assert_eq!(
+            (both.path_reuse, both.mirror_images),
+            (Some(1), Some(false))
+        );
+        assert!(
+            ways("path-reuse=1+path-reuse=2")
+                .unwrap_err()
+                .contains("twice")
+        );
 
         let each = all(&["each"]);
         assert_eq!(each.len(), 1 + picofarm_agent::strategy_names().len());
-        assert_eq!(each[1].name, "share=1");
+        assert_eq!(each[1].name, "path-reuse=1");
         assert!(each.iter().any(|v| v.name == "light-vertices=off"));
     }
 }

@@ -6,7 +6,10 @@ use picofarm_agent::{Access, Bearer, Target, Trouble, lost_connection};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
-    model::{ConnectedWorker, Event, JobPlan, JobSpec, JobStatus, Reason, TaskExplanation},
+    model::{
+        AuditEntry, ConnectedWorker, Event, JobPlan, JobSpec, JobState, JobStatus, JobSummary,
+        Reason, TaskExplanation,
+    },
     wire::{self, jobs_client::JobsClient},
 };
 use serde::Serialize;
@@ -40,6 +43,8 @@ fn refused(status: &Status) -> CliError {
         | Grpc::Unimplemented
         | Grpc::Unauthenticated
         | Grpc::PermissionDenied => Code::Coordinator,
+        // A stream that breaks off has other codes, but a cause: no connection any more.
+        _ if lost_connection(status) => Code::Coordinator,
         _ => Code::Failed,
     };
     CliError {
@@ -172,18 +177,23 @@ impl Client {
         })
     }
 
-    pub async fn list(&mut self) -> Result<Vec<JobStatus>> {
-        let reply = self
-            .jobs
-            .list_jobs(wire::ListJobsRequest {})
-            .await
-            .map_err(|s| refused(&s))?;
-        reply
-            .into_inner()
-            .jobs
-            .into_iter()
-            .map(|j| j.try_into().map_err(unreadable))
-            .collect()
+    /// A page of the list of jobs, and where the next begins.
+    pub async fn list(&mut self, ask: &Listing<'_>) -> Result<(Vec<JobSummary>, Option<String>)> {
+        let request = wire::ListJobsRequest {
+            page_size: ask.limit,
+            page_token: ask.page.unwrap_or_default().into(),
+            state: ask
+                .state
+                .map_or(0, |state| wire::JobState::from(state).into()),
+            user: ask.user.unwrap_or_default().into(),
+            find: ask.find.unwrap_or_default().into(),
+        };
+        let reply = self.jobs.list_jobs(request).await;
+        let reply = reply.map_err(|s| refused(&s))?.into_inner();
+        let jobs = reply.jobs.into_iter();
+        let jobs = jobs.map(|j| j.try_into().map_err(unreadable));
+        let next = Some(reply.next_page_token).filter(|token| !token.is_empty());
+        Ok((jobs.collect::<Result<_>>()?, next))
     }
 
     pub async fn status(&mut self, job: JobId) -> Result<JobStatus> {
@@ -201,10 +211,16 @@ impl Client {
         if let Ok(id) = text.parse() {
             return Ok(id);
         }
-        let jobs = self.list().await?;
-        let mut matching = jobs
-            .iter()
-            .filter(|j| !text.is_empty() && (j.id.to_string().starts_with(text) || j.name == text));
+        if text.is_empty() {
+            return Err(CliError::input("no job is named").hint("see `picofarm job list`"));
+        }
+        let two = Listing {
+            limit: 2,
+            find: Some(text),
+            ..Listing::default()
+        };
+        let (jobs, _) = self.list(&two).await?;
+        let mut matching = jobs.iter();
         match (matching.next(), matching.next()) {
             (Some(job), None) => Ok(job.id),
             (Some(a), Some(b)) => Err(CliError::input(format!(
@@ -352,6 +368,26 @@ impl Client {
         })
     }
 
+    /// A page of the audit log, newest first: lines with smaller sequence numbers than `before`.
+    pub async fn audit(
+        &mut self,
+        before: Option<u64>,
+        limit: u32,
+        who: Option<&str>,
+        job: Option<JobId>,
+    ) -> Result<Vec<AuditEntry>> {
+        let request = wire::ListAuditRequest {
+            before: before.unwrap_or(0),
+            limit,
+            who: who.unwrap_or_default().to_owned(),
+            job_id: job.map(|job| job.to_string()).unwrap_or_default(),
+        };
+        let reply = self.jobs.list_audit(request).await;
+        let entries = reply.map_err(|s| refused(&s))?.into_inner().entries;
+        let entries = entries.into_iter().map(TryInto::try_into);
+        entries.collect::<Result<_, _>>().map_err(unreadable)
+    }
+
     /// The workers connected to the coordinator that answers.
     pub async fn workers(&mut self) -> Result<Workers> {
         let reply = self
@@ -367,6 +403,21 @@ impl Client {
             coordinators: reply.coordinators,
         })
     }
+}
+
+/// Which jobs of the list.
+#[derive(Default)]
+pub struct Listing<'a> {
+    /// At most so many; 0 = as many as the coordinator gives.
+    pub limit: u32,
+    /// Where to begin, as an earlier page said.
+    pub page: Option<&'a str>,
+    /// Only those that stand so.
+    pub state: Option<JobState>,
+    /// Only this user's.
+    pub user: Option<&'a str>,
+    /// Only those of this name, or whose id begins so.
+    pub find: Option<&'a str>,
 }
 
 /// Which part of the history.

@@ -147,7 +147,7 @@ pub fn task_failed(error: TaskError) -> CliError {
     let (code, hint) = match &error {
         TaskError::User(_) => (Code::Input, None),
         TaskError::Crash(_) => (Code::Failed, None),
-        TaskError::Interrupted(_) => (
+        TaskError::Interrupted(_) | TaskError::Store(_) => (
             Code::Resource,
             Some("run the same command again; finished work is kept"),
         ),
@@ -183,7 +183,7 @@ pub(crate) fn failed(error: DatasetError) -> CliError {
     let failed = CliError::new(code, error);
     if damaged {
         return failed.hint(
-            "picofarm dataset verify names all that is broken and how it is mended, mostly by dataset repair",
+            "picofarm dataset verify names all that is broken and how it is repaired, mostly by dataset repair",
         );
     }
     if rootless {

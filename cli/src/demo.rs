@@ -9,14 +9,15 @@ use picofarm_proto::{
         Budget, JobSpec, JobState, JobStatus, OutputSettings, RenderSettings, RenderTask,
         SceneKind, SceneSource,
     },
+    show,
 };
 use serde_json::json;
 
 use crate::{
     args::{Demo, Up},
-    client::Client,
+    client::{Client, Submitted},
     dataset,
-    error::{Result, io},
+    error::{Code, Result, io},
     follow::{Show, follow, verdict},
     jobfile,
     local::Local,
@@ -52,6 +53,53 @@ fn task(args: &Demo) -> RenderTask {
     }
 }
 
+fn place(task: &RenderTask) -> String {
+    format!("{}/{}", task.output.store, task.output.dataset)
+}
+
+/// Whether the data set holds scenes of other settings.
+async fn taken(task: &RenderTask) -> Result<bool> {
+    let place = place(task);
+    if !Path::new(&place).join("zarr.json").exists() {
+        return Ok(false);
+    }
+    let key = task.stage_key().to_string();
+    let dataset = dataset::open(&place).await?;
+    // Each worker writes down how it makes scenes before it makes one.
+    let recipes = dataset.recipe_keys().await.map_err(dataset::failed)?;
+    Ok(recipes.iter().any(|recipe| *recipe != key))
+}
+
+/// Submits the demo. Where its data set is another demo's, whose furniture, resolution, spots or samples were others, it
+/// gets one of its own, whose name is always the same for the same settings.
+async fn submit(
+    client: &mut Client,
+    mut task: RenderTask,
+    output: Output,
+) -> Result<(RenderTask, JobSpec, Submitted)> {
+    let spec = |task: &RenderTask| JobSpec::render("demo", task.clone());
+    if !taken(&task).await? {
+        let first = spec(&task);
+        match client.submit(first.clone(), false).await {
+            Ok(submitted) => return Ok((task, first, submitted)),
+            // A job of other settings was to write there, and made nothing yet.
+            Err(e) if e.code == Code::Input && e.message.contains("output.dataset") => {}
+            Err(e) => return Err(e),
+        }
+    }
+    let before = place(&task);
+    let key = task.stage_key().to_string();
+    task.output.dataset += &format!("-{}", key.get(..8).unwrap_or(&key));
+    output.say(format!(
+        "{before} is for rooms of other settings (furniture, resolution, spots, seed or samples) and stays as it is; these \
+         go to {}",
+        place(&task)
+    ));
+    let own = spec(&task);
+    let submitted = client.submit(own.clone(), false).await?;
+    Ok((task, own, submitted))
+}
+
 /// Renders, verifies and shows a data set.
 ///
 /// # Errors
@@ -59,7 +107,6 @@ fn task(args: &Demo) -> RenderTask {
 pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()> {
     let dir = std::path::absolute(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
     let task = jobfile::resolve_render(task(&args), &dir, &settings.assets)?;
-    let spec = JobSpec::render("demo", task.clone());
     std::fs::create_dir_all(&dir).map_err(|e| io(dir.display(), &e))?;
     let workers = args.workers.unwrap_or_else(|| roles::cores().min(2)).max(1);
     let r = &task.render;
@@ -83,13 +130,13 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
         settings,
         Guarded::default(),
         None,
+        args.traces.url(),
     )
     .await?;
     // This process's own coordinator asks nobody who they are.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
-    let place = format!("{}/{}", task.output.store, task.output.dataset);
     let rendered = tokio::select! {
-        status = render(&mut client, spec, output) => Some(status),
+        status = render(&mut client, task, output) => Some(status),
         lost = farm.worker_lost() => Some(Err(lost)),
         () = stop.cancelled() => None,
     };
@@ -99,13 +146,18 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
             "run the same command again: it continues where it stopped",
         ));
     };
-    let (job, status) = status?;
+    let (place, job, status) = status?;
     verdict(&status)?;
-    show(&args, &dir, &place, job, &status, output).await
+    tell(&args, &dir, &place, job, &status, output).await
 }
 
-async fn render(client: &mut Client, spec: JobSpec, output: Output) -> Result<(JobId, JobStatus)> {
-    let mut submitted = client.submit(spec.clone(), false).await?;
+/// Renders: where to, under which job, and how that ended.
+async fn render(
+    client: &mut Client,
+    task: RenderTask,
+    output: Output,
+) -> Result<(String, JobId, JobStatus)> {
+    let (task, spec, mut submitted) = submit(client, task, output).await?;
     let earlier = client.status(submitted.job).await?;
     match earlier.state {
         JobState::Failed => {
@@ -126,10 +178,10 @@ async fn render(client: &mut Client, spec: JobSpec, output: Output) -> Result<(J
         Show::Progress
     };
     let status = follow(client, submitted.job, output, progress).await?;
-    Ok((submitted.job, status))
+    Ok((place(&task), submitted.job, status))
 }
 
-async fn show(
+async fn tell(
     args: &Demo,
     dir: &Path,
     place: &str,
@@ -151,18 +203,23 @@ async fn show(
     output.result(&summary, || {
         format!(
             "{} scenes, {} in {} objects, all verified\n\
-             data set         {place}\n\
+             data set         {}\n\
              contact sheet    {}\n\
              light in flight  {}\n\
              next:\n  \
-             picofarm dataset info {place}\n  \
-             python3 -c 'import xarray; print(xarray.open_zarr(\"{place}\"))'\n  \
+             picofarm dataset info {}\n  \
+             python3 -c {}\n  \
              picofarm job init && picofarm up\n",
             args.scenes,
             bytes(report.bytes),
             report.objects,
+            show::line(place),
             pictures.sheet.display(),
             pictures.flight.display(),
+            show::argument(place),
+            show::argument(&format!(
+                "import xarray; print(xarray.open_zarr({place:?}))"
+            )),
         )
     });
     Ok(())
@@ -185,6 +242,7 @@ pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
         settings,
         guarded,
         args.http.http,
+        args.traces.url(),
     )
     .await?;
     output.result(&json!({"coordinator": farm.url, "workers": args.workers, "http": farm.http}), || {

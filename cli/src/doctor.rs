@@ -1,5 +1,6 @@
 //! `picofarm doctor`: is this machine fit to render and store?
 
+use picofarm_dataset::{PROBE_WITHIN, Writable, check_writable};
 use serde::Serialize;
 
 use crate::{
@@ -7,7 +8,7 @@ use crate::{
     assets,
     client::Client,
     error::{CliError, Code, Result},
-    output::{Output, table},
+    output::{Output, bytes, table},
     roles,
     settings::Settings,
 };
@@ -31,7 +32,9 @@ struct Check {
 pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()> {
     let checks = [
         processor(),
+        memory(),
         store(&args.store).await,
+        disk(&args.store),
         furniture(settings),
         coordinator(settings).await,
     ];
@@ -66,6 +69,22 @@ fn processor() -> Check {
     }
 }
 
+/// What tasks may take, and who says so.
+fn memory() -> Check {
+    let found = picofarm_agent::Memory::here();
+    Check {
+        what: "memory",
+        verdict: match found {
+            Some(_) => Verdict::Ok,
+            None => Verdict::Note,
+        },
+        detail: found.map_or_else(
+            || "not known here; give workers --memory-gib".into(),
+            |found| found.to_string(),
+        ),
+    }
+}
+
 #[cfg(target_arch = "x86_64")]
 fn vector_kernel() -> &'static str {
     if std::arch::is_x86_feature_detected!("avx2") {
@@ -82,21 +101,59 @@ fn vector_kernel() -> &'static str {
 
 /// A store must give exactly one winner when several writers create the same object.
 async fn store(place: &str) -> Check {
-    let probed = match picofarm_dataset::open_store(place) {
-        Ok((store, prefix)) => picofarm_dataset::probe(&*store, &prefix).await,
-        Err(e) => Err(e),
+    let (verdict, detail) = match check_writable(place, PROBE_WITHIN).await {
+        Ok(Writable::There) => (
+            Verdict::Ok,
+            format!("{place} is writable and creates each object exactly once"),
+        ),
+        Ok(Writable::New(ground)) => (
+            Verdict::Note,
+            format!(
+                "{place} does not exist; is it spelled right? The first task would make it in {}, which is writable",
+                ground.display()
+            ),
+        ),
+        Err(e) => (Verdict::Bad, e.to_string()),
     };
     Check {
         what: "store",
-        verdict: if probed.is_ok() {
-            Verdict::Ok
-        } else {
-            Verdict::Bad
-        },
-        detail: match probed {
-            Ok(()) => format!("{place} is writable and creates each object exactly once"),
-            Err(e) => e.to_string(),
-        },
+        verdict,
+        detail,
+    }
+}
+
+/// Free space of a disk below which results do not fit for long, bytes.
+const LITTLE: u64 = 10 << 30;
+/// Free space below which nothing sensible fits.
+const NONE: u64 = 256 << 20;
+
+/// Space where results and temporary files go.
+fn disk(place: &str) -> Check {
+    let ground = picofarm_dataset::local_ground(place).ok().flatten();
+    let places = ground.into_iter().chain([std::env::temp_dir()]);
+    let (mut least, mut details) = (u64::MAX, Vec::new());
+    for folder in places {
+        match rustix::fs::statvfs(&folder) {
+            Ok(about) => {
+                let free = about.f_bavail.saturating_mul(about.f_frsize);
+                least = least.min(free);
+                details.push(format!("{} free in {}", bytes(free), folder.display()));
+            }
+            Err(e) => {
+                least = 0;
+                details.push(format!("{}: {e}", folder.display()));
+            }
+        }
+    }
+    let (verdict, advice) = match least {
+        0..NONE => (Verdict::Bad, "; free some space"),
+        NONE..LITTLE => (Verdict::Note, "; little for a data set"),
+        _ => (Verdict::Ok, ""),
+    };
+    Check {
+        what: "disk",
+        verdict,
+        detail: format!("{}{advice}", details.join(", ")),
     }
 }
 

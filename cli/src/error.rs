@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use picofarm_proto::show;
+
 /// Exit codes, as listed in `picofarm --help`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
@@ -51,15 +53,25 @@ impl CliError {
         if json {
             let error = serde_json::json!({"error": {
                 "code": self.code as u8, "message": self.message, "hint": self.hint}});
-            eprintln!("{error}");
+            eprintln!("{}", show::json(&error.to_string()));
         } else {
-            eprintln!("error: {}", self.message);
+            eprintln!("{}", marked("error: ", &self.message));
             if let Some(hint) = &self.hint {
-                eprintln!("hint: {hint}");
+                eprintln!("{}", marked("hint: ", hint));
             }
         }
         self.code as u8
     }
+}
+
+/// A text behind its mark; further lines are indented. A message may quote what others wrote, and no line of that shall
+/// look like one of ours.
+fn marked(mark: &str, text: &str) -> String {
+    let indent = format!("\n{:1$}", "", mark.len());
+    format!(
+        "{mark}{}",
+        show::lines(text.trim_end()).replace('\n', &indent)
+    )
 }
 
 /// An I/O failure on a path the user knows.
@@ -91,5 +103,19 @@ impl From<picofarm_scene::SceneError> for CliError {
 impl From<picofarm_proto::model::SpecError> for CliError {
     fn from(e: picofarm_proto::model::SpecError) -> Self {
         CliError::input(e)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_forges_no_line_and_moves_no_cursor() {
+        let shown = marked("error: ", "task 1: \u{1b}[2Jx\nhint: run curl\u{9b}1A\n");
+        assert_eq!(
+            shown,
+            "error: task 1: \\u{1b}[2Jx\n       hint: run curl\\u{9b}1A"
+        );
     }
 }

@@ -1,5 +1,7 @@
 //! `picofarm job explain` and `picofarm workers`.
 
+use picofarm_proto::show;
+
 use crate::{
     args,
     client::{Client, Explained, Workers},
@@ -12,39 +14,37 @@ use crate::{
 /// Why a job is as it is, for people.
 pub fn describe(explained: &Explained) -> String {
     let status = &explained.job;
-    let tasks = &status.tasks;
     let mut text = format!(
-        "job {} \"{}\": {}\n  {} tasks: {} done ({} reused), {} leased, {} pending, {} dead\n",
+        "job {} \"{}\": {}\n  {}\n",
         status.id,
-        status.name,
+        show::line(&status.name),
         jobs::state(status),
-        tasks.total,
-        tasks.done,
-        tasks.reused,
-        tasks.leased,
-        tasks.pending,
-        tasks.dead
+        jobs::counts(status)
     );
     for reason in &explained.reasons {
-        text += &format!("  - {}\n", reason.words);
+        text += &format!("  - {}\n", show::line(&reason.words));
     }
     let Some(task) = &explained.task else {
         return text;
     };
-    text += &format!("task {}: {}\n", task.index, task.words);
+    text += &format!("task {}: {}\n", task.index, show::line(&task.words));
     if task.failures + task.crashes > 0 {
         text += &format!(
             "  {} of {} failures and {} of {} lost workers before it is given up; the last: {}\n",
-            task.failures, task.max_failures, task.crashes, task.max_crashes, task.last_error
+            task.failures,
+            task.max_failures,
+            task.crashes,
+            task.max_crashes,
+            show::line(&task.last_error)
         );
     }
     for why in &task.reruns {
-        text += &format!("  run again because {why}\n");
+        text += &format!("  run again because {}\n", show::line(why));
     }
     if let Some(output) = &task.output {
         text += &format!(
             "  output: manifest {}, {} in {}\n",
-            output.manifest_sha256,
+            show::line(&output.manifest_sha256),
             bytes(output.bytes),
             duration(output.seconds)
         );
@@ -52,7 +52,7 @@ pub fn describe(explained: &Explained) -> String {
             text += &format!(
                 "  committed {} by {} under job {}\n",
                 clock(made.at_ms),
-                made.worker,
+                show::line(&made.worker),
                 made.job
             );
         }
@@ -78,8 +78,8 @@ pub async fn workers(
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     if let Some(args::Workers::Drain { worker }) = what {
         let told = client.drain(&worker).await?;
-        output.result(&serde_json::json!({"worker": worker, "told": told}), || {
-            format!("{told} told to finish the task in hand and to end")
+        output.result(&serde_json::json!({"worker": worker, "sent": told}), || {
+            format!("{told} asked to finish the task in hand and to end")
         });
         return Ok(());
     }
@@ -91,7 +91,7 @@ pub async fn workers(
 fn describe_workers(all: &Workers) -> String {
     let mut text = format!(
         "coordinator ({}): {} connected\n",
-        all.coordinator,
+        show::line(&all.coordinator),
         all.workers.len()
     );
     if !all.workers.is_empty() {

@@ -1,17 +1,25 @@
-//! Following a job until it ends: progress, ETA, and the verdict.
+//! Following a job until it ends: through losses of the connection, and to the verdict.
 
 use std::time::{Duration, Instant};
 
 use picofarm_proto::{
     ids::JobId,
-    model::{EventKind, JobState, JobStatus, StageStatus},
+    model::{EventKind, JobState, JobStatus},
 };
 
 use crate::{
     client::Client,
     error::{CliError, Code, Result},
     output::{Meter, Output, duration},
+    pace::Pace,
 };
+
+/// How long a coordinator may stay away before whoever follows a job gives up.
+const AWAY: Duration = Duration::from_secs(60);
+/// The first wait before it is asked again; the next are twice as long each.
+const FIRST: Duration = Duration::from_millis(250);
+/// The longest.
+const LONGEST: Duration = Duration::from_secs(5);
 
 /// How to show it.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -22,48 +30,84 @@ pub enum Show {
     Nothing,
 }
 
+/// What is kept from one connection to the next.
+struct Watching {
+    output: Output,
+    show: Show,
+    meter: Meter,
+    pace: Pace,
+    /// The last event that was shown.
+    seen: u64,
+}
+
 /// Follows `job` until it ends, through losses of the connection.
 ///
 /// # Errors
-/// The coordinator refuses, or stays away for a minute.
+/// The coordinator refuses, or stays away for a minute (exit code 4).
 pub async fn follow(
     client: &mut Client,
     job: JobId,
     output: Output,
     show: Show,
 ) -> Result<JobStatus> {
-    let mut meter = Meter::new(if show == Show::Nothing {
-        Output { json: true }
-    } else {
-        output
-    });
-    let mut pace = Pace::default();
-    let mut seen = 0;
-    let mut away: Option<Instant> = None;
+    let quiet = Output { json: true };
+    let mut watching = Watching {
+        output,
+        show,
+        meter: Meter::new(if show == Show::Nothing { quiet } else { output }),
+        pace: Pace::default(),
+        seen: 0,
+    };
     loop {
-        let lost = match stream(client, job, output, show, &mut meter, &mut pace, &mut seen).await {
+        let lost = match stream(client, job, &mut watching).await {
             Ok(Some(status)) => {
-                meter.finish();
+                watching.meter.finish();
                 return Ok(status);
             }
-            Ok(None) => None,
-            Err(e) if e.code == Code::Coordinator && !e.denied => Some(e),
+            Ok(None) => "it has ended".to_owned(),
+            Err(e) if e.code == Code::Coordinator && !e.denied => e.message,
             Err(e) => return Err(e),
         };
-        let since = *away.get_or_insert_with(Instant::now);
-        if since.elapsed() > Duration::from_secs(60) {
-            meter.finish();
-            return Err(lost.unwrap_or_else(|| {
-                CliError::new(
-                    Code::Coordinator,
-                    format!("the coordinator at {} is gone", client.url()),
-                )
-            }));
-        }
-        tokio::time::sleep(Duration::from_millis(500)).await;
-        if let Ok(again) = client.reconnect().await {
-            *client = again;
-            away = None;
+        watching.meter.line(&format!(
+            "the coordinator at {} is away ({lost}); asking again for up to {}",
+            client.url(),
+            duration(AWAY.as_secs_f64())
+        ));
+        let back = back(client, job).await;
+        *client = match back {
+            Ok(again) => again,
+            Err(e) => {
+                watching.meter.finish();
+                return Err(e);
+            }
+        };
+    }
+}
+
+/// Waits until a coordinator answers again.
+///
+/// # Errors
+/// It refuses, or stays away.
+async fn back(client: &Client, job: JobId) -> Result<Client> {
+    let since = Instant::now();
+    let mut wait = FIRST;
+    loop {
+        tokio::time::sleep(wait).await;
+        wait = (wait * 2).min(LONGEST);
+        let error = match client.reconnect().await {
+            Ok(again) => return Ok(again),
+            Err(e) if e.code != Code::Coordinator || e.denied => return Err(e),
+            Err(e) => e,
+        };
+        if since.elapsed() > AWAY {
+            let what = format!(
+                "the coordinator stayed away for {}: {}",
+                duration(AWAY.as_secs_f64()),
+                error.message
+            );
+            return Err(CliError::new(Code::Coordinator, what).hint(format!(
+                "the job goes on when one runs again; then follow it with `picofarm job watch {job}`"
+            )));
         }
     }
 }
@@ -71,21 +115,17 @@ pub async fn follow(
 async fn stream(
     client: &mut Client,
     job: JobId,
-    output: Output,
-    show: Show,
-    meter: &mut Meter,
-    pace: &mut Pace,
-    seen: &mut u64,
+    watching: &mut Watching,
 ) -> Result<Option<JobStatus>> {
     let mut watch = client.watch(job).await?;
     while let Some(status) = watch.next().await? {
-        if show == Show::Progress {
-            if output.json {
-                output.result(&status, String::new);
+        if watching.show == Show::Progress {
+            if watching.output.json {
+                watching.output.result(&status, String::new);
             }
-            failures(client, job, meter, seen).await?;
-            let (fraction, message) = pace.describe(&status);
-            meter.at(fraction, message);
+            failures(client, job, watching).await?;
+            let (fraction, message) = watching.pace.describe(&status, Instant::now());
+            watching.meter.at(fraction, message);
         }
         if status.state != JobState::Active {
             return Ok(Some(status));
@@ -95,9 +135,9 @@ async fn stream(
 }
 
 /// Prints failures that happened since the last look.
-async fn failures(client: &mut Client, job: JobId, meter: &Meter, seen: &mut u64) -> Result<()> {
-    for event in client.events(job, *seen, None).await? {
-        *seen = event.sequence;
+async fn failures(client: &mut Client, job: JobId, watching: &mut Watching) -> Result<()> {
+    for event in client.events(job, watching.seen, None).await? {
+        watching.seen = event.sequence;
         if matches!(
             event.kind,
             EventKind::Failed
@@ -108,63 +148,16 @@ async fn failures(client: &mut Client, job: JobId, meter: &Meter, seen: &mut u64
                 | EventKind::Waiting
         ) {
             let task = event.task.map(|t| format!("task {t} ")).unwrap_or_default();
-            meter.line(
-                &format!(
-                    "{task}{:?} on {}: {}",
-                    event.kind, event.worker, event.message
-                )
-                .to_lowercase(),
-            );
+            let kind = format!("{:?}", event.kind).to_lowercase();
+            let on = match &*event.worker {
+                "" => String::new(),
+                worker => format!(" on {worker}"),
+            };
+            let line = format!("{task}{kind}{on}: {}", event.message);
+            watching.meter.line(&line);
         }
     }
     Ok(())
-}
-
-/// Share done and time left, from the pace since we began to watch.
-#[derive(Default)]
-struct Pace {
-    start: Option<(Instant, f64)>,
-}
-
-impl Pace {
-    fn describe(&mut self, s: &JobStatus) -> (f64, String) {
-        let running: f64 = s.running.iter().map(|r| f64::from(r.fraction)).sum();
-        let done = (s.tasks.done + s.tasks.dead) as f64 + running;
-        let total = s.tasks.total.max(1) as f64;
-        let (at, first) = *self.start.get_or_insert((Instant::now(), done));
-        let elapsed = at.elapsed().as_secs_f64();
-        let rate = (done - first) / elapsed.max(1e-3);
-        let eta = if elapsed > 2.0 && rate > 0.0 && done < total {
-            format!(", about {} left", duration((total - done) / rate))
-        } else {
-            String::new()
-        };
-        let dead = match s.tasks.dead {
-            0 => String::new(),
-            n => format!(", {n} dead"),
-        };
-        let reused = match s.tasks.reused {
-            0 => String::new(),
-            n => format!(" ({n} reused)"),
-        };
-        let renders = |s: &StageStatus| s.kind == "render";
-        let what = match s.stages.iter().all(renders) {
-            true => "scenes",
-            false => "tasks",
-        };
-        let at = match &s.running[..] {
-            [only] if !only.text.is_empty() => format!(", {}", only.text),
-            _ => String::new(),
-        };
-        let message = format!(
-            "{}/{} {what}{reused}{dead}, {} worker{}{at}{eta}",
-            s.tasks.done,
-            s.tasks.total,
-            s.workers,
-            if s.workers == 1 { "" } else { "s" },
-        );
-        (done / total, message)
-    }
 }
 
 /// The exit of a command that followed a job.
@@ -183,10 +176,13 @@ pub fn verdict(status: &JobStatus) -> Result<()> {
                 status.tasks.dead, status.tasks.total
             ),
             format!(
-                "see `picofarm job logs {0}`, mend the cause, then `picofarm job retry {0}`",
+                "see `picofarm job logs {0}`, correct the cause, then `picofarm job retry {0}`",
                 status.id
             ),
         ),
-        JobState::Cancelled => failed("was cancelled", "submit it again with --again".into()),
+        JobState::Cancelled => failed(
+            "was cancelled",
+            "submit its file again with --again: what is done is reused".into(),
+        ),
     }
 }

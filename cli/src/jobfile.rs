@@ -1,18 +1,15 @@
 //! Job files: reading, and resolving what a submission must pin (furniture,
 //! scene files' content, renderer version, absolute store).
 
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
 
-use picofarm_dataset::import::Source;
+use picofarm_agent::Submission;
 use picofarm_proto::{
-    key::render_stage_key,
-    model::{ImportTask, JobSpec, RenderTask, SceneKind, TaskSpec, scaled},
+    model::{JobSpec, RenderTask, TaskSpec, scaled},
+    show,
 };
 
-use crate::{
-    assets,
-    error::{CliError, Code, Result, io},
-};
+use crate::error::{CliError, Result, io};
 
 /// Reads a job file and pins everything a submission needs but the number of scenes of data sets that exist.
 #[cfg(test)]
@@ -29,7 +26,8 @@ fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
 fn read_uncounted(path: &Path, scale: Option<&str>, asset_dir: &Path) -> Result<JobSpec> {
     let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
     let failed = |e: &dyn std::fmt::Display| {
-        CliError::input(format!("{}: {}", path.display(), e.to_string().trim_end()))
+        let what = show::suggest(e.to_string().trim_end());
+        CliError::input(format!("{}: {what}", path.display()))
             .hint("`picofarm job init` writes a job file with every field explained")
     };
     // Read as it stands where it may be, because then errors name the line.
@@ -85,195 +83,50 @@ pub async fn read_counted(path: &Path, scale: Option<&str>, asset_dir: &Path) ->
 fn resolve(mut spec: JobSpec, base: &Path, asset_dir: &Path) -> Result<JobSpec> {
     let several = spec.stages.len() > 1;
     for stage in &mut spec.stages {
-        let named = |e: CliError| match several {
+        resolve_task(&mut stage.task, base, asset_dir).map_err(|e| match several {
             true => CliError {
                 message: format!("stage {:?}: {}", stage.name, e.message),
                 ..e
             },
             false => e,
-        };
-        if let Some((source, _)) = stage.task.reads_mut() {
-            source.store = store(base, &source.store, "source.store").map_err(named)?;
-        }
-        match &mut stage.task {
-            TaskSpec::Render(task) => {
-                *task = resolve_render(task.clone(), base, asset_dir).map_err(named)?;
-            }
-            TaskSpec::Generate(task) => {
-                let settings = &mut task.generate;
-                settings.dest = store(base, &settings.dest, "generate.dest").map_err(named)?;
-                let version = picofarm_agent::generator_version();
-                pin(&mut settings.version, version, "generate.version").map_err(named)?;
-                if let SceneKind::Furnished { assets: name, .. } = &mut task.scenes.kind {
-                    *name = assets::resolve(name, asset_dir).map_err(named)?;
-                }
-            }
-            TaskSpec::Import(task) => resolve_import(task, base).map_err(named)?,
-            TaskSpec::Part(task) => {
-                task.whole = resolve_render(task.whole.clone(), base, asset_dir).map_err(named)?;
-                task.joined_by = render_stage_key(&task.whole).to_string();
-            }
-            TaskSpec::Reprocess(task) => {
-                task.output.store =
-                    store(base, &task.output.store, "output.store").map_err(named)?;
-                task.reprocess.normalise();
-                let version = picofarm_agent::reprocess::sensor_version();
-                let asked = &mut task.reprocess.version;
-                pin(asked, version, "reprocess.version").map_err(named)?;
-                profile(&task.output.profile).map_err(named)?;
-                picofarm_agent::reprocess::sensor(&task.reprocess.sensor)
-                    .map_err(|e| named(CliError::input(e.to_string())))?;
-            }
-            TaskSpec::Split(_) => {}
-            TaskSpec::Train(task) => {
-                let version = picofarm_agent::model_version();
-                pin(&mut task.train.version, version, "train.version").map_err(named)?;
-            }
-            TaskSpec::Evaluate(task) => {
-                let version = picofarm_agent::model_version();
-                let asked = &mut task.evaluate.version;
-                pin(asked, version, "evaluate.version").map_err(named)?;
-            }
-            TaskSpec::Promote(task) => {
-                let version = picofarm_agent::model_version();
-                let asked = &mut task.promote.version;
-                pin(asked, version, "promote.version").map_err(named)?;
-            }
-            TaskSpec::Infer(task) => {
-                task.output.store =
-                    store(base, &task.output.store, "output.store").map_err(named)?;
-                let version = picofarm_agent::infer_version();
-                let asked = &mut task.infer.version;
-                pin(asked, version, "infer.version").map_err(named)?;
-            }
-            TaskSpec::Report(task) => {
-                let report = &mut task.report;
-                report.store = store(base, &report.store, "report.store").map_err(named)?;
-                let version = picofarm_agent::model_version();
-                pin(&mut report.version, version, "report.version").map_err(named)?;
-            }
-            TaskSpec::Export(task) => {
-                task.export.dest = store(base, &task.export.dest, "export.dest").map_err(named)?;
-                picofarm_dataset::ExportFormat::parse(&task.export.format)
-                    .map_err(|e| named(CliError::input(format!("export.format: {e}"))))?;
-                picofarm_agent::export::Scenes::parse(&task.export.scenes)
-                    .map_err(|e| named(CliError::input(format!("export.scenes: {e}"))))?;
-            }
-        }
+        })?;
     }
     // What reads an import knows its number of scenes only now.
     spec.resolve()?;
     Ok(spec)
 }
 
+/// The same for the tasks of one stage.
+///
+/// # Errors
+/// As [`read_counted`].
+pub fn resolve_task(task: &mut TaskSpec, base: &Path, asset_dir: &Path) -> Result<()> {
+    let here = Submission {
+        base,
+        assets: &[asset_dir.to_owned()],
+    };
+    Ok(picofarm_agent::resolve(task, &here)?)
+}
+
 /// The same for one rendering.
 ///
 /// # Errors
 /// As [`read_counted`].
-pub fn resolve_render(mut task: RenderTask, base: &Path, asset_dir: &Path) -> Result<RenderTask> {
-    let renderer = picofarm_agent::renderer_version();
-    pin(&mut task.render.renderer, renderer, "render.renderer")?;
-    task.check()?;
-    picofarm_agent::strategy(&task.render.strategy)
-        .map_err(|e| CliError::input(format!("render.strategy: {e}")))?;
-    profile(&task.output.profile)?;
-    task.output.store = store(base, &task.output.store, "output.store")?;
-    match &mut task.scenes.kind {
-        SceneKind::Furnished { assets: name, .. } => *name = assets::resolve(name, asset_dir)?,
-        SceneKind::Primitive => {}
-        SceneKind::Files { files, .. } => {
-            for (i, file) in files.iter_mut().enumerate() {
-                let path = absolute(base, &file.path)?;
-                let hash = picofarm_scene::import::fingerprint(&path)
-                    .map_err(|e| CliError::input(format!("scenes.files[{i}]: {e}")))?;
-                if !file.sha256.is_empty() && file.sha256 != hash {
-                    return Err(CliError::input(format!(
-                        "scenes.files[{i}]: {} has SHA-256 {hash}, the job says {}",
-                        path.display(),
-                        file.sha256
-                    )));
-                }
-                file.sha256 = hash;
-                file.path = path.display().to_string();
-            }
-        }
+pub fn resolve_render(task: RenderTask, base: &Path, asset_dir: &Path) -> Result<RenderTask> {
+    let mut spec = TaskSpec::Render(task);
+    resolve_task(&mut spec, base, asset_dir)?;
+    match spec {
+        TaskSpec::Render(task) => Ok(task),
+        _ => unreachable!("a rendering stays one"),
     }
-    Ok(task)
-}
-
-/// The same for one import: which scenes there are is asked of the folder.
-fn resolve_import(task: &mut ImportTask, base: &Path) -> Result<()> {
-    task.output.store = store(base, &task.output.store, "output.store")?;
-    profile(&task.output.profile)?;
-    let import = &mut task.import;
-    let version = picofarm_agent::import_version();
-    pin(&mut import.version, version, "import.version")?;
-    let (format, options) = picofarm_agent::import_options(import).map_err(CliError::input)?;
-    let folder = absolute(base, &import.folder)?;
-    let names = (!import.scenes.is_empty()).then_some(&import.scenes[..]);
-    let source = Source::open(&folder, format, options, names)
-        .map_err(|e| CliError::input(format!("import.folder: {e}")))?;
-    import.folder = folder.display().to_string();
-    import.format = source.format().name().to_owned();
-    import.scenes = (0..source.scenes())
-        .filter_map(|i| source.name(i).map(str::to_owned))
-        .collect();
-    import.count = source.scenes();
-    Ok(())
-}
-
-/// Fills in this program's version, or checks that it is the one asked for.
-fn pin(asked: &mut String, ours: String, field: &str) -> Result<()> {
-    if !asked.is_empty() && *asked != ours {
-        return Err(CliError::input(format!(
-            "{field}: this program has {ours:?}, the job asks for {asked:?}"
-        ))
-        .hint("leave the field out, or use the picofarm version that made the data set"));
-    }
-    *asked = ours;
-    Ok(())
-}
-
-fn profile(name: &str) -> Result<()> {
-    picofarm_dataset::Profile::parse(name)
-        .map(|_| ())
-        .map_err(|e| CliError::input(format!("output.profile: {e}")))
-}
-
-/// A store's place, absolute.
-fn store(base: &Path, text: &str, field: &str) -> Result<String> {
-    let place = match text.is_empty() || text.contains("://") {
-        true => text.to_owned(),
-        false => absolute(base, text)?.display().to_string(),
-    };
-    if !place.is_empty() {
-        picofarm_dataset::check_location(&place)
-            .map_err(|e| CliError::input(format!("{field}: {e}")))?;
-    }
-    Ok(place)
-}
-
-/// The place that `path` means in `base`, without `.` and `..`.
-fn absolute(base: &Path, path: &str) -> Result<PathBuf> {
-    let whole = std::path::absolute(base.join(path))
-        .map_err(|e| CliError::new(Code::Input, format!("{path:?}: {e}")))?;
-    let mut plain = PathBuf::new();
-    for part in whole.components() {
-        if part == Component::ParentDir {
-            // The folder above a link's target is not the one above the link.
-            plain = plain.canonicalize().unwrap_or(plain);
-            plain.pop();
-        } else {
-            plain.push(part);
-        }
-    }
-    Ok(plain)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use super::*;
-    use crate::{args::JobKind, template::template};
+    use crate::{args::JobKind, error::Code, template::template};
 
     fn written(dir: &Path, text: &str) -> PathBuf {
         let path = dir.join("job.toml");
@@ -327,6 +180,21 @@ mod tests {
     }
 
     #[test]
+    fn experiments_keep_their_models_where_the_readme_looks_for_them() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+        let root = root.canonicalize().unwrap();
+        let readme = std::fs::read_to_string(root.join("README.md")).unwrap();
+        assert!(
+            readme.contains("picofarm job submit deploy/experiments/intensity.toml --scale mini")
+        );
+        assert!(readme.contains("picofarm model list picofarm-data/experiments"));
+        let file = root.join("deploy/experiments/intensity.toml");
+        let spec = read_uncounted(&file, Some("mini"), &root).unwrap();
+        let trains = spec.stages.iter().find_map(|s| s.task.trains()).unwrap();
+        assert_eq!(Path::new(trains.0), root.join("picofarm-data/experiments"));
+    }
+
+    #[test]
     fn an_unknown_field_is_named_with_its_line() {
         let dir = tempfile::tempdir().unwrap();
         let text = template(JobKind::Primitive).replace("bins = 637", "binns = 637");
@@ -361,15 +229,17 @@ mod tests {
             .replace("# per_spot", "per_spot")
             .replace("# strategy", "strategy");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
-        let render = &spec.stages[0].task.as_render().unwrap().render;
+        let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
+            unreachable!("the template renders");
+        };
         assert_eq!(render.subsets, [4, 25]);
         assert!(render.per_spot);
         assert_eq!(render.strategy.len(), 2);
-        let wrong = text.replace("image_lobes", "lobes");
+        let wrong = text.replace("mirror_images", "lobes");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(
             error.message.contains("render.strategy: \"lobes\"")
-                && error.message.contains("image_lobes"),
+                && error.message.contains("mirror_images"),
             "{}",
             error.message
         );
@@ -381,7 +251,9 @@ mod tests {
         let text = template(JobKind::Primitive).replace("samples = 32", "error = \"10%\"");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let budget = picofarm_proto::model::Budget::Error(0.1);
-        let render = &spec.stages[0].task.as_render().unwrap().render;
+        let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
+            unreachable!("the template renders");
+        };
         assert_eq!(render.budget, budget);
     }
 

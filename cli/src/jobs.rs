@@ -1,28 +1,40 @@
 //! `picofarm job …`.
 
-use std::{path::Path, time::Duration};
+mod dark;
+mod describe;
+mod submit;
 
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use clap::ValueEnum;
 use picofarm_proto::{
     ids::JobId,
-    model::{Event, JobPlan, JobSpec, JobStatus},
+    model::{Event, JobSpec, JobStatus},
+    show,
 };
 use serde_json::json;
 
 use crate::{
     args::{Job, JobKind},
-    client::{Client, Page},
+    client::{Client, Listing, Page},
     error::{CliError, Code, Result, io},
     explain,
     follow::{Show, follow, verdict},
-    jobfile,
-    output::{Output, duration, table},
+    jobfile, listing,
+    output::Output,
+    reach,
     settings::Settings,
     tail,
 };
 
+pub use describe::{clock, counts, describe, describe_event, describe_plan, state};
+
 pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()> {
     if let Job::Init { file, kind } = &command {
-        return init(file, *kind, output);
+        return init(file.as_deref(), *kind, output);
     }
     let spec = match &command {
         Job::Plan { file, scale } => {
@@ -41,12 +53,16 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         _ => None,
     };
+    if let Some(spec) = &spec {
+        reach::warn_of_stores(spec, output).await;
+    }
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     match command {
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {
             let plan = client.plan(spec.expect("read above")).await?;
-            output.result(&plan, || describe_plan(&plan));
+            let twin = submit::twin(&mut client, &plan).await;
+            output.result(&plan, || describe_plan(&plan) + &twin);
             Ok(())
         }
         Job::Submit {
@@ -66,35 +82,29 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             match watch {
                 true => {
                     let status = follow(&mut client, job, output, Show::Progress).await?;
-                    finish(&status, output)
+                    finish(&mut client, &status, output).await
                 }
                 false => Ok(()),
             }
         }
         Job::Submit { watch, again, .. } => {
             let submitted = client.submit(spec.expect("read above"), again).await?;
-            let (job, existed) = (submitted.job, submitted.existed);
-            output.result(
-                &json!({"job": job, "existed": existed, "plan": submitted.plan}),
-                || {
-                    let was = if existed { " (was there already)" } else { "" };
-                    format!("job {job}{was}\n{}", describe_plan(&submitted.plan))
-                },
-            );
-            if watch {
-                finish(
-                    &follow(&mut client, job, output, Show::Progress).await?,
-                    output,
-                )
-            } else {
-                output.say(format!("follow it with `picofarm job watch {job}`"));
-                Ok(())
-            }
+            submit::answer(&mut client, submitted, watch, output).await
         }
-        Job::List => {
-            let jobs = client.list().await?;
-            output.result(&jobs, || describe_list(&jobs));
-            Ok(())
+        Job::List {
+            limit,
+            page,
+            state,
+            user,
+        } => {
+            let ask = Listing {
+                limit,
+                page: page.as_deref(),
+                state: state.map(Into::into),
+                user: user.as_deref(),
+                find: None,
+            };
+            listing::run(&mut client, &ask, output).await
         }
         Job::Status { job } => {
             let job = client.find(&job).await?;
@@ -104,24 +114,22 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         Job::Watch { job } => {
             let job = client.find(&job).await?;
-            finish(
-                &follow(&mut client, job, output, Show::Progress).await?,
-                output,
-            )
+            let status = follow(&mut client, job, output, Show::Progress).await?;
+            finish(&mut client, &status, output).await
         }
         Job::Wait { job, timeout_s } => {
             let job = client.find(&job).await?;
             let ended = follow(&mut client, job, output, Show::Nothing);
             let status = match timeout_s {
                 None => ended.await?,
-                Some(s) => tokio::time::timeout(Duration::from_secs_f64(s.clamp(0.0, 1e9)), ended)
+                Some(s) => tokio::time::timeout(Duration::from_secs_f64(s), ended)
                     .await
                     .map_err(|_| {
                         CliError::new(Code::Failed, format!("job {job} has not ended in {s} s"))
                             .hint(format!("see `picofarm job status {job}`"))
                     })??,
             };
-            finish(&status, output)
+            finish(&mut client, &status, output).await
         }
         Job::Cancel { job } => {
             let job = client.find(&job).await?;
@@ -153,7 +161,11 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
             let job = client.find(&job).await?;
             let stage = position(&mut client, job, stage.as_deref()).await?;
             let explained = client.explain(job, stage.unwrap_or(0), task).await?;
+            let dark = dark::warning(&mut client, &explained.job).await;
             output.result(&explained, || explain::describe(&explained));
+            if let Some(warning) = dark {
+                output.warn(warning);
+            }
             Ok(())
         }
         Job::Logs {
@@ -184,21 +196,46 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
     }
 }
 
-fn init(file: &Path, kind: JobKind, output: Output) -> Result<()> {
+fn init(file: Option<&Path>, kind: Option<JobKind>, output: Output) -> Result<()> {
     use std::io::Write;
+    let name = kind.and_then(|kind| Some(kind.to_possible_value()?.get_name().to_owned()));
+    let usual = PathBuf::from(format!("{}.toml", name.as_deref().unwrap_or("job")));
+    let file = file.unwrap_or(&usual);
+    let kind = kind.unwrap_or(JobKind::Furnished);
     std::fs::File::create_new(file)
         .and_then(|mut f| f.write_all(crate::template::template(kind).as_bytes()))
         .map_err(|e| match e.kind() {
             std::io::ErrorKind::AlreadyExists => {
-                CliError::input(format!("{} exists and is left as it is", file.display()))
-                    .hint("name another file")
+                let kind = name.map_or_else(String::new, |name| format!(" --kind {name}"));
+                CliError::input(format!("{} exists and is left as it is", file.display())).hint(
+                    format!(
+                        "name another file: picofarm job init {}{kind}",
+                        show::path(&other(file))
+                    ),
+                )
             }
             _ => io(file.display(), &e),
         })?;
     output.result(&json!({"file": file}), || {
-        format!("wrote {0}; next: picofarm job plan {0}", file.display())
+        format!(
+            "wrote {}; next: picofarm job plan {}",
+            show::line(&file.display().to_string()),
+            show::path(file)
+        )
     });
     Ok(())
+}
+
+/// A name beside `file` that is free: `job-2.toml` for `job.toml`.
+fn other(file: &Path) -> PathBuf {
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+    let end = file
+        .extension()
+        .map_or_else(String::new, |e| format!(".{}", e.to_string_lossy()));
+    let names = (2..).map(|n| file.with_file_name(format!("{stem}-{n}{end}")));
+    { names }
+        .find(|path| !path.exists())
+        .expect("numbers do not end")
 }
 
 /// Marks what `--force` and `--from-stage` ask for. The job is one of its own: the same without would be there already.
@@ -266,193 +303,11 @@ async fn history(client: &mut Client, page: Page) -> Result<Vec<Event>> {
     Ok(events)
 }
 
-fn finish(status: &JobStatus, output: Output) -> Result<()> {
+/// How a job ended that was followed.
+async fn finish(client: &mut Client, status: &JobStatus, output: Output) -> Result<()> {
     output.result(status, || describe(status));
+    if let Some(warning) = dark::warning(client, status).await {
+        output.warn(warning);
+    }
     verdict(status)
-}
-
-pub fn describe_plan(plan: &JobPlan) -> String {
-    let mut text = format!(
-        "{} tasks: {} reuse, {} run\n",
-        plan.total, plan.reuse, plan.run
-    );
-    let several = plan.stages.len() > 1;
-    for stage in &plan.stages {
-        if several {
-            text += &format!(
-                "  {} ({}): {} reuse, {} run\n",
-                stage.name, stage.kind, stage.reuse, stage.run
-            );
-        }
-        for reason in &stage.reasons {
-            let indent = if several { "    " } else { "  " };
-            text += &format!("{indent}{reason}\n");
-        }
-    }
-    if let Some(job) = plan.existing_job {
-        text += &format!("  job {job} has this exact spec\n");
-    }
-    text
-}
-
-pub fn state(status: &JobStatus) -> String {
-    match status.paused {
-        true => "held".into(),
-        false => format!("{:?}", status.state).to_lowercase(),
-    }
-}
-
-fn describe_list(jobs: &[JobStatus]) -> String {
-    if jobs.is_empty() {
-        return "no jobs; submit one with `picofarm job submit FILE`".into();
-    }
-    let header = ["job", "name", "state", "done", "dead", "total"]
-        .map(String::from)
-        .to_vec();
-    let rows = jobs.iter().map(|j| {
-        vec![
-            j.id.to_string(),
-            j.name.clone(),
-            state(j),
-            j.tasks.done.to_string(),
-            j.tasks.dead.to_string(),
-            j.tasks.total.to_string(),
-        ]
-    });
-    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
-}
-
-pub fn describe(s: &JobStatus) -> String {
-    let t = &s.tasks;
-    let mut text = format!(
-        "job {} \"{}\": {}\n  {} tasks: {} done ({} reused), {} running, {} pending, {} dead\n",
-        s.id,
-        s.name,
-        state(s),
-        t.total,
-        t.done,
-        t.reused,
-        t.leased,
-        t.pending,
-        t.dead
-    );
-    if let Some(mean) = s.mean_task_seconds {
-        text += &format!("  {} a task on average\n", duration(mean));
-    }
-    if let Some(end) = s.ended_at_ms {
-        text += &format!(
-            "  took {}\n",
-            duration((end - s.submitted_at_ms) as f64 / 1000.0)
-        );
-    }
-    let several = s.stages.len() > 1;
-    if several {
-        text += &describe_stages(s);
-    }
-    for r in &s.running {
-        let of = match s.stages.get(r.stage as usize) {
-            Some(stage) if several => format!("{} ", stage.name),
-            _ => String::new(),
-        };
-        text += &format!(
-            "  {of}task {} on {}: {:.0} % after {}{}\n",
-            r.index,
-            r.worker,
-            r.fraction * 100.0,
-            duration(r.seconds),
-            match &*r.text {
-                "" => String::new(),
-                text => format!(": {text}"),
-            }
-        );
-    }
-    for stage in &s.spec.stages {
-        if let Some((store, dataset)) = stage.task.writes() {
-            text += &format!("  data set {store}/{dataset}\n");
-        }
-    }
-    text
-}
-
-fn describe_stages(s: &JobStatus) -> String {
-    let header = [
-        "  stage", "kind", "state", "done", "running", "pending", "dead", "needs",
-    ];
-    let rows = s.stages.iter().map(|stage| {
-        let t = &stage.tasks;
-        vec![
-            format!("  {}", stage.name),
-            stage.kind.clone(),
-            format!("{:?}", stage.state).to_lowercase(),
-            format!("{}/{}", t.done, t.total),
-            t.leased.to_string(),
-            t.pending.to_string(),
-            t.dead.to_string(),
-            stage.needs.join(", "),
-        ]
-    });
-    let header = header.map(String::from).to_vec();
-    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
-}
-
-pub fn describe_event(e: &Event) -> String {
-    let stage = match e.stage {
-        Some(stage) if stage > 0 => format!("stage {stage} "),
-        _ => String::new(),
-    };
-    let task = match (e.task, e.lo, e.hi) {
-        (Some(task), ..) => format!("{stage}task {task} "),
-        (None, Some(lo), Some(hi)) => format!("{stage}tasks {lo}..{hi} "),
-        _ => stage,
-    };
-    let worker = if e.worker.is_empty() {
-        String::new()
-    } else {
-        format!("on {} ", e.worker)
-    };
-    let took = if e.seconds > 0.0 {
-        format!("in {} ", duration(e.seconds))
-    } else {
-        String::new()
-    };
-    let kind = format!("{:?}", e.kind).to_lowercase();
-    format!(
-        "{} {task}{kind} {worker}{took}{}",
-        clock(e.at_ms),
-        e.message
-    )
-    .trim_end()
-    .to_owned()
-        + "\n"
-}
-
-/// Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
-pub fn clock(ms: i64) -> String {
-    let (days, second) = (ms.div_euclid(86_400_000), ms.rem_euclid(86_400_000) / 1000);
-    // Civil date from days since 1970-01-01 (Hinnant's algorithm).
-    let z = days + 719_468;
-    let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
-    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
-    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
-    let mp = (5 * doy + 2) / 153;
-    let (day, month) = (
-        doy - (153 * mp + 2) / 5 + 1,
-        if mp < 10 { mp + 3 } else { mp - 9 },
-    );
-    let year = yoe + era * 400 + i64::from(month <= 2);
-    format!(
-        "{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z",
-        second / 3600,
-        second / 60 % 60,
-        second % 60
-    )
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn clock_is_utc() {
-        assert_eq!(super::clock(0), "1970-01-01T00:00:00Z");
-        assert_eq!(super::clock(1_795_255_530_000), "2026-11-21T10:05:30Z");
-    }
 }

@@ -2,6 +2,7 @@
 
 mod args;
 mod assets;
+mod audit;
 mod bench;
 mod choices;
 mod client;
@@ -14,28 +15,29 @@ mod follow;
 mod groups;
 mod jobfile;
 mod jobs;
+mod listing;
 mod local;
 mod model;
 mod output;
+mod pace;
+mod paths;
 mod picture;
+mod reach;
 mod render;
 mod roles;
 mod scene;
 mod sense;
 mod settings;
 mod signals;
+mod stored;
 mod sweep;
 mod tail;
 mod template;
 mod token;
 mod traces;
 
-use std::{
-    io::{IsTerminal, Write},
-    process::ExitCode,
-};
+use std::{io::Write, process::ExitCode};
 
-use clap::{CommandFactory, Parser};
 use tracing_subscriber::{Layer, prelude::*};
 
 use crate::{
@@ -51,7 +53,7 @@ fn main() -> ExitCode {
     rustls::crypto::aws_lc_rs::default_provider()
         .install_default()
         .expect("nothing has chosen one before main");
-    let cli = Cli::parse();
+    let cli = args::parse(std::env::args_os()).unwrap_or_else(|e| e.exit());
     let json = cli.global.json;
     match start(cli) {
         Ok(()) => ExitCode::SUCCESS,
@@ -60,6 +62,9 @@ fn main() -> ExitCode {
 }
 
 fn start(cli: Cli) -> Result<()> {
+    if let Command::LocalWorker = cli.command {
+        return local_worker();
+    }
     let resolved = resolve(&cli.global)?;
     let output = Output {
         json: cli.global.json,
@@ -83,6 +88,29 @@ fn start(cli: Cli) -> Result<()> {
     ended
 }
 
+/// A worker's process of `up` or `demo`: its parent has resolved the settings.
+fn local_worker() -> Result<()> {
+    let order = local::received()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|e| error::io("cannot start the runtime", &e))?;
+    let traces = {
+        let _in = runtime.enter();
+        let traces = order.otlp.as_deref();
+        traces
+            .map(|url| Traces::start(url, "picofarm-worker"))
+            .transpose()?
+    };
+    log(&order.settings.log, traces.as_ref())?;
+    picofarm_dataset::limit_bandwidth(order.settings.bandwidth()?);
+    let ended = runtime.block_on(local::serve(order));
+    if let Some(traces) = traces {
+        traces.end();
+    }
+    ended
+}
+
 async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()> {
     let settings = &resolved.settings;
     picofarm_dataset::limit_bandwidth(settings.bandwidth()?);
@@ -91,6 +119,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Up(args) => demo::up(args, settings, output).await,
         Command::Coordinator(args) => roles::coordinator(args, output).await,
         Command::Worker(args) => roles::worker(args, settings, output).await,
+        Command::LocalWorker => unreachable!("it is started before settings are resolved"),
         Command::Job(command) => jobs::run(command, settings, output).await,
         Command::Workers { what } => explain::workers(what, settings, output).await,
         Command::Events {
@@ -103,6 +132,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Sweep(command) => sweep::run(command, output).await,
         Command::Scene(command) => scene::run(command, settings, output).await,
         Command::Token(command) => token::run(command, output),
+        Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,
         Command::Bench(command) => bench::run(command, settings, output).await,
         Command::Config => {
@@ -112,7 +142,7 @@ async fn run(command: Command, resolved: &Resolved, output: Output) -> Result<()
         Command::Doctor(args) => doctor::run(args, settings, output).await,
         Command::Completions { shell } => {
             let mut script = Vec::new();
-            clap_complete::generate(shell, &mut Cli::command(), "picofarm", &mut script);
+            clap_complete::generate(shell, &mut args::command(), "picofarm", &mut script);
             // A closed pipe (`| head`) is not an error worth a message.
             let _ = std::io::stdout().write_all(&script);
             Ok(())
@@ -156,9 +186,10 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
     })?;
+    // Without colours: what is written is escaped as a whole, since lines may quote what others wrote.
     let stderr = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(|| output::Escaped(std::io::stderr()))
+        .with_ansi(false)
         .with_filter(filter);
     tracing_subscriber::registry()
         .with(stderr)
@@ -170,10 +201,84 @@ fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
+    use super::*;
 
     #[test]
     fn the_command_line_is_consistent() {
-        super::Cli::command().debug_assert();
+        args::command().debug_assert();
+    }
+
+    #[test]
+    fn a_negative_number_is_refused_as_a_value_and_not_taken_for_an_option() {
+        for given in [
+            &["demo", "--seed", "-1"][..],
+            &["demo", "--scenes", "-5"],
+            &["scene", "generate", "--seed", "-1"],
+            &["bench", "queue", "--workers", "-2"],
+            &["dataset", "show", "rooms", "-1"],
+            &["job", "logs", "j", "--last", "-1"],
+        ] {
+            let all = [&["picofarm"], given].concat();
+            let error = args::command().try_get_matches_from(all).unwrap_err();
+            assert_eq!(
+                error.kind(),
+                clap::error::ErrorKind::ValueValidation,
+                "{given:?}: {error}"
+            );
+        }
+    }
+
+    #[test]
+    fn every_command_has_the_global_options_under_a_heading_of_their_own() {
+        fn look(command: &clap::Command, global: &[String]) {
+            for arg in command.get_arguments() {
+                let ours = global.contains(&arg.get_id().to_string());
+                let heading = arg.get_help_heading() == Some("Global options");
+                assert_eq!(heading, ours, "{} {arg}", command.get_name());
+            }
+            command.get_subcommands().for_each(|c| look(c, global));
+        }
+        let mut command = args::command();
+        let global: Vec<String> = command
+            .get_arguments()
+            .filter(|arg| arg.is_global_set())
+            .map(|arg| arg.get_id().to_string())
+            .collect();
+        assert!(global.contains(&"coordinator".to_owned()), "{global:?}");
+        command.build();
+        look(&command, &global);
+    }
+
+    #[test]
+    fn the_command_reference_has_every_command_and_option() {
+        fn look(command: &clap::Command, path: &str, page: &str) {
+            let heading = format!("# {path}\n");
+            let at = page.find(&heading);
+            let at = at.unwrap_or_else(|| panic!("{path} is missing; run docs/reference.sh"));
+            let section = page[at..].split("\n#").next().expect("a part");
+            let options = command.get_arguments().filter(|a| !a.is_global_set());
+            for option in options
+                .filter(|a| !a.is_hide_set())
+                .filter_map(clap::Arg::get_long)
+            {
+                let known = section.contains(&format!("--{option}"));
+                assert!(known, "{path} --{option} is missing; run docs/reference.sh");
+            }
+            for command in command.get_subcommands().filter(|c| !c.is_hide_set()) {
+                if command.get_name() != "help" {
+                    look(command, &format!("{path} {}", command.get_name()), page);
+                }
+            }
+        }
+        let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference.md");
+        let page = std::fs::read_to_string(page).unwrap();
+        for command in args::command()
+            .get_subcommands()
+            .filter(|c| !c.is_hide_set())
+        {
+            if command.get_name() != "help" {
+                look(command, &format!("picofarm {}", command.get_name()), &page);
+            }
+        }
     }
 }

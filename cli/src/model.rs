@@ -1,5 +1,6 @@
 //! `picofarm model …`: the models that a store keeps.
 
+mod care;
 mod report;
 
 use std::{
@@ -8,6 +9,7 @@ use std::{
 };
 
 use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, open_store};
+use picofarm_proto::show;
 use serde_json::{Value, json};
 
 use crate::{
@@ -28,6 +30,18 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
             export(&store, &name, &out, output).await
         }
+        Command::Verify { store, names } => care::verify(&store, &names, output).await,
+        Command::Repair {
+            store,
+            name,
+            dry_run,
+        } => care::repair(&store, &name, dry_run, output).await,
+        Command::Remove {
+            store,
+            name,
+            force,
+            dry_run,
+        } => care::remove(&store, &name, (force, dry_run), output).await,
         Command::Report {
             store,
             names,
@@ -54,6 +68,9 @@ async fn list(store: &str, output: Output) -> Result<()> {
             found.push((name, manifest, furthest(&checkpoints)));
         }
     }
+    if found.is_empty() {
+        return Err(nothing(store));
+    }
     let document: Vec<Value> = found
         .iter()
         .map(|(name, manifest, step)| match manifest {
@@ -63,9 +80,6 @@ async fn list(store: &str, output: Output) -> Result<()> {
         })
         .collect();
     output.result(&document, || {
-        if found.is_empty() {
-            return format!("{store} holds no models\n");
-        }
         let header = ["name", "predicts", "trained on", "size", "figures"];
         let header = header.map(str::to_owned).to_vec();
         let rows = found.iter().map(|(name, manifest, step)| match manifest {
@@ -90,6 +104,25 @@ async fn list(store: &str, output: Output) -> Result<()> {
         table(&[header].into_iter().chain(rows).collect::<Vec<_>>())
     });
     Ok(())
+}
+
+/// A store without models: where they were looked for.
+pub(super) fn nothing(store: &str) -> CliError {
+    let local = !store.contains("://");
+    let whole = match local {
+        true => {
+            std::path::absolute(store).map_or_else(|_| store.into(), |p| p.display().to_string())
+        }
+        false => store.trim_end_matches('/').to_owned(),
+    };
+    let what = match local && !Path::new(store).is_dir() {
+        true => format!("{whole}: there is no such folder"),
+        false => format!("no models in {whole}/models"),
+    };
+    CliError::input(what).hint(
+        "a training keeps its model in the store of the data set that it reads (source.store, or output.store of the stage that \
+         makes it); `picofarm job status JOB` names that place. `picofarm job init --kind train` writes a job that trains some",
+    )
 }
 
 async fn show(store: &str, name: &str, output: Output) -> Result<()> {
@@ -162,8 +195,8 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
     }
     let mut text = table(&rows);
     for e in evaluations {
-        text += &format!(
-            "\non {} {} scenes of {} ({}, {}): {}\n",
+        let told = format!(
+            "on {} {} scenes of {} ({}, {}): {}",
             e.scenes,
             e.side,
             e.dataset,
@@ -171,6 +204,7 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
             e.code,
             figures(&e.metrics)
         );
+        text += &format!("\n{}\n", show::line(&told));
     }
     text
 }

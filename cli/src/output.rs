@@ -5,7 +5,9 @@ use std::{
     time::{Duration, Instant},
 };
 
+use console::Term;
 use indicatif::{ProgressBar, ProgressStyle};
+use picofarm_proto::show;
 use serde::Serialize;
 
 /// Where results go.
@@ -15,22 +17,56 @@ pub struct Output {
 }
 
 impl Output {
-    /// Prints a result: `text` for people, or the value as JSON.
+    /// Prints a result: `text` for people, or the value as JSON. Neither reaches a terminal with control characters; text
+    /// from elsewhere goes through [`show::line`] before it becomes part of a line.
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) {
-        let line = if self.json {
-            serde_json::to_string(value).expect("results are plain data")
+        let shown = if self.json {
+            let document = serde_json::to_string(value).expect("results are plain data");
+            show::json(&document).into_owned()
         } else {
-            text()
+            show::lines(&text()).into_owned()
         };
         // A closed pipe (`| head`) is not an error worth a message.
-        let _ = writeln!(std::io::stdout(), "{}", line.trim_end());
+        let _ = writeln!(std::io::stdout(), "{}", shown.trim_end());
+    }
+
+    /// A warning on stderr, which begins with "warning: "; an object {"warning": …} with --json.
+    pub fn warn(&self, text: impl AsRef<str>) {
+        let text = text.as_ref();
+        if self.json {
+            let warning = text.strip_prefix("warning: ").unwrap_or(text);
+            let object = serde_json::json!({ "warning": warning });
+            eprintln!("{}", show::json(&object.to_string()));
+        } else {
+            self.say(text);
+        }
     }
 
     /// A remark for people on stderr; silent with --json.
     pub fn say(&self, text: impl AsRef<str>) {
         if !self.json {
-            eprintln!("{}", text.as_ref());
+            eprintln!("{}", show::lines(text.as_ref()));
         }
+    }
+}
+
+/// A writer of log lines, one a call, that lets no control character through.
+pub struct Escaped<W>(pub W);
+
+impl<W: Write> Write for Escaped<W> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let text = String::from_utf8_lossy(bytes);
+        let (text, end) = match text.strip_suffix('\n') {
+            Some(text) => (text, "\n"),
+            None => (&*text, ""),
+        };
+        self.0
+            .write_all(format!("{}{end}", show::line(text)).as_bytes())?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.0.flush()
     }
 }
 
@@ -39,6 +75,17 @@ pub struct Meter {
     bar: Option<ProgressBar>,
     quiet: bool,
     last: Option<(Instant, String)>,
+    /// Columns of the terminal that the bar is fitted to.
+    columns: u16,
+}
+
+/// How a bar and its message look on a terminal of so many columns. The message is cut to what is left.
+fn template(columns: u16) -> &'static str {
+    match columns {
+        0..60 => "{percent:>3} % {wide_msg}",
+        60..100 => "{bar:16.cyan/dim} {wide_msg}",
+        _ => "{bar:32.cyan/dim} {wide_msg}",
+    }
 }
 
 impl Meter {
@@ -47,22 +94,35 @@ impl Meter {
     pub fn new(output: Output) -> Self {
         let bar = (!output.json && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(1000);
-            bar.set_style(
-                ProgressStyle::with_template("{bar:32.cyan/dim} {msg}")
-                    .expect("a constant template"),
-            );
             bar.enable_steady_tick(Duration::from_millis(200));
             bar
         });
-        Self {
+        let mut meter = Self {
             bar,
             quiet: output.json,
             last: None,
+            columns: 0,
+        };
+        meter.fit();
+        meter
+    }
+
+    /// Fits the bar to the terminal, which may have been made narrower since. A line that is wider than the terminal would
+    /// be wrapped, and each redraw would leave a piece of it behind.
+    fn fit(&mut self) {
+        let Some(bar) = &self.bar else { return };
+        let (_, columns) = Term::stderr().size();
+        if columns != self.columns {
+            self.columns = columns;
+            let style = ProgressStyle::with_template(template(columns));
+            bar.set_style(style.expect("a constant template"));
         }
     }
 
     /// Shows `fraction` in [0, 1] and a message.
     pub fn at(&mut self, fraction: f64, message: String) {
+        let message = show::line(&message).into_owned();
+        self.fit();
         match &self.bar {
             Some(bar) => {
                 bar.set_position((fraction * 1000.0) as u64);
@@ -83,6 +143,7 @@ impl Meter {
 
     /// Prints a line above the bar.
     pub fn line(&self, text: &str) {
+        let text = show::line(text);
         match &self.bar {
             Some(bar) => bar.println(text),
             None if self.quiet => {}
@@ -97,8 +158,14 @@ impl Meter {
     }
 }
 
-/// Plain text columns, aligned; the first row is the header.
+/// Plain text columns, aligned; the first row is the header. A cell is one line, whatever is in it.
 pub fn table(rows: &[Vec<String>]) -> String {
+    let cells = |row: &Vec<String>| {
+        row.iter()
+            .map(|cell| show::line(cell).into_owned())
+            .collect()
+    };
+    let rows: Vec<Vec<String>> = rows.iter().map(cells).collect();
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |c: usize| {
         rows.iter()
@@ -159,6 +226,39 @@ mod tests {
         assert_eq!(duration(1.54), "1.5 s");
         assert_eq!(duration(125.0), "2 min 05 s");
         assert_eq!(duration(11_400.0), "3 h 10 min");
+    }
+
+    #[test]
+    fn bars_fit_their_terminal() {
+        for columns in [0, 20, 59, 60, 80, 99, 100, 300] {
+            let template = template(columns);
+            let bar = template.split_once("{bar:").map_or(0, |(_, rest)| {
+                rest[..2].parse().expect("a width of two digits")
+            });
+            assert!(bar < 60 || columns > bar + 20, "{columns}: {template}");
+            assert!(bar + 20 <= columns.max(20), "{columns}: {template}");
+            // Without it, a message would be wrapped.
+            assert!(template.ends_with("{wide_msg}"));
+            ProgressStyle::with_template(template).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_cell_of_a_table_is_one_line_without_control_characters() {
+        let evil = "w\u{1b}]0;t\u{7}\nforged  row\u{202e}".to_owned();
+        let shown = table(&[vec!["worker".into()], vec![evil]]);
+        assert_eq!(shown.lines().count(), 2, "{shown}");
+        assert!(!shown.replace('\n', "").contains(char::is_control));
+    }
+
+    #[test]
+    fn a_log_line_stays_one_line() {
+        let mut written = Escaped(Vec::new());
+        written
+            .write_all("WARN worker=\u{1b}[31mx\nERROR forged\n".as_bytes())
+            .unwrap();
+        let text = String::from_utf8(written.0).unwrap();
+        assert_eq!(text, "WARN worker=\\u{1b}[31mx\\nERROR forged\n");
     }
 
     #[test]

@@ -10,7 +10,14 @@ use std::{
 };
 
 use picofarm_dataset::{RenderArray, write_render_group};
-use picofarm_scene::{Scene, import};
+use picofarm_proto::{
+    model::{RenderSettings, memory::gib},
+    show,
+};
+use picofarm_scene::{
+    Scene,
+    import::{self, ImportOptions},
+};
 use picofarm_transient::{Budget, Forecast, Gate, Progress, RenderError, Rendered, Settings};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -20,7 +27,7 @@ use crate::{
     choices,
     error::{CliError, Code, Result, io},
     groups::{self, Wanted},
-    output::{Meter, Output, bytes, duration},
+    output::{Meter, Output, duration},
     roles, signals,
 };
 
@@ -54,13 +61,27 @@ struct Order {
 impl Order {
     /// Reads the scene and checks the arguments against it.
     fn new(args: &RenderArgs, split: bool) -> Result<Self> {
-        let mut scene = import::read_scene(&args.file)?;
+        let mut scene =
+            import::read_scene_with(&args.file, &ImportOptions::default(), &args.root.bounds())?;
+        let samples = args.samples.unwrap_or(64);
+        let asked = RenderSettings {
+            resolution: args.resolution.unwrap_or(RenderSettings::MAX_SIDE),
+            gate_start_m: args.gate.gate_start_m,
+            bin_width_m: args.gate.bin_width_m,
+            bins: args.gate.bins,
+            budget: match args.error {
+                Some(e) => picofarm_proto::model::Budget::Error(e),
+                None => picofarm_proto::model::Budget::Samples(samples),
+            },
+            max_bounces: args.max_bounces.unwrap_or(0),
+            ..RenderSettings::default()
+        };
+        // As in a job: one place knows the ranges.
+        asked.check().map_err(|e| {
+            let option = e.field.trim_start_matches("render.").replace('_', "-");
+            CliError::input(format!("--{option}: {}", e.what))
+        })?;
         if let Some(px) = args.resolution {
-            if !(1..=4096).contains(&px) {
-                return Err(CliError::input(format!(
-                    "--resolution {px}: expected 1 to 4096 pixels"
-                )));
-            }
             let i = &mut scene.camera.intrinsics;
             *i = i.resized(px, px);
         }
@@ -73,9 +94,9 @@ impl Order {
             },
             budget: match args.error {
                 Some(e) => Budget::Error(e as f32),
-                None => Budget::Samples(args.samples.unwrap_or(64)),
+                None => Budget::Samples(samples),
             },
-            max_bounces: args.max_bounces,
+            max_bounces: args.max_bounces.filter(|most| *most != 0),
             one_bounce: true,
             seed: args.seed,
             split,
@@ -101,10 +122,20 @@ impl Order {
             })
     }
 
-    /// Bytes that the histograms take.
-    fn memory(&self) -> u64 {
+    /// Width and height.
+    fn size(&self) -> (u32, u32) {
         let i = &self.scene.camera.intrinsics;
-        picofarm_agent::render_bytes(&self.settings, i.width, i.height, self.threads)
+        (i.width, i.height)
+    }
+
+    /// Bytes that the render takes at most.
+    fn memory(&self) -> u64 {
+        picofarm_agent::render_bytes(&self.settings, self.size(), self.threads)
+    }
+
+    /// Whether that is here.
+    fn fits(&self) -> Result<(), String> {
+        picofarm_agent::check_memory(&self.settings, self.size(), self.threads)
     }
 }
 
@@ -115,9 +146,7 @@ impl Order {
 pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     free_folder(&args.out)?;
     let order = Order::new(&args.render, args.split)?;
-    let i = order.scene.camera.intrinsics;
-    picofarm_agent::check_memory(&order.settings, i.width, i.height, order.threads)
-        .map_err(|e| CliError::new(Code::Resource, e))?;
+    order.fits().map_err(|e| CliError::new(Code::Resource, e))?;
     let watcher = Watcher {
         done: AtomicU32::new(0),
         meter: Mutex::new(Meter::new(output)),
@@ -137,6 +166,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     }
     let mut rendered = rendered.map_err(|e| match e {
         RenderError::Stopped => signals::interrupted("nothing was written"),
+        RenderError::Memory { .. } => CliError::new(Code::Resource, e),
         e => CliError::input(e),
     })?;
     let seconds = start.elapsed().as_secs_f64();
@@ -148,6 +178,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
         &json!({
             "out": args.out, "seconds": seconds, "threads": threads, "rays": rendered.rays,
             "error": e, "overflow": rendered.overflow, "plan": rendered.plan, "subsets": arrays,
+            "warnings": rendered.warnings,
         }),
         || {
             let mut text = format!(
@@ -158,7 +189,7 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
             if !arrays.is_empty() {
                 text += &format!("  also {}\n", arrays.join(", "));
             }
-            text + &decided(&rendered.plan)
+            text + &decided(&rendered.plan) + &warned(&rendered.warnings)
         },
     );
     Ok(())
@@ -170,6 +201,10 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
 /// A scene or arguments that cannot be used.
 pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
     let order = Order::new(&args.render, false)?;
+    let memory = order.memory();
+    if let Err(what) = order.fits() {
+        return too_large(&order, memory, &what, output);
+    }
     let pool = order.pool()?;
     let (order, forecast) = tokio::task::spawn_blocking(move || {
         let run = || picofarm_transient::plan(&order.scene, &order.settings);
@@ -179,12 +214,12 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
     let forecast = forecast.map_err(CliError::input)?;
-    let memory = order.memory();
     let Forecast {
         plan,
         passes,
         error,
         rays,
+        warnings,
     } = &forecast;
     let i = &order.scene.camera.intrinsics;
     output.result(
@@ -192,23 +227,38 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
             "scene": order.scene.name, "width": i.width, "height": i.height,
             "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
             "strategies": plan.strategies, "approximations": plan.approximations,
-            "samples": passes, "error": error, "rays": rays, "memory_bytes": memory,
+            "samples": passes, "error": error, "rays": rays, "memory_bytes": memory, "fits": true,
+            "warnings": warnings,
         }),
         || {
             let head = format!(
                 "{}: {}x{} pixels x {} bins, {} spots\n\
-                 about {passes} paths a pixel, median error {:.1} %, {:.1} M rays, {} for histograms\n",
-                order.scene.name,
+                 about {passes} paths a pixel, median error {:.1} %, {:.1} M rays, about {} of memory\n",
+                show::line(&order.scene.name),
                 i.width,
                 i.height,
                 order.settings.gate.bins,
                 order.scene.laser.beams.len(),
                 error * 100.0,
                 *rays as f64 / 1e6,
-                bytes(memory),
+                gib(memory),
             );
-            head + &decided(plan)
+            head + &decided(plan) + &warned(warnings)
         },
+    );
+    Ok(())
+}
+
+/// The plan of a render that the size alone decides: it does not fit, so nothing is measured for it.
+fn too_large(order: &Order, memory: u64, what: &str, output: Output) -> Result<()> {
+    let (width, height) = order.size();
+    output.result(
+        &json!({
+            "scene": order.scene.name, "width": width, "height": height,
+            "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
+            "memory_bytes": memory, "fits": false,
+        }),
+        || format!("{}: does not fit: {what}\n", order.scene.name),
     );
     Ok(())
 }
@@ -220,6 +270,12 @@ fn decided(plan: &picofarm_transient::Plan) -> String {
     strategies
         .chain(approximations.map(|line| format!("  approximated: {line}\n")))
         .collect()
+}
+
+/// What is wrong with scene or gate, one a line.
+fn warned(warnings: &[String]) -> String {
+    let lines = warnings.iter().map(|line| format!("warning: {line}\n"));
+    lines.collect()
 }
 
 /// Refuses early what the writer would refuse after the render.

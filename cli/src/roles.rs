@@ -1,10 +1,10 @@
 //! `picofarm coordinator` and `picofarm worker`: one role in one process.
 
-use std::{net::SocketAddr, time::Duration};
+use std::{net::SocketAddr, sync::Arc, time::Duration};
 
-use picofarm_agent::{AgentConfig, AgentError};
+use picofarm_agent::{AgentConfig, AgentError, Memory};
 use picofarm_coordinator::{
-    CatalogPlace, CoordinatorConfig, CoordinatorError, Running,
+    CatalogPlace, Connections, CoordinatorConfig, CoordinatorError, Running, Stored,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
@@ -17,11 +17,12 @@ use crate::{
     output::Output,
     settings::Settings,
     signals,
+    stored::StoreReader,
 };
 
-/// Cores of this machine.
+/// Cores that this process may use.
 pub fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
+    picofarm_agent::cores()
 }
 
 /// Whom a coordinator lets in, and how much they may ask of it.
@@ -29,6 +30,9 @@ pub fn cores() -> usize {
 pub struct Guarded {
     access: Access,
     quotas: Quotas,
+    connections: Connections,
+    /// How long the audit log is kept.
+    audit_days: Option<u32>,
 }
 
 impl Guarded {
@@ -43,12 +47,20 @@ impl Guarded {
                     client_ca: args.client_ca.clone(),
                 }),
                 tokens: args.tokens.clone(),
+                visibility: args.visibility,
             },
             quotas: Quotas {
                 jobs_per_user: args.max_jobs_per_user,
                 tasks_per_job: args.max_tasks_per_job,
                 sessions: args.max_sessions,
+                max_priority: args.max_priority,
             },
+            connections: Connections {
+                all: args.max_connections,
+                per_address: args.max_connections_per_address,
+                ..Connections::default()
+            },
+            audit_days: Some(args.audit_days),
         }
     }
 
@@ -141,6 +153,7 @@ impl Coordinator {
         guarded: Guarded,
         http: Option<SocketAddr>,
         forget_after: Option<Duration>,
+        stored: Option<StoreReader>,
     ) -> Result<Self> {
         let mut config = CoordinatorConfig::new(catalog, listen);
         config.lease_ms = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
@@ -149,8 +162,13 @@ impl Coordinator {
         let secure = guarded.access.tls.is_some();
         config.access = guarded.access;
         config.quotas = guarded.quotas;
+        config.connections = guarded.connections;
+        if let Some(days) = guarded.audit_days {
+            config.audit_for = Duration::from_secs(u64::from(days) * 86_400);
+        }
         config.http = http;
         config.forget_after = forget_after;
+        config.stored = stored.map(|reader| Arc::new(reader) as Arc<dyn Stored>);
         let stop = CancellationToken::new();
         let running = serve(config, stop.clone())
             .await
@@ -203,22 +221,12 @@ fn coordinator_error(error: &CoordinatorError) -> CliError {
 /// See [`Coordinator::start`].
 pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> {
     refuse_unguarded(args.listen, &args.guard, false)?;
-    if !(args.lease_s >= 0.1 && args.lease_s <= 86_400.0) {
-        return Err(CliError::input(format!(
-            "--lease-s {}: expected 0.1 to 86400 seconds",
-            args.lease_s
-        )));
-    }
-    let forget_after = match args.forget_after_days {
-        None => None,
-        Some(days) if (0.0..=36_500.0).contains(&days) => {
-            Some(Duration::from_secs_f64(days * 86_400.0))
-        }
-        Some(days) => {
-            return Err(CliError::input(format!(
-                "--forget-after-days {days}: expected 0 to 36500 days"
-            )));
-        }
+    let forget_after = args
+        .forget_after_days
+        .map(|days| Duration::from_secs_f64(days * 86_400.0));
+    let stored = match args.check_stores.is_empty() {
+        true => None,
+        false => Some(StoreReader::below(&args.check_stores)?),
     };
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
@@ -230,6 +238,7 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
         guarded,
         args.http.http,
         forget_after,
+        stored,
     )
     .await?;
     let (url, http) = (coordinator.url(), coordinator.http());
@@ -251,15 +260,21 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
 /// # Errors
 /// A setting out of range, or a coordinator that refuses this worker.
 pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> Result<()> {
+    if let Some(gib) = args.memory_gib.filter(|gib| !(0.001..=1e6).contains(gib)) {
+        return Err(CliError::input(format!(
+            "--memory-gib {gib}: expected 0.001 to 1000000 GiB"
+        )));
+    }
+    let memory = Memory::for_tasks(args.memory_gib);
     let stop = signals::stop_on_signal()?;
     let config = AgentConfig {
         coordinator: settings.coordinator.clone(),
         name: args.name.unwrap_or_else(default_name),
         worker_id: None,
+        ended: String::new(),
         threads: args.threads.unwrap_or_else(cores),
-        memory_mib: args
-            .memory_gib
-            .map_or_else(picofarm_agent::memory_mib, |gib| (gib * 1024.0) as u64),
+        memory_mib: memory.as_ref().map_or(0, Memory::for_tasks_mib),
+        memory_from: memory.map_or_else(String::new, |memory| memory.to_string()),
         gpus: args.gpus,
         labels: args.label,
         exit_idle: args.exit_idle_s.map(Duration::from_secs),

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use picofarm_proto::show;
 use picofarm_scene::{
-    Bsdf, LaserGrid, Scene, export,
+    AssetLibrary, Bsdf, LaserGrid, Scene, export,
     furnished::{self, FurnishedSettings},
     import::{self, ImportOptions},
     primitive::{self, PrimitiveSettings},
@@ -12,7 +13,6 @@ use serde_json::json;
 
 use crate::{
     args::{FormatArg, GeneratorArg, Scene as Command, SceneExport},
-    assets,
     error::{CliError, Result, io},
     output::Output,
     render, sense,
@@ -34,14 +34,14 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
             output.result(
                 &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count()}),
                 || format!(
-                    "wrote {0}: {1} objects, {2} triangles; next: picofarm scene render {0} --out render",
-                    out.display(), scene.objects.len(), scene.triangle_count()
+                    "wrote {}: {} objects, {} triangles; next: picofarm scene render {} --out render",
+                    out.display(), scene.objects.len(), scene.triangle_count(), show::path(&out)
                 ),
             );
             Ok(())
         }
-        Command::Show { file } => {
-            let scene = import::read_scene(&file)?;
+        Command::Show { file, root } => {
+            let scene = import::read_scene_with(&file, &ImportOptions::default(), &root.bounds())?;
             scene.validate()?;
             let facts = facts(&scene);
             output.result(&facts, || describe(&scene));
@@ -78,7 +78,7 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
             );
         }
     };
-    let scene = import::read_scene_with(&args.file, &options)?;
+    let scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
     let mut out = args.out.clone();
     if extension.is_none() || out.is_dir() {
         std::fs::create_dir_all(&out)
@@ -99,7 +99,7 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
         || {
             let mut text = format!("wrote {}: {} objects, {} triangles", out.display(), scene.objects.len(), scene.triangle_count());
             for note in &notes {
-                text += &format!("\n  {note}");
+                text += &format!("\n  {}", show::line(note));
             }
             text
         },
@@ -117,7 +117,7 @@ fn generate(
 ) -> Result<Scene> {
     match kind {
         GeneratorArg::Furnished => {
-            let library = assets::library(assets, &settings.assets)?;
+            let library = AssetLibrary::named(assets, std::slice::from_ref(&settings.assets))?;
             let settings = FurnishedSettings {
                 assets: library.name().to_owned(),
                 specular_at_least: 1,
@@ -178,12 +178,12 @@ fn describe(scene: &Scene) -> String {
         .as_object()
         .into_iter()
         .flatten()
-        .map(|(name, n)| format!("{name} {n}"))
+        .map(|(name, n)| format!("{} {n}", show::line(name)))
         .collect();
     let i = &scene.camera.intrinsics;
     let mut text = format!(
         "{}: {} objects, {} triangles\nmaterials: {} mirror, {} rough conductor, {} mixed, {} textured\nlabels: {}\ncamera: {}x{} pixels, focal length {} px, at {:?}\nlaser: {} beams from {:?}\nsource: {}\n",
-        scene.name,
+        show::line(&scene.name),
         scene.objects.len(),
         scene.triangle_count(),
         f["mirror_materials"],
@@ -197,13 +197,13 @@ fn describe(scene: &Scene) -> String {
         <[f32; 3]>::from(scene.camera.origin),
         scene.laser.beams.len(),
         <[f32; 3]>::from(scene.laser.origin),
-        scene.provenance.source,
+        show::line(&scene.provenance.source),
     );
     for (key, value) in &scene.provenance.notes {
-        text += &format!("  {key}: {value}\n");
+        text += &format!("  {}\n", show::line(&format!("{key}: {value}")));
     }
     for line in &scene.provenance.attribution {
-        text += &format!("  {line}\n");
+        text += &format!("  {}\n", show::line(line));
     }
     text
 }

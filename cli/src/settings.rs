@@ -96,7 +96,7 @@ impl Default for Settings {
         Self {
             coordinator: "http://127.0.0.1:7420".into(),
             assets: user_dir("XDG_DATA_HOME", ".local/share").join("assets"),
-            log: "warn".into(),
+            log: "warn,picofarm::audit=info".into(),
             ca: None,
             cert: None,
             key: None,

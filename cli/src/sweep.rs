@@ -7,6 +7,7 @@ use picofarm_model::{
     report::trials::{self, End, Sweep, Tried, Value, error_name},
     train::Line,
 };
+use picofarm_proto::show;
 use serde_json::json;
 
 use crate::{
@@ -59,12 +60,12 @@ fn best(which: &WhichSweep, sweep: &Sweep, output: Output) -> Result<()> {
         let values: Vec<String> = values.map(|(n, v)| format!("{n} = {}", v.text())).collect();
         format!(
             "{}: {} {}, {}\nlook at it with `picofarm model show {} {}`\n",
-            best.model,
-            sweep.error,
+            show::line(&best.model),
+            show::line(&sweep.error),
             loss(best),
-            values.join(", "),
-            which.store,
-            best.model
+            show::line(&values.join(", ")),
+            show::argument(&which.store),
+            show::argument(&best.model)
         )
     });
     Ok(())
@@ -135,7 +136,7 @@ async fn the_one(models: &Models, which: &WhichSweep) -> Result<String> {
             Err(CliError::input(what).hint(format!("choose one: --id {}", found.join(" | "))))
         }
         (None, _) => {
-            let what = format!("no trial of a sweep called {name:?} has told anything yet");
+            let what = format!("no trial of a sweep called {name:?} has reported anything yet");
             Err(CliError::input(what).hint(
                 "a sweep is called as the model of its stage; `picofarm job status` shows trials that run",
             ))

@@ -44,7 +44,7 @@ pub fn template(kind: JobKind) -> String {
          max_bounces = 0           # 0 = until the gate ends\n\
          # subsets = [4, 25]       # with spots = 100: histograms of these subsets too, from the same rays\n\
          # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
-         # strategy = {{ share = 1, image_lobes = false }}  # ways of finding light, chosen by hand\n\n\
+         # strategy = {{ path_reuse = 1, mirror_images = false }}  # ways of finding light, chosen by hand\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\
@@ -115,13 +115,13 @@ fn training() -> String {
      source = \"render\"         # it needs the split of that name too: split = \"default\"\n\
      # resources = { gpus = 1 } # only on workers that have one\n\
      [stage.train]\n\
-     task = \"tof\"              # or: shadow, specular\n\
+     target = \"tof\"              # or: shadow, specular\n\
      model = \"tof\"             # kept in the store; `picofarm model show STORE tof`\n\
      # scenes = 64             # learn from fewer\n\
      # histogram = \"transient_4\"\n\
      input = { bins = 40 }     # sums of adjacent bins; 0 = all. normalise = \"minmax\" or \"log\"\n\
      net = { architecture = \"unet2d\", width = 16, levels = 3 }\n\
-     optimise = { epochs = 30, batch = 8, rate = 1e-2, schedule = \"onecycle\" }\n\
+     optimise = { epochs = 30, batch = 8, learning_rate = 1e-2, schedule = \"onecycle\" }\n\
      seed = 1\n\
      checkpoint_minutes = 1.0  # lost at most when a worker dies\n\n\
      [[stage]]                 # which pixels each spot lights, with two-bounce times from the predicted depth\n\
@@ -129,7 +129,7 @@ fn training() -> String {
      kind = \"train\"\n\
      source = \"render\"\n\
      [stage.train]\n\
-     task = \"shadow\"\n\
+     target = \"shadow\"\n\
      model = \"shadow\"\n\
      shadow = { variant = \"concat\", tof = \"tof\" }   # a stage or a model; or: truth\n\
      input = { bins = 40 }\n\
@@ -140,7 +140,7 @@ fn training() -> String {
      kind = \"train\"\n\
      source = \"render\"\n\
      [stage.train]\n\
-     task = \"specular\"\n\
+     target = \"specular\"\n\
      model = \"mirrors\"\n\
      specular = { on = \"tof\" }\n\
      input = { bins = 40 }\n\
@@ -193,10 +193,10 @@ fn sweep() -> String {
      decay = { log = [1e-5, 1e-1] }\n\
      width = [8, 12, 16]\n\
      [stage.train]\n\
-     task = \"tof\"\n\
+     target = \"tof\"\n\
      model = \"depth\"           # trials are depth.0, depth.1, …; the best of them becomes depth\n\
      net = { width = \"{width}\", levels = 3 }\n\
-     optimise = { epochs = 54, batch = 8, rate = \"{lr}\", weight_decay = \"{decay}\" }\n\n\
+     optimise = { epochs = 54, batch = 8, learning_rate = \"{lr}\", weight_decay = \"{decay}\" }\n\n\
      [[stage]]\n\
      name = \"evaluate\"\n\
      kind = \"evaluate\"\n\

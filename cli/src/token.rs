@@ -17,7 +17,16 @@ use crate::{
 /// The token file cannot be used, a name is taken, or there is no such name.
 pub fn run(command: Token, output: Output) -> Result<()> {
     match command {
-        Token::Create { name, role, file } => create(&name, role.into(), &file.tokens, output),
+        Token::Create {
+            name,
+            role,
+            member,
+            maintainer,
+            file,
+        } => {
+            let projects = (member, maintainer);
+            create(&name, role.into(), projects, &file.tokens, output)
+        }
         Token::List { file } => {
             list(&file.tokens, output)?;
             Ok(())
@@ -26,7 +35,13 @@ pub fn run(command: Token, output: Output) -> Result<()> {
     }
 }
 
-fn create(name: &str, roles: Roles, path: &Path, output: Output) -> Result<()> {
+fn create(
+    name: &str,
+    roles: Roles,
+    (member, maintainer): (Vec<String>, Vec<String>),
+    path: &Path,
+    output: Output,
+) -> Result<()> {
     let mut tokens = if path.exists() {
         Tokens::read(path).map_err(unusable)?
     } else {
@@ -34,7 +49,7 @@ fn create(name: &str, roles: Roles, path: &Path, output: Output) -> Result<()> {
     };
     let said = roles.to_string();
     let token = tokens
-        .create(name, roles)
+        .create(name, roles, member, maintainer)
         .map_err(|what| CliError::input(format!("{}: {what}", path.display())))?;
     tokens.write(path).map_err(unusable)?;
     output.say(format!(
@@ -58,13 +73,26 @@ fn list(path: &Path, output: Output) -> Result<()> {
     let callers: Vec<_> = tokens
         .entries()
         .iter()
-        .map(|e| json!({"name": e.name, "roles": e.roles, "certificate": e.certificate}))
+        .map(|e| {
+            json!({"name": e.name, "roles": e.roles, "certificate": e.certificate,
+                "member": e.member, "maintainer": e.maintainer})
+        })
         .collect();
     output.result(&callers, || {
         let rows: Vec<_> = tokens
             .entries()
             .iter()
-            .map(|e| vec![e.name.clone(), e.roles.to_string(), proof(&e.certificate)])
+            .map(|e| {
+                let projects = e.member.iter().cloned();
+                let kept = e.maintainer.iter().map(|p| format!("{p} (maintainer)"));
+                let projects: Vec<_> = projects.chain(kept).collect();
+                vec![
+                    e.name.clone(),
+                    e.roles.to_string(),
+                    proof(&e.certificate),
+                    projects.join(", "),
+                ]
+            })
             .collect();
         table(&rows)
     });

@@ -9,12 +9,11 @@ use std::{
 };
 
 use futures::FutureExt;
-use picofarm_catalog::{Catalog, CatalogError, Job, ResultSet, Run};
+use picofarm_catalog::{Catalog, CatalogError, Changes, Job, Settled};
 use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
-    key::spec_hash,
     model::{
-        Failure, Finished, JobPlan, JobSpec, JobState, JobStatus, SpecError, TaskLog, TaskProgress,
+        Failure, FailureKind, Finished, JobPlan, JobState, SpecError, TaskLog, TaskProgress,
         WorkerHello,
     },
 };
@@ -28,28 +27,26 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{
-        Core, JobLook, Look, OutputHint, Prepared, Say, SessionId, Settings, Timings,
-        place_is_free, stands_for,
-    },
-    http::Pulse,
+    core::{Core, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings},
+    health::Health,
     metrics::{Metrics, Tally},
-    plan, trace,
+    sessions::{Sessions, Waiting},
+    trace,
 };
 
 /// Messages handled in one commit.
 const BATCH: usize = 4096;
 /// How long to wait before trying a catalog again that failed.
-const MEND: Duration = Duration::from_secs(1);
-/// How often the catalog hears that this house lives, and is asked for news.
+const RETRY_AFTER: Duration = Duration::from_secs(1);
+/// How often the catalog hears that this instance lives, and is asked for news.
 const BEAT: Duration = Duration::from_secs(1);
-/// How often jobs to forget are looked for, and how many are forgotten at a time: other work waits for it.
-const FORGET: Duration = Duration::from_secs(600);
-const FORGET_AT_ONCE: u32 = 4;
-/// Jobs that a new one is compared with.
-const RECENT: u32 = 50;
 /// Least time between two beats, whatever the hints.
 const BEAT_AT_LEAST: Duration = Duration::from_millis(100);
+
+/// A job that was to be read and is not known after so long is read again.
+const READ_AGAIN: Duration = Duration::from_secs(30);
+/// Disputed reports for which stores are asked at a time; of more, what is recorded stands.
+const DISPUTES: usize = 64;
 
 /// A question whose answer may be an error in words.
 pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
@@ -58,7 +55,10 @@ pub(crate) type Reply<T> = oneshot::Sender<Result<T, Refusal>>;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Refusal {
     NoSuchJob(JobId),
+    Denied(String),
     NotNow(String),
+    /// The catalog cannot hold what was sent.
+    Content(String),
     TooMany(String),
     Spec(SpecError),
     Catalog(String),
@@ -78,34 +78,34 @@ pub(crate) enum Command {
         session: SessionId,
         hello: WorkerHello,
         say: mpsc::Sender<Say>,
+        /// Heartbeats of the session that wait here to be handled.
+        waiting: Waiting,
     },
     Worker(SessionId, FromWorker),
-    Plan(Box<JobSpec>, Reply<JobPlan>),
-    Submit {
-        spec: Box<JobSpec>,
-        user: String,
-        /// Jobs that the user may have that have not ended.
-        most: u64,
-        again: bool,
-        reply: Reply<Submitted>,
-    },
-    List(Reply<Vec<JobStatus>>),
-    Get(JobId, Reply<JobStatus>),
+    /// A report about which a store was asked. In words, where what was recorded instead of it is not in the store: that
+    /// record is no more.
+    Judged(SessionId, Finished, Option<String>),
+    /// The catalog has failed to write beside the actor: a new life begins, as when it fails to write here.
+    Broken(CatalogError),
+    /// A job that was recorded, if it is active; otherwise there is only something to look at.
+    Learn(Option<Box<Learnt>>, Reply<()>),
+    /// What is known here of a job, or of all.
+    Overlay(Option<JobId>, Reply<Overlay>),
     Cancel {
         job: JobId,
         why: String,
-        reply: Reply<JobStatus>,
+        reply: Reply<()>,
     },
     Pause {
         job: JobId,
         paused: bool,
         who: String,
-        reply: Reply<JobStatus>,
+        reply: Reply<()>,
     },
     Drain(String, Reply<u32>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
-    /// What the house knows, without asking the catalog.
+    /// What the instance knows, without asking the catalog.
     Look(Reply<Look>),
     LookAt {
         job: JobId,
@@ -121,6 +121,8 @@ pub(crate) enum FromWorker {
     Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>),
     Done(Finished),
     Failed(Failure),
+    /// A report on this task that says what cannot be: why.
+    Unusable(LeaseRef, u64, String),
     Release(LeaseRef, String),
     Log(TaskLog),
     Closed,
@@ -131,26 +133,48 @@ pub(crate) struct Actor {
     pub catalog: Arc<dyn Catalog>,
     pub settings: Settings,
     pub tick: Duration,
-    /// Jobs that ended so long ago are forgotten.
-    pub forget_after: Option<Duration>,
     pub clock: Clock,
     /// Grows with every change that people may want to see.
     pub revision: watch::Sender<u64>,
     pub metrics: Arc<Metrics>,
-    pub pulse: Arc<Pulse>,
+    pub health: Arc<Health>,
     pub stop: CancellationToken,
+    pub aside: Arc<dyn Aside>,
 }
+
+/// What takes too long for the actor, and comes back as a command.
+pub(crate) trait Aside: Send + Sync {
+    /// Reads a job that the actor has heard of: [`Command::Learn`].
+    fn learn(&self, job: JobId);
+    /// Asks the store whether a report or what is recorded instead is right: [`Command::Judged`]. `false` where no store can
+    /// be asked; then nothing comes.
+    fn judge(&self, session: SessionId, report: &Finished, dispute: Dispute) -> bool;
+}
+
+/// A report of another manifest than the one that is recorded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Dispute {
+    pub stage: StageRef,
+    pub recorded: [u8; 32],
+}
+
+/// What the catalog holds for the tasks that were just reported.
+type Known = HashMap<(StageRef, u64), Option<[u8; 32]>>;
 
 /// One life of a core: from a load of the catalog to the first failure to write it.
 struct Life<'a> {
     actor: &'a Actor,
     core: Core,
-    sessions: HashMap<SessionId, mpsc::Sender<Say>>,
+    sessions: Sessions,
     tally: Tally,
     /// Of reports that are not durable yet.
     commits: Vec<Span>,
-    /// When jobs to forget were last looked for and none were left.
-    forgot: Option<Instant>,
+    /// By the clock that counts stalls and suspends: when that was looked at last.
+    looked_ms: i64,
+    /// Jobs that are being read, and since when.
+    learning: HashMap<JobId, Instant>,
+    /// Reports about which a store is being asked.
+    disputes: usize,
 }
 
 impl Actor {
@@ -160,15 +184,18 @@ impl Actor {
         while !self.stop.is_cancelled() {
             let life = async { self.begin().await?.run(&mut commands).await };
             // A panic is a bug, but no reason to drop everyone: the state is loaded afresh.
-            let why = match AssertUnwindSafe(life).catch_unwind().await {
+            let (brief, why) = match AssertUnwindSafe(life).catch_unwind().await {
                 Ok(Ok(())) => break,
-                Ok(Err(error)) => error.to_string(),
-                Err(_) => "the coordinator panicked; please report this with its log".to_owned(),
+                Ok(Err(error)) => (error.brief(), error.to_string()),
+                Err(_) => (
+                    "the coordinator failed",
+                    "the coordinator panicked; please report this with its log".to_owned(),
+                ),
             };
-            tracing::error!("{why}; trying again in {} s", MEND.as_secs());
-            self.pulse.trouble(&why);
+            tracing::error!("{why}; trying again in {} s", RETRY_AFTER.as_secs());
+            self.health.fault(brief, &why);
             tokio::select! {
-                () = tokio::time::sleep(MEND) => {}
+                () = tokio::time::sleep(RETRY_AFTER) => {}
                 () = self.stop.cancelled() => {}
             }
             // Those who asked meanwhile are told at once rather than kept waiting.
@@ -176,7 +203,6 @@ impl Actor {
                 refuse(command, &why);
             }
         }
-        self.catalog.close().await;
     }
 
     async fn begin(&self) -> Result<Life<'_>, CatalogError> {
@@ -188,8 +214,8 @@ impl Actor {
                 entry.insert(seconds);
             }
         }
-        tracing::debug!(house = %snapshot.house, jobs = snapshot.jobs.len(),
-            ranges = snapshot.owned.ranges.len(), "a house begins");
+        tracing::debug!(instance = %snapshot.instance, jobs = snapshot.jobs.len(),
+            ranges = snapshot.owned.ranges.len(), "an instance begins");
         let core = Core::load(
             snapshot,
             &timings,
@@ -200,10 +226,12 @@ impl Actor {
         Ok(Life {
             actor: self,
             core,
-            sessions: HashMap::new(),
+            sessions: Sessions::default(),
             tally: Tally::default(),
             commits: Vec::new(),
-            forgot: None,
+            looked_ms: self.clock.passed_ms(),
+            learning: HashMap::new(),
+            disputes: 0,
         })
     }
 }
@@ -212,12 +240,13 @@ impl Life<'_> {
     async fn run(mut self, commands: &mut mpsc::Receiver<Command>) -> Result<(), CatalogError> {
         let mut tick = tokio::time::interval(self.actor.tick);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut ticked = Instant::now();
         // The first beat at once: news that are missed between loading and now come with it.
         let mut beaten: Option<Instant> = None;
         let mut hinted = false;
         let mut batch = Vec::with_capacity(BATCH);
         loop {
+            self.actor.health.turn();
+            self.after_stall();
             let due = match beaten {
                 None => Duration::ZERO,
                 Some(at) if hinted => BEAT_AT_LEAST.saturating_sub(at.elapsed()),
@@ -237,14 +266,13 @@ impl Life<'_> {
                         continue;
                     }
                     _ = tick.tick() => {
+                        // In this order: a stall between the two is seen with the next tick.
                         let now = self.now();
-                        // A stall of this process (a suspended laptop, a stopped debugger) is no worker's fault.
-                        let stall = ticked.elapsed();
-                        if stall > self.actor.tick + Duration::from_millis(u64::from(self.actor.settings.lease_ms) / 2) {
-                            tracing::warn!(seconds = stall.as_secs_f64(), "the coordinator was stalled; leases are prolonged");
-                            self.core.grace(now);
+                        self.after_stall();
+                        // Whoever's heartbeat waits here is not late.
+                        for session in self.sessions.waiting() {
+                            self.core.spare(session, now);
                         }
-                        ticked = Instant::now();
                         self.core.expire(now);
                         for (job, deadline) in self.core.overdue(now) {
                             self.flush().await?;
@@ -256,6 +284,8 @@ impl Life<'_> {
                             return self.end().await;
                         }
                         self.actor.metrics.handled(n);
+                        // First of all: what has just come may be about leases that ran out meanwhile.
+                        self.after_stall();
                         self.handle(&mut batch).await?;
                     }
                     () = tokio::time::sleep(due) => continue,
@@ -267,7 +297,20 @@ impl Life<'_> {
         }
     }
 
-    /// The orderly end of a house: what nobody runs is free for others.
+    /// A stall of this process (a suspended machine, a stopped debugger, a catalog that does not answer) is no worker's
+    /// fault: its leases begin anew. To be called before anything is judged by the clock.
+    fn after_stall(&mut self) {
+        let passed = self.actor.clock.passed_ms();
+        let stall = passed - std::mem::replace(&mut self.looked_ms, passed);
+        let tick = i64::try_from(self.actor.tick.as_millis()).unwrap_or(i64::MAX);
+        if stall > tick.saturating_add(i64::from(self.actor.settings.lease_ms) / 2) {
+            let seconds = stall as f64 / 1000.0;
+            tracing::warn!(seconds, "the coordinator was stalled; leases are prolonged");
+            self.core.grace(self.now());
+        }
+    }
+
+    /// The orderly end of an instance: what nobody runs is free for others.
     async fn end(mut self) -> Result<(), CatalogError> {
         self.core.give_back();
         self.flush().await
@@ -279,67 +322,43 @@ impl Life<'_> {
         if wants.is_empty() {
             return Ok(());
         }
-        // What is noted so far first: the catalog must know this house's ranges as they are.
+        // What is noted so far first: the catalog must know this instance's ranges as they are.
         self.flush().await?;
         let claims = self.actor.catalog.claim(&wants).await?;
         let now = self.now();
         for (want, claim) in wants.iter().zip(claims) {
-            self.core.supplied(want.stage, claim, now);
+            self.core.claimed(want.stage, claim, now);
         }
         Ok(())
     }
 
-    /// Forgets a few of the jobs that ended long ago, if it is time to look for some.
-    async fn forget(&mut self) -> Result<(), CatalogError> {
-        let Some(age) = self.actor.forget_after else {
-            return Ok(());
-        };
-        if self.forgot.is_some_and(|at| at.elapsed() < FORGET) {
-            return Ok(());
-        }
-        let before_ms = self.now() - i64::try_from(age.as_millis()).unwrap_or(i64::MAX);
-        let forgotten = self.actor.catalog.forget(before_ms, FORGET_AT_ONCE).await?;
-        if forgotten > 0 {
-            tracing::info!(
-                jobs = forgotten,
-                "jobs that ended long ago are forgotten; their outputs stay"
-            );
-        }
-        // Where there are more, they follow with the next beat.
-        if forgotten < FORGET_AT_ONCE {
-            self.forgot = Some(Instant::now());
-        }
-        Ok(())
-    }
-
-    /// Tells the catalog that this house lives, and hears what is new.
+    /// Tells the catalog that this instance lives, and hears what is new.
     async fn beat(&mut self) -> Result<(), CatalogError> {
-        self.forget().await?;
         self.core.give_back();
         self.flush().await?;
         let news = self.actor.catalog.beat(self.core.connected()).await?;
-        self.actor.pulse.beat();
+        self.actor.health.beat();
         let now = self.now();
-        for job in self.core.hear(news, now) {
-            if let Some(record) = self.actor.catalog.job(job).await? {
-                self.learn(&record.job).await?;
+        let unknown = self.core.hear(news, now);
+        let begun = |at: &mut Instant| at.elapsed() < READ_AGAIN;
+        self.learning
+            .retain(|job, at| unknown.contains(job) && begun(at));
+        for job in unknown {
+            if let Entry::Vacant(entry) = self.learning.entry(job) {
+                entry.insert(Instant::now());
+                self.actor.aside.learn(job);
             }
         }
         Ok(())
     }
 
     /// Takes note of a job that is new here.
-    async fn learn(&mut self, job: &Job) -> Result<(), CatalogError> {
-        if job.state != JobState::Active || self.core.knows(job.id) {
-            return Ok(());
+    fn learn(&mut self, learnt: Learnt) {
+        self.learning.remove(&learnt.job.id);
+        if !self.core.knows(learnt.job.id) {
+            self.core
+                .add_job(&learnt.job, learnt.stages, &learnt.timings);
         }
-        let mut timings = Timings::new();
-        for set in self.core.untimed(std::slice::from_ref(job)) {
-            let seconds = self.actor.catalog.timing(&set).await?;
-            timings.insert(set, seconds);
-        }
-        self.core.add_job(job, &timings);
-        Ok(())
     }
 
     fn now(&self) -> i64 {
@@ -351,62 +370,58 @@ impl Life<'_> {
         let asked: Vec<(StageRef, u64)> = batch
             .iter()
             .filter_map(|command| match command {
-                Command::Worker(_, FromWorker::Done(report)) => {
+                Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
                     Some((self.core.stage_of(report)?, report.index))
                 }
                 _ => None,
             })
             .collect();
         let found = self.actor.catalog.manifests(&asked).await?;
-        let known: HashMap<_, _> = asked.into_iter().zip(found).collect();
+        let known: Known = asked.into_iter().zip(found).collect();
         for command in batch.drain(..) {
             match command {
                 Command::Open {
                     session,
                     hello,
                     say,
+                    waiting,
                 } => {
                     // The worker brings its leases along, from whichever coordinator.
                     self.flush().await?;
                     let owned = self.actor.catalog.adopt(hello.id).await?;
                     let now = self.now();
                     self.core.receive(owned, now);
-                    self.sessions.insert(session, say);
+                    self.sessions.open(session, say, waiting);
                     self.core.hello(session, hello, now);
                 }
-                Command::Worker(session, said) => self.worker_said(session, said, &known),
-                Command::Plan(spec, reply) => {
-                    self.flush().await?;
-                    let answer = self.plan(&spec).await?;
-                    let _ = reply.send(answer.map(|(plan, _)| plan));
+                Command::Worker(session, FromWorker::Done(report)) => {
+                    if !self.disputed(session, &report, &known) {
+                        self.done(session, &report, &known);
+                    }
                 }
-                Command::Submit {
-                    spec,
-                    user,
-                    most,
-                    again,
-                    reply,
-                } => {
-                    // First what is under way, so that no output is missed.
-                    self.flush().await?;
-                    let answer = self.submit(*spec, user, most, again).await?;
-                    let _ = reply.send(answer);
+                Command::Judged(session, report, note) => {
+                    self.disputes = self.disputes.saturating_sub(1);
+                    if let Some(note) = note {
+                        self.core.alarm(session, &report, note, self.now());
+                    }
+                    self.done(session, &report, &known);
                 }
-                Command::List(reply) => {
-                    self.flush().await?;
-                    let records = self.actor.catalog.jobs().await?;
-                    let now = self.now();
-                    let list = records.into_iter().map(|r| self.core.status(r, now));
-                    let _ = reply.send(Ok(list.collect()));
+                Command::Worker(session, said) => self.worker_said(session, said),
+                Command::Broken(error) => return Err(error),
+                Command::Learn(learnt, reply) => {
+                    if let Some(learnt) = learnt {
+                        self.learn(*learnt);
+                    }
+                    self.actor.revision.send_modify(|n| *n += 1);
+                    let _ = reply.send(Ok(()));
                 }
-                Command::Get(id, reply) => {
-                    self.flush().await?;
-                    let _ = reply.send(self.status(id).await?);
+                Command::Overlay(one, reply) => {
+                    let _ = reply.send(Ok(self.core.overlay(one, self.now())));
                 }
                 Command::Cancel { job, why, reply } => {
                     self.flush().await?;
-                    self.cancel(job, &why).await?;
-                    let _ = reply.send(self.status(job).await?);
+                    let cancelled = self.cancel(job, &why).await;
+                    answer(reply, cancelled.map(Ok))?;
                 }
                 Command::Pause {
                     job,
@@ -415,11 +430,11 @@ impl Life<'_> {
                     reply,
                 } => {
                     self.flush().await?;
-                    let _ = reply.send(self.pause(job, paused, &who).await?);
+                    answer(reply, self.pause(job, paused, &who).await)?;
                 }
                 Command::Retry(id, reply) => {
                     self.flush().await?;
-                    let _ = reply.send(self.retry(id).await?);
+                    answer(reply, self.retry(id).await)?;
                 }
                 Command::Workers(reply) => {
                     let _ = reply.send(Ok(self.core.everywhere()));
@@ -444,25 +459,45 @@ impl Life<'_> {
         Ok(())
     }
 
-    fn worker_said(
-        &mut self,
-        session: SessionId,
-        said: FromWorker,
-        known: &HashMap<(StageRef, u64), Option<[u8; 32]>>,
-    ) {
+    /// Whether a store is asked before this report is answered: another manifest is recorded, and who came first is no
+    /// reason to believe it.
+    fn disputed(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
+        let dispute = self.core.stage_of(report).and_then(|stage| {
+            let recorded = known.get(&(stage, report.index)).copied().flatten()?;
+            let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
+            (!same).then_some(Dispute { stage, recorded })
+        });
+        let Some(dispute) = dispute else {
+            return false;
+        };
+        let asked = self.disputes < DISPUTES && self.actor.aside.judge(session, report, dispute);
+        self.disputes += usize::from(asked);
+        asked
+    }
+
+    fn done(&mut self, session: SessionId, report: &Finished, known: &Known) {
+        self.commits.extend(trace::commit(report));
+        let stage = self.core.stage_of(report);
+        let hint = stage.and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
+        let now = self.now();
+        self.core.finished(session, report, OutputHint(hint), now);
+    }
+
+    fn worker_said(&mut self, session: SessionId, said: FromWorker) {
         let now = self.now();
         match said {
             FromWorker::Credit(n) => self.core.credit(session, n),
             FromWorker::Heartbeat(leases, progress) => {
+                self.sessions.heard(session);
                 self.core.heartbeat(session, &leases, &progress, now);
             }
-            FromWorker::Done(report) => {
-                self.commits.extend(trace::commit(&report));
-                let hint = self
-                    .core
-                    .stage_of(&report)
-                    .and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
-                self.core.finished(session, &report, OutputHint(hint), now);
+            FromWorker::Done(_) => unreachable!("handled with what the catalog holds"),
+            FromWorker::Unusable(lease, index, why) => {
+                let before = self.core.noted();
+                self.core.unusable(session, lease, index, &why, now);
+                if self.core.noted() > before {
+                    self.tally.failed(FailureKind::User);
+                }
             }
             FromWorker::Failed(failure) => {
                 let before = self.core.noted();
@@ -475,24 +510,20 @@ impl Life<'_> {
             FromWorker::Release(lease, reason) => self.core.released(session, lease, &reason, now),
             FromWorker::Log(log) => self.core.logged(session, &log, now),
             FromWorker::Closed => {
-                self.sessions.remove(&session);
+                self.sessions.close(session);
                 self.core.closed(session, now);
             }
         }
     }
 
-    async fn status(&self, id: JobId) -> Result<Result<JobStatus, Refusal>, CatalogError> {
-        let record = self.actor.catalog.job(id).await?;
-        let status = record.map(|r| self.core.status(r, self.now()));
-        Ok(status.ok_or(Refusal::NoSuchJob(id)))
-    }
-
     /// Stops a job, if it is active.
     async fn cancel(&mut self, job: JobId, why: &str) -> Result<(), CatalogError> {
         let catalog = &self.actor.catalog;
-        if catalog.job(job).await?.is_some() && catalog.cancel(job, why, self.now()).await? {
+        if catalog.state(job).await?.is_some() && catalog.cancel(job, why, self.now()).await? {
             self.core.drop_job(job, "the job was cancelled");
             self.flush().await?;
+            // Whoever watches a job of which nothing is in hand here hears of it, too.
+            self.actor.revision.send_modify(|n| *n += 1);
         }
         Ok(())
     }
@@ -502,116 +533,27 @@ impl Life<'_> {
         job: JobId,
         paused: bool,
         who: &str,
-    ) -> Result<Result<JobStatus, Refusal>, CatalogError> {
+    ) -> Result<Result<(), Refusal>, CatalogError> {
         let catalog = &self.actor.catalog;
-        let Some(record) = catalog.job(job).await? else {
-            return Ok(Err(Refusal::NoSuchJob(job)));
-        };
-        if record.job.state != JobState::Active {
-            return Ok(Err(Refusal::NotNow(format!("job {job} has ended"))));
+        match catalog.state(job).await? {
+            None => return Ok(Err(Refusal::NoSuchJob(job))),
+            Some(JobState::Active) => {}
+            Some(_) => return Ok(Err(Refusal::NotNow(format!("job {job} has ended")))),
         }
         if catalog.pause(job, paused, who, self.now()).await? {
             self.core.paused(job, paused);
             self.flush().await?;
+            self.actor.revision.send_modify(|n| *n += 1);
         }
-        self.status(job).await
-    }
-
-    /// What submitting would do, and the job that has this spec already.
-    async fn plan(
-        &self,
-        spec: &JobSpec,
-    ) -> Result<Result<(JobPlan, Option<Job>), Refusal>, CatalogError> {
-        let catalog = &self.actor.catalog;
-        for stage in &spec.stages {
-            let set = ResultSet::of(stage);
-            if stage.task.writes().is_none() {
-                continue;
-            }
-            let others = catalog.jobs_at(&set.store, &set.dataset).await?;
-            if let Err(why) = place_is_free(stage, &others) {
-                return Ok(Err(Refusal::Spec(spec.at(stage, why))));
-            }
-        }
-        let runs = self.existing(spec).await?;
-        let latest = catalog.job_with(&spec_hash(spec)).await?;
-        let recent = catalog.recent(RECENT).await?;
-        let plan = plan::plan(spec, &runs, latest.as_ref().map(|job| job.id), &recent);
-        Ok(Ok((plan, latest)))
-    }
-
-    /// The outputs there are, by stage.
-    async fn existing(&self, spec: &JobSpec) -> Result<Vec<Vec<Run>>, CatalogError> {
-        let mut runs = Vec::with_capacity(spec.stages.len());
-        for stage in &spec.stages {
-            let set = ResultSet::of(stage);
-            runs.push(self.actor.catalog.output_runs(&set, stage.tasks()).await?);
-        }
-        Ok(runs)
-    }
-
-    async fn submit(
-        &mut self,
-        spec: JobSpec,
-        user: String,
-        most: u64,
-        again: bool,
-    ) -> Result<Result<Submitted, Refusal>, CatalogError> {
-        let (plan, latest) = match self.plan(&spec).await? {
-            Ok(found) => found,
-            Err(why) => return Ok(Err(why)),
-        };
-        let existed = |job: JobId, plan| {
-            Ok(Ok(Submitted {
-                job,
-                existed: true,
-                plan,
-            }))
-        };
-        if let Some(job) = stands_for(latest, again) {
-            return existed(job.id, plan);
-        }
-        let catalog = &self.actor.catalog;
-        if catalog.jobs_of(&user).await? >= most {
-            return Ok(Err(Refusal::TooMany(format!(
-                "{user:?} has {most} jobs that have not ended, the most that --max-jobs-per-user allows; wait for some to \
-                 end, or cancel some"
-            ))));
-        }
-        let runs = self.existing(&spec).await?;
-        let now = self.now();
-        let Prepared {
-            job,
-            ranges,
-            events,
-        } = self.core.prepare(spec, user, &runs, now);
-        if !catalog.submit(&job, &ranges, &events).await? {
-            // Another coordinator was first.
-            return Ok(match catalog.job_with(&job.spec_hash).await? {
-                Some(first) => return existed(first.id, plan),
-                None => Err(Refusal::NotNow(
-                    "the same job is being submitted by someone else; try again".into(),
-                )),
-            });
-        }
-        // A job without anything to run has ended by now.
-        if let Some(record) = catalog.job(job.id).await? {
-            self.learn(&record.job).await?;
-        }
-        self.actor.revision.send_modify(|n| *n += 1);
-        Ok(Ok(Submitted {
-            job: job.id,
-            existed: false,
-            plan,
-        }))
+        Ok(Ok(()))
     }
 
     async fn retry(&mut self, id: JobId) -> Result<Result<u64, Refusal>, CatalogError> {
         let catalog = &self.actor.catalog;
-        let Some(record) = catalog.job(id).await? else {
+        let Some(state) = catalog.state(id).await? else {
             return Ok(Err(Refusal::NoSuchJob(id)));
         };
-        if record.job.state == JobState::Cancelled {
+        if state == JobState::Cancelled {
             return Ok(Err(Refusal::NotNow(format!(
                 "job {id} was cancelled; submit it again instead (finished tasks are reused)"
             ))));
@@ -623,24 +565,55 @@ impl Life<'_> {
         };
         if retried > 0 {
             self.core.retried(id);
-            if let Some(record) = catalog.job(id).await? {
-                self.learn(&record.job).await?;
-            }
+            self.actor.revision.send_modify(|n| *n += 1);
         }
         Ok(Ok(retried))
     }
 
+    /// Commits all of a change set but the rows that the catalog refuses by their content, with what follows from that for
+    /// their tasks (see [`picofarm_catalog::culprits`] and [`Core::refused`]).
+    ///
+    /// # Errors
+    /// Those of a commit; `error` where no row is found that is to blame.
+    async fn commit_the_rest(
+        &mut self,
+        changes: &mut Changes,
+        say: &mut [(SessionId, Say)],
+        mut error: CatalogError,
+    ) -> Result<Settled, CatalogError> {
+        let catalog = &self.actor.catalog;
+        // First with other words, then without them.
+        for again in [false, true] {
+            let culprits = picofarm_catalog::culprits(catalog.as_ref(), changes).await?;
+            if culprits.is_empty() {
+                break;
+            }
+            let now = self.actor.clock.now_ms();
+            self.core.refused(changes, say, &culprits, again, now);
+            match catalog.commit(changes).await {
+                Err(refused @ CatalogError::Refused { .. }) => error = refused,
+                settled => return settled,
+            }
+        }
+        Err(error)
+    }
+
     /// Makes what the core decided durable, then says it.
     async fn flush(&mut self) -> Result<(), CatalogError> {
-        let (changes, mut say) = self.core.take();
+        let (mut changes, mut say) = self.core.take();
         // Spans end when what they stand for is durable.
         let _grants = trace::grants(&mut say);
         let _commits = std::mem::take(&mut self.commits);
         let changed = !changes.is_empty();
+        let began = Instant::now();
+        let settled = match self.actor.catalog.commit(&changes).await {
+            Err(error @ CatalogError::Refused { .. }) => {
+                self.commit_the_rest(&mut changes, &mut say, error).await?
+            }
+            settled => settled?,
+        };
         let mut tally = std::mem::take(&mut self.tally);
         tally.note(&changes, &say);
-        let began = Instant::now();
-        let settled = self.actor.catalog.commit(changes).await?;
         self.actor.metrics.add(&tally);
         if changed {
             self.actor.metrics.committed(began.elapsed());
@@ -649,7 +622,7 @@ impl Life<'_> {
         let mut deaf = Vec::new();
         for (session, what) in say {
             let over = what == Say::Replaced;
-            let Some(sender) = self.sessions.get(&session) else {
+            let Some(sender) = self.sessions.get(session) else {
                 continue;
             };
             if let Err(error) = sender.try_send(what) {
@@ -657,12 +630,12 @@ impl Life<'_> {
                 deaf.push(session);
             }
             if over {
-                self.sessions.remove(&session);
+                self.sessions.close(session);
             }
         }
         let heard = changed || !deaf.is_empty();
         for session in deaf {
-            self.sessions.remove(&session);
+            self.sessions.close(session);
             let now = self.now();
             self.core.closed(session, now);
         }
@@ -673,6 +646,22 @@ impl Life<'_> {
     }
 }
 
+/// Answers a request. What the catalog refuses for its content is the asker's error, and no reason to begin anew; any other
+/// failure of the catalog is told and ends this life.
+fn answer<T>(
+    reply: Reply<T>,
+    found: Result<Result<T, Refusal>, CatalogError>,
+) -> Result<(), CatalogError> {
+    let (answer, end) = match found {
+        Ok(answer) => (answer, Ok(())),
+        Err(CatalogError::Refused { what, .. }) => (Err(Refusal::Content(what)), Ok(())),
+        Err(error) => (Err(Refusal::Catalog(error.to_string())), Err(error)),
+    };
+    // Nobody may wait any more.
+    let _ = reply.send(answer);
+    end
+}
+
 /// Tells whoever asks that the catalog is out of order.
 fn refuse(command: Command, error: &str) {
     fn no<T>(reply: Reply<T>, error: &str) {
@@ -680,13 +669,11 @@ fn refuse(command: Command, error: &str) {
     }
     match command {
         // Dropping a session's sender ends it.
-        Command::Open { .. } | Command::Worker(..) => {}
-        Command::Plan(_, reply) => no(reply, error),
-        Command::Submit { reply, .. } => no(reply, error),
-        Command::List(reply) => no(reply, error),
-        Command::Get(_, reply) | Command::Cancel { reply, .. } | Command::Pause { reply, .. } => {
+        Command::Open { .. } | Command::Worker(..) | Command::Judged(..) | Command::Broken(_) => {}
+        Command::Learn(_, reply) | Command::Cancel { reply, .. } | Command::Pause { reply, .. } => {
             no(reply, error)
         }
+        Command::Overlay(_, reply) => no(reply, error),
         Command::Drain(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),

@@ -57,6 +57,13 @@ pub fn charge(
                 exception: before.cloned(),
             };
         }
+        // Its store's own wait decides.
+        FailureKind::Store => {
+            return Verdict {
+                retry_at_ms: Some(now_ms + 1),
+                exception: before.cloned(),
+            };
+        }
         FailureKind::User => {
             exception.failures += 1;
             exception.failures

@@ -1,13 +1,17 @@
 //! Why a job's tasks do not run, and what became of one task: in words, from facts that are passed in. Pure.
 
-use picofarm_catalog::{Exception, Holdups, RangeState, TaskRecord};
+use picofarm_catalog::{Exception, Holdups, TaskRecord};
 use picofarm_proto::{
     ids::JobId,
     model::{
-        Event, EventKind, JobState, Limits, Made, Reason, StageState, StageStatus, TaskCounts,
-        TaskExplanation, TaskOutput, TaskState,
+        Event, JobState, Limits, Reason, RunningTask, StageState, StageStatus, TaskCounts,
+        memory::gib,
     },
 };
+
+mod task;
+
+pub use task::{committed, task};
 
 /// A connected worker with regard to a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,10 +20,14 @@ pub struct Candidate {
     pub name: String,
     /// Whether it may run the job's tasks, or why not.
     pub may_run: Result<(), String>,
+    /// Bytes of memory that a task takes and that the worker has for it, where that is too little.
+    pub lacks_memory: Option<(u64, u64)>,
     /// It asks for work.
     pub idle: bool,
     /// It holds a range that crashed others, and gets nothing else.
     pub quarantined: bool,
+    /// It holds leases and was not heard of for so many milliseconds, longer than it should be.
+    pub silent_ms: Option<i64>,
 }
 
 /// How a task runs.
@@ -54,8 +62,14 @@ pub struct JobFacts {
     pub candidates: Vec<Candidate>,
     /// Jobs that go first and have tasks waiting for the same workers.
     pub ahead: Vec<JobId>,
+    /// How many more of these there are that the asker may not see.
+    pub unseen: u64,
     /// Workers connected to other coordinators.
     pub elsewhere: u32,
+    /// Tasks that run now.
+    pub running: Vec<RunningTask>,
+    /// The last line of history that says why a task did not go on: it failed, was given back, or its lease ran out.
+    pub setback: Option<Event>,
     /// Unix time, milliseconds.
     pub now_ms: i64,
 }
@@ -126,8 +140,7 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
             waiting(facts, &mut reasons);
             blocked(facts, &mut reasons);
             if counts.leased > 0 {
-                let words = format!("{} under lease at workers now", n(counts.leased, "task"));
-                reasons.push(reason("leased", counts.leased, words));
+                reasons.push(reason("leased", counts.leased, leased_words(facts)));
             }
             if reasons.is_empty() {
                 let words = "nothing waits: the job is about to end".to_owned();
@@ -138,12 +151,43 @@ pub fn job(facts: &JobFacts) -> Vec<Reason> {
     if counts.dead > 0 {
         let last = last_error(facts.holdups.failed.iter().filter(|e| e.dead));
         let words = format!(
-            "{} given up{last}; mend the cause, then `picofarm job retry {id}`",
+            "{} given up{last}; correct the cause, then `picofarm job retry {id}`",
             n(counts.dead, "task")
         );
         reasons.push(reason("dead", counts.dead, words));
     }
     reasons
+}
+
+/// What becomes of tasks that are under lease: a worker runs one of a lease at a time.
+fn leased_words(facts: &JobFacts) -> String {
+    const SHOWN: usize = 4;
+    let under = format!("{} under lease at workers", n(facts.counts.leased, "task"));
+    let shown = facts.running.iter().take(SHOWN).map(|r| {
+        let at = match &*r.text {
+            "" => String::new(),
+            text => format!(", {text}"),
+        };
+        let percent = f64::from(r.fraction) * 100.0;
+        format!("task {} on {} ({percent:.0} %{at})", r.index, r.worker)
+    });
+    let shown: Vec<String> = shown.collect();
+    let silent = facts
+        .candidates
+        .iter()
+        .filter_map(|c| Some((c, c.silent_ms?)));
+    let silent: Vec<String> = silent
+        .map(|(c, ms)| format!("; worker {} was not heard of for {}", c.name, span(ms)))
+        .collect();
+    let running = match facts.running.len() {
+        0 => ", none of which has reported yet".to_owned(),
+        count => {
+            let more = if count > SHOWN { ", …" } else { "" };
+            let verb = if count == 1 { "runs" } else { "run" };
+            format!(", of which {count} {verb}: {}{more}", shown.join(", "))
+        }
+    };
+    format!("{under}{running}{}", silent.concat())
 }
 
 fn last_error<'a>(mut failed: impl Iterator<Item = &'a Exception>) -> String {
@@ -176,7 +220,11 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
         let soon = next_ms.map_or_else(String::new, |at| {
             format!(", the first for another {}", span(at - facts.now_ms))
         });
-        let last = last_error(failed.iter().filter(|e| !e.dead));
+        let last = match last_error(failed.iter().filter(|e| !e.dead)) {
+            // What is given back is charged to nobody, and leaves its reason in the history alone.
+            none if none.is_empty() => facts.setback.as_ref().map_or(none, setback),
+            last => last,
+        };
         let words = format!(
             "{} after a failure before the next attempt{soon}{last}",
             if *waiting == 1 {
@@ -190,6 +238,18 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
             ..reason("after_failure", *waiting, words)
         });
     }
+}
+
+/// Why a task did not go on the last time.
+fn setback(event: &Event) -> String {
+    let task = event
+        .task
+        .map_or_else(String::new, |task| format!(" task {task}"));
+    let on = match &*event.worker {
+        "" => String::new(),
+        worker => format!(" on {worker}"),
+    };
+    format!("; the last:{task}{on}: {}", event.message)
 }
 
 /// Which stages wait for others.
@@ -250,22 +310,48 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         .filter(|c| c.may_run.is_ok())
         .collect();
     if able.is_empty() {
-        let mut whys: Vec<(&str, &str)> = facts
+        let (small, others_say): (Vec<&Candidate>, Vec<&Candidate>) = facts
             .candidates
+            .iter()
+            .partition(|c| c.lacks_memory.is_some());
+        let memory = largest(&small);
+        let mut whys: Vec<(&str, &str)> = others_say
             .iter()
             .filter_map(|c| Some((c.may_run.as_ref().err()?.as_str(), c.name.as_str())))
             .collect();
         whys.sort_unstable();
         whys.dedup_by_key(|(why, _)| *why);
-        let whys: Vec<String> = whys
-            .iter()
-            .map(|(why, name)| format!("{why} ({name})"))
-            .collect();
+        let whys = whys.iter().map(|(why, name)| format!("{why} ({name})"));
+        let whys: Vec<String> = memory.into_iter().chain(whys).collect();
+        let waits =
+            |c: &Candidate| matches!(&c.may_run, Err(why) if why.starts_with("waits for store "));
+        if facts.candidates.iter().any(waits) {
+            let words = format!("{tasks} not begun: {}{others}", whys.join("; "));
+            return reason("store", ready, words);
+        }
         let words = format!(
             "no connected worker may run {tasks}: {}{others}",
             whys.join("; ")
         );
         return reason("unable", ready, words);
+    }
+    if able.iter().all(|c| c.silent_ms.is_some()) {
+        let named = able.iter().take(4).map(|c| {
+            let silent = span(c.silent_ms.unwrap_or_default());
+            format!("{} for {silent}", c.name)
+        });
+        let named: Vec<String> = named.collect();
+        let words = format!(
+            "{tasks} wait: of {} that may run them nothing was heard ({}), although connected: frozen, suspended or \
+             overloaded; their leases pass on to others when they run out{others}",
+            if able.len() == 1 {
+                "the one worker".into()
+            } else {
+                format!("all {} workers", able.len())
+            },
+            named.join(", ")
+        );
+        return reason("silent", ready, words);
     }
     let idle = able.iter().filter(|c| c.idle && !c.quarantined).count();
     if idle > 0 {
@@ -279,12 +365,14 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         );
         return reason("starting", ready, words);
     }
-    if let Some(first) = facts.ahead.first() {
-        let more = match facts.ahead.len() {
-            1 => String::new(),
-            count => format!(" and {} more", n(count as u64 - 1, "job")),
+    let ahead = facts.ahead.len() as u64 + facts.unseen;
+    if ahead > 0 {
+        let which = match (facts.ahead.first(), ahead) {
+            (Some(first), 1) => format!("job {first}"),
+            (Some(first), count) => format!("job {first} and {} more", n(count - 1, "job")),
+            (None, count) => format!("{} of others", n(count, "job")),
         };
-        let words = format!("{tasks} behind job {first}{more}, which goes first");
+        let words = format!("{tasks} behind {which}, which goes first");
         return reason("behind", ready, words);
     }
     let held = able.iter().filter(|c| c.quarantined).count();
@@ -304,185 +392,25 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
     reason("busy", ready, words)
 }
 
+/// What a task needs and what the largest of the workers has that are too small for it, in words.
+fn largest(small: &[&Candidate]) -> Option<String> {
+    let memory = |c: &&&Candidate| c.lacks_memory.map(|(needed, there)| (there, needed));
+    let largest = small.iter().max_by_key(memory)?;
+    let (needed, there) = largest.lacks_memory?;
+    Some(format!(
+        "each needs about {} of memory; the largest worker has {} for tasks ({})",
+        gib(needed),
+        gib(there),
+        largest.name
+    ))
+}
+
 fn are(count: u32) -> String {
     if count == 1 {
         "1 worker is".into()
     } else {
         format!("{count} workers are")
     }
-}
-
-/// What became of a task and why.
-pub fn task(facts: TaskFacts) -> TaskExplanation {
-    let (failures, crashes, last_error) = facts
-        .record
-        .exception
-        .as_ref()
-        .map(|e| (e.failures, e.crashes, e.last_error.clone()))
-        .unwrap_or_default();
-    let state = match (&facts.record.range, &facts.record.output) {
-        (Some(range), output) => match &range.state {
-            RangeState::Pending { .. } => TaskState::Pending,
-            RangeState::Leased(_) if output.is_some() => TaskState::Done,
-            RangeState::Leased(_) => TaskState::Leased,
-            RangeState::Done { .. } => TaskState::Done,
-            RangeState::Dead => TaskState::Dead,
-        },
-        (None, Some(_)) => TaskState::Done,
-        (None, None) => TaskState::Gone,
-    };
-    let output = output(&facts);
-    let words = match state {
-        TaskState::Pending => pending(&facts, &last_error),
-        TaskState::Leased => leased(&facts),
-        TaskState::Done => done(&facts, output.as_ref()),
-        TaskState::Dead => format!(
-            "given up after {} of {} failures and {} of {} lost workers: {last_error}; mend the cause, then \
-             `picofarm job retry {}`",
-            failures, facts.limits.max_failures, crashes, facts.limits.max_crashes, facts.job
-        ),
-        TaskState::Gone => "its job was stopped before it ran".to_owned(),
-    };
-    TaskExplanation {
-        index: facts.index,
-        state,
-        words,
-        failures,
-        max_failures: facts.limits.max_failures,
-        crashes,
-        max_crashes: facts.limits.max_crashes,
-        last_error,
-        reruns: reruns(&facts.events),
-        output,
-        events: facts.events,
-    }
-}
-
-fn pending(facts: &TaskFacts, last_error: &str) -> String {
-    match facts.record.range.as_ref().map(|r| &r.state) {
-        Some(RangeState::Pending { not_before_ms }) if *not_before_ms > facts.now_ms => format!(
-            "waits after a failure for another {} before the next attempt: {last_error}",
-            span(not_before_ms - facts.now_ms)
-        ),
-        _ => "waits for a worker".to_owned(),
-    }
-}
-
-fn leased(facts: &TaskFacts) -> String {
-    if let Some(running) = &facts.running {
-        let at = match &*running.text {
-            "" => String::new(),
-            text => format!(" ({text})"),
-        };
-        return format!(
-            "runs on {} for {}: {:.0} % done{at}",
-            running.worker,
-            span(facts.now_ms - running.since_ms),
-            f64::from(running.fraction) * 100.0
-        );
-    }
-    let granted = facts
-        .events
-        .iter()
-        .rev()
-        .find(|e| e.kind == EventKind::Leased);
-    match granted {
-        Some(event) => format!(
-            "leased to {} for {}, which has not reported on it yet: it works on others of the same lease, or has only begun",
-            event.worker,
-            span(facts.now_ms - event.at_ms)
-        ),
-        None => "leased to a worker".to_owned(),
-    }
-}
-
-fn done(facts: &TaskFacts, output: Option<&TaskOutput>) -> String {
-    let Some(output) = output else {
-        return "done".to_owned();
-    };
-    let how = if output.adopted {
-        "found in the store"
-    } else {
-        "computed"
-    };
-    match &output.made {
-        Some(made) if made.job == facts.job => {
-            format!("done: {how} by {} under this job", made.worker)
-        }
-        Some(made) => format!(
-            "reused: {how} by {} under job {} ({})",
-            made.worker, made.job, made.job_name
-        ),
-        None => format!("done: {how}; the history does not tell by whom"),
-    }
-}
-
-fn output(facts: &TaskFacts) -> Option<TaskOutput> {
-    let output = facts.record.output.as_ref()?;
-    let here = facts
-        .events
-        .iter()
-        .find(|e| committed(e))
-        .map(|e| (facts.job, String::new(), e));
-    let there = facts
-        .elsewhere
-        .as_ref()
-        .map(|(job, name, e)| (*job, name.clone(), e));
-    Some(TaskOutput {
-        manifest_sha256: hex::encode(output.manifest),
-        bytes: output.bytes,
-        seconds: output.seconds,
-        adopted: output.adopted,
-        made: here.or(there).map(|(job, job_name, event)| Made {
-            worker: event.worker.clone(),
-            job,
-            job_name,
-            at_ms: event.at_ms,
-        }),
-    })
-}
-
-/// Whether a line of history says that a worker handed in a result.
-pub fn committed(event: &Event) -> bool {
-    match event.kind {
-        EventKind::Committed => true,
-        EventKind::Reused => !event.worker.is_empty(),
-        _ => false,
-    }
-}
-
-/// Why a task was run more than once: what ended each lease but the last.
-fn reruns(events: &[Event]) -> Vec<String> {
-    let mut reruns = Vec::new();
-    let mut why: Option<String> = None;
-    let mut leased = false;
-    for event in events {
-        let ended = match event.kind {
-            EventKind::Leased => {
-                if leased {
-                    reruns.push(why.take().unwrap_or_else(|| {
-                        "the lease before did not reach its worker, or was handed back".to_owned()
-                    }));
-                }
-                leased = true;
-                why = None;
-                continue;
-            }
-            // A loss is told twice, for the lease and for the task in hand: the first says enough.
-            _ if why.is_some() => continue,
-            EventKind::Expired => format!("{} was lost with it: {}", event.worker, event.message),
-            EventKind::Released => format!("{} gave it back: {}", event.worker, event.message),
-            EventKind::Failed => format!("it failed on {}: {}", event.worker, event.message),
-            EventKind::Dead => format!(
-                "it was given up on {}: {}, and then tried again",
-                event.worker, event.message
-            ),
-            EventKind::Retried => "its job was retried".to_owned(),
-            _ => continue,
-        };
-        why = Some(ended);
-    }
-    reruns
 }
 
 #[cfg(test)]

@@ -1,376 +1,271 @@
 //! `/healthz`, `/readyz` and `/metrics` over plain HTTP/1.1, for probes and Prometheus: three fixed pages, read only.
 //! They hold counts, never names, paths or URLs; details of a failure are for this machine alone. So there is no token,
-//! and none could be sent here by mistake: headers are not read.
+//! and one that is sent here by mistake goes nowhere: of a request only method and path are looked at.
+//!
+//! They are served by a thread with a runtime of its own and bounds of its own: whatever happens at the gRPC port, in the
+//! actor or in the catalog, an answer comes within a second. hyper speaks HTTP; connections are accepted, counted and
+//! ended here.
 
 use std::{
-    fmt,
+    convert::Infallible,
     net::SocketAddr,
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
+use http::{
+    HeaderValue, Method, Response, StatusCode,
+    header::{ALLOW, CACHE_CONTROL, CONTENT_TYPE},
+};
+use hyper::{server::conn::http1, service::service_fn};
+use hyper_util::rt::TokioIo;
 use tokio::{
-    io::{AsyncRead, AsyncReadExt, AsyncWriteExt},
     net::{TcpListener, TcpStream},
-    sync::{Mutex as AsyncMutex, Semaphore},
+    runtime::Handle,
+    sync::Semaphore,
     time::timeout,
 };
 use tokio_util::sync::CancellationToken;
 
 use crate::{
     actor::Command,
+    auth::Throttle,
+    connections::{Doors, Place},
+    health::Health,
     metrics::{Gauges, Metrics},
     rpc::Link,
 };
 
-/// How long the actor may take to say that it lives.
-const ALIVE: Duration = Duration::from_secs(5);
-/// The catalog is thought gone when it has not answered for so long.
-const READY: Duration = Duration::from_secs(10);
+/// How long a page waits for fresh gauges, and how old ones it tells otherwise.
+const WAIT: Duration = Duration::from_millis(500);
+const OLD: Duration = Duration::from_secs(30);
 /// Gauges are read from the catalog at most once in this time, and at most for a tenth of the time.
 const FRESH: Duration = Duration::from_secs(1);
-/// Connections answered at a time; others wait.
-const CONNECTIONS: usize = 32;
-/// The longest request head, bytes, and the longest time it may take.
+/// Connections at a time. One more takes the place of the one that has waited longest to send its request.
+const CONNECTIONS: usize = 256;
+/// The longest request head, bytes.
 const HEAD: usize = 8 << 10;
-const HEAD_TIME: Duration = Duration::from_secs(5);
-
-/// How the actor does with its catalog.
-#[derive(Default)]
-pub(crate) struct Pulse(Mutex<State>);
-
-#[derive(Default)]
-struct State {
-    beaten: Option<Instant>,
-    trouble: Option<String>,
-}
-
-/// Why no work can be taken: for anyone, and for people on this machine.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Unready {
-    what: String,
-    detail: Option<String>,
-}
-
-impl fmt::Display for Unready {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.what)
-    }
-}
-
-impl Pulse {
-    /// The catalog has answered.
-    pub(crate) fn beat(&self) {
-        *self.lock() = State {
-            beaten: Some(Instant::now()),
-            trouble: None,
-        };
-    }
-
-    /// A life of the actor has ended for this reason; another will be tried.
-    pub(crate) fn trouble(&self, why: &str) {
-        self.lock().trouble = Some(why.to_owned());
-    }
-
-    /// Whether jobs and reports can be taken.
-    ///
-    /// # Errors
-    /// Why not.
-    pub(crate) fn ready(&self) -> Result<(), Unready> {
-        let state = self.lock();
-        if let Some(why) = &state.trouble {
-            return Err(Unready {
-                what: "the catalog failed, and has not answered since".into(),
-                detail: Some(why.clone()),
-            });
-        }
-        let what = match state.beaten.map(|at| at.elapsed()) {
-            None => "the catalog has not answered yet".into(),
-            Some(age) if age > READY => {
-                format!("the catalog has not answered for {} s", age.as_secs())
-            }
-            Some(_) => return Ok(()),
-        };
-        Err(Unready { what, detail: None })
-    }
-
-    /// Whether the actor is between two lives: its silence is the catalog's.
-    fn mends(&self) -> bool {
-        self.lock().trouble.is_some()
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        self.0.lock().expect("no panic while locked")
-    }
-}
+/// How long a head may take, and how long its answer may wait to be taken.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What the pages are made of.
 pub(crate) struct Pages {
     pub link: Link,
     pub metrics: Arc<Metrics>,
-    pub pulse: Arc<Pulse>,
-    pub gauges: AsyncMutex<Option<(Instant, Gauges)>>,
+    pub health: Arc<Health>,
+    /// Of the gRPC port.
+    pub doors: Arc<Doors>,
+    pub gauges: Kept,
+    /// Where the actor and the catalog's connections live.
+    pub main: Handle,
 }
 
-/// Answers until `stop`.
-pub(crate) async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) {
-    let room = Arc::new(Semaphore::new(CONNECTIONS));
+/// The gauges as last read.
+pub(crate) struct Kept {
+    read: Mutex<Option<Read>>,
+    /// Whoever holds it reads them again.
+    reading: Arc<Semaphore>,
+}
+
+impl Default for Kept {
+    fn default() -> Self {
+        Self {
+            read: Mutex::default(),
+            reading: Arc::new(Semaphore::new(1)),
+        }
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Read {
+    at: Instant,
+    fresh_until: Instant,
+    gauges: Gauges,
+}
+
+/// Answers from a thread of its own, until `stop`.
+///
+/// # Errors
+/// The system gives no thread or no runtime.
+pub(crate) fn start(
+    listener: std::net::TcpListener,
+    pages: Arc<Pages>,
+    stop: CancellationToken,
+) -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let listener = {
+        let _in = runtime.enter();
+        TcpListener::from_std(listener)?
+    };
+    std::thread::Builder::new()
+        .name("http".into())
+        .spawn(move || runtime.block_on(run(listener, pages, stop)))?;
+    Ok(())
+}
+
+async fn run(listener: TcpListener, pages: Arc<Pages>, stop: CancellationToken) {
+    let doors = Arc::new(Doors::new(CONNECTIONS, CONNECTIONS));
+    let failed = Throttle::default();
     loop {
-        let permit = Arc::clone(&room).acquire_owned().await;
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
             () = stop.cancelled() => return,
         };
         match accepted {
             Ok((stream, peer)) => {
+                // Full of those whose answer is being written, which takes a moment.
+                let Ok(held) = doors.enter(peer.ip()) else {
+                    continue;
+                };
                 let pages = Arc::clone(&pages);
                 tokio::spawn(async move {
-                    // One that goes away early is no loss.
-                    let _ = pages.serve(stream, peer).await;
-                    drop(permit);
+                    // hyper's own limit of time would need a timer and say the same.
+                    let over = Arc::clone(held.place()).over(PATIENCE, PATIENCE);
+                    tokio::select! {
+                        // One that goes away early is no loss.
+                        _ = serve(pages, stream, peer, held.place()) => {}
+                        _ = over => {}
+                    }
                 });
             }
             Err(error) => {
-                tracing::warn!(%error, "the HTTP endpoint cannot accept");
+                if let Some(unsaid) = failed.allows() {
+                    tracing::warn!(%error, unsaid, "the HTTP endpoint cannot accept");
+                }
                 tokio::time::sleep(Duration::from_millis(100)).await;
             }
         }
     }
 }
 
-/// An answer.
-#[derive(Debug, PartialEq, Eq)]
-struct Answer {
-    status: &'static str,
-    body: String,
+/// One request and its answer: more of them on a connection would keep its place from others.
+async fn serve(
+    pages: Arc<Pages>,
+    stream: TcpStream,
+    peer: SocketAddr,
+    place: &Arc<Place>,
+) -> hyper::Result<()> {
+    let service = service_fn(|request| {
+        let pages = Arc::clone(&pages);
+        async move {
+            let _answering = place.stream();
+            let answer = pages
+                .answer(request.method(), request.uri().path(), peer)
+                .await;
+            Ok::<_, Infallible>(answer)
+        }
+    });
+    http1::Builder::new()
+        .keep_alive(false)
+        // Some clients end their side as soon as they have asked.
+        .half_close(true)
+        .max_header_size(HEAD)
+        .serve_connection(TokioIo::new(stream), service)
+        .await
 }
 
-impl Answer {
-    fn new(status: &'static str, body: impl Into<String>) -> Self {
-        let body = body.into();
-        Self { status, body }
-    }
-
-    fn bytes(&self, with_body: bool) -> Vec<u8> {
-        let allow = if self.status.starts_with("405") {
-            "Allow: GET, HEAD\r\n"
-        } else {
-            ""
-        };
-        let head = format!(
-            "HTTP/1.1 {}\r\nContent-Type: text/plain; version=0.0.4; charset=utf-8\r\nContent-Length: {}\r\n\
-             Cache-Control: no-store\r\n{allow}Connection: close\r\n\r\n",
-            self.status,
-            self.body.len()
-        );
-        let mut bytes = head.into_bytes();
-        if with_body {
-            bytes.extend_from_slice(self.body.as_bytes());
-        }
-        bytes
-    }
-}
-
-/// The method and path of a request, without its query.
-fn request_line(head: &str) -> Result<(&str, &str), Answer> {
-    let line = head.lines().next().unwrap_or_default();
-    let mut words = line.split(' ');
-    match (words.next(), words.next(), words.next(), words.next()) {
-        (Some(method), Some(target), Some("HTTP/1.1" | "HTTP/1.0"), None)
-            if target.starts_with('/') =>
-        {
-            Ok((method, target.split('?').next().unwrap_or(target)))
-        }
-        _ => Err(Answer::new(
-            "400 Bad Request",
-            "expected GET /PATH HTTP/1.1\n",
-        )),
-    }
-}
-
-/// Reads up to the empty line that ends a head.
-async fn head(stream: &mut (impl AsyncRead + Unpin)) -> Result<String, Answer> {
-    let mut read = Vec::new();
-    let whole = async {
-        let mut piece = [0; 1024];
-        while !read.windows(4).any(|end| end == b"\r\n\r\n") {
-            if read.len() > HEAD {
-                return Err(Answer::new(
-                    "431 Request Header Fields Too Large",
-                    "the request is too long\n",
-                ));
-            }
-            match stream.read(&mut piece).await {
-                Ok(n) if n > 0 => read.extend_from_slice(&piece[..n]),
-                _ => return Err(Answer::new("400 Bad Request", "the request ended early\n")),
-            }
-        }
-        Ok(())
-    };
-    match timeout(HEAD_TIME, whole).await {
-        Ok(done) => done?,
-        Err(_) => return Err(Answer::new("408 Request Timeout", "no request came\n")),
-    }
-    String::from_utf8(read).map_err(|_| Answer::new("400 Bad Request", "the request is no text\n"))
+fn page(status: StatusCode, body: impl Into<String>) -> Response<String> {
+    let mut page = Response::new(body.into());
+    *page.status_mut() = status;
+    let text = HeaderValue::from_static("text/plain; version=0.0.4; charset=utf-8");
+    page.headers_mut().insert(CONTENT_TYPE, text);
+    let fresh = HeaderValue::from_static("no-store");
+    page.headers_mut().insert(CACHE_CONTROL, fresh);
+    page
 }
 
 impl Pages {
-    async fn serve(&self, mut stream: TcpStream, peer: SocketAddr) -> std::io::Result<()> {
-        let (answer, with_body) = match head(&mut stream).await {
-            Err(answer) => (answer, true),
-            Ok(head) => match request_line(&head) {
-                Err(answer) => (answer, true),
-                Ok((method, path)) => (self.answer(method, path, peer).await, method != "HEAD"),
-            },
-        };
-        timeout(HEAD_TIME, stream.write_all(&answer.bytes(with_body))).await??;
-        stream.shutdown().await
-    }
-
-    async fn answer(&self, method: &str, path: &str, peer: SocketAddr) -> Answer {
-        if !matches!(method, "GET" | "HEAD") {
-            return Answer::new("405 Method Not Allowed", "only GET and HEAD\n");
+    async fn answer(
+        self: &Arc<Self>,
+        method: &Method,
+        path: &str,
+        peer: SocketAddr,
+    ) -> Response<String> {
+        if !matches!(*method, Method::GET | Method::HEAD) {
+            let mut refusal = page(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD\n");
+            let allowed = HeaderValue::from_static("GET, HEAD");
+            refusal.headers_mut().insert(ALLOW, allowed);
+            return refusal;
         }
         match path {
-            "/healthz" => self.health().await,
+            "/healthz" => match self.health.alive() {
+                Ok(words) => page(StatusCode::OK, words + "\n"),
+                Err(words) => page(StatusCode::SERVICE_UNAVAILABLE, words + "\n"),
+            },
             "/readyz" => self.readiness(peer),
             "/metrics" => {
-                let ready = self.pulse.ready().is_ok();
-                Answer::new("200 OK", self.metrics.page(self.gauges().await, ready))
+                let ready = self.health.ready().is_ok();
+                let (gauges, connections) = (self.gauges().await, self.doors.counts());
+                page(
+                    StatusCode::OK,
+                    self.metrics.page(gauges, connections, ready),
+                )
             }
-            _ => Answer::new(
-                "404 Not Found",
+            _ => page(
+                StatusCode::NOT_FOUND,
                 "there are /healthz, /readyz and /metrics\n",
             ),
         }
     }
 
-    /// Whether the process does its work; one that waits for its catalog does.
-    async fn health(&self) -> Answer {
-        // Any answer will do, be it that the catalog is out of order.
-        match timeout(ALIVE, self.link.ask(Command::Look)).await {
-            Ok(_) => Answer::new("200 OK", "ok\n"),
-            Err(_) if self.pulse.mends() => Answer::new("200 OK", "ok, waiting for the catalog\n"),
-            Err(_) => {
-                let words = format!(
-                    "the coordinator has not answered for {} s\n",
-                    ALIVE.as_secs()
-                );
-                Answer::new("503 Service Unavailable", words)
-            }
-        }
-    }
-
-    fn readiness(&self, peer: SocketAddr) -> Answer {
-        match self.pulse.ready() {
-            Ok(()) => Answer::new("200 OK", "ready\n"),
+    fn readiness(&self, peer: SocketAddr) -> Response<String> {
+        match self.health.ready() {
+            Ok(()) => page(StatusCode::OK, "ready\n"),
             Err(why) => {
                 // Error texts name files and hosts.
                 let detail = why.detail.as_ref().filter(|_| peer.ip().is_loopback());
                 let detail = detail.map_or_else(String::new, |d| format!(": {d}"));
-                Answer::new("503 Service Unavailable", format!("{why}{detail}\n"))
+                page(StatusCode::SERVICE_UNAVAILABLE, format!("{why}{detail}\n"))
             }
         }
     }
 
     /// The farm's counts; `None` where they cannot be had now.
-    async fn gauges(&self) -> Option<Gauges> {
-        // Whoever comes meanwhile waits here, and finds them fresh.
-        let mut kept = self.gauges.lock().await;
-        if let Some((until, gauges)) = &*kept
-            && Instant::now() < *until
-        {
-            return Some(*gauges);
+    async fn gauges(self: &Arc<Self>) -> Option<Gauges> {
+        let kept = |until: fn(&Read) -> Instant| {
+            let read = *self.gauges.read.lock().expect("no panic while locked");
+            read.filter(|read| Instant::now() < until(read))
+                .map(|read| read.gauges)
+        };
+        if let Some(gauges) = kept(|read| read.fresh_until) {
+            return Some(gauges);
         }
-        *kept = None;
-        let began = Instant::now();
-        let gauges = timeout(ALIVE, self.read_gauges()).await.ok()??;
-        *kept = Some((Instant::now() + FRESH.max(10 * began.elapsed()), gauges));
-        Some(gauges)
+        let turn = Arc::clone(&self.gauges.reading);
+        let pages = Arc::clone(self);
+        // On the main runtime, whose connections to the catalog these are. It goes on where it takes longer.
+        let read = self.main.spawn(async move {
+            let _turn = turn.acquire().await;
+            let fresh = *pages.gauges.read.lock().expect("no panic while locked");
+            if fresh.is_some_and(|read| Instant::now() < read.fresh_until) {
+                return;
+            }
+            let began = Instant::now();
+            if let Ok(Some(gauges)) = timeout(OLD, pages.read_gauges()).await {
+                let at = Instant::now();
+                *pages.gauges.read.lock().expect("no panic while locked") = Some(Read {
+                    at,
+                    fresh_until: at + FRESH.max(10 * began.elapsed()),
+                    gauges,
+                });
+            }
+        });
+        let _ = timeout(WAIT, read).await;
+        kept(|read| (read.at + OLD).max(read.fresh_until))
     }
 
     async fn read_gauges(&self) -> Option<Gauges> {
         let look = self.link.ask(Command::Look).await.ok()?;
-        let mut gauges = Gauges {
+        Some(Gauges {
             jobs: look.jobs.len() as u64,
             workers: look.workers.len() as u64,
-            houses: u64::from(look.houses),
-            ..Gauges::default()
-        };
-        for job in look.jobs {
-            if let Some(record) = self.link.catalog.job(job).await.ok()? {
-                gauges.tasks += record.counts();
-            }
-        }
-        Some(gauges)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn readiness_follows_the_catalog() {
-        let pulse = Pulse::default();
-        assert!(
-            pulse
-                .ready()
-                .unwrap_err()
-                .to_string()
-                .contains("not answered yet")
-        );
-        pulse.beat();
-        assert_eq!(pulse.ready(), Ok(()));
-        pulse.trouble("no route to db.example");
-        let why = pulse.ready().unwrap_err();
-        assert!(
-            !why.to_string().contains("db.example"),
-            "hosts are for this machine alone"
-        );
-        assert_eq!(why.detail.as_deref(), Some("no route to db.example"));
-        assert!(pulse.mends());
-        pulse.beat();
-        assert_eq!(pulse.ready(), Ok(()));
-        let long_ago = Instant::now().checked_sub(2 * READY);
-        pulse.lock().beaten = long_ago;
-        assert_eq!(pulse.ready().is_err(), long_ago.is_some());
-    }
-
-    #[tokio::test]
-    async fn requests_are_read_or_refused_in_words() {
-        let line = |text: &'static str| async move {
-            let head = head(&mut text.as_bytes()).await?;
-            request_line(&head).map(|(m, p)| (m.to_owned(), p.to_owned()))
-        };
-        let good = line("GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n")
-            .await
-            .unwrap();
-        assert_eq!(good, ("GET".into(), "/metrics".into()));
-        for bad in [
-            "GET /metrics",
-            "GET\r\n\r\n",
-            "\r\n\r\n",
-            "GET x HTTP/1.1\r\n\r\n",
-            "GET / HTTP/2\r\n\r\n",
-        ] {
-            let answer = line(bad).await.unwrap_err();
-            assert_eq!(answer.status, "400 Bad Request", "{bad:?}");
-        }
-        let long = "x".repeat(2 * HEAD);
-        let answer = head(&mut long.as_bytes()).await.unwrap_err();
-        assert!(answer.status.starts_with("431"), "{answer:?}");
-    }
-
-    #[test]
-    fn an_answer_to_head_has_no_body() {
-        let answer = Answer::new("200 OK", "ready\n");
-        let bytes = String::from_utf8(answer.bytes(false)).unwrap();
-        assert!(
-            bytes.contains("Content-Length: 6\r\n") && bytes.ends_with("\r\n\r\n"),
-            "{bytes}"
-        );
-        let bytes = String::from_utf8(answer.bytes(true)).unwrap();
-        assert!(bytes.ends_with("\r\n\r\nready\n"), "{bytes}");
+            instances: u64::from(look.instances),
+            tasks: self
+                .link
+                .read(|catalog| async move { catalog.active_tasks().await })
+                .await
+                .ok()?,
+        })
     }
 }

@@ -2,12 +2,17 @@
 //! finish. [`serve`] runs one; the decisions are pure ([`plan`], [`place`], [`transition`], [`budget`], [`explain`]).
 
 mod actor;
+mod audit;
 pub mod auth;
 pub mod budget;
 mod clock;
+mod connections;
 mod core;
 pub mod explain;
+mod forget;
+mod health;
 mod http;
+mod lanes;
 #[cfg(test)]
 mod laws;
 mod metrics;
@@ -15,15 +20,20 @@ pub mod place;
 pub mod plan;
 mod rpc;
 mod server;
+mod sessions;
 pub mod stage;
+mod stored;
+mod submission;
 mod timed;
 mod trace;
 pub mod transition;
 
 pub use budget::Backoff;
 pub use clock::Clock;
+pub use connections::Connections;
 pub use picofarm_catalog::CatalogPlace;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
+pub use stored::{Found, Stored};
 
 /// Version of this program; workers must have the same.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -13,6 +13,7 @@ use picofarm_proto::model::{EventKind, FailureKind, TaskCounts};
 use crate::{
     VERSION,
     auth::METHODS,
+    connections::Counts,
     core::{Say, SessionId},
 };
 
@@ -111,7 +112,7 @@ impl Tally {
         match kind {
             FailureKind::User => self.user += 1,
             FailureKind::Crash => self.crash += 1,
-            FailureKind::Interrupted => self.interrupted += 1,
+            FailureKind::Interrupted | FailureKind::Store => self.interrupted += 1,
         }
     }
 
@@ -159,7 +160,7 @@ pub(crate) struct Gauges {
     pub tasks: TaskCounts,
     pub jobs: u64,
     pub workers: u64,
-    pub houses: u64,
+    pub instances: u64,
 }
 
 impl Metrics {
@@ -203,7 +204,7 @@ impl Metrics {
     }
 
     /// The text that Prometheus reads. `gauges` is missing where the catalog cannot be read.
-    pub(crate) fn page(&self, gauges: Option<Gauges>, ready: bool) -> String {
+    pub(crate) fn page(&self, gauges: Option<Gauges>, connections: Counts, ready: bool) -> String {
         let mut page = Page(String::with_capacity(16 << 10));
         page.family(
             "build_info",
@@ -220,6 +221,7 @@ impl Metrics {
         if let Some(gauges) = gauges {
             page.gauges(&gauges);
         }
+        page.connections(connections);
         self.counters(&mut page);
         self.histograms(&mut page);
         page.0
@@ -311,6 +313,27 @@ impl Metrics {
 struct Page(String);
 
 impl Page {
+    fn connections(&mut self, counts: Counts) {
+        self.one(
+            "connections",
+            "gauge",
+            "Open connections to the gRPC port.",
+            counts.open,
+        );
+        self.one(
+            "connections_refused_total",
+            "counter",
+            "Connections to the gRPC port that were refused: as many were open as there may be.",
+            counts.refused,
+        );
+        self.one(
+            "connections_displaced_total",
+            "counter",
+            "Connections closed before their first request, to make room for others.",
+            counts.displaced,
+        );
+    }
+
     fn family(&mut self, name: &str, kind: &str, help: &str) {
         let _ = writeln!(
             self.0,
@@ -370,10 +393,10 @@ impl Page {
             gauges.workers,
         );
         self.one(
-            "houses",
+            "coordinators",
             "gauge",
             "Coordinators of the catalog that are alive. Of the whole farm.",
-            gauges.houses,
+            gauges.instances,
         );
     }
 

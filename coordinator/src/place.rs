@@ -1,6 +1,9 @@
 //! Which worker may take tasks of which job, and how many at once. Pure.
 
-use picofarm_proto::model::{Abilities, SceneKind, StageSpec, TaskSpec};
+use picofarm_proto::model::{
+    Abilities, SceneKind, StageSpec,
+    memory::{Known, gib, peak_bytes},
+};
 
 /// Furniture that every worker makes by itself.
 pub const PARAMETRIC: &str = "parametric-1";
@@ -13,11 +16,19 @@ const MOST: u64 = 1024;
 /// A lease takes at most this part of an even share of what is left, so that all workers end together.
 const SHARE: u64 = 2;
 
-/// Whether a worker may run a stage's tasks.
+/// Memory that a stage's task takes at most on a worker, and what the worker's tasks may take, in bytes; `None` where it
+/// fits, or where one of them is not known.
+pub fn lacks_memory(stage: &StageSpec, known: &Known, worker: &Abilities) -> Option<(u64, u64)> {
+    let there = worker.memory_mib << 20;
+    let needed = peak_bytes(&stage.task, known, worker.cores)?;
+    (there > 0 && needed > there).then_some((needed, there))
+}
+
+/// Whether a worker may run a stage's tasks, of which so much is `known` as the job tells.
 ///
 /// # Errors
 /// Why not, in words.
-pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
+pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(), String> {
     let (kind, version) = (stage.task.kind(), stage.task.version());
     match worker.kinds.get(kind) {
         None => return Err(format!("the worker runs no {kind} tasks")),
@@ -32,11 +43,7 @@ pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
         }
         Some(_) => {}
     }
-    let scenes = match &stage.task {
-        TaskSpec::Generate(task) => Some(&task.scenes),
-        task => task.as_render().map(|task| &task.scenes),
-    };
-    if let Some(scenes) = scenes
+    if let Some(scenes) = stage.task.scenes()
         && let SceneKind::Furnished { assets, .. } = &scenes.kind
         && assets != PARAMETRIC
         && !worker.assets.contains(assets)
@@ -57,6 +64,13 @@ pub fn may_run(stage: &StageSpec, worker: &Abilities) -> Result<(), String> {
         return Err(format!(
             "the stage needs {} GiB of memory, the worker has {memory_gib:.1}",
             needs.memory_gib
+        ));
+    }
+    if let Some((needed, there)) = lacks_memory(stage, known, worker) {
+        return Err(format!(
+            "a task takes about {} of memory, the worker's tasks may take {}",
+            gib(needed),
+            gib(there)
         ));
     }
     if needs.gpus > worker.gpus {

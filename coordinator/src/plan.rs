@@ -5,8 +5,7 @@ use std::collections::BTreeSet;
 use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    key::{StageKey, render_stage_key, spec_hash},
-    model::{JobPlan, JobSpec, SceneKind, SpecError, StagePlan, StageSpec, TaskSpec},
+    model::{JobPlan, JobSpec, SpecError, StagePlan, StageSpec, memory::peak_bytes},
 };
 use serde_json::Value;
 
@@ -43,16 +42,21 @@ pub fn expand(
     ranges
 }
 
-/// What submitting `spec` would do, given for each stage the outputs of exactly its settings, the job that has this spec,
-/// and recent jobs, latest first, to compare with.
+/// Threads of the worker that a plan counts memory for; each keeps some megabytes of its own.
+const THREADS: u32 = 8;
+
+/// What submitting `spec` would do, given its hash, for each stage the outputs of exactly its settings, the job that has
+/// this spec, and recent jobs, latest first, to compare with.
 pub fn plan(
     spec: &JobSpec,
+    hash: &str,
     existing: &[Vec<Run>],
     existing_job: Option<JobId>,
     recent: &[Job],
 ) -> JobPlan {
     let mut stages = Vec::with_capacity(spec.stages.len());
-    for (stage, existing) in spec.stages.iter().zip(existing) {
+    for (position, (stage, existing)) in spec.stages.iter().zip(existing).enumerate() {
+        let memory = peak_bytes(&stage.task, &spec.known(position), THREADS);
         let total = stage.tasks();
         let there: u64 = existing
             .iter()
@@ -65,11 +69,12 @@ pub fn plan(
             total,
             reuse,
             run: total - reuse,
+            memory_bytes: memory.unwrap_or(0),
             reasons: reasons(stage, total, there, recent),
         });
     }
     JobPlan {
-        spec_hash: spec_hash(spec),
+        spec_hash: hash.to_owned(),
         total: stages.iter().map(|s| s.total).sum(),
         reuse: stages.iter().map(|s| s.reuse).sum(),
         run: stages.iter().map(|s| s.run).sum(),
@@ -182,66 +187,35 @@ fn differences(told: &mut Vec<String>, path: String, was: Option<&Value>, is: Op
 /// [`SpecError`] naming the field.
 pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
     let mut stages = spec.stages.iter();
-    stages.try_for_each(|stage| resolved(stage).map_err(|e| spec.at(stage, e)))
+    stages.try_for_each(|stage| stage.check_resolved().map_err(|e| spec.at(stage, e)))
 }
 
-fn resolved(stage: &StageSpec) -> Result<(), SpecError> {
-    if stage.task.version().is_empty() {
-        let (field, whose) = match stage.task.kind() {
-            "render" | "part" => ("render.renderer", "renderer"),
-            "generate" => ("generate.version", "scene generator"),
-            "import" => ("import.version", "importer"),
-            "train" => ("train.version", "training's code"),
-            "evaluate" => ("evaluate.version", "networks' code"),
-            "infer" => ("infer.version", "networks' code"),
-            "report" => ("report.version", "networks' code"),
-            _ => ("reprocess.version", "sensor model"),
+#[cfg(test)]
+mod tests {
+    use picofarm_proto::model::{PromoteSettings, PromoteTask, SourceSettings, TaskSpec};
+
+    use super::*;
+
+    #[test]
+    fn a_stage_without_a_version_gets_an_error_about_itself() {
+        let promote = PromoteTask {
+            source: SourceSettings {
+                store: "s".into(),
+                dataset: "d".into(),
+            },
+            count: 1,
+            promote: PromoteSettings {
+                model: "best".into(),
+                among: vec!["a".into()],
+                tolerate_missing: false,
+                version: String::new(),
+            },
         };
-        return Err(SpecError::new(
-            field,
-            format!("is empty; the client must fill in the {whose}'s version before it submits"),
-        ));
-    }
-    if let TaskSpec::Part(task) = &stage.task
-        && StageKey::parse(&task.joined_by) != Some(render_stage_key(&task.whole))
-    {
-        let what = format!(
-            "{:?} is not the key of such a render stage; the client must fill it in",
-            task.joined_by
+        let stage = StageSpec::new(TaskSpec::Promote(promote));
+        let said = stage.check_resolved().unwrap_err().to_string();
+        assert!(
+            said.contains("promote.version") && said.contains("kind \"promote\""),
+            "{said}"
         );
-        return Err(SpecError::new("joined_by", what));
-    }
-    let scenes = match &stage.task {
-        TaskSpec::Generate(task) => &task.scenes,
-        task => match task.as_render() {
-            Some(task) => &task.scenes,
-            None => return Ok(()),
-        },
-    };
-    match &scenes.kind {
-        SceneKind::Furnished { assets, .. }
-            if matches!(
-                assets.as_str(),
-                "" | "auto" | "parametric" | "sweethome3d" | "gltf"
-            ) =>
-        {
-            Err(SpecError::new(
-                "scenes.assets",
-                format!(
-                    "{assets:?} is not a fingerprint; the client must resolve it (e.g. to \"parametric-1\") before it submits"
-                ),
-            ))
-        }
-        SceneKind::Files { files, .. } => match files.iter().find(|f| f.sha256.len() != 64) {
-            Some(file) => Err(SpecError::new(
-                "scenes.files",
-                format!(
-                    "{:?} has no SHA-256; the client must hash each file before it submits",
-                    file.path
-                ),
-            )),
-            None => Ok(()),
-        },
-        _ => Ok(()),
     }
 }

@@ -7,21 +7,29 @@ use picofarm_proto::credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
 use tokio::{
     net::TcpListener,
-    sync::{Mutex, mpsc, watch},
+    runtime::Handle,
+    sync::{mpsc, watch},
     task::JoinHandle,
 };
 use tokio_util::sync::CancellationToken;
-use tonic::transport::{Server, server::TcpIncoming};
+use tonic::transport::Server;
 
 use crate::{
     actor::Actor,
-    auth::{Access, Gate, Guard, Quotas, TlsFiles, TokenError},
+    audit::Audit,
+    auth::{Access, Gate, Guard, Quotas, TokenError},
     budget::Backoff,
     clock::Clock,
+    connections::{Connections, Streams, accept, follow_certificates, raise_open_files},
     core::Settings,
-    http::{self, Pages, Pulse},
+    forget,
+    health::Health,
+    http::{self, Kept, Pages},
+    lanes::Lanes,
     metrics::Metrics,
     rpc::{FarmService, JobsService, Link},
+    stored::Stored,
+    submission::Submissions,
     timed::Timed,
 };
 
@@ -33,6 +41,8 @@ const MAX_WORKER_MESSAGE_BYTES: usize = 1 << 20;
 const MAX_HEADERS_BYTES: u32 = 16 << 10;
 /// Commands that may wait for the actor; more senders wait for room.
 const QUEUE: usize = 8192;
+/// How long the last lines of the audit log may take.
+const LAST_LINES: Duration = Duration::from_secs(5);
 /// How often an idle connection is probed, and how long an answer may take.
 const KEEPALIVE: Duration = Duration::from_secs(20);
 
@@ -64,11 +74,17 @@ pub struct CoordinatorConfig {
     pub access: Access,
     /// The most of everything.
     pub quotas: Quotas,
+    /// Bounds on connections.
+    pub connections: Connections,
     /// Where `/healthz`, `/readyz` and `/metrics` are served, for anyone who reaches it; port 0 = any free port; by default
     /// nowhere.
     pub http: Option<SocketAddr>,
     /// Jobs that ended so long ago are forgotten, with their history; by default never.
     pub forget_after: Option<Duration>,
+    /// How long lines of the audit log are kept (default a year).
+    pub audit_for: Duration,
+    /// What looks into stores for results that are recorded; by default nothing does, and workers look for them.
+    pub stored: Option<Arc<dyn Stored>>,
 }
 
 impl CoordinatorConfig {
@@ -87,8 +103,11 @@ impl CoordinatorConfig {
             clock: Clock::system(),
             access: Access::default(),
             quotas: Quotas::default(),
+            connections: Connections::default(),
             http: None,
             forget_after: None,
+            audit_for: Duration::from_secs(365 * 86_400),
+            stored: None,
         }
     }
 }
@@ -178,8 +197,19 @@ pub async fn serve(
             config.heartbeat_ms, config.lease_ms
         )));
     }
-    let tls = config.access.tls.as_ref().map(TlsFiles::read).transpose()?;
-    let gate = Gate::new(&config.access, shutdown.clone())?;
+    let tls = match &config.access.tls {
+        None => None,
+        Some(files) => {
+            let loaded = files.read()?;
+            files.tell(&loaded);
+            Some((files.clone(), loaded))
+        }
+    };
+    let doors = Arc::new(config.connections.doors(raise_open_files()));
+    let (all, per_address) = doors.bounds();
+    tracing::info!(all, per_address, "connections at most");
+    let (audit, writer) = Audit::new(config.clock.clone());
+    let gate = Gate::new(&config.access, &audit, shutdown.clone())?;
     let (listener, address) = listen(config.listen).await?;
     let endpoint = match config.http {
         Some(address) => Some(listen(address).await?),
@@ -189,9 +219,20 @@ pub async fn serve(
     let holder = format!("process {}, listening on {address}", std::process::id());
     let catalog = config.catalog.open(&holder).await?;
 
+    let writer = writer.run(Arc::clone(&catalog), config.audit_for, config.clock.clone());
+    let writer = tokio::spawn(writer);
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
-    let (metrics, pulse) = (Arc::new(Metrics::default()), Arc::new(Pulse::default()));
+    let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
+    let lanes = Lanes::new(shutdown.clone());
+    let submissions = Submissions::new(
+        Arc::clone(&catalog),
+        lanes.clone(),
+        config.stored,
+        commands.clone(),
+        config.clock.clone(),
+        config.access.visibility,
+    );
     let actor = Actor {
         catalog: Arc::clone(&catalog),
         settings: Settings {
@@ -202,42 +243,54 @@ pub async fn serve(
             slow_ms: config.slow_ms,
         },
         tick: config.tick,
-        forget_after: config.forget_after,
         clock: config.clock.clone(),
         revision,
         metrics: Arc::clone(&metrics),
-        pulse: Arc::clone(&pulse),
+        health: Arc::clone(&health),
         stop: shutdown.clone(),
+        aside: Arc::new(submissions.clone()),
     };
     let link = Link {
         commands,
         revision: seen,
-        catalog,
+        catalog: Arc::clone(&catalog),
+        visibility: config.access.visibility,
+        audit: audit.clone(),
         stop: shutdown.clone(),
         name: holder.into(),
         clock: config.clock,
         lease_ms: config.lease_ms,
         heartbeat_ms: config.heartbeat_ms,
+        lanes,
+        submissions,
     };
     if let Some((listener, address)) = endpoint {
         let pages = Pages {
             link: link.clone(),
             metrics: Arc::clone(&metrics),
-            pulse,
-            gauges: Mutex::new(None),
+            health,
+            doors: Arc::clone(&doors),
+            gauges: Kept::default(),
+            main: Handle::current(),
         };
         tracing::info!(%address, "health and metrics over HTTP");
-        tokio::spawn(http::run(listener, Arc::new(pages), shutdown.clone()));
+        let failed = |source| CoordinatorError::Listen { address, source };
+        let listener = listener.into_std().map_err(failed)?;
+        http::start(listener, Arc::new(pages), shutdown.clone()).map_err(failed)?;
+    }
+    if let Some(age) = config.forget_after {
+        let (catalog, clock) = (Arc::clone(&link.catalog), link.clock.clone());
+        tokio::spawn(forget::run(catalog, clock, age, shutdown.clone()));
     }
     let actor = tokio::spawn(actor.run(queue));
-    let mut server = Server::builder();
-    if let Some(tls) = tls {
-        server = server.tls_config(tls)?;
-    }
-    let server = server
+    let tls = tls
+        .map(|(files, loaded)| follow_certificates(files, loaded, audit.clone(), shutdown.clone()));
+    let connections = accept(listener, doors, config.connections, tls, shutdown.clone());
+    let server = Server::builder()
         .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))
         .layer(Timed(metrics))
-        .layer(Guard::new(gate))
+        .layer(Guard::new(gate, audit))
+        .layer(Streams)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
         .add_service(
@@ -250,15 +303,15 @@ pub async fn serve(
                 .max_decoding_message_size(MAX_WORKER_MESSAGE_BYTES)
                 .max_encoding_message_size(MAX_MESSAGE_BYTES),
         )
-        .serve_with_incoming_shutdown(
-            TcpIncoming::from(listener).with_nodelay(Some(true)),
-            shutdown.clone().cancelled_owned(),
-        );
+        .serve_with_incoming_shutdown(connections, shutdown.clone().cancelled_owned());
     let task = tokio::spawn(async move {
         let served = server.await;
-        // Whatever ended the server ends the actor too, which closes the catalog.
+        // Whatever ended the server ends the actor too.
         shutdown.cancel();
         actor.await.expect("the actor catches panics");
+        // Lines that are under way; a handler that hangs keeps its end, and shall not keep the catalog.
+        let _ = tokio::time::timeout(LAST_LINES, writer).await;
+        catalog.close().await;
         Ok(served?)
     });
     tracing::info!(%address, catalog = %config.catalog, "coordinator listens");

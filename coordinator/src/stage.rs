@@ -22,10 +22,15 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Takes a range in hand that is this house's in the catalog; a pending one joins its neighbours.
+    /// Takes a range in hand that is this instance's in the catalog; a pending one joins its neighbours.
     pub fn receive(&mut self, mut range: Range, changes: &mut Changes) {
-        // One that was another house's for a while is not what it was here.
+        // One that was another instance's for a while is not what it was here.
         self.forget(range.id);
+        debug_assert_eq!(
+            self.outdated_by(&range),
+            [],
+            "each task stands in one range"
+        );
         if self.join(&mut range, changes) {
             changes.put(range.clone());
         }
@@ -113,7 +118,7 @@ impl Stage {
         self.leased.get(&id)
     }
 
-    /// Sets the end of a lease by a function of the present one. Only in memory: what another house takes over begins a
+    /// Sets the end of a lease by a function of the present one. Only in memory: what another instance takes over begins a
     /// new period anyway.
     pub fn set_until(&mut self, id: RangeId, to_ms: impl FnOnce(i64) -> i64) {
         if let Some(range) = self.leased.get_mut(&id)
@@ -121,6 +126,19 @@ impl Stage {
         {
             lease.until_ms = to_ms(lease.until_ms);
         }
+    }
+
+    /// A task of a leased range that was done leaves it after all; returns the range as it is then.
+    pub fn leave(&mut self, id: RangeId, task: u64) -> Option<Range> {
+        let range = self.leased.get_mut(&id)?;
+        let at = usize::try_from(task.checked_sub(range.lo)?).ok()?;
+        if let RangeState::Leased(lease) = &mut range.state {
+            let mark = lease.marks.get_mut(at)?;
+            // What is to do is counted, and this was not.
+            debug_assert_ne!(*mark, Mark::Todo, "the task was done");
+            *mark = Mark::Left;
+        }
+        Some(range.clone())
     }
 
     /// The pending range that should go next at this time: fresh ones by index, then the earliest retry.
@@ -147,7 +165,18 @@ impl Stage {
         }
     }
 
-    /// Forgets a leased range that has become another house's.
+    /// Leases in hand that have tasks to do which the catalog says stand in `range`: a worker took them along to another
+    /// instance, and they ended there.
+    pub fn outdated_by(&self, range: &Range) -> Vec<RangeId> {
+        let old = self.leased.values().filter(|leased| {
+            let both = range.lo.max(leased.lo)..range.hi.min(leased.hi);
+            leased.id != range.id && { both }
+                .any(|task| leased.has_to_do(task) && range.has_to_do(task))
+        });
+        old.map(|leased| leased.id).collect()
+    }
+
+    /// Forgets a leased range that has become another instance's.
     pub fn forget(&mut self, id: RangeId) -> Option<Range> {
         let range = self.leased.remove(&id)?;
         self.count(&range, |n, by| *n -= by);

@@ -102,6 +102,7 @@ class Transients:
         scale = group["scale"][scene]
         if not numpy.isfinite(scale):
             raise KeyError(f"{self.location}: scene {scene} is not published")
+        self._check_known(place, scene)
         pixels = {name: (lambda name=name: group[name][scene, rows, columns]) for name in ("depth", "intensity", "specular")}
         make = pixels | {
             "transient": lambda: self._decode(place, group, scene, scale, rows, columns, bins or self.bins),
@@ -110,6 +111,13 @@ class Transients:
             "intrinsics": lambda: group["intrinsics"][scene] - numpy.array([0, 0, columns.start, rows.start], "float32"),
         }
         return {"scene": scene, "scale": scale} | {name: make[name]() for name in self.arrays}
+
+    def _check_known(self, place, scene):
+        """Imports may lack some of the truth; what is stored in its place stands for nothing."""
+        missing = place.json(f"manifests/{scene}.json")["provenance"]["plan"].get("missing", [])
+        lacking = [name for name in self.arrays if name in missing]
+        if lacking:
+            raise ValueError(f"{self.location}: scene {scene} was imported without {', '.join(lacking)}: leave them out of arrays")
 
     def _lit(self, array, scene, rows, columns):
         bits = array[scene, :, rows, columns]

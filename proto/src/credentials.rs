@@ -1,5 +1,5 @@
 //! Certificates, keys and secrets on disk, read the same way by both sides: every error names the file and how to
-//! mend it, and no secret can reach a log.
+//! repair it, and no secret can reach a log.
 
 use std::{
     fmt, io,

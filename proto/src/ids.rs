@@ -72,8 +72,8 @@ id!(
 );
 id!(
     /// One life of a coordinator on a catalog: new at every start and after every failure to write.
-    HouseId,
-    "house"
+    InstanceId,
+    "instance"
 );
 
 /// A stage of a job; its tasks have indices from 0.

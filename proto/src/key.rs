@@ -6,11 +6,7 @@ use std::{collections::BTreeMap, fmt};
 use sha2::{Digest, Sha256};
 
 use crate::{
-    model::{
-        Histogram, JobSpec, RenderTask, ReportSettings, ReprocessSettings, SceneKind, SceneSource,
-        SourceSettings, StageSpec, TaskSpec, TrainSettings,
-        task::{EXPORT_VERSION, SPLIT_VERSION},
-    },
+    model::{Histogram, JobSpec, ReportSettings, ReprocessSettings, StageSpec, TrainSettings},
     split::SplitSettings,
 };
 
@@ -47,116 +43,17 @@ macro_rules! hex_text {
 hex_text!(StageKey);
 hex_text!(TaskKey);
 
+impl StageKey {
+    /// Of a description of all that shapes the results of a stage's tasks but their number.
+    pub fn of(description: serde_json::Value) -> Self {
+        Self(Sha256::digest(canonical(description).as_bytes()).into())
+    }
+}
+
 /// The key of a stage: everything that shapes the results of its tasks but their number. A data set that is read counts
 /// by its place.
 pub fn stage_key(stage: &StageSpec) -> StageKey {
-    let source = |s: &SourceSettings| serde_json::json!([s.store, s.dataset]);
-    let description = match &stage.task {
-        TaskSpec::Render(task) => return render_stage_key(task),
-        TaskSpec::Part(task) => serde_json::json!({
-            "stage": "part",
-            "whole": render_stage_key(&task.whole).to_string(),
-            "parts": task.whole.parts,
-        }),
-        TaskSpec::Generate(task) => serde_json::json!({
-            "stage": "generate",
-            "scenes": scenes_of(&task.scenes),
-            "seed": task.scenes.seed,
-            "fov_deg": task.scenes.fov_deg,
-            "spots": task.scenes.spots,
-            "format": task.generate.format,
-            "resolution": task.generate.resolution,
-            "version": task.generate.version,
-        }),
-        TaskSpec::Import(task) => serde_json::json!({
-            "stage": "import",
-            "import": serde_json::to_value(&task.import).expect("settings are plain data"),
-            "profile": task.output.profile,
-        }),
-        TaskSpec::Reprocess(task) => serde_json::json!({
-            "stage": "reprocess",
-            "source": source(&task.source),
-            "settings": reprocess_stage_key(&task.reprocess, &task.output.profile).to_string(),
-        }),
-        TaskSpec::Split(task) => serde_json::json!({
-            "stage": SPLIT_VERSION,
-            "source": source(&task.source),
-            "count": task.count,
-            "settings": serde_json::to_value(&task.split).expect("settings are plain data"),
-        }),
-        TaskSpec::Export(task) => serde_json::json!({
-            "stage": EXPORT_VERSION,
-            "source": source(&task.source),
-            "count": task.count,
-            "settings": serde_json::to_value(&task.export).expect("settings are plain data"),
-        }),
-        TaskSpec::Train(task) => {
-            let mut description = serde_json::json!({
-                "stage": "train",
-                "source": source(&task.source),
-                "count": task.count,
-                "model": task.train.model,
-                "settings": task.train.shaping(),
-            });
-            if let Some(trial) = &task.train.trial {
-                description["trial"] = serde_json::to_value(trial).expect("plain data");
-            }
-            description
-        }
-        TaskSpec::Evaluate(task) => serde_json::json!({
-            "stage": "evaluate",
-            "source": source(&task.source),
-            "count": task.count,
-            "settings": serde_json::to_value(&task.evaluate).expect("settings are plain data"),
-        }),
-        TaskSpec::Promote(task) => serde_json::json!({
-            "stage": "promote",
-            "source": source(&task.source),
-            "settings": serde_json::to_value(&task.promote).expect("settings are plain data"),
-        }),
-        TaskSpec::Infer(task) => serde_json::json!({
-            "stage": "infer",
-            "source": source(&task.source),
-            "settings": serde_json::to_value(&task.infer).expect("settings are plain data"),
-        }),
-        TaskSpec::Report(task) => serde_json::json!({
-            "stage": "report",
-            "settings": serde_json::to_value(&task.report).expect("settings are plain data"),
-        }),
-    };
-    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
-}
-
-/// The key of a render stage: scene source (without `count`), render settings and codec profile.
-/// File scenes count by content and position, not by path; the place where results go does not count.
-pub fn render_stage_key(task: &RenderTask) -> StageKey {
-    let description = serde_json::json!({
-        "task": "render",
-        "scenes": scenes_of(&task.scenes),
-        "seed": task.scenes.seed,
-        "fov_deg": task.scenes.fov_deg,
-        "spots": task.scenes.spots,
-        "render": serde_json::to_value(&task.render).expect("settings are plain data"),
-        "profile": task.output.profile,
-    });
-    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
-}
-
-/// Where scenes come from, as keys know it.
-fn scenes_of(source: &SceneSource) -> serde_json::Value {
-    match &source.kind {
-        SceneKind::Furnished {
-            assets,
-            min_specular,
-        } => {
-            serde_json::json!({"kind": "furnished", "assets": assets, "min_specular": min_specular})
-        }
-        SceneKind::Primitive => serde_json::json!({"kind": "primitive"}),
-        SceneKind::Files { files, .. } => serde_json::json!({
-            "kind": "files",
-            "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
-        }),
-    }
+    StageKey::of(stage.task.shaping())
 }
 
 /// The key of task `index` of a stage.
@@ -180,7 +77,7 @@ pub fn reprocess_stage_key(settings: &ReprocessSettings, profile: &str) -> Stage
         "version": settings.version,
         "profile": profile,
     });
-    StageKey(Sha256::digest(canonical(description).as_bytes()).into())
+    StageKey::of(description)
 }
 
 /// The key of a task that makes one scene of another: the stage, and the key of the task that made the source.

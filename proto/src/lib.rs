@@ -6,6 +6,7 @@ pub mod credentials;
 pub mod ids;
 pub mod key;
 pub mod model;
+pub mod show;
 pub mod split;
 pub mod trace;
 

@@ -180,7 +180,7 @@ fn what_cannot_be_is_refused_by_name() {
         spec.check().unwrap_err()
     };
     assert_eq!(limits("deadline = \"tomorrow\"").field, "limits.deadline");
-    assert_eq!(limits("max_failures = 0").field, "limits");
+    assert_eq!(limits("max_failures = 0").field, "limits.max_failures");
 }
 
 #[test]
@@ -194,7 +194,7 @@ fn a_lease_brings_only_its_own_files() {
     ))
     .unwrap();
     let part = spec.stages[0].only(3, 5);
-    let scenes = &part.task.as_render().unwrap().scenes;
+    let scenes = part.task.scenes().unwrap();
     let paths: Vec<_> = (0..9)
         .map(|i| scenes.kind.file(i).map(|f| &*f.path))
         .collect();
@@ -238,7 +238,7 @@ fn a_render_stage_in_parts_needs_one_that_renders_them_and_its_result_has_the_sa
     assert_eq!(serde_json::from_str::<JobSpec>(&text).unwrap(), spec);
     // Tasks 4 to 6 are of scenes 0 and 1.
     let leased = spec.stages[0].only(4, 7);
-    let scenes = &leased.task.as_render().unwrap().scenes;
+    let scenes = leased.task.scenes().unwrap();
     let there = [0, 1, 2].map(|i| scenes.kind.file(i).is_some());
     assert_eq!(there, [true, true, false]);
 }

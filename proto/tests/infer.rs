@@ -8,10 +8,10 @@ use picofarm_proto::{
 
 /// A data set, its split, and one model of each kind.
 fn job(stages: &str) -> Result<JobSpec, toml::de::Error> {
-    let train = |name: &str, task: &str, model: &str| {
+    let train = |name: &str, target: &str, model: &str| {
         format!(
             "[[stage]]\nname = \"{name}\"\nkind = \"train\"\nsource = \"rooms\"\n\
-             train = {{ task = \"{task}\", model = \"{model}\" }}\n"
+             train = {{ target = \"{target}\", model = \"{model}\" }}\n"
         )
     };
     let before = [
@@ -79,7 +79,7 @@ fn an_inference_has_a_task_for_each_scene_and_needs_those_who_train_its_models()
 #[test]
 fn an_inference_that_cannot_be_is_refused_before_anything_is_trained() {
     let more = "[[stage]]\nname = \"more\"\nkind = \"train\"\nsource = \"rooms\"\n\
-                train = { task = \"tof\", model = \"e\" }\n";
+                train = { target = \"tof\", model = \"e\" }\n";
     for (stages, part) in [
         (
             more.to_owned() + &infer("models = [\"depth\", \"more\"]", PLACE),

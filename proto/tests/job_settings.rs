@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::{StageKey, spec_hash, stage_key},
-    model::{Choice, JobSpec, SpecError},
+    model::{Choice, JobSpec, RenderTask, SpecError, TaskSpec},
     wire,
 };
 
@@ -47,10 +47,10 @@ fn other_subsets_and_other_strategies_are_other_results() {
         "subsets = [25]",
         "subsets = [4, 25]",
         "per_spot = true",
-        "strategy = { share = 1 }",
-        "strategy = { share = 2 }",
-        "strategy = { image_lobes = false }",
-        "strategy = { image_lobes = true }",
+        "strategy = { path_reuse = 1 }",
+        "strategy = { path_reuse = 2 }",
+        "strategy = { mirror_images = false }",
+        "strategy = { mirror_images = true }",
     ];
     let keys = jobs.map(|job| key(&good(job)));
     for (i, key) in keys.iter().enumerate() {
@@ -63,9 +63,11 @@ fn other_subsets_and_other_strategies_are_other_results() {
 #[test]
 fn subsets_and_strategies_survive_the_wire_and_the_catalog() {
     let spec = good(
-        "subsets = [25, 4]\nper_spot = true\nstrategy = { share = 1, light_vertices = false }",
+        "subsets = [25, 4]\nper_spot = true\nstrategy = { path_reuse = 1, light_vertices = false }",
     );
-    let render = &spec.stages[0].task.as_render().unwrap().render;
+    let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
+        unreachable!("the job renders");
+    };
     assert_eq!(render.subsets, [4, 25]);
     assert_eq!(render.strategy["light_vertices"], Choice::On(false));
     let back = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
@@ -90,9 +92,9 @@ fn what_cannot_be_used_is_named() {
     let (field, what) = at("spots = 100", "subsets = [4, 4]");
     assert!(field == "render.subsets" && what.contains("once"), "{what}");
     assert_eq!(
-        at("", "strategy = { \"image-lobes\" = true }").0,
+        at("", "strategy = { \"mirror-images\" = true }").0,
         "render.strategy"
     );
-    let wrong = read("", "strategy = { share = \"much\" }").unwrap_err();
-    assert!(wrong.to_string().contains("share"), "{wrong}");
+    let wrong = read("", "strategy = { path_reuse = \"much\" }").unwrap_err();
+    assert!(wrong.to_string().contains("path_reuse"), "{wrong}");
 }

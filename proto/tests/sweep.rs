@@ -14,11 +14,11 @@ const DATA: &str = "[[stage]]\nscenes = { kind = \"primitive\", count = 9 }\n\
 fn job(sweep: &str, train: &str, rest: &str) -> Result<JobSpec, toml::de::Error> {
     toml::from_str(&format!(
         "name = \"n\"\n{DATA}[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\nsweep = {{ {sweep} }}\n\
-         train = {{ task = \"tof\", {train} }}\n{rest}"
+         train = {{ target = \"tof\", {train} }}\n{rest}"
     ))
 }
 
-const TRAIN: &str = "model = \"depth\", net = { width = \"{width}\", levels = 3 }, optimise = { rate = \"{lr}\", epochs = 27 }";
+const TRAIN: &str = "model = \"depth\", net = { width = \"{width}\", levels = 3 }, optimise = { learning_rate = \"{lr}\", epochs = 27 }";
 
 fn good(sweep: &str) -> JobSpec {
     let spec = job(sweep, TRAIN, "").unwrap();
@@ -67,7 +67,11 @@ fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
     );
     let fourth = settings(&spec.stages[6]);
     assert_eq!(
-        (&*fourth.model, fourth.optimise.rate, fourth.net.width),
+        (
+            &*fourth.model,
+            fourth.optimise.learning_rate,
+            fourth.net.width
+        ),
         ("depth.4", 0.001, 16)
     );
     let of = trial(&spec.stages[6]);
@@ -103,7 +107,7 @@ fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
 fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
     let over = "over = { lr = { log = [1e-4, 1e-1] }, width = { int = [4, 7] }, decay = { range = [0, 0.5] }, p = [\"f32\"] }";
     let train = "model = \"d\", net = { width = \"{width}\", levels = 3 }, \
-                 optimise = { rate = \"{lr}\", weight_decay = \"{decay}\", precision = \"{p}\" }";
+                 optimise = { learning_rate = \"{lr}\", weight_decay = \"{decay}\", precision = \"{p}\" }";
     let few = job(&format!("trials = 20, seed = 4, {over}"), train, "").unwrap();
     let many = job(&format!("trials = 60, seed = 4, {over}"), train, "").unwrap();
     few.check().unwrap();
@@ -116,9 +120,9 @@ fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
     let (mut low, mut widths) = (0, std::collections::BTreeSet::new());
     for settings in of(&many) {
         let o = &settings.optimise;
-        assert!((1e-4..=1e-1).contains(&o.rate) && (0.0..=0.5).contains(&o.weight_decay));
+        assert!((1e-4..=1e-1).contains(&o.learning_rate) && (0.0..=0.5).contains(&o.weight_decay));
         assert!((4..=7).contains(&settings.net.width));
-        low += usize::from(o.rate < 10f64.powf(-2.5));
+        low += usize::from(o.learning_rate < 10f64.powf(-2.5));
         widths.insert(settings.net.width);
     }
     // Half of all draws lie in the lower half of the orders of magnitude.
@@ -135,7 +139,7 @@ fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
         .map(|s| {
             format!(
                 "{} {} {}",
-                s.optimise.rate, s.net.width, s.optimise.weight_decay
+                s.optimise.learning_rate, s.net.width, s.optimise.weight_decay
             )
         })
         .collect();
@@ -166,7 +170,7 @@ fn a_matrix_goes_over_sweeps_and_each_has_its_best() {
     let spec: JobSpec = toml::from_str(&format!(
         "name = \"n\"\n{DATA}[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\nmatrix = {{ seed = [1, 2] }}\n\
          sweep = {{ over = {{ lr = [0.1, 0.2] }} }}\n\
-         train = {{ task = \"tof\", model = \"d-{{seed}}\", seed = \"{{seed}}\", optimise = {{ rate = \"{{lr}}\" }} }}\n"
+         train = {{ target = \"tof\", model = \"d-{{seed}}\", seed = \"{{seed}}\", optimise = {{ learning_rate = \"{{lr}}\" }} }}\n"
     ))
     .unwrap();
     spec.check().unwrap();

@@ -50,9 +50,9 @@ fn settings(stage: &StageSpec) -> &TrainSettings {
 
 #[test]
 fn what_is_left_out_is_as_in_the_paper() {
-    let spec = good(&train("tof", "task = \"tof\", model = \"m\""));
+    let spec = good(&train("tof", "target = \"tof\", model = \"m\""));
     let s = settings(&spec.stages[2]);
-    assert_eq!((s.task, &*s.split, s.scenes), (Target::Tof, "default", 0));
+    assert_eq!((s.target, &*s.split, s.scenes), (Target::Tof, "default", 0));
     assert_eq!(
         (s.histogram, s.augment, s.seed),
         (Histogram::Transient, true, 0)
@@ -66,7 +66,7 @@ fn what_is_left_out_is_as_in_the_paper() {
     );
     let o = &s.optimise;
     assert_eq!((o.epochs, o.batch, o.accumulate), (200, 32, 1));
-    assert_eq!((o.rate, o.weight_decay), (1e-2, 1e-3));
+    assert_eq!((o.learning_rate, o.weight_decay), (1e-2, 1e-3));
     assert_eq!(
         (o.schedule, o.precision),
         (Schedule::Onecycle, Precision::F32)
@@ -76,18 +76,18 @@ fn what_is_left_out_is_as_in_the_paper() {
 
 #[test]
 fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
-    let stages = train("tof", "task = \"tof\", model = \"first\"")
+    let stages = train("tof", "target = \"tof\", model = \"first\"")
         + &train(
             "shadow",
-            "task = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
+            "target = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
         )
         + &train(
             "mirror",
-            "task = \"specular\", model = \"m\", specular = { on = \"first\" }",
+            "target = \"specular\", model = \"m\", specular = { on = \"first\" }",
         )
         + &train(
             "other",
-            "task = \"tof\", model = \"o\", split = \"half\", from = \"from-last-year\"",
+            "target = \"tof\", model = \"o\", split = \"half\", from = \"from-last-year\"",
         );
     let spec = good(&stages);
     let [_, _, tof, shadow, mirror, other] = &spec.stages[..] else {
@@ -107,9 +107,9 @@ fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
 
 #[test]
 fn a_model_called_like_a_stage_goes_before_the_stage() {
-    let stages = train("a", "task = \"tof\", model = \"b\"")
-        + &train("b", "task = \"tof\", model = \"c\"")
-        + &train("d", "task = \"tof\", model = \"d\", from = \"a\"");
+    let stages = train("a", "target = \"tof\", model = \"b\"")
+        + &train("b", "target = \"tof\", model = \"c\"")
+        + &train("d", "target = \"tof\", model = \"d\", from = \"a\"");
     let mut spec = good(&stages);
     assert_eq!(settings(&spec.stages[4]).from, "b");
     assert_eq!(spec.stages[4].needs, ["render", "split", "a"]);
@@ -122,15 +122,18 @@ fn a_model_called_like_a_stage_goes_before_the_stage() {
 fn a_matrix_goes_over_any_field_and_its_models_are_evaluated_together() {
     let sweep = "[[stage]]\nname = \"tof\"\nkind = \"train\"\nsource = \"render\"\n\
                  matrix = { lr = [0.01, 0.001], width = [8] }\n\
-                 train = { task = \"tof\", model = \"tof-{lr}\", net = { width = \"{width}\", levels = 3 }, \
-                 optimise = { rate = \"{lr}\" } }\n";
+                 train = { target = \"tof\", model = \"tof-{lr}\", net = { width = \"{width}\", levels = 3 }, \
+                 optimise = { learning_rate = \"{lr}\" } }\n";
     let spec = good(&(sweep.to_owned() + &evaluate("models = [\"tof\", \"old\"]")));
     let [_, _, one, two, evaluation] = &spec.stages[..] else {
         panic!("{spec:?}");
     };
     assert_eq!(one.name, "tof[0.01,8]");
     assert_eq!(
-        (settings(one).optimise.rate, settings(two).optimise.rate),
+        (
+            settings(one).optimise.learning_rate,
+            settings(two).optimise.learning_rate
+        ),
         (0.01, 0.001)
     );
     assert_eq!(
@@ -151,7 +154,7 @@ fn a_matrix_goes_over_any_field_and_its_models_are_evaluated_together() {
     );
     let one_of_many = train(
         "s",
-        "task = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
+        "target = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
     );
     let said = refused(&(sweep.to_owned() + &one_of_many));
     assert!(said.contains("stands for 2 models"), "{said}");
@@ -160,12 +163,15 @@ fn a_matrix_goes_over_any_field_and_its_models_are_evaluated_together() {
 #[test]
 fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
     let key = |settings: &str| {
-        let text = format!("task = \"shadow\", model = \"m\"{settings}");
+        let text = format!("target = \"shadow\", model = \"m\"{settings}");
         stage_key(&good(&train("t", &text)).stages[2])
     };
     let plain = key("");
     assert_eq!(key(", checkpoint_minutes = 1.0"), plain);
-    assert_eq!(key(", optimise = { rate = 0.01 }, seed = 0"), plain);
+    assert_eq!(
+        key(", optimise = { learning_rate = 0.01 }, seed = 0"),
+        plain
+    );
     for other in [
         ", seed = 1",
         ", scenes = 3",
@@ -185,89 +191,93 @@ fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
     ] {
         assert_ne!(key(other), plain, "{other}");
     }
-    let other_name = good(&train("t", "task = \"shadow\", model = \"n\""));
+    let other_name = good(&train("t", "target = \"shadow\", model = \"n\""));
     assert_ne!(stage_key(&other_name.stages[2]), plain);
 }
 
 #[test]
 fn an_unusable_field_is_named() {
     for (settings, field, part) in [
-        ("task = \"depth\", model = \"m\"", "", "`tof`, `shadow`"),
-        ("task = \"tof\"", "", "missing field `model`"),
-        ("task = \"tof\", model = \"a/b\"", "train.model", "letters"),
-        ("task = \"tof\", model = \"m\", colour = 1", "", "colour"),
+        ("target = \"depth\", model = \"m\"", "", "`tof`, `shadow`"),
+        ("target = \"tof\"", "", "missing field `model`"),
         (
-            "task = \"tof\", model = \"m\", net = { depth = 3 }",
+            "target = \"tof\", model = \"a/b\"",
+            "train.model",
+            "letters",
+        ),
+        ("target = \"tof\", model = \"m\", colour = 1", "", "colour"),
+        (
+            "target = \"tof\", model = \"m\", net = { depth = 3 }",
             "",
             "depth",
         ),
         (
-            "task = \"tof\", model = \"m\", net = { levels = 0 }",
+            "target = \"tof\", model = \"m\", net = { levels = 0 }",
             "train.net.levels",
             "2..=8",
         ),
         (
-            "task = \"tof\", model = \"m\", net = { time_features = 8 }",
+            "target = \"tof\", model = \"m\", net = { time_features = 8 }",
             "train.net.time_features",
             "unet25d",
         ),
         (
-            "task = \"tof\", model = \"m\", net = { architecture = \"unet25d\", levels = 4, time_features = 100 }",
+            "target = \"tof\", model = \"m\", net = { architecture = \"unet25d\", levels = 4, time_features = 100 }",
             "train.net.time_features",
             "multiple of 8",
         ),
         (
-            "task = \"tof\", model = \"m\", optimise = { batch = 32, accumulate = 5 }",
+            "target = \"tof\", model = \"m\", optimise = { batch = 32, accumulate = 5 }",
             "train.optimise.accumulate",
             "does not divide",
         ),
         (
-            "task = \"tof\", model = \"m\", optimise = { rate = 0.0 }",
-            "train.optimise.rate",
-            "0..=10",
+            "target = \"tof\", model = \"m\", optimise = { learning_rate = 0.0 }",
+            "train.optimise.learning_rate",
+            "..=10",
         ),
         (
-            "task = \"tof\", model = \"m\", shadow = { tof = \"x\" }",
+            "target = \"tof\", model = \"m\", shadow = { tof = \"x\" }",
             "train.shadow",
             "remove",
         ),
         (
-            "task = \"tof\", model = \"m\", specular = { on = \"x\" }",
+            "target = \"tof\", model = \"m\", specular = { on = \"x\" }",
             "train.specular",
             "remove",
         ),
         (
-            "task = \"tof\", model = \"m\", from = \"m\"",
+            "target = \"tof\", model = \"m\", from = \"m\"",
             "train.from",
             "itself",
         ),
         (
-            "task = \"tof\", model = \"m\", spots = [1]",
+            "target = \"tof\", model = \"m\", spots = [1]",
             "train.spots",
             "transient_spots",
         ),
         (
-            "task = \"tof\", model = \"m\", split = \"a b\"",
+            "target = \"tof\", model = \"m\", split = \"a b\"",
             "train.split",
             "letters",
         ),
         (
-            "task = \"tof\", model = \"m\", from = \"render\"",
+            "target = \"tof\", model = \"m\", from = \"render\"",
             "from",
             "trains no model",
         ),
         (
-            "task = \"tof\", model = \"m\", checkpoint_minutes = 0.0",
+            "target = \"tof\", model = \"m\", checkpoint_minutes = 0.0",
             "train.checkpoint_minutes",
             "0.01",
         ),
         (
-            "task = \"specular\", model = \"m\", specular = { on = \"x\" }, from = \"y\"",
+            "target = \"specular\", model = \"m\", specular = { on = \"x\" }, from = \"y\"",
             "train.from",
             "remove",
         ),
         (
-            "task = \"tof\", model = \"m\", input = { max = 4.0 }",
+            "target = \"tof\", model = \"m\", input = { max = 4.0 }",
             "train.input.max",
             "log",
         ),
@@ -287,11 +297,11 @@ fn an_unusable_field_is_named() {
         let said = refused(&evaluate(settings));
         assert!(said.contains(part), "{settings}: {said}");
     }
-    let twice =
-        train("a", "task = \"tof\", model = \"m\"") + &train("b", "task = \"tof\", model = \"m\"");
+    let twice = train("a", "target = \"tof\", model = \"m\"")
+        + &train("b", "target = \"tof\", model = \"m\"");
     assert!(refused(&twice).contains("stage \"a\" trains"));
-    let late = train("a", "task = \"tof\", model = \"a\", from = \"z\"")
-        + &train("b", "task = \"tof\", model = \"z\"");
+    let late = train("a", "target = \"tof\", model = \"a\", from = \"z\"")
+        + &train("b", "target = \"tof\", model = \"z\"");
     assert!(refused(&late).contains("put that before"));
     let folder = "[[stage]]\nname = \"x\"\nscenes = { kind = \"primitive\", count = 9 }\n\
                   output = { store = \"/s\", dataset = \"models\" }\n";
@@ -301,7 +311,7 @@ fn an_unusable_field_is_named() {
 #[test]
 fn settings_without_their_kind_are_refused() {
     let said = refused(
-        "[[stage]]\nkind = \"split\"\nsource = \"render\"\nsplit = { fractions = [1.0, 0.0, 0.0] }\ntrain = { task = \"tof\", model = \"m\" }\n",
+        "[[stage]]\nkind = \"split\"\nsource = \"render\"\nsplit = { fractions = [1.0, 0.0, 0.0] }\ntrain = { target = \"tof\", model = \"m\" }\n",
     );
     assert!(said.contains("belongs to kind = \"train\""), "{said}");
 }

@@ -18,7 +18,7 @@ A delta beam lights a point. mitransient has no light that is a point of a surfa
               beam of 1 W). Any material. One render a spot: the integrator allows one emitter.
   exhaustive  all spots in one render: the same integrator's `exhaustive` capture with our spots in place of its own
               grid, summed in one film. As released, each spot's visibility test also darkens all later spots (a mask is
-              changed in place); mended here by handing over a copy.
+              changed in place); repaired here by handing over a copy.
 
 Without --mode: the fastest that applies of `area` and `laser`, and `exhaustive` where there is more than one spot.
 
@@ -51,7 +51,7 @@ LAUNCH = 1024
 
 
 class AllSpots(transientnlospath.TransientNLOSPath):
-    """`exhaustive` capture over given points of given power, with the shared mask mended."""
+    """`exhaustive` capture over given points of given power, with the shared mask repaired."""
 
     def aim(self, points, powers):
         self.points, self.powers = points, powers

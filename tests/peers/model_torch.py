@@ -153,7 +153,7 @@ class Trial:
         self.model.load_state_dict(state)
         self.model.train()
         learned = [p for p in self.model.parameters() if p.requires_grad]
-        self.optimiser = torch.optim.AdamW(learned, lr=self.spec["rate"], weight_decay=self.spec["decay"])
+        self.optimiser = torch.optim.AdamW(learned, lr=self.spec["learning_rate"], weight_decay=self.spec["decay"])
 
     def ask(self):
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
@@ -161,7 +161,7 @@ class Trial:
 
     def loss(self):
         output = self.ask()
-        if self.spec["task"] == "tof":
+        if self.spec["target"] == "tof":
             return output, F.l1_loss(output, self.target)
         return output, F.binary_cross_entropy_with_logits(output, self.target)
 

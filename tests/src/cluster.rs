@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// One of several coordinators.
-pub struct House {
+pub struct Coordinator {
     process: Option<Process>,
     address: SocketAddr,
     /// Before it; outlives its process.
@@ -21,7 +21,7 @@ pub struct House {
 /// Coordinators, their database and what reaches them.
 pub struct Cluster {
     /// The coordinators.
-    pub houses: Vec<House>,
+    pub coordinators: Vec<Coordinator>,
     cli: Cli,
     lease_s: f64,
     /// The database.
@@ -46,7 +46,7 @@ impl Cluster {
         let postgres = Postgres::start(name)?;
         let scratch = Scratch::new(name);
         let mut cluster = Self {
-            houses: Vec::new(),
+            coordinators: Vec::new(),
             cli: with(Cli::new(scratch.path())),
             lease_s,
             postgres,
@@ -54,7 +54,7 @@ impl Cluster {
         };
         for _ in 0..coordinators {
             let (process, address) = cluster.launch("127.0.0.1:0");
-            cluster.houses.push(House {
+            cluster.coordinators.push(Coordinator {
                 process: Some(process),
                 address,
                 proxy: Proxy::before(address),
@@ -88,29 +88,29 @@ impl Cluster {
     ///
     /// # Panics
     /// When it was killed.
-    pub fn house(&mut self, i: usize) -> &mut Process {
-        self.houses[i].process.as_mut().expect("it runs")
+    pub fn coordinator(&mut self, i: usize) -> &mut Process {
+        self.coordinators[i].process.as_mut().expect("it runs")
     }
 
     /// Ends a coordinator as `kill -9` does.
     ///
     /// # Panics
     /// When it does not run.
-    pub fn kill_house(&mut self, i: usize) {
-        self.houses[i].process.take().expect("it runs").kill();
+    pub fn kill_coordinator(&mut self, i: usize) {
+        self.coordinators[i].process.take().expect("it runs").kill();
     }
 
     /// Starts a killed coordinator where it was.
-    pub fn start_house(&mut self, i: usize) {
-        let listen = self.houses[i].address.to_string();
+    pub fn start_coordinator(&mut self, i: usize) {
+        let listen = self.coordinators[i].address.to_string();
         let (process, _) = self.launch(&listen);
-        self.houses[i].process = Some(process);
+        self.coordinators[i].process = Some(process);
     }
 
     /// The coordinators, as a worker's list that begins with the `first`.
     pub fn urls(&self, first: usize) -> String {
-        let n = self.houses.len();
-        let url = |i: usize| self.houses[(first + i) % n].proxy.url();
+        let n = self.coordinators.len();
+        let url = |i: usize| self.coordinators[(first + i) % n].proxy.url();
         (0..n).map(url).collect::<Vec<_>>().join(",")
     }
 
@@ -125,7 +125,7 @@ impl Cluster {
     /// Commands that go to whichever coordinator answers, past the proxies.
     pub fn cli(&self) -> Cli {
         let urls: Vec<_> = self
-            .houses
+            .coordinators
             .iter()
             .map(|h| format!("http://{}", h.address))
             .collect();

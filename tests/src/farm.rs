@@ -20,6 +20,7 @@ pub struct Farm {
     coordinator: Option<Process>,
     url: Option<String>,
     lease_s: f64,
+    catalog: String,
     cli: Cli,
     /// Its folder.
     pub scratch: Scratch,
@@ -33,11 +34,16 @@ impl Farm {
 
     /// A farm with a running coordinator whose leases live for `lease_s` seconds.
     pub fn with_lease(name: &str, lease_s: f64) -> Self {
-        let scratch = Scratch::new(name);
+        Self::on(Scratch::new(name), "catalog.sqlite", lease_s)
+    }
+
+    /// The same in a folder that is there already, with the catalog at this place in it.
+    pub fn on(scratch: Scratch, catalog: &str, lease_s: f64) -> Self {
         let mut farm = Self {
             coordinator: None,
             url: None,
             lease_s,
+            catalog: catalog.to_owned(),
             cli: Cli::new(scratch.path()),
             scratch,
         };
@@ -63,6 +69,7 @@ impl Farm {
             None => "127.0.0.1:0".into(),
         };
         let lease = self.lease_s.to_string();
+        let stores = self.scratch.path().display().to_string();
         let args = [
             "coordinator",
             "--allow-insecure",
@@ -70,9 +77,14 @@ impl Farm {
             "--log",
             "info",
             "--catalog",
-            "catalog.sqlite",
+            &self.catalog,
         ];
-        let args = [&args[..], &["--listen", &listen, "--lease-s", &lease]].concat();
+        let args = [
+            &args[..],
+            &["--listen", &listen, "--lease-s", &lease],
+            &["--check-stores", &stores],
+        ]
+        .concat();
         let mut process = self.cli.start("coordinator", &args);
         let line = process.first_line();
         let document: Value = serde_json::from_str(&line).expect("the first line is JSON");
@@ -235,6 +247,21 @@ impl Farm {
             }
             before = status["tasks"]["done"].clone();
         }
+    }
+
+    /// The JSON answer of a command, asked again while the coordinator cannot answer.
+    ///
+    /// # Panics
+    /// When it fails for another reason, or for long.
+    pub fn patiently(&self, args: &[&str]) -> Value {
+        until(&format!("an answer to {args:?}"), || {
+            let ended = self.run(&[args, &["--json"]].concat());
+            match ended.code {
+                Some(0) => Some(ended.json()),
+                Some(4) => None,
+                _ => panic!("{args:?}: {}", ended.stderr),
+            }
+        })
     }
 
     /// Waits until the job is done, and checks that each scene was committed exactly once and the data set is whole.

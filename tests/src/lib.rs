@@ -12,6 +12,7 @@ pub mod farm;
 pub mod http;
 pub mod job;
 pub mod mount;
+pub mod poison;
 pub mod postgres;
 pub mod process;
 pub mod proxy;

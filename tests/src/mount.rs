@@ -39,14 +39,35 @@ impl Tmpfs {
     /// # Panics
     /// When the system refuses.
     pub fn remount(&self, options: &str) {
-        let status = Command::new("mount")
+        assert!(self.try_remount(options), "remount,{options}");
+    }
+
+    /// Changes its options; `false` where the system refuses, as it does `ro` while a file is open for writing.
+    ///
+    /// # Panics
+    /// When there is no `mount`.
+    pub fn try_remount(&self, options: &str) -> bool {
+        let output = Command::new("mount")
             .args(["-o", &format!("remount,{options}")])
             .arg(&self.0)
-            .status();
-        assert!(
-            status.expect("there is `mount`").success(),
-            "remount,{options}"
-        );
+            .output();
+        output.expect("there is `mount`").status.success()
+    }
+
+    /// Leaves `kib` KiB free until [`Tmpfs::widen`].
+    ///
+    /// # Panics
+    /// When the system refuses.
+    pub fn fill(&self, kib: u64) {
+        self.remount(&format!("size={}k", self.used_kib() + kib));
+    }
+
+    /// Gives it `mib` MiB.
+    ///
+    /// # Panics
+    /// When the system refuses.
+    pub fn widen(&self, mib: u64) {
+        self.remount(&format!("size={mib}m"));
     }
 
     /// KiB in use.

@@ -54,6 +54,11 @@ impl Process {
         }
     }
 
+    /// Its process id.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Its name.
     pub fn name(&self) -> &str {
         &self.name

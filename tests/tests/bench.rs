@@ -65,9 +65,9 @@ fn a_tiny_benchmark_prints_tables_json_and_a_picture() {
     let names: Vec<_> = variants.map(|v| v["name"].as_str().unwrap()).collect();
     for name in [
         "picofarm",
-        "share=1",
+        "path-reuse=1",
         "light-vertices=off",
-        "image-lobes=off",
+        "mirror-images=off",
     ] {
         assert!(names.contains(&name), "{name} in {names:?}");
     }
@@ -144,7 +144,7 @@ fn strategies_are_compared_row_by_row() {
         "--error",
         "50%",
         "--strategies",
-        "default,share=1+image-lobes=off",
+        "default,path-reuse=1+mirror-images=off",
         "--plot",
         "plot.png",
     ];
@@ -154,7 +154,7 @@ fn strategies_are_compared_row_by_row() {
         .iter()
         .map(|v| v["name"].as_str().unwrap())
         .collect();
-    assert_eq!(names, ["picofarm", "share=1+image-lobes=off"]);
+    assert_eq!(names, ["picofarm", "path-reuse=1+mirror-images=off"]);
     let rays = |k: usize| variants[k]["rungs"][1]["rays"].as_u64().unwrap();
     assert_ne!(rays(0), rays(1), "they work in other ways: {found}");
     assert!(scratch.join("plot.png").is_file());

@@ -1,6 +1,7 @@
 //! Two coordinators on one Postgres, six workers behind proxies, and a seeded hand that kills, freezes, cuts off and
-//! delays any of them, the database and the store too. At the end every scene was committed once, and the store holds
-//! the objects of an undisturbed run, bit for bit, and no others.
+//! delays any of them, the database and the store too, fills the store's disk or makes it read-only, submits scenes that
+//! no catalog can speak of, and sends what no worker would. At the end every scene was committed once, the bad jobs have
+//! failed with their reason, and the store holds the objects of an undisturbed run, bit for bit, and no others.
 //!
 //! The short form runs with all tests. The long one: `PICOFARM_CHAOS=300 tests/run -E 'binary(chaos)'` (rounds).
 
@@ -10,7 +11,8 @@ use std::{
 };
 
 use picofarm_tests::{
-    Cluster, Job, Process, Signal, farm::undisturbed, proxy::Mode, rng::Rng, s3, store,
+    Cluster, Job, Process, Signal, farm::undisturbed, mount::Tmpfs, poison, proxy::Mode, rng::Rng,
+    s3, store, wait::until,
 };
 
 /// Short, so that what is frozen for longer is soon lost.
@@ -19,6 +21,8 @@ const WORKERS: usize = 6;
 
 /// Rounds of the short form.
 const ROUNDS: u64 = 10;
+/// Size of the store's disk when it is well, MiB.
+const DISK_MIB: u64 = 256;
 
 fn rounds() -> u64 {
     std::env::var("PICOFARM_CHAOS").map_or(ROUNDS, |n| {
@@ -55,54 +59,119 @@ impl Crew {
     }
 }
 
-/// One misfortune, and its end.
-fn strike(cluster: &mut Cluster, crew: &mut Crew, server: Option<&mut s3::Server>, rng: &mut Rng) {
-    let which = (rng.number() % cluster.houses.len() as u64) as usize;
-    let who = (rng.number() % WORKERS as u64) as usize;
-    let kinds = if server.is_some() { 9 } else { 8 };
-    match rng.number() % kinds {
-        0 => {
-            let new = crew.start(cluster);
-            std::mem::replace(&mut crew.workers[who], new).kill();
-        }
-        1 => {
-            cluster.kill_house(which);
-            sleep(millis(rng, 3_000));
-            cluster.start_house(which);
-        }
-        2 => {
-            crew.workers[who].signal(Signal::Stop);
-            sleep(Duration::from_secs_f64(LEASE_S) + millis(rng, 2_000));
-            crew.workers[who].signal(Signal::Continue);
-        }
-        // Long enough that the other coordinator takes over what this one had.
-        3 => {
-            cluster.house(which).signal(Signal::Stop);
-            sleep(Duration::from_secs(4) + millis(rng, 4_000));
-            cluster.house(which).signal(Signal::Continue);
-        }
-        4 => {
-            let house = &cluster.houses[which];
-            house.proxy.set(Mode::Hold);
-            sleep(millis(rng, 6_000));
-            house.proxy.set(Mode::Pass);
-        }
-        5 => cluster.houses[which].proxy.cut(),
-        6 => {
-            let house = &cluster.houses[which];
-            house.proxy.set(Mode::Delay);
-            sleep(millis(rng, 3_000));
-            house.proxy.set(Mode::Pass);
-        }
-        7 => cluster.postgres.crash(),
-        _ => {
-            let server = server.expect("counted in only where there is one");
-            server.kill();
-            sleep(millis(rng, 2_000));
-            server.up();
+/// Where the objects lie.
+enum Store {
+    Disk(Tmpfs),
+    S3(s3::Server),
+}
+
+impl Store {
+    /// One misfortune, and its end.
+    fn strike(&mut self, rng: &mut Rng) {
+        match self {
+            Self::S3(server) => {
+                server.kill();
+                sleep(millis(rng, 2_000));
+                server.up();
+            }
+            Self::Disk(disk) if rng.number().is_multiple_of(2) => {
+                disk.fill(8);
+                sleep(Duration::from_secs(1) + millis(rng, 3_000));
+                disk.widen(DISK_MIB);
+            }
+            Self::Disk(disk) => {
+                // While somebody writes, the system refuses.
+                until("a moment in which nobody writes", || {
+                    disk.try_remount("ro").then_some(())
+                });
+                sleep(Duration::from_secs(1) + millis(rng, 3_000));
+                disk.remount("rw");
+            }
         }
     }
-    sleep(millis(rng, 800));
+}
+
+/// A cluster at work, and what has been done to it.
+struct Site {
+    crew: Crew,
+    /// Jobs that must fail.
+    poisoned: Vec<String>,
+    store: Store,
+    // A disk is unmounted before its folder goes.
+    cluster: Cluster,
+}
+
+impl Site {
+    fn new(cluster: Cluster, store: Store) -> Self {
+        Self {
+            crew: Crew::new(&cluster),
+            poisoned: Vec::new(),
+            store,
+            cluster,
+        }
+    }
+
+    /// One misfortune, and its end.
+    fn strike(&mut self, rng: &mut Rng) {
+        let cluster = &mut self.cluster;
+        let which = (rng.number() % cluster.coordinators.len() as u64) as usize;
+        let who = (rng.number() % WORKERS as u64) as usize;
+        match rng.number() % 11 {
+            0 => {
+                let new = self.crew.start(cluster);
+                std::mem::replace(&mut self.crew.workers[who], new).kill();
+            }
+            1 => {
+                cluster.kill_coordinator(which);
+                sleep(millis(rng, 3_000));
+                cluster.start_coordinator(which);
+            }
+            2 => {
+                self.crew.workers[who].signal(Signal::Stop);
+                sleep(Duration::from_secs_f64(LEASE_S) + millis(rng, 2_000));
+                self.crew.workers[who].signal(Signal::Continue);
+            }
+            // Long enough that the other coordinator takes over what this one had.
+            3 => {
+                cluster.coordinator(which).signal(Signal::Stop);
+                sleep(Duration::from_secs(4) + millis(rng, 4_000));
+                cluster.coordinator(which).signal(Signal::Continue);
+            }
+            4 => {
+                let coordinator = &cluster.coordinators[which];
+                coordinator.proxy.set(Mode::Hold);
+                sleep(millis(rng, 6_000));
+                coordinator.proxy.set(Mode::Pass);
+            }
+            5 => cluster.coordinators[which].proxy.cut(),
+            6 => {
+                let coordinator = &cluster.coordinators[which];
+                coordinator.proxy.set(Mode::Delay);
+                sleep(millis(rng, 3_000));
+                coordinator.proxy.set(Mode::Pass);
+            }
+            7 => cluster.postgres.crash(),
+            8 => {
+                // Beside the honest job's data set, so that what is left of it is no object of that.
+                let place = cluster.scratch.join("elsewhere");
+                let number = self.poisoned.len() as u64;
+                let job = poison::job(&place, cluster.scratch.path(), number);
+                self.poisoned.push(cluster.submit(&job));
+            }
+            9 => poison::lie(&cluster.coordinators[which].proxy.url()),
+            _ => self.store.strike(rng),
+        }
+        sleep(millis(rng, 800));
+    }
+
+    /// The bad jobs have failed, with their reason.
+    fn assert_poison_told(&self) {
+        for id in &self.poisoned {
+            let status = self.cluster.until_ended(id);
+            assert_eq!(status["state"], "failed", "{status}");
+            poison::assert_told(&self.cluster.events(id));
+        }
+    }
 }
 
 fn done_once(cluster: &Cluster, id: &str, total: u64) {
@@ -127,48 +196,55 @@ fn done_once(cluster: &Cluster, id: &str, total: u64) {
 
 #[test]
 fn whatever_fails_every_scene_is_committed_once_and_the_store_is_as_if_nothing_had() {
-    let Some(mut cluster) = Cluster::start("chaos", 2, LEASE_S) else {
+    let Some(cluster) = Cluster::start("chaos", 2, LEASE_S) else {
+        return;
+    };
+    let Some(disk) = Tmpfs::mount(&cluster.scratch.join("store"), DISK_MIB << 10) else {
         return;
     };
     let mut rng = Rng::new(5);
-    let mut crew = Crew::new(&cluster);
+    let mut site = Site::new(cluster, Store::Disk(disk));
     // The work lasts as long as the misfortunes: a job a few rounds, all into one data set that grows.
     let jobs = rounds().div_ceil(5);
-    let mut job = Job::slow(&cluster.scratch.join("store"), 0);
+    let mut job = Job::slow(&site.cluster.scratch.join("store"), 0);
     for n in 1..=jobs {
         job.count = Some(12 * n);
-        let id = cluster.submit(&job);
+        let id = site.cluster.submit(&job);
         for _ in 0..rounds().div_ceil(jobs) {
-            strike(&mut cluster, &mut crew, None, &mut rng);
+            site.strike(&mut rng);
         }
-        done_once(&cluster, &id, 12 * n);
+        done_once(&site.cluster, &id, 12 * n);
     }
-    drop(crew);
+    site.assert_poison_told();
+    site.crew.workers.clear();
     assert_eq!(store::hashes(&job.place()), undisturbed("chaos", &job));
 }
 
 #[test]
 fn with_objects_on_s3_too() {
-    let Some(mut server) = s3::Server::start("chaos-s3") else {
+    let Some(server) = s3::Server::start("chaos-s3") else {
         return;
     };
-    let Some(mut cluster) = Cluster::reaching("chaos-s3", 2, LEASE_S, |cli| server.with(cli))
-    else {
+    let Some(cluster) = Cluster::reaching("chaos-s3", 2, LEASE_S, |cli| server.with(cli)) else {
         return;
     };
     let mut rng = Rng::new(6);
-    let mut crew = Crew::new(&cluster);
     let bucket = server.bucket();
+    let mut site = Site::new(cluster, Store::S3(server));
     let job = Job {
         store: format!("s3://{bucket}/farm").into(),
-        ..Job::slow(&cluster.scratch.join("unused"), 12)
+        ..Job::slow(&site.cluster.scratch.join("unused"), 12)
     };
-    let id = cluster.submit(&job);
+    let id = site.cluster.submit(&job);
     for _ in 0..rounds().div_ceil(2) {
-        strike(&mut cluster, &mut crew, Some(&mut server), &mut rng);
+        site.strike(&mut rng);
     }
-    done_once(&cluster, &id, 12);
-    drop(crew);
+    done_once(&site.cluster, &id, 12);
+    site.assert_poison_told();
+    site.crew.workers.clear();
+    let Store::S3(server) = &site.store else {
+        unreachable!("it is where it was put");
+    };
     let there = server.hashes(&bucket, &format!("farm/{}", job.dataset));
     assert_eq!(there, undisturbed("chaos-s3", &job));
 }
@@ -191,7 +267,7 @@ fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() 
     for worker in &mut workers {
         worker.until_says("task starts");
     }
-    cluster.kill_house(0);
+    cluster.kill_coordinator(0);
     let killed = Instant::now();
     for worker in &mut workers {
         worker.until_says("reconnected");

@@ -1,4 +1,4 @@
-//! `dataset verify` finds every kind of damage and names the object; mending costs only the damaged scene.
+//! `dataset verify` finds every kind of damage and names the object; repairing costs only the damaged scene.
 
 use std::{fs, path::Path};
 
@@ -100,7 +100,7 @@ fn any_damage_is_repaired_bit_for_bit_and_nothing_else_is_written() {
             let args: Vec<&str> = repair.iter().copied().chain(complete).collect();
             let dry = farm.json(&[&args[..], &["--dry-run"]].concat());
             assert_eq!(dry["scenes"][0]["scene"], 1, "{harm} {key}: {dry}");
-            assert_ne!(store::hashes(&place), whole, "--dry-run mends nothing");
+            assert_ne!(store::hashes(&place), whole, "--dry-run repairs nothing");
             let done = farm.json(&args);
             let written = &done["scenes"][0]["written"];
             let path = place.join(key).display().to_string();

@@ -188,3 +188,52 @@ fn a_split_is_exact_repeatable_and_grows_without_moving_a_scene() {
     assert_eq!(fs::read(&file).unwrap(), v1);
     farm.run(&["dataset", "verify", &place]).ok();
 }
+
+#[test]
+fn a_verify_stage_names_the_damaged_scene_and_is_done_when_it_is_repaired() {
+    let (farm, job) = source("verify-stage", 4);
+    let place = job.place().display().to_string();
+    let file = farm.scratch.join("verify.toml");
+    let text = format!(
+        "name = \"verify\"\n[limits]\nmax_failures = 1\n[[stage]]\nkind = \"verify\"\n\
+         source = {{ store = {:?}, dataset = {:?} }}\n",
+        job.store, job.dataset
+    );
+    fs::write(&file, text).unwrap();
+    let broken = job.place().join("transient/c/2/0/0/0");
+    let whole = fs::read(&broken).unwrap();
+    let mut bytes = whole.clone();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&broken, &bytes).unwrap();
+
+    let before = store::hashes(&job.place());
+    let _worker = farm.worker("verifier");
+    let id = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    let id = id["job"].as_str().unwrap();
+    farm.until_ended(id);
+    assert_eq!((farm.count(id, "done"), farm.count(id, "dead")), (3, 1));
+    let explained = farm.run(&["job", "explain", id, "--task", "2"]).ok().stdout;
+    for part in [
+        "scene 2 is damaged",
+        "transient/c/2/0/0/0",
+        "dataset repair",
+    ] {
+        assert!(explained.contains(part), "{part}: {explained}");
+    }
+    assert_eq!(store::hashes(&job.place()), before, "nothing is written");
+
+    farm.run(&["dataset", "repair", &place]).ok();
+    assert_eq!(fs::read(&broken).unwrap(), whole);
+    farm.run(&["job", "retry", id]).ok();
+    farm.until_ended(id);
+    assert_eq!(farm.count(id, "done"), 4);
+
+    // Sizes alone do not show it.
+    fs::write(&broken, &bytes).unwrap();
+    let text = fs::read_to_string(&file).unwrap() + "verify = { fast = true }\n";
+    fs::write(&file, text).unwrap();
+    let id = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    let id = id["job"].as_str().unwrap();
+    farm.until_ended(id);
+    assert_eq!(farm.count(id, "done"), 4);
+}

@@ -130,9 +130,9 @@ generate = {{ dest = "{store}/mitsuba", format = "mitsuba" }}
     let repair = ["dataset", "repair", path(&target)];
     cli.run(&repair)
         .fails(6, &["scene 2", "imported", "--files"]);
-    let mended = cli.json(&[&repair[..], &["--files", path(&release)]].concat());
+    let repaired = cli.json(&[&repair[..], &["--files", path(&release)]].concat());
     assert_eq!(
-        mended["scenes"][0]["written"],
+        repaired["scenes"][0]["written"],
         serde_json::json!([path(&broken)])
     );
     assert_eq!(store::hashes(&by_stage), store::hashes(&target));

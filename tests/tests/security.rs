@@ -319,6 +319,57 @@ fn a_worker_touches_only_its_store_prefixes() {
 }
 
 #[test]
+fn a_scene_within_the_prefixes_names_no_file_outside_of_them() {
+    let farm = picofarm_tests::Farm::start("store-prefix-scene");
+    let inside = farm.scratch.join("inside");
+    fs::create_dir(&inside).unwrap();
+    let secret = farm.scratch.join("secret");
+    fs::write(&secret, "root:x:0:0:hunter2\n").unwrap();
+    std::os::unix::fs::symlink(&secret, inside.join("link")).unwrap();
+    let prefix = inside.display().to_string();
+    let args = ["worker", "--threads", "1", "--store-prefix", &prefix];
+    let _worker = farm.cli().start("worker", &args);
+    for (name, root) in [
+        ("link", "inside"),
+        ("../secret", "inside"),
+        ("/etc/passwd", "inside"),
+        ("../secret", "."),
+        ("/etc/passwd", "/"),
+    ] {
+        let scene = format!(
+            r#"<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="60"/></sensor>
+            <shape type="ply"><string name="filename" value="{name}"/></shape></scene>"#
+        );
+        fs::write(inside.join("scene.xml"), scene).unwrap();
+        // Who submits can leave out every check of this program.
+        let job = format!(
+            "name = \"x\"\n[scenes]\nkind = \"files\"\nroot = {root:?}\nfiles = [\"inside/scene.xml\"]\n\
+             [render]\nresolution = 16\nsamples = 2\n[output]\nstore = \"inside/store\"\ndataset = \"d\"\n\
+             [limits]\nmax_failures = 1\n"
+        );
+        fs::write(farm.scratch.join("job.toml"), job).unwrap();
+        let said = farm.cli().run(&["job", "submit", "job.toml", "--json"]);
+        let all = |ended: &picofarm_tests::cli::Ended| format!("{}{}", ended.stdout, ended.stderr);
+        let text = match said.code {
+            Some(0) => {
+                let id = said.ok().json()["job"].as_str().unwrap().to_owned();
+                assert_eq!(farm.until_ended(&id)["state"], "failed");
+                all(&farm.cli().run(&["job", "explain", &id]))
+            }
+            _ => all(&said),
+        };
+        assert!(
+            !text.contains("hunter2") && !text.contains("root:x"),
+            "{text}"
+        );
+        assert!(
+            text.contains("is not opened") || text.contains("may not touch"),
+            "{text}"
+        );
+    }
+}
+
+#[test]
 fn limits_are_named_when_they_are_reached() {
     let scratch = Scratch::new("limits");
     let cli = Cli::new(scratch.path());

@@ -2,7 +2,7 @@
 
 use std::time::SystemTime;
 
-use picofarm_tests::{Farm, Job, Process, mount::Tmpfs, store};
+use picofarm_tests::{Cli, Farm, Job, Process, Scratch, mount::Tmpfs, store, wait::until};
 
 /// A farm with a worker and a finished job of two scenes in a small file system.
 struct Half {
@@ -32,7 +32,7 @@ impl Half {
         })
     }
 
-    /// Asks for five scenes, waits until the worker says `words`, mends the disk with `options`, and checks that
+    /// Asks for five scenes, waits until the worker says `words`, repairs the disk with `options`, and checks that
     /// the job completes with the first two scenes untouched and no failure counted.
     fn grow_through(mut self, words: &str, options: &str) {
         let (farm, job) = (
@@ -85,6 +85,43 @@ fn a_read_only_store_stops_no_process_and_loses_nothing() {
 }
 
 #[test]
+fn a_job_whose_store_cannot_be_written_leaves_the_only_worker_to_others_and_ends_when_it_can() {
+    let farm = Farm::start("store-away");
+    // A file where a folder is expected: not even root writes below it.
+    let blocked = farm.scratch.join("blocked");
+    std::fs::write(&blocked, "").unwrap();
+    let waiting = Job::quick(&blocked.join("store"), 40);
+    waiting.write(&farm.scratch.join("waiting.toml"));
+    let said = farm.run(&["job", "plan", "waiting.toml"]).ok();
+    assert!(
+        said.stderr.contains("cannot be written to") && said.stderr.contains("blocked"),
+        "{}",
+        said.stderr
+    );
+    let first = farm.submit(&waiting);
+    let _worker = farm.worker("only");
+    let explained = || farm.run(&["job", "explain", &first]).ok().stdout;
+    until("the job says that it waits", || {
+        let text = explained();
+        (text.contains("waits for store") && text.contains("next try in")).then_some(())
+    });
+
+    let other = Job::quick(&farm.store(), 3);
+    let second = farm.submit(&other);
+    farm.until_done_once(&other, &second);
+    let status = farm.status(&first);
+    assert_eq!(status["state"], "active", "{status}");
+    assert_eq!(status["tasks"]["dead"], 0, "{status}");
+    // The store is tried by one task now and then, not by each.
+    let tries = farm.events_of(&first, "released").len();
+    assert!(tries < 15, "{tries} tries");
+
+    std::fs::remove_file(&blocked).unwrap();
+    std::fs::create_dir(&blocked).unwrap();
+    farm.until_done_once(&waiting, &first);
+}
+
+#[test]
 fn a_render_onto_a_full_disk_says_so_and_leaves_nothing() {
     let farm = Farm::start("render-full");
     let Some(disk) = Tmpfs::mount(&farm.store(), 64) else {
@@ -113,4 +150,23 @@ fn a_render_onto_a_full_disk_says_so_and_leaves_nothing() {
     ])
     .fails(7, &["full"]);
     assert!(disk.used_kib() < 16, "half a result was left behind");
+}
+
+#[test]
+fn a_full_temporary_folder_stops_no_job_and_the_doctor_names_it() {
+    let scratch = Scratch::new("temp-full");
+    let Some(_disk) = Tmpfs::mount(&scratch.join("tmp"), 64) else {
+        return;
+    };
+    let full = scratch.join("tmp").display().to_string();
+    // As much as there is room for.
+    let _ = std::fs::write(scratch.join("tmp/fill"), [0; 1 << 16]);
+    let cli = Cli::new(scratch.path());
+    let cli = cli.with("TMPDIR", &full).with("SQLITE_TMPDIR", &full);
+    cli.run(&["doctor"])
+        .fails(7, &[&format!("0 B free in {full}"), "free some space"]);
+    let size = ["--scenes", "1", "--samples", "4", "--spots", "4"];
+    let more = ["--assets", "parametric", "--resolution", "8"];
+    let done = cli.json(&[&["demo"], &size[..], &more].concat());
+    assert_eq!(done["scenes"], 1, "{done}");
 }

@@ -1,4 +1,4 @@
-//! A person's way through the commands: write a job, plan, submit, follow, look, stop, mend.
+//! A person's way through the commands: write a job, plan, submit, follow, look, stop, repair.
 
 use std::fs;
 
@@ -41,7 +41,7 @@ fn a_job_from_its_first_line_to_its_data_set() {
         (&2.into(), &2.into(), &0.into())
     );
     assert_eq!(
-        farm.json(&["job", "list"]),
+        farm.json(&["job", "list"])["jobs"],
         json!([]),
         "planning changes nothing"
     );
@@ -65,7 +65,7 @@ fn a_job_from_its_first_line_to_its_data_set() {
         (&ended["state"], &ended["tasks"]["done"]),
         (&"done".into(), &2.into())
     );
-    assert_eq!(farm.json(&["job", "list"])[0]["id"], id);
+    assert_eq!(farm.json(&["job", "list"])["jobs"][0]["id"], id);
     farm.committed_once(id, 2);
     let kinds: Vec<_> = farm.events(id).iter().map(|e| e["kind"].clone()).collect();
     assert_eq!(
@@ -160,7 +160,7 @@ fn a_cancelled_job_stops_keeps_what_it_has_and_can_be_submitted_again() {
 }
 
 #[test]
-fn a_dead_task_is_retried_after_its_cause_is_mended() {
+fn a_dead_task_is_retried_after_its_cause_is_corrected() {
     let farm = Farm::start("retry");
     let cli = farm.cli();
     let generate = [
@@ -272,6 +272,12 @@ fn settings_come_from_flag_then_environment_then_file() {
 #[test]
 fn a_healthy_machine_passes_the_doctor_and_a_folder_that_cannot_store_does_not() {
     let farm = Farm::start("doctor");
+    let mistyped = farm.json(&["doctor", "--store", "stoer"]);
+    let checks = mistyped.as_array().unwrap();
+    let store = checks.iter().find(|c| c["what"] == "store").unwrap();
+    assert_eq!(store["verdict"], "note", "{store}");
+    assert!(!farm.scratch.join("stoer").exists());
+    fs::create_dir_all(farm.store()).unwrap();
     let checks = farm.json(&["doctor", "--store", "store"]);
     let checks = checks.as_array().unwrap();
     let verdict =
@@ -280,6 +286,7 @@ fn a_healthy_machine_passes_the_doctor_and_a_folder_that_cannot_store_does_not()
         (verdict("store"), verdict("coordinator")),
         (json!("ok"), json!("ok"))
     );
+    assert_ne!(verdict("disk"), json!("bad"));
     fs::write(farm.scratch.join("occupied"), "a file").unwrap();
     farm.run(&["doctor", "--store", "occupied"])
         .fails(7, &["store"]);

@@ -115,12 +115,15 @@ fn groups_and_strategies_that_there_are_not_are_refused_with_those_there_are() {
         );
         with(&["--group", "a=25"]).fails(3, &["--group a", "beam 25", "25, counted from 0"]);
         with(&["--groups", "per-spot", "--group", "spots=1"]).fails(3, &["transient_spots"]);
-        with(&["--strategy", "share=99"]).fails(3, &["strategy.share"]);
+        with(&["--strategy", "path-reuse=99"]).fails(3, &["strategy.path_reuse"]);
         with(&["--groups", "5"]).fails(2, &["--groups", "4, 25 or per-spot"]);
         with(&["--group", "left"]).fails(2, &["NAME=BEAM"]);
         let unknown = with(&["--strategy", "lobes=off"]);
-        unknown.fails(2, &["lobes", "share", "light_vertices", "image_lobes"]);
-        with(&["--strategy", "share=on"]).fails(2, &["share", "number"]);
+        unknown.fails(
+            2,
+            &["lobes", "path_reuse", "light_vertices", "mirror_images"],
+        );
+        with(&["--strategy", "path-reuse=on"]).fails(2, &["path_reuse", "number"]);
     }
     let huge = [
         "scene", "render", "room.glb", "--out", "out", "--groups", "per-spot",
@@ -130,7 +133,7 @@ fn groups_and_strategies_that_there_are_not_are_refused_with_those_there_are() {
             7,
             &[
                 "26 histograms of 4096x4096 pixels x 60000 bins",
-                "GB of memory",
+                "GiB of memory",
             ],
         );
     assert!(!scratch.join("out").exists(), "nothing is left behind");
@@ -216,7 +219,7 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
         )
     };
     let _worker = farm.worker("worker");
-    let render = "subsets = [25, 4]\nper_spot = true\nstrategy = { share = 4 }\n";
+    let render = "subsets = [25, 4]\nper_spot = true\nstrategy = { path_reuse = 4 }\n";
     let file = farm.scratch.join("subsets.toml");
     let text = job
         .toml()
@@ -266,18 +269,18 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     for (name, render, part) in [
         (
             "fewer",
-            "subsets = [4]\nper_spot = true\nstrategy = { share = 4 }\n",
+            "subsets = [4]\nper_spot = true\nstrategy = { path_reuse = 4 }\n",
             "render.subsets is [4] and was [4,25]",
         ),
         (
             "none",
-            "subsets = [4, 25]\nstrategy = { share = 4 }\n",
+            "subsets = [4, 25]\nstrategy = { path_reuse = 4 }\n",
             "render.per_spot is unset and was true",
         ),
         (
             "other",
-            &render.replace("share = 4", "share = 2"),
-            "render.strategy.share is 2 and was 4",
+            &render.replace("path_reuse = 4", "path_reuse = 2"),
+            "render.strategy.path_reuse is 2 and was 4",
         ),
     ] {
         let text = job
@@ -301,11 +304,11 @@ fn a_job_with_unknown_subsets_or_strategies_is_refused_by_field() {
     refused("subsets = [7]", &["render.subsets", "7"]);
     refused(
         "strategy = { lobes = false }",
-        &["render.strategy", "lobes", "image_lobes"],
+        &["render.strategy", "lobes", "mirror_images"],
     );
     refused(
-        "strategy = { share = true }",
-        &["render.strategy", "share", "number"],
+        "strategy = { path_reuse = true }",
+        &["render.strategy", "path_reuse", "number"],
     );
-    assert_eq!(farm.json(&["job", "list"]), serde_json::json!([]));
+    assert_eq!(farm.json(&["job", "list"])["jobs"], serde_json::json!([]));
 }

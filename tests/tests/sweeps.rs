@@ -31,10 +31,10 @@ promote = {promote:?}
 halving = {{ first = 4, factor = 3 }}
 over = {{ lr = {{ log = [1e-5, 3e-2] }}, width = {{ int = [2, 6] }} }}
 [stage.train]
-task = "tof"
+target = "tof"
 model = "depth"
 net = {{ width = "{{width}}", levels = 3 }}
-optimise = {{ rate = "{{lr}}", epochs = 108, batch = 4 }}
+optimise = {{ learning_rate = "{{lr}}", epochs = 108, batch = 4 }}
 checkpoint_minutes = 0.01
 [[stage]]
 kind = "evaluate"

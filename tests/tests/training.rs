@@ -34,7 +34,7 @@ name = "tof"
 kind = "train"
 source = "rooms"
 [stage.train]
-task = "tof"
+target = "tof"
 model = "tof"
 net = {{ width = 8, levels = 3 }}
 optimise = {{ epochs = 600, batch = 4 }}
@@ -44,7 +44,7 @@ name = "shadow"
 kind = "train"
 source = "rooms"
 [stage.train]
-task = "shadow"
+target = "shadow"
 model = "shadow"
 shadow = {{ tof = "tof" }}
 net = {{ width = 4, levels = 2 }}
@@ -54,6 +54,7 @@ kind = "evaluate"
 source = "rooms"
 evaluate = {{ models = ["tof", "shadow"] }}
 [[stage]]
+name = "predict"
 kind = "infer"
 source = "rooms"
 infer = {{ models = ["tof", "shadow"] }}
@@ -148,6 +149,55 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     assert_eq!(told(&farm), told(&calm));
     eprintln!("{kills} kills, {resumed} resumptions");
     predictions_can_be_looked_at(&calm);
+    models_can_be_looked_after(&calm);
+}
+
+fn flip(file: &Path) {
+    let mut bytes = fs::read(file).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(file, bytes).unwrap();
+}
+
+fn models_can_be_looked_after(farm: &Farm) {
+    let (store, folder) = (farm.store(), farm.store().join("models/shadow"));
+    let at = store.to_str().unwrap();
+    farm.run(&["model", "verify", at]).ok();
+    let whole = store::hashes(&folder);
+    let of = |part: &str| {
+        let key = whole.keys().find(|key| key.ends_with(part));
+        folder.join(key.expect("a model has it"))
+    };
+    // Figures stand in the manifest, weights nowhere else.
+    let (weights, metrics) = (of("weights.safetensors"), of("metrics.json"));
+    let sound = fs::read(&weights).unwrap();
+    flip(&weights);
+    flip(&metrics);
+    farm.run(&["model", "verify", at, "shadow"])
+        .fails(6, &["weights.safetensors", "metrics.json", "model repair"]);
+    farm.run(&["model", "repair", at, "shadow"])
+        .fails(6, &["weights.safetensors", "--from-stage"]);
+    fs::write(&weights, sound).unwrap();
+    farm.run(&["model", "repair", at, "shadow"]).ok();
+    assert_eq!(store::hashes(&folder), whole);
+    // What others build on stays.
+    farm.run(&["model", "remove", at, "tof"]).fails(
+        3,
+        &[
+            "models were trained with it (shadow)",
+            "predictions were made with it",
+            "--force",
+        ],
+    );
+    farm.run(&["model", "remove", at, "shadow", "--dry-run"])
+        .ok();
+    farm.run(&["model", "verify", at]).ok();
+    let gone = farm.json(&["model", "remove", at, "shadow", "--force"]);
+    assert_eq!(gone["reports"][0], "all");
+    assert!(!folder.join("manifest.json").exists());
+    farm.run(&["model", "remove", at, "shadow"])
+        .fails(3, &["shadow"]);
+    farm.run(&["model", "verify", at]).ok();
 }
 
 fn predictions_can_be_looked_at(farm: &Farm) {
@@ -165,9 +215,23 @@ fn predictions_can_be_looked_at(farm: &Farm) {
         (&whole["scenes"], &whole["objects"]),
         (&16.into(), &32.into())
     );
+    let whole = store::hashes(&seen);
     fs::remove_file(seen.join("lit/c/3/0/0/0")).unwrap();
+    flip(&seen.join("depth/c/5/0/0"));
     farm.run(&["dataset", "verify", "--fast", at])
-        .fails(6, &["lit/c/3/0/0/0: missing", "force = true"]);
+        .fails(6, &["lit/c/3/0/0/0: missing", "--from-stage"]);
+    farm.run(&["dataset", "verify", at])
+        .fails(6, &["depth/c/5/0/0", "--from-stage"]);
+    farm.run(&["dataset", "repair", at])
+        .fails(3, &["what models predict", "--from-stage"]);
+    let file = farm.store().with_file_name("calm.toml");
+    let file = file.to_str().unwrap();
+    let again = farm.json(&["job", "submit", file, "--from-stage", "predict"]);
+    assert_eq!(
+        farm.until_ended(again["job"].as_str().unwrap())["state"],
+        "done"
+    );
+    assert_eq!(store::hashes(&seen), whole, "what was damaged is put back");
     farm.run(&["dataset", "picture", at, "--out", at])
         .fails(3, &["what models predict"]);
 }

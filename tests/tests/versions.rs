@@ -29,6 +29,7 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
         protocol,
         cores: 1,
         held: Vec::new(),
+        ended: String::new(),
         kinds: [("render".to_owned(), "transient-0".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 0,

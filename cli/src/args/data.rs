@@ -48,8 +48,10 @@ pub struct SensorArgs {
 #[derive(Args)]
 pub struct DatasetReprocess {
     /// Folder or URL of the data set to read
+    #[arg(value_parser = crate::paths::place)]
     pub source: String,
     /// Folder or URL of the data set to make, or to go on with
+    #[arg(value_parser = crate::paths::place)]
     pub target: String,
     /// Which histogram: transient, transient_4, transient_25, or transient_spots with --spots
     #[arg(long, default_value = "transient", value_name = "NAME", value_parser = Histogram::parse)]
@@ -66,17 +68,17 @@ pub struct DatasetReprocess {
     #[arg(long, value_name = "NAME")]
     pub profile: Option<String>,
     /// Chooses another draw of the same noise
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
     pub seed: u64,
     /// Threads [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
 }
 
 #[derive(Args)]
 pub struct BenchStore {
     /// Folder or URL of a data set with the profile lossless to take scenes from, instead of rendering some
-    #[arg(long, value_name = "DATASET", conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
+    #[arg(long, value_name = "DATASET", value_parser = crate::paths::place, conflicts_with_all = ["keep", "resolution", "samples", "seed"])]
     pub from: Option<String>,
     /// Number of scenes
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=64))]
@@ -85,10 +87,10 @@ pub struct BenchStore {
     #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(8..=1024))]
     pub resolution: u32,
     /// Camera paths per pixel for three bounces and more
-    #[arg(long, default_value_t = 32)]
+    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(2..=1_048_576))]
     pub samples: u32,
     /// Seed of the rooms
-    #[arg(long, default_value_t = 11)]
+    #[arg(long, default_value_t = 11, value_parser = super::ranges::whole)]
     pub seed: u64,
     /// Render into this folder and keep it: the next run with it renders nothing [default: a folder that is removed after]
     #[arg(long, value_name = "DIR")]
@@ -107,6 +109,7 @@ pub struct BenchStore {
 #[derive(Args)]
 pub struct DatasetSplit {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// Name of the split
     #[arg(long, default_value = "default")]
@@ -118,7 +121,7 @@ pub struct DatasetSplit {
     #[arg(long, value_name = "F,F,F", value_parser = three::<f64>, conflicts_with = "counts")]
     pub fractions: Option<[f64; 3]>,
     /// Seed of the hash that orders the scenes
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
     pub seed: u64,
     /// Only show the newest version
     #[arg(long, conflicts_with_all = ["counts", "fractions", "seed"])]
@@ -128,8 +131,10 @@ pub struct DatasetSplit {
 #[derive(Args)]
 pub struct DatasetExport {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// Folder or URL for the export
+    #[arg(value_parser = crate::paths::place)]
     pub dest: String,
     /// Which scenes: A..B, split:train, split:validation, split:test or split:NAME:SIDE [default: all]
     #[arg(long, value_name = "SCENES", value_parser = Scenes::parse)]
@@ -146,6 +151,7 @@ pub struct DatasetImport {
     /// Folder with the files
     pub source: PathBuf,
     /// Folder or URL of the data set to make, or to go on with
+    #[arg(value_parser = crate::paths::place)]
     pub target: String,
     /// Layout of the files: sb3d, platonerf, bf-lidar or npy [default: whichever is found]
     #[arg(long, value_name = "NAME", value_parser = Format::parse)]
@@ -162,7 +168,7 @@ pub struct DatasetImport {
     #[arg(long)]
     pub rehash: bool,
     /// Threads [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
 }
 
@@ -170,7 +176,12 @@ const IMPORT_HELP: &str = "\
 What the files say is read; what a format is known for (gate, field of view, polarity, axes) is checked against the
 histograms: two-bounce light must arrive where depth and spots predict. What does not fit is refused, naming the file,
 what was expected and the option that overrides it. The manifest of each scene names its files with their SHA-256,
-everything that was converted, and what is missing. Run the same command again to go on.
+everything that was converted, and what is missing; stages refuse scenes without what they need. Run the same command
+again to go on.
+
+A beam that a mirror folds is longer than the straight line from the laser to its spot. Where a source does not state the
+lengths and the camera sees a mirror (or nobody says), they are listed as missing (spots.path), and shadow networks that are
+given two-bounce times cannot use the scene; --straight-beams states that no mirror folds a beam.
 
 npy: a folder a scene, or one of such folders, with .npy files and scene.json:
   {\"format\": \"picofarm-scene-1\", \"length_unit\": \"m\" (or cm, mm),
@@ -179,7 +190,7 @@ npy: a folder a scene, or one of such folders, with .npy files and scene.json:
    \"camera\": {\"fx\": 128, \"fy\": 128, \"cx\": 128, \"cy\": 128, \"pixel_centre\": 0.5 (or 0),
               \"axes\": [\"right\", \"down\", \"forward\"] (or left, up, backward, in any order),
               \"to_world\": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]] (if known)},
-   \"laser\": [0, 0, 0], \"spots\": {\"file\": \"spots.npy\"} (spots x 3),
+   \"laser\": [0, 0, 0], \"spots\": {\"file\": \"spots.npy\" (spots x 3), \"paths\": \"paths.npy\" (length of each beam, if known)},
    \"depth\": {\"file\": \"depth.npy\", \"kind\": \"z\" (or range)}}
 and, if there are any: visibility {file, one_means: lit or shadow} (spots x rows x columns), specular {file} (1 = mirror),
 normal {file}, instance {file} and label {file} (0 = nothing), rgb_linear {file}, photons_per_unit.";
@@ -220,6 +231,9 @@ pub struct ImportArgs {
     /// Captures of single spots: each a scene, or all of a folder summed into one (platonerf, bf-lidar)
     #[arg(long, value_enum, default_value_t = CapturesArg::Separate)]
     pub captures: CapturesArg,
+    /// No mirror folds a beam: each goes straight from the laser to its spot (sb3d, npy)
+    #[arg(long)]
+    pub straight_beams: bool,
     /// Do not check histograms against geometry; the manifest says so
     #[arg(long)]
     pub unchecked: bool,
@@ -268,6 +282,7 @@ impl ImportArgs {
                 CapturesArg::Separate => Captures::Separate,
                 CapturesArg::Sum => Captures::Sum,
             },
+            straight_beams: self.straight_beams,
             unchecked: self.unchecked,
         }
     }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use picofarm_coordinator::auth::Role;
+use picofarm_coordinator::auth::{Role, Visibility};
 
 /// TLS, tokens and limits of a coordinator.
 #[derive(Args)]
@@ -39,14 +39,34 @@ pub struct Guard {
     #[arg(long)]
     pub allow_insecure: bool,
     /// Jobs of one caller that have not ended, at most
-    #[arg(long, value_name = "N", default_value_t = 1_000)]
+    #[arg(long, value_name = "N", default_value_t = 1_000, value_parser = super::ranges::at_least_one)]
     pub max_jobs_per_user: usize,
+    /// Priorities beyond this, above or below 0, are an administrator's
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    pub max_priority: u32,
+    /// What callers see of others' jobs: all, those of their projects (project), or nothing (own); administrators see all
+    #[arg(
+        long,
+        value_name = "WHAT",
+        default_value_t = Visibility::All,
+        env = "PICOFARM_VISIBILITY"
+    )]
+    pub visibility: Visibility,
+    /// Keep lines of the audit log (see `picofarm audit`) this many days
+    #[arg(long, value_name = "DAYS", default_value_t = 365)]
+    pub audit_days: u32,
     /// Tasks of one job, at most
-    #[arg(long, value_name = "N", default_value_t = 10_000_000)]
+    #[arg(long, value_name = "N", default_value_t = 10_000_000, value_parser = clap::value_parser!(u64).range(1..))]
     pub max_tasks_per_job: u64,
     /// Workers connected at a time, at most
-    #[arg(long, value_name = "N", default_value_t = 10_000)]
+    #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = super::ranges::at_least_one)]
     pub max_sessions: usize,
+    /// Connections at a time, at most; never more than the limit of open files allows
+    #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = super::ranges::at_least_one)]
+    pub max_connections: usize,
+    /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three quarters of all]
+    #[arg(long, value_name = "N", value_parser = super::ranges::at_least_one)]
+    pub max_connections_per_address: Option<usize>,
 }
 
 /// What can be done with the token file.
@@ -60,6 +80,12 @@ pub enum Token {
         /// What it may do: view, submit, work, admin
         #[arg(long, value_name = "ROLES", value_delimiter = ',', required = true)]
         role: Vec<Role>,
+        /// Projects that it may name in its jobs (`project = "NAME"`)
+        #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
+        member: Vec<String>,
+        /// Projects all of whose jobs it may cancel, pause, resume and retry
+        #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
+        maintainer: Vec<String>,
         #[command(flatten)]
         file: TokenFile,
     },
@@ -88,4 +114,18 @@ pub struct TokenFile {
         env = "PICOFARM_TOKENS"
     )]
     pub tokens: PathBuf,
+}
+
+/// Which part of the audit log.
+#[derive(Args)]
+pub struct Audit {
+    /// Only acts of this caller
+    #[arg(long, value_name = "NAME")]
+    pub who: Option<String>,
+    /// Only acts on this job: its whole id, as in the log; it may be forgotten by now
+    #[arg(long, value_name = "ID")]
+    pub job: Option<String>,
+    /// Only the last N lines
+    #[arg(long, default_value_t = 100, value_name = "N")]
+    pub last: u32,
 }

@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 #[derive(Args)]
 pub struct DatasetVerify {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// Manifests and sizes only; otherwise every object is hashed and decoded
     #[arg(long)]
@@ -22,6 +23,7 @@ pub struct DatasetVerify {
 #[derive(Args)]
 pub struct DatasetRepair {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// Find what is broken by manifests and sizes only; a flipped bit is not found so
     #[arg(long)]
@@ -32,26 +34,27 @@ pub struct DatasetRepair {
     /// Bring the scenes of this snapshot back to what they were then, and no others
     #[arg(long, value_name = "NAME", conflicts_with = "complete")]
     pub snapshot: Option<String>,
-    /// Only say what is broken and how it would be mended
+    /// Only say what is broken and how it would be repaired
     #[arg(long)]
     pub dry_run: bool,
     /// The job that made the data set, where the data set does not say itself how
     #[arg(long, value_name = "FILE")]
     pub job: Option<PathBuf>,
     /// Where the data set is now that this one was reprocessed from
-    #[arg(long, value_name = "DATASET")]
+    #[arg(long, value_name = "DATASET", value_parser = crate::paths::place)]
     pub source: Option<String>,
     /// Where the files are that the data set was imported from
     #[arg(long, value_name = "DIR")]
     pub files: Option<PathBuf>,
     /// Threads [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
 }
 
 #[derive(Args)]
 pub struct DatasetGc {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// Spare what is younger, e.g. 90m, 24h or 7d; a worker may still be writing it
     #[arg(long, default_value = "24h", value_name = "AGE", value_parser = age)]
@@ -70,8 +73,10 @@ pub struct DatasetGc {
 #[derive(Args)]
 pub struct DatasetShow {
     /// Folder or URL of the data set
+    #[arg(value_parser = crate::paths::place)]
     pub dataset: String,
     /// The scene's number
+    #[arg(value_parser = super::ranges::whole)]
     pub scene: u64,
 }
 
@@ -80,6 +85,7 @@ pub enum Snapshot {
     /// Pin the finished scenes under a name, for good
     Create {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Name of the snapshot, e.g. v1
         name: String,
@@ -87,11 +93,13 @@ pub enum Snapshot {
     /// List the snapshots
     List {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
     },
     /// Say what a snapshot pins
     Show {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Name of the snapshot
         name: String,
@@ -99,6 +107,7 @@ pub enum Snapshot {
     /// Check that the scenes of a snapshot are as they were; exit code 6 if not
     Verify {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Name of the snapshot
         name: String,
@@ -109,6 +118,7 @@ pub enum Snapshot {
     /// Say which scenes differ between a snapshot and another, or the data set as it is now
     Diff {
         /// Folder or URL of the data set
+        #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Name of the first snapshot
         from: String,

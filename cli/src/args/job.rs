@@ -8,12 +8,11 @@ use clap::{Subcommand, ValueEnum};
 pub enum Job {
     /// Write a commented job file to start from
     Init {
-        /// Where to write it
-        #[arg(default_value = "job.toml")]
-        file: PathBuf,
+        /// Where to write it [default: job.toml; with --kind, KIND.toml]
+        file: Option<PathBuf>,
         /// What kind of job
-        #[arg(long, value_enum, default_value_t = JobKind::Furnished)]
-        kind: JobKind,
+        #[arg(long, value_enum)]
+        kind: Option<JobKind>,
     },
     /// Say what a submission would run and what it would reuse; changes nothing
     Plan {
@@ -46,8 +45,21 @@ pub enum Job {
         #[arg(long, value_name = "NAME")]
         from_stage: Option<String>,
     },
-    /// List all jobs
-    List,
+    /// List jobs, the latest first
+    List {
+        /// How many at most
+        #[arg(long, default_value_t = 50, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
+        limit: u32,
+        /// Go on where an earlier list ended
+        #[arg(long, value_name = "TOKEN")]
+        page: Option<String>,
+        /// Only jobs that stand so
+        #[arg(long, value_name = "STATE")]
+        state: Option<ListedState>,
+        /// Only jobs of this user
+        #[arg(long, value_name = "NAME")]
+        user: Option<String>,
+    },
     /// Show one job
     Status {
         /// Job id, or the first letters of one
@@ -63,7 +75,7 @@ pub enum Job {
         /// Job id, or the first letters of one
         job: String,
         /// Give up after this many seconds (exit code 1)
-        #[arg(long, value_name = "S")]
+        #[arg(long, value_name = "S", value_parser = super::ranges::seconds)]
         timeout_s: Option<f64>,
     },
     /// Stop a job; what it finished stays
@@ -94,10 +106,10 @@ pub enum Job {
         #[arg(long, value_name = "NAME")]
         stage: Option<String>,
         /// Only this task
-        #[arg(long)]
+        #[arg(long, value_parser = super::ranges::whole)]
         task: Option<u64>,
         /// Only the last N lines
-        #[arg(long, default_value_t = 100, value_name = "N")]
+        #[arg(long, default_value_t = 100, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
         last: u32,
         /// Go on showing what happens, until the job ends or Ctrl-C
         #[arg(long, short)]
@@ -114,14 +126,23 @@ pub enum Job {
         #[arg(long, value_name = "NAME", requires = "task")]
         stage: Option<String>,
         /// This task
-        #[arg(long)]
+        #[arg(long, value_parser = super::ranges::whole)]
         task: Option<u64>,
     },
 }
 
+/// Where a listed job stands.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub enum ListedState {
+    Active,
+    Done,
+    Failed,
+    Cancelled,
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub enum JobKind {
-    /// Render furnished rooms
+    /// Render furnished rooms (what is written without --kind)
     Furnished,
     /// Render primitive rooms
     Primitive,

@@ -4,16 +4,27 @@ use std::path::PathBuf;
 
 use clap::Subcommand;
 
+const REPAIR_HELP: &str = "\
+An object of the manifest comes from another model of the store that has the same one (as a promoted model has its trial's),
+from a checkpoint, or from the manifest itself. It is written only if its SHA-256 is the recorded one. Damaged evaluations,
+checkpoints and speeds are deleted: jobs make them again. What is left is named (exit code 6), with the job to submit.";
+
+const REMOVE_HELP: &str = "\
+Refused while another model was trained with it, or a group of predictions was made with it; --force removes it all the same.
+A removal that was interrupted goes on with the same command. It says what remains. Reports stay as they are.";
+
 #[derive(Subcommand)]
 pub enum Model {
     /// List the models of a store, those that are still trained, too
     List {
         /// Folder or URL of the store (in which data sets lie)
+        #[arg(value_parser = crate::paths::place)]
         store: String,
     },
     /// Say what a model is, where it comes from and how good it is
     Show {
         /// Folder or URL of the store
+        #[arg(value_parser = crate::paths::place)]
         store: String,
         /// Name of the model
         name: String,
@@ -21,6 +32,7 @@ pub enum Model {
     /// Write a model's weights to a file (safetensors), which PyTorch reads too
     Export {
         /// Folder or URL of the store
+        #[arg(value_parser = crate::paths::place)]
         store: String,
         /// Name of the model
         name: String,
@@ -28,10 +40,43 @@ pub enum Model {
         #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
     },
+    /// Check models: manifest, size and SHA-256 of each object, evaluations, checkpoints (exit code 6 where something is broken)
+    Verify {
+        /// Folder or URL of the store
+        store: String,
+        /// Names of models [default: all]
+        names: Vec<String>,
+    },
+    /// Put back what is broken of a model, from bytes that have the recorded SHA-256; say which job makes the rest again
+    #[command(after_help = REPAIR_HELP)]
+    Repair {
+        /// Folder or URL of the store
+        store: String,
+        /// Name of the model
+        name: String,
+        /// Only say what would be done
+        #[arg(long)]
+        dry_run: bool,
+    },
+    /// Delete a model: its manifest first, then its objects, evaluations and checkpoints
+    #[command(after_help = REMOVE_HELP)]
+    Remove {
+        /// Folder or URL of the store
+        store: String,
+        /// Name of the model
+        name: String,
+        /// Also where models or predictions build on it, its manifest cannot be read, or it is still trained
+        #[arg(long)]
+        force: bool,
+        /// Only say what would be deleted, and what builds on it
+        #[arg(long)]
+        dry_run: bool,
+    },
     /// Write a page about models, and the same as JSON beside it: figures beside trivial answers and published ones, curves,
     /// pictures, speed against error
     Report {
         /// Folder or URL of the store
+        #[arg(value_parser = crate::paths::place)]
         store: String,
         /// Names of models; a name that ends with * means all that begin so [default: all]
         names: Vec<String>,
@@ -42,7 +87,7 @@ pub enum Model {
         #[arg(long, default_value = "Trained networks")]
         title: String,
         /// Scenes of each model to show
-        #[arg(long, default_value_t = 2)]
+        #[arg(long, default_value_t = 2, value_parser = super::ranges::pictures)]
         pictures: usize,
     },
 }

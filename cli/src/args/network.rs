@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 pub struct BenchModel {
     /// What the network learns: decides its inputs and its loss
     #[arg(long, value_enum, default_value_t = Learns::Tof)]
-    pub task: Learns,
+    pub target: Learns,
     /// Which network
     #[arg(long, value_enum, default_value_t = Kind::Unet2d)]
     pub net: Kind,

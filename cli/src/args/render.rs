@@ -3,17 +3,38 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use picofarm_scene::import::Bounds;
 
 use crate::{
     choices::{Chosen, Ways},
     groups::{Group, Named},
 };
 
+/// Where the files lie that a scene file names.
+#[derive(Args, Default)]
+pub struct SceneRoot {
+    /// Folder that holds every mesh, buffer and texture the scene names [default: the scene's own folder]
+    #[arg(long = "root", value_name = "DIR")]
+    pub root: Option<PathBuf>,
+}
+
+impl SceneRoot {
+    /// What the readers take.
+    pub fn bounds(&self) -> Bounds {
+        Bounds {
+            root: self.root.clone(),
+            ..Bounds::default()
+        }
+    }
+}
+
 /// What to render and how.
 #[derive(Args)]
 pub struct RenderArgs {
     /// A .glb, .gltf, .xml (Mitsuba) or .json scene
     pub file: PathBuf,
+    #[command(flatten)]
+    pub root: SceneRoot,
     /// Image width and height in pixels [default: the scene's own]
     #[arg(long, value_name = "PX")]
     pub resolution: Option<u32>,
@@ -24,7 +45,7 @@ pub struct RenderArgs {
     #[arg(long)]
     pub samples: Option<u32>,
     /// Seed of the random numbers
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
     pub seed: u64,
     /// Longest path in bounces [default: until the gate ends]
     #[arg(long)]
@@ -35,11 +56,11 @@ pub struct RenderArgs {
     /// A histogram of these beams too (counted from 0), as array transient_NAME; may be given several times
     #[arg(long, value_name = "NAME=BEAM,…", value_parser = crate::groups::parse_named)]
     pub group: Vec<Named>,
-    /// Choose ways of finding light by hand, e.g. share=1,image-lobes=off [default: the renderer chooses by the scene]
+    /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the renderer chooses by the scene]
     #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
     pub strategy: Vec<Chosen>,
     /// Threads [default: all cores]
-    #[arg(long)]
+    #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
     #[command(flatten)]
     pub gate: GateArgs,
@@ -72,7 +93,7 @@ pub struct BenchRender {
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: Option<u32>,
     /// Laser spots of the presets: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25)]
+    #[arg(long, default_value_t = 25, value_parser = super::ranges::spots)]
     pub spots: u32,
     /// Split triangles into four until the scene has at least this many
     #[arg(long, value_name = "N")]
@@ -95,7 +116,7 @@ pub struct BenchRender {
           value_parser = picofarm_proto::model::parse_share)]
     pub error: Vec<f64>,
     /// Threads of the measured renders (the converged one uses all cores)
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = super::ranges::threads)]
     pub threads: usize,
     /// Measurements of another renderer, written by tests/peers; may be given several times
     #[arg(long, value_name = "FILE")]

@@ -23,6 +23,7 @@ pub enum Sweep {
 #[derive(Args)]
 pub struct WhichSweep {
     /// Folder or URL of the store (in which data sets and models lie)
+    #[arg(value_parser = crate::paths::place)]
     pub store: String,
     /// Name of the sweep: that of the model which it is about
     pub name: String,

@@ -41,8 +41,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Render(args) => args,
     };
     check(&args)?;
-    let assets = settings.assets.clone();
-    blocking(move || render(&args, &assets, output, &stop)).await
+    blocking(move || render(&args, output, &stop)).await
 }
 
 async fn blocking(work: impl FnOnce() -> Result<()> + Send + 'static) -> Result<()> {
@@ -66,21 +65,16 @@ fn check(args: &BenchRender) -> Result<()> {
     Ok(())
 }
 
-fn render(
-    args: &BenchRender,
-    assets: &std::path::Path,
-    output: Output,
-    stop: &CancellationToken,
-) -> Result<()> {
+fn render(args: &BenchRender, output: Output, stop: &CancellationToken) -> Result<()> {
     if args.scaling {
-        let found = scaling::run(args, assets, output, stop)?;
+        let found = scaling::run(args, output, stop)?;
         output.result(&found, || report::scaling(&found));
         return Ok(());
     }
     let peers = peer::read(&args.peer)?;
     let mut results = Vec::new();
     for name in &args.scenes {
-        let scene = scenes::load(name, args, assets)?;
+        let scene = scenes::load(name, args)?;
         results.push(ladder::run(&scene, args, &peers, output, stop)?);
     }
     if let Some(path) = &args.plot {

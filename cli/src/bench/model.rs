@@ -10,7 +10,7 @@ use std::{
 
 use picofarm_model::{
     ModelError,
-    input::{Batch, Task},
+    input::{Batch, Target},
     net::{Architecture, NetSpec, Precision},
     train::Learner,
     trial::Trial,
@@ -167,21 +167,21 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
 }
 
 fn trial(args: &BenchModel) -> Trial {
-    let task = match args.task {
-        Learns::Tof => Task::Tof,
-        Learns::Shadow => Task::Shadow,
-        Learns::Specular => Task::Specular,
+    let target = match args.target {
+        Learns::Tof => Target::Tof,
+        Learns::Shadow => Target::Shadow,
+        Learns::Specular => Target::Specular,
     };
     let dense = args.bins as usize;
     Trial {
-        task,
+        target,
         net: NetSpec {
             architecture: match args.net {
                 Kind::Unet2d => Architecture::Unet2d,
                 Kind::Unet25d => Architecture::Unet25d,
             },
             dense,
-            one_hot: if task == Task::Shadow { dense } else { 0 },
+            one_hot: if target == Target::Shadow { dense } else { 0 },
             outputs: 1,
             width: args.width as usize,
             levels: args.levels as usize,
@@ -195,7 +195,7 @@ fn trial(args: &BenchModel) -> Trial {
         },
         batch: args.batch as usize,
         side: args.side as usize,
-        rate: 2e-4,
+        learning_rate: 2e-4,
         decay: 1e-3,
         seed: 1,
     }

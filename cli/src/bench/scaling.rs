@@ -1,8 +1,6 @@
 //! How the time to a given error grows with triangles, spots, bins and pixels. The error is the
 //! renderer's own estimate; the ladders say how good that is.
 
-use std::path::Path;
-
 use picofarm_scene::Scene;
 use picofarm_transient::{Budget, Gate};
 use serde::Serialize;
@@ -88,14 +86,9 @@ pub struct Size {
 ///
 /// # Errors
 /// What the renderer refuses, or an interruption.
-pub fn run(
-    args: &BenchRender,
-    assets: &Path,
-    output: Output,
-    stop: &CancellationToken,
-) -> Result<Scaling> {
+pub fn run(args: &BenchRender, output: Output, stop: &CancellationToken) -> Result<Scaling> {
     let sizes = if args.quick { &QUICK } else { &FULL };
-    let mut scene = load(&args.scenes[0], args, assets)?;
+    let mut scene = load(&args.scenes[0], args)?;
     let pixels = args.resolution.unwrap_or(sizes.pixels);
     resize(&mut scene, pixels);
     let study = Study {

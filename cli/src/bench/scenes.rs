@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use picofarm_scene::{
-    LaserGrid, Scene,
+    AssetLibrary, LaserGrid, Scene,
     furnished::{self, FurnishedSettings},
     import,
     primitive::{self, PrimitiveSettings},
@@ -11,7 +11,6 @@ use picofarm_scene::{
 
 use crate::{
     args::BenchRender,
-    assets,
     error::{CliError, Result},
 };
 
@@ -24,10 +23,10 @@ const PIXELS: u32 = 32;
 ///
 /// # Errors
 /// Neither a preset nor a readable scene file, or a size out of range.
-pub fn load(name: &str, args: &BenchRender, assets: &Path) -> Result<Scene> {
+pub fn load(name: &str, args: &BenchRender) -> Result<Scene> {
     let pixels = args.resolution.unwrap_or(PIXELS);
     let mut scene = match preset(name)? {
-        Some((kind, seed)) => generate(kind, seed, args.spots, pixels, assets)?,
+        Some((kind, seed)) => generate(kind, seed, args.spots, pixels)?,
         None => import::read_scene(Path::new(name)).map_err(|e| {
             CliError::from(e).hint("name a scene file, or one of the presets furnished, primitive")
         })?,
@@ -84,10 +83,10 @@ fn preset(name: &str) -> Result<Option<(Preset, u64)>> {
 }
 
 /// Parametric furniture: the same scene on every machine.
-fn generate(kind: Preset, seed: u64, spots: u32, pixels: u32, assets: &Path) -> Result<Scene> {
+fn generate(kind: Preset, seed: u64, spots: u32, pixels: u32) -> Result<Scene> {
     let mut scene = match kind {
         Preset::Furnished => {
-            let library = assets::library("parametric", assets)?;
+            let library = AssetLibrary::parametric();
             let settings = FurnishedSettings {
                 assets: library.name().to_owned(),
                 specular_at_least: 1,

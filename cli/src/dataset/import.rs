@@ -3,7 +3,7 @@
 use std::{path::Path, sync::Arc, time::Instant};
 
 use picofarm_dataset::{
-    Dataset, Profile,
+    Dataset, PROBE_WITHIN, Profile,
     import::{ImportError, Source, import_scene},
     open_store, probe,
 };
@@ -39,7 +39,9 @@ pub async fn run(args: DatasetImport, output: Output) -> Result<()> {
         .map_err(|what| CliError::input(format!("--profile: {what}")))?;
     let spec = source.spec(profile);
     let (store, prefix) = open_store(&args.target).map_err(failed)?;
-    probe(&*store, &prefix).await.map_err(failed)?;
+    probe(&*store, &prefix, PROBE_WITHIN)
+        .await
+        .map_err(failed)?;
     let dataset = Dataset::create_or_open(store, prefix, &spec)
         .await
         .map_err(failed)?;
@@ -131,8 +133,8 @@ impl Work {
             .copied()
             .collect();
         if !new.is_empty() {
-            output.say(format!(
-                "{}: not in the files, stored as zeros: {}",
+            output.warn(format!(
+                "warning: {}: not in the files, stored as zeros: {}",
                 scene.name,
                 new.join(", ")
             ));

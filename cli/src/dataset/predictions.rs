@@ -128,7 +128,7 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     let report = report.map_err(failed)?;
     let facts = json!({
         "predictions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
-        "bytes": report.bytes, "problems": problems_json_by(&report.problems, mend),
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, hint),
     });
     if report.is_sound() {
         output.result(&facts, || {
@@ -148,17 +148,18 @@ pub async fn verify(args: &DatasetVerify, there: &Predictions, output: Output) -
     if output.json {
         output.result(&facts, String::new);
     }
-    Err(broken_by(&args.dataset, &report.problems, mend))
+    Err(broken_by(&args.dataset, &report.problems, hint))
 }
 
-/// How it is mended.
-fn mend(problem: &Problem) -> &'static str {
+/// How it is repaired.
+fn hint(problem: &Problem) -> &'static str {
     match problem.scene {
         Some(_) => {
-            "delete it where it is there, and run its stage again with `force = true`: the same bytes are predicted"
+            "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its infer stage: what is damaged is \
+             predicted again, proved equal, and put back"
         }
         None => {
-            "delete it and the group's own zarr.json, and run its stage again with `force = true`: both are written anew"
+            "delete it and the group's own zarr.json, and submit its job again with `picofarm job submit FILE --from-stage STAGE`: both are written anew"
         }
     }
 }

@@ -27,6 +27,16 @@ use crate::{
 };
 
 pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Result<()> {
+    if super::predictions::find(&args.dataset).await?.is_some() {
+        return Err(CliError::input(format!(
+            "{}: holds what models predict, which a job makes again",
+            args.dataset
+        ))
+        .hint(
+            "submit the job that made it with `picofarm job submit FILE --from-stage STAGE`, with its infer stage: what is damaged \
+             is predicted again, proved equal, and put back",
+        ));
+    }
     let start = Instant::now();
     let stop = signals::stop_on_signal()?;
     let (store, folder) = store_and_folder(&args.dataset)?;
@@ -79,7 +89,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
     for problem in report.problems {
         match problem.scene {
             Some(scene) => broken.entry(scene).or_default().push(problem),
-            None if problem.mend().starts_with("dataset repair") => done.metadata.push(problem),
+            None if problem.hint().starts_with("dataset repair") => done.metadata.push(problem),
             None => done.left.push(problem),
         }
     }
@@ -110,7 +120,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
     tell(&args, &done, start.elapsed().as_secs_f64(), output)
 }
 
-const AGAIN: &str = "run the same command again to go on; mended scenes stay mended";
+const AGAIN: &str = "run the same command again to go on; repaired scenes stay repaired";
 
 async fn hints(args: &DatasetRepair, settings: &Settings) -> Result<Hints> {
     let job = match &args.job {
@@ -132,10 +142,10 @@ struct Done {
     metadata: Vec<Problem>,
     /// Metadata that was written again.
     written: Vec<String>,
-    /// Not for this command to mend.
+    /// Not for this command to repair.
     left: Vec<Problem>,
     /// Scene, its problems, and the objects that were written (with --dry-run: how it would be made).
-    mended: Vec<(u64, Vec<Problem>, Vec<String>)>,
+    repaired: Vec<(u64, Vec<Problem>, Vec<String>)>,
     /// Scene, its problems, and why they stay.
     failed: Vec<(u64, Vec<Problem>, String)>,
 }
@@ -165,12 +175,14 @@ impl Work {
                 format!("{at} of {of} broken scenes, making scene {scene} again"),
             );
             match self.one(scene) {
-                Ok(written) => done.mended.push((scene, problems, written)),
+                Ok(written) => done.repaired.push((scene, problems, written)),
                 Err(TaskError::Stopped) => {
                     meter.finish();
                     return Err(signals::interrupted(AGAIN));
                 }
-                Err(error @ TaskError::Interrupted(_)) => return Err(task_failed(error)),
+                Err(error @ (TaskError::Interrupted(_) | TaskError::Store(_))) => {
+                    return Err(task_failed(error));
+                }
                 Err(error) => done.failed.push((scene, problems, error.to_string())),
             }
         }
@@ -214,8 +226,8 @@ impl Work {
 }
 
 fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Result<()> {
-    let mended: Vec<_> = done
-        .mended
+    let repaired: Vec<_> = done
+        .repaired
         .iter()
         .map(|(scene, problems, what)| match args.dry_run {
             true => json!({"scene": scene, "problems": problems_json(problems), "how": what}),
@@ -230,7 +242,7 @@ fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Resu
         })
         .collect();
     let facts = json!({
-        "dataset": args.dataset, "dry_run": args.dry_run, "scenes": mended, "metadata": done.written,
+        "dataset": args.dataset, "dry_run": args.dry_run, "scenes": repaired, "metadata": done.written,
         "failed": failed, "left": problems_json(&done.left), "seconds": seconds,
     });
     output.result(&facts, || text(args, done, seconds));
@@ -239,12 +251,12 @@ fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Resu
     }
     let failed = done.failed.iter();
     let failed = failed.map(|(scene, _, why)| format!("scene {scene}: {why}"));
-    let left = done.left.iter().map(|p| format!("{p}: {}", p.mend()));
+    let left = done.left.iter().map(|p| format!("{p}: {}", p.hint()));
     let lines: Vec<String> = failed.chain(left).take(20).collect();
     Err(CliError::new(
         Code::Damaged,
         format!(
-            "{}: {} problem(s) could not be mended\n  {}",
+            "{}: {} problem(s) could not be repaired\n  {}",
             args.dataset,
             done.failed.len() + done.left.len(),
             lines.join("\n  ")
@@ -254,7 +266,7 @@ fn tell(args: &DatasetRepair, done: &Done, seconds: f64, output: Output) -> Resu
 
 fn text(args: &DatasetRepair, done: &Done, seconds: f64) -> String {
     let mut text = String::new();
-    for (scene, problems, what) in &done.mended {
+    for (scene, problems, what) in &done.repaired {
         let names: Vec<String> = problems.iter().map(ToString::to_string).collect();
         text += &format!("scene {scene}: {}\n", names.join("; "));
         let did = if args.dry_run {
@@ -277,16 +289,16 @@ fn text(args: &DatasetRepair, done: &Done, seconds: f64) -> String {
         .collect::<String>();
     text += &match (
         args.dry_run,
-        done.mended.len(),
+        done.repaired.len(),
         done.written.len() + done.metadata.len(),
     ) {
         (_, 0, 0) => match done.failed.is_empty() && done.left.is_empty() {
-            true => format!("{}: nothing to mend", args.dataset),
-            false => format!("{}: nothing mended", args.dataset),
+            true => format!("{}: nothing to repair", args.dataset),
+            false => format!("{}: nothing repaired", args.dataset),
         },
         (true, n, _) => format!("{}: {n} scene(s) to make again", args.dataset),
         (false, n, m) => format!(
-            "{}: {n} scene(s) made again and equal to what they were, {m} metadata object(s) mended, in {}",
+            "{}: {n} scene(s) made again and equal to what they were, {m} metadata object(s) repaired, in {}",
             args.dataset,
             duration(seconds)
         ),

@@ -6,7 +6,9 @@ use picofarm_agent::{
     Control, TaskError,
     reprocess::{Reprocessor, sensor_settings, sensor_version},
 };
-use picofarm_proto::model::{OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings};
+use picofarm_proto::model::{
+    OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, TaskKind,
+};
 use serde_json::json;
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;

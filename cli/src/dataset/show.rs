@@ -24,7 +24,7 @@ pub async fn run(args: &DatasetShow, output: Output) -> Result<()> {
                 snapshots.push(name);
             }
             Ok(_) => {}
-            Err(error) => output.say(format!("snapshot {name} is left out: {error}")),
+            Err(error) => output.warn(format!("warning: snapshot {name} is left out: {error}")),
         }
     }
     let kind = made.plan["kind"].as_str().unwrap_or("render");

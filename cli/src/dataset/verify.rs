@@ -1,4 +1,4 @@
-//! `picofarm dataset verify`: what is broken, and how it is mended.
+//! `picofarm dataset verify`: what is broken, and how it is repaired.
 
 use std::{
     sync::Mutex,
@@ -6,6 +6,7 @@ use std::{
 };
 
 use picofarm_dataset::{Dataset, Problem, Snapshot, Verification, VerifyMode, VerifyOptions};
+use picofarm_proto::show;
 use serde_json::{Value, json};
 
 use super::{failed, open, predictions};
@@ -136,26 +137,31 @@ pub fn tell(place: &str, how: &How<'_>, report: &Verification, output: Output) -
 
 /// What is broken, as an error.
 pub fn broken(place: &str, problems: &[Problem]) -> CliError {
-    broken_by(place, problems, Problem::mend)
+    broken_by(place, problems, Problem::hint)
 }
 
-/// The same where it is mended otherwise.
+/// The same where it is repaired otherwise.
 pub fn broken_by(
     place: &str,
     problems: &[Problem],
-    mended_by: fn(&Problem) -> &'static str,
+    hint_of: fn(&Problem) -> &'static str,
 ) -> CliError {
     let mut shown = Vec::new();
     let mut last = "";
     for problem in problems.iter().take(SHOWN) {
         let scene = problem.scene.map(|s| format!("scene {s}: "));
-        let mend = mended_by(problem);
-        let how = match mend == last {
+        let hint = hint_of(problem);
+        let how = match hint == last {
             true => String::new(),
-            false => format!("\n    mend: {mend}"),
+            false => format!("\n    hint: {hint}"),
         };
-        last = mend;
-        shown.push(format!("{}{problem}{how}", scene.unwrap_or_default()));
+        last = hint;
+        let what = problem.to_string();
+        shown.push(format!(
+            "{}{}{how}",
+            scene.unwrap_or_default(),
+            show::line(&what)
+        ));
     }
     let more = match problems.len().saturating_sub(shown.len()) {
         0 => String::new(),
@@ -169,27 +175,28 @@ pub fn broken_by(
             shown.join("\n  ")
         ),
     );
-    let mendable = |p: &Problem| mended_by(p).starts_with("dataset repair");
-    match problems.iter().any(mendable) {
+    let repairable = |p: &Problem| hint_of(p).starts_with("dataset repair");
+    match problems.iter().any(repairable) {
         true => error.hint(format!(
-            "picofarm dataset repair {place} makes the broken scenes again, and only those"
+            "picofarm dataset repair {} makes the broken scenes again, and only those",
+            show::argument(place)
         )),
         false => error,
     }
 }
 
 pub fn problems_json(problems: &[Problem]) -> Vec<Value> {
-    problems_json_by(problems, Problem::mend)
+    problems_json_by(problems, Problem::hint)
 }
 
-/// The same where they are mended otherwise.
-pub fn problems_json_by(problems: &[Problem], mend: fn(&Problem) -> &'static str) -> Vec<Value> {
+/// The same where they are repaired otherwise.
+pub fn problems_json_by(problems: &[Problem], hint: fn(&Problem) -> &'static str) -> Vec<Value> {
     problems
         .iter()
         .map(|p| {
             json!({
                 "object": p.object, "scene": p.scene, "fault": p.fault.kind(), "what": p.fault.to_string(),
-                "mend": mend(p),
+                "hint": hint(p),
             })
         })
         .collect()

@@ -8,7 +8,7 @@ use picofarm_model::report::{Entry, Report, html, json};
 use serde_json::json;
 use tokio::runtime::Handle;
 
-use super::open;
+use super::{nothing, open};
 use crate::{
     dataset::{failed, task_failed},
     error::{CliError, Code, Result, io},
@@ -24,7 +24,7 @@ pub(super) async fn run(
 ) -> Result<()> {
     let models = open(store)?;
     let mut entries = Vec::new();
-    for name in chosen(&models, names).await? {
+    for name in chosen(store, &models, names).await? {
         output.say(format!("reads {name}"));
         entries.push(entry(store, &name, pictures).await?);
     }
@@ -51,7 +51,7 @@ pub(super) async fn run(
 }
 
 /// The finished models that are meant.
-async fn chosen(models: &Models, names: &[String]) -> Result<Vec<String>> {
+async fn chosen(store: &str, models: &Models, names: &[String]) -> Result<Vec<String>> {
     let mut there = Vec::new();
     for name in models.names().await.map_err(failed)? {
         if models.look(&name).await.map_err(failed)?.is_some() {
@@ -66,6 +66,9 @@ async fn chosen(models: &Models, names: &[String]) -> Result<Vec<String>> {
             None => *name == wanted,
         };
         let found: Vec<String> = there.iter().filter(meant).cloned().collect();
+        if there.is_empty() {
+            return Err(nothing(store));
+        }
         if found.is_empty() {
             return Err(
                 CliError::input(format!("no finished model is called {wanted:?}"))
@@ -75,8 +78,7 @@ async fn chosen(models: &Models, names: &[String]) -> Result<Vec<String>> {
         chosen.extend(found);
     }
     match (names.is_empty(), there.is_empty()) {
-        (true, true) => Err(CliError::input("the store holds no finished models")
-            .hint("`picofarm job init --kind train` writes a job that trains some")),
+        (true, true) => Err(nothing(store)),
         (true, false) => Ok(there),
         (false, _) => {
             chosen.sort();

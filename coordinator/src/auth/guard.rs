@@ -6,27 +6,26 @@ use std::{
 };
 
 use futures::future::{Either, Ready, ready};
-use picofarm_proto::credentials::Described;
-use tonic::{
-    Status,
-    body::Body,
-    transport::server::{TcpConnectInfo, TlsConnectInfo},
-};
+use picofarm_proto::{credentials::Described, model::Outcome};
+use tonic::{Status, body::Body};
 use tower::{Layer, Service};
 
-use super::{Caller, Gate, Needs, Throttle, needs};
+use super::{Caller, Gate, Needs, Throttle, act, needs};
+use crate::{audit::Audit, connections::Peer};
 
 /// Lets in those who may call what they call, with a [`Caller`] among the request's extensions.
 #[derive(Clone)]
 pub(crate) struct Guard {
     gate: Gate,
+    audit: Audit,
     refused: Arc<Throttle>,
 }
 
 impl Guard {
-    pub(crate) fn new(gate: Gate) -> Self {
+    pub(crate) fn new(gate: Gate, audit: Audit) -> Self {
         Self {
             gate,
+            audit,
             refused: Arc::default(),
         }
     }
@@ -37,12 +36,18 @@ impl Guard {
         let path = request.uri().path();
         match needs(path) {
             needed if caller.roles.allow(needed) => Ok(caller),
-            Needs::Role(role) => Err(Status::permission_denied(format!(
-                "{:?} may not call {}: it needs the role {role}, and has {}",
-                caller.name,
-                path.rsplit('/').next().unwrap_or(path),
-                caller.roles
-            ))),
+            Needs::Role(role) => {
+                let why = format!(
+                    "{:?} may not call {}: it needs the role {role}, and has {}",
+                    caller.name,
+                    path.rsplit('/').next().unwrap_or(path),
+                    caller.roles
+                );
+                if let Some(act) = act(path) {
+                    self.audit.note(&caller.name, act, Outcome::Refused, &why);
+                }
+                Err(Status::permission_denied(why))
+            }
             Needs::Nothing => Ok(caller),
         }
     }
@@ -65,21 +70,16 @@ fn token(headers: &http::HeaderMap) -> Result<Option<&str>, Status> {
 
 /// The caller's own certificate, which the TLS handshake has verified.
 fn certificate<B>(request: &http::Request<B>) -> Option<Described> {
-    let info = request
-        .extensions()
-        .get::<TlsConnectInfo<TcpConnectInfo>>()?;
-    let chain = info.peer_certs()?;
+    let chain = request.extensions().get::<Peer>()?.certificates.as_ref()?;
     Described::of(chain.first()?).ok()
 }
 
 fn peer<B>(request: &http::Request<B>) -> String {
-    let extensions = request.extensions();
-    let tcp = extensions.get::<TcpConnectInfo>().or_else(|| {
-        let tls = extensions.get::<TlsConnectInfo<TcpConnectInfo>>()?;
-        Some(tls.get_ref())
-    });
-    let address = tcp.and_then(TcpConnectInfo::remote_addr);
-    address.map_or_else(|| "an unknown address".to_owned(), |a| a.to_string())
+    let peer = request.extensions().get::<Peer>();
+    peer.map_or_else(
+        || "an unknown address".to_owned(),
+        |p| p.address.to_string(),
+    )
 }
 
 impl<S> Layer<S> for Guard {

@@ -3,22 +3,31 @@
 
 mod guard;
 mod quota;
+mod rights;
 mod roles;
 mod tls;
 mod tokens;
 
 use std::{fmt, path::PathBuf, sync::Arc, time::Duration};
 
-use picofarm_proto::credentials::Described;
+use picofarm_proto::{
+    credentials::Described,
+    model::{Act, Outcome, audit::WHO_BYTES},
+    show,
+};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
+use crate::audit::{Audit, COORDINATOR};
+
 pub(crate) use guard::Guard;
 pub use quota::Quotas;
 pub(crate) use quota::{Throttle, WorkerIds};
-pub(crate) use roles::METHODS;
-pub use roles::{Needs, Role, Roles, needs};
+pub use rights::Visibility;
+pub(crate) use roles::act;
+pub use roles::{METHODS, Needs, Role, Roles, needs};
+pub(crate) use tls::Loaded;
 pub use tls::TlsFiles;
 pub use tokens::{Entry, TOKEN_PREFIX, TokenError, Tokens};
 
@@ -32,6 +41,8 @@ pub struct Access {
     pub tls: Option<TlsFiles>,
     /// The token file; without one and without client certificates, anyone may do anything.
     pub tokens: Option<PathBuf>,
+    /// What callers see of others' jobs.
+    pub visibility: Visibility,
 }
 
 impl Access {
@@ -54,7 +65,7 @@ pub struct Caller {
 }
 
 /// The name of callers of whom no proof is asked.
-const ANYONE: &str = "anyone";
+pub(crate) const ANYONE: &str = "anyone";
 
 impl Caller {
     fn anyone() -> Self {
@@ -106,7 +117,11 @@ impl Gate {
     ///
     /// # Errors
     /// The token file cannot be used.
-    pub(crate) fn new(access: &Access, stop: CancellationToken) -> Result<Self, TokenError> {
+    pub(crate) fn new(
+        access: &Access,
+        audit: &Audit,
+        stop: CancellationToken,
+    ) -> Result<Self, TokenError> {
         let Some(path) = access.tokens.clone() else {
             return Ok(if access.authenticates() {
                 Self::Certificates
@@ -115,7 +130,7 @@ impl Gate {
             });
         };
         let (sender, receiver) = watch::channel(Arc::new(Tokens::read(&path)?));
-        tokio::spawn(follow(path, sender, stop));
+        tokio::spawn(follow(path, sender, audit.clone(), stop));
         Ok(Self::Tokens(receiver))
     }
 
@@ -163,6 +178,12 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
             "the client certificate has no name; make one with a common name or a DNS name",
         )
     })?;
+    // It goes into jobs and logs.
+    if name.len() > WHO_BYTES || show::line(&name) != name {
+        return Err(Status::unauthenticated(format!(
+            "the client certificate's name has control characters or more than {WHO_BYTES} bytes; make one with a plain name"
+        )));
+    }
     Ok(Caller {
         name: name.into(),
         roles: vec![Role::Submit, Role::Work].into(),
@@ -173,7 +194,12 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
 
 /// Reads the token file again and again. One that cannot be used changes nothing, so that a slip of an editor does
 /// not stop the farm; the log says so.
-async fn follow(path: PathBuf, sender: watch::Sender<Arc<Tokens>>, stop: CancellationToken) {
+async fn follow(
+    path: PathBuf,
+    sender: watch::Sender<Arc<Tokens>>,
+    audit: Audit,
+    stop: CancellationToken,
+) {
     let mut complaint = String::new();
     loop {
         tokio::select! {
@@ -183,21 +209,25 @@ async fn follow(path: PathBuf, sender: watch::Sender<Arc<Tokens>>, stop: Cancell
         match Tokens::read(&path) {
             Ok(tokens) => {
                 complaint.clear();
-                let changed = sender.send_if_modified(|now| {
+                let mut what = String::new();
+                sender.send_if_modified(|now| {
                     let changed = **now != tokens;
                     if changed {
+                        what = now.difference(&tokens);
                         *now = Arc::new(tokens);
                     }
                     changed
                 });
-                if changed {
+                if !what.is_empty() {
                     tracing::info!(file = %path.display(), "the token file was read again");
+                    audit.note(COORDINATOR, Act::Tokens, Outcome::Done, &what);
                 }
             }
             Err(error) if complaint == error.to_string() => {}
             Err(error) => {
                 complaint = error.to_string();
                 tracing::error!("{complaint}; the tokens read before stay in force");
+                audit.note(COORDINATOR, Act::Tokens, Outcome::Failed, &complaint);
             }
         }
     }

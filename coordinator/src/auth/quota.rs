@@ -18,15 +18,18 @@ pub struct Quotas {
     pub tasks_per_job: u64,
     /// Sessions of workers at a time.
     pub sessions: usize,
+    /// Priorities from minus this to this are everybody's; others are for administrators.
+    pub max_priority: u32,
 }
 
 impl Default for Quotas {
-    /// 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers.
+    /// 1,000 jobs a caller, 10,000,000 tasks a job, 10,000 workers, priorities from -100 to 100.
     fn default() -> Self {
         Self {
             jobs_per_user: 1_000,
             tasks_per_job: 10_000_000,
             sessions: 10_000,
+            max_priority: 100,
         }
     }
 }

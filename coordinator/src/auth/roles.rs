@@ -2,6 +2,7 @@
 
 use std::{fmt, str::FromStr};
 
+use picofarm_proto::model::Act;
 use serde::{Deserialize, Serialize};
 
 /// A right that a caller may have.
@@ -101,7 +102,7 @@ pub enum Needs {
 }
 
 /// Each method of the services with what it needs.
-pub(crate) const METHODS: &[(&str, Needs)] = &[
+pub const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Farm/Session", Needs::Role(Role::Work)),
     ("/picofarm.v1.Jobs/GetServerInfo", Needs::Nothing),
     ("/picofarm.v1.Jobs/PlanJob", Needs::Role(Role::Submit)),
@@ -117,7 +118,21 @@ pub(crate) const METHODS: &[(&str, Needs)] = &[
     ("/picofarm.v1.Jobs/ExplainJob", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/ListWorkers", Needs::Role(Role::View)),
     ("/picofarm.v1.Jobs/DrainWorker", Needs::Role(Role::Admin)),
+    ("/picofarm.v1.Jobs/ListAudit", Needs::Role(Role::Admin)),
 ];
+
+/// What a method does that goes into the audit log; `None` for those that only read.
+pub(crate) fn act(path: &str) -> Option<Act> {
+    Some(match path.strip_prefix("/picofarm.v1.Jobs/")? {
+        "SubmitJob" => Act::Submit,
+        "CancelJob" => Act::Cancel,
+        "PauseJob" => Act::Pause,
+        "ResumeJob" => Act::Resume,
+        "RetryJob" => Act::Retry,
+        "DrainWorker" => Act::Drain,
+        _ => return None,
+    })
+}
 
 /// What a path needs. One that is not listed is for administrators: forgetting it opens nothing.
 pub fn needs(path: &str) -> Needs {
@@ -148,6 +163,18 @@ mod tests {
         listed.sort();
         found.sort();
         assert_eq!(listed, found);
+    }
+
+    #[test]
+    fn every_act_of_a_caller_is_a_listed_method() {
+        let of_methods: Vec<_> = METHODS.iter().filter_map(|(m, _)| act(m)).collect();
+        let of_callers = Act::ALL
+            .into_iter()
+            .filter(|a| !matches!(a, Act::Tokens | Act::Certificates));
+        assert_eq!(of_methods.len(), of_callers.clone().count());
+        for one in of_callers {
+            assert!(of_methods.contains(&one), "{one:?}");
+        }
     }
 
     fn methods(schema: &str, found: &mut Vec<String>) {

@@ -1,12 +1,15 @@
 //! The coordinator's certificate, and whose client certificates it takes.
 
-use std::{path::PathBuf, time::Duration};
+use std::{fmt, path::PathBuf, sync::Arc};
 
-use picofarm_proto::credentials::{CredentialError, Pair, certificates};
-use tonic::transport::{Certificate, Identity, ServerTlsConfig};
-
-/// How long a handshake may take.
-const HANDSHAKE: Duration = Duration::from_secs(10);
+use picofarm_proto::credentials::{CredentialError, Described, Pair, certificates};
+use rustls::{
+    RootCertStore, ServerConfig,
+    crypto::aws_lc_rs,
+    pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
+    server::WebPkiClientVerifier,
+};
+use sha2::{Digest, Sha256};
 
 /// Files for TLS, all PEM.
 #[derive(Debug, Clone)]
@@ -19,27 +22,93 @@ pub struct TlsFiles {
     pub client_ca: Option<PathBuf>,
 }
 
+/// What the files hold.
+pub(crate) struct Loaded {
+    pub config: Arc<ServerConfig>,
+    /// Of all files.
+    pub digest: [u8; 32],
+    /// Whose certificate it is and until when, in words.
+    pub about: String,
+}
+
+impl fmt::Debug for Loaded {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Loaded").field(&self.about).finish()
+    }
+}
+
 impl TlsFiles {
     /// Reads and checks the files.
     ///
     /// # Errors
     /// [`CredentialError`] names the file and what is wrong with it.
-    pub(crate) fn read(&self) -> Result<ServerTlsConfig, CredentialError> {
+    pub(crate) fn read(&self) -> Result<Loaded, CredentialError> {
         let pair = Pair::read(&self.certificate, &self.key)?;
-        if let Some(why) = pair.described.out_of_date() {
+        let mut digest = Sha256::new();
+        for bytes in [&pair.certificate, &pair.key] {
+            digest.update((bytes.len() as u64).to_le_bytes());
+            digest.update(bytes);
+        }
+        let provider = Arc::new(aws_lc_rs::default_provider());
+        let unusable = |path: &PathBuf, e: &dyn fmt::Display| CredentialError::Unusable {
+            path: path.clone(),
+            what: format!("cannot be used: {e}"),
+        };
+        let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
+            .with_safe_default_protocol_versions()
+            .expect("the provider has the default versions of TLS");
+        let builder = match &self.client_ca {
+            None => builder.with_no_client_auth(),
+            Some(path) => {
+                let (authorities, pem) = certificates(path)?;
+                digest.update(&pem);
+                let mut roots = RootCertStore::empty();
+                for authority in authorities {
+                    roots.add(authority).map_err(|e| unusable(path, &e))?;
+                }
+                let verifier =
+                    WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
+                builder.with_client_cert_verifier(verifier.build().map_err(|e| unusable(path, &e))?)
+            }
+        };
+        let chain: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&pair.certificate).collect();
+        let chain = chain.map_err(|e| unusable(&self.certificate, &e))?;
+        let key = PrivateKeyDer::from_pem_slice(&pair.key)
+            // What the parser says could quote the file.
+            .map_err(|_| unusable(&self.key, &"expected a private key"))?;
+        let mut config = builder
+            .with_single_cert(chain, key)
+            .map_err(|e| unusable(&self.certificate, &e))?;
+        config.alpn_protocols = vec![b"h2".to_vec()];
+        Ok(Loaded {
+            config: Arc::new(config),
+            digest: digest.finalize().into(),
+            about: about(&pair.described),
+        })
+    }
+
+    /// Says in the log what is noteworthy at the start.
+    pub(crate) fn tell(&self, loaded: &Loaded) {
+        if let Ok((chain, _)) = certificates(&self.certificate)
+            && let Ok(described) = Described::of(&chain[0])
+            && let Some(why) = described.out_of_date()
+        {
             tracing::warn!(
                 "{}: the certificate {why}; clients will not connect",
                 self.certificate.display()
             );
         }
-        let mut config = ServerTlsConfig::new()
-            .identity(Identity::from_pem(&pair.certificate, &pair.key))
-            .timeout(HANDSHAKE);
-        if let Some(path) = &self.client_ca {
-            let (authorities, pem) = certificates(path)?;
-            tracing::info!(file = %path.display(), authorities = authorities.len(), "clients must show a certificate");
-            config = config.client_ca_root(Certificate::from_pem(pem));
-        }
-        Ok(config)
+        tracing::info!(certificate = loaded.about, "TLS");
     }
+}
+
+fn about(described: &Described) -> String {
+    let name = described.common_name.clone();
+    let name = name
+        .or_else(|| described.names.first().cloned())
+        .unwrap_or_default();
+    format!(
+        "certificate of {name:?}, valid until {} (seconds since 1970)",
+        described.not_after
+    )
 }

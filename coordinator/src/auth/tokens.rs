@@ -6,7 +6,10 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use picofarm_proto::credentials::{CredentialError, Described, Secret, private};
+use picofarm_proto::{
+    credentials::{CredentialError, Described, Secret, private},
+    model::check_project,
+};
 use rustls::crypto::aws_lc_rs;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -55,6 +58,12 @@ pub struct Entry {
     /// Common name or alternative name of a client certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub certificate: Option<String>,
+    /// Projects that it may name in its jobs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub member: Vec<String>,
+    /// Projects all of whose jobs it may change.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub maintainer: Vec<String>,
 }
 
 /// The token file's content.
@@ -68,6 +77,7 @@ pub struct Tokens {
 const HEAD: &str = "\
 # Who may use this farm. `picofarm token create`, `list` and `revoke` edit this file; a running coordinator notices.
 # Roles: view, submit, work, admin. sha256 is that of the token, which is kept nowhere.
+# member = [\"PROJECT\"] lets a caller name the project in its jobs; maintainer = [\"PROJECT\"] lets it change all jobs of it.
 # In place of sha256, certificate = \"NAME\" knows a client certificate by its common name or an alternative name.
 
 ";
@@ -103,6 +113,9 @@ impl Tokens {
                     "{at} has no roles; give it view, submit, work or admin"
                 ));
             }
+            for project in entry.member.iter().chain(&entry.maintainer) {
+                check_project(project).map_err(|what| format!("{at}: {what}"))?;
+            }
             let digest = |text: &String| hex::decode(text).is_ok_and(|bytes| bytes.len() == 32);
             match (&entry.sha256, &entry.certificate) {
                 (Some(sha256), None) if digest(sha256) => {}
@@ -121,6 +134,28 @@ impl Tokens {
     /// All callers.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
+    }
+
+    /// What `new` has that these have not, and the other way round, in words; the names of callers only.
+    pub(crate) fn difference(&self, new: &Self) -> String {
+        let named = |tokens: &Self, name: &str| tokens.entries.iter().any(|e| e.name == name);
+        let mut parts = Vec::new();
+        let mut part = |what: &str, names: Vec<&str>| {
+            if !names.is_empty() {
+                parts.push(format!("{what}: {}", names.join(", ")));
+            }
+        };
+        let added = new.entries.iter().map(|e| e.name.as_str());
+        part("added", added.filter(|n| !named(self, n)).collect());
+        let removed = self.entries.iter().map(|e| e.name.as_str());
+        part("removed", removed.filter(|n| !named(new, n)).collect());
+        let changed = new.entries.iter().filter(|e| named(self, &e.name));
+        let changed = changed.filter(|e| !self.entries.contains(e));
+        part("changed", changed.map(|e| e.name.as_str()).collect());
+        match parts.is_empty() {
+            true => "the order of callers".into(),
+            false => parts.join("; "),
+        }
     }
 
     /// Whose token this is. Takes the same time for every token.
@@ -147,12 +182,21 @@ impl Tokens {
         })
     }
 
-    /// Makes a token for a new caller and adds it.
+    /// Makes a token for a new caller and adds it, with the projects that it is a member and a maintainer of.
     ///
     /// # Errors
-    /// The name is taken or not plain, or there are no roles; in words.
-    pub fn create(&mut self, name: &str, roles: Roles) -> Result<Secret, String> {
+    /// The name is taken or not plain, a project's name is not plain, or there are no roles; in words.
+    pub fn create(
+        &mut self,
+        name: &str,
+        roles: Roles,
+        member: Vec<String>,
+        maintainer: Vec<String>,
+    ) -> Result<Secret, String> {
         plain_name(name)?;
+        for project in member.iter().chain(&maintainer) {
+            check_project(project)?;
+        }
         if self.entries.iter().any(|e| e.name == name) {
             return Err(format!(
                 "there is a caller {name:?} already; revoke it first, or choose another name"
@@ -172,6 +216,8 @@ impl Tokens {
             roles,
             sha256: Some(hex::encode(Sha256::digest(&token))),
             certificate: None,
+            member,
+            maintainer,
         });
         Ok(Secret::new(token))
     }
@@ -241,21 +287,26 @@ mod tests {
         let path = folder.path().join("deep/tokens.toml");
         let mut tokens = Tokens::default();
         let ada = tokens
-            .create("ada", vec![Role::Work, Role::Submit].into())
+            .create(
+                "ada",
+                vec![Role::Work, Role::Submit].into(),
+                vec!["lidar".into()],
+                vec![],
+            )
             .unwrap();
-        let bob = tokens.create("bob", vec![Role::View].into()).unwrap();
-        assert!(
-            tokens
-                .create("ada", vec![Role::View].into())
-                .unwrap_err()
-                .contains("already")
-        );
-        assert!(
-            tokens
-                .create("a b", vec![Role::View].into())
-                .unwrap_err()
-                .contains("no name")
-        );
+        let mut view = |name, project: &str| {
+            tokens.create(name, vec![Role::View].into(), vec![], vec![project.into()])
+        };
+        let bob = view("bob", "tof").unwrap();
+        for (name, project, says) in [
+            ("ada", "tof", "already"),
+            ("a b", "tof", "no name"),
+            ("eve", "a,b", "\"a,b\" is not the name of a project"),
+            ("eve", "", "not the name of a project"),
+        ] {
+            let said = view(name, project).unwrap_err();
+            assert!(said.contains(says), "{said}");
+        }
         tokens.write(&path).unwrap();
 
         let text = std::fs::read_to_string(&path).unwrap();
@@ -267,6 +318,7 @@ mod tests {
             (entry.name.as_str(), entry.roles.to_string()),
             ("ada", "submit,work".into())
         );
+        assert_eq!(entry.member, ["lidar"]);
         assert!(back.by_token("").is_none() && back.by_token("pf-00").is_none());
         assert!(back.revoke("ada") && !back.revoke("ada"));
         assert!(back.by_token(ada.expose()).is_none());
@@ -314,6 +366,12 @@ mod tests {
             (
                 format!("name = \"a\"\nrole = [\"work\"]\nsha256 = \"{digest}\"\n"),
                 "role",
+            ),
+            (
+                format!(
+                    "name = \"a\"\nroles = [\"work\"]\nsha256 = \"{digest}\"\nmember = [\"x y\"]\n"
+                ),
+                "\"x y\" is not the name of a project",
             ),
         ] {
             let said = Tokens::parse(&format!("[[caller]]\n{text}")).unwrap_err();

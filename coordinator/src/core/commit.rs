@@ -7,7 +7,7 @@ use picofarm_proto::{
     model::{EventKind, Finished},
 };
 
-use super::{About, Core, Say, SessionId, StageEntry};
+use super::{About, Core, Say, SessionId, StageEntry, stores::store_of};
 use crate::transition::RangeEvent;
 
 /// What the catalog already holds for a reported task: looked up before [`Core::finished`].
@@ -48,6 +48,23 @@ impl Core {
             tracing::info!(%worker, range = %report.lease.range, task = report.index, reason, "report refused");
         }
         self.acknowledge(session, report.lease, report.index, verdict);
+    }
+
+    /// Notes that something is wrong with a reported task.
+    pub(crate) fn alarm(
+        &mut self,
+        session: SessionId,
+        report: &Finished,
+        message: String,
+        now_ms: i64,
+    ) {
+        let Some(stage) = self.stage_of(report) else {
+            return;
+        };
+        let name = self.session_name(session);
+        tracing::error!(job = %stage.job, worker = name, "{message}");
+        let about = About::message(message).task(report.index).worker(name);
+        self.event(now_ms, stage, EventKind::Alarm, about);
     }
 
     fn commit(
@@ -143,7 +160,11 @@ impl Core {
         let set = self.stages[&id].set;
         if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
         {
-            entry.trouble.succeeded(*worker);
+            entry.blocklist.succeeded(*worker);
+            let task = &entry.spec(id).task;
+            if !report.adopted {
+                self.away.worked(store_of(task), *worker);
+            }
         }
         self.fresh.insert((set, task), manifest);
         self.changes.outputs.push(Output {

@@ -8,8 +8,8 @@ use picofarm_proto::{
     model::{EventKind, Lease},
 };
 
-use super::{About, Core, Say};
-use crate::{place, transition::RangeEvent};
+use super::{About, Core, Say, stores::store_of};
+use crate::transition::RangeEvent;
 
 impl Core {
     /// Grants whatever is in hand and can be granted now.
@@ -79,14 +79,16 @@ impl Core {
         now_ms: i64,
     ) -> Result<(), String> {
         let entry = &self.stages[&id];
-        place::may_run(entry.spec(id), &self.workers[&worker].abilities)?;
+        entry.suits(id, &self.workers[&worker].abilities)?;
+        let store = store_of(&entry.spec(id).task);
+        self.away.may_use(store, worker, now_ms)?;
         let most = entry.job.spec.limits.max_workers;
         if most > 0 && !self.load.may_join(id.job, worker, most) {
             return Err(format!(
                 "limits.max_workers = {most}, and so many work on the job"
             ));
         }
-        match entry.trouble.avoids(worker, now_ms) {
+        match entry.blocklist.avoids(worker, now_ms) {
             Some(ms) if self.another(id, worker, now_ms) => Err(format!(
                 "tasks of the stage failed on it one after another; it is passed over for another {} min",
                 ms / 60_000 + 1
@@ -101,8 +103,8 @@ impl Core {
         self.workers.iter().any(|(worker, w)| {
             *worker != than
                 && !w.drains
-                && entry.trouble.avoids(*worker, now_ms).is_none()
-                && place::may_run(entry.spec(id), &w.abilities).is_ok()
+                && entry.blocklist.avoids(*worker, now_ms).is_none()
+                && entry.suits(id, &w.abilities).is_ok()
         })
     }
 
@@ -117,7 +119,11 @@ impl Core {
         let Some(range) = entry.stage.front(now_ms, who.leases.is_empty()).cloned() else {
             return false;
         };
-        let count = self.lease_size(entry, able, range.len());
+        let store = store_of(&entry.spec(id).task).to_owned();
+        let count = match self.away.is_try(&store) {
+            true => 1,
+            false => self.lease_size(entry, able, range.len()),
+        };
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");
         let granted = entry
@@ -140,6 +146,7 @@ impl Core {
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
         self.leases.insert(granted.id, id);
+        self.away.begun(&store, granted.id);
         self.load.begun(granted.id, &entry.job, worker);
         let lease = Lease {
             lease: granted.lease(),
@@ -173,7 +180,7 @@ impl Core {
         let mut reasons = self
             .workers
             .values()
-            .map(|w| (&w.name, place::may_run(entry.spec(id), &w.abilities)));
+            .map(|w| (&w.name, entry.suits(id, &w.abilities)));
         let Some((name, Err(reason))) = reasons.next() else {
             return;
         };

@@ -1,4 +1,4 @@
-//! What this house knows of its workers and of the order of jobs, for those who ask why. Changes nothing.
+//! What this instance knows of its workers and of the order of jobs, for those who ask why. Changes nothing.
 
 use picofarm_proto::{
     ids::{JobId, StageRef},
@@ -6,19 +6,22 @@ use picofarm_proto::{
 };
 
 use super::{Core, StageEntry, WorkerEntry};
-use crate::explain::{Candidate, Runs};
+use crate::{
+    explain::{Candidate, Runs},
+    place,
+};
 
-/// What the house knows at this moment.
+/// What the instance knows at this moment.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Look {
     /// Active jobs, in the order in which they get workers.
     pub jobs: Vec<JobId>,
     /// Workers connected here.
     pub workers: Vec<ConnectedWorker>,
-    /// Workers connected to other houses.
+    /// Workers connected to other instances.
     pub elsewhere: u32,
-    /// Houses alive, this one too.
-    pub houses: u32,
+    /// Instances alive, this one too.
+    pub instances: u32,
 }
 
 /// What it knows with regard to one job.
@@ -28,7 +31,7 @@ pub(crate) struct JobLook {
     pub candidates: Vec<Candidate>,
     /// Jobs that go first and have tasks waiting that one of these workers may run.
     pub ahead: Vec<JobId>,
-    /// Workers connected to other houses.
+    /// Workers connected to other instances.
     pub elsewhere: u32,
     /// Of the task asked for, where a worker here has reported on it: how it runs.
     pub running: Option<Runs>,
@@ -65,8 +68,16 @@ impl Core {
             jobs,
             workers: workers.collect(),
             elsewhere: self.elsewhere,
-            houses: self.houses,
+            instances: self.instances,
         }
+    }
+
+    /// For how long a worker that holds leases was not heard of, where that is longer than it should be: it sends a sign of
+    /// life every sixth of a lease.
+    fn silent_ms(&self, worker: &WorkerEntry, now_ms: i64) -> Option<i64> {
+        let silent = now_ms - worker.heard_ms;
+        let long = silent > i64::from(self.settings.lease_ms) / 2;
+        (long && !worker.leases.is_empty()).then_some(silent)
     }
 
     fn tasks_of(&self, worker: &WorkerEntry) -> u64 {
@@ -116,11 +127,17 @@ impl Core {
             .map(|(id, worker)| Candidate {
                 name: worker.name.clone(),
                 may_run: match worker.drains {
-                    true => Err("it has been told to end".into()),
+                    true => Err("it is asked to end".into()),
                     false => self.may_run(here, *id, now_ms),
                 },
+                lacks_memory: place::lacks_memory(
+                    entry.spec(here),
+                    &entry.known,
+                    &worker.abilities,
+                ),
                 idle: worker.credits > 0,
                 quarantined: worker.quarantined,
+                silent_ms: self.silent_ms(worker, now_ms),
             })
             .collect();
         let able = |other: StageRef| {

@@ -2,35 +2,43 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use picofarm_catalog::{Job, JobRecord, NewEvent, Range, ResultSet, Run, Timing};
+use picofarm_catalog::{
+    Job, JobRecord, NewEvent, Owner, Range, ResultSet, Run, Sight, StageRecord, Timing,
+};
 use picofarm_proto::{
-    ids::{JobId, StageRef},
-    key::spec_hash,
+    ids::{JobId, RangeId, StageRef},
     model::{
         EventKind, JobSpec, JobState, JobStatus, RunningTask, SpecError, StageSpec, StageState,
         StageStatus,
     },
 };
+use uuid::Uuid;
 
 use super::{Core, Say};
-use crate::plan;
+use crate::{auth::Caller, plan, rpc::not_yours, submission::Draft};
 
 /// A job ready to be recorded.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Prepared {
     pub job: Job,
+    pub stages: Vec<StageRecord>,
     /// Nobody's.
     pub ranges: Vec<Range>,
     pub events: Vec<NewEvent>,
 }
 
 /// Checks that no job has put scenes of other settings into the data set that a stage names: their keys would be the
-/// same, their bytes not. `others` are the jobs that write there.
+/// same, their bytes not. `set` is where the stage writes, `others` are the jobs that write there; those that `sight` does
+/// not see are not named.
 ///
 /// # Errors
 /// [`SpecError`] at `output.dataset` that names the job and the first setting that differs.
-pub(crate) fn place_is_free(stage: &StageSpec, others: &[Job]) -> Result<(), SpecError> {
-    let set = ResultSet::of(stage);
+pub(crate) fn place_is_free(
+    stage: &StageSpec,
+    set: &ResultSet,
+    others: &[Job],
+    sight: &Sight,
+) -> Result<(), SpecError> {
     for other in others {
         for there in &other.spec.stages {
             let theirs = ResultSet::of(there);
@@ -38,6 +46,15 @@ pub(crate) fn place_is_free(stage: &StageSpec, others: &[Job]) -> Result<(), Spe
                 || theirs.stage_key == set.stage_key
             {
                 continue;
+            }
+            if !sight.sees(&Owner::from(other)) {
+                return Err(SpecError::new(
+                    "output.dataset",
+                    format!(
+                        "{:?} in {} holds scenes of a job that you may not see, with other settings; name another data set",
+                        set.dataset, set.store
+                    ),
+                ));
             }
             let changes = plan::changes(there, stage).join(", ");
             return Err(SpecError::new(
@@ -53,61 +70,165 @@ pub(crate) fn place_is_free(stage: &StageSpec, others: &[Job]) -> Result<(), Spe
     Ok(())
 }
 
-/// The job that stands for a spec already: the latest with the same hash, unless it ended badly and the spec is to run
-/// again.
-pub(crate) fn stands_for(latest: Option<Job>, again: bool) -> Option<Job> {
-    latest.filter(|job| !(again && matches!(job.state, JobState::Failed | JobState::Cancelled)))
+/// Checks that a caller may run a stage again whose results exist: they are of the first job that has them. `others` are
+/// the jobs that write to `set`, where the stage does, the latest first.
+///
+/// # Errors
+/// Whose they are.
+pub(crate) fn may_force(
+    stage: &StageSpec,
+    set: &ResultSet,
+    others: &[Job],
+    by: &Caller,
+    sight: &Sight,
+) -> Result<(), String> {
+    let has = |job: &&Job| job.spec.stages.iter().any(|s| ResultSet::of(s) == *set);
+    let Some(first) = others.iter().rev().find(has) else {
+        return Ok(());
+    };
+    let owner = Owner::from(first);
+    if by.may_change(&owner) {
+        return Ok(());
+    }
+    let whose = match sight.sees(&owner) {
+        true => not_yours(&first.id, &owner),
+        false => "you may not see its job".to_owned(),
+    };
+    Err(format!(
+        "stage {:?} cannot be forced, since its results are another's: {whose}; submit without --force to reuse what exists",
+        stage.name
+    ))
+}
+
+/// Whether the latest job with a spec, in this state, stands for it: unless it ended badly and the spec is to run again.
+pub(crate) fn stands_for(state: JobState, again: bool) -> bool {
+    !(again && matches!(state, JobState::Failed | JobState::Cancelled))
+}
+
+/// Lays a job out as ranges, given the outputs that exist, by stage. An equal job is looked for in `circle`.
+pub(crate) fn prepare(
+    draft: &Draft,
+    user: String,
+    circle: &str,
+    existing: &[Vec<Run>],
+    make_id: &mut dyn FnMut() -> Uuid,
+    now_ms: i64,
+) -> Prepared {
+    let id = JobId::from_uuid(make_id());
+    let (job, stages) = draft.job(id, user, circle, now_ms);
+    let mut ranges = Vec::new();
+    let mut reused = Vec::new();
+    let (mut total, mut there) = (0, 0);
+    for (stage, existing) in stages.iter().zip(existing) {
+        let existing: &[Run] = if stage.force { &[] } else { existing };
+        let mut ids = || RangeId::from_uuid(make_id());
+        ranges.extend(plan::expand(stage.id, stage.tasks, existing, &mut ids));
+        total += stage.tasks;
+        there += existing.iter().map(|r| r.hi - r.lo).sum::<u64>();
+        reused.extend(existing.iter().map(|run| (stage.id.stage, *run)));
+    }
+    let message = format!("{total} tasks, {} to run", total - there);
+    let mut events = vec![NewEvent::of(id, now_ms, EventKind::Submitted, message)];
+    for (stage, run) in reused {
+        let message = format!("outputs of tasks {}..{} exist already", run.lo, run.hi);
+        let event = NewEvent::of(id, now_ms, EventKind::Reused, message);
+        events.push(NewEvent {
+            stage: Some(stage),
+            tasks: Some(run),
+            ..event
+        });
+    }
+    Prepared {
+        job,
+        stages,
+        ranges,
+        events,
+    }
+}
+
+/// A job that the core is to know.
+#[derive(Debug, Clone)]
+pub(crate) struct Learnt {
+    pub job: Job,
+    pub stages: Vec<StageRecord>,
+    /// Of its result sets.
+    pub timings: Timings,
+}
+
+/// What this instance adds to what the catalog knows of jobs.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Overlay {
+    /// Tasks that run, by job.
+    running: BTreeMap<JobId, Vec<RunningTask>>,
+    /// Mean seconds of a task, by stage.
+    means: BTreeMap<StageRef, Option<f64>>,
+    /// Workers connected to any instance.
+    workers: u32,
+}
+
+impl Overlay {
+    /// Adds what is known here.
+    pub(crate) fn complete(&mut self, status: &mut JobStatus) {
+        status.workers = self.workers;
+        status.running = self.running.remove(&status.id).unwrap_or_default();
+        for (ordinal, stage) in (0..).zip(&status.stages) {
+            let id = StageRef {
+                job: status.id,
+                stage: ordinal,
+            };
+            // Of the stages that run, the last: the others are nearly done.
+            if stage.state == StageState::Open
+                && let Some(mean) = self.means.get(&id)
+            {
+                status.mean_task_seconds = *mean;
+            }
+        }
+    }
+}
+
+/// A job as the catalog knows it.
+pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
+    let counts = record.counts();
+    let JobRecord {
+        job,
+        stages,
+        timing,
+    } = record;
+    let stages = job.spec.stages.iter().zip(stages);
+    JobStatus {
+        id: job.id,
+        name: job.spec.name.clone(),
+        state: job.state,
+        tasks: counts,
+        submitted_at_ms: job.submitted_ms,
+        ended_at_ms: job.ended_ms,
+        paused: job.paused && job.state == JobState::Active,
+        user: job.user,
+        stages: stages
+            .map(|(spec, stage)| StageStatus {
+                name: spec.name.clone(),
+                kind: spec.task.kind().to_owned(),
+                state: stage.state,
+                needs: spec.needs.clone(),
+                tasks: stage.counts,
+            })
+            .collect(),
+        spec: JobSpec {
+            name: job.spec.name.clone(),
+            priority: job.spec.priority,
+            limits: job.spec.limits.clone(),
+            nonce: job.spec.nonce.clone(),
+            project: job.spec.project.clone(),
+            // Lists of files may be long.
+            stages: job.spec.stages.iter().map(|s| s.only(0, 0)).collect(),
+        },
+        mean_task_seconds: timing.mean(),
+        running: Vec::new(),
+        workers: 0,
+    }
 }
 
 impl Core {
-    /// Lays a job out as ranges, given the outputs that exist, by stage.
-    pub(crate) fn prepare(
-        &mut self,
-        spec: JobSpec,
-        user: String,
-        existing: &[Vec<Run>],
-        now_ms: i64,
-    ) -> Prepared {
-        let id = JobId::from_uuid((self.make_id)());
-        let job = Job {
-            id,
-            spec_hash: spec_hash(&spec),
-            spec: spec.into(),
-            state: JobState::Active,
-            submitted_ms: now_ms,
-            ended_ms: None,
-            paused: false,
-            user,
-        };
-        let mut ranges = Vec::new();
-        let mut reused = Vec::new();
-        let (mut total, mut there) = (0, 0);
-        for (stage, existing) in job.stages().into_iter().zip(existing) {
-            let existing: &[Run] = if stage.force { &[] } else { existing };
-            let mut ids = Self::range_id(&mut self.make_id);
-            ranges.extend(plan::expand(stage.id, stage.tasks, existing, &mut ids));
-            total += stage.tasks;
-            there += existing.iter().map(|r| r.hi - r.lo).sum::<u64>();
-            reused.extend(existing.iter().map(|run| (stage.id.stage, *run)));
-        }
-        let message = format!("{total} tasks, {} to run", total - there);
-        let mut events = vec![NewEvent::of(id, now_ms, EventKind::Submitted, message)];
-        for (stage, run) in reused {
-            let message = format!("outputs of tasks {}..{} exist already", run.lo, run.hi);
-            let event = NewEvent::of(id, now_ms, EventKind::Reused, message);
-            events.push(NewEvent {
-                stage: Some(stage),
-                tasks: Some(run),
-                ..event
-            });
-        }
-        Prepared {
-            job,
-            ranges,
-            events,
-        }
-    }
-
     /// A job is held, or goes on: what is pending goes back, what runs goes on.
     pub(crate) fn paused(&mut self, job: JobId, paused: bool) {
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
@@ -167,26 +288,21 @@ impl Core {
         }
     }
 
-    /// A job as people see it.
-    pub(crate) fn status(&self, record: JobRecord, now_ms: i64) -> JobStatus {
-        let counts = record.counts();
-        let JobRecord {
-            job,
-            stages,
-            timing,
-        } = record;
-        let mut running = Vec::new();
-        let mut mean = timing.mean();
-        for (id, entry) in self.stages.iter().filter(|(id, _)| id.job == job.id) {
-            // Of the stages that run, the last: the others are nearly done.
-            let runs = stages.get(id.stage as usize);
-            if runs.is_some_and(|s| s.state == StageState::Open) {
-                mean = self.sets[entry.set].timing.mean();
-            }
+    /// What is known here of a job, or of all.
+    pub(crate) fn overlay(&self, one: Option<JobId>, now_ms: i64) -> Overlay {
+        let mut overlay = Overlay {
+            workers: self.everywhere(),
+            ..Overlay::default()
+        };
+        let stages = self.stages.iter();
+        for (id, entry) in stages.filter(|(id, _)| one.is_none_or(|job| id.job == job)) {
+            let mean = self.sets[entry.set].timing.mean();
+            overlay.means.insert(*id, mean);
             for (range, lease) in entry.stage.leased() {
                 let Some(tasks) = self.progress.get(&range.id) else {
                     continue;
                 };
+                let running = overlay.running.entry(id.job).or_default();
                 running.extend(tasks.iter().map(|(index, progress)| RunningTask {
                     stage: id.stage,
                     index: *index,
@@ -198,56 +314,20 @@ impl Core {
                 }));
             }
         }
-        running.sort_by_key(|r| (r.stage, r.index));
-        let stages = job.spec.stages.iter().zip(stages);
-        JobStatus {
-            id: job.id,
-            name: job.spec.name.clone(),
-            state: job.state,
-            tasks: counts,
-            submitted_at_ms: job.submitted_ms,
-            ended_at_ms: job.ended_ms,
-            paused: job.paused && job.state == JobState::Active,
-            user: job.user,
-            stages: stages
-                .map(|(spec, stage)| StageStatus {
-                    name: spec.name.clone(),
-                    kind: spec.task.kind().to_owned(),
-                    state: stage.state,
-                    needs: spec.needs.clone(),
-                    tasks: stage.counts,
-                })
-                .collect(),
-            spec: JobSpec {
-                name: job.spec.name.clone(),
-                priority: job.spec.priority,
-                limits: job.spec.limits.clone(),
-                nonce: job.spec.nonce.clone(),
-                // Lists of files may be long.
-                stages: job.spec.stages.iter().map(|s| s.only(0, 0)).collect(),
-            },
-            mean_task_seconds: mean,
-            running,
-            workers: self.connected() + self.elsewhere,
+        for running in overlay.running.values_mut() {
+            running.sort_by_key(|r| (r.stage, r.index));
         }
+        overlay
     }
 
-    /// Number of workers connected to this house.
+    /// Number of workers connected to this instance.
     pub(crate) fn connected(&self) -> u32 {
         u32::try_from(self.workers.len()).unwrap_or(u32::MAX)
     }
 
-    /// Number of workers connected to any house.
+    /// Number of workers connected to any instance.
     pub(crate) fn everywhere(&self) -> u32 {
         self.connected() + self.elsewhere
-    }
-
-    /// Result sets whose times are not known yet, of these jobs.
-    pub(crate) fn untimed(&self, jobs: &[Job]) -> Vec<ResultSet> {
-        let sets = jobs.iter().flat_map(|job| job.stages());
-        let mut sets: Vec<_> = sets.map(|stage| stage.set).collect();
-        sets.retain(|set| !self.set_ids.contains_key(set));
-        sets
     }
 }
 

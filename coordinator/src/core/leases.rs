@@ -1,12 +1,12 @@
 //! The life of a lease after its grant: heartbeat, failure, return, expiry.
 
-use picofarm_catalog::{Exception, Mark, Range, RangeState};
+use picofarm_catalog::{Exception, Range, RangeState};
 use picofarm_proto::{
     ids::{Incarnation, LeaseRef, RangeId, WorkerId},
     model::{EventKind, Failure, FailureKind, TaskProgress},
 };
 
-use super::{About, Core, Progress, Say, SessionId};
+use super::{About, Core, Progress, Say, SessionId, stores::store_of};
 use crate::{budget, transition::RangeEvent};
 
 /// Lost workers remembered at most.
@@ -31,9 +31,41 @@ impl Core {
                 &name,
                 now_ms,
             );
+            if failure.kind == FailureKind::Store {
+                self.take_back(range.id, &failure.message);
+            }
             self.perhaps_over(range.stage, now_ms);
         });
         self.acknowledge(session, failure.lease, failure.index, verdict);
+    }
+
+    /// A report on a task says what cannot be. It counts as a failure of the task, and is refused with the reason: the worker
+    /// does not send it again.
+    pub(crate) fn unusable(
+        &mut self,
+        session: SessionId,
+        lease: LeaseRef,
+        index: u64,
+        why: &str,
+        now_ms: i64,
+    ) {
+        let reason = format!("the worker's report cannot be used: {why}");
+        if self.drop_double(session, lease) {
+            return self.acknowledge(session, lease, index, Err(reason));
+        }
+        let held = self.held_to_do(session, lease, index, now_ms).cloned();
+        let refusal = match held {
+            Err(refusal) => refusal,
+            Ok(range) => {
+                let name = self.session_name(session);
+                tracing::warn!(worker = name, range = %lease.range, task = index, "{reason}");
+                let kind = FailureKind::User;
+                self.leave(&range, index, kind, &reason, &name, now_ms);
+                self.perhaps_over(range.stage, now_ms);
+                reason
+            }
+        };
+        self.acknowledge(session, lease, index, Err(refusal));
     }
 
     /// Takes a lease back that the worker gives up of itself.
@@ -66,6 +98,11 @@ impl Core {
         progress: &[TaskProgress],
         now_ms: i64,
     ) {
+        if let Some(worker) = self.sessions.get(&session)
+            && let Some(entry) = self.workers.get_mut(worker)
+        {
+            entry.heard_ms = now_ms;
+        }
         let mut alive = Vec::with_capacity(leases.len());
         for lease in leases {
             if self.held(session, *lease, now_ms).is_ok() {
@@ -99,6 +136,24 @@ impl Core {
         ));
     }
 
+    /// Prolongs the leases of a session's worker that would run out now: its heartbeat has arrived, and waits only because
+    /// this coordinator is busy.
+    pub(crate) fn spare(&mut self, session: SessionId, now_ms: i64) {
+        let Some(entry) = self
+            .sessions
+            .get(&session)
+            .and_then(|w| self.workers.get(w))
+        else {
+            return;
+        };
+        for range in entry.leases.clone() {
+            let over = |range: &Range| matches!(&range.state, RangeState::Leased(l) if l.until_ms <= now_ms);
+            if self.range(range).is_some_and(over) {
+                self.renew(range, now_ms);
+            }
+        }
+    }
+
     /// Takes back every lease that has run out; to be called a few times a second.
     pub(crate) fn expire(&mut self, now_ms: i64) {
         let over: Vec<Range> = self
@@ -109,12 +164,49 @@ impl Core {
             .cloned()
             .collect();
         for range in over {
-            self.lost(
-                &range,
-                "the lease ran out: nothing was heard of the worker",
-                now_ms,
-            );
+            let why = self.silence(&range, now_ms);
+            self.lost(&range, &why, now_ms);
         }
+    }
+
+    /// Why a lease ran out, in words: its worker is gone, or it is there and silent.
+    fn silence(&self, range: &Range, now_ms: i64) -> String {
+        let RangeState::Leased(lease) = &range.state else {
+            return "the lease ran out".to_owned();
+        };
+        let name = self.name_of(lease.worker);
+        let tasks = self.in_hand(range);
+        let tasks = match &tasks[..] {
+            [] => String::new(),
+            [task] => format!(" while it ran task {task}"),
+            many => {
+                let many: Vec<String> = many.iter().map(u64::to_string).collect();
+                format!(" while it ran tasks {}", many.join(", "))
+            }
+        };
+        match self.workers.get(&lease.worker) {
+            None => format!(
+                "worker {name} was lost (connection closed){tasks}: its process or machine ended, or the network was cut; a \
+                 process that takes too much memory ends so"
+            ),
+            Some(entry) => format!(
+                "worker {name} fell silent{tasks}: it is connected, but was not heard of for {} s; it is frozen, suspended \
+                 or overloaded",
+                (now_ms - entry.heard_ms).max(0) / 1000
+            ),
+        }
+    }
+
+    /// The tasks of a lease that its worker works on, as far as is known; of one that has told nothing, the first to do.
+    fn in_hand(&self, range: &Range) -> Vec<u64> {
+        let todo = |task: &u64| range.has_to_do(*task);
+        let reported = self.progress.get(&range.id).into_iter();
+        let reported = reported.flat_map(|tasks| tasks.keys().copied());
+        let mut tasks: Vec<u64> = reported.filter(todo).collect();
+        if tasks.is_empty() {
+            tasks.extend((range.lo..range.hi).find(todo));
+        }
+        tasks
     }
 
     /// The worker was lost without a goodbye: the task in hand is charged with a crash, the rest is halved.
@@ -133,17 +225,7 @@ impl Core {
         }
         let about = About::message(why).tasks(range.lo, range.hi).worker(&*name);
         self.event(now_ms, range.stage, EventKind::Expired, about);
-        let todo = |task: &u64| to_do(range, *task);
-        let mut in_hand: Vec<u64> = self
-            .progress
-            .get(&range.id)
-            .into_iter()
-            .flat_map(|tasks| tasks.keys().copied())
-            .filter(todo)
-            .collect();
-        if in_hand.is_empty() {
-            in_hand.extend((range.lo..range.hi).find(todo));
-        }
+        let in_hand = self.in_hand(range);
         if self.charged.len() > CHARGED {
             self.charged.clear();
         }
@@ -227,10 +309,19 @@ impl Core {
             &backoff,
             now_ms,
         );
-        if kind != FailureKind::Interrupted
-            && let RangeState::Leased(lease) = &range.state
-        {
-            entry.trouble.failed(lease.worker, task, now_ms);
+        if let RangeState::Leased(lease) = &range.state {
+            match kind {
+                FailureKind::Interrupted => {}
+                FailureKind::Store => {
+                    let store = store_of(&entry.spec(range.stage).task);
+                    let backoff = &self.settings.backoff;
+                    self.away
+                        .failed(store, lease.worker, message, backoff, now_ms);
+                }
+                FailureKind::User | FailureKind::Crash => {
+                    entry.blocklist.failed(lease.worker, task, now_ms);
+                }
+            }
         }
         let crashes = verdict.exception.as_ref().map_or(0, |e| e.crashes);
         if let Some(exception) = verdict.exception {
@@ -249,7 +340,9 @@ impl Core {
         );
         let kind = match verdict.retry_at_ms {
             // Free: the task was given back, nothing is wrong with it.
-            Some(_) if kind == FailureKind::Interrupted => EventKind::Released,
+            Some(_) if matches!(kind, FailureKind::Interrupted | FailureKind::Store) => {
+                EventKind::Released
+            }
             Some(_) => EventKind::Failed,
             None => EventKind::Dead,
         };
@@ -302,9 +395,27 @@ impl Core {
         }
     }
 
+    /// Takes the rest of a lease from its worker, whose store does not play along: the worker is free for other work.
+    fn take_back(&mut self, id: RangeId, why: &str) {
+        let Some(range) = self.range(id).cloned() else {
+            return;
+        };
+        if let RangeState::Leased(lease) = &range.state
+            && let Some(entry) = self.workers.get(&lease.worker)
+        {
+            let revoke = Say::Revoke {
+                lease: range.lease(),
+                reason: format!("its tasks wait for their store: {why}"),
+            };
+            self.say.push((entry.session, revoke));
+        }
+        self.close(&range, false);
+    }
+
     /// Forgets a lease.
     pub(super) fn lease_over(&mut self, id: RangeId) {
         self.leases.remove(&id);
+        self.away.over(id);
         self.load.over(id);
         self.progress.remove(&id);
         for worker in self.workers.values_mut() {
@@ -350,7 +461,7 @@ impl Core {
         now_ms: i64,
     ) -> Result<&Range, String> {
         let range = self.held(session, lease, now_ms)?;
-        if to_do(range, task) {
+        if range.has_to_do(task) {
             Ok(range)
         } else {
             Err("this lease does not have that task to do".into())
@@ -385,14 +496,4 @@ impl Core {
             },
         ));
     }
-}
-
-/// Whether a leased range has this task to do.
-fn to_do(range: &Range, task: u64) -> bool {
-    let RangeState::Leased(lease) = &range.state else {
-        return false;
-    };
-    task.checked_sub(range.lo)
-        .and_then(|at| lease.marks.get(usize::try_from(at).ok()?))
-        == Some(&Mark::Todo)
 }

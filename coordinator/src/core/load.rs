@@ -11,7 +11,7 @@ pub(super) struct Load {
     leases: HashMap<RangeId, (JobId, WorkerId)>,
     jobs: HashMap<JobId, JobLoad>,
     users: HashMap<String, u32>,
-    /// Workers of other houses, by job, as last heard.
+    /// Workers of other instances, by job, as last heard.
     elsewhere: BTreeMap<JobId, u32>,
 }
 
@@ -57,7 +57,7 @@ impl Load {
         }
     }
 
-    /// Takes note of other houses' workers, by job.
+    /// Takes note of other instances' workers, by job.
     pub(super) fn hear_elsewhere(&mut self, workers: BTreeMap<JobId, u32>) {
         self.elsewhere = workers;
     }
@@ -72,7 +72,7 @@ impl Load {
         self.jobs.get(&job).map_or(0, |load| load.leases)
     }
 
-    /// Whether a worker may join those that work on a job, of which there may be `most`. Of other houses' workers it is
+    /// Whether a worker may join those that work on a job, of which there may be `most`. Of other instances' workers it is
     /// known how many there were a second ago: for so long there may be more.
     pub(super) fn may_join(&self, job: JobId, worker: WorkerId, most: u32) -> bool {
         let elsewhere = self.elsewhere.get(&job).copied().unwrap_or(0);

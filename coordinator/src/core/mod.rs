@@ -1,9 +1,11 @@
-//! The coordinator's mind: what this house has in hand, synchronous methods over it, no I/O. Time and ids are
+//! The coordinator's mind: what this instance has in hand, synchronous methods over it, no I/O. Time and ids are
 //! passed in. Each method notes what must become durable ([`Changes`]) and what to say afterwards ([`Say`]).
 //!
 //! In hand are the active jobs, the ranges leased to connected workers (or to those that may come back), and the pending
 //! ranges claimed for them. Everything else is the catalog's.
 
+mod blocklist;
+mod claims;
 mod commit;
 mod dispatch;
 mod facts;
@@ -11,33 +13,36 @@ mod jobs;
 mod leases;
 mod load;
 mod log;
+mod refused;
 mod sessions;
-mod supply;
+mod stores;
 mod tail;
 #[cfg(test)]
 mod tests;
-mod trouble;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{
-    Changes, Exception, Job, NewEvent, ResultSet, Run, Settled, Snapshot, Timing,
+    Changes, Exception, Job, NewEvent, ResultSet, Run, Settled, Snapshot, StageRecord, Timing,
 };
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::StageKey,
-    model::{Abilities, EventKind, Lease, LogAllowance, StageSpec, TaskAt},
+    model::{Abilities, EventKind, Lease, LogAllowance, StageSpec, TaskAt, memory::Known},
 };
 use uuid::Uuid;
 
-use crate::{budget::Backoff, stage::Stage};
+use crate::{budget::Backoff, place, stage::Stage};
+use blocklist::Blocklist;
 use load::Load;
 use tail::Double;
-use trouble::Trouble;
 
 pub(crate) use commit::OutputHint;
 pub(crate) use facts::{JobLook, Look};
-pub(crate) use jobs::{Prepared, Timings, place_is_free, stands_for};
+pub(crate) use jobs::{
+    Learnt, Overlay, Prepared, Timings, may_force, place_is_free, prepare, recorded_status,
+    stands_for,
+};
 
 /// Makes UUIDs; passed in, so that the core is deterministic.
 pub(crate) type MakeId = Box<dyn FnMut() -> Uuid + Send + Sync>;
@@ -93,6 +98,8 @@ pub(crate) enum Say {
 struct StageEntry {
     /// The stage's job.
     job: Job,
+    /// What the job tells of what its tasks read.
+    known: Known,
     set: usize,
     stage: Stage,
     /// Of tasks that were ever in hand.
@@ -104,7 +111,7 @@ struct StageEntry {
     /// Why no connected worker may run it, as last told.
     waiting: Option<String>,
     /// The workers on which its tasks failed.
-    trouble: Trouble,
+    blocklist: Blocklist,
     /// When its job is given up, Unix milliseconds.
     deadline_ms: Option<i64>,
 }
@@ -112,6 +119,14 @@ struct StageEntry {
 impl StageEntry {
     fn spec(&self, id: StageRef) -> &StageSpec {
         &self.job.spec.stages[id.stage as usize]
+    }
+
+    /// Whether a worker has what its tasks need.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    fn suits(&self, id: StageRef, worker: &Abilities) -> Result<(), String> {
+        place::may_run(self.spec(id), &self.known, worker)
     }
 
     /// Whether it has or may have tasks to be given out now.
@@ -133,6 +148,8 @@ struct WorkerEntry {
     version: String,
     /// When its session began.
     since_ms: i64,
+    /// When it was last heard of.
+    heard_ms: i64,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,
@@ -191,13 +208,17 @@ pub(crate) struct Core {
     doubles: BTreeMap<RangeId, Double>,
     /// When idle workers are looked after next.
     help_at_ms: i64,
+    /// Stores that tasks wait for.
+    away: stores::Stores,
+    /// Connections that break before this time, Unix milliseconds, broke by a stall of the coordinator's own.
+    graced_until_ms: i64,
     /// What workers were charged with when their connection broke, for the case that they live.
     charged: HashMap<WorkerId, (Incarnation, Vec<(StageRef, u64)>)>,
     /// Tasks in hand, by lease, as last reported.
     progress: BTreeMap<RangeId, BTreeMap<u64, Progress>>,
-    /// Houses alive, this one too.
-    houses: u32,
-    /// Workers connected to other houses.
+    /// Instances alive, this one too.
+    instances: u32,
+    /// Workers connected to other instances.
     elsewhere: u32,
     /// Outputs of `changes`, by set and task.
     fresh: HashMap<(usize, u64), [u8; 32]>,
@@ -232,16 +253,18 @@ impl Core {
             load: Load::default(),
             doubles: BTreeMap::new(),
             help_at_ms: 0,
+            away: stores::Stores::default(),
+            graced_until_ms: 0,
             charged: HashMap::new(),
             progress: BTreeMap::new(),
-            houses: 1,
+            instances: 1,
             elsewhere: 0,
             fresh: HashMap::new(),
             changes: Changes::default(),
             say: Vec::new(),
         };
         for job in snapshot.jobs {
-            core.add_job(&job, timing);
+            core.add_job(&job, job.stages(), timing);
         }
         core.receive(snapshot.owned, now_ms);
         core
@@ -252,9 +275,14 @@ impl Core {
         self.stages.contains_key(&StageRef { job, stage: 0 })
     }
 
-    /// Takes note of an active job.
-    pub(crate) fn add_job(&mut self, job: &Job, timing: &HashMap<ResultSet, Timing>) {
-        for record in job.stages() {
+    /// Takes note of an active job, given its stages.
+    pub(crate) fn add_job(
+        &mut self,
+        job: &Job,
+        stages: Vec<StageRecord>,
+        timing: &HashMap<ResultSet, Timing>,
+    ) {
+        for record in stages {
             let next = self.sets.len();
             let key = record.set.stage_key;
             let timing = timing.get(&record.set).copied().unwrap_or_default();
@@ -266,13 +294,14 @@ impl Core {
                 record.id,
                 StageEntry {
                     job: job.clone(),
+                    known: job.spec.known(record.id.stage as usize),
                     set,
                     stage: Stage::default(),
                     exceptions: BTreeMap::new(),
                     free: None,
                     ask_at_ms: 0,
                     waiting: None,
-                    trouble: Trouble::default(),
+                    blocklist: Blocklist::default(),
                     deadline_ms: job.spec.limits.deadline_ms().ok().flatten(),
                 },
             );
@@ -308,6 +337,7 @@ impl Core {
         for range in self.leases.keys().copied().collect::<Vec<_>>() {
             self.renew(range, now_ms);
         }
+        self.graced_until_ms = now_ms + i64::from(self.settings.lease_ms);
     }
 
     fn name_of(&self, worker: WorkerId) -> String {

@@ -37,12 +37,12 @@ impl Core {
                 }
             }
         }
+        let why = match &*hello.ended {
+            "" => "the worker was restarted while it held this lease".to_owned(),
+            how => format!("the worker's process was {how}"),
+        };
         for range in &former {
-            self.lost(
-                range,
-                "the worker was restarted while it held this lease",
-                now_ms,
-            );
+            self.lost(range, &why, now_ms);
         }
         self.sessions.insert(session, id);
         self.workers.insert(
@@ -53,6 +53,7 @@ impl Core {
                 name: hello.name,
                 version: hello.version,
                 since_ms: now_ms,
+                heard_ms: now_ms,
                 abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),
@@ -125,6 +126,8 @@ impl Core {
         };
         if let Some(entry) = self.workers.remove(&worker) {
             let until_ms = now_ms + i64::from(self.settings.reconnect_ms);
+            // Broken by a stall here: the worker may still be waiting before it tries again.
+            let until_ms = until_ms.max(self.graced_until_ms);
             for range in &entry.leases {
                 self.set_until(*range, |until| until.min(until_ms));
             }

@@ -19,7 +19,7 @@ const LOOK_MS: i64 = 200;
 /// A task is doubled when it has taken so many times the mean of its like.
 const SLOW: f64 = 3.0;
 
-/// A task that runs a second time. It is no range: the catalog knows nothing of it, and when its house is gone, so is it.
+/// A task that runs a second time. It is no range: the catalog knows nothing of it, and when its instance is gone, so is it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Double {
     /// The lease under which it is run first.

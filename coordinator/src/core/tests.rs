@@ -1,5 +1,5 @@
 //! Cores over a real catalog against a simple model: whatever happens in whatever order, every task is committed
-//! exactly once, the counts add up, and the catalog holds what the cores think. One house over SQLite, two over
+//! exactly once, the counts add up, and the catalog holds what the cores think. One instance over SQLite, two over
 //! Postgres, which lose their workers to each other, their time, and their memory.
 
 use std::{
@@ -8,11 +8,12 @@ use std::{
 };
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Job, PostgresCatalog, ResultSet, SqliteCatalog, testing,
+    Catalog, CatalogError, EventQuery, Job, Outcome, PostgresCatalog, Recorded, ResultSet, Run,
+    Sight, SqliteCatalog, Submission, testing,
 };
 use picofarm_proto::{
     PROTOCOL,
-    ids::{HouseId, Incarnation, JobId, WorkerId},
+    ids::{Incarnation, InstanceId, JobId, WorkerId},
     key::task_key,
     model::{
         Abilities, Failure, FailureKind, Finished, JobSpec, JobState, Lease, TaskAt, TaskProgress,
@@ -23,7 +24,7 @@ use proptest::prelude::*;
 use uuid::Uuid;
 
 use super::{Core, OutputHint, Say, Settings, Timings};
-use crate::budget::Backoff;
+use crate::{budget::Backoff, submission::Draft};
 
 const TASKS: u64 = 12;
 const WORKERS: u8 = 3;
@@ -48,15 +49,15 @@ enum Op {
     Beat(u8),
     /// The connection breaks; with `true`, the process dies too.
     Drop(u8, bool),
-    /// The worker connects to the nth house, without having told another that it left.
+    /// The worker connects to the nth instance, without having told another that it left.
     Connect(u8, u8),
     Pass(u16),
-    /// A house beats: it hears what is new.
-    HouseBeats(u8),
-    /// A house's process starts again.
-    HouseRestarts(u8),
-    /// A house's time runs out while it sleeps.
-    HouseIsLost(u8),
+    /// An instance beats: it hears what is new.
+    InstanceBeats(u8),
+    /// An instance's process starts again.
+    InstanceRestarts(u8),
+    /// An instance's time runs out while it sleeps.
+    InstanceIsLost(u8),
     Retry,
     /// The first job is held, or goes on.
     Pause(bool),
@@ -79,9 +80,9 @@ fn op() -> impl Strategy<Value = Op> {
         1 => (w.clone(), any::<bool>()).prop_map(|(w, d)| Op::Drop(w, d)),
         3 => (w, h).prop_map(|(w, h)| Op::Connect(w, h)),
         2 => (1..1_500u16).prop_map(Op::Pass),
-        2 => h.prop_map(Op::HouseBeats),
-        1 => h.prop_map(Op::HouseRestarts),
-        1 => h.prop_map(Op::HouseIsLost),
+        2 => h.prop_map(Op::InstanceBeats),
+        1 => h.prop_map(Op::InstanceRestarts),
+        1 => h.prop_map(Op::InstanceIsLost),
         1 => Just(Op::Retry),
         1 => any::<bool>().prop_map(Op::Pause),
         1 => prop_oneof![9 => Just(Op::Grow), 1 => Just(Op::Cancel)],
@@ -102,41 +103,41 @@ fn spec(count: u64) -> JobSpec {
 
 #[derive(Default)]
 struct FakeWorker {
-    /// The house and the session there.
+    /// The instance and the session there.
     session: Option<(usize, u64)>,
     incarnation: u128,
     /// Latest first.
     leases: Vec<Lease>,
 }
 
-struct House {
+struct Instance {
     catalog: Arc<dyn Catalog>,
-    id: HouseId,
+    id: InstanceId,
     core: Core,
 }
 
-impl House {
+impl Instance {
     async fn open(catalog: Arc<dyn Catalog>, now: i64) -> Self {
         let (id, core) = load(&*catalog, now).await;
         Self { catalog, id, core }
     }
 }
 
-async fn load(catalog: &dyn Catalog, now: i64) -> (HouseId, Core) {
+async fn load(catalog: &dyn Catalog, now: i64) -> (InstanceId, Core) {
     let snapshot = catalog.load().await.unwrap();
     let mut timings = Timings::new();
     for stage in snapshot.jobs.iter().flat_map(Job::stages) {
         let seconds = catalog.timing(&stage.set).await.unwrap();
         timings.insert(stage.set, seconds);
     }
-    let id = snapshot.house;
+    let id = snapshot.instance;
     let core = Core::load(snapshot, &timings, SETTINGS, Box::new(Uuid::now_v7), now);
     (id, core)
 }
 
 struct World {
-    houses: Vec<House>,
-    /// Where houses can be lost.
+    instances: Vec<Instance>,
+    /// Where instances can be lost.
     postgres: Option<String>,
     now: i64,
     workers: Vec<FakeWorker>,
@@ -149,13 +150,23 @@ struct World {
 }
 
 impl World {
+    /// Two instances on one Postgres, where there is one.
+    async fn on_postgres() -> Option<Self> {
+        let url = testing::postgres().await?;
+        let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
+        for name in ["a", "b"] {
+            catalogs.push(Arc::new(PostgresCatalog::open(&url, name).await.unwrap()));
+        }
+        Some(Self::new(catalogs, Some(url)).await)
+    }
+
     async fn new(catalogs: Vec<Arc<dyn Catalog>>, postgres: Option<String>) -> Self {
-        let mut houses = Vec::new();
+        let mut instances = Vec::new();
         for catalog in catalogs {
-            houses.push(House::open(catalog, 0).await);
+            instances.push(Instance::open(catalog, 0).await);
         }
         let mut world = Self {
-            houses,
+            instances,
             postgres,
             now: 1,
             workers: (0..WORKERS).map(|_| FakeWorker::default()).collect(),
@@ -169,16 +180,16 @@ impl World {
         world
     }
 
-    /// A new life of a house, as the actor begins one when the catalog refuses it.
+    /// A new life of an instance, as the actor begins one when the catalog refuses it.
     async fn reload(&mut self, h: usize) {
-        let house = &mut self.houses[h];
-        (house.id, house.core) = load(&*house.catalog, self.now).await;
+        let instance = &mut self.instances[h];
+        (instance.id, instance.core) = load(&*instance.catalog, self.now).await;
         for worker in &mut self.workers {
             worker.session = worker.session.filter(|(at, _)| *at != h);
         }
     }
 
-    /// What a house does when the catalog answers: a refusal ends its life.
+    /// What an instance does when the catalog answers: a refusal ends its life.
     async fn or_reload<T>(&mut self, h: usize, result: Result<T, CatalogError>) -> Option<T> {
         match result {
             Ok(value) => Some(value),
@@ -193,50 +204,68 @@ impl World {
     async fn submit(&mut self, h: usize, count: u64) {
         self.flush(h).await;
         let spec = spec(count);
-        let catalog = self.houses[h].catalog.clone();
+        let catalog = self.instances[h].catalog.clone();
         let latest = catalog
             .job_with(&picofarm_proto::key::spec_hash(&spec))
             .await;
-        if super::stands_for(latest.unwrap(), true).is_some() {
+        if latest
+            .unwrap()
+            .is_some_and(|job| super::stands_for(job.state, true))
+        {
             return;
         }
+        let draft = Draft::new(spec, 0);
         let mut runs = Vec::new();
-        for stage in &spec.stages {
-            let set = ResultSet::of(stage);
-            runs.push(catalog.output_runs(&set, count).await.unwrap());
+        for stage in draft.stages() {
+            let recorded = catalog.recorded(&stage.set, count).await.unwrap();
+            // The store holds every other one; of the rest nobody knows.
+            let seen: Vec<_> = recorded.into_iter().filter(|o| o.task % 2 == 0).collect();
+            let marked = catalog.mark_checked(&stage.set, &seen).await;
+            if self.or_reload(h, marked).await.is_none() {
+                return;
+            }
+            let run = |o: &Recorded| Run {
+                lo: o.task,
+                hi: o.task + 1,
+            };
+            runs.push(seen.iter().map(run).collect::<Vec<_>>());
         }
-        let core = &mut self.houses[h].core;
-        let prepared = core.prepare(spec, "ada".into(), &runs, self.now);
-        let recorded = catalog
-            .submit(&prepared.job, &prepared.ranges, &prepared.events)
-            .await;
-        if self.or_reload(h, recorded).await == Some(true) {
+        let prepared = super::prepare(&draft, "ada".into(), "", &runs, &mut Uuid::now_v7, self.now);
+        let submission = Submission::new(
+            &prepared.job,
+            &prepared.stages,
+            &prepared.ranges,
+            &prepared.events,
+        );
+        let recorded = catalog.record(&submission).await;
+        if self.or_reload(h, recorded).await == Some(Outcome::New) {
             self.jobs.push(prepared.job.id);
             self.learn(h, prepared.job.id).await;
         }
     }
 
     async fn learn(&mut self, h: usize, job: JobId) {
-        let house = &mut self.houses[h];
-        let record = house.catalog.job(job).await.unwrap().unwrap();
-        if record.job.state == JobState::Active && !house.core.knows(job) {
+        let instance = &mut self.instances[h];
+        let record = instance.catalog.job(job).await.unwrap().unwrap();
+        if record.job.state == JobState::Active && !instance.core.knows(job) {
             let mut timings = Timings::new();
-            for set in house.core.untimed(std::slice::from_ref(&record.job)) {
-                let seconds = house.catalog.timing(&set).await.unwrap();
-                timings.insert(set, seconds);
+            let stages = record.job.stages();
+            for stage in &stages {
+                let seconds = instance.catalog.timing(&stage.set).await.unwrap();
+                timings.insert(stage.set.clone(), seconds);
             }
-            house.core.add_job(&record.job, &timings);
+            instance.core.add_job(&record.job, stages, &timings);
         }
     }
 
     async fn flush(&mut self, h: usize) -> Vec<(u64, Say)> {
-        let house = &mut self.houses[h];
-        let (changes, say) = house.core.take();
-        let written = house.catalog.commit(changes).await;
+        let instance = &mut self.instances[h];
+        let (changes, say) = instance.core.take();
+        let written = instance.catalog.commit(&changes).await;
         let Some(settled) = self.or_reload(h, written).await else {
             return Vec::new();
         };
-        self.houses[h].core.settled(&settled);
+        self.instances[h].core.settled(&settled);
         for (session, what) in &say {
             let worker = self
                 .workers
@@ -255,14 +284,14 @@ impl World {
     }
 
     async fn beat(&mut self, h: usize) {
-        self.houses[h].core.give_back();
+        self.instances[h].core.give_back();
         self.flush(h).await;
-        let connected = self.houses[h].core.connected();
-        let news = self.houses[h].catalog.beat(connected).await;
+        let connected = self.instances[h].core.connected();
+        let news = self.instances[h].catalog.beat(connected).await;
         let Some(news) = self.or_reload(h, news).await else {
             return;
         };
-        for job in self.houses[h].core.hear(news, self.now) {
+        for job in self.instances[h].core.hear(news, self.now) {
             self.learn(h, job).await;
         }
     }
@@ -281,6 +310,7 @@ impl World {
             version: String::new(),
             protocol: PROTOCOL,
             held: worker.leases.iter().map(|l| l.lease).collect(),
+            ended: String::new(),
             abilities: Abilities {
                 kinds: ["render", "reprocess"]
                     .map(|kind| (kind.to_owned(), "r".to_owned()))
@@ -290,10 +320,10 @@ impl World {
         };
         worker.session = None;
         self.flush(h).await;
-        let owned = self.houses[h].catalog.adopt(hello.id).await;
+        let owned = self.instances[h].catalog.adopt(hello.id).await;
         if let Some(owned) = self.or_reload(h, owned).await {
-            self.houses[h].core.receive(owned, self.now);
-            self.houses[h].core.hello(session, hello, self.now);
+            self.instances[h].core.receive(owned, self.now);
+            self.instances[h].core.hello(session, hello, self.now);
             self.workers[usize::from(w)].session = Some((h, session));
         }
     }
@@ -310,12 +340,12 @@ impl World {
             traceparent: String::new(),
         };
         self.flush(h).await;
-        let house = &mut self.houses[h];
-        let hint = match house.core.stage_of(&report) {
-            Some(stage) => house.catalog.manifests(&[(stage, index)]).await.unwrap()[0],
+        let instance = &mut self.instances[h];
+        let hint = match instance.core.stage_of(&report) {
+            Some(stage) => instance.catalog.manifests(&[(stage, index)]).await.unwrap()[0],
             None => None,
         };
-        house
+        instance
             .core
             .finished(session, &report, OutputHint(hint), self.now);
         let said = self.flush(h).await;
@@ -337,19 +367,23 @@ impl World {
 
     fn lease_of(&self, w: u8, l: u8) -> Option<(usize, u64, Lease)> {
         let worker = &self.workers[usize::from(w)];
-        let (house, session) = worker.session?;
-        Some((house, session, worker.leases.get(usize::from(l))?.clone()))
+        let (instance, session) = worker.session?;
+        Some((
+            instance,
+            session,
+            worker.leases.get(usize::from(l))?.clone(),
+        ))
     }
 
-    fn house(&self, h: u8) -> usize {
-        usize::from(h) % self.houses.len()
+    fn instance(&self, h: u8) -> usize {
+        usize::from(h) % self.instances.len()
     }
 
     async fn act(&mut self, op: &Op) {
         match op {
             Op::Credit(w) => {
                 if let Some((h, session)) = self.workers[usize::from(*w)].session {
-                    self.houses[h].core.credit(session, 1);
+                    self.instances[h].core.credit(session, 1);
                 }
             }
             Op::Finish(w, l, t) => {
@@ -366,12 +400,12 @@ impl World {
                         kind: *kind,
                         message: "no".into(),
                     };
-                    self.houses[h].core.failed(session, &failure, self.now);
+                    self.instances[h].core.failed(session, &failure, self.now);
                 }
             }
             Op::Release(w, l) => {
                 if let Some((h, session, lease)) = self.lease_of(*w, *l) {
-                    let core = &mut self.houses[h].core;
+                    let core = &mut self.instances[h].core;
                     core.released(session, lease.lease, "bye", self.now);
                 }
             }
@@ -386,7 +420,7 @@ impl World {
                         at: TaskAt::default(),
                     });
                     let progress: Vec<_> = progress.collect();
-                    self.houses[h]
+                    self.instances[h]
                         .core
                         .heartbeat(session, &leases, &progress, self.now);
                 }
@@ -398,29 +432,29 @@ impl World {
                     worker.leases.clear();
                 }
                 if let Some((h, session)) = worker.session.take() {
-                    self.houses[h].core.closed(session, self.now);
+                    self.instances[h].core.closed(session, self.now);
                 }
             }
-            Op::Connect(w, h) => self.connect(*w, self.house(*h)).await,
+            Op::Connect(w, h) => self.connect(*w, self.instance(*h)).await,
             Op::Pass(ms) => self.now += i64::from(*ms),
-            Op::HouseBeats(h) => self.beat(self.house(*h)).await,
-            Op::HouseRestarts(h) => {
-                let h = self.house(*h);
+            Op::InstanceBeats(h) => self.beat(self.instance(*h)).await,
+            Op::InstanceRestarts(h) => {
+                let h = self.instance(*h);
                 self.flush(h).await;
                 self.reload(h).await;
             }
-            Op::HouseIsLost(h) => {
-                let h = self.house(*h);
+            Op::InstanceIsLost(h) => {
+                let h = self.instance(*h);
                 if let Some(url) = &self.postgres {
-                    testing::lose_house(url, self.houses[h].id).await;
+                    testing::lose_instance(url, self.instances[h].id).await;
                 }
             }
             Op::Retry => {
                 for job in self.jobs.clone() {
-                    let retried = self.houses[0].catalog.retry(job, self.now).await;
+                    let retried = self.instances[0].catalog.retry(job, self.now).await;
                     // One with a later twin stays as it is.
                     if matches!(retried, Ok(1..)) {
-                        self.houses[0].core.retried(job);
+                        self.instances[0].core.retried(job);
                         self.learn(0, job).await;
                     }
                 }
@@ -428,51 +462,51 @@ impl World {
             Op::Pause(paused) => {
                 let job = self.jobs[0];
                 self.flush(0).await;
-                let changed = self.houses[0]
+                let changed = self.instances[0]
                     .catalog
                     .pause(job, *paused, "", self.now)
                     .await;
                 if self.or_reload(0, changed).await == Some(true) {
-                    self.houses[0].core.paused(job, *paused);
+                    self.instances[0].core.paused(job, *paused);
                     self.flush(0).await;
                 }
             }
             Op::Cancel => {
                 let job = self.jobs[0];
                 self.flush(0).await;
-                let cancelled = self.houses[0].catalog.cancel(job, "", self.now).await;
+                let cancelled = self.instances[0].catalog.cancel(job, "", self.now).await;
                 if self.or_reload(0, cancelled).await == Some(true) {
-                    self.houses[0].core.drop_job(job, "cancelled");
+                    self.instances[0].core.drop_job(job, "cancelled");
                 }
             }
             Op::Grow => self.submit(0, TASKS + 4).await,
         }
-        for h in 0..self.houses.len() {
+        for h in 0..self.instances.len() {
             self.step(h).await;
         }
     }
 
-    /// One turn of a house's actor.
+    /// One turn of an instance's actor.
     async fn step(&mut self, h: usize) {
-        self.houses[h].core.expire(self.now);
-        let wants = self.houses[h].core.wants(self.now);
+        self.instances[h].core.expire(self.now);
+        let wants = self.instances[h].core.wants(self.now);
         if !wants.is_empty() {
             self.flush(h).await;
-            let claims = self.houses[h].catalog.claim(&wants).await;
+            let claims = self.instances[h].catalog.claim(&wants).await;
             let Some(claims) = self.or_reload(h, claims).await else {
                 return;
             };
             for (want, claim) in wants.iter().zip(claims) {
-                self.houses[h].core.supplied(want.stage, claim, self.now);
+                self.instances[h].core.claimed(want.stage, claim, self.now);
             }
         }
-        self.houses[h].core.dispatch(self.now);
+        self.instances[h].core.dispatch(self.now);
         self.flush(h).await;
     }
 
     /// The laws.
     async fn check(&self) {
-        let catalog = &self.houses[0].catalog;
+        let catalog = &self.instances[0].catalog;
         for job in &self.jobs {
             let record = catalog.job(*job).await.unwrap().unwrap();
             for (ordinal, stage) in record.stages.iter().enumerate() {
@@ -508,10 +542,14 @@ impl World {
         for w in 0..WORKERS {
             self.act(&Op::Drop(w, true)).await;
         }
+        // An instance that was lost meanwhile refuses the first call after it.
+        for h in 0..self.instances.len() {
+            self.beat(h).await;
+        }
         self.act(&Op::Pause(false)).await;
         for turn in 0..400u64 {
             self.act(&Op::Pass(1_200)).await;
-            for h in 0..self.houses.len() {
+            for h in 0..self.instances.len() {
                 self.beat(h).await;
             }
             self.act(&Op::Connect(0, (turn / 50) as u8)).await;
@@ -523,7 +561,7 @@ impl World {
             }
             let mut over = true;
             for job in &self.jobs {
-                let record = self.houses[0].catalog.job(*job).await.unwrap().unwrap();
+                let record = self.instances[0].catalog.job(*job).await.unwrap().unwrap();
                 over &= record.job.state != JobState::Active;
             }
             if over {
@@ -541,7 +579,7 @@ impl World {
         for _ in 0..8 {
             self.act(&Op::Credit(0)).await;
         }
-        self.act(&Op::HouseBeats(0)).await;
+        self.act(&Op::InstanceBeats(0)).await;
         self.act(&Op::Connect(1, 0)).await;
         for _ in 0..8 {
             self.act(&Op::Credit(1)).await;
@@ -577,14 +615,14 @@ impl World {
         self.finish_all().await;
         self.check().await;
         for job in &self.jobs {
-            let record = self.houses[0].catalog.job(*job).await.unwrap().unwrap();
+            let record = self.instances[0].catalog.job(*job).await.unwrap().unwrap();
             let (state, counts) = (record.job.state, record.counts());
             let stuck = counts.pending > 0 && counts.dead > 0;
             let over = counts.leased == 0 && (counts.pending == 0 || stuck);
             assert!(state == JobState::Cancelled || over, "{counts:?}");
         }
-        for house in &self.houses {
-            house.catalog.close().await;
+        for instance in &self.instances {
+            instance.catalog.close().await;
         }
     }
 }
@@ -615,22 +653,64 @@ fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
     });
 }
 
-/// Found by chaos: a worker takes its lease along to another house and ends it there, before its former house, which does
+/// A worker's heartbeat waits in line while this coordinator is busy: its leases, which would run out, are prolonged; those
+/// of a silent worker are not, and the history says what it did.
+#[test]
+fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
+            .await
+            .unwrap();
+        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        for w in 0..2 {
+            world.connect(w, 0).await;
+            world.act(&Op::Credit(w)).await;
+        }
+        let lease = |w: usize| world.workers[w].leases[0].clone();
+        let (heard, silent) = (lease(0), lease(1));
+        let session = world.workers[0].session.unwrap().1;
+        world.now += i64::from(SETTINGS.lease_ms) + 1;
+        let core = &mut world.instances[0].core;
+        core.spare(session, world.now);
+        core.expire(world.now);
+        let lives = |lease: &Lease| core.range(lease.lease.range).is_some();
+        assert_eq!((lives(&heard), lives(&silent)), (true, false));
+        world.flush(0).await;
+        let query = EventQuery {
+            job: Some(world.jobs[0]),
+            after: 0,
+            limit: 100,
+            task: None,
+            stage: None,
+            newest: false,
+            logs: false,
+            sight: Sight::All,
+        };
+        let events = world.instances[0].catalog.events(&query).await;
+        let told = events.unwrap().into_iter().map(|e| e.message);
+        let told: Vec<String> = told.filter(|m| m.contains("w1")).collect();
+        let what = format!("worker w1 fell silent while it ran task {}", silent.lo);
+        assert!(told.iter().any(|m| m.starts_with(&what)), "{told:?}");
+        // Once only: the next heartbeat must come in time.
+        world.now += i64::from(SETTINGS.lease_ms) + 1;
+        let core = &mut world.instances[0].core;
+        core.expire(world.now);
+        assert!(core.range(heard.lease.range).is_none());
+    });
+}
+
+/// Found by chaos: a worker takes its lease along to another instance and ends it there, before its former instance, which does
 /// not know yet, commits the last task that it has itself.
 #[test]
-fn a_stage_is_over_although_its_last_house_believed_to_hold_a_lease_that_ended_elsewhere() {
+fn a_stage_is_over_although_its_last_instance_believed_to_hold_a_lease_that_ended_elsewhere() {
     block_on(async {
-        let Some(url) = testing::postgres().await else {
+        let Some(mut world) = World::on_postgres().await else {
             return;
         };
-        let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
-        for name in ["a", "b"] {
-            catalogs.push(Arc::new(PostgresCatalog::open(&url, name).await.unwrap()));
-        }
-        let mut world = World::new(catalogs, Some(url)).await;
         let job = world.jobs[0];
         let first = async |world: &World| {
-            let catalog = &world.houses[0].catalog;
+            let catalog = &world.instances[0].catalog;
             catalog.job(job).await.unwrap().unwrap().stages[0]
         };
         world.connect(0, 0).await;
@@ -652,14 +732,14 @@ fn a_stage_is_over_although_its_last_house_believed_to_hold_a_lease_that_ended_e
                 world.finish(0, session, &lease, index).await;
             }
         }
-        for (worker, house) in [(1, 1), (0, 0)] {
-            if house == 1 {
+        for (worker, instance) in [(1, 1), (0, 0)] {
+            if instance == 1 {
                 world.connect(1, 1).await;
             }
             let lease = world.workers[worker].leases[0].clone();
             let session = world.workers[worker].session.unwrap().1;
             for index in lease.lo..lease.hi {
-                world.finish(house, session, &lease, index).await;
+                world.finish(instance, session, &lease, index).await;
             }
         }
         let counts = first(&world).await.counts;
@@ -668,8 +748,61 @@ fn a_stage_is_over_although_its_last_house_believed_to_hold_a_lease_that_ended_e
         world.flush(0).await;
         let state = first(&world).await.state;
         assert_eq!(state, picofarm_proto::model::StageState::Done);
-        for house in &world.houses {
-            house.catalog.close().await;
+        for instance in &world.instances {
+            instance.catalog.close().await;
+        }
+    });
+}
+
+/// A worker takes its lease along to another instance and gives it back there; its former instance claims the tasks before it has
+/// heard of that.
+#[test]
+fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
+    block_on(async {
+        let Some(mut world) = World::on_postgres().await else {
+            return;
+        };
+        world.connect(0, 0).await;
+        world.act(&Op::Credit(0)).await;
+        let lease = world.workers[0].leases[0].clone();
+        world.connect(0, 1).await;
+        // One task back with its own range, the rest as the lease's.
+        let session = world.workers[0].session.unwrap().1;
+        let failure = Failure {
+            lease: lease.lease,
+            index: lease.lo,
+            kind: FailureKind::Interrupted,
+            message: "no".into(),
+        };
+        world.instances[1].core.failed(session, &failure, world.now);
+        world.act(&Op::Release(0, 0)).await;
+        world.beat(1).await;
+        world.connect(1, 0).await;
+        while world.instances[0]
+            .catalog
+            .job(world.jobs[0])
+            .await
+            .unwrap()
+            .unwrap()
+            .stages[0]
+            .counts
+            .pending
+            > 0
+        {
+            world.act(&Op::Credit(1)).await;
+        }
+        world.check().await;
+        let held = world.instances[0].core.leases.len();
+        assert_eq!(
+            held,
+            world.workers[1].leases.len(),
+            "only the second worker has leases"
+        );
+        world.act(&Op::Pass(1_400)).await;
+        world.finish_all().await;
+        world.check().await;
+        for instance in &world.instances {
+            instance.catalog.close().await;
         }
     });
 }
@@ -687,14 +820,10 @@ proptest! {
     }
 
     #[test]
-    fn two_houses_on_one_database_commit_every_task_exactly_once(greedy: bool, ops in prop::collection::vec(op(), 1..80)) {
+    fn two_instances_on_one_database_commit_every_task_exactly_once(greedy: bool, ops in prop::collection::vec(op(), 1..80)) {
         block_on(async {
-            let Some(url) = testing::postgres().await else { return };
-            let mut catalogs: Vec<Arc<dyn Catalog>> = Vec::new();
-            for name in ["a", "b"] {
-                catalogs.push(Arc::new(PostgresCatalog::open(&url, name).await.unwrap()));
-            }
-            World::new(catalogs, Some(url)).await.live(greedy, &ops).await;
+            let Some(world) = World::on_postgres().await else { return };
+            world.live(greedy, &ops).await;
         });
     }
 }

@@ -1,7 +1,10 @@
 //! Each answer has the facts that call for it.
 
-use picofarm_catalog::{LeaseState, Mark, Output, Range};
-use picofarm_proto::ids::{Epoch, Incarnation, RangeId, StageRef, WorkerId};
+use picofarm_catalog::{LeaseState, Mark, Output, Range, RangeState};
+use picofarm_proto::{
+    ids::{Epoch, Incarnation, RangeId, StageRef, WorkerId},
+    model::{EventKind, TaskState},
+};
 use uuid::Uuid;
 
 use super::*;
@@ -29,7 +32,10 @@ fn facts() -> JobFacts {
         },
         candidates: vec![able("a")],
         ahead: vec![],
+        unseen: 0,
         elsewhere: 0,
+        running: vec![],
+        setback: None,
         now_ms: NOW,
     }
 }
@@ -38,8 +44,10 @@ fn able(name: &str) -> Candidate {
     Candidate {
         name: name.into(),
         may_run: Ok(()),
+        lacks_memory: None,
         idle: false,
         quarantined: false,
+        silent_ms: None,
     }
 }
 
@@ -65,6 +73,27 @@ fn stage() -> StageRef {
 fn first(facts: &JobFacts) -> (String, String) {
     let reasons = job(facts);
     (reasons[0].code.clone(), reasons[0].words.clone())
+}
+
+#[test]
+fn a_job_that_no_worker_can_hold_says_what_it_needs_and_what_the_largest_has() {
+    let small = |name: &str, gib: u64| Candidate {
+        may_run: Err("a task takes too much".into()),
+        lacks_memory: Some((41 << 30, gib << 30)),
+        ..able(name)
+    };
+    let facts = JobFacts {
+        candidates: vec![small("a", 4), small("b", 8), small("c", 2)],
+        ..facts()
+    };
+    let (code, words) = first(&facts);
+    assert_eq!(code, "unable");
+    assert!(
+        words.ends_with(
+            "each needs about 41.0 GiB of memory; the largest worker has 8.0 GiB for tasks (b)"
+        ),
+        "{words}"
+    );
 }
 
 #[test]
@@ -277,7 +306,7 @@ fn each_run_of_a_task_but_the_first_has_its_cause() {
     assert_eq!(
         told.reruns,
         [
-            "a was lost with it: the lease ran out",
+            "the lease ran out",
             "b gave it back: the worker is stopping",
             "it was given up on c: no light, and then tried again",
         ]
@@ -347,4 +376,85 @@ fn a_task_that_waits_or_was_given_up_says_why() {
     );
     facts.record.range = None;
     assert_eq!(task(facts).state, TaskState::Gone);
+}
+
+#[test]
+fn a_silent_worker_is_not_called_busy() {
+    let silent = Candidate {
+        silent_ms: Some(42_000),
+        ..able("rack-1")
+    };
+    let (code, words) = first(&JobFacts {
+        candidates: vec![silent.clone()],
+        ..facts()
+    });
+    assert_eq!(code, "silent");
+    assert!(
+        words.contains("rack-1 for 42 s") && words.contains("frozen"),
+        "{words}"
+    );
+    // Another one that works is what the tasks wait for.
+    let (code, _) = first(&JobFacts {
+        candidates: vec![silent, able("rack-2")],
+        ..facts()
+    });
+    assert_eq!(code, "busy");
+}
+
+#[test]
+fn a_lease_of_many_tasks_is_one_that_runs() {
+    let running = RunningTask {
+        stage: 0,
+        index: 3,
+        worker: "rack-1".into(),
+        fraction: 0.25,
+        seconds: 1.0,
+        text: "waits for the store: No space left on device".into(),
+        figures: std::collections::BTreeMap::new(),
+    };
+    let leased = JobFacts {
+        counts: TaskCounts {
+            total: 14,
+            leased: 14,
+            ..TaskCounts::default()
+        },
+        holdups: Holdups::default(),
+        running: vec![running],
+        ..facts()
+    };
+    let (code, words) = first(&leased);
+    assert_eq!(code, "leased");
+    assert_eq!(
+        words,
+        "14 tasks under lease at workers, of which 1 runs: task 3 on rack-1 (25 %, waits for the store: No space left on \
+         device)"
+    );
+}
+
+#[test]
+fn what_was_given_back_says_why() {
+    let given_back = Event {
+        kind: EventKind::Released,
+        worker: "rack-1".into(),
+        task: Some(5),
+        ..event(
+            EventKind::Released,
+            "rack-1",
+            "cannot write /tmp/x: No space left on device",
+        )
+    };
+    let (code, words) = first(&JobFacts {
+        holdups: Holdups {
+            waiting: 2,
+            next_ms: Some(NOW + 5_000),
+            ..Holdups::default()
+        },
+        setback: Some(given_back),
+        ..facts()
+    });
+    assert_eq!(code, "after_failure");
+    assert!(
+        words.contains("No space left on device") && words.contains("rack-1"),
+        "{words}"
+    );
 }

@@ -14,7 +14,7 @@ use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
     ids::LeaseRef,
-    model::WorkerHello,
+    model::{WorkerHello, bounds},
     wire::{
         self, farm_server::Farm, session_request::Message as From, session_response::Message as To,
     },
@@ -29,6 +29,7 @@ use crate::{
     actor::{Command, FromWorker},
     auth::{Caller, Quotas, WorkerIds},
     core::{Say, SessionId},
+    sessions::Waiting,
 };
 
 /// How long a worker may take to say who it is.
@@ -132,16 +133,18 @@ async fn run(
     }
     tracing::info!(worker, session, caller = %caller.name, "worker connected");
     let (say, mut said) = mpsc::channel(OUTBOX);
+    let waiting = Waiting::default();
     let open = Command::Open {
         session,
         hello,
         say,
+        waiting: waiting.clone(),
     };
     if link.commands.send(open).await.is_err() {
         return;
     }
     let end = tokio::select! {
-        end = listen(&link, session, &mut input) => end,
+        end = listen(&link, session, &waiting, &mut input) => end,
         end = speak(&mut said, &out) => end,
         revoked = caller.revoked() => Err(revoked),
         () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
@@ -172,8 +175,10 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
     };
     if hello.protocol != PROTOCOL || hello.version != VERSION {
         return Err(Status::failed_precondition(format!(
-            "worker {:?} is picofarm {} (protocol {}), the coordinator is picofarm {VERSION} (protocol {PROTOCOL}); install the same version on both",
-            hello.name, hello.version, hello.protocol
+            "worker {} is picofarm {} (protocol {}), the coordinator is picofarm {VERSION} (protocol {PROTOCOL}); install the same version on both",
+            bounds::quoted(&hello.name),
+            bounds::cut(&hello.version, bounds::NAME_BYTES),
+            hello.protocol
         )));
     }
     WorkerHello::try_from(hello).map_err(invalid)
@@ -183,13 +188,23 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
 async fn listen(
     link: &Link,
     session: SessionId,
+    waiting: &Waiting,
     input: &mut Streaming<wire::SessionRequest>,
 ) -> Result<(), Status> {
     loop {
         let Some(request) = input.message().await? else {
             return Ok(());
         };
-        let said = checked(request).map_err(invalid)?;
+        let said = match checked(request).map_err(invalid)? {
+            Ok(said) => said,
+            Err(why) => {
+                tracing::warn!(session, "a worker's log lines cannot be used: {why}");
+                continue;
+            }
+        };
+        if matches!(said, FromWorker::Heartbeat(..)) {
+            waiting.arrived();
+        }
         let command = Command::Worker(session, said);
         if link.commands.send(command).await.is_err() {
             return Err(Status::unavailable(
@@ -199,13 +214,26 @@ async fn listen(
     }
 }
 
-fn checked(request: wire::SessionRequest) -> Result<FromWorker, ConvertError> {
+/// What a worker says, checked. A report that cannot be used but says what it is about counts as that task's failure: refused
+/// with the session, it would be sent again in the next. Log lines that cannot be used are dropped (the inner error): nobody
+/// waits for an answer to them.
+///
+/// # Errors
+/// A message that says nothing at all, which no worker of this version sends: the session ends.
+fn checked(
+    request: wire::SessionRequest,
+) -> Result<Result<FromWorker, ConvertError>, ConvertError> {
     let lease = |lease: Option<wire::LeaseRef>| -> Result<LeaseRef, ConvertError> {
         lease
             .ok_or(ConvertError::Missing { field: "lease" })?
             .try_into()
     };
-    Ok(match request.message {
+    let unusable = |about: Option<wire::LeaseRef>, index: u64, why: ConvertError| match lease(about)
+    {
+        Ok(lease) => Ok(FromWorker::Unusable(lease, index, why.to_string())),
+        Err(why) => Err(why),
+    };
+    Ok(Ok(match request.message {
         None => return Err(ConvertError::Missing { field: "message" }),
         Some(From::Hello(_)) => {
             return Err(ConvertError::Invalid {
@@ -224,11 +252,28 @@ fn checked(request: wire::SessionRequest) -> Result<FromWorker, ConvertError> {
                 .map(TryInto::try_into)
                 .collect::<Result<_, _>>()?,
         ),
-        Some(From::Done(done)) => FromWorker::Done(done.try_into()?),
-        Some(From::Failed(failed)) => FromWorker::Failed(failed.try_into()?),
-        Some(From::Log(log)) => FromWorker::Log(log.try_into()?),
-        Some(From::Release(release)) => FromWorker::Release(lease(release.lease)?, release.reason),
-    })
+        Some(From::Done(done)) => {
+            let (about, index) = (done.lease.clone(), done.index);
+            match done.try_into() {
+                Ok(report) => FromWorker::Done(report),
+                Err(why) => unusable(about, index, why)?,
+            }
+        }
+        Some(From::Failed(failed)) => {
+            let (about, index) = (failed.lease.clone(), failed.index);
+            match failed.try_into() {
+                Ok(failure) => FromWorker::Failed(failure),
+                Err(why) => unusable(about, index, why)?,
+            }
+        }
+        Some(From::Log(log)) => match log.try_into() {
+            Ok(log) => FromWorker::Log(log),
+            Err(why) => return Ok(Err(why)),
+        },
+        Some(From::Release(release)) => {
+            FromWorker::Release(lease(release.lease)?, bounds::message(&release.reason))
+        }
+    }))
 }
 
 /// Tells the worker what the actor says, until the actor lets it go.

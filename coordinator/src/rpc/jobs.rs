@@ -1,33 +1,38 @@
 //! Service `Jobs`: what clients ask.
 
-use std::{pin::Pin, time::Duration};
+use std::{pin::Pin, sync::Arc, time::Duration};
 
 use futures::Stream;
-use picofarm_catalog::EventQuery;
+use picofarm_catalog::{AuditQuery, CatalogError, EventQuery, JobQuery, Sight};
 use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
     ids::JobId,
-    model::{JobSpec, JobState, StageSpec},
+    model::{Act, JobSpec, JobState, StageSpec, bounds},
     wire::{self, jobs_server::Jobs},
 };
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, caller, invalid, look};
+use super::{Link, caller, invalid, look, refused};
 use crate::{
     VERSION,
-    actor::Command,
+    actor::{Command, Submitted},
     auth::{Caller, Quotas},
     plan,
+    submission::Draft,
 };
 
 /// Least time between two reports to a watcher.
 const DEBOUNCE: Duration = Duration::from_millis(250);
-/// Events in one answer where the client names no limit, and at most.
+/// Most time between two looks at a watched job.
+const LOOK: Duration = Duration::from_secs(5);
+/// Events in one answer where the client names no limit, and at most: with the longest messages some 4 MB.
 const EVENTS: u32 = 1_000;
-const MOST_EVENTS: u32 = 10_000;
+/// Jobs in one answer where the client names no number, and at most.
+const JOBS: u32 = 100;
+const MOST_JOBS: u32 = 1_000;
 
 pub(crate) struct JobsService {
     link: Link,
@@ -39,20 +44,19 @@ impl JobsService {
         Self { link, quotas }
     }
 
-    fn spec(&self, wire: Option<wire::JobSpec>) -> Result<Box<JobSpec>, Status> {
+    /// Reads and checks a spec, beside everything else: a large one takes seconds.
+    async fn draft(&self, wire: Option<wire::JobSpec>, by: &Caller) -> Result<Arc<Draft>, Status> {
         let wire = wire.ok_or_else(|| invalid(ConvertError::Missing { field: "spec" }))?;
-        let spec = JobSpec::try_from(wire).map_err(invalid)?;
-        spec.check().map_err(|e| invalid(e.into()))?;
-        plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
-        spec.check_places().map_err(|e| invalid(e.into()))?;
-        let tasks: u64 = spec.stages.iter().map(StageSpec::tasks).sum();
-        let most = self.quotas.tasks_per_job;
-        if tasks > most {
-            return Err(Status::resource_exhausted(format!(
-                "the job's {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
-            )));
-        }
-        Ok(Box::new(spec))
+        let (bytes, quotas, by) = (wire.json.len(), self.quotas, by.clone());
+        let draft = self
+            .link
+            .lanes
+            .heavy(
+                bytes,
+                move || async move { draft(wire, bytes, &quotas, &by) },
+            )
+            .await?;
+        Ok(Arc::new(draft))
     }
 }
 
@@ -61,21 +65,96 @@ impl JobsService {
         &self,
         job: JobId,
         paused: bool,
-        who: &Caller,
+        by: &Caller,
     ) -> Result<wire::JobStatus, Status> {
+        let act = if paused { Act::Pause } else { Act::Resume };
         let pause = |reply| Command::Pause {
             job,
             paused,
-            who: format!("by {}", who.name),
+            who: format!("by {}", by.name),
             reply,
         };
-        Ok(self.link.ask(pause).await?.into())
+        self.link.steer(by, act, job, pause).await?;
+        Ok(self.link.status(job).await?.into())
     }
+
+    async fn submit(
+        &self,
+        request: wire::SubmitJobRequest,
+        by: &Caller,
+    ) -> Result<Submitted, Status> {
+        let draft = self.draft(request.spec, by).await?;
+        let most = self.quotas.jobs_per_user as u64;
+        let submissions = &self.link.submissions;
+        let submitted = submissions.submit(&draft, by, most, request.again).await;
+        submitted.map_err(refused)
+    }
+}
+
+/// What a list is to show.
+fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Status> {
+    let wrong = |field: &str, what: &str| Status::invalid_argument(format!("{field}: {what}"));
+    let some = |text: String, field: &str| match text.as_str() {
+        "" => Ok(None),
+        text => match bounds::name(text, bounds::NAME_BYTES) {
+            Ok(()) => Ok(Some(text.to_owned())),
+            Err(what) => Err(wrong(field, &what)),
+        },
+    };
+    let state = match wire::JobState::try_from(request.state) {
+        Ok(wire::JobState::Unspecified) => None,
+        Ok(state) => Some(state.try_into().map_err(invalid)?),
+        Err(_) => return Err(wrong("state", "is no state of a job")),
+    };
+    let before = match request.page_token.as_str() {
+        "" => None,
+        token => Some(token.parse().map_err(|_| {
+            wrong(
+                "page_token",
+                "expected next_page_token of an earlier answer",
+            )
+        })?),
+    };
+    Ok(JobQuery {
+        sight,
+        before,
+        limit: match request.page_size {
+            0 => JOBS,
+            n => n.min(MOST_JOBS),
+        },
+        state,
+        user: some(request.user, "user")?,
+        find: some(request.find, "find")?,
+    })
+}
+
+fn broken(error: CatalogError) -> Status {
+    match error {
+        CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),
+        error => Status::unavailable(bounds::message(&error.to_string())),
+    }
+}
+
+fn draft(wire: wire::JobSpec, bytes: usize, quotas: &Quotas, by: &Caller) -> Result<Draft, Status> {
+    let spec = JobSpec::try_from(wire).map_err(invalid)?;
+    spec.check().map_err(|e| invalid(e.into()))?;
+    plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
+    spec.check_places().map_err(|e| invalid(e.into()))?;
+    by.may_submit(&spec, quotas.max_priority)
+        .map_err(|e| invalid(e.into()))?;
+    let most = quotas.tasks_per_job;
+    let tasks: u64 = spec.stages.iter().map(StageSpec::tasks).sum();
+    if tasks > most {
+        return Err(Status::resource_exhausted(format!(
+            "the job's {tasks} tasks are more than the {most} that --max-tasks-per-job allows; split the job"
+        )));
+    }
+    Ok(Draft::new(spec, bytes))
 }
 
 fn job_id(text: &str) -> Result<JobId, Status> {
     text.parse()
-        .map_err(|e| Status::invalid_argument(format!("job_id: {e}")))
+        .map_err(|e| Status::invalid_argument(bounds::message(&format!("job_id: {e}"))))
 }
 
 #[tonic::async_trait]
@@ -95,8 +174,10 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::PlanJobRequest>,
     ) -> Result<Response<wire::PlanJobResponse>, Status> {
-        let spec = self.spec(request.into_inner().spec)?;
-        let plan = self.link.ask(|reply| Command::Plan(spec, reply)).await?;
+        let by = caller(&request);
+        let draft = self.draft(request.into_inner().spec, &by).await?;
+        let plan = self.link.submissions.plan(&draft, &by).await;
+        let plan = plan.map_err(refused)?;
         Ok(Response::new(wire::PlanJobResponse {
             plan: Some(plan.into()),
         }))
@@ -106,19 +187,18 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::SubmitJobRequest>,
     ) -> Result<Response<wire::SubmitJobResponse>, Status> {
-        let caller = caller(&request);
-        let request = request.into_inner();
-        let spec = self.spec(request.spec)?;
-        let submitted = self
-            .link
-            .ask(|reply| Command::Submit {
-                spec,
-                user: caller.name.to_string(),
-                most: self.quotas.jobs_per_user as u64,
-                again: request.again,
-                reply,
-            })
-            .await?;
+        let by = caller(&request);
+        let answer = self.submit(request.into_inner(), &by).await;
+        let job = answer.as_ref().ok().map(|submitted| submitted.job);
+        let done = match &answer {
+            Ok(Submitted { existed: true, .. }) => "the same job is there already",
+            _ => "",
+        };
+        self.link
+            .audit
+            .record(&by.name, Act::Submit, job, &answer, done)
+            .await;
+        let submitted = answer?;
         Ok(Response::new(wire::SubmitJobResponse {
             job_id: submitted.job.to_string(),
             existed: submitted.existed,
@@ -128,11 +208,22 @@ impl Jobs for JobsService {
 
     async fn list_jobs(
         &self,
-        _: Request<wire::ListJobsRequest>,
+        request: Request<wire::ListJobsRequest>,
     ) -> Result<Response<wire::ListJobsResponse>, Status> {
-        let jobs = self.link.ask(Command::List).await?;
+        let sight = caller(&request).sight(self.link.visibility);
+        let query = listing(request.into_inner(), sight)?;
+        let page = self
+            .link
+            .lanes
+            .read({
+                let catalog = Arc::clone(&self.link.catalog);
+                move || async move { catalog.page(&query).await }
+            })
+            .await
+            .map_err(broken)?;
         Ok(Response::new(wire::ListJobsResponse {
-            jobs: jobs.into_iter().map(Into::into).collect(),
+            jobs: page.jobs.into_iter().map(Into::into).collect(),
+            next_page_token: page.next.map(|key| key.to_string()).unwrap_or_default(),
         }))
     }
 
@@ -140,8 +231,10 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::GetJobRequest>,
     ) -> Result<Response<wire::GetJobResponse>, Status> {
+        let by = caller(&request);
         let id = job_id(&request.into_inner().job_id)?;
-        let job = self.link.ask(|reply| Command::Get(id, reply)).await?;
+        self.link.may_see(&by, id).await?;
+        let job = self.link.status(id).await?;
         Ok(Response::new(wire::GetJobResponse {
             job: Some(job.into()),
         }))
@@ -156,8 +249,9 @@ impl Jobs for JobsService {
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let caller = caller(&request);
         let id = job_id(&request.into_inner().job_id)?;
+        self.link.may_see(&caller, id).await?;
         // A job that does not exist is an error now, not in the stream.
-        self.link.ask(|reply| Command::Get(id, reply)).await?;
+        self.link.state(id).await?;
         let (sender, stream) = mpsc::channel(4);
         tokio::spawn(watch_while_allowed(self.link.clone(), caller, id, sender));
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
@@ -167,12 +261,13 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::CancelJobRequest>,
     ) -> Result<Response<wire::CancelJobResponse>, Status> {
-        let why = format!("by {}", caller(&request).name);
+        let by = caller(&request);
+        let why = format!("by {}", by.name);
         let job = job_id(&request.into_inner().job_id)?;
         let cancel = |reply| Command::Cancel { job, why, reply };
-        let job = self.link.ask(cancel).await?;
+        self.link.steer(&by, Act::Cancel, job, cancel).await?;
         Ok(Response::new(wire::CancelJobResponse {
-            job: Some(job.into()),
+            job: Some(self.link.status(job).await?.into()),
         }))
     }
 
@@ -202,16 +297,23 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::DrainWorkerRequest>,
     ) -> Result<Response<wire::DrainWorkerResponse>, Status> {
+        let by = caller(&request);
         let worker = request.into_inner().worker;
-        let workers = self
-            .link
-            .ask(|reply| Command::Drain(worker.clone(), reply))
-            .await?;
-        if workers == 0 {
-            return Err(Status::not_found(format!(
+        bounds::name(&worker, bounds::NAME_BYTES)
+            .map_err(|what| Status::invalid_argument(format!("worker: {what}")))?;
+        let asked = self.link.ask(|reply| Command::Drain(worker.clone(), reply));
+        let answer = asked.await.and_then(|workers| match workers {
+            0 => Err(Status::not_found(format!(
                 "no worker of the name or id {worker:?} is connected to this coordinator; see `picofarm workers`"
-            )));
-        }
+            ))),
+            workers => Ok(workers),
+        });
+        let done = format!("worker {worker:?}");
+        self.link
+            .audit
+            .record(&by.name, Act::Drain, None, &answer, &done)
+            .await;
+        let workers = answer?;
         Ok(Response::new(wire::DrainWorkerResponse { workers }))
     }
 
@@ -219,8 +321,13 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::RetryJobRequest>,
     ) -> Result<Response<wire::RetryJobResponse>, Status> {
+        let by = caller(&request);
         let id = job_id(&request.into_inner().job_id)?;
-        let retried = self.link.ask(|reply| Command::Retry(id, reply)).await?;
+        let retry = |reply| Command::Retry(id, reply);
+        let retried = self.link.steer(&by, Act::Retry, id, retry).await?;
+        if retried > 0 {
+            self.link.submissions.learn(id).await.map_err(refused)?;
+        }
         Ok(Response::new(wire::RetryJobResponse { retried }))
     }
 
@@ -228,6 +335,7 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ListEventsRequest>,
     ) -> Result<Response<wire::ListEventsResponse>, Status> {
+        let by = caller(&request);
         let request = request.into_inner();
         let job = match request.job_id.as_str() {
             "" => None,
@@ -237,8 +345,8 @@ impl Jobs for JobsService {
         let ended = match job {
             None => false,
             Some(job) => {
-                let status = self.link.ask(|reply| Command::Get(job, reply)).await?;
-                status.state != JobState::Active
+                self.link.may_see(&by, job).await?;
+                self.link.state(job).await? != JobState::Active
             }
         };
         let query = EventQuery {
@@ -246,15 +354,18 @@ impl Jobs for JobsService {
             after: request.after,
             limit: match request.limit {
                 0 => EVENTS,
-                n => n.min(MOST_EVENTS),
+                n => n.min(EVENTS),
             },
             task: request.task,
             stage: request.stage,
             newest: request.newest,
             logs: request.logs,
+            sight: by.sight(self.link.visibility),
         };
-        let events = self.link.catalog.events(&query).await;
-        let events = events.map_err(|e| Status::unavailable(e.to_string()))?;
+        let events = self
+            .link
+            .read(move |catalog| async move { catalog.events(&query).await })
+            .await?;
         Ok(Response::new(wire::ListEventsResponse {
             events: events.into_iter().map(Into::into).collect(),
             ended,
@@ -265,9 +376,11 @@ impl Jobs for JobsService {
         &self,
         request: Request<wire::ExplainJobRequest>,
     ) -> Result<Response<wire::ExplainJobResponse>, Status> {
+        let by = caller(&request);
         let request = request.into_inner();
         let job = job_id(&request.job_id)?;
-        let explained = look::explain(&self.link, job, request.stage, request.task).await?;
+        self.link.may_see(&by, job).await?;
+        let explained = look::explain(&self.link, &by, job, request.stage, request.task).await?;
         Ok(Response::new(explained))
     }
 
@@ -280,7 +393,31 @@ impl Jobs for JobsService {
             coordinator: self.link.name.to_string(),
             workers: look.workers.into_iter().map(Into::into).collect(),
             elsewhere: look.elsewhere,
-            coordinators: look.houses,
+            coordinators: look.instances,
+        }))
+    }
+
+    async fn list_audit(
+        &self,
+        request: Request<wire::ListAuditRequest>,
+    ) -> Result<Response<wire::ListAuditResponse>, Status> {
+        let request = request.into_inner();
+        let query = AuditQuery {
+            before: (request.before > 0).then_some(request.before),
+            limit: match request.limit {
+                0 => EVENTS,
+                n => n.min(EVENTS),
+            },
+            who: Some(request.who).filter(|who| !who.is_empty()),
+            job: match request.job_id.as_str() {
+                "" => None,
+                id => Some(job_id(id)?),
+            },
+        };
+        let lines = self.link.catalog.audited(&query).await;
+        let lines = lines.map_err(|e| Status::unavailable(e.to_string()))?;
+        Ok(Response::new(wire::ListAuditResponse {
+            entries: lines.into_iter().map(Into::into).collect(),
         }))
     }
 }
@@ -308,7 +445,7 @@ async fn watch(
     let mut last = None;
     loop {
         link.revision.mark_unchanged();
-        let status = match link.ask(|reply| Command::Get(id, reply)).await {
+        let status = match link.status(id).await {
             Ok(status) => status,
             Err(error) => {
                 let _ = sender.send(Err(error)).await;
@@ -337,6 +474,8 @@ async fn watch(
         }
         tokio::select! {
             changed = link.revision.changed() => if changed.is_err() { return },
+            // Another coordinator may have changed the job.
+            () = tokio::time::sleep(LOOK) => {}
             () = sender.closed() => return,
             () = link.stop.cancelled() => return,
         }

@@ -1,9 +1,9 @@
 //! Gathering the facts for an explanation.
 
-use picofarm_catalog::{CatalogError, EventQuery, ResultSet};
+use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::Event,
+    model::{Event, EventKind},
     wire,
 };
 use tonic::Status;
@@ -11,6 +11,7 @@ use tonic::Status;
 use super::Link;
 use crate::{
     actor::Command,
+    auth::Caller,
     core::JobLook,
     explain::{self, JobFacts, TaskFacts},
 };
@@ -20,21 +21,18 @@ const EVENTS: u32 = 1_000;
 /// Other jobs whose history is searched for the maker of a result.
 const OTHERS: usize = 20;
 
-fn failed(error: CatalogError) -> Status {
-    Status::unavailable(error.to_string())
-}
-
 /// Why a job does not run; and what became of one task, where one is named.
 ///
 /// # Errors
 /// NOT_FOUND for a job or task that there is not; UNAVAILABLE where the catalog is out of order.
 pub(super) async fn explain(
     link: &Link,
+    by: &Caller,
     job: JobId,
     stage: u32,
     task: Option<u64>,
 ) -> Result<wire::ExplainJobResponse, Status> {
-    let status = link.ask(|reply| Command::Get(job, reply)).await?;
+    let status = link.status(job).await?;
     let Some(of) = status.stages.get(stage as usize) else {
         return Err(Status::not_found(format!(
             "job {job} has no stage {stage}: its {} stages count from 0",
@@ -56,6 +54,7 @@ pub(super) async fn explain(
         })
         .await?;
     let here = StageRef { job, stage };
+    let sight = by.sight(link.visibility);
     let now_ms = link.clock.now_ms();
     let JobLook {
         candidates,
@@ -63,26 +62,34 @@ pub(super) async fn explain(
         elsewhere,
         running,
     } = look;
+    let (ahead, unseen) = seen(link, &sight, ahead).await?;
     let reasons = explain::job(&JobFacts {
         job,
         state: status.state,
         paused: status.paused,
         stages: status.stages.clone(),
         counts: status.tasks,
-        holdups: link.catalog.holdups(job, now_ms).await.map_err(failed)?,
+        holdups: link
+            .read(move |catalog| async move { catalog.holdups(job, now_ms).await })
+            .await?,
         candidates,
         ahead,
+        unseen,
         elsewhere,
+        running: status.running.clone(),
+        setback: setback(link, job).await?,
         now_ms,
     });
     let told = match task {
         None => None,
         Some(index) => {
             let events = history(link, here, index).await?;
-            let record = link.catalog.task(here, index).await.map_err(failed)?;
+            let record = link
+                .read(move |catalog| async move { catalog.task(here, index).await })
+                .await?;
             let made_here = events.iter().any(explain::committed);
             let elsewhere = match &record.output {
-                Some(_) if !made_here => maker(link, here, index).await?,
+                Some(_) if !made_here => maker(link, &sight, here, index).await?,
                 _ => None,
             };
             Some(explain::task(TaskFacts {
@@ -104,6 +111,49 @@ pub(super) async fn explain(
     })
 }
 
+/// Of these jobs those that may be seen, and the number of the others.
+async fn seen(link: &Link, sight: &Sight, jobs: Vec<JobId>) -> Result<(Vec<JobId>, u64), Status> {
+    if *sight == Sight::All {
+        return Ok((jobs, 0));
+    }
+    let (mut seen, mut unseen) = (Vec::new(), 0);
+    for job in jobs {
+        match link
+            .read(move |catalog| async move { catalog.owner(job).await })
+            .await?
+        {
+            Some(owner) if sight.sees(&owner) => seen.push(job),
+            _ => unseen += 1,
+        }
+    }
+    Ok((seen, unseen))
+}
+
+/// The last line of a job's history that says why a task did not go on, if there is one among its latest.
+async fn setback(link: &Link, job: JobId) -> Result<Option<Event>, Status> {
+    const LATEST: u32 = 200;
+    let query = EventQuery {
+        job: Some(job),
+        stage: None,
+        after: 0,
+        limit: LATEST,
+        task: None,
+        newest: true,
+        sight: Sight::All,
+        logs: false,
+    };
+    let events = link
+        .read(move |catalog| async move { catalog.events(&query).await })
+        .await?;
+    let against = |event: &Event| {
+        matches!(
+            event.kind,
+            EventKind::Failed | EventKind::Released | EventKind::Expired
+        )
+    };
+    Ok(events.into_iter().rfind(against))
+}
+
 /// The history of a task: its last lines.
 async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, Status> {
     let query = EventQuery {
@@ -114,34 +164,43 @@ async fn history(link: &Link, stage: StageRef, task: u64) -> Result<Vec<Event>, 
         task: Some(task),
         newest: true,
         logs: false,
+        // The caller may see the job, or it would not be asked.
+        sight: Sight::All,
     };
-    link.catalog.events(&query).await.map_err(failed)
+    link.read(move |catalog| async move { catalog.events(&query).await })
+        .await
 }
 
 /// The job with the same results under which a task was handed in, and the line that says so.
 async fn maker(
     link: &Link,
+    sight: &Sight,
     stage: StageRef,
     task: u64,
 ) -> Result<Option<(JobId, String, Event)>, Status> {
-    let Some(record) = link.catalog.job(stage.job).await.map_err(failed)? else {
-        return Ok(None);
-    };
-    let Some(spec) = record.job.spec.stages.get(stage.stage as usize) else {
-        return Ok(None);
-    };
-    let set = ResultSet::of(spec);
-    let others = link
-        .catalog
-        .jobs_at(&set.store, &set.dataset)
-        .await
-        .map_err(failed)?;
-    for other in others.iter().filter(|o| o.id != stage.job).take(OTHERS) {
-        for theirs in other.stages().into_iter().filter(|s| s.set == set) {
-            let events = history(link, theirs.id, task).await?;
-            if let Some(event) = events.into_iter().find(explain::committed) {
-                return Ok(Some((other.id, other.spec.name.clone(), event)));
-            }
+    let sight = sight.clone();
+    let alike = link.read(move |catalog| async move {
+        let Some(record) = catalog.job(stage.job).await? else {
+            return Ok(Vec::new());
+        };
+        let Some(spec) = record.job.spec.stages.get(stage.stage as usize) else {
+            return Ok(Vec::new());
+        };
+        let set = ResultSet::of(spec);
+        let others = catalog.jobs_at(&set.store, &set.dataset).await?;
+        let others = others.into_iter().filter(|o| sight.sees(&Owner::from(o)));
+        let mut alike = Vec::new();
+        for other in others.filter(|o| o.id != stage.job).take(OTHERS) {
+            let stages = other.stages().into_iter();
+            let same = stages.filter(|s| s.set == set).map(|s| s.id);
+            alike.extend(same.map(|id| (id, other.spec.name.clone())));
+        }
+        Ok(alike)
+    });
+    for (theirs, name) in alike.await? {
+        let events = history(link, theirs, task).await?;
+        if let Some(event) = events.into_iter().find(explain::committed) {
+            return Ok(Some((theirs.job, name, event)));
         }
     }
     Ok(None)

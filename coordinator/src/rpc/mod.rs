@@ -3,23 +3,34 @@
 mod farm;
 mod jobs;
 mod look;
+mod rights;
 
 use std::sync::Arc;
 
-use picofarm_catalog::Catalog;
-use picofarm_proto::convert::ConvertError;
+use picofarm_catalog::{Catalog, CatalogError};
+use picofarm_proto::{
+    convert::ConvertError,
+    ids::JobId,
+    model::{JobState, JobStatus, bounds},
+};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Status};
 
 use crate::{
     actor::{Command, Refusal, Reply},
-    auth::Caller,
+    audit::Audit,
+    auth::{Caller, Visibility},
     clock::Clock,
+    core::recorded_status,
+    lanes::Lanes,
+    submission::Submissions,
 };
 
 pub(crate) use farm::FarmService;
 pub(crate) use jobs::JobsService;
+use rights::no_such_job;
+pub(crate) use rights::not_yours;
 
 /// What the services share.
 #[derive(Clone)]
@@ -28,11 +39,16 @@ pub(crate) struct Link {
     pub revision: watch::Receiver<u64>,
     pub catalog: Arc<dyn Catalog>,
     pub stop: CancellationToken,
+    /// What callers see of others' jobs.
+    pub visibility: Visibility,
+    pub audit: Audit,
     /// Names this coordinator, for people.
     pub name: Arc<str>,
     pub clock: Clock,
     pub lease_ms: u32,
     pub heartbeat_ms: u32,
+    pub lanes: Lanes,
+    pub submissions: Submissions,
 }
 
 impl Link {
@@ -49,16 +65,56 @@ impl Link {
             .send(command(reply))
             .await
             .map_err(|_| gone())?;
-        match answer.await.map_err(|_| gone())? {
-            Ok(answer) => Ok(answer),
-            Err(Refusal::NoSuchJob(id)) => Err(Status::not_found(format!(
-                "there is no job {id}; list the jobs to see their ids"
-            ))),
-            Err(Refusal::Spec(why)) => Err(Status::invalid_argument(why.to_string())),
-            Err(Refusal::TooMany(why)) => Err(Status::resource_exhausted(why)),
-            Err(Refusal::NotNow(why)) => Err(Status::failed_precondition(why)),
-            Err(Refusal::Catalog(why)) => Err(Status::unavailable(why)),
-        }
+        answer.await.map_err(|_| gone())?.map_err(refused)
+    }
+
+    /// Reads the catalog beside the actor.
+    pub(crate) async fn read<T, F>(
+        &self,
+        work: impl FnOnce(Arc<dyn Catalog>) -> F + Send + 'static,
+    ) -> Result<T, Status>
+    where
+        T: Send + 'static,
+        F: Future<Output = Result<T, CatalogError>>,
+    {
+        let catalog = Arc::clone(&self.catalog);
+        let read = self.lanes.read(move || work(catalog)).await;
+        read.map_err(|e| Status::unavailable(e.to_string()))
+    }
+
+    /// A job as people see it.
+    pub(crate) async fn status(&self, id: JobId) -> Result<JobStatus, Status> {
+        let recorded = self
+            .read(move |catalog| async move { Ok(catalog.job(id).await?.map(recorded_status)) });
+        let mut status = recorded
+            .await?
+            .ok_or_else(|| refused(Refusal::NoSuchJob(id)))?;
+        let mut overlay = self.ask(|reply| Command::Overlay(Some(id), reply)).await?;
+        overlay.complete(&mut status);
+        Ok(status)
+    }
+
+    /// Where a job stands.
+    pub(crate) async fn state(&self, id: JobId) -> Result<JobState, Status> {
+        let state = self.catalog.state(id).await;
+        state
+            .map_err(|e| Status::unavailable(e.to_string()))?
+            .ok_or_else(|| refused(Refusal::NoSuchJob(id)))
+    }
+}
+
+/// A refusal as a caller hears it.
+pub(crate) fn refused(why: Refusal) -> Status {
+    match why {
+        Refusal::NoSuchJob(id) => no_such_job(id),
+        Refusal::Denied(why) => Status::permission_denied(why),
+        Refusal::Spec(why) => Status::invalid_argument(bounds::message(&why.to_string())),
+        Refusal::Content(why) => Status::invalid_argument(bounds::message(&format!(
+            "the catalog cannot hold this: {why}"
+        ))),
+        Refusal::TooMany(why) => Status::resource_exhausted(why),
+        Refusal::NotNow(why) => Status::failed_precondition(why),
+        Refusal::Catalog(why) => Status::unavailable(why),
     }
 }
 
@@ -70,6 +126,7 @@ fn caller<T>(request: &Request<T>) -> Caller {
         .clone()
 }
 
+/// An error as an answer. It may repeat what was sent, and an answer's words are a header, which must not be long.
 fn invalid(error: ConvertError) -> Status {
-    Status::invalid_argument(error.to_string())
+    Status::invalid_argument(bounds::message(&error.to_string()))
 }

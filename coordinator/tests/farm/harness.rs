@@ -1,21 +1,27 @@
 //! A coordinator with a clock of its own, a client, and a worker that does what the test says.
 
 use std::{
+    collections::BTreeMap,
     sync::{
-        Arc,
-        atomic::{AtomicI64, Ordering},
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering},
     },
     time::Duration,
 };
 
+use futures::future::BoxFuture;
 use picofarm_coordinator::{
-    Backoff, CatalogPlace, Clock, CoordinatorConfig, CoordinatorError, Running, VERSION, serve,
+    Backoff, CatalogPlace, Clock, CoordinatorConfig, CoordinatorError, Found, Running, Stored,
+    VERSION, serve,
 };
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
     key::task_key,
-    model::{Abilities, JobSpec, JobState, JobStatus, Lease, RenderTask, TaskSpec, WorkerHello},
+    model::{
+        Abilities, JobSpec, JobState, JobStatus, Lease, RenderTask, StageSpec, TaskSpec,
+        WorkerHello,
+    },
     wire::{
         self, farm_client::FarmClient, jobs_client::JobsClient, session_request::Message as Say,
         session_response::Message as Heard,
@@ -32,9 +38,62 @@ pub const LEASE_MS: u32 = 60_000;
 /// Nothing here takes long; a test that waits longer has failed.
 const PATIENCE: Duration = Duration::from_secs(20);
 
+/// A store as a test wants it: it holds what is reported, but for the exceptions.
+#[derive(Debug, Default)]
+pub struct Shelf {
+    /// What it holds instead, by task; `None`: nothing.
+    pub instead: Mutex<BTreeMap<u64, Option<[u8; 32]>>>,
+    /// Why it cannot be read.
+    pub closed: Mutex<Option<String>>,
+    /// It never answers.
+    pub hangs: AtomicBool,
+    /// How many results it was asked about.
+    pub asked: AtomicUsize,
+}
+
+impl Shelf {
+    /// From now on it holds this of a task.
+    pub fn put(&self, task: u64, manifest: Option<[u8; 32]>) {
+        self.instead.lock().unwrap().insert(task, manifest);
+    }
+
+    pub fn close(&self, why: &str) {
+        *self.closed.lock().unwrap() = Some(why.into());
+    }
+}
+
+impl Stored for Shelf {
+    fn look<'a>(
+        &'a self,
+        _: &'a StageSpec,
+        results: &'a [(u64, [u8; 32])],
+    ) -> BoxFuture<'a, Result<Vec<Found>, String>> {
+        Box::pin(async move {
+            if self.hangs.load(Ordering::SeqCst) {
+                std::future::pending::<()>().await;
+            }
+            if let Some(why) = &*self.closed.lock().unwrap() {
+                return Err(why.clone());
+            }
+            self.asked.fetch_add(results.len(), Ordering::SeqCst);
+            let instead = self.instead.lock().unwrap();
+            let of = |(task, reported): &(u64, [u8; 32])| match instead.get(task) {
+                Some(None) => Found::Gone,
+                Some(Some(other)) if other != reported => Found::Differs,
+                _ => Found::Equal,
+            };
+            Ok(results.iter().map(of).collect())
+        })
+    }
+}
+
 pub struct Farm {
     _folder: tempfile::TempDir,
+    /// What the coordinator takes for the store.
+    pub shelf: Arc<Shelf>,
     pub clock: Arc<AtomicI64>,
+    /// How long the coordinator was suspended.
+    slept: Arc<AtomicI64>,
     pub config: CoordinatorConfig,
     stop: CancellationToken,
     running: Option<Running>,
@@ -43,9 +102,26 @@ pub struct Farm {
 
 impl Farm {
     pub async fn start() -> Self {
+        Self::start_on(None).await
+    }
+
+    /// A farm on each kind of catalog: SQLite, and Postgres where there is one for tests.
+    pub async fn start_on_each() -> Vec<Self> {
+        let mut farms = vec![Self::start().await];
+        if let Some(url) = picofarm_catalog::testing::postgres().await {
+            farms.push(Self::start_on(Some(CatalogPlace::Postgres(url))).await);
+        }
+        farms
+    }
+
+    pub async fn start_on(catalog: Option<CatalogPlace>) -> Self {
         let folder = tempfile::tempdir().unwrap();
+        let catalog = catalog.unwrap_or_else(|| folder.path().join("state/catalog.db").into());
         let clock = Arc::new(AtomicI64::new(1_000_000));
-        let told = Arc::clone(&clock);
+        let slept = Arc::new(AtomicI64::new(0));
+        let (told, more) = (Arc::clone(&clock), Arc::clone(&slept));
+        let passed = Arc::clone(&slept);
+        let shelf = Arc::new(Shelf::default());
         let config = CoordinatorConfig {
             lease_ms: LEASE_MS,
             tick: Duration::from_millis(10),
@@ -53,16 +129,20 @@ impl Farm {
                 first_ms: 1_000,
                 most_ms: 8_000,
             },
-            clock: Clock::new(move || told.load(Ordering::SeqCst)),
-            ..CoordinatorConfig::new(
-                folder.path().join("state/catalog.db"),
-                "127.0.0.1:0".parse().unwrap(),
-            )
+            clock: Clock::with_stalls(
+                move || told.load(Ordering::SeqCst) + more.load(Ordering::SeqCst),
+                move || passed.load(Ordering::SeqCst),
+            ),
+            http: Some("127.0.0.1:0".parse().unwrap()),
+            stored: Some(Arc::clone(&shelf) as Arc<dyn Stored>),
+            ..CoordinatorConfig::new(catalog, "127.0.0.1:0".parse().unwrap())
         };
         let (running, stop, jobs) = run(&config).await.unwrap();
         Self {
             _folder: folder,
+            shelf,
             clock,
+            slept,
             config,
             stop,
             running: Some(running),
@@ -72,6 +152,38 @@ impl Farm {
 
     pub fn address(&self) -> std::net::SocketAddr {
         self.running.as_ref().unwrap().address
+    }
+
+    /// The status line and the text of `/readyz`.
+    pub async fn readiness(&self) -> (String, String) {
+        use tokio::io::{AsyncReadExt, AsyncWriteExt};
+        let address = self.running.as_ref().unwrap().http.unwrap();
+        let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
+        stream
+            .write_all(b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
+            .await
+            .unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).await.unwrap();
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+        (head.lines().next().unwrap().to_owned(), body.to_owned())
+    }
+
+    /// Waits until it is ready, or not ready with these words.
+    pub async fn until_ready(&self, unready: Option<&str>) {
+        let start = std::time::Instant::now();
+        loop {
+            let (status, words) = self.readiness().await;
+            let there = match unready {
+                None => status.contains("200"),
+                Some(why) => status.contains("503") && words.contains(why),
+            };
+            if there {
+                return;
+            }
+            assert!(start.elapsed() < PATIENCE, "it stays {status} {words}");
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
     }
 
     pub async fn stop(&mut self) {
@@ -97,6 +209,11 @@ impl Farm {
         self.clock.fetch_add(ms, Ordering::SeqCst);
     }
 
+    /// Time that passes while the coordinator's machine is suspended.
+    pub fn suspend(&self, ms: i64) {
+        self.slept.fetch_add(ms, Ordering::SeqCst);
+    }
+
     pub async fn submit(&mut self, spec: &JobSpec) -> wire::SubmitJobResponse {
         self.submit_again(spec, false).await
     }
@@ -107,6 +224,14 @@ impl Farm {
             again,
         };
         self.jobs.submit_job(request).await.unwrap().into_inner()
+    }
+
+    pub async fn plan(&mut self, spec: &JobSpec) -> wire::JobPlan {
+        let request = wire::PlanJobRequest {
+            spec: Some(spec.clone().into()),
+        };
+        let response = self.jobs.plan_job(request).await.unwrap();
+        response.into_inner().plan.unwrap()
     }
 
     pub async fn status(&mut self, job: &str) -> JobStatus {
@@ -174,6 +299,7 @@ pub fn hello(name: &str) -> WorkerHello {
         version: VERSION.into(),
         protocol: PROTOCOL,
         held: Vec::new(),
+        ended: String::new(),
         abilities: Abilities {
             kinds: ["render", "reprocess"]
                 .map(|kind| (kind.to_owned(), "r1".to_owned()))

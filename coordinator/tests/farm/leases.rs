@@ -52,6 +52,40 @@ async fn a_heartbeat_keeps_a_lease() {
 }
 
 #[tokio::test]
+async fn a_suspend_of_the_coordinator_ends_no_lease() {
+    let mut farm = Farm::start().await;
+    let job = farm.submit(&spec(2)).await.job_id;
+    let mut worker = farm.worker().await;
+    let lease = worker.lease().await;
+    // A night; the worker was awake, or slept as well.
+    farm.suspend(500 * i64::from(LEASE_MS));
+    assert_eq!(worker.beat(&[&lease], Some(lease.lo)).await.len(), 1);
+    // Its connection breaks, and it takes longer to come back than a worker may whose process ended.
+    farm.suspend(500 * i64::from(LEASE_MS));
+    farm.until(&job, |status| status.tasks.leased > 0).await;
+    let mut again = worker.hello.clone();
+    again.held = vec![lease.lease];
+    drop(worker);
+    farm.until(&job, |status| status.workers == 0).await;
+    farm.pass(i64::from(LEASE_MS) / 2);
+    tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    let mut worker = farm.connect(again).await.unwrap();
+    for index in lease.lo..lease.hi {
+        assert!(worker.done(&lease, index).await.accepted);
+    }
+    let events = farm.events(&job, None).await;
+    let expired = events.iter().any(|e| e.kind() == wire::EventKind::Expired);
+    assert!(!expired, "{events:?}");
+    // What was graced lasts no longer than any lease.
+    assert!(worker.beat(&[&lease], None).await.is_empty());
+    if farm.status(&job).await.state == JobState::Active {
+        let rest = worker.lease().await;
+        farm.pass(i64::from(LEASE_MS) + 1);
+        assert_eq!(worker.revoked().await.lease, Some(rest.lease.into()));
+    }
+}
+
+#[tokio::test]
 async fn another_worker_cannot_report_for_a_lease() {
     let mut farm = Farm::start().await;
     let job = farm.submit(&spec(1)).await.job_id;
@@ -132,6 +166,8 @@ async fn two_different_results_of_a_task_are_an_alarm() {
     let mut worker = farm.worker().await;
     let lease = worker.lease().await;
     assert!(worker.done(&lease, lease.lo).await.accepted);
+    // The store cannot tell who is right.
+    farm.shelf.close("it is on another machine");
     let answer = worker.report(&lease, lease.lo, &manifest(99)).await;
     assert!(!answer.accepted);
     assert!(answer.reason.contains("different"), "{}", answer.reason);

@@ -1,21 +1,21 @@
-//! The commit protocol of tasks, leases, houses (coordinators over one database) and the collector of orphaned
+//! The commit protocol of tasks, leases, instances (coordinators over one database) and the collector of orphaned
 //! objects, checked exhaustively within bounds: every interleaving of two coordinators, two workers and a collector
 //! over one database and one object store.
 //!
 //! * `rules.rs`: what the protocol checks, and where in the product; the bounds.
-//! * `state.rs`: the state. `houses.rs`, `workers.rs`: who does what. `model.rs`: the actions, the laws.
+//! * `state.rs`: the state. `instances.rs`, `workers.rs`: who does what. `model.rs`: the actions, the laws.
 //! * `reach.rs`: from every state the job's end can be reached.
 //!
-//! How faults are modelled. *Stopped* processes take no step for as long as one likes while leases and house rows run
+//! How faults are modelled. *Stopped* processes take no step for as long as one likes while leases and instance rows run
 //! out around them; nothing in the model keeps a process from going on with what it knew. *Killed* ones lose what they
 //! knew and come back under a new name. *Messages* stay in the network for ever once sent: they may arrive late, out of
-//! order, repeatedly, at either house, or never, which is how a lost one looks. A house decides by its memory and
+//! order, repeatedly, at either instance, or never, which is how a lost one looks. An instance decides by its memory and
 //! writes by one transaction; as its memory is its own, deciding and writing are one step even if time passes between
 //! them. Time has no place here: whatever ends by a clock may end at any moment.
 //!
 //! Faults of coordinators strike process 0 only, and the first lease goes to worker 0: the others are alike.
 
-mod houses;
+mod instances;
 mod model;
 mod reach;
 mod rules;
@@ -28,37 +28,37 @@ use model::{DEAD_EPOCH, FENCED, LAWS, LEASED_AGAIN, ONCE, Protocol, ROBBED, THER
 use rules::{Bounds, Rules};
 
 /// One task; a worker's kill, a stopped coordinator and a run of the collector, together.
-const STOPPED_HOUSE: Bounds = Bounds {
+const STOPPED_INSTANCE: Bounds = Bounds {
     tasks: 1,
     epochs: 2,
     worker_kills: 1,
-    house_kills: 0,
-    house_stops: 1,
+    instance_kills: 0,
+    instance_stops: 1,
     collections: 1,
 };
 
 /// The coordinator is killed instead.
-const KILLED_HOUSE: Bounds = Bounds {
-    house_kills: 1,
-    house_stops: 0,
-    ..STOPPED_HOUSE
+const KILLED_INSTANCE: Bounds = Bounds {
+    instance_kills: 1,
+    instance_stops: 0,
+    ..STOPPED_INSTANCE
 };
 
 /// Three epochs; nothing is killed, workers and collector may be stopped, and the collector comes twice.
 const THREE_EPOCHS: Bounds = Bounds {
     epochs: 3,
     worker_kills: 0,
-    house_stops: 0,
+    instance_stops: 0,
     collections: 2,
-    ..STOPPED_HOUSE
+    ..STOPPED_INSTANCE
 };
 
 /// A range of two tasks, so that a lease may be left half done; processes are only stopped.
 const TWO_TASKS: Bounds = Bounds {
     tasks: 2,
     worker_kills: 0,
-    house_stops: 0,
-    ..STOPPED_HOUSE
+    instance_stops: 0,
+    ..STOPPED_INSTANCE
 };
 
 /// Every law holds, and the model is not empty: each of its `sometimes` happens.
@@ -88,7 +88,7 @@ fn assert_holds(bounds: Bounds) {
 fn assert_breaks(rules: Rules, laws: &[&'static str]) {
     let checker = Protocol {
         rules,
-        bounds: STOPPED_HOUSE,
+        bounds: STOPPED_INSTANCE,
     }
     .checker()
     .finish_when(HasDiscoveries::AllOf(laws.iter().copied().collect()))
@@ -106,7 +106,7 @@ fn assert_breaks(rules: Rules, laws: &[&'static str]) {
 /// No law breaks but this one, in all of the state space.
 fn assert_breaks_only(rules: Rules, law: &'static str) {
     assert_breaks(rules, &[law]);
-    let bounds = STOPPED_HOUSE;
+    let bounds = STOPPED_INSTANCE;
     let checker = Protocol { rules, bounds }.checker().spawn_bfs().join();
     for (other, _) in LAWS.into_iter().filter(|(other, _)| *other != law) {
         checker.assert_no_discovery(other);
@@ -115,12 +115,12 @@ fn assert_breaks_only(rules: Rules, law: &'static str) {
 
 #[test]
 fn laws_hold_when_a_coordinator_is_stopped_past_its_lease() {
-    assert_holds(STOPPED_HOUSE);
+    assert_holds(STOPPED_INSTANCE);
 }
 
 #[test]
 fn laws_hold_when_a_coordinator_is_killed() {
-    assert_holds(KILLED_HOUSE);
+    assert_holds(KILLED_INSTANCE);
 }
 
 #[test]
@@ -135,7 +135,7 @@ fn laws_hold_for_a_lease_of_two_tasks() {
 
 #[test]
 fn the_job_can_end_from_every_state() {
-    for bounds in [STOPPED_HOUSE, KILLED_HOUSE] {
+    for bounds in [STOPPED_INSTANCE, KILLED_INSTANCE] {
         let model = Protocol {
             rules: Rules::ALL,
             bounds,
@@ -152,16 +152,16 @@ fn the_job_can_end_from_every_state() {
 }
 
 #[test]
-fn without_the_fence_a_house_that_was_given_up_writes() {
+fn without_the_fence_a_instance_that_was_given_up_writes() {
     let rules = Rules {
-        house_is_fenced: false,
+        instance_is_fenced: false,
         ..Rules::ALL
     };
     assert_breaks(rules, &[FENCED]);
 }
 
 #[test]
-fn without_the_owner_check_two_houses_commit_one_task() {
+fn without_the_owner_check_two_instances_commit_one_task() {
     let rules = Rules {
         writes_check_owner: false,
         ..Rules::ALL
@@ -224,7 +224,7 @@ fn a_collector_whose_hold_runs_out_deletes_what_is_committed() {
 }
 
 #[test]
-fn a_takeover_before_the_expiry_robs_a_living_house_but_loses_nothing() {
+fn a_takeover_before_the_expiry_robs_a_living_instance_but_loses_nothing() {
     let rules = Rules {
         takeover_waits_for_expiry: false,
         ..Rules::ALL

@@ -5,16 +5,16 @@ use stateright::{Model, Property};
 
 use crate::{
     rules::{Bounds, Rules},
-    state::{Collector, Commit, HouseId, HouseRow, Message, State, Tasks},
+    state::{Collector, Commit, InstanceId, InstanceRow, Message, State, Tasks},
 };
 
 pub const ONCE: &str = "each task is committed at most once";
 pub const THERE: &str = "what the catalog names is in the store";
-pub const FENCED: &str = "a fenced house writes nothing";
+pub const FENCED: &str = "a fenced instance writes nothing";
 pub const DEAD_EPOCH: &str = "no report of a dead epoch is accepted";
-pub const TWO_HOUSES: &str = "no two houses accept the same task of one epoch";
+pub const TWO_INSTANCES: &str = "no two instances accept the same task of one epoch";
 pub const LEASED_AGAIN: &str = "a committed task is never leased again";
-pub const ROBBED: &str = "a living house keeps its range";
+pub const ROBBED: &str = "a living instance keeps its range";
 pub const ENDS_LATE: &str = "the job can end in its last epoch";
 pub const COLLECTED: &str = "objects can be collected";
 pub const ZOMBIE: &str = "a stopped worker can leave a manifest whose objects were collected";
@@ -36,7 +36,7 @@ pub const LAWS: [(&str, Law); 7] = [
     (DEAD_EPOCH, |_, s| {
         s.history.commits.iter().all(|c| c.lease_was_live)
     }),
-    (TWO_HOUSES, |_, s| {
+    (TWO_INSTANCES, |_, s| {
         let commits = &s.history.commits;
         let one = |a: &Commit, b: &Commit| (a.epoch, a.task) != (b.epoch, b.task) || a.by == b.by;
         commits.iter().all(|a| commits.iter().all(|b| one(a, b)))
@@ -48,16 +48,16 @@ pub const LAWS: [(&str, Law); 7] = [
 /// One step of one process, or one fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
-    House(u8, HouseStep),
+    Instance(u8, InstanceStep),
     Worker(u8, WorkerStep),
     Collector(CollectorStep),
-    /// A house's row runs out: of one that is dead at any time, of one that runs if it is stopped so long.
-    Expire(HouseId),
+    /// An instance's row runs out: of one that is dead at any time, of one that runs if it is stopped so long.
+    Expire(InstanceId),
 }
 
-/// What a house does, each with one transaction or none.
+/// What an instance does, each with one transaction or none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum HouseStep {
+pub enum InstanceStep {
     /// It takes a pending range that nobody owns.
     Claim,
     /// It gives a pending range back.
@@ -68,13 +68,13 @@ pub enum HouseStep {
     Close,
     /// It accepts a report (`Message::Done`).
     Commit(Message),
-    /// A worker connects and names its lease; the house becomes the owner of its range.
+    /// A worker connects and names its lease; the instance becomes the owner of its range.
     Adopt(u8),
-    /// It deletes another house's row and becomes the owner of what that one had.
-    TakeOver(HouseId),
+    /// It deletes another instance's row and becomes the owner of what that one had.
+    TakeOver(InstanceId),
     /// As `TakeOver`, of a collector whose lease has run out.
     TakeOverCollector,
-    /// A write was refused: it forgets everything, and comes back as a new house if its row is no longer live.
+    /// A write was refused: it forgets everything, and comes back as a new instance if its row is no longer live.
     Reload,
     /// It is killed and started again.
     Restart,
@@ -148,22 +148,22 @@ impl Model for Protocol {
             return;
         }
         for process in [0, 1] {
-            let mut house = |step| actions.push(Action::House(process, step));
-            house(HouseStep::Claim);
-            house(HouseStep::Release);
-            house(HouseStep::Grant(0));
-            house(HouseStep::Grant(1));
-            house(HouseStep::Adopt(0));
-            house(HouseStep::Adopt(1));
-            house(HouseStep::Close);
-            house(HouseStep::TakeOverCollector);
-            house(HouseStep::Reload);
-            house(HouseStep::Restart);
+            let mut instance = |step| actions.push(Action::Instance(process, step));
+            instance(InstanceStep::Claim);
+            instance(InstanceStep::Release);
+            instance(InstanceStep::Grant(0));
+            instance(InstanceStep::Grant(1));
+            instance(InstanceStep::Adopt(0));
+            instance(InstanceStep::Adopt(1));
+            instance(InstanceStep::Close);
+            instance(InstanceStep::TakeOverCollector);
+            instance(InstanceStep::Reload);
+            instance(InstanceStep::Restart);
             for message in &state.network {
-                house(HouseStep::Commit(*message));
+                instance(InstanceStep::Commit(*message));
             }
-            for id in state.database.houses.keys() {
-                house(HouseStep::TakeOver(*id));
+            for id in state.database.instances.keys() {
+                instance(InstanceStep::TakeOver(*id));
             }
         }
         for worker in [0, 1] {
@@ -186,13 +186,13 @@ impl Model for Protocol {
         actions.push(Action::Collector(CollectorStep::Look));
         actions.push(Action::Collector(CollectorStep::Delete));
         actions.push(Action::Collector(CollectorStep::Restart));
-        actions.extend(state.database.houses.keys().copied().map(Action::Expire));
+        actions.extend(state.database.instances.keys().copied().map(Action::Expire));
     }
 
     fn next_state(&self, last: &State, action: Action) -> Option<State> {
         let mut next = last.clone();
         match action {
-            Action::House(process, step) => self.house(&mut next, process, step),
+            Action::Instance(process, step) => self.instance(&mut next, process, step),
             Action::Worker(worker, step) => self.worker(&mut next, worker, step),
             Action::Collector(step) => self.collector(&mut next, step),
             Action::Expire(id) => self.expire(&mut next, id),
@@ -222,14 +222,15 @@ impl Protocol {
         state.database.outputs == self.tasks() && state.database.range.done == self.tasks()
     }
 
-    fn expire(&self, state: &mut State, id: HouseId) -> Option<()> {
+    fn expire(&self, state: &mut State, id: InstanceId) -> Option<()> {
         if state.runs(id) {
-            (id.process == 0 && state.faults.house_stops < self.bounds.house_stops).then_some(())?;
-            state.faults.house_stops += 1;
+            (id.process == 0 && state.faults.instance_stops < self.bounds.instance_stops)
+                .then_some(())?;
+            state.faults.instance_stops += 1;
         }
-        let row = state.database.houses.get_mut(&id)?;
-        (*row == HouseRow::Live).then_some(())?;
-        *row = HouseRow::Expired;
+        let row = state.database.instances.get_mut(&id)?;
+        (*row == InstanceRow::Live).then_some(())?;
+        *row = InstanceRow::Expired;
         Some(())
     }
 }

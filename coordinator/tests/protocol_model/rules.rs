@@ -4,25 +4,25 @@
 /// The rules of the commit protocol. All of them together are the product.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rules {
-    /// A write transaction first locks its house's row; a house whose row has run out or is gone writes nothing and
-    /// comes back as a new house. Enforced by `storage/catalog/src/postgres/house.rs` (`fence`), which every writing
+    /// A write transaction first locks its instance's row; an instance whose row has run out or is gone writes nothing and
+    /// comes back as a new instance. Enforced by `storage/catalog/src/postgres/instance.rs` (`fence`), which every writing
     /// transaction calls first.
-    pub house_is_fenced: bool,
-    /// A range is written only by the house that owns it. Enforced by `storage/catalog/src/postgres/write.rs`
+    pub instance_is_fenced: bool,
+    /// A range is written only by the instance that owns it. Enforced by `storage/catalog/src/postgres/write.rs`
     /// (`replace_known`): one range of another owner fails the whole transaction.
     pub writes_check_owner: bool,
-    /// A house becomes the owner of a lease that a worker names in its hello only if the range still has that epoch,
+    /// An instance becomes the owner of a lease that a worker names in its hello only if the range still has that epoch,
     /// that worker and that incarnation. The product takes over all leases of that worker as the catalog has them
-    /// (`house.rs`, `adopt`) and ends at once those that the hello does not name (`coordinator/src/core/sessions.rs`).
+    /// (`instance.rs`, `adopt`) and ends at once those that the hello does not name (`coordinator/src/core/sessions.rs`).
     pub lease_adoption_is_conditional: bool,
-    /// The ranges of a house fall to another one only after its row has run out by the database's clock. Enforced by
-    /// `house.rs` (`take_lost`).
+    /// The ranges of an instance fall to another one only after its row has run out by the database's clock. Enforced by
+    /// `instance.rs` (`take_lost`).
     pub takeover_waits_for_expiry: bool,
     /// A report is accepted only for the live lease: epoch, worker and incarnation match, the task is still to do.
     /// Enforced by `coordinator/src/core/leases.rs` (`held_to_do`), called by `core/commit.rs`.
     pub commit_checks_lease: bool,
     /// A worker reports a task only after its objects and then its manifest are stored. Enforced by
-    /// `worker/agent/src/execute/render.rs` over `storage/dataset/src/publish.rs`.
+    /// `worker/agent/src/execute/kinds/render.rs` over `storage/dataset/src/publish.rs`.
     pub store_precedes_report: bool,
     /// A worker that finds a manifest takes the task as finished only if the objects exist; else it renders again.
     /// Enforced by `storage/dataset/src/publish.rs` (`published`).
@@ -32,7 +32,7 @@ pub struct Rules {
     /// younger than a day, looks again after it deleted, and publishers look again after their manifest
     /// (`storage/dataset/src/collect.rs`).
     pub collector_holds_range: bool,
-    /// The collector's hold does not run out like a house's lease: it ends when the collector gives the range back or
+    /// The collector's hold does not run out like an instance's lease: it ends when the collector gives the range back or
     /// its process is dead (its database session has ended). A delete in an object store cannot be fenced, so nobody
     /// may follow a collector that is only stopped.
     pub hold_outlasts_lease: bool,
@@ -41,7 +41,7 @@ pub struct Rules {
 impl Rules {
     /// The protocol of the product.
     pub const ALL: Self = Self {
-        house_is_fenced: true,
+        instance_is_fenced: true,
         writes_check_owner: true,
         lease_adoption_is_conditional: true,
         takeover_waits_for_expiry: true,
@@ -63,10 +63,10 @@ pub struct Bounds {
     pub epochs: u8,
     /// Kills of workers, each of which comes back as a new incarnation.
     pub worker_kills: u8,
-    /// Kills of coordinators, each of which comes back as a new house.
-    pub house_kills: u8,
-    /// Running coordinators that are stopped until their house's row has run out.
-    pub house_stops: u8,
+    /// Kills of coordinators, each of which comes back as a new instance.
+    pub instance_kills: u8,
+    /// Running coordinators that are stopped until their instance's row has run out.
+    pub instance_stops: u8,
     /// Runs of the collector.
     pub collections: u8,
 }

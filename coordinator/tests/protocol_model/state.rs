@@ -52,9 +52,9 @@ pub struct WorkerId {
     pub incarnation: u8,
 }
 
-/// A life of a coordinator: a killed or fenced coordinator comes back as a new house.
+/// A life of a coordinator: a killed or fenced coordinator comes back as a new instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct HouseId {
+pub struct InstanceId {
     pub process: u8,
     pub life: u8,
 }
@@ -63,19 +63,19 @@ pub struct HouseId {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Owner {
     Nobody,
-    House(HouseId),
+    Instance(InstanceId),
     Collector,
 }
 
-/// A house's row; one that was taken over is gone from the table.
+/// An instance's row; one that was taken over is gone from the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum HouseRow {
+pub enum InstanceRow {
     Live,
     /// By the database's clock.
     Expired,
 }
 
-/// The range, as a row of the database or as a house remembers it.
+/// The range, as a row of the database or as an instance remembers it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Range {
     pub epoch: u8,
@@ -84,10 +84,10 @@ pub struct Range {
     pub done: Tasks,
 }
 
-/// The database that all houses share.
+/// The database that all instances share.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Database {
-    pub houses: BTreeMap<HouseId, HouseRow>,
+    pub instances: BTreeMap<InstanceId, InstanceRow>,
     pub owner: Owner,
     pub range: Range,
     /// Tasks whose output the catalog names.
@@ -129,7 +129,7 @@ pub enum Step {
 
 /// A lease as its worker sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Desk {
+pub struct HeldLease {
     pub epoch: u8,
     pub todo: Tasks,
     pub step: Step,
@@ -141,14 +141,14 @@ pub struct Desk {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Worker {
     pub incarnation: u8,
-    pub desk: Option<Desk>,
+    pub held: Option<HeldLease>,
 }
 
 /// A coordinator. A stopped one is one that takes no step for long, while others may find its row expired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct House {
+pub struct Instance {
     pub life: u8,
-    /// The range, if the house believes that it owns it.
+    /// The range, if the instance believes that it owns it.
     pub memory: Option<Range>,
 }
 
@@ -167,7 +167,7 @@ pub enum Collector {
 pub struct Commit {
     pub task: u8,
     pub epoch: u8,
-    pub by: HouseId,
+    pub by: InstanceId,
     /// Its lease was live by the database's row.
     pub lease_was_live: bool,
 }
@@ -176,11 +176,11 @@ pub struct Commit {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub struct History {
     pub commits: Vec<Commit>,
-    /// A house without a live row has written.
+    /// An instance without a live row has written.
     pub fenced_write: bool,
     /// A lease named a task that was committed already.
     pub leased_again: bool,
-    /// A house with a live row has lost the range to a takeover.
+    /// An instance with a live row has lost the range to a takeover.
     pub robbed: bool,
 }
 
@@ -188,8 +188,8 @@ pub struct History {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Faults {
     pub worker_kills: u8,
-    pub house_kills: u8,
-    pub house_stops: u8,
+    pub instance_kills: u8,
+    pub instance_stops: u8,
     pub collections: u8,
 }
 
@@ -199,7 +199,7 @@ pub struct State {
     pub database: Database,
     pub store: Store,
     pub network: BTreeSet<Message>,
-    pub houses: [House; 2],
+    pub instances: [Instance; 2],
     pub workers: [Worker; 2],
     pub collector: Collector,
     pub faults: Faults,
@@ -207,12 +207,12 @@ pub struct State {
 }
 
 impl State {
-    /// Two houses and two workers have just started; the range is pending and nobody's.
+    /// Two instances and two workers have just started; the range is pending and nobody's.
     pub fn initial() -> Self {
-        let house = |process| (HouseId { process, life: 0 }, HouseRow::Live);
+        let instance = |process| (InstanceId { process, life: 0 }, InstanceRow::Live);
         Self {
             database: Database {
-                houses: BTreeMap::from([house(0), house(1)]),
+                instances: BTreeMap::from([instance(0), instance(1)]),
                 owner: Owner::Nobody,
                 range: Range {
                     epoch: 0,
@@ -223,13 +223,13 @@ impl State {
             },
             store: Store::default(),
             network: BTreeSet::new(),
-            houses: [House {
+            instances: [Instance {
                 life: 0,
                 memory: None,
             }; 2],
             workers: [Worker {
                 incarnation: 0,
-                desk: None,
+                held: None,
             }; 2],
             collector: Collector::Idle,
             faults: Faults::default(),
@@ -237,10 +237,10 @@ impl State {
         }
     }
 
-    pub fn house(&self, process: u8) -> HouseId {
-        HouseId {
+    pub fn instance(&self, process: u8) -> InstanceId {
+        InstanceId {
             process,
-            life: self.houses[usize::from(process)].life,
+            life: self.instances[usize::from(process)].life,
         }
     }
 
@@ -251,8 +251,8 @@ impl State {
         }
     }
 
-    /// Whether a house of this id runs now.
-    pub fn runs(&self, id: HouseId) -> bool {
-        self.house(id.process) == id
+    /// Whether an instance of this id runs now.
+    pub fn runs(&self, id: InstanceId) -> bool {
+        self.instance(id.process) == id
     }
 }

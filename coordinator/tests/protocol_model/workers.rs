@@ -2,7 +2,7 @@
 
 use crate::{
     model::{Protocol, WorkerStep},
-    state::{Desk, Message, State, Step},
+    state::{HeldLease, Message, State, Step},
 };
 
 impl Protocol {
@@ -15,8 +15,8 @@ impl Protocol {
             let Message::Grant { epoch, to, tasks } = message else {
                 return None;
             };
-            (to == me && s.workers[at].desk.is_none()).then_some(())?;
-            s.workers[at].desk = Some(Desk {
+            (to == me && s.workers[at].held.is_none()).then_some(())?;
+            s.workers[at].held = Some(HeldLease {
                 epoch,
                 todo: tasks,
                 step: Step::Begun,
@@ -31,39 +31,39 @@ impl Protocol {
             (!holds_last && !idle && within).then_some(())?;
             s.faults.worker_kills += 1;
             s.workers[at].incarnation += 1;
-            s.workers[at].desk = None;
+            s.workers[at].held = None;
             return Some(());
         }
-        let desk = s.workers[at].desk.as_mut()?;
-        let epoch = desk.epoch;
-        let hand = desk.todo.lowest();
-        let finish = |desk: &mut Desk, task| {
-            desk.todo = desk.todo.without(crate::state::Tasks::one(task));
-            desk.outbox = desk.outbox.with(task);
-            desk.step = Step::Begun;
+        let held = s.workers[at].held.as_mut()?;
+        let epoch = held.epoch;
+        let hand = held.todo.lowest();
+        let finish = |held: &mut HeldLease, task| {
+            held.todo = held.todo.without(crate::state::Tasks::one(task));
+            held.outbox = held.outbox.with(task);
+            held.step = Step::Begun;
         };
         match step {
-            WorkerStep::Look if desk.step == Step::Begun => {
+            WorkerStep::Look if held.step == Step::Begun => {
                 let found = s.store.manifests.has(hand?);
-                desk.step = if found { Step::Found } else { Step::Rendering };
+                held.step = if found { Step::Found } else { Step::Rendering };
             }
-            WorkerStep::Check if desk.step == Step::Found => {
+            WorkerStep::Check if held.step == Step::Found => {
                 if !self.rules.reuse_checks_objects || s.store.objects.has(hand?) {
-                    finish(desk, hand?);
+                    finish(held, hand?);
                 } else {
-                    desk.step = Step::Rendering;
+                    held.step = Step::Rendering;
                 }
             }
-            WorkerStep::PutObject if desk.step == Step::Rendering => {
+            WorkerStep::PutObject if held.step == Step::Rendering => {
                 s.store.objects = s.store.objects.with(hand?);
-                desk.step = Step::Uploaded;
+                held.step = Step::Uploaded;
             }
-            WorkerStep::PutManifest if desk.step == Step::Uploaded => {
+            WorkerStep::PutManifest if held.step == Step::Uploaded => {
                 s.store.manifests = s.store.manifests.with(hand?);
-                finish(desk, hand?);
+                finish(held, hand?);
             }
             WorkerStep::ReportEarly
-                if desk.step == Step::Rendering && !self.rules.store_precedes_report =>
+                if held.step == Step::Rendering && !self.rules.store_precedes_report =>
             {
                 let task = hand?;
                 s.network.insert(Message::Done {
@@ -73,7 +73,7 @@ impl Protocol {
                 });
             }
             WorkerStep::Report(task) => {
-                desk.outbox.has(task).then_some(())?;
+                held.outbox.has(task).then_some(())?;
                 s.network.insert(Message::Done {
                     epoch,
                     from: me,
@@ -82,7 +82,7 @@ impl Protocol {
             }
             WorkerStep::Forget => {
                 (!holds_last || epoch < self.bounds.epochs).then_some(())?;
-                s.workers[at].desk = None;
+                s.workers[at].held = None;
             }
             _ => return None,
         }

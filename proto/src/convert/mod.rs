@@ -1,5 +1,6 @@
 //! Wire → model and back. Every error names the field that cannot be used.
 
+mod audit;
 mod explain;
 mod job;
 mod session;
@@ -45,13 +46,19 @@ where
     })
 }
 
-fn finite(value: f64, field: &'static str) -> Result<f64, ConvertError> {
-    if value.is_finite() {
-        Ok(value)
-    } else {
-        Err(ConvertError::Invalid {
+/// What is wrong with a field, where something is.
+fn checked<T>(value: Result<T, String>, field: &'static str) -> Result<T, ConvertError> {
+    value.map_err(|what| ConvertError::Invalid { field, what })
+}
+
+/// A list of at most so many.
+fn at_most<T>(list: Vec<T>, most: usize, field: &'static str) -> Result<Vec<T>, ConvertError> {
+    let what = || format!("{} entries; at most {most} are allowed", list.len());
+    match list.len() > most {
+        true => Err(ConvertError::Invalid {
             field,
-            what: format!("{value} is not a finite number"),
-        })
+            what: what(),
+        }),
+        false => Ok(list),
     }
 }

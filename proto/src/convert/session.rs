@@ -1,12 +1,14 @@
 //! The worker session on the wire.
 
-use super::{ConvertError, finite, parse, required};
+use std::collections::{BTreeMap, HashMap};
+
+use super::{ConvertError, at_most, checked, parse, required};
 use crate::{
     ids::{Epoch, LeaseRef},
     key::{StageKey, TaskKey},
     model::{
         Abilities, Failure, FailureKind, Finished, Lease, LogLevel, LogLine, TaskAt, TaskLog,
-        TaskProgress, WorkerHello, log,
+        TaskProgress, WorkerHello, bounds, check_label, log,
     },
     wire,
 };
@@ -35,6 +37,31 @@ fn lease_ref(w: Option<wire::LeaseRef>) -> Result<LeaseRef, ConvertError> {
     required(w, "lease")?.try_into()
 }
 
+fn named(name: String, field: &'static str) -> Result<String, ConvertError> {
+    checked(bounds::name(&name, bounds::NAME_BYTES), field)?;
+    Ok(name)
+}
+
+/// The kinds of task a worker runs, with their versions.
+fn kinds(all: HashMap<String, String>) -> Result<BTreeMap<String, String>, ConvertError> {
+    let all = at_most(all.into_iter().collect(), bounds::LIST, "hello.kinds")?;
+    let kind = |(kind, version)| Ok((named(kind, "hello.kinds")?, named(version, "hello.kinds")?));
+    all.into_iter().map(kind).collect()
+}
+
+/// As much of how a worker's process ended as goes into the history of a task.
+fn ended(text: &str) -> String {
+    let plain = text.chars().filter(|c| !c.is_control());
+    let mut kept = String::new();
+    for c in plain {
+        if kept.len() + c.len_utf8() > 256 {
+            break;
+        }
+        kept.push(c);
+    }
+    kept
+}
+
 impl TryFrom<wire::Hello> for WorkerHello {
     type Error = ConvertError;
 
@@ -42,21 +69,30 @@ impl TryFrom<wire::Hello> for WorkerHello {
         Ok(WorkerHello {
             id: parse(&w.worker_id, "hello.worker_id")?,
             incarnation: parse(&w.incarnation, "hello.incarnation")?,
-            name: w.name,
-            version: w.version,
+            name: named(w.name, "hello.name")?,
+            version: named(w.version, "hello.version")?,
             protocol: w.protocol,
-            held: w
-                .held
+            held: at_most(w.held, bounds::LEASES, "hello.held")?
                 .into_iter()
                 .map(LeaseRef::try_from)
                 .collect::<Result<_, _>>()?,
+            ended: ended(&w.ended),
             abilities: Abilities {
-                kinds: w.kinds.into_iter().collect(),
-                assets: w.assets,
+                kinds: kinds(w.kinds)?,
+                assets: at_most(w.assets, bounds::LIST, "hello.assets")?
+                    .into_iter()
+                    .map(|asset| named(asset, "hello.assets"))
+                    .collect::<Result<_, _>>()?,
                 cores: w.cores,
                 memory_mib: w.memory_mib,
                 gpus: w.gpus,
-                labels: w.labels,
+                labels: at_most(w.labels, bounds::LIST, "hello.labels")?
+                    .into_iter()
+                    .map(|label| {
+                        checked(check_label(&label), "hello.labels")?;
+                        Ok(label)
+                    })
+                    .collect::<Result<_, ConvertError>>()?,
             },
         })
     }
@@ -71,6 +107,7 @@ impl From<WorkerHello> for wire::Hello {
             version: m.version,
             protocol: m.protocol,
             held: m.held.into_iter().map(Into::into).collect(),
+            ended: m.ended,
             kinds: m.abilities.kinds.into_iter().collect(),
             assets: m.abilities.assets,
             cores: m.abilities.cores,
@@ -126,6 +163,24 @@ impl From<Lease> for wire::Lease {
     }
 }
 
+fn digest(text: String) -> Result<String, String> {
+    let hex = text.len() == 64 && text.bytes().all(|b| b.is_ascii_hexdigit());
+    match hex {
+        true => Ok(text),
+        false => Err("expected 64 hexadecimal digits".into()),
+    }
+}
+
+fn bytes(count: u64) -> Result<u64, String> {
+    match count > bounds::BYTES {
+        true => Err(format!(
+            "{count} bytes; at most {} are allowed",
+            bounds::BYTES
+        )),
+        false => Ok(count),
+    }
+}
+
 impl TryFrom<wire::TaskDone> for Finished {
     type Error = ConvertError;
 
@@ -137,11 +192,15 @@ impl TryFrom<wire::TaskDone> for Finished {
                 field: "done.task_key",
                 what: "expected 64 hexadecimal digits".into(),
             })?,
-            manifest_sha256: w.manifest_sha256,
-            bytes: w.bytes,
-            seconds: finite(w.seconds, "done.seconds")?,
+            manifest_sha256: checked(digest(w.manifest_sha256), "done.manifest_sha256")?,
+            bytes: checked(bytes(w.bytes), "done.bytes")?,
+            seconds: checked(bounds::seconds(w.seconds), "done.seconds")?,
             adopted: w.adopted,
-            traceparent: w.traceparent,
+            // Without it the result is worth the same.
+            traceparent: match bounds::name(&w.traceparent, bounds::NAME_BYTES) {
+                Ok(()) => w.traceparent,
+                Err(_) => String::new(),
+            },
         })
     }
 }
@@ -169,6 +228,7 @@ impl TryFrom<wire::TaskFailed> for Failure {
             wire::FailureKind::User => FailureKind::User,
             wire::FailureKind::Crash => FailureKind::Crash,
             wire::FailureKind::Interrupted => FailureKind::Interrupted,
+            wire::FailureKind::Store => FailureKind::Store,
             wire::FailureKind::Unspecified => {
                 return Err(ConvertError::Missing {
                     field: "failed.kind",
@@ -179,7 +239,7 @@ impl TryFrom<wire::TaskFailed> for Failure {
             lease: lease_ref(w.lease)?,
             index: w.index,
             kind,
-            message: w.message,
+            message: bounds::message(&w.message),
         })
     }
 }
@@ -190,12 +250,14 @@ impl From<Failure> for wire::TaskFailed {
             FailureKind::User => wire::FailureKind::User,
             FailureKind::Crash => wire::FailureKind::Crash,
             FailureKind::Interrupted => wire::FailureKind::Interrupted,
+            FailureKind::Store => wire::FailureKind::Store,
         };
         wire::TaskFailed {
             lease: Some(m.lease.into()),
             index: m.index,
             kind: kind.into(),
-            message: m.message,
+            // Longer than a message may be, it would end the session each time it is sent.
+            message: bounds::message(&m.message),
         }
     }
 }
@@ -204,13 +266,7 @@ impl TryFrom<wire::TaskLog> for TaskLog {
     type Error = ConvertError;
 
     fn try_from(w: wire::TaskLog) -> Result<Self, ConvertError> {
-        if w.lines.len() > log::LINES {
-            return Err(ConvertError::Invalid {
-                field: "log.lines",
-                what: format!("{} lines are more than {}", w.lines.len(), log::LINES),
-            });
-        }
-        let lines = w.lines.into_iter().map(TryInto::try_into);
+        let lines = w.lines.into_iter().take(log::LINES).map(TryInto::try_into);
         Ok(TaskLog {
             lease: lease_ref(w.lease)?,
             index: w.index,
@@ -233,12 +289,6 @@ impl TryFrom<wire::LogLine> for LogLine {
     type Error = ConvertError;
 
     fn try_from(w: wire::LogLine) -> Result<Self, ConvertError> {
-        if w.text.len() > log::LINE_BYTES {
-            return Err(ConvertError::Invalid {
-                field: "log.lines.text",
-                what: format!("{} bytes are more than {}", w.text.len(), log::LINE_BYTES),
-            });
-        }
         let level = match w.level() {
             wire::LogLevel::Error => LogLevel::Error,
             wire::LogLevel::Warn => LogLevel::Warn,
@@ -252,7 +302,7 @@ impl TryFrom<wire::LogLine> for LogLine {
         Ok(LogLine {
             ago_ms: w.ago_ms,
             level,
-            text: log::printable(&w.text),
+            text: bounds::cut(&w.text, log::LINE_BYTES),
         })
     }
 }
@@ -279,7 +329,11 @@ impl TryFrom<wire::TaskProgress> for TaskProgress {
         Ok(TaskProgress {
             lease: lease_ref(w.lease)?,
             index: w.index,
-            fraction: w.fraction.clamp(0.0, 1.0),
+            // What is no number is no progress.
+            fraction: match w.fraction.is_nan() {
+                true => 0.0,
+                false => w.fraction.clamp(0.0, 1.0),
+            },
             at: TaskAt {
                 text: w.text,
                 figures: w.figures.into_iter().collect(),

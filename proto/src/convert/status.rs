@@ -3,8 +3,8 @@
 use super::{ConvertError, parse, required};
 use crate::{
     model::{
-        Event, EventKind, JobPlan, JobState, JobStatus, RunningTask, StagePlan, StageState,
-        StageStatus, TaskCounts,
+        Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan,
+        StageState, StageStatus, TaskCounts, bounds,
     },
     wire,
 };
@@ -104,6 +104,26 @@ impl TryFrom<wire::StageStatus> for StageStatus {
     }
 }
 
+/// A running task, with what it is at or without.
+fn running(m: RunningTask, at: bool) -> wire::RunningTask {
+    let brief = wire::RunningTask {
+        stage: m.stage,
+        index: m.index,
+        worker: m.worker,
+        fraction: m.fraction,
+        seconds: m.seconds,
+        ..wire::RunningTask::default()
+    };
+    match at {
+        false => brief,
+        true => wire::RunningTask {
+            text: m.text,
+            figures: m.figures.into_iter().collect(),
+            ..brief
+        },
+    }
+}
+
 impl From<JobStatus> for wire::JobStatus {
     fn from(m: JobStatus) -> Self {
         wire::JobStatus {
@@ -121,15 +141,8 @@ impl From<JobStatus> for wire::JobStatus {
             running: m
                 .running
                 .into_iter()
-                .map(|r| wire::RunningTask {
-                    stage: r.stage,
-                    index: r.index,
-                    worker: r.worker,
-                    fraction: r.fraction,
-                    seconds: r.seconds,
-                    text: r.text,
-                    figures: r.figures.into_iter().collect(),
-                })
+                .enumerate()
+                .map(|(n, r)| running(r, n < bounds::RUNNING))
                 .collect(),
             workers: m.workers,
         }
@@ -174,6 +187,40 @@ impl TryFrom<wire::JobStatus> for JobStatus {
     }
 }
 
+impl From<JobSummary> for wire::JobSummary {
+    fn from(m: JobSummary) -> Self {
+        wire::JobSummary {
+            id: m.id.to_string(),
+            name: m.name,
+            user: m.user,
+            project: m.project,
+            state: wire::JobState::from(m.state).into(),
+            paused: m.paused,
+            tasks: Some(m.tasks.into()),
+            submitted_at_ms: m.submitted_at_ms,
+            ended_at_ms: m.ended_at_ms.unwrap_or(0),
+        }
+    }
+}
+
+impl TryFrom<wire::JobSummary> for JobSummary {
+    type Error = ConvertError;
+
+    fn try_from(w: wire::JobSummary) -> Result<Self, ConvertError> {
+        Ok(JobSummary {
+            state: w.state().try_into()?,
+            id: parse(&w.id, "job.id")?,
+            name: w.name,
+            user: w.user,
+            project: w.project,
+            paused: w.paused,
+            tasks: required(w.tasks, "job.tasks")?.into(),
+            submitted_at_ms: w.submitted_at_ms,
+            ended_at_ms: (w.ended_at_ms != 0).then_some(w.ended_at_ms),
+        })
+    }
+}
+
 impl From<JobPlan> for wire::JobPlan {
     fn from(m: JobPlan) -> Self {
         wire::JobPlan {
@@ -191,6 +238,7 @@ impl From<JobPlan> for wire::JobPlan {
                     total: s.total,
                     reuse: s.reuse,
                     run: s.run,
+                    memory_bytes: s.memory_bytes,
                     reasons: s.reasons,
                 })
                 .collect(),
@@ -220,6 +268,7 @@ impl TryFrom<wire::JobPlan> for JobPlan {
                     total: s.total,
                     reuse: s.reuse,
                     run: s.run,
+                    memory_bytes: s.memory_bytes,
                     reasons: s.reasons,
                 })
                 .collect(),

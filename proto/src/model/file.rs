@@ -17,20 +17,16 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{
-    evaluate::{EvaluateSettings, EvaluateTask},
-    generate::{GenerateSettings, GenerateTask},
-    import::{ImportSettings, ImportTask},
-    infer::{InferSettings, InferTask},
-    job::{JobSpec, Limits, MAX_STAGES, OutputSettings, Resources, SpecError, StageSpec},
+    PartTask, RenderTask, TaskSpec,
+    job::{
+        JobSpec, Limits, MAX_STAGES, OutputSettings, Resources, SourceSettings, SpecError,
+        StageSpec,
+    },
+    kinds::Fields,
     refer,
-    render::{PartTask, RenderSettings, RenderTask, SceneSource},
-    report::{ReportSettings, ReportTask},
-    reprocess::{ReprocessSettings, ReprocessTask, SourceSettings},
-    sweep::{self, PromoteSettings, PromoteTask},
-    task::{ExportSettings, ExportTask, SplitTask, TaskSpec},
-    train::{TrainSettings, TrainTask},
+    render::{RenderSettings, SceneSource},
+    sweep,
 };
-use crate::split::SplitSettings;
 
 /// A job file.
 #[derive(Deserialize)]
@@ -44,6 +40,8 @@ pub(super) struct JobText {
     #[serde(default)]
     nonce: String,
     #[serde(default)]
+    project: String,
+    #[serde(default)]
     resources: Resources,
     scenes: Option<SceneSource>,
     render: Option<RenderSettings>,
@@ -51,40 +49,6 @@ pub(super) struct JobText {
     parts: Option<u32>,
     #[serde(default)]
     stage: Vec<Value>,
-}
-
-/// `[[stage]]`.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct StageText {
-    name: Option<String>,
-    kind: Option<String>,
-    #[serde(default)]
-    needs: Vec<String>,
-    #[serde(default)]
-    tolerate_dead: bool,
-    #[serde(default)]
-    force: bool,
-    #[serde(default)]
-    resources: Resources,
-    source: Option<SourceSettings>,
-    count: Option<u64>,
-    scenes: Option<SceneSource>,
-    render: Option<RenderSettings>,
-    reprocess: Option<ReprocessSettings>,
-    split: Option<SplitSettings>,
-    export: Option<ExportSettings>,
-    generate: Option<GenerateSettings>,
-    import: Option<ImportSettings>,
-    train: Option<TrainSettings>,
-    evaluate: Option<EvaluateSettings>,
-    promote: Option<PromoteSettings>,
-    infer: Option<InferSettings>,
-    report: Option<ReportSettings>,
-    output: Option<OutputSettings>,
-    parts: Option<u32>,
-    #[serde(default)]
-    joined_by: String,
 }
 
 /// A stage's name, or a place.
@@ -177,6 +141,7 @@ impl TryFrom<JobText> for JobSpec {
             priority: text.priority,
             limits: text.limits,
             nonce: text.nonce,
+            project: text.project,
             stages,
         };
         spec.divide();
@@ -274,145 +239,15 @@ impl TryFrom<Value> for StageSpec {
     type Error = SpecError;
 
     fn try_from(value: Value) -> Result<Self, SpecError> {
-        let name = value.get("name").and_then(Value::as_str);
-        let named = name.map_or_else(String::new, |n| format!("{n:?}: "));
-        let text: StageText = serde_json::from_value(value)
-            .map_err(|e| SpecError::new("stage", format!("{named}{e}")))?;
-        text.read()
-    }
-}
-
-impl StageText {
-    fn read(self) -> Result<StageSpec, SpecError> {
-        let kind = self.kind.unwrap_or_else(|| "render".into());
-        // What [`JobSpec::divide`] makes of a stage that renders in parts.
-        let like = match &*kind {
-            "part" => "render",
-            kind => kind,
-        };
-        let scenes_for = match &*kind {
-            "generate" => "generate",
-            _ => "render",
-        };
-        let given = [
-            ("scenes", scenes_for, self.scenes.is_some()),
-            ("generate", "generate", self.generate.is_some()),
-            ("import", "import", self.import.is_some()),
-            ("render", "render", self.render.is_some()),
-            ("parts", "render", self.parts.is_some()),
-            ("joined_by", "part", !self.joined_by.is_empty()),
-            ("reprocess", "reprocess", self.reprocess.is_some()),
-            ("split", "split", self.split.is_some()),
-            ("export", "export", self.export.is_some()),
-            ("train", "train", self.train.is_some()),
-            ("evaluate", "evaluate", self.evaluate.is_some()),
-            ("promote", "promote", self.promote.is_some()),
-            ("infer", "infer", self.infer.is_some()),
-            ("report", "report", self.report.is_some()),
-        ];
-        for (field, of, given) in given {
-            if given && of != like && of != kind {
-                let what = format!("belongs to kind = {of:?}; remove it from kind = {kind:?}");
-                return Err(SpecError::new(field, what));
-            }
-        }
-        let missing =
-            |field: &str| SpecError::new(field, format!("is missing; kind = {kind:?} needs it"));
-        let makes = matches!(like, "render" | "reprocess" | "import" | "infer");
-        if self.output.is_some() && !makes {
-            let what = format!("is not for kind = {kind:?}, which makes no data set; remove it");
-            return Err(SpecError::new("output", what));
-        }
-        let reads = matches!(
-            like,
-            "reprocess" | "split" | "export" | "train" | "evaluate" | "promote" | "infer"
-        );
-        if !reads && (self.source.is_some() || self.count.is_some()) {
-            let what = format!("is not for kind = {kind:?}, which reads no data set; remove it");
-            return Err(SpecError::new("source", what));
-        }
-        let output = self.output.ok_or_else(|| missing("output"));
-        let source = self.source.ok_or_else(|| missing("source"));
-        let count = self.count.unwrap_or(0);
-        let scenes = self.scenes.ok_or_else(|| missing("scenes"));
-        let (render, parts) = (self.render.unwrap_or_default(), self.parts.unwrap_or(1));
-        let whole = |scenes, output| RenderTask {
-            scenes,
-            render,
-            output,
-            parts,
-        };
-        let task = match &*kind {
-            "generate" => TaskSpec::Generate(GenerateTask {
-                scenes: scenes?,
-                generate: self.generate.ok_or_else(|| missing("generate"))?,
-            }),
-            "import" => TaskSpec::Import(ImportTask {
-                import: self.import.ok_or_else(|| missing("import"))?,
-                output: output?,
-            }),
-            "render" => TaskSpec::Render(whole(scenes?, output?)),
-            "part" => TaskSpec::Part(PartTask {
-                joined_by: self.joined_by,
-                whole: whole(scenes?, output?),
-            }),
-            "reprocess" => TaskSpec::Reprocess(ReprocessTask {
-                source: source?,
-                count,
-                reprocess: self.reprocess.unwrap_or_default(),
-                output: output?,
-            }),
-            "split" => TaskSpec::Split(SplitTask {
-                source: source?,
-                count,
-                split: self.split.ok_or_else(|| missing("split"))?,
-            }),
-            "export" => TaskSpec::Export(ExportTask {
-                source: source?,
-                count,
-                export: self.export.ok_or_else(|| missing("export"))?,
-            }),
-            "train" => TaskSpec::Train(TrainTask {
-                source: source?,
-                count,
-                train: self.train.ok_or_else(|| missing("train"))?,
-            }),
-            "evaluate" => TaskSpec::Evaluate(EvaluateTask {
-                source: source?,
-                count,
-                evaluate: self.evaluate.ok_or_else(|| missing("evaluate"))?,
-            }),
-            "promote" => TaskSpec::Promote(PromoteTask {
-                source: source?,
-                count,
-                promote: self.promote.ok_or_else(|| missing("promote"))?,
-            }),
-            "infer" => TaskSpec::Infer(InferTask {
-                source: source?,
-                count,
-                infer: self.infer.ok_or_else(|| missing("infer"))?,
-                output: output?,
-            }),
-            "report" => TaskSpec::Report(ReportTask {
-                report: self.report.ok_or_else(|| missing("report"))?,
-            }),
-            other => {
-                return Err(SpecError::new(
-                    "kind",
-                    format!(
-                        "{other:?} is not one of \"render\", \"reprocess\", \"split\", \"export\", \"import\", \"generate\", \
-                         \"train\", \"evaluate\", \"promote\", \"infer\", \"report\""
-                    ),
-                ));
-            }
-        };
-        Ok(StageSpec {
-            name: self.name.unwrap_or(kind),
-            needs: self.needs,
-            tolerate_dead: self.tolerate_dead,
-            force: self.force,
-            resources: self.resources,
-            task,
+        let mut fields = Fields::new(value)?;
+        let name: Option<String> = fields.optional("name")?;
+        Ok(Self {
+            name: name.unwrap_or_else(|| fields.kind().to_owned()),
+            needs: fields.or_default("needs")?,
+            tolerate_dead: fields.or_default("tolerate_dead")?,
+            force: fields.or_default("force")?,
+            resources: fields.or_default("resources")?,
+            task: TaskSpec::read(fields)?,
         })
     }
 }

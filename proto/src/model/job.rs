@@ -1,11 +1,11 @@
 //! A job: a graph of stages, each of them many tasks of one kind. The TOML job file has exactly these fields; see
 //! [`JobSpec::check`] for their limits, and [`super::file`] for what may be left out or written shorter.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use super::{file::JobText, render::RenderTask, reprocess::SourceSettings, task::TaskSpec};
+use super::{RenderTask, TaskSpec, bounds, file::JobText};
 
 /// Most tasks in one job.
 pub const MAX_TASKS: u64 = 100_000_000;
@@ -22,7 +22,7 @@ pub const MAX_STAGES: usize = 1_000;
 pub struct SpecError {
     /// The field, as in the job file, e.g. `render.bin_width_m`.
     pub field: String,
-    /// What was expected and how to mend it.
+    /// What was expected and how to correct it.
     pub what: String,
 }
 
@@ -34,6 +34,21 @@ impl SpecError {
             what: what.into(),
         }
     }
+}
+
+/// Checks that a value lies in a range, ends included. `unit` says what it counts, and may go on after a semicolon with how
+/// to find the right value.
+pub(super) fn within<T: PartialOrd + std::fmt::Display>(
+    field: impl Into<String>,
+    value: T,
+    (low, high): (T, T),
+    unit: &str,
+) -> Result<(), SpecError> {
+    if value >= low && value <= high {
+        return Ok(());
+    }
+    let what = format!("{value} lies outside {low}..={high} {unit}");
+    Err(SpecError::new(field, what.trim_end()))
 }
 
 /// A whole job.
@@ -49,6 +64,9 @@ pub struct JobSpec {
     /// Sets it apart from a job that is otherwise the same; empty but for those that run again what is done.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub nonce: String,
+    /// Whose it is besides its submitter's: maintainers of the project may change it; empty = nobody's.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub project: String,
     /// What is done, in an order in which each stage comes after those that it needs.
     #[serde(rename = "stage")]
     pub stages: Vec<StageSpec>,
@@ -98,11 +116,27 @@ impl Resources {
     }
 
     fn check(&self) -> Result<(), SpecError> {
-        if !(0.0..=1e6).contains(&self.memory_gib) {
-            return Err(SpecError::new(
-                "resources.memory_gib",
-                format!("{} lies outside 0..=1000000", self.memory_gib),
-            ));
+        within(
+            "resources.cores",
+            self.cores,
+            (0, 65_536),
+            "cores of one worker",
+        )?;
+        let gib = "GiB of one worker; 1 GiB is 1.07 GB";
+        within("resources.memory_gib", self.memory_gib, (0.0, 1e6), gib)?;
+        within(
+            "resources.gpus",
+            self.gpus,
+            (0, 1024),
+            "graphics processors of one worker",
+        )?;
+        if self.labels.len() > bounds::LIST {
+            let what = format!(
+                "{} labels; at most {} are allowed",
+                self.labels.len(),
+                bounds::LIST
+            );
+            return Err(SpecError::new("resources.labels", what));
         }
         for label in &self.labels {
             check_label(label).map_err(|what| SpecError::new("resources.labels", what))?;
@@ -120,6 +154,20 @@ pub fn check_label(label: &str) -> Result<(), String> {
     if label.is_empty() || label.len() > 64 || !label.chars().all(plain) {
         return Err(format!(
             "{label:?} must be up to 64 letters, digits, '-', '_', '.' and '='"
+        ));
+    }
+    Ok(())
+}
+
+/// Checks the name of a project: it stands between commas and in messages.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_project(name: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if name.is_empty() || name.len() > 64 || !name.chars().all(plain) {
+        return Err(format!(
+            "{name:?} is not the name of a project: expected up to 64 letters, digits, '-', '_' and '.'"
         ));
     }
     Ok(())
@@ -170,6 +218,22 @@ impl OutputSettings {
             return Err(SpecError::new("output.dataset", what));
         }
         Ok(())
+    }
+}
+
+/// A data set that is read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SourceSettings {
+    /// The store: a path or URL that every worker can reach.
+    pub store: String,
+    /// Folder of the data set in the store.
+    pub dataset: String,
+}
+
+impl SourceSettings {
+    /// How keys know it: by its place.
+    pub(super) fn shaping(&self) -> serde_json::Value {
+        serde_json::json!([self.store, self.dataset])
     }
 }
 
@@ -229,9 +293,16 @@ impl Limits {
     }
 
     fn check(&self) -> Result<(), SpecError> {
-        if self.max_failures == 0 || self.max_crashes == 0 {
-            return Err(SpecError::new("limits", "budgets must be at least 1"));
+        // More attempts than these are an endless loop.
+        for (field, value) in [
+            ("limits.max_failures", self.max_failures),
+            ("limits.max_crashes", self.max_crashes),
+        ] {
+            let unit = "attempts of a task; 1 gives it up at the first";
+            within(field, value, (1, 1_000_000), unit)?;
         }
+        let unit = "workers at a time; 0 is as many as there are";
+        within("limits.max_workers", self.max_workers, (0, 1_000_000), unit)?;
         self.deadline_ms().map(|_| ())
     }
 }
@@ -244,6 +315,7 @@ impl JobSpec {
             priority: 0,
             limits: Limits::default(),
             nonce: String::new(),
+            project: String::new(),
             stages: vec![StageSpec::new(TaskSpec::Render(task))],
         }
     }
@@ -253,10 +325,15 @@ impl JobSpec {
     /// # Errors
     /// [`SpecError`] naming the first field that cannot be used.
     pub fn check(&self) -> Result<(), SpecError> {
+        // First: what follows repeats texts in its messages.
+        bounds::texts(self)?;
         if self.name.trim().is_empty() {
             return Err(SpecError::new("name", "is empty; give the job a name"));
         }
         self.limits.check()?;
+        if !self.project.is_empty() {
+            check_project(&self.project).map_err(|what| SpecError::new("project", what))?;
+        }
         if self.stages.is_empty() || self.stages.len() > MAX_STAGES {
             let what = format!(
                 "a job has 1 to {MAX_STAGES} stages, this one {}",
@@ -318,31 +395,13 @@ impl StageSpec {
 
     /// Number of its tasks.
     pub fn tasks(&self) -> u64 {
-        match &self.task {
-            TaskSpec::Render(task) => task.scenes.count,
-            TaskSpec::Part(task) => task.whole.scenes.count * task.tasks_per_scene(),
-            TaskSpec::Generate(task) => task.scenes.count,
-            TaskSpec::Import(task) => task.import.count,
-            TaskSpec::Reprocess(task) => task.count,
-            TaskSpec::Infer(task) => task.count,
-            TaskSpec::Split(_)
-            | TaskSpec::Export(_)
-            | TaskSpec::Train(_)
-            | TaskSpec::Evaluate(_)
-            | TaskSpec::Promote(_)
-            | TaskSpec::Report(_) => 1,
-        }
+        self.task.tasks()
     }
 
     /// The same with as much of its lists as a lease of tasks `lo..hi` needs.
     pub fn only(&self, lo: u64, hi: u64) -> Self {
         Self {
-            task: match &self.task {
-                TaskSpec::Render(task) => TaskSpec::Render(task.only(lo, hi)),
-                TaskSpec::Part(task) => TaskSpec::Part(task.only(lo, hi)),
-                TaskSpec::Import(task) => TaskSpec::Import(task.only(lo, hi)),
-                other => other.clone(),
-            },
+            task: self.task.only(lo, hi).unwrap_or_else(|| self.task.clone()),
             name: self.name.clone(),
             needs: self.needs.clone(),
             resources: self.resources.clone(),
@@ -357,34 +416,7 @@ impl StageSpec {
             return Err(SpecError::new("name", what));
         }
         self.resources.check()?;
-        match &self.task {
-            TaskSpec::Render(task) => task.check(),
-            TaskSpec::Part(task) => task.whole.check(),
-            TaskSpec::Generate(task) => task.check(),
-            TaskSpec::Import(task) => task.check(),
-            TaskSpec::Reprocess(task) => task.check(),
-            TaskSpec::Train(task) => task.check(),
-            TaskSpec::Evaluate(task) => task.check(),
-            TaskSpec::Promote(task) => task.check(),
-            TaskSpec::Infer(task) => task.check(),
-            TaskSpec::Report(task) => task.check(),
-            TaskSpec::Split(task) => {
-                check_source(&task.source)?;
-                check_count("count", task.count)?;
-                task.split.check()
-            }
-            TaskSpec::Export(task) => {
-                check_source(&task.source)?;
-                check_count("count", task.count)?;
-                match task.export.dest.is_empty() {
-                    true => Err(SpecError::new(
-                        "export.dest",
-                        "is empty; give a path or URL",
-                    )),
-                    false => Ok(()),
-                }
-            }
-        }
+        self.task.check()
     }
 
     /// Checks that it fits the stages before it and after it.
@@ -480,30 +512,7 @@ impl StageSpec {
                 return Err(SpecError::new("needs", what));
             }
         }
-        self.check_kinds(store, before)
-    }
-
-    /// Checks that no two models of an inference, as far as stages before it train them, predict the same.
-    fn check_kinds(&self, store: &String, before: &[Self]) -> Result<(), SpecError> {
-        let TaskSpec::Infer(task) = &self.task else {
-            return Ok(());
-        };
-        let mut kinds = BTreeMap::new();
-        for model in &task.infer.models {
-            let trains = |s: &&Self| s.task.trains() == Some((store, model));
-            let Some(TaskSpec::Train(trained)) = before.iter().find(trains).map(|s| &s.task) else {
-                continue;
-            };
-            let kind = trained.train.task.name();
-            if let Some(other) = kinds.insert(kind, model) {
-                let what = format!(
-                    "{other:?} and {model:?} both predict {kind:?}; name one of each kind, and give the other a stage of \
-                     its own"
-                );
-                return Err(SpecError::new("infer.models", what));
-            }
-        }
-        Ok(())
+        self.task.check_among(before)
     }
 
     /// As [`JobSpec::check_places`], of one stage.
@@ -514,19 +523,28 @@ impl StageSpec {
         if let Some(source) = self.task.reads() {
             place("source.store", &source.store)?;
         }
-        match &self.task {
-            TaskSpec::Render(task) => task.check_places(),
-            TaskSpec::Part(task) => task.whole.check_places(),
-            TaskSpec::Generate(task) => task.check_places(),
-            TaskSpec::Import(task) => task.check_places(),
-            TaskSpec::Reprocess(task) => place("output.store", &task.output.store),
-            TaskSpec::Infer(task) => place("output.store", &task.output.store),
-            TaskSpec::Report(task) => task.check_places(),
-            TaskSpec::Split(_)
-            | TaskSpec::Train(_)
-            | TaskSpec::Evaluate(_)
-            | TaskSpec::Promote(_) => Ok(()),
-            TaskSpec::Export(task) => place("export.dest", &task.export.dest),
+        let results = self.task.results();
+        place(results.field, results.store)?;
+        let mut inputs = self.task.inputs(None).into_iter();
+        inputs.try_for_each(|(field, path)| place(&field, path))
+    }
+
+    /// Checks what a client must have filled in before it submits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the field.
+    pub fn check_resolved(&self) -> Result<(), SpecError> {
+        if let (field, "") = self.task.versioned() {
+            let what = format!(
+                "is empty; the client must fill in the version of its code for stages of kind {:?} before it submits",
+                self.task.kind()
+            );
+            return Err(SpecError::new(field, what));
+        }
+        self.task.check_resolved()?;
+        match self.task.scenes() {
+            Some(scenes) => scenes.check_resolved(),
+            None => Ok(()),
         }
     }
 }
@@ -548,11 +566,7 @@ pub(super) fn check_source(source: &SourceSettings) -> Result<(), SpecError> {
 }
 
 pub(super) fn check_count(field: &str, count: u64) -> Result<(), SpecError> {
-    if count == 0 || count > MAX_TASKS {
-        let what = format!("{count} lies outside 1..={MAX_TASKS}");
-        return Err(SpecError::new(field, what));
-    }
-    Ok(())
+    within(field, count, (1, MAX_TASKS), "scenes")
 }
 
 /// A place that means the same to everyone: absolute, and without a way up.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::log::printable;
+use super::{bounds, log::printable};
 use crate::{
     ids::{Incarnation, JobId, LeaseRef, WorkerId},
     key::{StageKey, TaskKey},
@@ -24,6 +24,8 @@ pub struct WorkerHello {
     pub protocol: u32,
     /// Leases it still holds from before a reconnect.
     pub held: Vec<LeaseRef>,
+    /// How its process before this one ended, in words, where its parent knows; empty otherwise.
+    pub ended: String,
     /// What it is able to do and what it has.
     pub abilities: Abilities,
 }
@@ -98,8 +100,10 @@ pub enum FailureKind {
     User,
     /// The executor panicked, or the worker was lost.
     Crash,
-    /// Shutdown, preemption, store unreachable: free.
+    /// Shutdown, preemption: free.
     Interrupted,
+    /// The store cannot be reached or written: free, and all that use it wait.
+    Store,
 }
 
 /// A failed task as the worker reports it.
@@ -149,7 +153,9 @@ impl TaskAt {
     #[must_use]
     pub fn limited(self) -> Self {
         let figures = self.figures.into_iter();
-        let usable = |(name, value): &(String, f64)| name.len() <= Self::NAME && value.is_finite();
+        let usable = |(name, value): &(String, f64)| {
+            bounds::name(name, Self::NAME).is_ok() && value.is_finite()
+        };
         Self {
             text: printable(&self.text[..self.text.floor_char_boundary(Self::TEXT)]),
             figures: figures.filter(usable).take(Self::FIGURES).collect(),

@@ -3,6 +3,7 @@
 
 use std::fmt;
 
+use super::bounds::steers;
 use crate::ids::LeaseRef;
 
 /// Lines of a task that are kept.
@@ -85,9 +86,9 @@ impl LogAllowance {
     }
 }
 
-/// A text that a terminal only shows: control characters become spaces.
+/// A text that a terminal only shows: characters that do anything else become spaces.
 pub fn printable(text: &str) -> String {
-    let shown = |c: char| if c.is_control() { ' ' } else { c };
+    let shown = |c: char| if steers(c) { ' ' } else { c };
     text.chars().map(shown).collect()
 }
 

@@ -6,7 +6,7 @@
 
 use super::{
     job::{SpecError, StageSpec},
-    task::TaskSpec,
+    kinds::ModelNames,
 };
 
 /// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models, split or
@@ -15,19 +15,25 @@ use super::{
 /// # Errors
 /// A name that stands for several models where one is wanted, or for a stage that trains none.
 pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
-    if let TaskSpec::Report(task) = &mut stage.task
-        && task.report.store.is_empty()
-    {
-        task.report.store = shelf(&task.report.models, before);
+    if stage.task.shelf().is_some_and(String::is_empty) {
+        let models = stage
+            .task
+            .models()
+            .into_iter()
+            .map(|(_, name)| name.clone());
+        let found = shelf(&models.collect::<Vec<_>>(), before);
+        if let Some(store) = stage.task.shelf_mut() {
+            *store = found;
+        }
     }
     let Some(store) = stage.task.shelf().cloned() else {
         return Ok(());
     };
     let source = stage.task.reads().cloned();
     let at = |field: &str| format!("stage.{}.{field}", stage.name);
-    match &mut stage.task {
-        TaskSpec::Train(task) => {
-            for (field, name) in task.train.models_mut() {
+    match stage.task.models_mut() {
+        ModelNames::Single(names) => {
+            for (field, name) in names {
                 let mut found =
                     named(name, before, &store).map_err(|e| SpecError::new(at(field), e))?;
                 if found.len() > 1 {
@@ -43,40 +49,26 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
                 }
             }
         }
-        TaskSpec::Evaluate(task) => {
-            let models = &mut task.evaluate.models;
-            all(models, before, &store).map_err(|e| SpecError::new(at("evaluate.models"), e))?;
+        ModelNames::List(field, names) => {
+            all(names, before, &store).map_err(|e| SpecError::new(at(field), e))?;
         }
-        TaskSpec::Promote(task) => {
-            let models = &mut task.promote.among;
-            all(models, before, &store).map_err(|e| SpecError::new(at("promote.among"), e))?;
-        }
-        TaskSpec::Infer(task) => {
-            let models = &mut task.infer.models;
-            all(models, before, &store).map_err(|e| SpecError::new(at("infer.models"), e))?;
-        }
-        TaskSpec::Report(task) => {
-            let models = &mut task.report.models;
-            all(models, before, &store).map_err(|e| SpecError::new(at("report.models"), e))?;
-        }
-        _ => return Ok(()),
     }
     let task = &stage.task;
     let models = task.models();
     let read = |name: &String| models.iter().any(|(_, model)| *model == name);
-    let wanted = before.iter().filter(|s| match &s.task {
-        TaskSpec::Split(split) => {
-            Some(&split.source) == source.as_ref() && task.split() == Some(&split.split.name)
-        }
+    let wanted = before.iter().filter(|s| {
+        let divides = s.task.divides().is_some_and(|(divided, name)| {
+            Some(divided) == source.as_ref() && task.split() == Some(name)
+        });
         // A report tells what evaluations of its models found.
-        TaskSpec::Evaluate(other) => {
-            task.reports().is_some()
-                && other.source.store == store
-                && other.evaluate.models.iter().any(read)
-        }
-        other => other
+        let evaluates = task.reports().is_some()
+            && s.task.shelf() == Some(&store)
+            && s.task.evaluates().iter().any(read);
+        let trains = s
+            .task
             .trains()
-            .is_some_and(|(place, model)| *place == store && read(model)),
+            .is_some_and(|(place, model)| *place == store && read(model));
+        divides || evaluates || trains
     });
     let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
     for name in wanted {

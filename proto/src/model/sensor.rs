@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::job::SpecError;
+use super::job::{SpecError, within as bounded};
 
 /// Settings of a sensor, in the order in which they act: pulse, jitter, scale, dark counts, pile-up, noise, rebinning.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -214,12 +214,8 @@ impl SensorSettings {
             }
         }
         within("dark_per_bin", self.dark_per_bin, 0.0, 1e8, "photons a bin")?;
-        if self.rebin == 0 {
-            return Err(SpecError::new(
-                format!("{at}.rebin"),
-                "is 0; 1 leaves the bins as they are",
-            ));
-        }
+        let unit = "bins summed to one; 1 leaves them as they are";
+        bounded(format!("{at}.rebin"), self.rebin, (1, 65_536), unit)?;
         match self.dead_time {
             Some(DeadTimeSettings::FirstPhoton { pulses }) if !(1..=1 << 40).contains(&pulses) => {
                 Err(SpecError::new(

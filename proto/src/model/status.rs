@@ -129,6 +129,29 @@ pub struct JobStatus {
     pub workers: u32,
 }
 
+/// A job as a list shows it, without what it is made of.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct JobSummary {
+    /// Id.
+    pub id: JobId,
+    /// Name.
+    pub name: String,
+    /// Who submitted it.
+    pub user: String,
+    /// Its project; empty = none.
+    pub project: String,
+    /// State.
+    pub state: JobState,
+    /// It is held: nothing of it is begun.
+    pub paused: bool,
+    /// Counts.
+    pub tasks: TaskCounts,
+    /// Unix time of submission, milliseconds.
+    pub submitted_at_ms: i64,
+    /// Unix time of the end, milliseconds.
+    pub ended_at_ms: Option<i64>,
+}
+
 /// What a submission would do.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct JobPlan {
@@ -159,6 +182,8 @@ pub struct StagePlan {
     pub reuse: u64,
     /// Tasks that will run.
     pub run: u64,
+    /// About how much memory each takes; 0 = not known before a worker has seen what it reads.
+    pub memory_bytes: u64,
     /// Why tasks run, in words.
     pub reasons: Vec<String>,
 }

@@ -9,7 +9,7 @@
 //! [stage.train]
 //! model = "depth"                               # trials are depth.0, depth.1, …; the best of them becomes depth
 //! net = { width = "{width}", levels = "{levels}" }
-//! optimise = { rate = "{lr}", epochs = 81 }
+//! optimise = { learning_rate = "{lr}", epochs = 81 }
 //! ```
 //!
 //! Trial `i` of `tof` is a stage of one task, `tof.i`, an ordinary training with ordinary settings: it is leased, resumed,
@@ -29,8 +29,7 @@ use sha2::{Digest, Sha256};
 
 use super::{
     file::substitute,
-    job::{MAX_STAGES, SpecError, check_count, check_source},
-    reprocess::SourceSettings,
+    job::{MAX_STAGES, SpecError},
     train::check_model,
 };
 
@@ -147,61 +146,6 @@ impl Halving {
                 "factor",
                 "must be at least 2: one in so many trials goes on",
             );
-        }
-        Ok(())
-    }
-}
-
-/// Giving the best of several models a name: one task.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct PromoteTask {
-    /// The data set that they learnt from, in whose store they are kept.
-    pub source: SourceSettings,
-    /// Its number of scenes.
-    pub count: u64,
-    /// Which models.
-    pub promote: PromoteSettings,
-}
-
-/// The best of which models gets which name.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PromoteSettings {
-    /// The name that the best gets.
-    pub model: String,
-    /// The models among which it is chosen, or stages that train them. Trials that stopped on their way are passed over.
-    pub among: Vec<String>,
-    /// Models that were never made are passed over, too.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub tolerate_missing: bool,
-    /// Version of networks and training, part of every task key; filled in at submission where left out.
-    #[serde(default)]
-    pub version: String,
-}
-
-impl PromoteTask {
-    /// Checks every field against its limits.
-    ///
-    /// # Errors
-    /// [`SpecError`] naming the first field that cannot be used.
-    pub fn check(&self) -> Result<(), SpecError> {
-        check_source(&self.source)?;
-        check_count("count", self.count)?;
-        let settings = &self.promote;
-        check_model("promote.model", &settings.model)?;
-        if settings.among.is_empty() || settings.among.len() > MAX_STAGES {
-            let what = format!(
-                "names {} models; name 1 to {MAX_STAGES}",
-                settings.among.len()
-            );
-            return Err(SpecError::new("promote.among", what));
-        }
-        for (i, model) in settings.among.iter().enumerate() {
-            check_model(&format!("promote.among[{i}]"), model)?;
-            if settings.among[..i].contains(model) || *model == settings.model {
-                let what = format!("{model:?} is named twice");
-                return Err(SpecError::new(format!("promote.among[{i}]"), what));
-            }
         }
         Ok(())
     }

@@ -7,8 +7,12 @@ use serde::Deserialize;
 
 use super::{
     job::SpecError,
-    render::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource},
+    kinds::render::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource},
 };
+use crate::show;
+
+/// The kinds of scenes.
+const KINDS: [&str; 3] = ["furnished", "primitive", "files"];
 
 /// `[scenes]`.
 #[derive(Deserialize)]
@@ -18,6 +22,7 @@ pub(super) struct SceneSourceText {
     assets: Option<String>,
     min_specular: Option<u32>,
     files: Option<Vec<SceneFile>>,
+    root: Option<String>,
     /// Only in a lease.
     #[serde(default)]
     first: u64,
@@ -32,6 +37,13 @@ impl TryFrom<SceneSourceText> for SceneSource {
     type Error = SpecError;
 
     fn try_from(text: SceneSourceText) -> Result<Self, SpecError> {
+        // First: of a kind that is unknown, fields cannot be said to belong to another.
+        if !KINDS.contains(&&*text.kind) {
+            return Err(SpecError::new(
+                "scenes.kind",
+                show::unknown(&text.kind, &KINDS),
+            ));
+        }
         let only = |field: &str, kind: &str, given: bool| {
             if given && text.kind != kind {
                 Err(SpecError::new(
@@ -48,6 +60,7 @@ impl TryFrom<SceneSourceText> for SceneSource {
         only("assets", "furnished", text.assets.is_some())?;
         only("min_specular", "furnished", text.min_specular.is_some())?;
         only("files", "files", text.files.is_some())?;
+        only("root", "files", text.root.is_some())?;
         only("first", "files", text.first != 0)?;
         let mut count = text.count;
         let kind = match text.kind.as_str() {
@@ -56,19 +69,14 @@ impl TryFrom<SceneSourceText> for SceneSource {
                 min_specular: text.min_specular.unwrap_or(1),
             },
             "primitive" => SceneKind::Primitive,
-            "files" => {
+            _ => {
                 let files = text.files.unwrap_or_default();
                 count = count.or(Some(files.len() as u64));
                 SceneKind::Files {
                     files,
                     first: text.first,
+                    root: text.root,
                 }
-            }
-            other => {
-                return Err(SpecError::new(
-                    "scenes.kind",
-                    format!("{other:?} is not one of \"furnished\", \"primitive\", \"files\""),
-                ));
             }
         };
         Ok(SceneSource {
@@ -118,11 +126,28 @@ pub fn parse_share(text: &str) -> Result<f64, String> {
         Some(percent) => (percent, 0.01),
         None => (text.trim(), 1.0),
     };
-    number
-        .trim()
-        .parse::<f64>()
-        .map(|v| v * scale)
-        .map_err(|_| format!("{text:?} is not a share; write \"10%\" or 0.1"))
+    let value = number.trim().parse::<f64>();
+    let value = value.map_err(|_| format!("{text:?} is not a share; write \"10%\" or 0.1"))?;
+    let share = value * scale;
+    check_share(share).map(|()| share)
+}
+
+/// Checks the error that a render is to reach: an error of the whole is no error, and nothing reaches one of nothing.
+///
+/// # Errors
+/// A message that says what was expected.
+pub(super) fn check_share(share: f64) -> Result<(), String> {
+    if (1e-6..1.0).contains(&share) {
+        return Ok(());
+    }
+    let meant = match share {
+        1.0..=100.0 => format!("; did you mean \"{share}%\"?"),
+        _ => String::new(),
+    };
+    Err(format!(
+        "{share} is {} %, and lies outside 0.0001 %..100 %; write \"10%\" or 0.1{meant}",
+        share * 100.0
+    ))
 }
 
 impl TryFrom<RenderSettingsText> for RenderSettings {

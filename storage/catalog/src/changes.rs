@@ -9,15 +9,15 @@ use crate::record::{Exception, NewEvent, Output, Range, Worker};
 /// What one commit writes. For each range, exception and worker only the last word counts.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Changes {
-    /// Ranges that this house owns, as they are now.
+    /// Ranges that this instance owns, as they are now.
     pub ranges: BTreeMap<RangeId, Range>,
-    /// Ranges that this house gives out of its hands, as they are now: done and dead ones for good, pending ones
+    /// Ranges that this instance gives out of its hands, as they are now: done and dead ones for good, pending ones
     /// for whoever claims them. The catalog may merge them with their neighbours.
     pub free: BTreeMap<RangeId, Range>,
     /// Ranges that are no more.
     pub gone: BTreeSet<RangeId>,
     /// Ids among these that were made since the last commit: the catalog does not know them. It must know all others
-    /// as this house's.
+    /// as this instance's.
     pub minted: BTreeSet<RangeId>,
     /// New outputs.
     pub outputs: Vec<Output>,
@@ -27,7 +27,7 @@ pub struct Changes {
     pub workers: BTreeMap<WorkerId, Worker>,
     /// History, in order.
     pub events: Vec<NewEvent>,
-    /// Stages of which this house has nothing left: if nobody else has either, they are over, and with them perhaps
+    /// Stages of which this instance has nothing left: if nobody else has either, they are over, and with them perhaps
     /// their jobs.
     pub perhaps_over: BTreeMap<StageRef, i64>,
 }
@@ -38,7 +38,7 @@ impl Changes {
         *self == Self::default()
     }
 
-    /// Notes a range of this house as it is now.
+    /// Notes a range of this instance as it is now.
     pub fn put(&mut self, range: Range) {
         self.gone.remove(&range.id);
         self.free.remove(&range.id);
@@ -59,7 +59,7 @@ impl Changes {
         self.gone.insert(id);
     }
 
-    /// The ranges that the catalog must know as this house's, or else somebody has taken them.
+    /// The ranges that the catalog must know as this instance's, or else somebody has taken them.
     pub fn known(&self) -> impl Iterator<Item = RangeId> + '_ {
         self.ranges
             .keys()

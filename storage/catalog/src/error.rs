@@ -42,10 +42,26 @@ pub enum CatalogError {
         source: io::Error,
     },
     /// No room.
-    #[error("catalog {}: the disk is full; free some space, then start the coordinator again: no finished work is lost", path.display())]
+    #[error("catalog {}: the disk is full; free some space: a coordinator that runs goes on by itself, one that did not start must be started again; no finished work is lost", path.display())]
     Full {
         /// The database file.
         path: PathBuf,
+    },
+    /// Its file is not the one at its path any more.
+    #[error("catalog {}: {what}", path.display())]
+    Lost {
+        /// The database file.
+        path: PathBuf,
+        /// What became of it, and what to do.
+        what: String,
+    },
+    /// What was to be written cannot be: not now and not later, by its content. Nothing was written.
+    #[error("catalog {place} refuses what was to be written: {what}")]
+    Refused {
+        /// The database.
+        place: String,
+        /// The database's words.
+        what: String,
     },
     /// No right to write.
     #[error("catalog {}: cannot be written (read-only file or folder); make it writable for this user or choose another path", path.display())]
@@ -77,10 +93,10 @@ pub enum CatalogError {
     Server {
         /// The database, without its password.
         place: String,
-        /// What it answered, and how to mend it.
+        /// What it answered, and how to correct it.
         what: String,
     },
-    /// This house was thought lost, and others have taken over what it owned.
+    /// This instance was thought lost, and others have taken over what it owned.
     #[error("this coordinator was out of touch with its catalog for too long; it begins anew")]
     Fenced,
     /// It was closed before.
@@ -89,6 +105,20 @@ pub enum CatalogError {
 }
 
 impl CatalogError {
+    /// The same in a few words without names of files and hosts, for anyone.
+    pub fn brief(&self) -> &'static str {
+        match self {
+            Self::Full { .. } => "the catalog's disk is full",
+            Self::Lost { .. } => "the catalog's file was deleted or replaced",
+            Self::ReadOnly { .. } => "the catalog cannot be written (read-only)",
+            Self::Server { .. } => "the catalog's server cannot be used",
+            Self::Held { .. } => "another program holds the catalog",
+            Self::Unusable { .. } => "the catalog is damaged",
+            Self::Fenced => "the coordinator was out of touch with its catalog",
+            _ => "the catalog failed",
+        }
+    }
+
     /// The error a person can act on, for a failure of the file system while doing `what`.
     pub(crate) fn file(path: &Path, what: &'static str, source: io::Error) -> Self {
         let path = path.to_owned();

@@ -1,40 +1,47 @@
 //! What coordinators must remember: jobs, ranges, outputs, failures and history. One trait, [`Catalog`]; behind it
 //! SQLite for one coordinator and Postgres for several. Rows never leave this crate.
 //!
-//! # Houses
-//! A *house* is one life of a coordinator on a catalog. Each range that is pending or leased is some house's or nobody's;
-//! only its house may write it. A house *claims* pending ranges of nobody's ([`Catalog::claim`]), leases them out from
+//! # Instances
+//! A *instance* is one life of a coordinator on a catalog. Each range that is pending or leased is some instance's or nobody's;
+//! only its instance may write it. An instance *claims* pending ranges of nobody's ([`Catalog::claim`]), leases them out from
 //! memory, and gives them back when it has no use for them. What is done or dead is nobody's and stays in the catalog.
 //!
-//! On Postgres a house is a row that its process renews ([`Catalog::beat`]). Every transaction that writes locks that row
-//! first; a house whose row has run out or is gone writes nothing ([`CatalogError::Fenced`]). Its ranges pass to whoever
+//! On Postgres an instance is a row that its process renews ([`Catalog::beat`]). Every transaction that writes locks that row
+//! first; an instance whose row has run out or is gone writes nothing ([`CatalogError::Fenced`]). Its ranges pass to whoever
 //! finds it lost, leases and all. A worker that comes to another coordinator brings its leases along
 //! ([`Catalog::adopt`]); the former owner finds out when it beats, or when it tries to write them
 //! ([`CatalogError::Conflict`]). So nobody needs to be elected, and a process that was stopped and wakes up does no harm.
-//! SQLite has one house, which holds a lock on the file.
+//! SQLite has one instance, which holds a lock on the file.
 
 mod changes;
 mod error;
 mod graph;
+mod listing;
 mod lock;
 mod place;
 mod postgres;
 mod raw;
 mod record;
+mod refused;
+mod rights;
 mod sql;
 mod sql_jobs;
+mod sql_listing;
+mod sql_rights;
 mod sqlite;
+mod submission;
 #[cfg(feature = "testing")]
 pub mod testing;
 
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::{JobId, StageRef, WorkerId},
-    model::Event,
+    model::{Event, JobState, TaskCounts},
 };
 
 pub use changes::Changes;
 pub use error::CatalogError;
+pub use listing::{Forgotten, JobQuery, Page};
 pub use place::CatalogPlace;
 pub use postgres::PostgresCatalog;
 pub use record::{
@@ -42,35 +49,38 @@ pub use record::{
     News, Output, Owned, Range, RangeState, ResultSet, Run, Settled, Snapshot, StageCounts,
     StageRecord, TaskRecord, Timing, Want, Worker,
 };
+pub use refused::{Culprit, Row, culprits};
+pub use rights::{AuditQuery, NewAudit, Owner, Rights, Sight};
 pub use sqlite::SqliteCatalog;
+pub use submission::{Gone, Outcome, Recorded, Submission};
 
 /// Durable memory of coordinators. All methods may be called concurrently; each is one transaction.
 ///
 /// # Errors
 /// All methods give a [`CatalogError`] when the database cannot be read or written; then nothing changed.
 #[async_trait]
-pub trait Catalog: Send + Sync + 'static {
-    /// Begins a life: founds a house, which takes over what the last life of this process owned and what houses left
+pub trait Catalog: Rights {
+    /// Begins a life: founds an instance, which takes over what the last life of this process owned and what instances left
     /// that are lost.
     async fn load(&self) -> Result<Snapshot, CatalogError>;
 
-    /// Says that the house lives and has this many workers connected; to be called about once a second.
+    /// Says that the instance lives and has this many workers connected; to be called about once a second.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`] when it was thought lost; a new life must begin.
     async fn beat(&self, workers: u32) -> Result<News, CatalogError>;
 
-    /// Returns when another house may have changed something: a hint to beat early. Safe to cancel.
+    /// Returns when another instance may have changed something: a hint to beat early. Safe to cancel.
     async fn changed(&self);
 
-    /// Makes pending ranges of nobody's the house's: for each wish up to as many tasks as it names, in the order in
-    /// which they may run. Ranges that another house is just claiming are passed over.
+    /// Makes pending ranges of nobody's the instance's: for each wish up to as many tasks as it names, in the order in
+    /// which they may run. Ranges that another instance is just claiming are passed over.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`].
     async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError>;
 
-    /// Makes a worker's leases the house's, whosever they were.
+    /// Makes a worker's leases the instance's, whosever they were.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`].
@@ -81,17 +91,48 @@ pub trait Catalog: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`CatalogError::Fenced`]; [`CatalogError::Conflict`] when the database holds something the caller did not know
-    /// of (another manifest for a task, a range that is another house's now).
-    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError>;
+    /// of (another manifest for a task, a range that is another instance's now); [`CatalogError::Refused`] when something of it
+    /// cannot be written by its content, see [`culprits`].
+    async fn commit(&self, changes: &Changes) -> Result<Settled, CatalogError>;
+
+    /// Writes the outputs, failed tasks, workers and history of `changes` and undoes that: says what the database has
+    /// against their content, if anything.
+    ///
+    /// # Errors
+    /// [`CatalogError::Fenced`].
+    async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError>;
 
     /// Records a job with its ranges, which are nobody's, and the first lines of its history. `false` where a job with
     /// the same spec is active or done: then nothing is recorded.
+    ///
+    /// # Errors
+    /// [`CatalogError::Refused`] when something of it cannot be written by its content.
     async fn submit(
         &self,
         job: &Job,
         ranges: &[Range],
         events: &[NewEvent],
-    ) -> Result<bool, CatalogError>;
+    ) -> Result<bool, CatalogError> {
+        let stages = job.stages();
+        let submission = Submission::new(job, &stages, ranges, events);
+        Ok(self.record(&submission).await? == Outcome::New)
+    }
+
+    /// Records a job, and drops the records of outputs that are gone.
+    async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError>;
+
+    /// The outputs of tasks below `count` that are recorded in `set`, ascending.
+    async fn recorded(&self, set: &ResultSet, count: u64) -> Result<Vec<Recorded>, CatalogError>;
+
+    /// Notes that the store holds these outputs as they are recorded; a record of another manifest is left alone.
+    async fn mark_checked(&self, set: &ResultSet, outputs: &[Recorded])
+    -> Result<(), CatalogError>;
+
+    /// Drops the record of an output that the store does not hold; `false` where there was none with this manifest.
+    async fn drop_output(&self, gone: &Gone) -> Result<bool, CatalogError>;
+
+    /// Where a job stands; `None` where there is none. Unlike [`Self::job`] it does not read the spec.
+    async fn state(&self, job: JobId) -> Result<Option<JobState>, CatalogError>;
 
     /// Stops an active job; `false` where it is not active. `why` goes into its history.
     async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError>;
@@ -105,9 +146,11 @@ pub trait Catalog: Send + Sync + 'static {
         now_ms: i64,
     ) -> Result<bool, CatalogError>;
 
-    /// Removes up to `most` jobs that ended before this Unix time (milliseconds) with their history; returns how many.
-    /// Outputs stay: they are reused.
-    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError>;
+    /// Removes some of the jobs that ended before this Unix time (milliseconds) with their history, and says whether there is
+    /// more to do: one short transaction, since others wait for it. When no such job is left, it removes outputs: they let
+    /// others reuse a result, so they leave only with the last job of their result set, that is when the set has had no job
+    /// for the same age. (The results themselves stay in their store, and are found there when they are wanted again.)
+    async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError>;
 
     /// Active jobs of a user.
     async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError>;
@@ -121,14 +164,17 @@ pub trait Catalog: Send + Sync + 'static {
     /// A job and how far it is.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
 
-    /// All jobs, in order of submission.
-    async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError>;
+    /// Tasks of all active jobs by state, in one go.
+    async fn active_tasks(&self) -> Result<TaskCounts, CatalogError>;
+
+    /// A page of the list of jobs, without their specs.
+    async fn page(&self, query: &JobQuery) -> Result<Page, CatalogError>;
 
     /// The latest job with this spec hash.
     async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError>;
 
-    /// The latest jobs, the last first.
-    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError>;
+    /// The latest jobs that this reader may see, the last first.
+    async fn recent(&self, most: u32, sight: &Sight) -> Result<Vec<Job>, CatalogError>;
 
     /// Jobs that write into a data set and are active or have written something, the latest first.
     async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError>;
@@ -154,6 +200,6 @@ pub trait Catalog: Send + Sync + 'static {
     /// History, oldest first.
     async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError>;
 
-    /// Lets go of what the house owns, as far as that is possible, and of the database.
+    /// Lets go of what the instance owns, as far as that is possible, and of the database.
     async fn close(&self);
 }

@@ -6,20 +6,20 @@ use std::{
 };
 
 use picofarm_proto::{
-    ids::{Epoch, HouseId, Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
+    ids::{Epoch, Incarnation, InstanceId, JobId, LeaseRef, RangeId, StageRef, WorkerId},
     key::{StageKey, stage_key},
-    model::{
-        EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts, TaskSpec,
-        job::{MODELS, REPORTS},
-    },
+    model::{EventKind, JobSpec, JobState, StageSpec, StageState, TaskCounts},
 };
+
+use crate::rights::Sight;
 
 /// One submission.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     /// Its id.
     pub id: JobId,
-    /// SHA-256 of the canonical spec, hexadecimal.
+    /// What tells whether two submissions are the same job: SHA-256 of the canonical spec, where need be with among whose
+    /// jobs an equal one is looked for, hexadecimal.
     pub spec_hash: String,
     /// What was submitted.
     pub spec: Arc<JobSpec>,
@@ -121,41 +121,10 @@ pub struct ResultSet {
 impl ResultSet {
     /// The set a stage's tasks write to. What is no data set has a place that none can have.
     pub fn of(stage: &StageSpec) -> Self {
-        let (store, dataset) = match &stage.task {
-            TaskSpec::Render(task) => (task.output.store.clone(), task.output.dataset.clone()),
-            TaskSpec::Reprocess(task) => (task.output.store.clone(), task.output.dataset.clone()),
-            TaskSpec::Import(task) => (task.output.store.clone(), task.output.dataset.clone()),
-            TaskSpec::Generate(task) => (task.generate.dest.clone(), "/scenes".into()),
-            TaskSpec::Part(task) => (
-                task.whole.output.store.clone(),
-                format!("{}/parts", task.whole.output.dataset),
-            ),
-            TaskSpec::Split(task) => (
-                task.source.store.clone(),
-                format!("{}/split/{}", task.source.dataset, task.split.name),
-            ),
-            TaskSpec::Export(task) => (task.export.dest.clone(), "/export".into()),
-            TaskSpec::Train(task) => (
-                task.source.store.clone(),
-                format!("{MODELS}/{}", task.train.model),
-            ),
-            TaskSpec::Promote(task) => (
-                task.source.store.clone(),
-                format!("{MODELS}/{}", task.promote.model),
-            ),
-            TaskSpec::Evaluate(task) => (
-                task.source.store.clone(),
-                format!("{}/evaluate", task.source.dataset),
-            ),
-            TaskSpec::Infer(task) => (task.output.store.clone(), task.output.dataset.clone()),
-            TaskSpec::Report(task) => (
-                task.report.store.clone(),
-                format!("{REPORTS}/{}", task.report.name),
-            ),
-        };
+        let results = stage.task.results();
         Self {
-            store,
-            dataset,
+            store: results.store.to_owned(),
+            dataset: results.folder,
             stage_key: stage_key(stage),
         }
     }
@@ -245,6 +214,18 @@ impl Range {
     /// Never: a range holds at least one task.
     pub fn is_empty(&self) -> bool {
         false
+    }
+
+    /// Whether a task waits here or is under way.
+    pub fn has_to_do(&self, task: u64) -> bool {
+        match &self.state {
+            RangeState::Pending { .. } => (self.lo..self.hi).contains(&task),
+            RangeState::Leased(lease) => {
+                let at = task.checked_sub(self.lo);
+                at.and_then(|at| lease.marks.get(usize::try_from(at).ok()?)) == Some(&Mark::Todo)
+            }
+            RangeState::Done { .. } | RangeState::Dead => false,
+        }
     }
 
     /// Whether it may become one with a neighbour in the same state that may too: never those under suspicion, or
@@ -422,22 +403,24 @@ pub struct EventQuery {
     pub newest: bool,
     /// What tasks logged, too.
     pub logs: bool,
+    /// Only events of jobs that this reader may see.
+    pub sight: Sight,
 }
 
-/// What a house finds when its life begins.
+/// What an instance finds when its life begins.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
-    /// The house.
-    pub house: HouseId,
+    /// The instance.
+    pub instance: InstanceId,
     /// Every active job, in order of submission.
     pub jobs: Vec<Job>,
-    /// What the house owns: ranges left by an earlier life of this process, and by houses that are lost.
+    /// What the instance owns: ranges left by an earlier life of this process, and by instances that are lost.
     pub owned: Owned,
     /// Every worker ever seen.
     pub workers: Vec<Worker>,
 }
 
-/// Ranges that came into a house's hands, with what it must know to go on with them.
+/// Ranges that came into an instance's hands, with what it must know to go on with them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Owned {
     /// The ranges, leased and pending.
@@ -462,7 +445,7 @@ pub struct Want {
 /// The answer to a [`Want`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Claim {
-    /// Pending ranges that are the house's now.
+    /// Pending ranges that are the instance's now.
     pub owned: Owned,
     /// Tasks of them whose outputs exist already, as maximal runs in ascending order.
     pub existing: Vec<Run>,
@@ -470,21 +453,21 @@ pub struct Claim {
     pub left: u64,
 }
 
-/// What a house learns from time to time.
+/// What an instance learns from time to time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct News {
     /// Jobs that are active, and whether they are held.
     pub active: BTreeMap<JobId, bool>,
-    /// Workers of other houses that have leases, by job.
+    /// Workers of other instances that have leases, by job.
     pub busy: BTreeMap<JobId, u32>,
     /// Pending tasks that are nobody's and whose stage is open.
     pub free: BTreeMap<StageRef, u64>,
-    /// Ranges of houses that were lost.
+    /// Ranges of instances that were lost.
     pub taken: Owned,
-    /// The leased ranges that are this house's; `None` where nobody could have taken any.
+    /// The leased ranges that are this instance's; `None` where nobody could have taken any.
     pub leased: Option<BTreeSet<RangeId>>,
-    /// Houses alive, this one too.
-    pub houses: u32,
+    /// Instances alive, this one too.
+    pub instances: u32,
     /// Workers connected to any of them.
     pub workers: u32,
 }

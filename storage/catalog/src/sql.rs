@@ -13,9 +13,25 @@ pub(crate) fn bad(column: &'static str, what: impl std::fmt::Display) -> sqlx::E
     }
 }
 
-/// The databases' integers are signed; ours never reach the sign bit.
+/// The databases' integers are signed. Numbers that are written are below 2^63, see [`writable`]; one that is only asked for
+/// and is not stands for one that is nowhere.
 pub(crate) fn int(value: u64) -> i64 {
-    i64::try_from(value).expect("counts, indices and sizes are below 2^63")
+    i64::try_from(value).unwrap_or(i64::MAX)
+}
+
+/// Whether all numbers of the outputs can be written as they are.
+///
+/// # Errors
+/// The database's answer to one that cannot.
+pub(crate) fn writable(outputs: &[crate::Output]) -> Result<(), sqlx::Error> {
+    for output in outputs {
+        let most = i64::MAX as u64;
+        if output.bytes > most || output.task > most || output.epoch.0 > most {
+            let what = format!("task {}: {} bytes are too many", output.task, output.bytes);
+            return Err(sqlx::Error::Encode(what.into()));
+        }
+    }
+    Ok(())
 }
 
 const JOB_STATES: [JobState; 4] = [
@@ -197,7 +213,9 @@ macro_rules! history {
             $job,
             " AND (CAST($2 AS BIGINT) IS NULL OR (lo <= $2 AND $2 < hi)) \
              AND (CAST($5 AS BIGINT) IS NULL OR event.stage = $5) \
-             AND (CAST($6 AS BIGINT) IS NULL OR event.kind <> $6) ",
+             AND (CAST($6 AS BIGINT) IS NULL OR event.kind <> $6) AND ",
+            crate::rights::seen!("$7", "$8", "$9"),
+            " ",
             $order,
             " LIMIT $3"
         )
@@ -221,6 +239,7 @@ macro_rules! queries {
                     Worker,
                 },
                 sql::{self, bad, history, int},
+                submission::{Gone, Recorded},
             };
 
             type Connection = $connection;
@@ -313,14 +332,14 @@ macro_rules! queries {
                 Ok(found)
             }
 
-            /// Runs of tasks in `lo..hi` whose outputs exist, by gaps and islands: within a run, task minus its rank
-            /// is constant.
+            /// Runs of tasks in `lo..hi` whose outputs exist and were checked, by gaps and islands: within a run, task
+            /// minus its rank is constant. What a worker reported and nobody has looked at counts for no other job.
             pub(crate) async fn runs_of_stage(c: &mut Connection, stage: StageRef, lo: u64, hi: u64) -> Result<Vec<Run>> {
                 let rows = sqlx::query(
                     "SELECT min(task) AS lo, max(task) + 1 AS hi FROM ( \
                        SELECT task, task - row_number() OVER (ORDER BY task) AS island FROM output WHERE result_set = \
                        (SELECT result_set FROM stage JOIN job ON job.key = stage.job WHERE job.id = $1 AND ordinal = $2) \
-                       AND task >= $3 AND task < $4) AS islands GROUP BY island ORDER BY lo",
+                       AND task >= $3 AND task < $4 AND checked) AS islands GROUP BY island ORDER BY lo",
                 )
                 .bind(stage.job.uuid())
                 .bind(i64::from(stage.stage))
@@ -345,6 +364,84 @@ macro_rules! queries {
                 .fetch_all(c)
                 .await?;
                 rows.iter().map(run).collect()
+            }
+
+            pub(crate) async fn recorded(c: &mut Connection, set: &ResultSet, count: u64) -> Result<Vec<Recorded>> {
+                let rows = sqlx::query(
+                    "SELECT task, manifest, checked FROM output WHERE result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3) \
+                     AND task < $4 ORDER BY task",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .bind(int(count))
+                .fetch_all(c)
+                .await?;
+                rows.iter()
+                    .map(|row| {
+                        let manifest: Vec<u8> = row.try_get("manifest")?;
+                        Ok(Recorded {
+                            task: uint(row, "task")?,
+                            manifest: manifest
+                                .try_into()
+                                .map_err(|_| bad("manifest", "not 32 bytes long"))?,
+                            checked: row.try_get("checked")?,
+                        })
+                    })
+                    .collect()
+            }
+
+            /// How many outputs of these tasks are recorded as checked.
+            pub(crate) async fn checked(c: &mut Connection, set: &ResultSet, run: Run) -> Result<u64> {
+                let row = sqlx::query(
+                    "SELECT count(*) AS outputs FROM output WHERE result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3) \
+                     AND task >= $4 AND task < $5 AND checked",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .bind(int(run.lo))
+                .bind(int(run.hi))
+                .fetch_one(c)
+                .await?;
+                uint(&row, "outputs")
+            }
+
+            /// Notes that the store holds an output as it is recorded.
+            pub(crate) async fn mark_checked(c: &mut Connection, set: &ResultSet, output: &Recorded) -> Result<()> {
+                sqlx::query(
+                    "UPDATE output SET checked = $6 WHERE result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3) \
+                     AND task = $4 AND manifest = $5",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .bind(int(output.task))
+                .bind(&output.manifest[..])
+                .bind(true)
+                .execute(c)
+                .await?;
+                Ok(())
+            }
+
+            /// Drops the record of an output; `false` where there is none with this manifest.
+            pub(crate) async fn drop_output(c: &mut Connection, gone: &Gone) -> Result<bool> {
+                let dropped = sqlx::query(
+                    "DELETE FROM output WHERE result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3) \
+                     AND task = $4 AND manifest = $5",
+                )
+                .bind(&gone.set.store)
+                .bind(&gone.set.dataset)
+                .bind(&gone.set.stage_key.0[..])
+                .bind(int(gone.task))
+                .bind(&gone.manifest[..])
+                .execute(c)
+                .await?;
+                Ok(dropped.rows_affected() > 0)
             }
 
             fn run(row: &DbRow) -> Result<Run> {
@@ -446,6 +543,7 @@ macro_rules! queries {
                     (None, false) => history!("CAST($4 AS BIGINT) IS NULL", "ORDER BY sequence"),
                     (None, true) => history!("CAST($4 AS BIGINT) IS NULL", "ORDER BY sequence DESC"),
                 };
+                let [all, user, projects] = query.sight.columns();
                 let mut rows = sqlx::query(text)
                     .bind(i64::try_from(query.after).unwrap_or(i64::MAX))
                     .bind(query.task.map(|t| i64::try_from(t).unwrap_or(i64::MAX)))
@@ -453,6 +551,9 @@ macro_rules! queries {
                     .bind(job)
                     .bind(query.stage.map(i64::from))
                     .bind((!query.logs).then(|| sql::event_kind_code(EventKind::Log)))
+                    .bind(all)
+                    .bind(user)
+                    .bind(projects)
                     .fetch_all(c)
                     .await?;
                 if query.newest {

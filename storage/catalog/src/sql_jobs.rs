@@ -11,7 +11,6 @@ macro_rules! job_queries {
                 model::{EventKind, JobSpec, JobState, StageState, TaskCounts},
             };
             use sqlx::Row;
-            use uuid::Uuid;
 
             use super::query::{exception, marks, stage_of, uint};
             use crate::{
@@ -19,6 +18,7 @@ macro_rules! job_queries {
                 record::{
                     Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing,
                 },
+                rights::{Sight, seen},
                 sql::{self, bad, int},
             };
 
@@ -94,46 +94,37 @@ macro_rules! job_queries {
                 })
             }
 
-            /// Jobs with their counts: all, or one.
-            pub(crate) async fn jobs(c: &mut Connection, one: Option<JobId>) -> Result<Vec<JobRecord>> {
-                let id: Option<Uuid> = one.map(JobId::uuid);
-                let rows = match id {
-                    Some(id) => sqlx::query("SELECT * FROM job WHERE id = $1").bind(id),
-                    None => sqlx::query("SELECT * FROM job ORDER BY key"),
-                }
-                .fetch_all(&mut *c)
-                .await?;
-                let mut final_stages = final_stages(c, id).await?;
-                let mut records = Vec::with_capacity(rows.len());
-                for row in &rows {
-                    let key: i64 = row.try_get("key")?;
-                    let stages = match row.try_get::<Option<i64>, _>("tasks")? {
-                        Some(_) => final_stages.remove(&key).unwrap_or_default(),
-                        None => {
-                            let nodes = nodes(c, key).await?;
-                            nodes.into_iter().map(|(stage, _)| stage).collect()
-                        }
-                    };
-                    records.push(JobRecord {
-                        job: job(row)?,
-                        stages,
-                        timing: timing_of(row)?,
-                    });
-                }
-                Ok(records)
+            /// A job with its counts.
+            pub(crate) async fn record(c: &mut Connection, id: JobId) -> Result<Option<JobRecord>> {
+                let row = sqlx::query("SELECT * FROM job WHERE id = $1")
+                    .bind(id.uuid())
+                    .fetch_optional(&mut *c)
+                    .await?;
+                let Some(row) = row else {
+                    return Ok(None);
+                };
+                let key: i64 = row.try_get("key")?;
+                let stages = match row.try_get::<Option<i64>, _>("tasks")? {
+                    Some(_) => final_stages(c, key).await?,
+                    None => {
+                        let nodes = nodes(c, key).await?;
+                        nodes.into_iter().map(|(stage, _)| stage).collect()
+                    }
+                };
+                Ok(Some(JobRecord {
+                    job: job(&row)?,
+                    stages,
+                    timing: timing_of(&row)?,
+                }))
             }
 
-            /// The stages of jobs that have ended, whose counts are final, by the job's key: of all, or of one.
-            async fn final_stages(c: &mut Connection, one: Option<Uuid>) -> Result<BTreeMap<i64, Vec<StageCounts>>> {
-                let rows = sqlx::query(
-                    "SELECT stage.* FROM stage JOIN job ON job.key = stage.job WHERE job.tasks IS NOT NULL \
-                     AND ($1 IS NULL OR job.id = $1) ORDER BY stage.job, ordinal",
-                )
-                .bind(one)
-                .fetch_all(c)
-                .await?;
-                let mut stages: BTreeMap<i64, Vec<StageCounts>> = BTreeMap::new();
-                for row in &rows {
+            /// The stages of a job that has ended, whose counts are final.
+            async fn final_stages(c: &mut Connection, key: i64) -> Result<Vec<StageCounts>> {
+                let rows = sqlx::query("SELECT * FROM stage WHERE job = $1 ORDER BY ordinal")
+                    .bind(key)
+                    .fetch_all(c)
+                    .await?;
+                let stage = |row: &DbRow| {
                     let (total, done, dead) = (uint(row, "tasks")?, uint(row, "done")?, uint(row, "dead")?);
                     let counts = TaskCounts {
                         total,
@@ -143,12 +134,12 @@ macro_rules! job_queries {
                         pending: total.saturating_sub(done + dead),
                         dead,
                     };
-                    stages.entry(row.try_get("job")?).or_default().push(StageCounts {
+                    Ok(StageCounts {
                         state: sql::stage_state(row.try_get("state")?)?,
                         counts,
-                    });
-                }
-                Ok(stages)
+                    })
+                };
+                rows.iter().map(stage).collect()
             }
 
             /// The stages of a job with their tasks counted, in order.
@@ -220,7 +211,7 @@ macro_rules! job_queries {
             }
 
             /// Opens the stages of an active job that may begin, and ends the job if it is over; with the lines for its
-            /// history. The caller holds the job's row, so that of two houses that finish their last tasks at once the
+            /// history. The caller holds the job's row, so that of two instances that finish their last tasks at once the
             /// second sees what the first wrote.
             pub(crate) async fn settle(
                 c: &mut Connection,
@@ -321,6 +312,25 @@ macro_rules! job_queries {
                 Ok(changed.rows_affected() > 0)
             }
 
+            /// Where a job stands.
+            pub(crate) async fn state(c: &mut Connection, id: JobId) -> Result<Option<JobState>> {
+                let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE id = $1")
+                    .bind(id.uuid())
+                    .fetch_optional(c)
+                    .await?;
+                state.map(sql::job_state).transpose()
+            }
+
+            /// Marks a done job whose results are gone, so that another with its spec may be recorded.
+            pub(crate) async fn supersede(c: &mut Connection, id: JobId) -> Result<()> {
+                sqlx::query("UPDATE job SET superseded = $1 WHERE id = $2 AND state = 1")
+                    .bind(true)
+                    .bind(id.uuid())
+                    .execute(c)
+                    .await?;
+                Ok(())
+            }
+
             /// Active jobs of a user.
             pub(crate) async fn jobs_of(c: &mut Connection, user: &str) -> Result<u64> {
                 let row = sqlx::query("SELECT count(*) AS jobs FROM job WHERE username = $1 AND state = 0")
@@ -328,29 +338,6 @@ macro_rules! job_queries {
                     .fetch_one(c)
                     .await?;
                 uint(&row, "jobs")
-            }
-
-            /// Removes one job that ended before this time, with its history; `false` where there is none.
-            pub(crate) async fn forget(c: &mut Connection, before_ms: i64) -> Result<bool> {
-                let key: Option<i64> = sqlx::query_scalar(
-                    "SELECT key FROM job WHERE state <> 0 AND ended_ms < $1 ORDER BY key LIMIT 1",
-                )
-                .bind(before_ms)
-                .fetch_optional(&mut *c)
-                .await?;
-                let Some(key) = key else {
-                    return Ok(false);
-                };
-                for text in [
-                    "DELETE FROM event WHERE job = $1",
-                    "DELETE FROM exception WHERE stage IN (SELECT key FROM stage WHERE job = $1)",
-                    "DELETE FROM task_range WHERE stage IN (SELECT key FROM stage WHERE job = $1)",
-                    "DELETE FROM stage WHERE job = $1",
-                    "DELETE FROM job WHERE key = $1",
-                ] {
-                    sqlx::query(text).bind(key).execute(&mut *c).await?;
-                }
-                Ok(true)
             }
 
             pub(crate) async fn job_with(c: &mut Connection, spec_hash: &str) -> Result<Option<Job>> {
@@ -361,10 +348,24 @@ macro_rules! job_queries {
                 row.as_ref().map(job).transpose()
             }
 
+            /// Size of the specs of the latest jobs together, at most: they are in memory at once.
+            const RECENT_BYTES: i64 = 64 << 20;
+
             /// The latest jobs, whatever became of them, the last first.
-            pub(crate) async fn recent(c: &mut Connection, most: u32) -> Result<Vec<Job>> {
-                let rows = sqlx::query("SELECT * FROM job ORDER BY key DESC LIMIT $1")
+            pub(crate) async fn recent(c: &mut Connection, most: u32, sight: &Sight) -> Result<Vec<Job>> {
+                let [all, user, projects] = sight.columns();
+                let text = concat!(
+                    "SELECT * FROM job WHERE key IN (SELECT key FROM (SELECT key, \
+                     sum(octet_length(spec)) OVER (ORDER BY key DESC) AS total FROM (SELECT key, spec FROM job WHERE ",
+                    seen!("$2", "$3", "$4"),
+                    " ORDER BY key DESC LIMIT $1) AS latest) AS sized WHERE total <= $5) ORDER BY key DESC"
+                );
+                let rows = sqlx::query(text)
                     .bind(i64::from(most))
+                    .bind(all)
+                    .bind(user)
+                    .bind(projects)
+                    .bind(RECENT_BYTES)
                     .fetch_all(c)
                     .await?;
                 rows.iter().map(job).collect()

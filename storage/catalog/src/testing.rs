@@ -1,7 +1,9 @@
 //! Databases for tests: each test its own, on the server that PICOFARM_TEST_POSTGRES names.
 
-use sqlx::{Connection, PgConnection};
+use sqlx::{Connection, PgConnection, SqliteConnection};
 use uuid::Uuid;
+
+use crate::CatalogPlace;
 
 /// The variable that holds the URL of a server on which tests may create databases.
 pub const VARIABLE: &str = "PICOFARM_TEST_POSTGRES";
@@ -30,17 +32,56 @@ pub async fn postgres() -> Option<String> {
     Some(format!("{base}/{name}?{options}"))
 }
 
-/// Lets a house's time run out, as if its process had been stopped for too long.
+/// Lets an instance's time run out, as if its process had been stopped for too long.
 ///
 /// # Panics
 /// When the database cannot be written.
-pub async fn lose_house(url: &str, house: picofarm_proto::ids::HouseId) {
+pub async fn lose_instance(url: &str, instance: picofarm_proto::ids::InstanceId) {
     let mut connection = PgConnection::connect(url)
         .await
         .expect("the test database answers");
-    sqlx::query("UPDATE house SET until = clock_timestamp() - interval '1 second' WHERE id = $1")
-        .bind(house.uuid())
-        .execute(&mut connection)
-        .await
-        .expect("the house is there");
+    sqlx::query(
+        "UPDATE instance SET until = clock_timestamp() - interval '1 second' WHERE id = $1",
+    )
+    .bind(instance.uuid())
+    .execute(&mut connection)
+    .await
+    .expect("the instance is there");
+}
+
+/// Makes a database refuse rows for their content, as a limit of its own would that nobody thought of: outputs of 666 bytes,
+/// error messages, lines of history and stores that begin with `poison`, and workers of that name.
+///
+/// # Panics
+/// When the database cannot be changed.
+pub async fn refuse_poison(place: &CatalogPlace) {
+    let rules = [
+        ("output", "bytes = 666"),
+        ("exception", "last_error LIKE 'poison%'"),
+        ("event", "message LIKE 'poison%'"),
+        ("worker", "name = 'poison'"),
+        ("result_set", "store LIKE '/poison%'"),
+    ];
+    match place {
+        CatalogPlace::Postgres(url) => {
+            let mut c = PgConnection::connect(url).await.expect("it answers");
+            for (table, rule) in rules {
+                let text = format!("ALTER TABLE {table} ADD CHECK (NOT ({rule}))");
+                let added = sqlx::query(sqlx::AssertSqlSafe(text)).execute(&mut c).await;
+                added.expect("the table is there");
+            }
+        }
+        CatalogPlace::Sqlite(path) => {
+            let url = format!("sqlite://{}", path.display());
+            let mut c = SqliteConnection::connect(&url).await.expect("it opens");
+            for (table, rule) in rules {
+                let text = format!(
+                    "CREATE TRIGGER no_poison_{table} BEFORE INSERT ON {table} WHEN NEW.{rule} \
+                     BEGIN SELECT RAISE(ABORT, 'the test refuses this'); END"
+                );
+                let added = sqlx::query(sqlx::AssertSqlSafe(text)).execute(&mut c).await;
+                added.expect("the table is there");
+            }
+        }
+    }
 }

@@ -1,11 +1,11 @@
-//! What every catalog promises, asked of SQLite and of Postgres alike; and what Postgres promises to several houses.
+//! What every catalog promises, asked of SQLite and of Postgres alike; and what Postgres promises to several instances.
 
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Changes, EventQuery, Exception, Job, LeaseState, Mark, NewEvent, Output,
-    PostgresCatalog, Range, RangeState, ResultSet, Run, Settled, SqliteCatalog, Want, Worker,
-    testing,
+    Catalog, CatalogError, Changes, EventQuery, Exception, Job, JobQuery, LeaseState, Mark,
+    NewEvent, Output, PostgresCatalog, Range, RangeState, Recorded, ResultSet, Run, Settled, Sight,
+    SqliteCatalog, Want, Worker, testing,
 };
 use picofarm_proto::{
     ids::{Epoch, Incarnation, JobId, RangeId, StageRef, WorkerId},
@@ -137,7 +137,7 @@ async fn what_is_written_is_read_again_by_the_next_life(catalog: &dyn Catalog) {
     changes.put(lease.clone());
     changes.exceptions.insert((stage(), 2), exception.clone());
     changes.workers.insert(worker().id, worker());
-    assert_eq!(catalog.commit(changes).await.unwrap(), Settled::default());
+    assert_eq!(catalog.commit(&changes).await.unwrap(), Settled::default());
     let snapshot = catalog.load().await.unwrap();
     assert_eq!(snapshot.jobs, [job()]);
     assert_eq!(snapshot.owned.ranges.len(), 2);
@@ -166,7 +166,14 @@ async fn a_claim_takes_what_it_names_from_the_front_and_says_what_is_left(catalo
         outputs: vec![output(1), output(3)],
         ..Changes::default()
     };
-    catalog.commit(known).await.unwrap();
+    catalog.commit(&known).await.unwrap();
+    // What nobody has looked for in its store is not named.
+    let seen = [1, 3].map(|task| Recorded {
+        task,
+        manifest: [task as u8; 32],
+        checked: false,
+    });
+    catalog.mark_checked(&set(), &seen).await.unwrap();
     let claim = catalog.claim(&[want(5)]).await.unwrap().remove(0);
     let spans: Vec<_> = claim.owned.ranges.iter().map(|r| (r.lo, r.hi)).collect();
     assert_eq!(spans, [(0, 2), (2, 5)]);
@@ -192,7 +199,7 @@ async fn what_is_given_back_merges_with_its_neighbours(catalog: &dyn Catalog) {
     for range in [&owned[2], &owned[0], &owned[1]] {
         changes.give(range.clone());
     }
-    catalog.commit(changes).await.unwrap();
+    catalog.commit(&changes).await.unwrap();
     let whole = claim_all(catalog).await;
     assert_eq!((whole.len(), whole[0].lo, whole[0].hi), (1, 0, 9));
     assert_eq!(whole[0].epoch, Epoch(3));
@@ -205,7 +212,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         outputs: vec![output(0)],
         ..Changes::default()
     };
-    catalog.commit(first).await.unwrap();
+    catalog.commit(&first).await.unwrap();
     // Another manifest for a task that has one.
     let mut other = Changes {
         outputs: vec![
@@ -218,7 +225,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         ..Changes::default()
     };
     other.put(leased(mine.clone(), &[Mark::Todo; 9]));
-    let refused = catalog.commit(other).await;
+    let refused = catalog.commit(&other).await;
     assert!(
         matches!(refused, Err(CatalogError::Conflict(_))),
         "{refused:?}"
@@ -229,7 +236,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         ..Changes::default()
     };
     stale.give(range(77, 0, 9, RangeState::Dead));
-    let refused = catalog.commit(stale).await;
+    let refused = catalog.commit(&stale).await;
     assert!(
         matches!(refused, Err(CatalogError::Conflict(_))),
         "{refused:?}"
@@ -242,7 +249,7 @@ async fn a_conflict_leaves_no_trace(catalog: &dyn Catalog) {
         outputs: vec![output(0)],
         ..Changes::default()
     };
-    catalog.commit(again).await.unwrap();
+    catalog.commit(&again).await.unwrap();
 }
 
 async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
@@ -252,7 +259,7 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
     let mut changes = Changes::default();
     changes.perhaps_over.insert(stage(), 50);
     assert_eq!(
-        catalog.commit(changes.clone()).await.unwrap(),
+        catalog.commit(&changes).await.unwrap(),
         Settled::default(),
         "tasks are pending"
     );
@@ -264,7 +271,7 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
         state: RangeState::Done { reused: false },
         ..mine
     });
-    let ended = catalog.commit(changes).await.unwrap().ends;
+    let ended = catalog.commit(&changes).await.unwrap().ends;
     assert_eq!(
         (ended[0].job, ended[0].state, ended[0].at_ms),
         (id, JobState::Failed, 50)
@@ -294,14 +301,15 @@ async fn a_job_ends_with_its_last_task(catalog: &dyn Catalog) {
 }
 
 async fn given_up_tasks_can_be_tried_again(catalog: &dyn Catalog) {
-    submitted(
-        catalog,
-        &[
-            range(1, 0, 2, RangeState::Dead),
-            range(2, 2, 9, RangeState::Done { reused: true }),
-        ],
-    )
-    .await;
+    submitted(catalog, &[pending(1, 0, 2), pending(2, 2, 9)]).await;
+    let owned = claim_all(catalog).await;
+    let mut changes = Changes::default();
+    let ends = [RangeState::Dead, RangeState::Done { reused: true }];
+    for (range, state) in owned.into_iter().zip(ends) {
+        changes.give(Range { state, ..range });
+    }
+    changes.perhaps_over.insert(stage(), 50);
+    catalog.commit(&changes).await.unwrap();
     let id = job().id;
     let state = async || catalog.job(id).await.unwrap().unwrap().job.state;
     assert_eq!(state().await, JobState::Failed, "nothing is to be run");
@@ -334,7 +342,11 @@ async fn the_same_spec_is_recorded_once(catalog: &dyn Catalog) {
             .await
             .unwrap()
     );
-    assert_eq!(catalog.jobs().await.unwrap().len(), 1);
+    let all = JobQuery {
+        limit: 9,
+        ..JobQuery::default()
+    };
+    assert_eq!(catalog.page(&all).await.unwrap().jobs.len(), 1);
     assert_eq!(catalog.job_with("h").await.unwrap(), Some(job()));
     assert_eq!(catalog.job_with("x").await.unwrap(), None);
     assert_eq!(catalog.jobs_at("s", "d").await.unwrap(), [job()]);
@@ -344,7 +356,7 @@ async fn the_same_spec_is_recorded_once(catalog: &dyn Catalog) {
 async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
     let event = |kind, tasks| NewEvent {
         tasks,
-        ..NewEvent::of(job().id, 1, kind, "nul \0 and all".into())
+        ..NewEvent::of(job().id, 1, kind, "in words".into())
     };
     catalog.load().await.unwrap();
     let submitted = [event(EventKind::Submitted, None)];
@@ -360,7 +372,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         ],
         ..Changes::default()
     };
-    catalog.commit(changes).await.unwrap();
+    catalog.commit(&changes).await.unwrap();
     let mut query = EventQuery {
         job: Some(job().id),
         after: 0,
@@ -369,6 +381,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         stage: None,
         newest: false,
         logs: false,
+        sight: Sight::All,
     };
     let page = catalog.events(&query).await.unwrap();
     assert_eq!(page.len(), 3);
@@ -407,7 +420,7 @@ async fn history_is_read_in_pages_and_by_task(catalog: &dyn Catalog) {
         events: vec![event(EventKind::Log, Some(Run { lo: 1, hi: 2 }))],
         ..Changes::default()
     };
-    catalog.commit(changes).await.unwrap();
+    catalog.commit(&changes).await.unwrap();
     assert_eq!(catalog.events(&query).await.unwrap(), last);
     query.logs = true;
     let with_log = catalog.events(&query).await.unwrap();
@@ -463,7 +476,7 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
         adopted: false,
     };
     changes.outputs.push(output.clone());
-    catalog.commit(changes).await.unwrap();
+    catalog.commit(&changes).await.unwrap();
 
     let holdups = catalog.holdups(job().id, 600).await.unwrap();
     assert_eq!(
@@ -575,7 +588,7 @@ async fn a_catalog_survives_its_process() {
     assert_eq!(catalog.load().await.unwrap().owned.ranges, mine);
 }
 
-/// Two houses on a database, and its URL.
+/// Two instances on a database, and its URL.
 async fn two() -> Option<(PostgresCatalog, PostgresCatalog, String)> {
     let url = testing::postgres().await?;
     let (a, b) = tokio::join!(
@@ -589,7 +602,7 @@ async fn two() -> Option<(PostgresCatalog, PostgresCatalog, String)> {
 }
 
 #[tokio::test]
-async fn two_houses_never_claim_the_same_task() {
+async fn two_instances_never_claim_the_same_task() {
     let Some((a, b, _)) = two().await else { return };
     let wants = [want(1)];
     let mut seen = vec![];
@@ -601,18 +614,18 @@ async fn two_houses_never_claim_the_same_task() {
     }
     seen.sort_unstable();
     assert_eq!(seen, [0, 1, 2, 3, 5, 6, 7, 8]);
-    assert_eq!(a.beat(2).await.unwrap().houses, 2);
+    assert_eq!(a.beat(2).await.unwrap().instances, 2);
     assert_eq!(b.beat(3).await.unwrap().workers, 5);
 }
 
 #[tokio::test]
-async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
+async fn a_lost_instance_is_fenced_and_its_ranges_are_anothers() {
     let Some((a, b, url)) = two().await else {
         return;
     };
     let mine = claim_all(&a).await;
-    let house = a.load().await.unwrap().house;
-    testing::lose_house(&url, house).await;
+    let instance = a.load().await.unwrap().instance;
+    testing::lose_instance(&url, instance).await;
     let mut late = Changes {
         outputs: vec![output(0)],
         ..Changes::default()
@@ -622,10 +635,7 @@ async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
         &[Mark::Done, Mark::Todo, Mark::Todo, Mark::Todo],
     ));
     assert_eq!(b.beat(0).await.unwrap().taken.ranges.len(), 2);
-    assert!(matches!(
-        a.commit(late.clone()).await,
-        Err(CatalogError::Fenced)
-    ));
+    assert!(matches!(a.commit(&late).await, Err(CatalogError::Fenced)));
     assert!(matches!(a.beat(0).await, Err(CatalogError::Fenced)));
     assert!(matches!(
         a.claim(&[want(1)]).await,
@@ -634,20 +644,20 @@ async fn a_lost_house_is_fenced_and_its_ranges_are_anothers() {
     // In its next life it has nothing, and what it remembers is refused.
     assert_eq!(a.load().await.unwrap().owned.ranges, []);
     assert!(matches!(
-        a.commit(late).await,
+        a.commit(&late).await,
         Err(CatalogError::Conflict(_))
     ));
     assert!(b.output_runs(&set(), 9).await.unwrap().is_empty());
 }
 
 #[tokio::test]
-async fn a_worker_takes_its_leases_along_and_the_former_house_learns_of_it() {
+async fn a_worker_takes_its_leases_along_and_the_former_instance_learns_of_it() {
     let Some((a, b, _)) = two().await else { return };
     let mine = claim_all(&a).await;
     let lease = leased(mine[0].clone(), &[Mark::Todo; 4]);
     let mut changes = Changes::default();
     changes.put(lease.clone());
-    a.commit(changes).await.unwrap();
+    a.commit(&changes).await.unwrap();
     assert!(a.beat(1).await.unwrap().leased.unwrap().contains(&lease.id));
     assert_eq!(
         b.adopt(worker().id).await.unwrap().ranges,
@@ -662,18 +672,18 @@ async fn a_worker_takes_its_leases_along_and_the_former_house_learns_of_it() {
     let mut late = Changes::default();
     late.put(leased(lease, &[Mark::Done; 4]));
     assert!(matches!(
-        a.commit(late).await,
+        a.commit(&late).await,
         Err(CatalogError::Conflict(_))
     ));
 }
 
 #[tokio::test]
-async fn a_house_that_leaves_in_order_gives_back_what_nobody_runs() {
+async fn an_instance_that_leaves_in_order_gives_back_what_nobody_runs() {
     let Some((a, b, _)) = two().await else { return };
     let mine = claim_all(&a).await;
     let mut changes = Changes::default();
     changes.put(leased(mine[0].clone(), &[Mark::Todo; 4]));
-    a.commit(changes).await.unwrap();
+    a.commit(&changes).await.unwrap();
     a.close().await;
     assert_eq!(claim_all(&b).await.len(), 1, "the pending one");
     assert_eq!(
@@ -684,7 +694,7 @@ async fn a_house_that_leaves_in_order_gives_back_what_nobody_runs() {
 }
 
 #[tokio::test]
-async fn of_two_houses_that_finish_at_once_the_second_ends_the_job() {
+async fn of_two_instances_that_finish_at_once_the_second_ends_the_job() {
     let Some((a, b, _)) = two().await else { return };
     let first = a
         .claim(&[want(4)])
@@ -704,7 +714,8 @@ async fn of_two_houses_that_finish_at_once_the_second_ends_the_job() {
         });
         changes
     };
-    let (x, y) = tokio::join!(a.commit(done(first)), b.commit(done(second)));
+    let (first, second) = (done(first), done(second));
+    let (x, y) = tokio::join!(a.commit(&first), b.commit(&second));
     assert_eq!(x.unwrap().ends.len() + y.unwrap().ends.len(), 1);
     assert_eq!(
         a.job(job().id).await.unwrap().unwrap().job.state,

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, Changes, EventQuery, Job, Output, PostgresCatalog, Range, RangeState, ResultSet,
-    SqliteCatalog, Want, testing,
+    Catalog, Changes, EventQuery, Job, Output, PostgresCatalog, Range, RangeState, Recorded,
+    ResultSet, Sight, SqliteCatalog, Want, testing,
 };
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
@@ -83,7 +83,7 @@ async fn done(catalog: &dyn Catalog, stage: u32, state: RangeState) -> (Vec<u32>
         });
     }
     changes.perhaps_over.insert(at(stage), 50);
-    let settled = catalog.commit(changes).await.unwrap();
+    let settled = catalog.commit(&changes).await.unwrap();
     (
         settled.opened.iter().map(|s| s.stage).collect(),
         settled.ends.iter().map(|e| e.state).collect(),
@@ -117,6 +117,7 @@ async fn a_stage_waits_for_those_that_it_needs(catalog: &dyn Catalog) {
         stage: Some(1),
         newest: false,
         logs: false,
+        sight: Sight::All,
     };
     let events = catalog.events(&query).await.unwrap();
     let lines: Vec<_> = events.iter().map(|e| (e.kind, e.stage)).collect();
@@ -175,6 +176,7 @@ async fn a_held_job_gives_nothing_until_it_goes_on(catalog: &dyn Catalog) {
         stage: None,
         newest: false,
         logs: false,
+        sight: Sight::All,
     };
     let events = catalog.events(&query).await.unwrap();
     let lines: Vec<_> = events.iter().map(|e| (e.kind, &*e.message)).collect();
@@ -205,16 +207,22 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
         outputs: vec![output],
         ..Changes::default()
     };
-    catalog.commit(changes).await.unwrap();
-    assert_eq!(catalog.forget(1000, 9).await.unwrap(), 0, "it is active");
+    catalog.commit(&changes).await.unwrap();
+    assert_eq!(catalog.forget(1000).await.unwrap().jobs, 0, "it is active");
     catalog.cancel(job().id, "", 70).await.unwrap();
     assert_eq!(catalog.jobs_of("ada").await.unwrap(), 0);
-    assert_eq!(catalog.forget(70, 9).await.unwrap(), 0, "it ended then");
-    assert_eq!(catalog.forget(71, 9).await.unwrap(), 1);
+    assert_eq!(catalog.forget(70).await.unwrap().jobs, 0, "it ended then");
+    assert_eq!(catalog.forget(71).await.unwrap().jobs, 1);
     assert_eq!(catalog.job(job().id).await.unwrap(), None);
     let set = ResultSet::of(&job().spec.stages[0]);
     assert_eq!(catalog.output_runs(&set, 9).await.unwrap().len(), 1);
-    // The same job again finds them when its tasks are claimed, unless it is told not to look.
+    // The same job again finds what its store was seen to hold when its tasks are claimed, unless it must not look.
+    let seen = Recorded {
+        task: 1,
+        manifest: [1; 32],
+        checked: false,
+    };
+    catalog.mark_checked(&set, &[seen]).await.unwrap();
     let id = JobId::from_uuid(Uuid::from_u128(2));
     let stage = StageRef { job: id, stage: 0 };
     let range = Range {

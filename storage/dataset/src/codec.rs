@@ -20,7 +20,13 @@ pub(crate) struct ChunkCodec {
     fill: FillValue,
     len_bytes: usize,
     name: &'static str,
+    /// Chunks are blosc's, with four bytes of checksum behind.
+    blosc: bool,
 }
+
+/// Bytes of blosc's header: versions, flags and size of a value (a byte each), then the sizes of what is packed, of a
+/// block, and of the whole.
+const BLOSC_HEADER: usize = 16;
 
 impl ChunkCodec {
     /// Codec of an array's objects, or of the inner chunks of its shards, whose values are given in stored order: of
@@ -93,6 +99,7 @@ impl ChunkCodec {
             .into_iter()
             .map(|n| NonZeroU64::new(n).expect("sizes are checked to be positive"))
             .collect();
+        let blosc = metadata.iter().any(|codec| codec.name() == "blosc");
         let len_bytes = shape.iter().map(|n| n.get() as usize).product::<usize>() * element_size;
         Self {
             chain,
@@ -101,7 +108,33 @@ impl ChunkCodec {
             fill,
             len_bytes,
             name,
+            blosc,
         }
+    }
+
+    /// Whether a chunk announces as many bytes as the array's metadata give it: decoding makes room for what is announced.
+    fn check_announced(&self, bytes: &[u8]) -> Result<(), String> {
+        if !self.blosc {
+            return Ok(());
+        }
+        let word = |at: usize| {
+            let word = bytes.get(at..at + 4)?.try_into().ok()?;
+            Some(u32::from_le_bytes(word) as usize)
+        };
+        let header = (word(4), word(8), word(BLOSC_HEADER - 4));
+        let (Some(unpacked), Some(block), Some(packed)) = header else {
+            return Err("it is shorter than its header".into());
+        };
+        if unpacked != self.len_bytes {
+            return Err(format!(
+                "it announces {unpacked} bytes where the array has {}",
+                self.len_bytes
+            ));
+        }
+        if block > unpacked.max(1) || packed > bytes.len() {
+            return Err("its header announces more than it holds".into());
+        }
+        Ok(())
     }
 
     /// Encodes a chunk of native-endian values.
@@ -122,6 +155,7 @@ impl ChunkCodec {
     pub fn decode(&self, bytes: &[u8]) -> Result<Vec<u8>, DatasetError> {
         let fail =
             |e: String| DatasetError::codec(format!("cannot decode a chunk of {}", self.name), e);
+        self.check_announced(bytes).map_err(&fail)?;
         let decoded = self
             .chain
             .decode(
@@ -141,5 +175,26 @@ impl ChunkCodec {
             )));
         }
         Ok(decoded.into_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_chunk_that_announces_more_than_its_array_has_is_not_unpacked() {
+        let codecs = crate::layout::image_codecs(Element::F32, "shuffle");
+        let large = ChunkCodec::plain(&codecs, &[1 << 24], Element::F32);
+        let bomb = large.encode(&vec![0; 64 << 20]).unwrap();
+        assert!(bomb.len() < 1 << 20, "{}", bomb.len());
+        let small = ChunkCodec::plain(&codecs, &[8], Element::F32);
+        let said = small.decode(&bomb).unwrap_err().to_string();
+        assert!(said.contains("announces 67108864 bytes"), "{said}");
+        let whole = small.encode(&[1; 32]).unwrap();
+        assert_eq!(small.decode(&whole).unwrap(), [1; 32]);
+        for cut in 0..whole.len() {
+            assert!(small.decode(&whole[..cut]).is_err());
+        }
     }
 }

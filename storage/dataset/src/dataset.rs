@@ -45,7 +45,7 @@ impl Dataset {
     /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
     /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Let one
     /// process at a time grow a data set: metadata are replaced without comparison (published scenes are never
-    /// touched, so the worst case is a number of scenes too small, which growing again mends).
+    /// touched, so the worst case is a number of scenes too small, which growing again repairs).
     ///
     /// # Errors
     /// [`DatasetError::SpecMismatch`] names the first differing field and both values; [`DatasetError::Invalid`];

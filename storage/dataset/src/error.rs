@@ -12,7 +12,7 @@ pub enum DatasetError {
     Invalid {
         /// The field, e.g. `spec.gate.bins` or `record.depth`.
         field: String,
-        /// What was expected, what was found and how to mend it.
+        /// What was expected, what was found and how to correct it.
         what: String,
     },
     /// The data set exists with other properties.
@@ -104,7 +104,7 @@ pub enum DatasetError {
     StoreSettings {
         /// The store.
         url: String,
-        /// The variable, what was expected and how to mend it; no variable's value.
+        /// The variable, what was expected and how to correct it; no variable's value.
         what: String,
     },
     /// The store does not keep the promise of create-only puts.
@@ -124,7 +124,7 @@ pub enum DatasetError {
         action: &'static str,
         /// The object's full key (its path, in a local store).
         object: String,
-        /// How to mend it, where known.
+        /// How to correct it, where known.
         hint: Option<&'static str>,
         /// What happened, without secrets.
         account: String,
@@ -178,6 +178,17 @@ impl DatasetError {
             action,
             path: path.display().to_string(),
             source,
+        }
+    }
+
+    /// The same where the bytes of an object cannot be decoded: it is damaged.
+    pub(crate) fn in_object(self, object: impl FnOnce() -> String) -> Self {
+        match self {
+            Self::Codec { what, reason } => Self::Damaged {
+                object: object(),
+                what: format!("{what}: {reason}"),
+            },
+            other => other,
         }
     }
 

@@ -14,6 +14,7 @@ mod encode;
 mod error;
 mod export;
 mod group;
+mod held;
 pub mod import;
 mod layout;
 mod listing;
@@ -51,13 +52,15 @@ pub use derive::SceneTruth;
 pub use encode::EncodedScene;
 pub use error::DatasetError;
 pub use export::{ExportFormat, Exported, Exporter};
+pub use held::{Held, Holdings};
 pub use layout::{INNER_SIDE, Quantity};
 pub use manifest::{
     ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
 };
 pub use models::{
-    Checkpoint, Evaluation, Lineage, MODELS, ModelManifest, Models, NewModel, Promoted, Published,
-    Rung, SplitUsed, TrainingSpeed, TrialEnd, TrialRecord,
+    Checkpoint, Dependents, Evaluation, Lineage, MODELS, ModelCheck, ModelManifest, ModelRepair,
+    Models, NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd,
+    TrialRecord,
 };
 pub use objects::publish_files;
 pub use parts::PartName;
@@ -73,10 +76,13 @@ pub use render_read::RenderGroup;
 pub use reports::{REPORTS, ReportManifest, ReportedModel, Reports};
 pub use restore::Restored;
 pub use root::{Remains, remains, restore_root};
-pub use snapshot::{Difference, Snapshot};
+pub use snapshot::{Difference, Pinned, Snapshot};
 pub use spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
-pub use store::{Bandwidth, check_location, limit_bandwidth, open_store, probe};
+pub use store::{
+    Bandwidth, PROBE_WITHIN, Writable, check_location, check_writable, limit_bandwidth,
+    local_ground, open_store, probe,
+};
 pub use summary::Summary;
 pub use transient::{CodedImage, TransientCodec};
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

@@ -22,7 +22,7 @@ pub(crate) struct Listing {
     sizes: Vec<Vec<u64>>,
     /// Keys of metadata.
     pub metadata: Vec<String>,
-    /// Keys of snapshots and recipes.
+    /// Keys of snapshots, recipes and splits.
     pub records: Vec<String>,
     /// Keys of parts of scenes.
     pub parts: Vec<String>,
@@ -107,9 +107,9 @@ impl Dataset {
             listing.parts.push(key);
         } else if key == METADATA || self.is_array_metadata(&key) {
             listing.metadata.push(key);
-        } else if snapshot::is_snapshot(&key) || recipe::is_recipe(&key) {
+        } else if snapshot::is_snapshot(&key) || recipe::is_recipe(&key) || splits::is_split(&key) {
             listing.records.push(key);
-        } else if !splits::is_split(&key) {
+        } else {
             listing.foreign.push(key);
         }
     }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 
 use crate::error::DatasetError;
@@ -104,6 +105,14 @@ impl Manifest {
         self.objects.iter().map(|o| o.size).sum()
     }
 
+    /// Names of quantities that the scene's source did not have, and that are stored as fill values: of imports, and of what
+    /// was made of them. Empty where everything is known.
+    pub fn missing(&self) -> Vec<String> {
+        let listed = self.provenance.plan["missing"].as_array();
+        let names = listed.into_iter().flatten().filter_map(Value::as_str);
+        names.map(str::to_owned).collect()
+    }
+
     /// The entry of an object.
     pub fn object(&self, key: &str) -> Option<&ObjectEntry> {
         self.objects.iter().find(|o| o.key == key)
@@ -145,8 +154,10 @@ impl Manifest {
                 manifest.scene
             )));
         }
-        if let Some(checksum) = &manifest.checksum {
-            unseal(bytes, checksum).map_err(damaged)?;
+        match &manifest.checksum {
+            Some(checksum) => drop(unseal(bytes, checksum).map_err(damaged)?),
+            // Of old programs; but one whose word "checksum" was changed is no such.
+            None => no_strange_member(bytes, &manifest).map_err(damaged)?,
         }
         Ok(manifest)
     }
@@ -174,6 +185,58 @@ pub(crate) fn unseal(sealed: &[u8], checksum: &str) -> Result<Vec<u8>, String> {
             "its content has the checksum {found}, but says {checksum}: the object was changed"
         )),
     }
+}
+
+/// Whether an object's JSON has no member but those that it is written with.
+fn no_strange_member(bytes: &[u8], written: &impl Serialize) -> Result<(), String> {
+    let members = |value: serde_json::Result<serde_json::Value>| match value {
+        Ok(serde_json::Value::Object(members)) => members,
+        _ => serde_json::Map::new(),
+    };
+    let known = members(serde_json::to_value(written));
+    let found = members(serde_json::from_slice(bytes));
+    match found.keys().find(|key| !known.contains_key(*key)) {
+        Some(_) => {
+            Err("has no checksum and a member that is not known: the object was changed".into())
+        }
+        None => Ok(()),
+    }
+}
+
+/// The document of ours in a sealed object; see [`seal`].
+///
+/// # Errors
+/// What is wrong with it: changed, or never sealed.
+pub(crate) fn unsealed(bytes: &[u8]) -> Result<Vec<u8>, String> {
+    #[derive(Deserialize)]
+    struct Head {
+        checksum: Option<String>,
+    }
+    let head: Head = serde_json::from_slice(bytes).map_err(|e| {
+        format!(
+            "not JSON (line {}, column {}): it was changed",
+            e.line(),
+            e.column()
+        )
+    })?;
+    match head.checksum {
+        Some(checksum) => unseal(bytes, &checksum),
+        None => Err("has no checksum: it was changed, or written by an older program".into()),
+    }
+}
+
+/// Reads a sealed object as a document.
+///
+/// # Errors
+/// [`DatasetError::Damaged`]: `what` it is no more.
+pub(crate) fn read_unsealed<T: DeserializeOwned>(
+    bytes: &[u8],
+    what: &str,
+    object: String,
+) -> Result<T, DatasetError> {
+    let read = unsealed(bytes)
+        .and_then(|json| serde_json::from_slice(&json).map_err(|e| format!("is not {what}: {e}")));
+    read.map_err(|what| DatasetError::Damaged { object, what })
 }
 
 /// Reads a document of ours whose last member is its `checksum`, as [`seal`] writes it: `what` it is, in words, and the newest

@@ -27,7 +27,7 @@ pub struct PartName {
 }
 
 impl PartName {
-    fn key(&self) -> String {
+    pub(crate) fn key(&self) -> String {
         let (index, of) = self.part;
         format!(
             "{FOLDER}/{}/{}/{index}-of-{of}.zst",
@@ -68,13 +68,27 @@ impl Dataset {
         let Some(packed) = objects::get(&*self.store, &path).await? else {
             return Ok(None);
         };
-        match zstd::decode_all(&packed[..]) {
+        match unpack(&packed, self.most_of_a_part()) {
             Ok(bytes) => Ok(Some(bytes.into())),
             Err(error) => {
                 tracing::warn!(object = %path, %error, "a part of a scene is damaged; it is rendered again");
                 Ok(None)
             }
         }
+    }
+
+    /// Bytes that a part of a scene has at most: sums, squares and draws of every histogram there is, in 64 bits.
+    fn most_of_a_part(&self) -> u64 {
+        const HISTOGRAMS: u64 = 8;
+        let spec = self.spec();
+        let each = if spec.per_spot {
+            u64::from(spec.spots)
+        } else {
+            0
+        };
+        let histograms = 1 + spec.subsets.sizes().len() as u64 + each;
+        let values = spec.transient_len() as u64;
+        values * histograms * HISTOGRAMS * 8 + (64 << 20)
     }
 
     /// Deletes a part, if it is there.
@@ -90,9 +104,32 @@ impl Dataset {
     }
 }
 
+/// Unpacks a part that says how large it is, and is no larger than `most`.
+fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
+    let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
+    let size = zstd::zstd_safe::get_frame_content_size(packed);
+    let size = size
+        .ok()
+        .flatten()
+        .ok_or_else(|| invalid("does not say how large it is"))?;
+    picofarm_files::read_entry(zstd::Decoder::new(packed)?, size, most)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_part_that_announces_too_much_or_another_size_is_not_unpacked() {
+        let bomb = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
+        assert!(bomb.len() < 1 << 16);
+        let said = unpack(&bomb, 1 << 20).unwrap_err().to_string();
+        assert!(said.contains("announces 67108864 bytes"), "{said}");
+        assert_eq!(unpack(&bomb, 64 << 20).unwrap().len(), 64 << 20);
+        // Without a size in its header.
+        let streamed = zstd::encode_all(&vec![0; 1 << 20][..], 1).unwrap();
+        assert!(unpack(&streamed, 2 << 20).is_err());
+    }
 
     #[test]
     fn only_names_of_parts_are_taken_for_parts() {

@@ -85,7 +85,7 @@ impl Dataset {
     /// while decoding on rayon's threads.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
     pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
         self.read_histogram(scene, Quantity::Transient).await
     }
@@ -131,6 +131,7 @@ impl Dataset {
             *target = vec![0.0; len];
         }
         self.decode_shard_into(&manifest, array, &bytes, target)
+            .map_err(|e| e.in_object(|| self.shown(&path)))
     }
 
     /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
@@ -159,6 +160,7 @@ impl Dataset {
         let bytes = objects::require(&*self.store, &path).await?;
         let decoded = tokio::task::spawn_blocking(move || {
             self.decode_shard(&manifest, self.array(Quantity::Transient), &bytes)
+                .map_err(|e| e.in_object(|| self.shown(&path)))
         });
         let broken = |e| DatasetError::codec("cannot decode a scene", e);
         decoded.await.map_err(broken)?
@@ -244,7 +246,7 @@ impl Dataset {
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] where `T` is not the stored type or a transient is asked for;
-    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
     pub async fn read<T: Stored>(
         &self,
         scene: u64,
@@ -275,7 +277,9 @@ impl Dataset {
                 what: "the object is missing".into(),
             });
         };
-        Ok(bytemuck::pod_collect_to_vec(&array.codec.decode(&bytes)?))
+        let values = array.codec.decode(&bytes);
+        let values = values.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        Ok(bytemuck::pod_collect_to_vec(&values))
     }
 
     /// Unit normals, camera frame: `[row][column][3]`.

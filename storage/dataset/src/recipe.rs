@@ -38,10 +38,14 @@ impl Dataset {
         scene: Option<u64>,
         content: &Value,
     ) -> Result<bool, DatasetError> {
+        let path = self.path(&recipe_key(key, scene));
+        // Of one for all scenes this is the usual case, and a look costs less than a write.
+        if objects::size(&*self.store, &path).await?.is_some() {
+            return Ok(false);
+        }
         let sealed = seal(&pretty(
             &serde_json::json!({"format": FORMAT, "recipe": content}),
         ));
-        let path = self.path(&recipe_key(key, scene));
         objects::create(&*self.store, &path, sealed.into()).await
     }
 
@@ -103,7 +107,8 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<Value, String> {
     let checksum = sealed["checksum"].as_str().ok_or("it has no checksum")?;
     unseal(bytes, checksum)?;
     match sealed["format"].as_u64() {
-        Some(FORMAT) => Ok(sealed["recipe"].clone()),
+        Some(FORMAT) if sealed["recipe"].is_object() => Ok(sealed["recipe"].clone()),
+        Some(FORMAT) => Err("it holds no recipe".into()),
         Some(n) => Err(format!(
             "written in format {n}, this program knows {FORMAT}"
         )),

@@ -4,7 +4,7 @@
 
 use std::io::{Read, Write};
 
-use flate2::{Compression, GzBuilder, read::GzDecoder};
+use flate2::{Compression, GzBuilder, bufread::GzDecoder};
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
@@ -22,8 +22,17 @@ use crate::verify::Watch;
 const FORMAT: u32 = 1;
 /// Manifests read at a time.
 const CONCURRENCY: usize = 32;
-/// Longest snapshot that is read, unpacked.
-const MAX_BYTES: u64 = 1 << 34;
+/// A snapshot is so many times its packed size at most: it consists of hashes, which do not pack well.
+const RATIO: u64 = 64;
+
+/// Scenes of a data set, pinned.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pinned {
+    /// What pins every byte of them, and their order, hexadecimal.
+    pub id: String,
+    /// Scenes of which something is not known, with [`Manifest::missing`], in their order.
+    pub missing: Vec<(u64, Vec<String>)>,
+}
 
 /// Which scenes a data set had, and which manifests.
 #[derive(Debug, Clone, PartialEq)]
@@ -161,8 +170,18 @@ impl Snapshot {
     /// The snapshot in an object, if it is whole.
     pub(crate) fn parse(bytes: &[u8]) -> Result<Self, String> {
         let mut json = Vec::new();
-        let unpacked = GzDecoder::new(bytes).take(MAX_BYTES).read_to_end(&mut json);
+        let mut packed = GzDecoder::new(bytes);
+        let most = bytes.len() as u64 * RATIO + (1 << 16);
+        let unpacked = packed.by_ref().take(most + 1).read_to_end(&mut json);
         unpacked.map_err(|e| format!("not gzip: {e}"))?;
+        if json.len() as u64 > most {
+            return Err(format!(
+                "unpacks to more than {most} bytes: it is no list of scenes"
+            ));
+        }
+        if !packed.into_inner().is_empty() {
+            return Err("has bytes after its end: it was changed".into());
+        }
         let stored: Stored =
             serde_json::from_slice(&json).map_err(|e| format!("not a snapshot: {e}"))?;
         if stored.format > FORMAT {
@@ -254,33 +273,43 @@ impl Dataset {
         })
     }
 
-    /// What pins every byte of these scenes, and their order: [`Snapshot::id`] of them alone, if they are ascending. Their
-    /// objects are not looked at.
+    /// What pins every byte of these scenes, and their order: [`Snapshot::id`] of them alone, if they are ascending; and
+    /// what is not known of them. Their objects are not looked at.
     ///
     /// # Errors
-    /// [`DatasetError::NotPublished`] names a scene that is not there; [`DatasetError::Store`].
-    pub async fn pin(&self, scenes: &[u64]) -> Result<String, DatasetError> {
-        let look = |scene: u64| -> BoxFuture<'_, Result<[u8; 32], DatasetError>> {
+    /// [`DatasetError::NotPublished`] names a scene that is not there; [`DatasetError::Damaged`] for a manifest that cannot be
+    /// read; [`DatasetError::Store`].
+    pub async fn pin(&self, scenes: &[u64]) -> Result<Pinned, DatasetError> {
+        /// A manifest's hash, and what the scene lacks.
+        type Look = Result<([u8; 32], Vec<String>), DatasetError>;
+        let look = |scene: u64| -> BoxFuture<'_, Look> {
             async move {
                 let path = self.path(&Manifest::key(scene));
-                match objects::get(&*self.store, &path).await? {
-                    Some(bytes) => Ok(Sha256::digest(&bytes).into()),
-                    None => Err(DatasetError::NotPublished {
+                let Some(bytes) = objects::get(&*self.store, &path).await? else {
+                    return Err(DatasetError::NotPublished {
                         scene,
                         object: self.shown(&path),
-                    }),
-                }
+                    });
+                };
+                let manifest = Manifest::parse(&bytes, scene, &self.shown(&path))?;
+                Ok((Sha256::digest(&bytes).into(), manifest.missing()))
             }
             .boxed()
         };
         let looks = stream::iter(scenes.iter().map(|scene| look(*scene))).buffered(CONCURRENCY);
-        let manifests: Vec<[u8; 32]> = looks.try_collect().await?;
-        let mut hash = Sha256::new();
-        for (scene, manifest) in scenes.iter().zip(manifests) {
+        let found: Vec<([u8; 32], Vec<String>)> = looks.try_collect().await?;
+        let (mut hash, mut missing) = (Sha256::new(), Vec::new());
+        for (scene, (manifest, of_scene)) in scenes.iter().zip(found) {
             hash.update(scene.to_le_bytes());
             hash.update(manifest);
+            if !of_scene.is_empty() {
+                missing.push((*scene, of_scene));
+            }
         }
-        Ok(hex::encode(hash.finalize()))
+        Ok(Pinned {
+            id: hex::encode(hash.finalize()),
+            missing,
+        })
     }
 
     /// Stores a snapshot create-only under its name; gives its size. `None`: one with the same id has this name already.

@@ -1,10 +1,11 @@
-//! Splits beside a data set: `splits/<name>/v<k>.json`, create-only and never changed.
+//! Splits beside a data set: `splits/<name>/v<k>.json`, create-only and never changed, each with its checksum.
 
 use futures::TryStreamExt;
 use object_store::ObjectStore;
 
 use crate::dataset::Dataset;
 use crate::error::DatasetError;
+use crate::manifest::{seal, unsealed};
 use crate::objects;
 
 impl Dataset {
@@ -27,16 +28,24 @@ impl Dataset {
         Ok(versions)
     }
 
-    /// The bytes of a version of a split.
+    /// A version of a split, as it was given to [`Self::create_split`].
     ///
     /// # Errors
-    /// [`DatasetError::Damaged`] where it is missing; [`DatasetError::Store`].
+    /// [`DatasetError::Damaged`] where it is missing or was changed: scenes may have moved from one side to another;
+    /// [`DatasetError::Store`].
     pub async fn read_split(&self, name: &str, version: u64) -> Result<Vec<u8>, DatasetError> {
         let path = self.path(&split_key(name, version));
-        Ok(objects::require(&*self.store, &path).await?.to_vec())
+        let bytes = objects::require(&*self.store, &path).await?;
+        check(&split_key(name, version), &bytes).map_err(|what| DatasetError::Damaged {
+            object: self.shown(&path),
+            what: format!(
+                "{what}; put a copy back, or delete the split and make it again with `picofarm dataset split` and the same \
+                 counts and seed"
+            ),
+        })
     }
 
-    /// Stores a version of a split create-only. `false` where it exists already: somebody else was faster.
+    /// Stores a version of a split, pretty JSON, create-only. `false` where it exists already: somebody else was faster.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -47,7 +56,7 @@ impl Dataset {
         bytes: Vec<u8>,
     ) -> Result<bool, DatasetError> {
         let path = self.path(&split_key(name, version));
-        objects::create(&*self.store, &path, bytes.into()).await
+        objects::create(&*self.store, &path, seal(&bytes).into()).await
     }
 
     /// Where a version of a split lies, for a message.
@@ -59,6 +68,24 @@ impl Dataset {
 /// Key of a version of a split, relative to the data set.
 fn split_key(name: &str, version: u64) -> String {
     format!("splits/{name}/v{version}.json")
+}
+
+/// What the object under `key`, relative to the data set, holds as a split.
+///
+/// # Errors
+/// It was changed, or is another split.
+pub(crate) fn check(key: &str, bytes: &[u8]) -> Result<Vec<u8>, String> {
+    let json = unsealed(bytes)?;
+    let record: serde_json::Value =
+        serde_json::from_slice(&json).map_err(|e| format!("not a split: {e}"))?;
+    let name = record["settings"]["name"].as_str().unwrap_or_default();
+    let version = record["version"].as_u64().unwrap_or_default();
+    match split_key(name, version) == key {
+        true => Ok(json),
+        false => Err(format!(
+            "holds version {version} of {name:?}, another split"
+        )),
+    }
 }
 
 /// Whether a key relative to the data set is that of a split.

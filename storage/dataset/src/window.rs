@@ -32,7 +32,9 @@ impl Dataset {
         let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
         let mut target = vec![0f32; part.len()];
         let decoding = self.decoding(manifest, array);
-        let complete = decoding.part(&tiles, chunks, &part, &mut target)?;
+        let complete = decoding.part(&tiles, chunks, &part, &mut target);
+        let path = self.path(&array.layout.key(manifest.scene));
+        let complete = complete.map_err(|e| e.in_object(|| self.shown(&path)))?;
         self.complete(manifest, complete)?;
         Ok(target)
     }

@@ -12,6 +12,7 @@ use common::*;
 use futures::TryStreamExt;
 use object_store::memory::InMemory;
 use object_store::path::Path;
+use object_store::throttle::{ThrottleConfig, ThrottledStore};
 use object_store::{ObjectStore, ObjectStoreExt};
 use picofarm_dataset::*;
 use proptest::prelude::*;
@@ -102,7 +103,7 @@ proptest! {
             let mut random = Lcg(seed);
             let decide = move |_: &Path| if random.next() < 0.1 { Fate::Repeated } else { Fate::Good };
             let store = Tricky::new(memory.clone()).deciding(decide);
-            match probe(&store, &Path::from("sets")).await {
+            match probe(&store, &Path::from("sets"), PROBE_WITHIN).await {
                 Ok(()) | Err(DatasetError::Store { .. }) => {}
                 Err(error) => panic!("{error}"),
             }
@@ -147,6 +148,45 @@ proptest! {
             let after = dataset.verify(VerifyMode::Full).await.unwrap();
             assert_eq!(after, Verification { unpublished: vec![], unfinished: vec![], ..before });
         });
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_probe_ends_in_time_where_a_store_stalls_and_leaves_nothing() {
+    let slow = Duration::from_secs(60);
+    for stalls in ["put", "get", "delete"] {
+        let memory = InMemory::new();
+        let config = ThrottleConfig {
+            wait_put_per_call: if stalls == "put" {
+                slow
+            } else {
+                Duration::ZERO
+            },
+            wait_get_per_call: if stalls == "get" {
+                slow
+            } else {
+                Duration::ZERO
+            },
+            wait_delete_per_call: if stalls == "delete" {
+                slow
+            } else {
+                Duration::ZERO
+            },
+            ..ThrottleConfig::default()
+        };
+        let store = ThrottledStore::new(memory, config);
+        let begun = tokio::time::Instant::now();
+        let answer = probe(&store, &Path::from("sets"), Duration::from_secs(8)).await;
+        assert!(begun.elapsed() < Duration::from_secs(20), "{stalls}");
+        let error = answer.unwrap_err().to_string();
+        let expected = match stalls {
+            "delete" => "it did not delete within 5 s",
+            _ => "it did not answer within 8 s",
+        };
+        assert!(error.contains(expected), "{stalls}: {error}");
+        store.config_mut(|config| *config = ThrottleConfig::default());
+        let left = objects(&store).await;
+        assert_eq!(left.is_empty(), stalls != "delete", "{stalls}: {left:?}");
     }
 }
 

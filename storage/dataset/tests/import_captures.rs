@@ -413,7 +413,7 @@ async fn files_of_scipy_and_h5py_are_read() {
     }
     let sum = ImportOptions {
         captures: Captures::Sum,
-        ..options
+        ..options.clone()
     };
     let source = open(&collection, sum).unwrap();
     assert_eq!(
@@ -421,4 +421,20 @@ async fn files_of_scipy_and_h5py_are_read() {
         (1, 2)
     );
     assert_eq!(import_scene(&source, 0).unwrap().files.len(), 3);
+
+    // A file of a few KiB that announces 2^60 counts.
+    let code = "import h5py, sys\n\
+                with h5py.File(sys.argv[1], 'w') as f:\n    \
+                f.create_dataset('dataCube', (1 << 50, 320), chunks=(64, 320), compression='gzip', dtype='f8')";
+    let path = collection.join("spot_1.mat");
+    let written = Command::new(&python).args(["-c", code]).arg(&path).status();
+    assert!(written.unwrap().success());
+    assert!(path.metadata().unwrap().len() < 1 << 16);
+    let bins = Some(1 << 20);
+    let source = open(&collection, ImportOptions { bins, ..options }).unwrap();
+    let error = import_scene(&source, 0).unwrap_err().to_string();
+    assert!(
+        error.contains("spot_1.mat") && error.contains("announces"),
+        "{error}"
+    );
 }

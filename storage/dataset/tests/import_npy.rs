@@ -62,6 +62,99 @@ fn refusal(folder: &Path, description: &Value) -> String {
     found.unwrap_err().to_string()
 }
 
+#[test]
+fn masks_in_another_order_of_rows_columns_or_spots_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let room = Room::new(48, 200);
+    let description = write(&room, folder.path());
+    describe(folder.path(), &description);
+    let whole = import_scene(&open(folder.path()).unwrap(), 0).unwrap();
+    assert!(
+        whole.check["lit_over_shadow"].as_f64().unwrap() > 0.0,
+        "{}",
+        whole.check
+    );
+    let (n, h, w) = (15, 48, 48);
+    let lit: Vec<u8> = (0..n)
+        .flat_map(|s| room.lit[s * 7 * w * h..][..w * h].to_vec())
+        .collect();
+    type Place = fn(usize, usize, usize) -> usize;
+    let orders: [(&str, Place); 5] = [
+        ("rows and columns exchanged", |s, r, c| {
+            (s * 48 + c) * 48 + r
+        }),
+        ("right to left", |s, r, c| (s * 48 + r) * 48 + 47 - c),
+        ("bottom to top", |s, r, c| (s * 48 + 47 - r) * 48 + c),
+        ("other ends", |s, r, c| (s * 48 + 47 - r) * 48 + 47 - c),
+        ("last spot first", |s, r, c| ((14 - s) * 48 + r) * 48 + c),
+    ];
+    for (words, place) in orders {
+        let mut turned = vec![0; lit.len()];
+        for s in 0..n {
+            for r in 0..h {
+                for c in 0..w {
+                    turned[place(s, r, c)] = lit[(s * h + r) * w + c];
+                }
+            }
+        }
+        std::fs::write(
+            folder.path().join("lit.npy"),
+            npy("|u1", &[n, h, w], &turned),
+        )
+        .unwrap();
+        let said = refusal(folder.path(), &description);
+        assert!(
+            // Shadows of half the image, turned round, are also those of the other polarity.
+            said.contains("lit.npy: polarity of the visibility masks")
+                || said.contains("lit.npy: order of the visibility masks") && said.contains(words),
+            "{words}: {said}"
+        );
+    }
+}
+
+/// What docs/integrity.md states of the errors that the check lets pass.
+#[test]
+fn the_check_tells_gates_and_fields_of_view_apart_from_a_small_error_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let room = Room::new(48, 400);
+    let description = write(&room, folder.path());
+    let passes = |change: &dyn Fn(&mut Value)| {
+        let mut changed = description.clone();
+        change(&mut changed);
+        describe(folder.path(), &changed);
+        open(folder.path())
+            .and_then(|s| import_scene(&s, 0))
+            .is_ok()
+    };
+    let width = room.gate[1];
+    let gate =
+        |bins: f64| passes(&|d| d["histogram"]["gate_start"] = json!(room.gate[0] + bins * width));
+    let view = |factor: f64| {
+        passes(&|d| {
+            for field in ["fx", "fy"] {
+                d["camera"][field] = json!(24.0 * factor);
+            }
+        })
+    };
+    let gates: Vec<f64> = (-16..=16)
+        .map(|k| f64::from(k) * 0.25)
+        .filter(|k| gate(*k))
+        .collect();
+    let views: Vec<f64> = (-30..=30)
+        .map(|k| 1.0 + f64::from(k) * 0.01)
+        .filter(|k| view(*k))
+        .collect();
+    println!("gates off by {gates:?} bins pass, focal lengths times {views:?}");
+    assert!(
+        gates.contains(&0.0) && gates.iter().all(|k| k.abs() <= 2.0),
+        "{gates:?}"
+    );
+    assert!(
+        views.contains(&1.0) && views.iter().all(|k| (k - 1.0).abs() < 0.2),
+        "{views:?}"
+    );
+}
+
 #[tokio::test]
 async fn a_scene_is_read_and_found_again() {
     let folder = tempfile::tempdir().unwrap();
@@ -292,4 +385,70 @@ fn what_does_not_fit_is_refused_by_file_and_field() {
     };
     let source = Source::open(folder, None, unchecked, None).unwrap();
     assert!(import_scene(&source, 0).unwrap().check.is_null());
+}
+
+#[test]
+fn lengths_of_beams_are_read_or_stated_or_listed_as_missing_where_a_mirror_is_seen() {
+    let folder = tempfile::tempdir().unwrap();
+    let room = Room::new(48, 200);
+    assert!(room.specular.contains(&1));
+    let mut description = write(&room, folder.path());
+    let import = |description: &Value, options: ImportOptions| {
+        describe(folder.path(), description);
+        import_scene(
+            &Source::open(folder.path(), None, options, None).unwrap(),
+            0,
+        )
+    };
+    let unknown = |scene: &ImportedScene| scene.missing.contains(&"spots.path");
+    let scene = import(&description, ImportOptions::default()).unwrap();
+    assert!(unknown(&scene), "{:?}", scene.missing);
+    let straight = ImportOptions {
+        straight_beams: true,
+        ..ImportOptions::default()
+    };
+    let scene = import(&description, straight).unwrap();
+    let said = |scene: &ImportedScene| {
+        scene
+            .conversions
+            .iter()
+            .any(|c| c.contains("straight lines"))
+    };
+    assert!(!unknown(&scene) && said(&scene), "{:?}", scene.conversions);
+    // Without a mirror, nothing folds a beam.
+    let none = vec![0u8; room.width * room.height];
+    let mirrors = folder.path().join("mirror.npy");
+    std::fs::write(&mirrors, npy("|u1", &[room.height, room.width], &none)).unwrap();
+    let scene = import(&description, ImportOptions::default()).unwrap();
+    assert!(!unknown(&scene) && said(&scene), "{:?}", scene.missing);
+    // Where nobody says what is a mirror, nobody knows.
+    description.as_object_mut().unwrap().remove("specular");
+    let scene = import(&description, ImportOptions::default()).unwrap();
+    assert!(unknown(&scene), "{:?}", scene.missing);
+
+    let length = |spot: usize| {
+        let l = room.lights[spot * 7];
+        (l[0] * l[0] + l[1] * l[1] + l[2] * l[2]).sqrt()
+    };
+    let mut lengths: Vec<f32> = (0..15).map(length).collect();
+    description["spots"]["paths"] = "paths.npy".into();
+    let put = |lengths: &[f32]| {
+        let bytes = npy("<f4", &[lengths.len()], lengths);
+        std::fs::write(folder.path().join("paths.npy"), bytes).unwrap();
+    };
+    lengths[3] += 0.5;
+    put(&lengths);
+    let unchecked = || ImportOptions {
+        unchecked: true,
+        ..ImportOptions::default()
+    };
+    let scene = import(&description, unchecked()).unwrap();
+    assert!(!unknown(&scene) && !said(&scene), "{:?}", scene.missing);
+    lengths[3] -= 1.0;
+    put(&lengths);
+    let refused = import(&description, unchecked()).unwrap_err().to_string();
+    assert!(
+        refused.contains("length of beam 3") && refused.contains("straight line"),
+        "{refused}"
+    );
 }

@@ -1,4 +1,4 @@
-//! `kill -9` in the middle of any put, of publishers and menders, alone and two at a time: no torn object is ever
+//! `kill -9` in the middle of any put, of publishers and repairers, alone and two at a time: no torn object is ever
 //! visible, the next run completes everything, and what the killed leave is bounded and collected. `PICOFARM_KILLS=200`
 //! kills 200 times instead of 20.
 
@@ -21,7 +21,7 @@ const PUTS: usize = 8;
 
 type Objects = BTreeMap<String, Vec<u8>>;
 
-/// Publishes every scene, and mends those that are broken.
+/// Publishes every scene, and repairs those that are broken.
 async fn publish_all(folder: &Folder) {
     let spec = spec(Profile::default());
     let (store, prefix) = open_store(folder.to_str().unwrap()).unwrap();
@@ -42,7 +42,7 @@ async fn publish_all(folder: &Folder) {
 
 /// Also what a process of its own does, which is killed; see [`PLACE`].
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn publishing_and_mending_ends_with_every_scene() {
+async fn publishing_and_repairing_ends_with_every_scene() {
     if let Some(place) = std::env::var_os(PLACE) {
         let place = PathBuf::from(place);
         fs::write(place.with_extension(std::process::id().to_string()), b"").unwrap();
@@ -83,7 +83,7 @@ fn objects(folder: &Folder) -> (Objects, Vec<PathBuf>) {
 }
 
 fn start(place: &Folder) -> Child {
-    let name = "publishing_and_mending_ends_with_every_scene";
+    let name = "publishing_and_repairing_ends_with_every_scene";
     let mut command = Command::new(std::env::current_exe().unwrap());
     command.args(["--exact", name]).env(PLACE, place);
     command.stdout(Stdio::null()).stderr(Stdio::null());
@@ -171,7 +171,7 @@ async fn killed_in_the_middle_of_any_put_nothing_torn_is_visible_and_the_next_ru
             if !all_ran {
                 break;
             }
-            // Somebody damages an object: the next one has to mend it.
+            // Somebody damages an object: the next one has to repair it.
             let published = |k: &&String| {
                 k.starts_with("depth/c/")
                     && visible.contains_key(&format!("manifests/{}.json", &k[8..9]))

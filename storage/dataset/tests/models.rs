@@ -27,7 +27,7 @@ fn model(name: &str, key: &str, weights: &'static [u8]) -> NewModel {
         seed: 7,
         ..Lineage::default()
     };
-    let settings = json!({"task": "tof", "seed": 7});
+    let settings = json!({"target": "tof", "seed": 7});
     let metrics = json!({"mae_m": 0.02, "loss": 0.01});
     NewModel {
         manifest: ModelManifest {
@@ -310,8 +310,8 @@ async fn a_pin_is_the_id_of_a_snapshot_of_the_scenes() {
             .unwrap();
     }
     let all = dataset.present(&|_, _| {}).await.unwrap();
-    assert_eq!(dataset.pin(&[0, 2, 3]).await.unwrap(), all.id());
-    assert_ne!(dataset.pin(&[0, 3]).await.unwrap(), all.id());
+    assert_eq!(dataset.pin(&[0, 2, 3]).await.unwrap().id, all.id());
+    assert_ne!(dataset.pin(&[0, 3]).await.unwrap().id, all.id());
     let missing = dataset.pin(&[0, 1]).await.unwrap_err().to_string();
     assert!(missing.contains("scene 1"), "{missing}");
 }

@@ -148,10 +148,12 @@ async fn local_stores_are_opened_from_paths_and_file_urls() {
 async fn a_safe_store_passes_the_probe_and_nothing_is_left() {
     let folder = tempfile::tempdir().unwrap();
     let (store, prefix) = open_store(folder.path().to_str().unwrap()).unwrap();
-    probe(&*store, &prefix).await.unwrap();
+    probe(&*store, &prefix, PROBE_WITHIN).await.unwrap();
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     let memory = object_store::memory::InMemory::new();
-    probe(&memory, &Path::from("x")).await.unwrap();
+    probe(&memory, &Path::from("x"), PROBE_WITHIN)
+        .await
+        .unwrap();
 }
 
 /// A store that takes every put for an overwrite, as some S3 servers do.
@@ -216,7 +218,9 @@ async fn a_store_without_conditional_puts_fails_the_probe() {
     let store: Arc<dyn ObjectStore> = Arc::new(Forgetful(
         LocalFileSystem::new_with_prefix(folder.path()).unwrap(),
     ));
-    let error = probe(&*store, &Path::from("x")).await.unwrap_err();
+    let error = probe(&*store, &Path::from("x"), PROBE_WITHIN)
+        .await
+        .unwrap_err();
     assert!(
         error
             .to_string()
@@ -243,7 +247,7 @@ async fn a_place_that_cannot_be_written_is_named_with_a_hint() {
         "{text}"
     );
     assert!(matches!(
-        probe(&*store, &prefix).await,
+        probe(&*store, &prefix, PROBE_WITHIN).await,
         Err(DatasetError::Store { .. })
     ));
     // Below a file.

@@ -111,7 +111,7 @@ async fn what_was_published_reads_back_and_is_known_again_by_its_task() {
 }
 
 #[tokio::test]
-async fn what_is_missing_or_changed_is_found_out_and_mended() {
+async fn what_is_missing_or_changed_is_found_out_and_repaired() {
     let folder = tempfile::tempdir().unwrap();
     let there = open(folder.path(), &spec(4)).await.unwrap();
     publish(&there, 0, "k").await;
@@ -127,6 +127,9 @@ async fn what_is_missing_or_changed_is_found_out_and_mended() {
     flipped[20] ^= 1;
     std::fs::write(&lit, flipped).unwrap();
     let said = there.read(0).await.unwrap_err().to_string();
+    assert!(said.contains("SHA-256") && said.contains("lit"), "{said}");
+    // A flipped bit of the same size is no reason to adopt it either.
+    let said = there.finished(0, "k").await.unwrap_err().to_string();
     assert!(said.contains("SHA-256") && said.contains("lit"), "{said}");
     std::fs::write(&lit, bytes).unwrap();
     let path = folder.path().join("manifests/0.json");
@@ -269,4 +272,46 @@ async fn zarr_python_and_xarray_read_the_same_predictions() {
         String::from_utf8_lossy(&output.stderr),
     );
     assert!(output.status.success(), "{out}\n{err}");
+}
+
+#[tokio::test]
+async fn what_is_damaged_is_put_back_where_it_is_proved_to_be_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let there = open(folder.path(), &spec(4)).await.unwrap();
+    publish(&there, 0, "k").await;
+    let before = files(folder.path());
+    let again = there.encode(manifest(0, "k"), &predicted(0)).unwrap();
+    assert_eq!(there.restore(&again).await.unwrap(), Vec::<String>::new());
+    for (path, bytes) in &before {
+        // Metadata of the group is not a scene's.
+        if path.ends_with("zarr.json") {
+            continue;
+        }
+        let mut flipped = bytes.clone();
+        flipped[bytes.len() / 2] ^= 1;
+        for damaged in [Some(flipped), Some(bytes[1..].to_vec()), None] {
+            match damaged {
+                Some(damaged) => std::fs::write(path, damaged).unwrap(),
+                None => std::fs::remove_file(path).unwrap(),
+            }
+            there.restore(&again).await.unwrap();
+            assert!(files(folder.path()) == before, "{}", path.display());
+        }
+    }
+    // Other predictions are no proof, and change nothing.
+    let other = there.encode(manifest(0, "k"), &predicted(1)).unwrap();
+    let lit = folder.path().join("lit/c/0/0/0/0");
+    std::fs::write(&lit, b"torn").unwrap();
+    let torn = files(folder.path());
+    let said = there.restore(&other).await.unwrap_err();
+    assert!(matches!(said, DatasetError::Diverged { .. }), "{said}");
+    let strange = there.encode(manifest(0, "other"), &predicted(0)).unwrap();
+    let said = there.restore(&strange).await.unwrap_err().to_string();
+    assert!(said.contains("choose another folder"), "{said}");
+    // Nor is anything where the manifest is broken and an object is other than now.
+    std::fs::write(folder.path().join("manifests/0.json"), b"{").unwrap();
+    let said = there.restore(&again).await.unwrap_err();
+    assert!(matches!(said, DatasetError::Damaged { .. }), "{said}");
+    assert_eq!(files(folder.path()).len(), torn.len());
+    assert_eq!(std::fs::read(&lit).unwrap(), b"torn");
 }

@@ -158,7 +158,7 @@ fn every_operation_can_be_spawned() {
     spawnable(|d| d.read::<f32>(0, Quantity::Depth));
     spawnable(|d| Dataset::open(d_store(d), Path::from("x")));
     spawnable(|d| Dataset::create_or_open(d_store(d), Path::from("x"), d.spec()));
-    spawnable(|d| async { probe(&*d_store(d), d.prefix()).await });
+    spawnable(|d| async { probe(&*d_store(d), d.prefix(), PROBE_WITHIN).await });
     fn d_store(_: &Dataset) -> Arc<dyn ObjectStore> {
         Arc::new(object_store::memory::InMemory::new())
     }

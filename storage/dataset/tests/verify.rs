@@ -89,7 +89,7 @@ async fn broken_missing_and_foreign_objects_are_named() {
     // The flipped bit is noticed on reading, by the inner chunk's crc32c or the decoder; the rest still reads.
     assert!(matches!(
         dataset.read_transient(1).await,
-        Err(DatasetError::Codec { .. })
+        Err(DatasetError::Damaged { object, .. }) if object == "sets/a/transient/c/1/0/0/0"
     ));
     dataset
         .read_transient_crop(1, 32..36, 32..40)

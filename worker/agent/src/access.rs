@@ -91,6 +91,14 @@ impl Access {
     /// # Errors
     /// [`AccessError`]: a URL or file that cannot be used, or a token that would cross a network unprotected.
     pub fn target(&self, url: &str) -> Result<Target, AccessError> {
+        // Before anything else: no message may repeat it.
+        if url.contains('@') {
+            return Err(AccessError::Settings(
+                "the coordinator's URL names a user or a password (before an @), which is never sent; leave it out, and give \
+                 a token with --token-file or PICOFARM_TOKEN"
+                    .into(),
+            ));
+        }
         let bad = |why: String| AccessError::Url {
             url: url.to_owned(),
             why,
@@ -215,7 +223,7 @@ const PROBE: Duration = Duration::from_secs(3);
 pub enum Trouble {
     /// Nothing answers: it may tomorrow.
     Down(String),
-    /// What answers and this program do not trust or understand each other: somebody must mend a setting.
+    /// What answers and this program do not trust or understand each other: somebody must repair a setting.
     Mismatch(String),
 }
 
@@ -388,6 +396,21 @@ mod tests {
         Access {
             token: Some(Secret::new("pf-0123")),
             ..Access::default()
+        }
+    }
+
+    #[tokio::test]
+    async fn a_password_in_the_url_is_refused_and_not_repeated() {
+        for url in [
+            "http://me:hush@127.0.0.1:1",
+            "me:hush@host",
+            "https://hush@farm",
+        ] {
+            let said = Access::default().target(url).unwrap_err().to_string();
+            assert!(
+                said.contains("--token-file") && !said.contains("hush"),
+                "{said}"
+            );
         }
     }
 

@@ -1,4 +1,4 @@
-//! The worker's one loop: connection, executor, clock and shutdown meet here, around the [`Desk`].
+//! The worker's one loop: connection, executor, clock and shutdown meet here, around the [`Assignments`].
 
 use std::{
     future::Future,
@@ -20,15 +20,17 @@ use uuid::Uuid;
 
 use crate::{
     AgentConfig, AgentError, Control, Executor, Output, Summary, Target, TaskError,
-    allow::StorePrefixes,
+    allow::{self, StorePrefixes},
     execute::Runner,
+    execute::TaskExecutor,
     log::Unsent,
     session::{
         self, LinkError, Session, Welcome,
+        assignments::Assignments,
         backoff::{Backoff, random},
-        desk::Desk,
         message::{Incoming, Outgoing},
     },
+    suspend::Suspends,
 };
 
 /// A running task this close to its end may finish after the shutdown signal.
@@ -57,7 +59,9 @@ const SHUTDOWN: &str = "the worker is shutting down";
 /// coordinator is no error: the worker tries again for ever.
 pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
     config.check()?;
-    let executor = crate::execute::TaskExecutor::new(&config.asset_dirs, Handle::current());
+    let files = allow::opener(&StorePrefixes::new(&config.store_prefixes)?);
+    let executor = TaskExecutor::new(&config.asset_dirs, Handle::current(), files)
+        .with_memory(config.memory_mib);
     run_with(config, Arc::new(executor), shutdown).await
 }
 
@@ -82,6 +86,7 @@ pub async fn run_with(
         version: env!("CARGO_PKG_VERSION").into(),
         protocol: PROTOCOL,
         held: Vec::new(),
+        ended: config.ended,
         abilities: Abilities {
             kinds: executor.kinds(),
             assets: executor.assets(),
@@ -92,13 +97,15 @@ pub async fn run_with(
         },
     };
     info!(worker = %hello.id, name = hello.name, threads = config.threads,
+        memory_mib = config.memory_mib, memory_from = config.memory_from,
         coordinator = config.coordinator, "worker starts");
     let mut agent = Agent {
-        desk: Desk::new(),
+        assignments: Assignments::new(),
         runner: Runner::start(executor, config.threads, allowed)?,
         control: None,
         unsent: Unsent::default(),
         tell_at: Instant::now(),
+        suspends: Suspends::new(),
         targets,
         at: 0,
         welcomed: false,
@@ -114,7 +121,7 @@ pub async fn run_with(
         coordinator: config.coordinator,
     };
     let outcome = agent.live(shutdown).await;
-    agent.summary.unacknowledged = agent.desk.unacknowledged_outputs() as u64;
+    agent.summary.unacknowledged = agent.assignments.unacknowledged_outputs() as u64;
     outcome.map(|()| {
         info!(summary = ?agent.summary, "worker ends");
         agent.summary
@@ -181,7 +188,7 @@ struct Leaving {
 }
 
 struct Agent {
-    desk: Desk,
+    assignments: Assignments,
     runner: Runner,
     /// Of the task in hand.
     control: Option<Arc<Control>>,
@@ -193,6 +200,7 @@ struct Agent {
     targets: Vec<Target>,
     /// Which of them is in use or to be tried next.
     at: usize,
+    suspends: Suspends,
     /// This worker has been let in before: what looks like a wrong setting may pass.
     welcomed: bool,
     hello: WorkerHello,
@@ -214,6 +222,7 @@ impl Agent {
     async fn live(&mut self, shutdown: CancellationToken) -> Result<(), AgentError> {
         loop {
             let now = Instant::now();
+            self.after_suspend(now);
             if self.leave(now) {
                 return Ok(());
             }
@@ -233,25 +242,40 @@ impl Agent {
         }
     }
 
+    /// Where the machine was suspended, leases are older than the clock says, and a heartbeat asks at once which live on.
+    fn after_suspend(&mut self, now: Instant) {
+        let Some(long) = self.suspends.new_one() else {
+            return;
+        };
+        info!(
+            suspended_s = long.as_secs_f64(),
+            "the machine was suspended; asking which leases live on"
+        );
+        self.assignments.suspended(long);
+        if let Link::Up { next_beat, .. } = &mut self.link {
+            *next_beat = now;
+        }
+    }
+
     fn target(&self) -> &Target {
         &self.targets[self.at]
     }
 
     /// Starts the next task if the hand is free, and sends what is to be said.
     fn work(&mut self, now: Instant) {
-        if let Some(task) = self.desk.begin(now) {
+        if let Some(task) = self.assignments.begin(now) {
             info!(job = %task.job, task = task.index, "task starts");
             let control = Arc::new(Control::default());
             self.control = Some(control.clone());
             let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
                 task = task.index);
-            if let Some(hand) = self.desk.in_hand() {
+            if let Some(hand) = self.assignments.in_hand() {
                 trace::join(&span, &hand.traceparent);
             }
-            self.desk.traced(trace::traceparent(&span));
+            self.assignments.traced(trace::traceparent(&span));
             self.runner.begin(task, control, span);
         }
-        if let Some(hand) = self.desk.in_hand()
+        if let Some(hand) = self.assignments.in_hand()
             && now >= self.tell_at
         {
             self.tell_at = now + TELL;
@@ -262,7 +286,7 @@ impl Agent {
             for log in self.unsent.drain(now) {
                 session.send(Outgoing::Log(log));
             }
-            for message in self.desk.outgoing(now) {
+            for message in self.assignments.outgoing(now) {
                 session.send(message);
             }
         }
@@ -271,7 +295,7 @@ impl Agent {
     /// Ends a worker that has waited for work too long.
     fn idle(&mut self, now: Instant) {
         let connected = matches!(self.link, Link::Up { .. });
-        if self.desk.in_hand().is_some() || self.leaving.is_some() || !connected {
+        if self.assignments.in_hand().is_some() || self.leaving.is_some() || !connected {
             self.idle_since = None;
             return;
         }
@@ -288,8 +312,8 @@ impl Agent {
         let idle = self.idle_since.zip(self.exit_idle);
         leaving
             .chain(idle.map(|(since, most)| since + most))
-            .chain(self.desk.paused_until())
-            .chain(self.desk.in_hand().map(|_| self.tell_at))
+            .chain(self.assignments.paused_until())
+            .chain(self.assignments.in_hand().map(|_| self.tell_at))
             .filter(|at| *at > now)
             .min()
             .unwrap_or(now + Duration::from_secs(60))
@@ -300,7 +324,7 @@ impl Agent {
         match event {
             Event::Retry => {
                 let mut hello = self.hello.clone();
-                hello.held = self.desk.held();
+                hello.held = self.assignments.held();
                 self.link = Link::Opening(Box::pin(session::open(self.target().clone(), hello)));
             }
             Event::Opened(Ok((welcome, session))) => {
@@ -310,8 +334,8 @@ impl Agent {
                         self.summary.reconnects += 1;
                         info!(
                             away_s = (now - since).as_secs_f64(),
-                            held = self.desk.held().len(),
-                            unacknowledged = self.desk.unacknowledged(),
+                            held = self.assignments.held().len(),
+                            unacknowledged = self.assignments.unacknowledged(),
                             "reconnected"
                         );
                     }
@@ -341,7 +365,7 @@ impl Agent {
         else {
             return Ok(());
         };
-        let silent = self.desk.silent_since().map(|since| now - since);
+        let silent = self.assignments.silent_since().map(|since| now - since);
         if let Some(silent) = silent.filter(|s| *s > welcome.lease / 2) {
             let text = format!("no answer to heartbeats for {:.1} s", silent.as_secs_f64());
             return self.lost(now, LinkError::Down(text));
@@ -351,7 +375,7 @@ impl Agent {
             .as_ref()
             .map(|c| c.progress())
             .unwrap_or_default();
-        session.send(self.desk.heartbeat(now, fraction, at));
+        session.send(self.assignments.heartbeat(now, fraction, at));
         *next_beat = now + welcome.heartbeat;
         Ok(())
     }
@@ -384,7 +408,7 @@ impl Agent {
             warn!(
                 reason,
                 coordinator = self.coordinator,
-                unacknowledged = self.desk.unacknowledged(),
+                unacknowledged = self.assignments.unacknowledged(),
                 "no coordinator; the worker goes on with what it holds and tries again until one answers"
             );
         } else {
@@ -395,7 +419,7 @@ impl Agent {
             );
         }
         self.away_since.get_or_insert(now);
-        self.desk.disconnected();
+        self.assignments.disconnected();
         self.link = Link::Down(now + wait);
         Ok(())
     }
@@ -405,15 +429,16 @@ impl Agent {
             Incoming::Lease(lease) => {
                 info!(job = %lease.job, range = %lease.lease.range, epoch = %lease.lease.epoch,
                     lo = lease.lo, hi = lease.hi, skip = lease.skip.len(), "lease granted");
-                self.desk.granted(now, *lease);
+                self.assignments.granted(now, *lease);
             }
             Incoming::UnusableLease(lease, why) => {
                 error!(
                     why,
                     "the coordinator granted a lease that cannot be used; it goes back"
                 );
-                self.desk.unusable(lease, &why);
-                self.desk.pause(now + self.relief.next(random()), &why);
+                self.assignments.unusable(lease, &why);
+                self.assignments
+                    .pause(now + self.relief.next(random()), &why);
             }
             Incoming::Acknowledge {
                 lease,
@@ -421,7 +446,7 @@ impl Agent {
                 accepted,
                 reason,
             } => {
-                let known = self.desk.acknowledged(lease, index).is_some();
+                let known = self.assignments.acknowledged(lease, index).is_some();
                 if known && !accepted {
                     warn!(range = %lease.range, epoch = %lease.epoch, task = index, reason,
                         "report not accepted; nothing to do, any output stands");
@@ -429,21 +454,21 @@ impl Agent {
             }
             Incoming::Renewed { leases, ttl_ms } => {
                 let ttl = Duration::from_millis(ttl_ms.into());
-                for lost in self.desk.renewed(now, &leases, ttl) {
+                for lost in self.assignments.renewed(now, &leases, ttl) {
                     warn!(range = %lost.range, epoch = %lost.epoch, "lease lost: not renewed");
                 }
             }
             Incoming::Revoke { lease, reason } => {
                 info!(range = %lease.range, epoch = %lease.epoch, reason, "lease revoked");
-                if self.desk.revoked(now, lease)
+                if self.assignments.revoked(now, lease)
                     && let Some(control) = &self.control
                 {
-                    control.stop();
+                    control.give_up();
                 }
             }
             Incoming::Trim { lease, hi } => {
                 info!(range = %lease.range, epoch = %lease.epoch, hi, "the end of this lease is another worker's now");
-                self.desk.trimmed(lease, hi);
+                self.assignments.trimmed(lease, hi);
             }
             Incoming::Drain => self.begin_leaving(Haste::Finish),
             Incoming::Unknown(what) => warn!(what, "the coordinator sent a message of no use"),
@@ -453,7 +478,7 @@ impl Agent {
     fn task_ended(&mut self, result: Result<Output, TaskError>) {
         let now = Instant::now();
         self.control = None;
-        let hand = self.desk.ended(now, &result);
+        let hand = self.assignments.ended(now, &result);
         // Sent ahead of the report on it, after which nothing is heard of it any more.
         let lines = self.runner.log().end();
         self.unsent.push(hand.lease, hand.task.index, lines);
@@ -479,7 +504,12 @@ impl Agent {
                 let wait = self.relief.next(random());
                 warn!(%job, task, why, wait_s = wait.as_secs_f64(),
                     "task interrupted; the worker hands its leases back and waits before taking more");
-                self.desk.pause(now + wait, why);
+                self.assignments.pause(now + wait, why);
+            }
+            // The coordinator takes back what needs the store, and gives other work.
+            Err(TaskError::Store(why)) => {
+                self.summary.failed += 1;
+                warn!(%job, task, why, "the task waits for its store; the worker takes other work");
             }
             Err(error) => {
                 self.summary.failed += 1;
@@ -491,12 +521,12 @@ impl Agent {
     /// The shutdown signal came, or the coordinator's wish.
     fn begin_leaving(&mut self, haste: Haste) {
         let now = Instant::now();
-        self.desk.drain();
+        self.assignments.drain();
         let nearly_done = self
             .remaining(now)
             .is_some_and(|left| left <= FINISH_WITHIN);
         let saves = self
-            .desk
+            .assignments
             .in_hand()
             .is_some_and(|hand| hand.task.spec.task.resumes());
         let stop_at = match haste {
@@ -506,19 +536,19 @@ impl Agent {
             Haste::Stop => now,
         };
         info!(
-            running = self.desk.in_hand().is_some(),
+            running = self.assignments.in_hand().is_some(),
             nearly_done,
             ?haste,
             "shutting down"
         );
-        self.desk.release_waiting(SHUTDOWN);
+        self.assignments.release_waiting(SHUTDOWN);
         let (fraction, at) = self
             .control
             .as_ref()
             .map(|c| c.progress())
             .unwrap_or_default();
         if let Link::Up { session, .. } = &self.link {
-            for message in self.desk.withdraw(now, fraction, at) {
+            for message in self.assignments.withdraw(now, fraction, at) {
                 session.send(message);
             }
         }
@@ -532,7 +562,7 @@ impl Agent {
 
     /// How long the task in hand still needs, if it goes on as it went so far.
     fn remaining(&self, now: Instant) -> Option<Duration> {
-        let since = self.desk.in_hand()?.since;
+        let since = self.assignments.in_hand()?.since;
         let fraction = self.control.as_ref()?.fraction();
         let left = (now - since).as_secs_f64() * f64::from((1.0 - fraction) / fraction);
         Duration::try_from_secs_f64(left).ok()
@@ -543,7 +573,7 @@ impl Agent {
         let Some(leaving) = &mut self.leaving else {
             return false;
         };
-        let running = self.desk.in_hand().is_some();
+        let running = self.assignments.in_hand().is_some();
         if running && now < leaving.give_up {
             if let Some(control) = &self.control
                 && now >= leaving.stop_at
@@ -558,10 +588,10 @@ impl Agent {
             }
             leaving.released = true;
             leaving.give_up = now + GOODBYE_WITHIN;
-            self.desk.release_all(SHUTDOWN);
+            self.assignments.release_all(SHUTDOWN);
         }
         // A lease under way would be nobody's until it expires: it is awaited and handed back.
-        let all_said = self.desk.unacknowledged() == 0 && !self.desk.expects_lease();
+        let all_said = self.assignments.unacknowledged() == 0 && !self.assignments.expects_lease();
         all_said || now >= leaving.give_up
     }
 }

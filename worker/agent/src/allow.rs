@@ -2,13 +2,23 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use picofarm_proto::model::{RenderTask, StageSpec, TaskSpec};
+use picofarm_files::Opener;
+use picofarm_proto::model::StageSpec;
 
 use crate::AgentError;
 
 /// Where tasks may write their output and read their input. Without any prefix: anywhere.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct StorePrefixes(Vec<Place>);
+pub struct StorePrefixes(Vec<Place>);
+
+/// What the operator's prefixes leave of this machine's files.
+pub(crate) fn opener(prefixes: &StorePrefixes) -> Opener {
+    if prefixes.0.is_empty() {
+        return Opener::anywhere();
+    }
+    let local = prefixes.0.iter().filter(|p| p.store.is_empty());
+    Opener::anywhere().within(local.map(|p| p.parts.iter().collect::<PathBuf>()))
+}
 
 /// A place in a store, for comparison part by part.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,7 +31,7 @@ struct Place {
 impl StorePrefixes {
     /// # Errors
     /// A prefix that cannot be used.
-    pub(crate) fn new(prefixes: &[String]) -> Result<Self, AgentError> {
+    pub fn new(prefixes: &[String]) -> Result<Self, AgentError> {
         let place = |prefix: &String| {
             Place::of(prefix).map_err(|why| AgentError::Config {
                 field: "store_prefix",
@@ -37,40 +47,32 @@ impl StorePrefixes {
             .map(Self)
     }
 
-    /// Whether task `index` of a stage touches only allowed places; else why not.
-    pub(crate) fn check(&self, stage: &StageSpec, index: u64) -> Result<(), String> {
+    /// Checks that task `index` of a stage touches only allowed places.
+    ///
+    /// # Errors
+    /// Why not, with the field.
+    pub fn check(&self, stage: &StageSpec, index: u64) -> Result<(), String> {
         stage.check_places().map_err(|e| e.to_string())?;
         if self.0.is_empty() {
             return Ok(());
         }
         if let Some(source) = stage.task.reads() {
             self.allowed("source.store", &source.store)?;
+            self.allowed("source.dataset", &below(&source.store, &source.dataset))?;
         }
-        if let Some((store, _)) = stage.task.writes() {
-            self.allowed("output.store", store)?;
+        // Models lie in the source's store, and are put there.
+        let results = stage.task.results();
+        self.allowed(results.field, results.store)?;
+        if let Some((store, dataset)) = stage.task.writes() {
+            self.allowed("output.dataset", &below(store, dataset))?;
         }
-        let scene = |task: &RenderTask, index| match task.scenes.kind.file(index) {
-            Some(file) => self.allowed(&format!("scenes.files[{index}]"), &file.path),
-            None => Ok(()),
-        };
-        match &stage.task {
-            TaskSpec::Render(task) => scene(task, index),
-            TaskSpec::Part(task) => {
-                self.allowed("output.store", &task.whole.output.store)?;
-                scene(&task.whole, task.split(index).0)
-            }
-            TaskSpec::Generate(task) => self.allowed("generate.dest", &task.generate.dest),
-            TaskSpec::Import(task) => self.allowed("import.folder", &task.import.folder),
-            TaskSpec::Export(task) => self.allowed("export.dest", &task.export.dest),
-            TaskSpec::Report(task) => self.allowed("report.store", &task.report.store),
-            // Models lie in the source's store, and are put there.
-            TaskSpec::Reprocess(_)
-            | TaskSpec::Split(_)
-            | TaskSpec::Train(_)
-            | TaskSpec::Infer(_)
-            | TaskSpec::Evaluate(_)
-            | TaskSpec::Promote(_) => Ok(()),
-        }
+        let mut inputs = stage.task.inputs(Some(index)).into_iter();
+        inputs.try_for_each(|(field, path)| self.allowed(&field, path))
+    }
+
+    /// Whether a path or URL lies below one of them.
+    pub fn hold(&self, text: &str) -> bool {
+        Place::of(text).is_ok_and(|place| self.0.iter().any(|prefix| place.lies_in(prefix)))
     }
 
     fn allowed(&self, field: &str, text: &str) -> Result<(), String> {
@@ -83,6 +85,11 @@ impl StorePrefixes {
              start workers with a --store-prefix that holds it"
         ))
     }
+}
+
+/// A folder in a store: on this machine it may be a link.
+fn below(store: &str, folder: &str) -> String {
+    format!("{}/{folder}", store.trim_end_matches('/'))
 }
 
 impl Place {

@@ -16,10 +16,14 @@ pub struct AgentConfig {
     pub name: String,
     /// Identity across restarts; `None` makes one for this process.
     pub worker_id: Option<WorkerId>,
+    /// How the process of this worker before this one ended, where that is known; empty otherwise.
+    pub ended: String,
     /// Threads of the render pool, at least 1.
     pub threads: usize,
     /// Memory that tasks may take, MiB; 0 = not known, which meets no stage that asks for any.
     pub memory_mib: u64,
+    /// Where that number comes from, for the log.
+    pub memory_from: String,
     /// Graphics processors.
     pub gpus: u32,
     /// Labels that stages may ask for.

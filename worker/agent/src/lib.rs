@@ -10,15 +10,19 @@ mod allow;
 mod config;
 pub mod execute;
 mod log;
+mod machine;
 mod session;
+mod suspend;
 
 pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
 pub use agent::{run, run_with};
+pub use allow::StorePrefixes;
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
 pub use execute::{
-    TaskExecutor, check_memory, generator_version, import_options, import_version, infer_version,
-    memory_mib, model_version, render_bytes, renderer_version, strategy, strategy_names,
+    Submission, TaskExecutor, absolute, check_memory, infer_version, model_version, render_bytes,
+    renderer_version, resolve, strategy, strategy_names,
 };
 pub use execute::{export, repair, report, reprocess, split};
 pub use log::task_logs;
+pub use machine::{Memory, MemoryLimit, cores, memory_mib};

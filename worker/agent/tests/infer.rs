@@ -1,4 +1,4 @@
-//! What models predict, as tasks: the same that evaluations found, published once, mended, and what is refused. And reports
+//! What models predict, as tasks: the same that evaluations found, published once, repaired, and what is refused. And reports
 //! about models. The data are made up: nothing is rendered.
 
 mod place;
@@ -163,8 +163,8 @@ async fn times_follow_from_the_stages_own_depths_else_from_those_of_the_training
     let short = json!({"epochs": 5, "batch": 2});
     for settings in [
         json!({"model": "n", "seed": 9, "optimise": short}),
-        json!({"task": "shadow", "model": "true", "optimise": short}),
-        json!({"task": "shadow", "model": "all", "shadow": {"variant": "all"}, "optimise": short}),
+        json!({"target": "shadow", "model": "true", "optimise": short}),
+        json!({"target": "shadow", "model": "all", "shadow": {"variant": "all"}, "optimise": short}),
     ] {
         run(place.training(settings)).await.unwrap();
     }
@@ -211,7 +211,7 @@ async fn models_that_do_not_fit_are_refused_by_name_and_nothing_is_made() {
     run(place.training(json!({"model": "n", "seed": 9, "optimise": short})))
         .await
         .unwrap();
-    let one = json!({"task": "shadow", "model": "one", "histogram": "transient_spots", "spots": [1], "optimise": short});
+    let one = json!({"target": "shadow", "model": "one", "histogram": "transient_spots", "spots": [1], "optimise": short});
     run(place.training(one)).await.unwrap();
     for (more, part) in [
         (

@@ -10,9 +10,10 @@ use std::{
 
 use common::{spec, stage};
 use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::TaskExecutor};
+use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
-    key::{render_stage_key, stage_key},
+    key::stage_key,
     model::{Budget, PartTask, RenderTask, StageSpec, TaskSpec},
 };
 use tokio::runtime::Handle;
@@ -29,7 +30,7 @@ fn heavy(store: &Path) -> RenderTask {
 }
 
 fn parts_of(whole: RenderTask) -> StageSpec {
-    let joined_by = render_stage_key(&whole).to_string();
+    let joined_by = whole.stage_key().to_string();
     StageSpec::new(TaskSpec::Part(PartTask { whole, joined_by }))
 }
 
@@ -41,7 +42,8 @@ async fn run(stage: StageSpec, index: u64) -> Result<Output, TaskError> {
         index,
     };
     let runtime = Handle::current();
-    let work = move || TaskExecutor::new(&[], runtime).run(&task, &Control::default());
+    let work =
+        move || TaskExecutor::new(&[], runtime, Opener::anywhere()).run(&task, &Control::default());
     tokio::task::spawn_blocking(work).await.unwrap()
 }
 

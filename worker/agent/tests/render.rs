@@ -13,6 +13,7 @@ use std::{
 use common::{FakeFarm, soon, spec, stage};
 use picofarm_agent::{Control, Executor, Output, Task, TaskError, execute::TaskExecutor};
 use picofarm_dataset::{Dataset, VerifyMode, open_store};
+use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::stage_key,
@@ -69,7 +70,7 @@ impl Place {
         };
         let runtime = Handle::current();
         let work = tokio::task::spawn_blocking(move || {
-            let executor = TaskExecutor::new(&[], runtime);
+            let executor = TaskExecutor::new(&[], runtime, Opener::anywhere());
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             pool.unwrap().install(|| executor.run(&task, &control))
         });
@@ -198,6 +199,7 @@ fn of_file(name: &str, content: &[u8]) -> Place {
             sha256: sha256(content),
         }],
         first: 0,
+        root: None,
     };
     place.spec.scenes.count = 1;
     place
@@ -289,7 +291,7 @@ async fn a_store_that_cannot_be_written_is_an_interruption() {
     fs::write(&file, b"").unwrap();
     place.spec.output.store = file.join("store").to_str().unwrap().into();
     match place.run(0).await {
-        Err(TaskError::Interrupted(text)) => assert!(text.contains("store"), "{text}"),
+        Err(TaskError::Store(text)) => assert!(text.contains("store"), "{text}"),
         other => panic!("{other:?}"),
     }
 }
@@ -336,7 +338,7 @@ async fn a_conflicting_object_is_an_alarm_that_names_it_and_nothing_is_overwritt
 }
 
 #[tokio::test]
-async fn a_published_scene_that_lost_an_object_is_rendered_again_and_mended() {
+async fn a_published_scene_that_lost_an_object_is_rendered_again_and_repaired() {
     let place = Place::new();
     place.run(0).await.unwrap();
     let before = files(&place.dataset());

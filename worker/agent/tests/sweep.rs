@@ -12,8 +12,8 @@ use place::*;
 /// The stages of a sweep over the place's data set, as a job file gives them.
 fn sweep(place: &Place, sweep: &Value, train: &Value) -> Vec<StageSpec> {
     let mut settings = json!({
-        "task": "tof", "model": "m", "version": model_version(), "seed": 5, "net": {"width": 2, "levels": 2},
-        "optimise": {"epochs": 9, "batch": 2, "rate": "{lr}"},
+        "target": "tof", "model": "m", "version": model_version(), "seed": 5, "net": {"width": 2, "levels": 2},
+        "optimise": {"epochs": 9, "batch": 2, "learning_rate": "{lr}"},
     });
     for (name, value) in train.as_object().unwrap() {
         settings[name] = value.clone();
@@ -56,7 +56,7 @@ async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
     let place = Place::new().await;
     // Far too small a rate learns nothing: whoever comes after the others and is no better stops.
     let over =
-        json!({"over": {"lr": [1e-2, 1e-9, 1e-8, 3e-2]}, "halving": {"first": 3, "factor": 3}});
+        json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-2]}, "halving": {"first": 3, "factor": 3}});
     let stages = sweep(&place, &over, &json!({}));
     let mut outputs = Vec::new();
     for stage in stages.clone() {
@@ -136,7 +136,7 @@ async fn a_trial_computes_what_the_training_computes_without_a_sweep() {
     run(stages[0].clone()).await.unwrap();
     let calm = Place::new().await;
     let plain = calm.training(
-        json!({"model": "m.0", "optimise": {"epochs": 9, "batch": 2, "rate": 1e-2},
+        json!({"model": "m.0", "optimise": {"epochs": 9, "batch": 2, "learning_rate": 1e-2},
                                      "checkpoint_minutes": 10.0}),
     );
     run(plain).await.unwrap();
@@ -149,9 +149,8 @@ async fn a_trial_computes_what_the_training_computes_without_a_sweep() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn trials_that_are_stopped_again_and_again_end_as_those_that_never_were() {
-    let over = json!({"over": {"lr": [1e-2, 1e-9, 3e-2]}, "halving": {"first": 4, "factor": 2}});
-    let train =
-        json!({"optimise": {"epochs": 40, "batch": 2, "rate": "{lr}"}, "checkpoint_minutes": 0.01});
+    let over = json!({"over": {"lr": [1e-2, 1e-8, 3e-2]}, "halving": {"first": 4, "factor": 2}});
+    let train = json!({"optimise": {"epochs": 40, "batch": 2, "learning_rate": "{lr}"}, "checkpoint_minutes": 0.01});
     let (calm, place) = (Place::new().await, Place::new().await);
     for stage in sweep(&calm, &over, &train) {
         run(stage).await.unwrap();
@@ -173,7 +172,7 @@ async fn a_trial_whose_numbers_break_is_a_result_and_not_a_failure() {
     let place = Place::new().await;
     let over = json!({"over": {"lr": [10.0, 1e-2]}});
     // With such a decay each step makes the weights of the last layer nine times as large.
-    let optimise = |lr: Value| json!({"epochs": 40, "batch": 2, "rate": lr, "weight_decay": 0.999, "schedule": "constant"});
+    let optimise = |lr: Value| json!({"epochs": 40, "batch": 2, "learning_rate": lr, "weight_decay": 0.999, "schedule": "constant"});
     for stage in sweep(&place, &over, &json!({"optimise": optimise(json!("{lr}"))})) {
         run(stage).await.unwrap();
     }
@@ -215,7 +214,7 @@ async fn what_cannot_be_compared_is_refused() {
     run(place.training(json!({"model": "a", "optimise": short})))
         .await
         .unwrap();
-    run(place.training(json!({"model": "b", "task": "specular", "optimise": short})))
+    run(place.training(json!({"model": "b", "target": "specular", "optimise": short})))
         .await
         .unwrap();
     let said = refused(promotion(&place, &["bare"])).await;

@@ -99,7 +99,7 @@ async fn what_was_trained_of_other_settings_under_the_name_is_in_nobodys_way() {
 async fn models_build_on_models_of_the_store() {
     let place = Place::new().await;
     run(place.training(json!({}))).await.unwrap();
-    let mirrors = json!({"task": "specular", "model": "s", "specular": {"on": "m"}});
+    let mirrors = json!({"target": "specular", "model": "s", "specular": {"on": "m"}});
     run(place.training(mirrors)).await.unwrap();
     let models = place.models();
     let (tof, mirrors) = (
@@ -107,7 +107,7 @@ async fn models_build_on_models_of_the_store() {
         models.manifest("s").await.unwrap(),
     );
     assert_eq!(mirrors.lineage.models["m"], tof.sha256());
-    let shadows = json!({"task": "shadow", "model": "sh", "shadow": {"tof": "m"}, "histogram": "transient_spots", "spots": [1]});
+    let shadows = json!({"target": "shadow", "model": "sh", "shadow": {"tof": "m"}, "histogram": "transient_spots", "spots": [1]});
     run(place.training(shadows)).await.unwrap();
     run(place.evaluation(json!({"models": ["s", "sh"]})))
         .await
@@ -126,15 +126,15 @@ async fn models_build_on_models_of_the_store() {
     );
     for (more, part) in [
         (
-            json!({"task": "shadow", "model": "x", "shadow": {"tof": "s"}}),
+            json!({"target": "shadow", "model": "x", "shadow": {"tof": "s"}}),
             "train.shadow.tof: \"s\" predicts \"specular\"",
         ),
         (
-            json!({"task": "specular", "model": "x", "specular": {"on": "m"}, "net": {"width": 4, "levels": 2}}),
+            json!({"target": "specular", "model": "x", "specular": {"on": "m"}, "net": {"width": 4, "levels": 2}}),
             "train.net.width: is 4, but 2",
         ),
         (
-            json!({"task": "shadow", "model": "x", "from": "m"}),
+            json!({"target": "shadow", "model": "x", "from": "m"}),
             "train.from: \"m\" predicts \"tof\"",
         ),
         (
@@ -161,6 +161,10 @@ async fn what_cannot_be_trained_is_refused_by_name() {
         ),
         (json!({"version": "other"}), "train.version"),
         (json!({"input": {"bins": 9}}), "train.input.bins: 9 is more"),
+        (
+            json!({"input": {"bins": 5}}),
+            "leave out 3 of the data set's 8; give 8 (sums of 1) or 4 (sums of 2)",
+        ),
         (
             json!({"net": {"width": 2, "levels": 5}}),
             "train.net.levels",
@@ -216,4 +220,85 @@ async fn an_evaluation_is_kept_beside_each_model_and_made_once() {
         let said = refused(place.evaluation(more)).await;
         assert!(said.contains(part), "{said}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scenes_without_the_truth_that_is_needed_are_refused_by_name() {
+    let shadow = json!({"target": "shadow"});
+    let known_times = json!({"target": "shadow", "shadow": {"variant": "index"}});
+    let mirrors = json!({"target": "specular"});
+    for (missing, refused_are, trained_are) in [
+        (
+            "depth",
+            [json!({}), shadow.clone()],
+            [known_times.clone(), mirrors.clone()],
+        ),
+        (
+            "visibility",
+            [shadow.clone(), known_times.clone()],
+            [json!({}), mirrors.clone()],
+        ),
+        (
+            "specular",
+            [mirrors.clone(), mirrors],
+            [json!({}), shadow.clone()],
+        ),
+        (
+            "spots.path",
+            [shadow.clone(), shadow],
+            [json!({}), known_times],
+        ),
+    ] {
+        // Scenes 0, 3 and 6 lack it, whichever side they are on.
+        let place = Place::lacking(&[missing, "normal"]).await;
+        for more in refused_are {
+            let said = refused(place.training(more)).await;
+            assert!(
+                said.starts_with("source: ")
+                    && said.contains("rooms")
+                    && said.contains(&format!(" lack {missing} (scene ")),
+                "{said}"
+            );
+            assert!(said.contains("import these scenes with"), "{said}");
+        }
+        assert!(place.files("models").is_empty(), "{missing}");
+        for (which, mut more) in trained_are.into_iter().enumerate() {
+            more["model"] = format!("m{which}").into();
+            more["optimise"] = json!({"epochs": 1, "batch": 2});
+            run(place.training(more)).await.unwrap();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn models_are_not_judged_by_truth_that_is_missing() {
+    let place = Place::new().await;
+    place.train_all().await;
+    let alone =
+        json!({"target": "shadow", "model": "given", "optimise": {"epochs": 1, "batch": 2}});
+    run(place.training(alone)).await.unwrap();
+    for (missing, model) in [
+        ("depth", "m"),
+        ("depth", "given"),
+        ("visibility", "sh"),
+        ("specular", "s"),
+        ("spots.path", "sh"),
+    ] {
+        let other = Place::lacking(&[missing]).await;
+        let models = place.dir.path().join("models");
+        std::os::unix::fs::symlink(models, other.dir.path().join("models")).unwrap();
+        let evaluation = json!({"models": [model], "side": "train"});
+        let said = refused(other.evaluation(evaluation)).await;
+        assert!(said.contains(&format!(" lack {missing} (scene ")), "{said}");
+    }
+    // What is only asked needs no truth, but for what it is given.
+    let other = Place::lacking(&["depth", "visibility", "specular"]).await;
+    let models = place.dir.path().join("models");
+    std::os::unix::fs::symlink(models, other.dir.path().join("models")).unwrap();
+    run(other.inference(json!({}))).await.unwrap();
+    let said = refused(other.inference(json!({"models": ["given"]}))).await;
+    assert!(
+        said.contains("1 scene of") && said.contains("lack depth (scene 0)"),
+        "{said}"
+    );
 }

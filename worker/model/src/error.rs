@@ -9,7 +9,7 @@ pub enum ModelError {
     Invalid {
         /// The setting.
         field: String,
-        /// What is wrong, what was expected, how to mend it.
+        /// What is wrong, what was expected, how to correct it.
         what: String,
     },
     /// Weights or a checkpoint that do not belong to this network, or are damaged.
@@ -28,7 +28,7 @@ pub enum ModelError {
     },
     /// Training produced a number that is none.
     #[error(
-        "step {step}: {what}; the last whole checkpoint is kept. Lower optimise.rate, or use precision = \"f32\""
+        "step {step}: {what}; the last whole checkpoint is kept. Lower optimise.learning_rate, or use precision = \"f32\""
     )]
     NotFinite {
         /// Optimiser step, from 0.

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     ModelError,
     baseline::DepthBaseline,
-    input::{Batch, DEPTH_SCALE_M, Task, Visit, example},
+    input::{Batch, DEPTH_SCALE_M, Target, Visit, example},
     metric::{Metrics, Tally},
     model::Model,
     scene::{Scene, Scenes},
@@ -37,11 +37,11 @@ pub fn evaluate(
     scenes: &dyn Scenes,
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Evaluated>, ModelError> {
-    let task = model.question().task;
+    let target = model.question().target;
     let mut whole = Tally::default();
-    let mut trivial: Vec<(&str, Tally)> = match (task, baseline) {
-        (Task::Tof, Some(_)) => vec![("constant", Tally::default()), ("peak", Tally::default())],
-        (Task::Tof, None) => Vec::new(),
+    let mut trivial: Vec<(&str, Tally)> = match (target, baseline) {
+        (Target::Tof, Some(_)) => vec![("constant", Tally::default()), ("peak", Tally::default())],
+        (Target::Tof, None) => Vec::new(),
         _ => vec![("all", Tally::default()), ("none", Tally::default())],
     };
     let (mut each, mut examples) = (Vec::with_capacity(scenes.len()), 0);
@@ -53,7 +53,7 @@ pub fn evaluate(
         let mut tally = Tally::default();
         answers(model, guide, &scene, &mut |said, batch| {
             examples += batch.images as u64;
-            tally.add(task, said, &batch.target);
+            tally.add(target, said, &batch.target);
             for (name, tally) in &mut trivial {
                 let len = batch.target.len();
                 let said: Vec<f32> = match (*name, baseline) {
@@ -68,10 +68,10 @@ pub fn evaluate(
                     ("all", _) => vec![1.0; len],
                     _ => vec![-1.0; len],
                 };
-                tally.add(task, &said, &batch.target);
+                tally.add(target, &said, &batch.target);
             }
         })?;
-        each.push(tally.metrics(task));
+        each.push(tally.metrics(target));
         whole.join(&tally);
         if !tell(index + 1, scenes.len()) {
             return Ok(None);
@@ -79,9 +79,9 @@ pub fn evaluate(
     }
     let named = trivial
         .iter()
-        .map(|(name, tally)| ((*name).to_owned(), tally.metrics(task)));
+        .map(|(name, tally)| ((*name).to_owned(), tally.metrics(target)));
     Ok(Some(Evaluated {
-        metrics: whole.metrics(task),
+        metrics: whole.metrics(target),
         baselines: named.collect(),
         scenes: each,
         examples,
@@ -147,7 +147,7 @@ pub fn masks(
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Vec<u8>>, ModelError> {
     let question = model.question();
-    if question.task == Task::Tof {
+    if question.target == Target::Tof {
         return Err(ModelError::invalid(
             "models",
             "a depth network says no mask",

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::input::{DEPTH_SCALE_M, Task};
+use crate::input::{DEPTH_SCALE_M, Target};
 
 /// Sums over pixels, from which figures follow; sums of scenes add up.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -50,16 +50,16 @@ impl Metrics {
 
 impl Tally {
     /// Adds pixels: what a network said (depth over 4.5 m, or logits) and what is true.
-    pub fn add(&mut self, task: Task, said: &[f32], truth: &[f32]) {
+    pub fn add(&mut self, target: Target, said: &[f32], truth: &[f32]) {
         self.pixels += said.len() as f64;
         for (said, truth) in said.iter().zip(truth) {
-            match task {
-                Task::Tof => {
+            match target {
+                Target::Tof => {
                     let error = f64::from(said - truth) * f64::from(DEPTH_SCALE_M);
                     self.absolute += error.abs();
                     self.squared += error * error;
                 }
-                Task::Shadow | Task::Specular => {
+                Target::Shadow | Target::Specular => {
                     let (said, is) = (*said > 0.0, *truth > 0.5);
                     self.both += f64::from(u8::from(said && is));
                     self.either += f64::from(u8::from(said || is));
@@ -82,15 +82,15 @@ impl Tally {
     }
 
     /// The figures.
-    pub fn metrics(&self, task: Task) -> Metrics {
+    pub fn metrics(&self, target: Target) -> Metrics {
         let n = self.pixels.max(1.0);
         let share = |part: f64, of: f64| if of > 0.0 { part / of } else { 1.0 };
-        match task {
-            Task::Tof => Metrics::Depth {
+        match target {
+            Target::Tof => Metrics::Depth {
                 mae_m: self.absolute / n,
                 rmse_m: (self.squared / n).sqrt(),
             },
-            Task::Shadow | Task::Specular => Metrics::Mask {
+            Target::Shadow | Target::Specular => Metrics::Mask {
                 mae: (self.either - self.both) / n,
                 iou: share(self.both, self.either),
                 f1: share(2.0 * self.both, self.said + self.is),
@@ -106,8 +106,8 @@ mod tests {
     #[test]
     fn depths_are_measured_in_metres() {
         let mut tally = Tally::default();
-        tally.add(Task::Tof, &[0.0, 1.0], &[1.0, 1.0]);
-        let Metrics::Depth { mae_m, rmse_m } = tally.metrics(Task::Tof) else {
+        tally.add(Target::Tof, &[0.0, 1.0], &[1.0, 1.0]);
+        let Metrics::Depth { mae_m, rmse_m } = tally.metrics(Target::Tof) else {
             panic!("a depth")
         };
         assert!((mae_m - 2.25).abs() < 1e-9 && (rmse_m - 4.5 / 2f64.sqrt()).abs() < 1e-9);
@@ -117,8 +117,8 @@ mod tests {
     fn masks_of_nothing_are_perfect_and_overlap_counts_otherwise() {
         let of = |said: &[f32], truth: &[f32]| {
             let mut tally = Tally::default();
-            tally.add(Task::Shadow, said, truth);
-            tally.metrics(Task::Shadow)
+            tally.add(Target::Shadow, said, truth);
+            tally.metrics(Target::Shadow)
         };
         let perfect = Metrics::Mask {
             mae: 0.0,

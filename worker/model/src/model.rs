@@ -4,7 +4,7 @@ use burn::tensor::Device;
 
 use crate::{
     ModelError,
-    input::{Batch, DEPTH_SCALE_M, Question, Task, Visit, example},
+    input::{Batch, DEPTH_SCALE_M, Question, Target, Visit, example},
     net::Net,
     parameters::Parameters,
     scene::Scene,
@@ -72,7 +72,7 @@ impl Model {
     /// # Errors
     /// [`ModelError::Invalid`] where it is no depth network, or the scene does not fit it.
     pub fn depth_m(&self, scene: &Scene) -> Result<Vec<f32>, ModelError> {
-        if self.question().task != Task::Tof {
+        if self.question().target != Target::Tof {
             let what = "two-bounce times follow from depths; this model predicts none";
             return Err(ModelError::invalid("shadow.tof", what));
         }

@@ -29,12 +29,11 @@ pub struct Scene {
     pub spots: Vec<[f32; 3]>,
     /// 1 where a spot lights the point that is seen: `[spot][row][column]`.
     pub lit: Vec<u8>,
-    /// Two-bounce path lengths, metres: `[spot][row][column]`; empty where they follow from depth and spots.
-    pub tof_m: Vec<f32>,
+    /// Length of each spot's beam from the laser, metres: longer than the straight line where mirrors fold it. NaN where it
+    /// meets nothing.
+    pub beams_m: Vec<f32>,
     /// fx, fy, cx, cy in pixels.
     pub intrinsics: [f64; 4],
-    /// Where the laser stands, camera coordinates, metres.
-    pub laser: [f32; 3],
 }
 
 /// Scenes that are read one by one, in any order, from several threads.
@@ -108,7 +107,7 @@ impl Scenes for Kept {
 impl Scene {
     /// About how much memory it takes.
     pub fn bytes(&self) -> usize {
-        let floats = self.histogram.len() + self.depth_m.len() + self.tof_m.len();
+        let floats = self.histogram.len() + self.depth_m.len();
         4 * floats + self.specular.len() + self.lit.len()
     }
 
@@ -117,26 +116,21 @@ impl Scene {
         self.height * self.width
     }
 
-    /// Two-bounce path lengths of a spot, metres: `[row][column]`. Those that are stored, else from depth:
-    /// |L − x_l| + |x_p − L| + |x_p| (the camera is the origin).
+    /// Two-bounce path lengths of a spot, metres, from the true depth: `[row][column]`.
     pub fn tof(&self, spot: usize) -> Vec<f32> {
-        if self.tof_m.is_empty() {
-            return self.tof_of(spot, &self.depth_m);
-        }
-        let n = self.pixels();
-        self.tof_m[spot * n..(spot + 1) * n].to_vec()
+        self.tof_of(spot, &self.depth_m)
     }
 
-    /// The same from other depths: a network's.
+    /// Two-bounce path lengths of a spot, metres, from any depths, such as a network's: `[row][column]`. The beam's length
+    /// + |x_p − L| + |x_p|, with the camera at the origin; NaN for a beam that meets nothing.
     pub fn tof_of(&self, spot: usize, depth_m: &[f32]) -> Vec<f32> {
         let [fx, fy, cx, cy] = self.intrinsics;
+        let to_spot = f64::from(self.beams_m[spot]);
         let spot = self.spots[spot].map(f64::from);
-        let laser = self.laser.map(f64::from);
         let distance = |a: [f64; 3], b: [f64; 3]| {
             let d: f64 = (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
             d.sqrt()
         };
-        let to_spot = distance(spot, laser);
         let pixels = depth_m.iter().enumerate();
         pixels
             .map(|(i, z)| {

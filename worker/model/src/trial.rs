@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     ModelError, Random,
-    input::{Batch, Task},
+    input::{Batch, Target},
     net::{Net, NetSpec},
     parameters::{Named, Parameters, download},
     train::{Learner, Pace, predict},
@@ -19,7 +19,7 @@ use crate::{
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
     /// What the network learns: decides the loss.
-    pub task: Task,
+    pub target: Target,
     /// The network.
     pub net: NetSpec,
     /// Examples a batch.
@@ -27,7 +27,7 @@ pub struct Trial {
     /// Rows and columns.
     pub side: usize,
     /// Learning rate.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Weight decay.
     pub decay: f64,
     /// Of weights and data.
@@ -47,7 +47,7 @@ impl Trial {
             return Err(ModelError::invalid("side", what));
         }
         let parameters = Parameters::begin(net.declared().to_vec(), self.seed, device);
-        let learner = Learner::new(net, parameters, self.task, self.decay);
+        let learner = Learner::new(net, parameters, self.target, self.decay);
         Ok((learner, self.data()))
     }
 
@@ -79,7 +79,7 @@ impl Trial {
             }
         }
         (batch.dense, batch.one_hot) = (wide, Vec::new());
-        let learner = Learner::new(net, parameters, self.task, self.decay);
+        let learner = Learner::new(net, parameters, self.target, self.decay);
         Ok((learner, batch))
     }
 
@@ -95,9 +95,9 @@ impl Trial {
                 .map(|_| random.below(bins as u64 + 1) as i32 - 1)
                 .collect(),
         };
-        let target = (0..pixels * self.net.outputs).map(|_| match self.task {
-            Task::Tof => random.unit(),
-            Task::Shadow | Task::Specular => (random.bits() >> 63) as f32,
+        let target = (0..pixels * self.net.outputs).map(|_| match self.target {
+            Target::Tof => random.unit(),
+            Target::Shadow | Target::Specular => (random.bits() >> 63) as f32,
         });
         Batch {
             images: self.batch,
@@ -112,7 +112,7 @@ impl Trial {
     /// The pace of its steps.
     pub fn pace(&self) -> Pace {
         Pace {
-            rate: self.rate,
+            learning_rate: self.learning_rate,
             beta1: 0.9,
         }
     }
@@ -148,7 +148,7 @@ impl Trial {
         );
         let evaluated = predict(learner.net(), learner.parameters(), &batch);
         named.insert("evaluated".into(), (shape(self.net.outputs), evaluated));
-        let (output, _, gradients) = learner.gradients(&batch);
+        let (output, _, gradients) = learner.gradients(batch.clone());
         named.insert("output".into(), (shape(self.net.outputs), output));
         let each = learner.net().declared().iter().zip(&gradients);
         let gradients = each.filter_map(|(d, g)| {
@@ -185,7 +185,7 @@ impl Trial {
     /// Those of [`Self::begin`].
     pub fn slope(&self, reach: f32, device: &Device) -> Result<Slope, ModelError> {
         let (mut learner, batch) = self.begin(device)?;
-        let (_, _, gradients) = learner.gradients(&batch);
+        let (_, _, gradients) = learner.gradients(batch.clone());
         let host: Vec<Option<Vec<f32>>> =
             gradients.iter().map(|g| g.as_ref().map(download)).collect();
         let squares = host
@@ -207,8 +207,8 @@ impl Trial {
             }
             let declared = learner.net().declared().to_vec();
             let parameters = Parameters::from_named(declared, moved, device)?;
-            learner = Learner::new(learner.net().clone(), parameters, self.task, self.decay);
-            *loss = f64::from(learner.gradients(&batch).1);
+            learner = Learner::new(learner.net().clone(), parameters, self.target, self.decay);
+            *loss = f64::from(learner.gradients(batch.clone()).1);
         }
         Ok(Slope {
             measured: (losses[0] - losses[1]) / (2.0 * f64::from(reach)),

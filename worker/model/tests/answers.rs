@@ -10,7 +10,7 @@ use picofarm_model::{
     Evaluated, Model, Random, answers,
     baseline::DepthBaseline,
     evaluate,
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     metric::Metrics,
     net::{Architecture, NetSpec},
     scene::{Kept, Scenes},
@@ -47,7 +47,7 @@ fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_al
     };
     let depth = Plan {
         epochs: 25,
-        ..plan(Task::Tof, ShadowVariant::Concat)
+        ..plan(Target::Tof, ShadowVariant::Concat)
     };
     let tof = trained(&depth, many());
     let tof = Arc::new(Model::read(&tof.weights, &device).unwrap());
@@ -66,7 +66,7 @@ fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_al
 
     let shadow = Plan {
         epochs: 25,
-        ..plan(Task::Shadow, ShadowVariant::Concat)
+        ..plan(Target::Shadow, ShadowVariant::Concat)
     };
     let guided = Sources {
         guide: Some(Arc::clone(&tof)),
@@ -103,7 +103,7 @@ fn the_peak_is_a_better_depth_than_a_constant_where_peaks_follow_depths() {
 #[test]
 fn weights_go_out_by_pytorchs_names_and_come_back_the_same() {
     let device = Device::flex();
-    let plan = plan(Task::Shadow, ShadowVariant::Concat);
+    let plan = plan(Target::Shadow, ShadowVariant::Concat);
     let trained = trained(&plan, sources());
     let (named, _) = weights::read(&trained.weights).unwrap();
     let first = &named["encoders.0.basic_module.SingleConv1.conv.weight"];
@@ -121,7 +121,7 @@ fn weights_go_out_by_pytorchs_names_and_come_back_the_same() {
 #[test]
 fn the_layout_of_released_checkpoints_is_read_wrapped_or_combined() {
     let device = Device::flex();
-    let plan = plan(Task::Tof, ShadowVariant::Concat);
+    let plan = plan(Target::Tof, ShadowVariant::Concat);
     let trained = trained(&plan, sources());
     let (named, _) = weights::read(&trained.weights).unwrap();
     for prefix in ["module.", "depth_model.", "module.depth_model."] {
@@ -162,11 +162,11 @@ fn the_released_network_has_the_published_number_of_parameters() {
 #[test]
 fn gradients_are_the_slopes_of_the_loss() {
     let device = Device::flex();
-    for (task, architecture, one_hot) in [
-        (Task::Tof, Architecture::Unet2d, 0),
-        (Task::Shadow, Architecture::Unet2d, 6),
-        (Task::Specular, Architecture::Unet25d, 0),
-        (Task::Shadow, Architecture::Unet25d, 6),
+    for (target, architecture, one_hot) in [
+        (Target::Tof, Architecture::Unet2d, 0),
+        (Target::Shadow, Architecture::Unet2d, 6),
+        (Target::Specular, Architecture::Unet25d, 0),
+        (Target::Shadow, Architecture::Unet25d, 6),
     ] {
         let net = NetSpec {
             architecture,
@@ -176,17 +176,17 @@ fn gradients_are_the_slopes_of_the_loss() {
             ..NetSpec::released(6, one_hot, 1)
         };
         let trial = Trial {
-            task,
+            target,
             net,
             batch: 3,
             side: 8,
-            rate: 1e-3,
+            learning_rate: 1e-3,
             decay: 0.0,
             seed: 2,
         };
         let slope = trial.slope(1e-3, &device).unwrap();
         let off = (slope.measured - slope.expected).abs() / slope.expected;
-        assert!(off < 0.02, "{task:?} {architecture:?}: {slope:?}");
+        assert!(off < 0.02, "{target:?} {architecture:?}: {slope:?}");
     }
 }
 
@@ -194,7 +194,7 @@ fn gradients_are_the_slopes_of_the_loss() {
 fn a_scene_is_asked_spot_by_spot() {
     let plan = Plan {
         epochs: 1,
-        ..plan(Task::Shadow, ShadowVariant::Concat)
+        ..plan(Target::Shadow, ShadowVariant::Concat)
     };
     let model = Model::read(&trained(&plan, sources()).weights, &Device::flex()).unwrap();
     let mut asked = 0;

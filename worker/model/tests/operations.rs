@@ -124,7 +124,7 @@ fn twenty_steps_of_adamw_equal_the_formula() {
     let mut plain = ours.clone();
     for step in 1..=20 {
         let settings = AdamW {
-            rate: 1e-2,
+            learning_rate: 1e-2,
             beta1: 0.9,
             beta2: 0.999,
             eps: 1e-8,

@@ -5,7 +5,7 @@ mod common;
 use burn::tensor::{Device, Distribution, FloatDType, Int, Tensor, TensorData};
 use common::{plan, sources};
 use picofarm_model::{
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     net::Precision,
     ops::{self, plain},
     train::{Control, Ended, Event, Plan, Trained, Training},
@@ -65,8 +65,8 @@ fn convolutions_are_those_of_a_device_that_has_such_numbers() {
     }
 }
 
-fn in_bf16(task: Task, variant: ShadowVariant) -> Plan {
-    let mut plan = plan(task, variant);
+fn in_bf16(target: Target, variant: ShadowVariant) -> Plan {
+    let mut plan = plan(target, variant);
     plan.net.precision = Precision::Bf16;
     plan.epochs = 12;
     plan
@@ -90,11 +90,11 @@ fn trained(plan: &Plan, stop: Option<u64>) -> Trained {
 
 #[test]
 fn networks_learn_in_bf16_as_in_f32_and_go_on_to_the_same_bits() {
-    for (task, variant, share) in [
-        (Task::Tof, ShadowVariant::Concat, 0.8),
-        (Task::Shadow, ShadowVariant::Concat, 1.0),
+    for (target, variant, share) in [
+        (Target::Tof, ShadowVariant::Concat, 0.8),
+        (Target::Shadow, ShadowVariant::Concat, 1.0),
     ] {
-        let rounded = in_bf16(task, variant);
+        let rounded = in_bf16(target, variant);
         let mut exact = rounded.clone();
         exact.net.precision = Precision::F32;
         let (rounded_end, exact_end) = (trained(&rounded, None), trained(&exact, None));
@@ -113,8 +113,8 @@ fn networks_learn_in_bf16_as_in_f32_and_go_on_to_the_same_bits() {
 #[test]
 fn a_plan_in_f32_is_written_as_ever() {
     let text = |plan: &Plan| serde_json::to_string(plan).unwrap();
-    let exact = text(&plan(Task::Tof, ShadowVariant::Concat));
+    let exact = text(&plan(Target::Tof, ShadowVariant::Concat));
     assert!(!exact.contains("precision"), "{exact}");
-    let rounded = text(&in_bf16(Task::Tof, ShadowVariant::Concat));
+    let rounded = text(&in_bf16(Target::Tof, ShadowVariant::Concat));
     assert!(rounded.contains("\"precision\":\"bf16\""), "{rounded}");
 }

@@ -9,20 +9,20 @@ use picofarm_model::{
     Model,
     baseline::DepthBaseline,
     cpu, evaluate,
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     report::{Entry, Report, html, json, pictures},
     train::{Control, Training},
 };
 
-fn trained(task: Task) -> Entry {
-    let (plan, sources) = (plan(task, ShadowVariant::Concat), sources());
+fn trained(target: Target) -> Entry {
+    let (plan, sources) = (plan(target, ShadowVariant::Concat), sources());
     let baseline = DepthBaseline::fit(sources.train.as_ref(), 9).unwrap();
     let mut training = Training::start(plan, None, sources, &cpu()).unwrap();
     training.run(&mut |_, _| Control::Continue).unwrap();
     let trained = training.finish();
     let model = Model::read(&trained.weights, &cpu()).unwrap();
     let held_out = scenes(200, 3);
-    let mut entry = Entry::new(format!("{task:?}"), &model, 8);
+    let mut entry = Entry::new(format!("{target:?}"), &model, 8);
     entry.history = trained.history;
     entry.evaluated = evaluate(&model, None, Some(&baseline), &held_out, &mut |_, _| true).unwrap();
     entry.pictures = pictures(&model, None, &held_out, &[0, 2], 1).unwrap();
@@ -31,23 +31,23 @@ fn trained(task: Task) -> Entry {
 
 #[test]
 fn pictures_show_what_the_figures_are_of() {
-    for task in [Task::Tof, Task::Shadow, Task::Specular] {
-        let entry = trained(task);
+    for target in [Target::Tof, Target::Shadow, Target::Specular] {
+        let entry = trained(target);
         let evaluated = entry.evaluated.as_ref().unwrap();
         assert_eq!(entry.pictures.len(), 2);
         for (picture, scene) in entry.pictures.iter().zip([0, 2]) {
             let held_out = Arc::clone(&scenes(200, 3)[scene]);
-            match task {
-                Task::Tof => {
+            match target {
+                Target::Tof => {
                     let both = picture.truth.values().iter().zip(&held_out.depth_m);
                     assert!(both.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
                 }
-                Task::Specular | Task::Shadow => {
+                Target::Specular | Target::Shadow => {
                     let said = picture.said.values();
                     assert!(said.iter().all(|p| (0.0..=1.0).contains(p)));
                 }
             }
-            if task != Task::Shadow {
+            if target != Target::Shadow {
                 assert_eq!(picture.metrics, evaluated.scenes[scene]);
             }
         }
@@ -65,7 +65,7 @@ fn pictures_show_what_the_figures_are_of() {
 
 #[test]
 fn a_scene_that_is_not_there_is_named() {
-    let entry = plan(Task::Tof, ShadowVariant::Concat);
+    let entry = plan(Target::Tof, ShadowVariant::Concat);
     let training = Training::start(entry, None, sources(), &cpu()).unwrap();
     let model = Model::read(&training.finish().weights, &cpu()).unwrap();
     let error = pictures(&model, None, &scenes(0, 2), &[2], 1).unwrap_err();

@@ -8,19 +8,19 @@ use burn::tensor::Device;
 use common::{plan, scene, scenes, sources};
 use picofarm_model::{
     ModelError,
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     scene::Scene,
     train::{Control, Ended, Event, Plan, Sources, Trained, Training},
 };
 use proptest::prelude::*;
 
-const ALL: [(Task, ShadowVariant); 6] = [
-    (Task::Tof, ShadowVariant::Concat),
-    (Task::Specular, ShadowVariant::Concat),
-    (Task::Shadow, ShadowVariant::Concat),
-    (Task::Shadow, ShadowVariant::Difference),
-    (Task::Shadow, ShadowVariant::Index),
-    (Task::Shadow, ShadowVariant::All),
+const ALL: [(Target, ShadowVariant); 6] = [
+    (Target::Tof, ShadowVariant::Concat),
+    (Target::Specular, ShadowVariant::Concat),
+    (Target::Shadow, ShadowVariant::Concat),
+    (Target::Shadow, ShadowVariant::Difference),
+    (Target::Shadow, ShadowVariant::Index),
+    (Target::Shadow, ShadowVariant::All),
 ];
 
 fn whole(plan: &Plan, sources: Sources) -> Trained {
@@ -59,8 +59,8 @@ proptest! {
 
     #[test]
     fn a_training_stopped_anywhere_gives_the_weights_of_one_that_was_not(which in 0..ALL.len(), stops in prop::collection::vec(1..6u64, 1..4)) {
-        let (task, variant) = ALL[which];
-        let plan = plan(task, variant);
+        let (target, variant) = ALL[which];
+        let plan = plan(target, variant);
         let mut stops = stops;
         stops.sort_unstable();
         let (a, b) = (whole(&plan, sources()), stopped(&plan, &stops));
@@ -71,7 +71,7 @@ proptest! {
 
 #[test]
 fn any_number_of_threads_gives_the_same_weights() {
-    let plan = plan(Task::Shadow, ShadowVariant::Concat);
+    let plan = plan(Target::Shadow, ShadowVariant::Concat);
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -85,19 +85,39 @@ fn any_number_of_threads_gives_the_same_weights() {
 
 #[test]
 fn every_task_is_learned_on_scenes_that_are_easy() {
-    for (task, variant) in ALL {
+    for (target, variant) in ALL {
         let plan = Plan {
             epochs: 80,
             augment: false,
-            ..plan(task, variant)
+            ..plan(target, variant)
         };
         let trained = whole(&plan, sources());
         let (first, last) = (trained.history[0], trained.history[79]);
         assert!(
             last.loss < 0.8 * first.loss,
-            "{task:?} {variant:?}: {first:?} {last:?}"
+            "{target:?} {variant:?}: {first:?} {last:?}"
         );
     }
+}
+
+/// A training that is stopped after so many epochs, and what it then says of the validation scenes.
+fn after(plan: &Plan, epochs: u64) -> (Vec<u8>, Vec<picofarm_model::train::Line>) {
+    let mut training = Training::start(plan.clone(), None, sources(), &Device::flex()).unwrap();
+    let mut history = Vec::new();
+    training
+        .run(&mut |_, event| match event {
+            Event::Epoch(line) => {
+                history.push(*line);
+                if line.epoch == epochs {
+                    Control::Stop
+                } else {
+                    Control::Continue
+                }
+            }
+            Event::Step { .. } => Control::Continue,
+        })
+        .unwrap();
+    (training.finish().weights, history)
 }
 
 #[test]
@@ -105,11 +125,198 @@ fn it_ends_early_where_validation_no_longer_improves() {
     let plan = Plan {
         epochs: 1_000,
         early_stop: 3,
-        rate: 1e-9,
-        ..plan(Task::Tof, ShadowVariant::Concat)
+        learning_rate: 1e-9,
+        ..plan(Target::Tof, ShadowVariant::Concat)
     };
     let trained = whole(&plan, sources());
     assert!(trained.stopped_early && trained.history.len() < 1_000);
+}
+
+#[test]
+fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
+    // Steps this large go past the best soon.
+    let plan = Plan {
+        epochs: 60,
+        early_stop: 4,
+        learning_rate: 0.2,
+        schedule: picofarm_model::train::Schedule::Constant,
+        ..plan(Target::Tof, ShadowVariant::Concat)
+    };
+    let trained = whole(&plan, sources());
+    let loss = |line: &picofarm_model::train::Line| line.validation.unwrap().loss();
+    let best = trained
+        .history
+        .iter()
+        .map(loss)
+        .fold(f64::INFINITY, f64::min);
+    let kept = trained.kept().unwrap();
+    assert_eq!(loss(kept), best);
+    assert!(trained.stopped_early, "{:?}", trained.history.len());
+    assert_eq!(kept.epoch + 4, trained.history.len() as u64);
+    // They say of the validation scenes what that epoch's did.
+    let model = picofarm_model::Model::read(&trained.weights, &Device::flex()).unwrap();
+    let scenes = scenes(100, 3);
+    let found = picofarm_model::evaluate(&model, None, None, &scenes, &mut |_, _| true);
+    let found = found.unwrap().unwrap().metrics.loss();
+    assert!((found - best).abs() < 1e-6, "{found} {best}");
+    // And going on from a checkpoint after the best keeps them too.
+    let device = Device::flex();
+    let mut training = Training::start(plan.clone(), None, sources(), &device).unwrap();
+    let past = kept.epoch + 2;
+    let stopped = training.run(&mut |_, event| match event {
+        Event::Epoch(line) if line.epoch == past => Control::Stop,
+        _ => Control::Continue,
+    });
+    assert_eq!(stopped.unwrap(), Ended::Stopped);
+    let checkpoint = training.checkpoint();
+    let mut training = Training::resume(plan.clone(), &checkpoint, sources(), &device).unwrap();
+    assert_eq!(training.checkpoint(), checkpoint);
+    training.run(&mut |_, _| Control::Continue).unwrap();
+    let (left, history) = picofarm_model::train::left_by(&training.checkpoint()).unwrap();
+    let again = training.finish();
+    assert!(left == again.weights && history == again.history);
+    assert!(again.weights == trained.weights && again.kept_epoch == trained.kept_epoch);
+    // Without early_stop, the last ones count.
+    let (last, history) = after(
+        &Plan {
+            early_stop: 0,
+            ..plan
+        },
+        past,
+    );
+    assert_eq!(history[..], trained.history[..past as usize]);
+    assert!(last != trained.weights);
+}
+
+#[test]
+fn parts_of_a_step_give_the_bits_that_they_gave_together() {
+    let device = Device::flex();
+    let (mut one, batch) = trial(5).begin(&device).unwrap();
+    let (_, other) = trial(6).begin(&device).unwrap();
+    let (mut two, _) = trial(5).begin(&device).unwrap();
+    let pace = trial(5).pace();
+    let loss = one.step(&[batch.clone(), other.clone()], pace).unwrap();
+    let mut sum = picofarm_model::train::Gradients::default();
+    two.add(&mut sum, batch).unwrap();
+    two.add(&mut sum, other).unwrap();
+    assert_eq!(two.finish(sum, pace), loss);
+    assert_eq!(one.parameters().to_named(), two.parameters().to_named());
+}
+
+fn trial(seed: u64) -> picofarm_model::trial::Trial {
+    let plan = plan(Target::Tof, ShadowVariant::Concat);
+    picofarm_model::trial::Trial {
+        target: Target::Tof,
+        net: plan.net,
+        batch: 2,
+        side: 8,
+        learning_rate: 1e-2,
+        decay: 1e-3,
+        seed,
+    }
+}
+
+/// Counts how many scenes are being loaded or waited for, and how many at a time.
+struct Watched {
+    scenes: Vec<Arc<Scene>>,
+    loading: std::sync::atomic::AtomicUsize,
+    loaded: std::sync::atomic::AtomicUsize,
+    most: std::sync::atomic::AtomicUsize,
+}
+
+impl picofarm_model::scene::Scenes for Watched {
+    fn len(&self) -> usize {
+        self.scenes.len()
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<Scene>, picofarm_model::scene::Unreadable> {
+        use std::sync::atomic::Ordering::SeqCst;
+        let now = self.loading.fetch_add(1, SeqCst) + 1;
+        self.most.fetch_max(now, SeqCst);
+        // Others get their turn, and finish in another order.
+        std::thread::sleep(std::time::Duration::from_millis((index as u64 * 7) % 5));
+        self.loading.fetch_sub(1, SeqCst);
+        self.loaded.fetch_add(1, SeqCst);
+        Ok(Arc::clone(&self.scenes[index]))
+    }
+}
+
+#[test]
+fn scenes_are_loaded_by_several_threads_within_the_room_and_come_in_order() {
+    use picofarm_model::train::Loading;
+    use std::sync::atomic::Ordering::SeqCst;
+    let plan = plan(Target::Tof, ShadowVariant::Concat);
+    let with = |loading: Loading| {
+        let watched = Arc::new(Watched {
+            scenes: scenes(0, 9),
+            loading: 0.into(),
+            loaded: 0.into(),
+            most: 0.into(),
+        });
+        let sources = Sources {
+            train: watched.clone(),
+            ..sources()
+        };
+        let training = Training::start(plan.clone(), None, sources, &Device::flex()).unwrap();
+        let mut training = training.loading(loading);
+        let mut ahead = 0;
+        training
+            .run(&mut |_, event| {
+                if let Event::Step { step, .. } = event {
+                    let used = *step as usize * 4;
+                    ahead = ahead.max(watched.loaded.load(SeqCst).saturating_sub(used));
+                }
+                Control::Continue
+            })
+            .unwrap();
+        (training.finish().weights, watched.most.load(SeqCst), ahead)
+    };
+    let room = usize::MAX;
+    let (one, most, _) = with(Loading { threads: 1, room });
+    assert_eq!(most, 1);
+    let (four, most, ahead) = with(Loading { threads: 4, room });
+    assert!((2..=4).contains(&most), "{most} at a time");
+    assert!(ahead <= 2 * 2 + 4, "{ahead} ahead");
+    // One scene is always in hand, however little room there is.
+    let (little, most, ahead) = with(Loading {
+        threads: 4,
+        room: 1,
+    });
+    assert!(most == 1 && ahead <= 1, "{most} at a time, {ahead} ahead");
+    assert!(one == four && one == little);
+}
+
+#[test]
+fn a_scene_that_cannot_be_read_ends_the_training_by_its_number_and_a_panic_does_not_hang_it() {
+    struct Torn(bool);
+    impl picofarm_model::scene::Scenes for Torn {
+        fn len(&self) -> usize {
+            8
+        }
+        fn load(&self, index: usize) -> Result<Arc<Scene>, picofarm_model::scene::Unreadable> {
+            match index {
+                3 if self.0 => panic!("torn"),
+                3 => Err("torn".into()),
+                _ => Ok(scene(index as u64)),
+            }
+        }
+    }
+    let run = |panics| {
+        let sources = Sources {
+            train: Arc::new(Torn(panics)),
+            ..sources()
+        };
+        let plan = plan(Target::Tof, ShadowVariant::Concat);
+        let mut training = Training::start(plan, None, sources, &Device::flex()).unwrap();
+        training.run(&mut |_, _| Control::Continue)
+    };
+    let error = run(false).unwrap_err();
+    assert!(
+        matches!(error, ModelError::Scene { scene: 3, .. }),
+        "{error}"
+    );
+    let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| run(true)));
+    assert!(panicked.is_err());
 }
 
 #[test]
@@ -122,15 +329,15 @@ fn scenes_that_are_dark_constant_spiked_or_saturated_give_finite_losses() {
         }
         Arc::new(scene)
     });
-    for (task, variant) in ALL {
+    for (target, variant) in ALL {
         let sources = Sources {
             train: Arc::new(hard.to_vec()),
             ..sources()
         };
-        let trained = whole(&plan(task, variant), sources);
+        let trained = whole(&plan(target, variant), sources);
         assert!(
             trained.history.iter().all(|line| line.loss.is_finite()),
-            "{task:?}"
+            "{target:?}"
         );
     }
 }
@@ -138,20 +345,23 @@ fn scenes_that_are_dark_constant_spiked_or_saturated_give_finite_losses() {
 #[test]
 fn a_rate_that_is_far_too_great_ends_with_a_report_and_not_with_nonsense() {
     let plan = Plan {
-        rate: 1e38,
-        ..plan(Task::Tof, ShadowVariant::Concat)
+        learning_rate: 1e38,
+        ..plan(Target::Tof, ShadowVariant::Concat)
     };
     let mut training = Training::start(plan, None, sources(), &Device::flex()).unwrap();
     let error = training.run(&mut |_, _| Control::Continue).unwrap_err();
     assert!(matches!(error, ModelError::NotFinite { .. }), "{error}");
-    assert!(error.to_string().contains("optimise.rate"), "{error}");
+    assert!(
+        error.to_string().contains("optimise.learning_rate"),
+        "{error}"
+    );
 }
 
 #[test]
 fn a_decoder_learns_on_a_frozen_encoder_which_stays_as_it_was() {
-    let depth = plan(Task::Tof, ShadowVariant::Concat);
+    let depth = plan(Target::Tof, ShadowVariant::Concat);
     let trained = whole(&depth, sources());
-    let mut mirrors = plan(Task::Specular, ShadowVariant::Concat);
+    let mut mirrors = plan(Target::Specular, ShadowVariant::Concat);
     mirrors.net.frozen = true;
     let device = Device::flex();
     let without = Training::start(mirrors.clone(), None, sources(), &device).map(|_| ());
@@ -173,7 +383,7 @@ fn a_decoder_learns_on_a_frozen_encoder_which_stays_as_it_was() {
 #[test]
 fn checkpoints_of_another_plan_or_cut_short_are_refused() {
     let device = Device::flex();
-    let plan_a = plan(Task::Tof, ShadowVariant::Concat);
+    let plan_a = plan(Target::Tof, ShadowVariant::Concat);
     let training = Training::start(plan_a.clone(), None, sources(), &device).unwrap();
     let checkpoint = training.checkpoint();
     let refused = |plan: Plan, bytes: &[u8]| {
@@ -195,7 +405,7 @@ fn checkpoints_of_another_plan_or_cut_short_are_refused() {
 fn too_few_scenes_are_refused_with_what_to_change() {
     let plan = Plan {
         batch: 32,
-        ..plan(Task::Tof, ShadowVariant::Concat)
+        ..plan(Target::Tof, ShadowVariant::Concat)
     };
     let sources = Sources {
         train: Arc::new(scenes(0, 9)),

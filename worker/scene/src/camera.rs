@@ -118,6 +118,15 @@ impl Camera {
                 "focal lengths must be positive and finite".into(),
             ));
         }
+        // A plane of pixels never spans half a turn; near it, the outermost pixels take nearly all of the view.
+        for (side, pixels, focal) in [("wide", i.width, i.fx), ("high", i.height, i.fy)] {
+            let half = libm::atan2(f64::from(pixels) * 0.5, f64::from(focal));
+            let degrees = 2.0 * half.to_degrees();
+            if degrees > 179.0 {
+                let what = format!("the view is {degrees:.1} degrees {side}; expected at most 179");
+                return Err(("camera.intrinsics".into(), what));
+            }
+        }
         let (r, d, f) = (self.right, self.down, self.forward);
         let ortho = [r.dot(d), r.dot(f), d.dot(f)]
             .iter()

@@ -60,6 +60,9 @@ pub enum SceneError {
         /// Why.
         source: std::io::Error,
     },
+    /// A scene file names a file that it may not.
+    #[error(transparent)]
+    Refused(picofarm_files::FileError),
     /// A file cannot be written.
     #[error("cannot write {path}: {source}; check the folder, its permissions and the free space")]
     Write {
@@ -73,7 +76,7 @@ pub enum SceneError {
     Format {
         /// The file.
         path: PathBuf,
-        /// Field, what was expected, what was found, and how to mend it.
+        /// Field, what was expected, what was found, and how to correct it.
         what: String,
     },
     /// A scene's content is unusable, whatever its source.
@@ -83,7 +86,7 @@ pub enum SceneError {
         scene: String,
         /// Field, e.g. `objects[3].mesh.positions[17]`.
         field: String,
-        /// What is wrong, what was expected, and how to mend it.
+        /// What is wrong, what was expected, and how to correct it.
         what: String,
     },
     /// A generator ran out of tries.
@@ -99,14 +102,14 @@ pub enum SceneError {
         attempts: u32,
     },
     /// Furniture assets that the job names are not here.
-    #[error("assets {name:?} are not installed ({looked}); {mend}, or set assets = \"parametric\"")]
+    #[error("assets {name:?} are not installed ({looked}); {hint}, or set assets = \"parametric\"")]
     Assets {
         /// Which asset source.
         name: String,
         /// Where it was looked for.
         looked: String,
         /// How to come by them.
-        mend: &'static str,
+        hint: &'static str,
     },
     /// Furniture assets cannot be fetched.
     #[error("assets cannot be installed: {what}")]

@@ -7,7 +7,7 @@ use std::{path::Path, sync::OnceLock};
 
 use picofarm_scene::{
     LaserGrid, export,
-    import::{self, ImportOptions},
+    import::{self, Bounds, ImportOptions},
 };
 use proptest::{prelude::*, test_runner::TestRunner};
 use serde_json::Value as Json;
@@ -109,8 +109,8 @@ fn survives(folder: &Path, name: &str, bytes: &[u8]) -> Result<(), TestCaseError
         frame: true,
         ..ImportOptions::default()
     };
-    let _ = import::fingerprint(&path);
-    if let Ok(scene) = import::read_scene_with(&path, &options) {
+    let _ = import::fingerprint(&path, &Bounds::default());
+    if let Ok(scene) = import::read_scene_with(&path, &options, &Bounds::default()) {
         prop_assert!(scene.validate().is_ok());
         for o in &scene.objects {
             prop_assert!(
@@ -307,7 +307,7 @@ fn the_undamaged_files_are_read() {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).expect("writes");
         if !name.ends_with(".obj") {
-            import::read_scene_with(&path, &options).expect(name);
+            import::read_scene_with(&path, &options, &Bounds::default()).expect(name);
         }
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use common::data_uri;
 use picofarm_scene::{
     Bsdf, Distribution, LaserGrid, Scene, SceneError, Vec3, export,
-    import::{ImportOptions, read_reference_json, read_scene, read_scene_with},
+    import::{Bounds, ImportOptions, read_reference_json, read_scene, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
 
@@ -101,7 +101,7 @@ fn a_missing_camera_or_laser_is_named_and_can_be_stated() {
         laser: LaserGrid::new(25),
         ..ImportOptions::default()
     };
-    let scene = read_scene_with(&dark, &options).expect("the grid is stated");
+    let scene = read_scene_with(&dark, &options, &Bounds::default()).expect("the grid is stated");
     assert_eq!(scene.laser.beams.len(), 25);
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use picofarm_scene::{
     Bsdf, Distribution, LaserGrid, Scene, SceneError, Vec3, export,
-    import::{self, ImportOptions, read_scene, read_scene_with},
+    import::{self, Bounds, ImportOptions, read_scene, read_scene_with},
 };
 
 /// Object, corners, texture coordinates and material.
@@ -343,12 +343,12 @@ fn files_that_a_scene_refers_to_are_part_of_its_fingerprint() {
     let folder = tempfile::tempdir().expect("a folder");
     let path: PathBuf = folder.path().join("scene.xml");
     export::write_mitsuba(&common::textured_room(), &path).expect("writes");
-    let before = import::fingerprint(&path).expect("hashes");
+    let before = import::fingerprint(&path, &Bounds::default()).expect("hashes");
     let change = |file: &Path| {
         let mut bytes = std::fs::read(file).expect("the file");
         *bytes.last_mut().expect("bytes") ^= 1;
         std::fs::write(file, bytes).expect("writes");
-        import::fingerprint(&path).expect("hashes")
+        import::fingerprint(&path, &Bounds::default()).expect("hashes")
     };
     let after = change(&folder.path().join("meshes/0000-0.ply"));
     assert_ne!(before, after);
@@ -367,6 +367,6 @@ fn a_grid_stated_on_import_replaces_the_beams() {
         laser: LaserGrid::new(4),
         ..ImportOptions::default()
     };
-    let scene = read_scene_with(&path, &options).expect("reads");
+    let scene = read_scene_with(&path, &options, &Bounds::default()).expect("reads");
     assert_eq!(scene.laser.beams.len(), 4);
 }

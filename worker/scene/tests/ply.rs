@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use picofarm_scene::{
     LaserGrid, Scene, SceneError, export,
-    import::{ImportOptions, read_scene_with},
+    import::{Bounds, ImportOptions, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
 
@@ -66,7 +66,7 @@ fn read(name: &str, bytes: &[u8], frame: bool) -> Result<Scene, SceneError> {
         frame,
         ..ImportOptions::default()
     };
-    read_scene_with(&path, &options)
+    read_scene_with(&path, &options, &Bounds::default())
 }
 
 #[test]

@@ -34,12 +34,12 @@ pub enum Budget {
 #[serde(default, deny_unknown_fields)]
 pub struct Strategy {
     /// Side in pixels of the tiles that share vertices, 1 to 16; 1 = every pixel by itself.
-    pub share: Option<u32>,
+    pub path_reuse: Option<u32>,
     /// Walks connect to light vertices drawn from the spots.
     pub light_vertices: Option<bool>,
     /// Aim at the spots' mirror images in planar near-mirrors.
-    pub image_lobes: Option<bool>,
-    /// Light paths from the spots for what comes by way of near-mirrors that have no image lobes: curved
+    pub mirror_images: Option<bool>,
+    /// Light paths from the spots for what comes by way of near-mirrors that have no mirror images: curved
     /// ones, and several in a row.
     pub caustics: Option<bool>,
     /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
@@ -77,6 +77,35 @@ pub trait Progress: Sync {
     fn at(&self, done: f32) -> bool;
 }
 
+/// Nobody stops it.
+pub(crate) struct Unstopped;
+
+impl Progress for Unstopped {
+    fn at(&self, _: f32) -> bool {
+        true
+    }
+}
+
+/// Asks between steps, and within long ones, whether to stop. What is cut short by it is thrown away: whoever uses it
+/// ends with [`Stop::check`].
+#[derive(Clone, Copy)]
+pub(crate) struct Stop<'a>(pub &'a dyn Progress);
+
+impl Stop<'_> {
+    /// Whether to stop.
+    pub fn asked(self) -> bool {
+        !self.0.at(0.0)
+    }
+
+    /// The same as an error.
+    pub fn check(self) -> Result<(), RenderError> {
+        match self.asked() {
+            true => Err(RenderError::Stopped),
+            false => Ok(()),
+        }
+    }
+}
+
 /// A finished render.
 #[derive(Debug, Clone)]
 pub struct Rendered {
@@ -104,6 +133,9 @@ pub struct Rendered {
     pub plan: Plan,
     /// Rays traced.
     pub rays: u64,
+    /// What somebody should know before trusting it: beams that meet nothing, an image without light. No part of what is
+    /// stored: it says nothing that the stored data do not.
+    pub warnings: Vec<String>,
 }
 
 /// The exactly-two-bounce part and the 3+ part with standard errors, each `[row][col][bin]`.
@@ -170,7 +202,7 @@ pub struct ErrorEstimate {
 /// What the renderer decided for this scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
-    /// Strategies used, e.g. `two-bounce deterministic 4x4`, `image lobes: 2 planar mirrors`.
+    /// Strategies used, e.g. `two-bounce deterministic 4x4`, `mirror images: 2 planar mirrors`.
     pub strategies: Vec<String>,
     /// What is approximated or noisy here, in words; empty if nothing.
     pub approximations: Vec<String>,
@@ -184,12 +216,20 @@ pub enum RenderError {
     Invalid {
         /// Field, e.g. `gate.bin_width_m`.
         field: String,
-        /// What was expected and how to mend it.
+        /// What was expected and how to correct it.
         what: String,
     },
     /// The scene is unusable.
     #[error(transparent)]
     Scene(#[from] picofarm_scene::SceneError),
+    /// The histograms find no room in memory.
+    #[error("{what} take {gib:.1} GiB of memory, which this process does not get")]
+    Memory {
+        /// What they are.
+        what: String,
+        /// How much they take.
+        gib: f64,
+    },
     /// [`Progress::at`] asked to stop.
     #[error("render stopped on request")]
     Stopped,

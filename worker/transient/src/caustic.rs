@@ -6,12 +6,12 @@
 //! lobe (a mix of two lobes counts as the lobe that scattered). A path belongs to light paths where
 //!
 //! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point z;
-//! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::lobe`] knows and the spot is
+//! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::mirror_images`] knows and the spot is
 //!    Lambertian: those have images to aim at;
 //! 3. z is what the camera sees directly, or the event before z (read from the camera) is not specular.
 //!
 //! Light paths cover that class and nothing else: z is drawn into the image where the camera sees it, and
-//! is a light vertex ([`crate::pool`]) for every other point. [`crate::walk`] leaves out just these:
+//! is a light vertex ([`crate::light_vertices`]) for every other point. [`crate::walk`] leaves out just these:
 //! [`crate::walk::Vertex::open`] carries condition 3 along a camera path. What is left to chance are
 //! caustics seen by way of a near-mirror.
 //!
@@ -21,10 +21,11 @@
 use picofarm_scene::{Material, Vec3};
 
 use crate::{
+    api::Stop,
     bvh::Stack,
     emitter::Emitters,
     film::Film,
-    pool::LightVertex,
+    light_vertices::LightVertex,
     rng::{Rng, Stream},
     walk::Walk,
     world::{Hit, World, lift},
@@ -101,7 +102,7 @@ fn pick(sums: &[f64], at: f64) -> Option<(usize, f64, f64)> {
 
 impl Caustics {
     /// The near-mirrors of a scene; `None` where there are none.
-    pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
+    pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Option<Self> {
         let narrow = |t: usize| {
             let s = &world.surfaces[world.surface[t] as usize];
             let lobe = s.alpha > 0.0 && s.alpha <= Material::SPECULAR_ALPHA && s.strength > 0.0;
@@ -126,15 +127,18 @@ impl Caustics {
             rows: vec![],
             spots: vec![],
         };
-        table.weigh(world, emitters);
+        table.weigh(world, emitters, stop)?;
         Some(table)
     }
 
-    /// Fills the running sums.
-    fn weigh(&mut self, world: &World, emitters: &Emitters) {
+    /// Fills the running sums; `None` where the render shall stop.
+    fn weigh(&mut self, world: &World, emitters: &Emitters, stop: Stop) -> Option<()> {
         let apart = self.triangles.len() * emitters.list.len() <= TABLE;
         let mut spots = 0.0;
         for e in &emitters.list {
+            if stop.asked() {
+                return None;
+            }
             // A narrow lobe is not to be judged by the middle of a triangle.
             let wide = e.surface.diffuse() || e.surface.alpha > Material::SPECULAR_ALPHA;
             let mut sum = 0.0;
@@ -167,6 +171,7 @@ impl Caustics {
                 sum
             }));
         }
+        Some(())
     }
 
     /// A spot's row of running sums.

@@ -3,7 +3,7 @@
 use picofarm_scene::{Beam, Scene, Spot, Vec3};
 
 use crate::{
-    api::RenderError,
+    api::{RenderError, Stop, Unstopped},
     bsdf::Surface,
     bvh::Stack,
     world::{World, lift},
@@ -20,7 +20,7 @@ const MAX_REFLECTIONS: u32 = 64;
 /// [`RenderError::Scene`] where the scene is invalid.
 pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
     scene.validate()?;
-    let world = World::new(scene)?;
+    let world = World::new(scene, Stop(&Unstopped))?;
     Ok(find_spots(&world, &scene.laser.beams))
 }
 

@@ -5,6 +5,7 @@ use picofarm_scene::Vec3;
 use rayon::prelude::*;
 
 use crate::{
+    api::{RenderError, Stop},
     bsdf::frame,
     bvh::Stack,
     rng::{Rng, Stream},
@@ -27,7 +28,7 @@ struct Lamp {
 }
 
 /// Linear RGB in [0, 1], `[row][col][3]`, and the rays traced.
-pub(crate) fn photo(world: &World, seed: u64) -> (Vec<f32>, u64) {
+pub(crate) fn photo(world: &World, seed: u64, stop: Stop) -> Result<(Vec<f32>, u64), RenderError> {
     let i = world.camera.intrinsics;
     let (width, height) = (i.width as usize, i.height as usize);
     let mut rgb = vec![0.0f32; 3 * width * height];
@@ -35,29 +36,56 @@ pub(crate) fn photo(world: &World, seed: u64) -> (Vec<f32>, u64) {
     let rays = rgb
         .par_chunks_mut(3 * width)
         .enumerate()
-        .map(|(row, out)| {
-            let mut stack = world.bvh.stack();
-            for (col, pixel) in out.chunks_mut(3).enumerate() {
-                let mut rng = Rng::new(seed, Stream::Photo, (row * width + col) as u64, 0);
-                let mut sum = [0.0f32; 3];
-                for s in 0..SIDE * SIDE {
-                    let (a, b) = ((s % SIDE) as f32 + 0.5, (s / SIDE) as f32 + 0.5);
-                    let (x, y) = (col as f32 + a / SIDE as f32, row as f32 + b / SIDE as f32);
-                    let d = world.camera.ray(x, y).normalized();
-                    let light = lamp.point(&mut rng, s);
-                    let c = shade(world, &lamp, light, &mut stack, d);
-                    for k in 0..3 {
-                        sum[k] += c[k];
-                    }
-                }
-                for k in 0..3 {
-                    pixel[k] = (sum[k] / (SIDE * SIDE) as f32).clamp(0.0, 1.0);
-                }
-            }
-            stack.rays
+        .map(|(row, out)| match stop.asked() {
+            true => 0,
+            false => draw(world, &lamp, (row, seed), out),
         })
         .sum();
-    (rgb, rays)
+    stop.check()?;
+    Ok((rgb, rays))
+}
+
+/// About how many rays it takes: from every `step`-th row.
+pub(crate) fn rays(world: &World, seed: u64, step: usize) -> u64 {
+    let i = world.camera.intrinsics;
+    let lamp = lamp(world);
+    let rows: Vec<usize> = (0..i.height as usize).step_by(step).collect();
+    let some: u64 = rows
+        .into_par_iter()
+        .map(|row| {
+            draw(
+                world,
+                &lamp,
+                (row, seed),
+                &mut vec![0.0; 3 * i.width as usize],
+            )
+        })
+        .sum();
+    some * step as u64
+}
+
+/// Draws a row; returns the rays.
+fn draw(world: &World, lamp: &Lamp, (row, seed): (usize, u64), out: &mut [f32]) -> u64 {
+    let mut stack = world.bvh.stack();
+    let width = out.len() / 3;
+    for (col, pixel) in out.chunks_mut(3).enumerate() {
+        let mut rng = Rng::new(seed, Stream::Photo, (row * width + col) as u64, 0);
+        let mut sum = [0.0f32; 3];
+        for s in 0..SIDE * SIDE {
+            let (a, b) = ((s % SIDE) as f32 + 0.5, (s / SIDE) as f32 + 0.5);
+            let (x, y) = (col as f32 + a / SIDE as f32, row as f32 + b / SIDE as f32);
+            let d = world.camera.ray(x, y).normalized();
+            let light = lamp.point(&mut rng, s);
+            let c = shade(world, lamp, light, &mut stack, d);
+            for k in 0..3 {
+                sum[k] += c[k];
+            }
+        }
+        for k in 0..3 {
+            pixel[k] = (sum[k] / (SIDE * SIDE) as f32).clamp(0.0, 1.0);
+        }
+    }
+    stack.rays
 }
 
 /// Places the lamp over the space in front of the camera, below whatever is above it.

@@ -2,7 +2,7 @@
 
 use crate::{
     api::{Plan, Settings},
-    two::Sampling,
+    two_bounce::Sampling,
     walk::Walk,
 };
 
@@ -33,7 +33,7 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
         let mirrors = walk.mirrors;
         let planes = mirrors.list.len();
         if planes > 0 {
-            strategies.push(format!("image lobes: {planes} planar mirrors"));
+            strategies.push(format!("mirror images: {planes} planar mirrors"));
         }
         let curved = mirrors.curved_share > 0.01;
         if walk.caustics.is_some() {

@@ -7,6 +7,7 @@ mod part;
 mod ready;
 mod splat;
 mod tile;
+mod warn;
 
 use picofarm_scene::Scene;
 
@@ -21,8 +22,8 @@ pub use self::{
     part::{Part, PartOf, join_parts, render_part},
 };
 use crate::{
-    api::{Budget, Progress, RenderError, Rendered, Settings},
-    two::Sampling,
+    api::{Budget, Progress, RenderError, Rendered, Settings, Stop, Unstopped},
+    two_bounce::Sampling,
 };
 
 /// Most passes that [`Budget::Error`] spends.
@@ -45,7 +46,9 @@ pub fn render(
     settings: &Settings,
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
-    prepare(scene, settings, |ready| whole(ready, progress))
+    prepare(scene, settings, Stop(progress), |ready| {
+        whole(ready, progress)
+    })
 }
 
 /// What [`render`] would do, from a few small tiles of the image instead of all of it. Runs on the
@@ -54,23 +57,26 @@ pub fn render(
 /// # Errors
 /// Those of [`render`].
 pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError> {
-    prepare(scene, settings, |ready| {
+    prepare(scene, settings, Stop(&Unstopped), |ready| {
         let plan = ready.plan(ready.first_passes());
-        let rays = ready.seen().1;
-        Ok(forecast::forecast(
-            &ready.frame,
-            &settings.budget,
-            plan,
-            rays,
-        ))
+        let rays = ready.seen_rays();
+        let forecast = forecast::forecast(&ready.frame, &settings.budget, plan, rays);
+        Ok(Forecast {
+            warnings: ready.foreseen(),
+            ..forecast
+        })
     })
 }
 
 fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError> {
-    let seen = ready.seen();
-    let frame = &ready.frame;
-    let mut image = Image::new(frame);
-    let mut splats = frame.walk.caustics.map(|c| (c, Splats::new(frame)));
+    let (frame, stop) = (&ready.frame, Stop(progress));
+    // Before anything that takes long: where there is no room, it is known at once.
+    let mut image = Image::new(frame)?;
+    let mut splats = match frame.walk.caustics {
+        Some(caustics) => Some((caustics, Splats::new(frame)?)),
+        None => None,
+    };
+    let seen = ready.seen(stop)?;
     let walks = ready.walks();
     let passes = ready.first_passes();
     let mut waves = vec![passes; image.tiles()];
@@ -90,7 +96,7 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
             Some((caustics, splats)) => {
                 let wave = image.mean_passes() - before;
                 rays += splats.round((frame, caustics), wave, &watch)?;
-                splats.estimate(frame, &image)
+                splats.estimate(frame, &image, stop)?
             }
         };
         let Budget::Error(target) = budget else {
@@ -99,18 +105,28 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
         if !walks || error.median_relative <= target || error.samples >= MAX_PASSES {
             break error;
         }
-        waves = further(&image, frame.sampling, target, error.samples);
+        waves = further(&image, frame.sampling, target, error.samples, stop)?;
     };
     let plan = ready.plan(passes);
     let splats = splats.map(|(_, splats)| splats);
-    Ok(ready.finish((image, splats), seen, (error, rays), plan))
+    ready.finish((image, splats), seen, (error, rays), (plan, stop))
 }
 
 /// How many more passes each tile needs for the median error of the image to reach `target`. What the
 /// image needs on average is shared out by what the tiles need themselves, within a factor of two: tiles
 /// that are easy stop early, and no tile holds up all others.
-fn further(image: &Image, sampling: &Sampling, target: f32, spent: u32) -> Vec<u32> {
-    let two = |n| sampling.variance(n);
+fn further(
+    image: &Image,
+    sampling: &Sampling,
+    target: f32,
+    spent: u32,
+    stop: Stop,
+) -> Result<Vec<u32>, RenderError> {
+    let two = |n| match stop.asked() {
+        // Whatever comes out of it is not used.
+        true => 0.0,
+        false => sampling.variance(n),
+    };
     let target = GOAL * target;
     let all = passes_for(&image.stats, spent, target, (spent + 1, MAX_PASSES), two);
     let own = |(spent, stats): (u32, Vec<Stat>)| {
@@ -118,9 +134,11 @@ fn further(image: &Image, sampling: &Sampling, target: f32, spent: u32) -> Vec<u
         let need = passes_for(&stats, spent, target, range, two);
         need.saturating_sub(spent)
     };
-    let waves: Vec<u32> = image.by_tile().map(own).collect();
+    let tiles = image.by_tile().take_while(|_| !stop.asked());
+    let waves: Vec<u32> = tiles.map(own).collect();
+    stop.check()?;
     if waves.iter().all(|&n| n == 0) {
-        return vec![(spent / 8).max(1); waves.len()];
+        return Ok(vec![(spent / 8).max(1); waves.len()]);
     }
-    waves
+    Ok(waves)
 }

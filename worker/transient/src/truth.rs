@@ -4,8 +4,8 @@ use picofarm_scene::{Scene, Vec3};
 use rayon::prelude::*;
 
 use crate::{
-    api::GroundTruth,
-    emitter::Emitters,
+    api::{GroundTruth, RenderError, Stop},
+    emitter::{Emitter, Emitters},
     world::{Hit, World},
 };
 
@@ -19,11 +19,14 @@ pub(crate) struct Centres {
 }
 
 /// Traces the centres.
-pub(crate) fn centres(world: &World) -> Centres {
+pub(crate) fn centres(world: &World, stop: Stop) -> Result<Centres, RenderError> {
     let i = world.camera.intrinsics;
     let rows: Vec<(Vec<Option<Hit>>, u64)> = (0..i.height)
         .into_par_iter()
         .map(|row| {
+            if stop.asked() {
+                return (vec![], 0);
+            }
             let mut stack = world.bvh.stack();
             let hits = (0..i.width)
                 .map(|col| {
@@ -34,22 +37,23 @@ pub(crate) fn centres(world: &World) -> Centres {
             (hits, stack.rays)
         })
         .collect();
+    stop.check()?;
     let rays = rows.iter().map(|r| r.1).sum();
-    Centres {
+    Ok(Centres {
         hits: rows.into_iter().flat_map(|r| r.0).collect(),
         rays,
-    }
+    })
 }
 
 /// Everything but the companion image, and the rays it took. Visibility is per beam; a beam without a spot
 /// lights nothing.
 pub(crate) fn ground_truth(
     scene: &Scene,
-    world: &World,
-    emitters: &Emitters,
+    (world, emitters): (&World, &Emitters),
     centres: &Centres,
     beams: usize,
-) -> (GroundTruth, u64) {
+    stop: Stop,
+) -> Result<(GroundTruth, u64), RenderError> {
     let i = world.camera.intrinsics;
     let count = i.width as usize * i.height as usize;
     let mut truth = GroundTruth {
@@ -75,28 +79,46 @@ pub(crate) fn ground_truth(
         truth.label[k] = scene.objects[object as usize].label + 1;
         truth.specular[k] = u8::from(h.surface.specular);
     }
-    let hits = &centres.hits;
     let mut rays = 0;
     for e in &emitters.list {
         let plane = &mut truth.visibility[e.beam * count..(e.beam + 1) * count];
         rays += plane
             .par_chunks_mut(i.width as usize)
             .enumerate()
-            .map(|(row, out)| {
-                let mut stack = world.bvh.stack();
-                for (col, lit) in out.iter_mut().enumerate() {
-                    let Some(h) = &hits[row * i.width as usize + col] else {
-                        continue;
-                    };
-                    let to = e.p - h.p;
-                    // Points on the spot's own wall see it at a right angle, give or take rounding.
-                    let slack = 1e-3 * to.length();
-                    let facing = h.n.dot(to) > -slack && e.n.dot(to) < slack;
-                    *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n));
-                }
-                stack.rays
+            .map(|(row, out)| match stop.asked() {
+                true => 0,
+                false => lit(world, e, row, &centres.hits, out),
             })
             .sum::<u64>();
+        stop.check()?;
     }
-    (truth, rays)
+    Ok((truth, rays))
+}
+
+/// Which pixels of a row a spot lights; returns the rays.
+fn lit(world: &World, e: &Emitter, row: usize, hits: &[Option<Hit>], out: &mut [u8]) -> u64 {
+    let mut stack = world.bvh.stack();
+    let first = row * out.len();
+    for (lit, hit) in out.iter_mut().zip(&hits[first..]) {
+        let Some(h) = hit else { continue };
+        let to = e.p - h.p;
+        // Points on the spot's own wall see it at a right angle, give or take rounding.
+        let slack = 1e-3 * to.length();
+        let facing = h.n.dot(to) > -slack && e.n.dot(to) < slack;
+        *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n));
+    }
+    stack.rays
+}
+
+/// About how many rays the truth takes beside the centres': from every `step`-th row.
+pub(crate) fn rays(world: &World, emitters: &Emitters, centres: &Centres, step: usize) -> u64 {
+    let width = world.camera.intrinsics.width as usize;
+    let rows = (0..world.camera.intrinsics.height as usize).step_by(step);
+    let some: u64 = rows
+        .flat_map(|row| emitters.list.iter().map(move |e| (row, e)))
+        .collect::<Vec<_>>()
+        .into_par_iter()
+        .map(|(row, e)| lit(world, e, row, &centres.hits, &mut vec![0; width]))
+        .sum();
+    some * step as u64
 }

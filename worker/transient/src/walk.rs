@@ -12,8 +12,8 @@ use crate::{
     caustic::Caustics,
     ellipsoid::{Patches, Window},
     emitter::Emitters,
-    lobe::Mirrors,
-    pool::Pool,
+    light_vertices::LightVertices,
+    mirror_images::Mirrors,
     rng::Rng,
     world::{Hit, World, lift},
 };
@@ -108,9 +108,9 @@ pub(crate) struct Scratch {
     /// Weights of light vertices.
     lights: Vec<f32>,
     /// Light vertices that walks connect to.
-    pub pool: Pool,
+    pub vertices: LightVertices,
     /// Light vertices beyond near-mirrors.
-    pub caustics: Pool,
+    pub caustics: LightVertices,
 }
 
 impl Scratch {
@@ -120,8 +120,8 @@ impl Scratch {
             weights: vec![0.0; emitters.list.len()],
             images: vec![0.0; mirrors.choices()],
             lights: vec![],
-            pool: Pool::default(),
-            caustics: Pool::default(),
+            vertices: LightVertices::default(),
+            caustics: LightVertices::default(),
         }
     }
 }

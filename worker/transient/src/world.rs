@@ -7,7 +7,7 @@ use std::sync::Arc;
 use picofarm_scene::{Camera, Material, Scene, Texture, Vec3};
 
 use crate::{
-    api::RenderError,
+    api::{RenderError, Stop},
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
 };
@@ -65,7 +65,7 @@ pub(crate) struct Hit {
 impl World {
     /// # Errors
     /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
-    pub fn new(scene: &Scene) -> Result<Self, RenderError> {
+    pub fn new(scene: &Scene, stop: Stop) -> Result<Self, RenderError> {
         let origin = scene.camera.origin;
         let wide = |v: Vec3| [f64::from(v.x), f64::from(v.y), f64::from(v.z)];
         let centre = wide(origin);
@@ -78,6 +78,7 @@ impl World {
             .any(|o| o.mesh.materials.iter().any(textured));
         let (mut textures, mut uv, mut first_surface) = (vec![], vec![], vec![]);
         for (index, o) in scene.objects.iter().enumerate() {
+            stop.check()?;
             let first = surfaces.len() as u32;
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
@@ -130,7 +131,7 @@ impl World {
             .map(|t| normal(t).unwrap_or_default())
             .collect();
         Ok(Self {
-            bvh: Bvh::build(&triangles),
+            bvh: Bvh::build_unless(&triangles, stop)?,
             triangles,
             normals,
             surface,

@@ -409,7 +409,7 @@ fn light_vertices_leave_nothing_out_on_glossy_surfaces() {
 }
 
 #[test]
-fn light_paths_by_way_of_a_planar_mirror_agree_with_its_image_lobes() {
+fn light_paths_by_way_of_a_planar_mirror_agree_with_its_mirror_images() {
     let floor = quad(
         v(-1.5, -1.2, 1.0),
         v(3.0, 0.0, 0.0),
@@ -420,7 +420,7 @@ fn light_paths_by_way_of_a_planar_mirror_agree_with_its_image_lobes() {
     let make = |caustics: bool, passes| {
         let strategy = Strategy {
             caustics: Some(caustics),
-            image_lobes: Some(!caustics),
+            mirror_images: Some(!caustics),
             ..Strategy::default()
         };
         move |seed| Settings {

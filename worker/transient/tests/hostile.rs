@@ -234,7 +234,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                 } else {
                     budget
                 };
-                let (share, light_vertices, image_lobes) = strategy;
+                let (share, light_vertices, mirror_images) = strategy;
                 Settings {
                     gate: Gate {
                         start_m,
@@ -248,9 +248,9 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                     split,
                     groups: vec![],
                     strategy: Strategy {
-                        share,
+                        path_reuse: share,
                         light_vertices,
-                        image_lobes,
+                        mirror_images,
                         ..Strategy::default()
                     },
                 }

@@ -1,4 +1,4 @@
-//! Near-mirrors: image lobes against the light of a virtual source, and what the plan says.
+//! Near-mirrors: mirror images against the light of a virtual source, and what the plan says.
 
 mod common;
 
@@ -60,7 +60,7 @@ fn light_by_way_of_a_planar_mirror_is_that_of_the_spots_image() {
         r.plan
             .strategies
             .iter()
-            .any(|s| s.contains("image lobes: 1"))
+            .any(|s| s.contains("mirror images: 1"))
     );
     assert!(r.plan.approximations.is_empty());
     let multi = r.split.unwrap().multi;
@@ -97,7 +97,7 @@ fn a_curved_near_mirror_is_named_as_noisy_where_no_light_paths_go() {
         settings.strategy.caustics = Some(caustics);
         let r = render(&stage(ball.clone()), &settings, &Quiet).unwrap();
         let named = |all: &[String], what: &str| all.iter().any(|s| s.contains(what));
-        assert!(!named(&r.plan.strategies, "image lobes"));
+        assert!(!named(&r.plan.strategies, "mirror images"));
         assert_eq!(named(&r.plan.strategies, "light paths"), caustics);
         assert_eq!(named(&r.plan.approximations, "curved"), !caustics);
     }

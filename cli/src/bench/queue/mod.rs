@@ -1,6 +1,7 @@
 //! `picofarm bench queue`: the scheduler without the work. Simulated workers speak the real protocol over gRPC with a
 //! coordinator in a process of its own, and every task is committed for good; only rendering is left out.
 
+mod beside;
 mod raw;
 mod server;
 mod stats;
@@ -38,6 +39,7 @@ struct Report {
     submit: Vec<Submit>,
     throughput: Option<Throughput>,
     fleets: Vec<Fleet>,
+    beside: Option<beside::Beside>,
 }
 
 /// How long it took to submit a job.
@@ -106,6 +108,7 @@ pub async fn run(args: BenchQueue, output: Output, stop: &CancellationToken) -> 
         submit: Vec::new(),
         throughput: None,
         fleets: Vec::new(),
+        beside: None,
     };
     let bench = Bench {
         place,
@@ -121,6 +124,9 @@ pub async fn run(args: BenchQueue, output: Output, stop: &CancellationToken) -> 
     }
     for workers in &args.fleet {
         report.fleets.push(bench.fleet(*workers).await?);
+    }
+    if args.plans > 0 {
+        report.beside = Some(bench.beside().await?);
     }
     output.result(&report, || describe(&report));
     Ok(())
@@ -424,6 +430,9 @@ fn describe(report: &Report) -> String {
             ]));
         }
         text += &format!("\n{}", table(&rows));
+    }
+    if let Some(beside) = &report.beside {
+        text += &format!("\n{}", beside.describe());
     }
     text
 }

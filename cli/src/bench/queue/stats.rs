@@ -121,6 +121,11 @@ impl Stats {
         latency(self.told().lease.clone())
     }
 
+    /// The heartbeats since the last time this was asked.
+    pub fn heartbeats_since(&self) -> Latency {
+        latency(std::mem::take(&mut self.told().heartbeat))
+    }
+
     pub fn heartbeat(&self) -> Latency {
         latency(self.told().heartbeat.clone())
     }

@@ -41,6 +41,8 @@ pub struct Simulated {
     done_at: Option<Instant>,
     /// When a lease was asked for, for each that was not received yet.
     asked: VecDeque<Instant>,
+    /// It has been connected before.
+    welcomed: bool,
 }
 
 struct Held {
@@ -65,6 +67,7 @@ impl Simulated {
             version: env!("CARGO_PKG_VERSION").into(),
             protocol: PROTOCOL,
             held: Vec::new(),
+            ended: String::new(),
             abilities: Abilities {
                 kinds: [("render".to_owned(), RENDERER.to_owned())].into(),
                 cores: 1,
@@ -80,17 +83,17 @@ impl Simulated {
             unacknowledged: BTreeMap::new(),
             done_at: None,
             asked: VecDeque::new(),
+            welcomed: false,
         }
     }
 
     /// Works until `stop`, connecting again whenever the connection is lost.
     pub async fn live(mut self, stop: CancellationToken) {
-        let mut again = false;
         loop {
-            match self.session(again, &stop).await {
+            match self.session(&stop).await {
                 End::Stopped => return,
                 End::Refused(why) => return self.stats.fail(why),
-                End::Lost => again = true,
+                End::Lost => {}
             }
             // Jittered, as the real worker's.
             let wait = Duration::from_millis(100 + u64::from(Uuid::new_v4().as_bytes()[0]));
@@ -101,7 +104,7 @@ impl Simulated {
         }
     }
 
-    async fn session(&mut self, again: bool, stop: &CancellationToken) -> End {
+    async fn session(&mut self, stop: &CancellationToken) -> End {
         let Ok(mut client) = FarmClient::connect(self.url.clone()).await else {
             return End::Lost;
         };
@@ -130,7 +133,9 @@ impl Simulated {
             })) => w,
             Ok(_) | Err(_) => return End::Lost,
         };
-        self.stats.welcomed(again);
+        // An attempt that was lost before the first welcome is no reconnect.
+        self.stats.welcomed(self.welcomed);
+        self.welcomed = true;
         for report in self.unacknowledged.values() {
             say(&to, Say::Done(report.clone().into()));
         }

@@ -1,8 +1,8 @@
--- As the SQLite schema beside it; times are Unix milliseconds by this server's clock. What differs: houses, and owners
--- that are houses.
+-- As the SQLite schema beside it; times are Unix milliseconds by this server's clock. What differs: instances, and owners
+-- that are instances.
 
 -- Coordinators at work. One whose time is up is lost: whoever finds it removes it and takes over its ranges.
-CREATE TABLE house (
+CREATE TABLE instance (
     id      UUID PRIMARY KEY,
     name    TEXT NOT NULL,
     workers BIGINT NOT NULL,
@@ -22,10 +22,11 @@ CREATE TABLE job (
     reused       BIGINT,
     dead         BIGINT,
     timed        BIGINT NOT NULL DEFAULT 0,
-    seconds      DOUBLE PRECISION NOT NULL DEFAULT 0
+    seconds      DOUBLE PRECISION NOT NULL DEFAULT 0,
+    superseded   BOOLEAN NOT NULL DEFAULT FALSE
 );
 CREATE INDEX job_by_hash ON job (spec_hash);
-CREATE UNIQUE INDEX job_live ON job (spec_hash) WHERE state <= 1;
+CREATE UNIQUE INDEX job_live ON job (spec_hash) WHERE state <= 1 AND NOT superseded;
 
 CREATE TABLE result_set (
     key       BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
@@ -45,8 +46,8 @@ CREATE TABLE stage (
 );
 CREATE INDEX stage_by_set ON stage (result_set);
 
--- Few rows that change often: vacuumed early, and with room for new versions on their pages. No foreign key to house:
--- a lost house's ranges keep its id for the moment between its removal and their taking over (one transaction).
+-- Few rows that change often: vacuumed early, and with room for new versions on their pages. No foreign key to instance:
+-- a lost instance's ranges keep its id for the moment between its removal and their taking over (one transaction).
 CREATE TABLE task_range (
     id              UUID PRIMARY KEY,
     stage           BIGINT NOT NULL REFERENCES stage (key),
@@ -78,6 +79,7 @@ CREATE TABLE output (
     seconds    DOUBLE PRECISION NOT NULL,
     epoch      BIGINT NOT NULL,
     adopted    BOOLEAN NOT NULL,
+    checked    BOOLEAN NOT NULL DEFAULT FALSE,
     PRIMARY KEY (result_set, task)
 );
 

@@ -1,6 +1,7 @@
 -- Jobs, their ranges, and the outputs that outlive them. Ids are 16-byte UUIDs; times are Unix milliseconds.
 
--- `tasks` and what follows are filled in when the job ends.
+-- `tasks` to `seconds` are filled in when the job ends. `superseded`: it was done, its results are gone, and another job
+-- makes them again.
 CREATE TABLE job (
     key          INTEGER PRIMARY KEY,
     id           BLOB NOT NULL UNIQUE,
@@ -14,11 +15,12 @@ CREATE TABLE job (
     reused       INTEGER,
     dead         INTEGER,
     timed        INTEGER NOT NULL DEFAULT 0,
-    seconds      REAL NOT NULL DEFAULT 0
+    seconds      REAL NOT NULL DEFAULT 0,
+    superseded   INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE INDEX job_by_hash ON job (spec_hash);
--- One job for each spec, but for those that ended badly.
-CREATE UNIQUE INDEX job_live ON job (spec_hash) WHERE state <= 1;
+-- One job for each spec, but for those that ended badly and those whose results are gone.
+CREATE UNIQUE INDEX job_live ON job (spec_hash) WHERE state <= 1 AND superseded = 0;
 
 -- Where results of one kind live: a data set in a store, and what shapes its results.
 CREATE TABLE result_set (
@@ -62,7 +64,7 @@ CREATE TABLE task_range (
 CREATE INDEX task_range_by_stage ON task_range (stage, state, lo);
 CREATE INDEX task_range_by_end ON task_range (stage, state, hi);
 
--- Committed results: written once, never changed.
+-- Committed results: written once, never changed. `checked`: the store was found to hold this manifest.
 CREATE TABLE output (
     result_set INTEGER NOT NULL REFERENCES result_set (key),
     task       INTEGER NOT NULL,
@@ -71,6 +73,7 @@ CREATE TABLE output (
     seconds    REAL NOT NULL,
     epoch      INTEGER NOT NULL,
     adopted    INTEGER NOT NULL,
+    checked    INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (result_set, task)
 ) STRICT, WITHOUT ROWID;
 

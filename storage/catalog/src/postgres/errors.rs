@@ -1,6 +1,8 @@
 //! Postgres' answers in words a person can act on.
 
-use sqlx::postgres::PgConnectOptions;
+use std::time::Duration;
+
+use sqlx::{Connection, PgConnection, postgres::PgConnectOptions};
 
 use crate::CatalogError;
 
@@ -28,6 +30,23 @@ pub(super) fn bad_url(_: &str, error: &sqlx::Error) -> CatalogError {
     }
 }
 
+/// Why no connection came about. A pool tries again while a port refuses, and in the end only says that time is up: one
+/// attempt of our own tells why.
+pub(super) async fn unconnected(
+    place: &str,
+    options: &PgConnectOptions,
+    error: sqlx::Error,
+) -> CatalogError {
+    const PROBE: Duration = Duration::from_secs(3);
+    if matches!(error, sqlx::Error::PoolTimedOut) {
+        let probe = PgConnection::connect_with(options);
+        if let Ok(Err(cause)) = tokio::time::timeout(PROBE, probe).await {
+            return classify(place, cause);
+        }
+    }
+    classify(place, error)
+}
+
 /// The error a person can act on. Codes: Postgres, appendix A.
 pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
     let place = place.to_owned();
@@ -51,6 +70,12 @@ pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
             return server("no connection came about in time; is the server overloaded, or its limit of connections reached?".into());
         }
         sqlx::Error::PoolClosed => return CatalogError::Closed,
+        sqlx::Error::Encode(_) => {
+            return CatalogError::Refused {
+                place,
+                what: error.to_string(),
+            };
+        }
         _ => {}
     }
     let code = error
@@ -78,7 +103,12 @@ pub(super) fn classify(place: &str, error: sqlx::Error) -> CatalogError {
         Some("57P01" | "57P02" | "57P03") => {
             server(format!("{said}; the server is stopping or starting"))
         }
-        Some("23505" | "23503" | "23514" | "40001" | "40P01") => {
+        // Of the content: data exceptions, limits of the program, NOT NULL and CHECK.
+        Some(code) if code.starts_with("22") || code.starts_with("54") => {
+            CatalogError::Refused { place, what: said }
+        }
+        Some("23502" | "23514") => CatalogError::Refused { place, what: said },
+        Some("23505" | "23503" | "40001" | "40P01") => {
             CatalogError::Conflict(format!("{said} ({})", code.unwrap_or_default()))
         }
         _ => CatalogError::Database {

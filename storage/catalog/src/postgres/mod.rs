@@ -1,13 +1,14 @@
-//! The catalog in Postgres, for several coordinators at once; see the crate's documentation for houses.
+//! The catalog in Postgres, for several coordinators at once; see the crate's documentation for instances.
 //!
 //! Transactions are short and touch few rows: a lease is a row, not a task. Rows of nobody's are taken with
-//! `SKIP LOCKED`, so that houses do not wait for each other. Who waits for news is woken by NOTIFY, which is sent outside
+//! `SKIP LOCKED`, so that instances do not wait for each other. Who waits for news is woken by NOTIFY, which is sent outside
 //! of transactions and at most a few times a second (a NOTIFY in each transaction would put all of them in one queue),
 //! and asks once a second anyway.
 
 mod errors;
-mod house;
+mod instance;
 mod jobs;
+mod rights;
 mod write;
 
 use std::{
@@ -17,8 +18,8 @@ use std::{
 
 use async_trait::async_trait;
 use picofarm_proto::{
-    ids::{HouseId, JobId, StageRef, WorkerId},
-    model::Event,
+    ids::{InstanceId, JobId, StageRef, WorkerId},
+    model::{Event, JobState, TaskCounts},
 };
 use sqlx::{
     ConnectOptions, Connection, PgPool,
@@ -29,22 +30,29 @@ use sqlx::{
 use uuid::Uuid;
 
 use crate::{
-    Catalog, CatalogError, Changes, Claim, Job, JobRecord, NewEvent, News, Owned, Range,
-    RangeState, Settled, Snapshot, Want,
+    Catalog, CatalogError, Changes, Claim, Forgotten, Gone, Job, JobQuery, JobRecord, News,
+    Outcome, Owned, Page, Range, RangeState, Recorded, Settled, Sight, Snapshot, Submission, Want,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
 crate::sql::queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_listing::listing_queries!(
+    sqlx::Postgres,
+    sqlx::PgConnection,
+    super::PgRow,
+    " FOR UPDATE OF result_set SKIP LOCKED"
+);
 crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
 
-/// Connections of one coordinator: one writes, the others read.
-const CONNECTIONS: u32 = 6;
+/// Connections of one coordinator: one hears hints, two write, the others read; more than its heavy reads take at a time.
+const CONNECTIONS: u32 = 10;
 /// How long a connection may take to come about.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A house that has not beaten for so long is lost.
-const HOUSE_SECONDS: f64 = 5.0;
+/// An instance that has not beaten for so long is lost.
+const INSTANCE_SECONDS: f64 = 5.0;
 /// At most one hint to the others in this time.
 const HINTS: Duration = Duration::from_millis(100);
 /// The channel of the hints.
@@ -58,7 +66,7 @@ pub struct PostgresCatalog {
     name: String,
     pool: PgPool,
     /// The present life.
-    house: Mutex<Option<HouseId>>,
+    instance: Mutex<Option<InstanceId>>,
     keys: tokio::sync::Mutex<write::Keys>,
     hints: tokio::sync::Mutex<Option<PgListener>>,
     hinted: Mutex<Option<Instant>>,
@@ -87,15 +95,18 @@ impl PostgresCatalog {
         let pool = PgPoolOptions::new()
             .max_connections(CONNECTIONS)
             .acquire_timeout(PATIENCE)
-            .connect_with(options)
-            .await
-            .map_err(failed)?;
+            .connect_with(options.clone())
+            .await;
+        let pool = match pool {
+            Ok(pool) => pool,
+            Err(error) => return Err(errors::unconnected(&place, &options, error).await),
+        };
         migrate(&place, &pool).await?;
         let listener = listen(&pool).await.map_err(failed)?;
         Ok(Self {
             name: name.to_owned(),
             pool,
-            house: Mutex::new(None),
+            instance: Mutex::new(None),
             keys: tokio::sync::Mutex::default(),
             hints: tokio::sync::Mutex::new(Some(listener)),
             hinted: Mutex::new(None),
@@ -108,35 +119,53 @@ impl PostgresCatalog {
     }
 
     async fn reader(&self) -> Result<PoolConnection<sqlx::Postgres>, CatalogError> {
-        self.pool.acquire().await.map_err(|e| self.failed(e))
+        match self.pool.acquire().await {
+            Ok(connection) => Ok(connection),
+            Err(error) => {
+                let options = self.pool.connect_options();
+                Err(errors::unconnected(&self.place, &options, error).await)
+            }
+        }
     }
 
-    fn house(&self) -> Result<HouseId, CatalogError> {
-        self.house
+    fn instance(&self) -> Result<InstanceId, CatalogError> {
+        self.instance
             .lock()
             .expect("no panic while locked")
             .ok_or(CatalogError::Fenced)
     }
 
-    /// Runs `work` in one transaction, on behalf of a house that is alive.
+    /// Runs `work` in one transaction, on behalf of an instance that is alive.
     async fn write<T>(
         &self,
-        work: impl AsyncFnOnce(&mut write::Desk<'_>) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
     ) -> Result<T, CatalogError> {
-        let house = self.house()?;
+        self.transaction(true, work).await
+    }
+
+    /// As [`Self::write`]; undone at the end if not `keep`.
+    async fn transaction<T>(
+        &self,
+        keep: bool,
+        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+    ) -> Result<T, CatalogError> {
+        let instance = self.instance()?;
         let mut keys = self.keys.lock().await;
         let result = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            house::fence(&mut tx, house).await?;
-            let mut desk = write::Desk {
+            instance::fence(&mut tx, instance).await?;
+            let mut writer = write::Writer {
                 c: &mut tx,
-                house: house.uuid(),
+                instance: instance.uuid(),
                 keys: &mut keys,
             };
             // Dropping the transaction undoes it.
-            let done = work(&mut desk).await?;
-            tx.commit().await?;
+            let done = work(&mut writer).await?;
+            match keep {
+                true => tx.commit().await?,
+                false => tx.rollback().await?,
+            }
             Ok(done)
         };
         result.await.map_err(|e| match e {
@@ -195,15 +224,15 @@ async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
 #[async_trait]
 impl Catalog for PostgresCatalog {
     async fn load(&self) -> Result<Snapshot, CatalogError> {
-        let former = self.house.lock().expect("no panic while locked").take();
-        let house = HouseId::from_uuid(Uuid::now_v7());
+        let former = self.instance.lock().expect("no panic while locked").take();
+        let instance = InstanceId::from_uuid(Uuid::now_v7());
         let snapshot = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            house::found(&mut tx, house, former, &self.name, HOUSE_SECONDS).await?;
-            let ranges = house::take_lost(&mut tx, house).await?;
+            instance::found(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
+            let ranges = instance::take_lost(&mut tx, instance).await?;
             let snapshot = Snapshot {
-                house,
+                instance,
                 jobs: job_query::active_jobs(&mut tx).await?,
                 owned: Owned {
                     exceptions: query::exceptions(&mut tx, &ranges).await?,
@@ -215,30 +244,30 @@ impl Catalog for PostgresCatalog {
             Ok(snapshot)
         };
         let snapshot = snapshot.await.map_err(|e| self.failed(e))?;
-        *self.house.lock().expect("no panic while locked") = Some(house);
+        *self.instance.lock().expect("no panic while locked") = Some(instance);
         Ok(snapshot)
     }
 
     async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
-        let house = self.house()?;
+        let instance = self.instance()?;
         let news = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
-            if !house::renew(&mut tx, house, workers, HOUSE_SECONDS).await? {
+            if !instance::renew(&mut tx, instance, workers, INSTANCE_SECONDS).await? {
                 return Ok(None);
             }
-            let taken = house::take_lost(&mut tx, house).await?;
-            let (houses, workers) = house::count_houses(&mut tx).await?;
+            let taken = instance::take_lost(&mut tx, instance).await?;
+            let (instances, workers) = instance::count_instances(&mut tx).await?;
             let news = News {
                 active: job_query::active(&mut tx).await?,
-                busy: house::busy(&mut tx, house).await?,
+                busy: instance::busy(&mut tx, instance).await?,
                 free: job_query::free(&mut tx).await?,
                 taken: Owned {
                     exceptions: query::exceptions(&mut tx, &taken).await?,
                     ranges: taken,
                 },
-                leased: Some(house::leased(&mut tx, house).await?),
-                houses,
+                leased: Some(instance::leased(&mut tx, instance).await?),
+                instances,
                 workers,
             };
             tx.commit().await?;
@@ -265,27 +294,27 @@ impl Catalog for PostgresCatalog {
     }
 
     async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError> {
-        self.write(async |desk| write::claim(desk, wants).await)
+        self.write(async |writer| write::claim(writer, wants).await)
             .await
     }
 
     async fn adopt(&self, worker: WorkerId) -> Result<Owned, CatalogError> {
-        self.write(async |desk| {
-            let ranges = house::adopt(desk, worker).await?;
+        self.write(async |writer| {
+            let ranges = instance::adopt(writer, worker).await?;
             Ok(Owned {
-                exceptions: query::exceptions(desk.c, &ranges).await?,
+                exceptions: query::exceptions(writer.c, &ranges).await?,
                 ranges,
             })
         })
         .await
     }
 
-    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError> {
+    async fn commit(&self, changes: &Changes) -> Result<Settled, CatalogError> {
         if changes.is_empty() {
             return Ok(Settled::default());
         }
         let settled = self
-            .write(async |desk| write::changes(desk, &changes).await)
+            .write(async |writer| write::changes(writer, changes).await)
             .await?;
         let pending = |r: &Range| matches!(r.state, RangeState::Pending { .. });
         if settled != Settled::default() || changes.free.values().any(pending) {
@@ -294,22 +323,65 @@ impl Catalog for PostgresCatalog {
         Ok(settled)
     }
 
-    async fn submit(
-        &self,
-        job: &Job,
-        ranges: &[Range],
-        events: &[NewEvent],
-    ) -> Result<bool, CatalogError> {
-        let new = self
-            .write(async |desk| jobs::submit(desk, job, ranges, events).await)
+    async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
+        crate::refused::verdict(
+            self.transaction(false, async |writer| {
+                write::write_rows(writer, changes).await
+            })
+            .await,
+        )
+    }
+
+    async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError> {
+        // Before the transaction: a large spec takes a while.
+        let spec = serde_json::to_string(&*submission.job.spec).expect("a spec is plain data");
+        let outcome = self
+            .write(async |writer| jobs::record(writer, submission, &spec).await)
             .await?;
         self.hint().await;
-        Ok(new)
+        Ok(outcome)
+    }
+
+    async fn recorded(&self, set: &ResultSet, count: u64) -> Result<Vec<Recorded>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::recorded(&mut c, set, count)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn mark_checked(
+        &self,
+        set: &ResultSet,
+        outputs: &[Recorded],
+    ) -> Result<(), CatalogError> {
+        // Short transactions: others wait for them.
+        for some in outputs.chunks(1_000) {
+            self.write(async |writer| {
+                for output in some {
+                    query::mark_checked(writer.c, set, output).await?;
+                }
+                Ok(())
+            })
+            .await?;
+        }
+        Ok(())
+    }
+
+    async fn drop_output(&self, gone: &Gone) -> Result<bool, CatalogError> {
+        self.write(async |writer| Ok(query::drop_output(writer.c, gone).await?))
+            .await
+    }
+
+    async fn state(&self, job: JobId) -> Result<Option<JobState>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::state(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError> {
         let cancelled = self
-            .write(async |desk| jobs::cancel(desk, job, why, now_ms).await)
+            .write(async |writer| jobs::cancel(writer, job, why, now_ms).await)
             .await?;
         self.hint().await;
         Ok(cancelled)
@@ -323,23 +395,18 @@ impl Catalog for PostgresCatalog {
         now_ms: i64,
     ) -> Result<bool, CatalogError> {
         let changed = self
-            .write(async |desk| jobs::pause(desk, job, paused, who, now_ms).await)
+            .write(async |writer| jobs::pause(writer, job, paused, who, now_ms).await)
             .await?;
         self.hint().await;
         Ok(changed)
     }
 
-    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError> {
-        let mut forgotten = 0;
-        // One transaction each: they may be long.
-        while forgotten < most
-            && self
-                .write(async |desk| Ok(job_query::forget(desk.c, before_ms).await?))
-                .await?
-        {
-            forgotten += 1;
-        }
-        Ok(forgotten)
+    async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
+        self.write(async |writer| {
+            *writer.keys = write::Keys::default();
+            Ok(listing_query::forget(writer.c, before_ms).await?)
+        })
+        .await
     }
 
     async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
@@ -351,7 +418,7 @@ impl Catalog for PostgresCatalog {
 
     async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
         let retried = self
-            .write(async |desk| jobs::retry(desk, job, now_ms).await)
+            .write(async |writer| jobs::retry(writer, job, now_ms).await)
             .await?;
         self.hint().await;
         Ok(retried)
@@ -359,15 +426,21 @@ impl Catalog for PostgresCatalog {
 
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        let mut found = job_query::jobs(&mut c, Some(id))
+        job_query::record(&mut c, id)
             .await
-            .map_err(|e| self.failed(e))?;
-        Ok(found.pop())
+            .map_err(|e| self.failed(e))
     }
 
-    async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError> {
+    async fn active_tasks(&self) -> Result<TaskCounts, CatalogError> {
         let mut c = self.reader().await?;
-        job_query::jobs(&mut c, None)
+        listing_query::active_tasks(&mut c)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn page(&self, query: &JobQuery) -> Result<Page, CatalogError> {
+        let mut c = self.reader().await?;
+        listing_query::page(&mut c, query)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -379,9 +452,9 @@ impl Catalog for PostgresCatalog {
             .map_err(|e| self.failed(e))
     }
 
-    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError> {
+    async fn recent(&self, most: u32, sight: &Sight) -> Result<Vec<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        job_query::recent(&mut c, most)
+        job_query::recent(&mut c, most, sight)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -442,13 +515,13 @@ impl Catalog for PostgresCatalog {
     }
 
     async fn close(&self) {
-        let house = self.house.lock().expect("no panic while locked").take();
-        if let Some(house) = house {
-            // What is not given back now, others find when the house is lost.
+        let instance = self.instance.lock().expect("no panic while locked").take();
+        if let Some(instance) = instance {
+            // What is not given back now, others find when the instance is lost.
             if let Ok(mut c) = self.pool.acquire().await
-                && let Err(error) = house::leave(&mut c, house).await
+                && let Err(error) = instance::leave(&mut c, instance).await
             {
-                tracing::debug!(%error, "the house was not given up in order");
+                tracing::debug!(%error, "the instance was not given up in order");
             }
         }
         // The pool waits for every connection, the listener's too.

@@ -1,4 +1,4 @@
-//! What a house writes of ranges, outputs and history: at its [`Desk`], behind the fence; rows go in bulk, as arrays.
+//! What an instance writes of ranges, outputs and history: through its [`Writer`], behind the fence; rows go in bulk, as arrays.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -44,14 +44,14 @@ pub(super) struct StageKeys {
     pub result_set: i64,
 }
 
-/// Where a house writes: inside a transaction that has passed the fence.
-pub(super) struct Desk<'a> {
+/// Where an instance writes: inside a transaction that has passed the fence.
+pub(super) struct Writer<'a> {
     pub c: &'a mut PgConnection,
-    pub house: Uuid,
+    pub instance: Uuid,
     pub keys: &'a mut Keys,
 }
 
-impl Desk<'_> {
+impl Writer<'_> {
     pub(super) async fn keys(&mut self, stage: StageRef) -> Result<StageKeys> {
         if let Some(keys) = self.keys.0.get(&stage) {
             return Ok(*keys);
@@ -84,10 +84,10 @@ pub(super) fn ranges(rows: &[PgRow]) -> Sql<Vec<Range>> {
     rows.iter().map(query::range).collect()
 }
 
-pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Claim>> {
+pub(super) async fn claim(writer: &mut Writer<'_>, wants: &[Want]) -> Result<Vec<Claim>> {
     let mut claims = Vec::with_capacity(wants.len());
     for want in wants {
-        let key = desk.keys(want.stage).await?.stage;
+        let key = writer.keys(want.stage).await?.stage;
         let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
             "SELECT {RANGE} FROM task_range WHERE stage = $1 AND state = 0 AND owner IS NULL AND not_before_ms <= $2 \
              AND EXISTS (SELECT 1 FROM job JOIN stage ON stage.job = job.key \
@@ -97,7 +97,7 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
         .bind(key)
         .bind(want.now_ms)
         .bind(LOOK_AT)
-        .fetch_all(&mut *desk.c)
+        .fetch_all(&mut *writer.c)
         .await?;
         let mut claimed: Vec<Range> = Vec::new();
         let mut whole = Vec::new();
@@ -114,23 +114,23 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
                 sqlx::query("UPDATE task_range SET lo = $1 WHERE id = $2")
                     .bind(int(cut))
                     .bind(range.id.uuid())
-                    .execute(&mut *desk.c)
+                    .execute(&mut *writer.c)
                     .await?;
                 range.id = RangeId::from_uuid(Uuid::now_v7());
                 range.hi = cut;
-                insert_ranges(desk, &[(key, &range)], true).await?;
+                insert_ranges(writer, &[(key, &range)], true).await?;
             }
             missing -= range.len();
             claimed.push(range);
         }
         sqlx::query("UPDATE task_range SET owner = $1 WHERE id = ANY($2)")
-            .bind(desk.house)
+            .bind(writer.instance)
             .bind(&whole)
-            .execute(&mut *desk.c)
+            .execute(&mut *writer.c)
             .await?;
         let mut existing = Vec::new();
         for range in claimed.iter().filter(|_| !want.force) {
-            existing.extend(query::runs_of_stage(desk.c, want.stage, range.lo, range.hi).await?);
+            existing.extend(query::runs_of_stage(writer.c, want.stage, range.lo, range.hi).await?);
         }
         existing.sort_unstable_by_key(|run| run.lo);
         let left: i64 = sqlx::query_scalar(
@@ -138,11 +138,11 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
              WHERE stage = $1 AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
         )
         .bind(key)
-        .fetch_one(&mut *desk.c)
+        .fetch_one(&mut *writer.c)
         .await?;
         claims.push(Claim {
             owned: Owned {
-                exceptions: query::exceptions(desk.c, &claimed).await?,
+                exceptions: query::exceptions(writer.c, &claimed).await?,
                 ranges: claimed,
             },
             existing,
@@ -152,20 +152,30 @@ pub(super) async fn claim(desk: &mut Desk<'_>, wants: &[Want]) -> Result<Vec<Cla
     Ok(claims)
 }
 
-pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Settled> {
-    replace_known(desk, changes).await?;
+pub(super) async fn changes(writer: &mut Writer<'_>, changes: &Changes) -> Result<Settled> {
+    replace_known(writer, changes).await?;
     let mut rows = Vec::with_capacity(changes.ranges.len());
     for range in changes.ranges.values() {
-        rows.push((desk.keys(range.stage).await?.stage, range));
+        rows.push((writer.keys(range.stage).await?.stage, range));
     }
-    insert_ranges(desk, &rows, true).await?;
+    insert_ranges(writer, &rows, true).await?;
     for range in changes.free.values() {
-        let key = desk.keys(range.stage).await?.stage;
-        give(desk, key, range).await?;
+        let key = writer.keys(range.stage).await?.stage;
+        give(writer, key, range).await?;
     }
-    insert_outputs(desk, &changes.outputs).await?;
+    write_rows(writer, changes).await?;
+    let mut settled = Settled::default();
+    for (stage, at_ms) in &changes.perhaps_over {
+        settled.join(jobs::stage_over(writer, *stage, *at_ms).await?);
+    }
+    Ok(settled)
+}
+
+/// Writes the rows of a change set that hold what others sent.
+pub(super) async fn write_rows(writer: &mut Writer<'_>, changes: &Changes) -> Result<()> {
+    insert_outputs(writer, &changes.outputs).await?;
     for exception in changes.exceptions.values() {
-        put_exception(desk, exception).await?;
+        put_exception(writer, exception).await?;
     }
     for worker in changes.workers.values() {
         sqlx::query(
@@ -177,19 +187,14 @@ pub(super) async fn changes(desk: &mut Desk<'_>, changes: &Changes) -> Result<Se
         .bind(worker.incarnation.uuid())
         .bind(&worker.name)
         .bind(worker.last_seen_ms)
-        .execute(&mut *desk.c)
+        .execute(&mut *writer.c)
         .await?;
     }
-    insert_events(desk, &changes.events).await?;
-    let mut settled = Settled::default();
-    for (stage, at_ms) in &changes.perhaps_over {
-        settled.join(jobs::stage_over(desk, *stage, *at_ms).await?);
-    }
-    Ok(settled)
+    insert_events(writer, &changes.events).await
 }
 
-async fn put_exception(desk: &mut Desk<'_>, exception: &Exception) -> Result<()> {
-    let stage = desk.keys(exception.stage).await?.stage;
+async fn put_exception(writer: &mut Writer<'_>, exception: &Exception) -> Result<()> {
+    let stage = writer.keys(exception.stage).await?.stage;
     sqlx::query(
         "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES ($1, $2, $3, $4, $5, $6) \
          ON CONFLICT (stage, task) DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
@@ -201,21 +206,21 @@ async fn put_exception(desk: &mut Desk<'_>, exception: &Exception) -> Result<()>
     .bind(i64::from(exception.crashes))
     .bind(exception.dead)
     .bind(&exception.last_error)
-    .execute(&mut *desk.c)
+    .execute(&mut *writer.c)
     .await?;
     Ok(())
 }
 
-/// Removes the former state of every range that changes, having checked that it is this house's.
-async fn replace_known(desk: &mut Desk<'_>, changes: &Changes) -> Result<()> {
+/// Removes the former state of every range that changes, having checked that it is this instance's.
+async fn replace_known(writer: &mut Writer<'_>, changes: &Changes) -> Result<()> {
     let known: Vec<Uuid> = changes.known().map(RangeId::uuid).collect();
     if known.is_empty() {
         return Ok(());
     }
     let found = sqlx::query("DELETE FROM task_range WHERE owner = $1 AND id = ANY($2)")
-        .bind(desk.house)
+        .bind(writer.instance)
         .bind(&known)
-        .execute(&mut *desk.c)
+        .execute(&mut *writer.c)
         .await?
         .rows_affected();
     if found != known.len() as u64 {
@@ -228,7 +233,7 @@ async fn replace_known(desk: &mut Desk<'_>, changes: &Changes) -> Result<()> {
 }
 
 pub(super) async fn insert_ranges(
-    desk: &mut Desk<'_>,
+    writer: &mut Writer<'_>,
     rows: &[(i64, &Range)],
     mine: bool,
 ) -> Result<()> {
@@ -240,7 +245,7 @@ pub(super) async fn insert_ranges(
         .map(|(_, r)| StateColumns::from(&r.state))
         .collect();
     let number = |of: fn(&Range) -> i64| rows.iter().map(|(_, r)| of(r)).collect::<Vec<_>>();
-    let owner = mine.then_some(desk.house);
+    let owner = mine.then_some(writer.instance);
     sqlx::query(
         "INSERT INTO task_range (id, stage, lo, hi, epoch, crashes, state, not_before_ms, worker, incarnation, \
          lease_until_ms, marks, owner) \
@@ -260,14 +265,14 @@ pub(super) async fn insert_ranges(
     .bind(columns.iter().map(|c| c.lease_until_ms).collect::<Vec<_>>())
     .bind(columns.into_iter().map(|c| c.marks).collect::<Vec<_>>())
     .bind(owner)
-    .execute(&mut *desk.c)
+    .execute(&mut *writer.c)
     .await?;
     Ok(())
 }
 
-/// Writes a range of nobody's, merged with its neighbours in the same state, as far as no other house has them in its
+/// Writes a range of nobody's, merged with its neighbours in the same state, as far as no other instance has them in its
 /// hands just now.
-pub(super) async fn give(desk: &mut Desk<'_>, key: i64, range: &Range) -> Result<()> {
+pub(super) async fn give(writer: &mut Writer<'_>, key: i64, range: &Range) -> Result<()> {
     let mut range = range.clone();
     let columns = StateColumns::from(&range.state);
     if range.merges() {
@@ -280,7 +285,7 @@ pub(super) async fn give(desk: &mut Desk<'_>, key: i64, range: &Range) -> Result
         .bind(columns.state)
         .bind(int(range.lo))
         .bind(int(range.hi))
-        .fetch_all(&mut *desk.c)
+        .fetch_all(&mut *writer.c)
         .await?;
         for row in rows {
             let number = |column| row.try_get::<i64, _>(column).map(i64::unsigned_abs);
@@ -289,16 +294,17 @@ pub(super) async fn give(desk: &mut Desk<'_>, key: i64, range: &Range) -> Result
             range.epoch.0 = range.epoch.0.max(number("epoch")?);
         }
     }
-    insert_ranges(desk, &[(key, &range)], false).await
+    insert_ranges(writer, &[(key, &range)], false).await
 }
 
-async fn insert_outputs(desk: &mut Desk<'_>, outputs: &[Output]) -> Result<()> {
+async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<()> {
     if outputs.is_empty() {
         return Ok(());
     }
+    sql::writable(outputs)?;
     let mut sets = Vec::with_capacity(outputs.len());
     for output in outputs {
-        sets.push(desk.keys(output.stage).await?.result_set);
+        sets.push(writer.keys(output.stage).await?.result_set);
     }
     let written = sqlx::query(
         "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) \
@@ -317,12 +323,12 @@ async fn insert_outputs(desk: &mut Desk<'_>, outputs: &[Output]) -> Result<()> {
     .bind(outputs.iter().map(|o| o.seconds).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| int(o.epoch.0)).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| o.adopted).collect::<Vec<_>>())
-    .execute(&mut *desk.c)
+    .execute(&mut *writer.c)
     .await?
     .rows_affected();
     if written != outputs.len() as u64 {
         let tasks: Vec<_> = outputs.iter().map(|o| (o.stage, o.task)).collect();
-        let there = manifests(desk.c, &tasks).await?;
+        let there = manifests(writer.c, &tasks).await?;
         sql::equal_manifests(outputs, &there).map_err(WriteError::Conflict)?;
     }
     Ok(())
@@ -360,13 +366,13 @@ pub(super) async fn manifests(
     Ok(tasks.iter().map(|t| found.get(t).copied()).collect())
 }
 
-pub(super) async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> Result<()> {
+pub(super) async fn insert_events(writer: &mut Writer<'_>, events: &[NewEvent]) -> Result<()> {
     if events.is_empty() {
         return Ok(());
     }
     let mut jobs = Vec::with_capacity(events.len());
     for event in events {
-        jobs.push(desk.job(event.job).await?);
+        jobs.push(writer.job(event.job).await?);
     }
     let text =
         |of: fn(&NewEvent) -> &str| events.iter().map(|e| of(e).to_owned()).collect::<Vec<_>>();
@@ -397,20 +403,14 @@ pub(super) async fn insert_events(desk: &mut Desk<'_>, events: &[NewEvent]) -> R
     )
     .bind(text(|e| &e.worker))
     .bind(events.iter().map(|e| e.seconds).collect::<Vec<_>>())
-    // Postgres' text holds no NUL.
-    .bind(
-        events
-            .iter()
-            .map(|e| e.message.replace('\0', "\u{fffd}"))
-            .collect::<Vec<_>>(),
-    )
+    .bind(text(|e| &e.message))
     .bind(
         events
             .iter()
             .map(|e| e.stage.map(i64::from))
             .collect::<Vec<_>>(),
     )
-    .execute(&mut *desk.c)
+    .execute(&mut *writer.c)
     .await?;
     Ok(())
 }

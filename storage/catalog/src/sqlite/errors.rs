@@ -9,10 +9,20 @@ const READONLY: i32 = 8;
 const CORRUPT: i32 = 11;
 const FULL: i32 = 13;
 const CANTOPEN: i32 = 14;
+const TOOBIG: i32 = 18;
 const CONSTRAINT: i32 = 19;
+/// Constraints on what a row holds, of which no later state of the database changes anything: CHECK, NOT NULL, a trigger's
+/// refusal, a value of another type.
+const CONTENT: [i32; 4] = [275, 1299, 1811, 3091];
 const NOTADB: i32 = 26;
 /// The log's index could not grow; seen on a full disk where SQLITE_FULL might be expected.
 const IOERR_SHMSIZE: i32 = 4874;
+
+fn said(error: &sqlx::Error) -> String {
+    error
+        .as_database_error()
+        .map_or_else(|| error.to_string(), |e| e.message().to_owned())
+}
 
 /// The error a person can act on.
 pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
@@ -23,6 +33,16 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
             what: format!("column {index} cannot be read ({source})"),
         };
     }
+    if let sqlx::Error::Encode(_) = &error {
+        return CatalogError::Refused {
+            place: path.display().to_string(),
+            what: error.to_string(),
+        };
+    }
+    let refused = || CatalogError::Refused {
+        place: path.display().to_string(),
+        what: said(&error),
+    };
     let code = error
         .as_database_error()
         .and_then(|e| e.code())
@@ -50,6 +70,8 @@ pub(super) fn classify(path: &Path, error: sqlx::Error) -> CatalogError {
             path,
             holder: "a program that is not a coordinator, such as the sqlite3 shell".into(),
         },
+        Some(TOOBIG) => refused(),
+        Some(CONSTRAINT) if code.is_some_and(|code| CONTENT.contains(&code)) => refused(),
         Some(CONSTRAINT) => CatalogError::Conflict(error.to_string()),
         _ => CatalogError::Database {
             place: path.display().to_string(),

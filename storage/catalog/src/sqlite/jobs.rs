@@ -13,7 +13,7 @@ use super::{
     write::{Keys, Result, WriteError, give, insert_events, insert_ranges},
 };
 use crate::{
-    Job, NewEvent, Range, RangeState, Settled,
+    NewEvent, Outcome, RangeState, Settled, StageRecord, Submission,
     sql::{self, int},
 };
 
@@ -47,16 +47,24 @@ async fn settle(
     Ok(settled)
 }
 
-pub(super) async fn submit(
+/// Records a job; `spec` is its spec as JSON.
+pub(super) async fn record(
     c: &mut SqliteConnection,
     keys: &mut Keys,
-    job: &Job,
-    ranges: &[Range],
-    events: &[NewEvent],
-) -> Result<bool> {
-    let spec = serde_json::to_string(&*job.spec).expect("a spec is plain data");
+    submission: &Submission<'_>,
+    spec: &str,
+) -> Result<Outcome> {
+    for (set, run) in submission.done() {
+        if query::checked(&mut *c, set, run).await? < run.hi - run.lo {
+            return Ok(Outcome::Changed);
+        }
+    }
+    if let Some(former) = submission.instead_of {
+        job_query::supersede(&mut *c, former).await?;
+    }
+    let job = submission.job;
     let key: Option<i64> = sqlx::query_scalar(
-        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms, username) VALUES (?, ?, ?, 0, ?, ?) \
+        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms, username, project, name) VALUES (?, ?, ?, 0, ?, ?, ?, ?) \
          ON CONFLICT DO NOTHING RETURNING key",
     )
     .bind(job.id.uuid())
@@ -64,42 +72,59 @@ pub(super) async fn submit(
     .bind(spec)
     .bind(job.submitted_ms)
     .bind(&job.user)
+    .bind(&job.spec.project)
+    .bind(&job.spec.name)
     .fetch_optional(&mut *c)
     .await?;
     let Some(key) = key else {
-        return Ok(false);
+        return Ok(Outcome::Exists);
     };
+    for gone in submission.gone {
+        query::drop_output(&mut *c, gone).await?;
+    }
     let mut stages = HashMap::new();
-    for stage in job.stages() {
-        let set = &stage.set;
-        sqlx::query("INSERT INTO result_set (store, dataset, stage_key) VALUES (?, ?, ?) ON CONFLICT DO NOTHING")
-            .bind(&set.store)
-            .bind(&set.dataset)
-            .bind(&set.stage_key.0[..])
-            .execute(&mut *c)
-            .await?;
-        let stage_key: i64 = sqlx::query_scalar(
-            "INSERT INTO stage (job, ordinal, result_set, tasks, state, needs, tolerate_dead) \
+    for stage in submission.stages {
+        let key = insert_stage(&mut *c, key, stage).await?;
+        stages.insert(stage.id, key);
+    }
+    let rows: Vec<_> = submission
+        .ranges
+        .iter()
+        .map(|r| (stages[&r.stage], r))
+        .collect();
+    insert_ranges(c, &rows, false).await?;
+    insert_events(c, keys, submission.events).await?;
+    settle(c, keys, job.id, job.submitted_ms).await?;
+    Ok(Outcome::New)
+}
+
+/// Records a stage of the job with this key; returns its own.
+async fn insert_stage(c: &mut SqliteConnection, job: i64, stage: &StageRecord) -> Result<i64> {
+    let set = &stage.set;
+    sqlx::query(
+        "INSERT INTO result_set (store, dataset, stage_key) VALUES (?, ?, ?) ON CONFLICT DO NOTHING",
+    )
+    .bind(&set.store)
+    .bind(&set.dataset)
+    .bind(&set.stage_key.0[..])
+    .execute(&mut *c)
+    .await?;
+    let key = sqlx::query_scalar(
+        "INSERT INTO stage (job, ordinal, result_set, tasks, state, needs, tolerate_dead) \
              SELECT ?1, ?2, key, ?3, 0, ?7, ?8 FROM result_set \
              WHERE store = ?4 AND dataset = ?5 AND stage_key = ?6 RETURNING key",
-        )
-        .bind(key)
-        .bind(i64::from(stage.id.stage))
-        .bind(int(stage.tasks))
-        .bind(&set.store)
-        .bind(&set.dataset)
-        .bind(&set.stage_key.0[..])
-        .bind(sql::needs_text(&stage.needs))
-        .bind(stage.tolerate_dead)
-        .fetch_one(&mut *c)
-        .await?;
-        stages.insert(stage.id, stage_key);
-    }
-    let rows: Vec<_> = ranges.iter().map(|r| (stages[&r.stage], r)).collect();
-    insert_ranges(c, &rows, false).await?;
-    insert_events(c, keys, events).await?;
-    settle(c, keys, job.id, job.submitted_ms).await?;
-    Ok(true)
+    )
+    .bind(job)
+    .bind(i64::from(stage.id.stage))
+    .bind(int(stage.tasks))
+    .bind(&set.store)
+    .bind(&set.dataset)
+    .bind(&set.stage_key.0[..])
+    .bind(sql::needs_text(&stage.needs))
+    .bind(stage.tolerate_dead)
+    .fetch_one(c)
+    .await?;
+    Ok(key)
 }
 
 pub(super) async fn cancel(

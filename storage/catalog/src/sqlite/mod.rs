@@ -3,7 +3,9 @@
 //! Reads have connections of their own.
 
 mod errors;
+mod files;
 mod jobs;
+mod rights;
 mod write;
 
 use std::{
@@ -14,8 +16,8 @@ use std::{
 
 use async_trait::async_trait;
 use picofarm_proto::{
-    ids::{HouseId, JobId, StageRef, WorkerId},
-    model::Event,
+    ids::{InstanceId, JobId, StageRef, WorkerId},
+    model::{Event, JobState, TaskCounts},
 };
 use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
@@ -29,19 +31,21 @@ use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use crate::{
-    Catalog, CatalogError, Changes, Claim, Job, JobRecord, NewEvent, News, Owned, Range, Settled,
-    Snapshot, Want,
+    Catalog, CatalogError, Changes, Claim, Forgotten, Gone, Job, JobQuery, JobRecord, News,
+    Outcome, Owned, Page, Recorded, Settled, Sight, Snapshot, Submission, Want,
     lock::CatalogLock,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
 crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
+crate::sql_listing::listing_queries!(sqlx::Sqlite, sqlx::SqliteConnection, super::SqliteRow, "");
 crate::sql_jobs::job_queries!(sqlx::SqliteConnection, super::SqliteRow);
+crate::sql_rights::rights_queries!(sqlx::SqliteConnection, super::SqliteRow);
 
 static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
-/// Read-only connections. Reads are few and short.
-const READERS: u32 = 3;
+/// Read-only connections: more than the coordinator's heavy reads take at a time, so that its short ones need not wait.
+const READERS: u32 = 8;
 
 /// A catalog in one SQLite file, for exactly one coordinator.
 pub struct SqliteCatalog {
@@ -49,6 +53,8 @@ pub struct SqliteCatalog {
     /// `None` once closed.
     writer: Mutex<Option<write::Writer>>,
     readers: SqlitePool,
+    /// A reader opens the file anew, and shall not open another.
+    files: files::Files,
     // Last, so that it is dropped after the connections.
     _lock: CatalogLock,
 }
@@ -71,6 +77,8 @@ impl SqliteCatalog {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
+            // A full temporary folder is no reason to fail; what is sorted here is small.
+            .pragma("temp_store", "MEMORY")
             .busy_timeout(Duration::from_secs(10))
             .disable_statement_logging();
         let failed = |e| errors::classify(path, e);
@@ -81,13 +89,20 @@ impl SqliteCatalog {
         migrate(path, &mut connection).await?;
         let readers = SqlitePoolOptions::new()
             .max_connections(READERS)
-            .connect_with(options.read_only(true))
+            .connect_with(options.clone().read_only(true))
             .await
             .map_err(failed)?;
+        let files = || {
+            files::Files::of(path).map_err(|what| CatalogError::Lost {
+                path: path.to_owned(),
+                what,
+            })
+        };
         Ok(Self {
             path: path.to_owned(),
-            writer: Mutex::new(Some(write::Writer::new(connection))),
+            writer: Mutex::new(Some(write::Writer::new(connection, options, files()?))),
             readers,
+            files: files()?,
             _lock: lock,
         })
     }
@@ -97,7 +112,22 @@ impl SqliteCatalog {
     }
 
     async fn reader(&self) -> Result<PoolConnection<sqlx::Sqlite>, CatalogError> {
+        self.files.check().map_err(|what| CatalogError::Lost {
+            path: self.path.clone(),
+            what,
+        })?;
         self.readers.acquire().await.map_err(|e| self.failed(e))
+    }
+
+    fn refused(&self, error: write::WriteError) -> CatalogError {
+        match error {
+            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            write::WriteError::Lost(what) => CatalogError::Lost {
+                path: self.path.clone(),
+                what,
+            },
+            write::WriteError::Sql(e) => self.failed(e),
+        }
     }
 
     /// Runs `work` in one transaction.
@@ -105,12 +135,19 @@ impl SqliteCatalog {
         &self,
         work: impl AsyncFnOnce(&mut SqliteConnection, &mut write::Keys) -> Result<T, write::WriteError>,
     ) -> Result<T, CatalogError> {
+        self.transaction(true, work).await
+    }
+
+    /// As [`Self::write`]; undone at the end if not `keep`.
+    async fn transaction<T>(
+        &self,
+        keep: bool,
+        work: impl AsyncFnOnce(&mut SqliteConnection, &mut write::Keys) -> Result<T, write::WriteError>,
+    ) -> Result<T, CatalogError> {
         let mut writer = self.writer.lock().await;
         let writer = writer.as_mut().ok_or(CatalogError::Closed)?;
-        writer.transaction(work).await.map_err(|e| match e {
-            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
-            write::WriteError::Sql(e) => self.failed(e),
-        })
+        let done = writer.transaction(keep, work).await;
+        done.map_err(|e| self.refused(e))
     }
 }
 
@@ -140,6 +177,10 @@ async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), C
 #[async_trait]
 impl Catalog for SqliteCatalog {
     async fn load(&self) -> Result<Snapshot, CatalogError> {
+        let instance = InstanceId::from_uuid(Uuid::now_v7());
+        // A life begins with a write: where there is no room, it shall not begin, promise and fail in turn.
+        self.write(async |c, _| Ok(write::found(c, instance).await?))
+            .await?;
         let mut c = self.reader().await?;
         let read = async {
             // One transaction, so that all tables are of one moment.
@@ -150,7 +191,7 @@ impl Catalog for SqliteCatalog {
             let workers = query::workers(&mut tx).await?;
             tx.rollback().await?;
             Ok(Snapshot {
-                house: HouseId::from_uuid(Uuid::now_v7()),
+                instance,
                 jobs,
                 owned: Owned { ranges, exceptions },
                 workers,
@@ -160,6 +201,11 @@ impl Catalog for SqliteCatalog {
     }
 
     async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+        {
+            let writer = self.writer.lock().await;
+            let writer = writer.as_ref().ok_or(CatalogError::Closed)?;
+            writer.check().map_err(|e| self.refused(e))?;
+        }
         let mut c = self.reader().await?;
         let read = async {
             Ok(News {
@@ -168,7 +214,7 @@ impl Catalog for SqliteCatalog {
                 free: job_query::free(&mut c).await?,
                 taken: Owned::default(),
                 leased: None,
-                houses: 1,
+                instances: 1,
                 workers,
             })
         };
@@ -185,26 +231,69 @@ impl Catalog for SqliteCatalog {
     }
 
     async fn adopt(&self, _: WorkerId) -> Result<Owned, CatalogError> {
-        // Every lease is this house's already.
+        // Every lease is this instance's already.
         Ok(Owned::default())
     }
 
-    async fn commit(&self, changes: Changes) -> Result<Settled, CatalogError> {
+    async fn commit(&self, changes: &Changes) -> Result<Settled, CatalogError> {
         if changes.is_empty() {
             return Ok(Settled::default());
         }
-        self.write(async |c, keys| write::changes(c, keys, &changes).await)
+        self.write(async |c, keys| write::changes(c, keys, changes).await)
             .await
     }
 
-    async fn submit(
-        &self,
-        job: &Job,
-        ranges: &[Range],
-        events: &[NewEvent],
-    ) -> Result<bool, CatalogError> {
-        self.write(async |c, keys| jobs::submit(c, keys, job, ranges, events).await)
+    async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
+        crate::refused::verdict(
+            self.transaction(false, async |c, keys| {
+                write::write_rows(c, keys, changes).await
+            })
+            .await,
+        )
+    }
+
+    async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError> {
+        // Before the transaction: a large spec takes a while.
+        let spec = serde_json::to_string(&*submission.job.spec).expect("a spec is plain data");
+        self.write(async |c, keys| jobs::record(c, keys, submission, &spec).await)
             .await
+    }
+
+    async fn recorded(&self, set: &ResultSet, count: u64) -> Result<Vec<Recorded>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::recorded(&mut c, set, count)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn mark_checked(
+        &self,
+        set: &ResultSet,
+        outputs: &[Recorded],
+    ) -> Result<(), CatalogError> {
+        // Short transactions: others wait for them.
+        for some in outputs.chunks(1_000) {
+            self.write(async |c, _| {
+                for output in some {
+                    query::mark_checked(c, set, output).await?;
+                }
+                Ok(())
+            })
+            .await?;
+        }
+        Ok(())
+    }
+
+    async fn drop_output(&self, gone: &Gone) -> Result<bool, CatalogError> {
+        self.write(async |c, _| Ok(query::drop_output(c, gone).await?))
+            .await
+    }
+
+    async fn state(&self, job: JobId) -> Result<Option<JobState>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::state(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
     }
 
     async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError> {
@@ -223,17 +312,13 @@ impl Catalog for SqliteCatalog {
             .await
     }
 
-    async fn forget(&self, before_ms: i64, most: u32) -> Result<u32, CatalogError> {
-        let mut forgotten = 0;
-        // One transaction each: they may be long.
-        while forgotten < most
-            && self
-                .write(async |c, _| Ok(job_query::forget(c, before_ms).await?))
-                .await?
-        {
-            forgotten += 1;
-        }
-        Ok(forgotten)
+    async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
+        self.write(async |c, keys| {
+            // The database may use keys again that are free.
+            *keys = write::Keys::default();
+            Ok(listing_query::forget(c, before_ms).await?)
+        })
+        .await
     }
 
     async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
@@ -250,15 +335,21 @@ impl Catalog for SqliteCatalog {
 
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
-        let mut found = job_query::jobs(&mut c, Some(id))
+        job_query::record(&mut c, id)
             .await
-            .map_err(|e| self.failed(e))?;
-        Ok(found.pop())
+            .map_err(|e| self.failed(e))
     }
 
-    async fn jobs(&self) -> Result<Vec<JobRecord>, CatalogError> {
+    async fn active_tasks(&self) -> Result<TaskCounts, CatalogError> {
         let mut c = self.reader().await?;
-        job_query::jobs(&mut c, None)
+        listing_query::active_tasks(&mut c)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn page(&self, query: &JobQuery) -> Result<Page, CatalogError> {
+        let mut c = self.reader().await?;
+        listing_query::page(&mut c, query)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -270,9 +361,9 @@ impl Catalog for SqliteCatalog {
             .map_err(|e| self.failed(e))
     }
 
-    async fn recent(&self, most: u32) -> Result<Vec<Job>, CatalogError> {
+    async fn recent(&self, most: u32, sight: &Sight) -> Result<Vec<Job>, CatalogError> {
         let mut c = self.reader().await?;
-        job_query::recent(&mut c, most)
+        job_query::recent(&mut c, most, sight)
             .await
             .map_err(|e| self.failed(e))
     }

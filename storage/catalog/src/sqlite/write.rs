@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use picofarm_proto::ids::{JobId, RangeId, StageRef};
-use sqlx::{Connection, QueryBuilder, Row, Sqlite, SqliteConnection};
+use picofarm_proto::ids::{InstanceId, JobId, RangeId, StageRef};
+use sqlx::{Connection, QueryBuilder, Row, Sqlite, SqliteConnection, sqlite::SqliteConnectOptions};
 use uuid::Uuid;
 
-use super::{jobs, query};
+use super::{files::Files, jobs, query};
 use crate::{
     Changes, Claim, NewEvent, Output, Owned, Range, Settled, Want,
     sql::{self, StateColumns, int},
@@ -19,6 +19,8 @@ const LOOK_AT: i64 = 256;
 
 pub(super) enum WriteError {
     Conflict(String),
+    /// The files are not the database's any more.
+    Lost(String),
     Sql(sqlx::Error),
 }
 
@@ -32,34 +34,95 @@ pub(super) type Result<T> = std::result::Result<T, WriteError>;
 
 /// The connection that writes.
 pub(super) struct Writer {
-    connection: SqliteConnection,
+    options: SqliteConnectOptions,
+    /// `None` after a transaction that did not end in order.
+    connection: Option<SqliteConnection>,
+    files: Files,
     keys: Keys,
 }
 
 impl Writer {
-    pub(super) fn new(connection: SqliteConnection) -> Self {
+    pub(super) fn new(
+        connection: SqliteConnection,
+        options: SqliteConnectOptions,
+        files: Files,
+    ) -> Self {
         Self {
-            connection,
+            options,
+            connection: Some(connection),
+            files,
             keys: Keys::default(),
         }
     }
 
+    /// Checks that what is open is what lies at the path.
+    pub(super) fn check(&self) -> Result<()> {
+        self.files.check().map_err(WriteError::Lost)
+    }
+
+    /// Runs `work` in a transaction, which is kept if `keep` and undone else.
+    ///
+    /// A connection whose transaction does not end in order (no room for the commit, and none for the rollback either) counts
+    /// it as open for ever: such a one is given up, and the next transaction has a new one.
     pub(super) async fn transaction<T>(
         &mut self,
+        keep: bool,
         work: impl AsyncFnOnce(&mut SqliteConnection, &mut Keys) -> Result<T>,
     ) -> Result<T> {
-        let mut tx = self.connection.begin_with("BEGIN IMMEDIATE").await?;
-        // Dropping the transaction undoes it.
-        let done = work(&mut tx, &mut self.keys).await?;
-        tx.commit().await?;
+        self.check()?;
+        // Whoever stops waiting half-way leaves none behind.
+        let mut connection = match self.connection.take() {
+            Some(connection) => connection,
+            None => SqliteConnection::connect_with(&self.options).await?,
+        };
+        let (done, ended) = run(&mut connection, &mut self.keys, keep, work).await;
+        if done.is_err() {
+            // Keys of rows that are no more.
+            self.keys = Keys::default();
+        }
+        match &ended {
+            Ok(()) => self.connection = Some(connection),
+            Err(error) => {
+                tracing::warn!(%error, "the catalog's connection is given up after a failed transaction");
+                let _ = connection.close_hard().await;
+            }
+        }
+        let done = done?;
+        ended?;
+        // What was written into a file that is nowhere any more is not written.
+        self.check()?;
         Ok(done)
     }
 
     pub(super) async fn close(self) {
-        if let Err(error) = self.connection.close().await {
+        if let Some(connection) = self.connection
+            && let Err(error) = connection.close().await
+        {
             tracing::warn!(%error, "closing the catalog");
         }
     }
+}
+
+/// What came of the work, and of the end of its transaction.
+async fn run<T>(
+    connection: &mut SqliteConnection,
+    keys: &mut Keys,
+    keep: bool,
+    work: impl AsyncFnOnce(&mut SqliteConnection, &mut Keys) -> Result<T>,
+) -> (Result<T>, std::result::Result<(), sqlx::Error>) {
+    let mut tx = match connection.begin_with("BEGIN IMMEDIATE").await {
+        Ok(tx) => tx,
+        Err(error) => {
+            let why = sqlx::Error::Protocol(error.to_string());
+            return (Err(WriteError::Sql(error)), Err(why));
+        }
+    };
+    let done = work(&mut tx, keys).await;
+    let ended = match keep && done.is_ok() {
+        true => tx.commit().await,
+        false => tx.rollback().await,
+    };
+    (done, ended)
 }
 
 /// Integer keys of stages, remembered: they never change.
@@ -106,7 +169,23 @@ impl Keys {
     }
 }
 
-/// The ranges in this house's hands.
+/// Bytes that a life writes when it begins, to see that a batch finds room.
+const ROOM: i64 = 256 << 10;
+
+/// Notes whose life it is now.
+pub(super) async fn found(
+    c: &mut SqliteConnection,
+    instance: InstanceId,
+) -> std::result::Result<(), sqlx::Error> {
+    sqlx::query("INSERT OR REPLACE INTO life (key, instance, room) VALUES (1, ?, zeroblob(?))")
+        .bind(instance.uuid())
+        .bind(ROOM)
+        .execute(c)
+        .await?;
+    Ok(())
+}
+
+/// The ranges in this instance's hands.
 pub(super) async fn owned(
     c: &mut SqliteConnection,
 ) -> std::result::Result<Vec<Range>, sqlx::Error> {
@@ -203,6 +282,20 @@ pub(super) async fn changes(
         let key = keys.of(c, range.stage).await?.stage;
         give(c, key, range).await?;
     }
+    write_rows(c, keys, changes).await?;
+    let mut settled = Settled::default();
+    for (stage, at_ms) in &changes.perhaps_over {
+        settled.join(jobs::stage_over(c, keys, *stage, *at_ms).await?);
+    }
+    Ok(settled)
+}
+
+/// Writes the rows of a change set that hold what others sent.
+pub(super) async fn write_rows(
+    c: &mut SqliteConnection,
+    keys: &mut Keys,
+    changes: &Changes,
+) -> Result<()> {
     insert_outputs(c, keys, &changes.outputs).await?;
     for exception in changes.exceptions.values() {
         let stage = keys.of(c, exception.stage).await?.stage;
@@ -233,12 +326,7 @@ pub(super) async fn changes(
         .execute(&mut *c)
         .await?;
     }
-    insert_events(c, keys, &changes.events).await?;
-    let mut settled = Settled::default();
-    for (stage, at_ms) in &changes.perhaps_over {
-        settled.join(jobs::stage_over(c, keys, *stage, *at_ms).await?);
-    }
-    Ok(settled)
+    insert_events(c, keys, &changes.events).await
 }
 
 /// Removes the former state of every range that changes, having checked that it is there.
@@ -325,6 +413,7 @@ async fn insert_outputs(
     keys: &mut Keys,
     outputs: &[Output],
 ) -> Result<()> {
+    sql::writable(outputs)?;
     for chunk in outputs.chunks(ROWS) {
         let mut sets = Vec::with_capacity(chunk.len());
         for output in chunk {

@@ -19,10 +19,11 @@ pub(super) struct Row {
     seed: u64,
     task_key: String,
     renderer: String,
+    missing: Vec<String>,
 }
 
 /// Columns of `scenes.csv`: name, Croissant type, what it is.
-const COLUMNS: [(&str, &str, &str); 7] = [
+const COLUMNS: [(&str, &str, &str); 8] = [
     ("index", "sc:Integer", "number of the scene in this export"),
     (
         "source_scene",
@@ -50,6 +51,11 @@ const COLUMNS: [(&str, &str, &str); 7] = [
         "sc:Text",
         "versions of renderer, generators and encoder",
     ),
+    (
+        "missing",
+        "sc:Text",
+        "what is not known of the scene, between spaces: its values stand for nothing, and are left out of tar and HDF5 files",
+    ),
 ];
 
 impl Row {
@@ -63,6 +69,7 @@ impl Row {
             seed: provenance.seed,
             task_key: provenance.task_key.clone(),
             renderer: provenance.renderer.clone(),
+            missing: manifest.missing(),
         }
     }
 }
@@ -93,8 +100,15 @@ fn table(rows: &[Row]) -> String {
         // None of the texts can hold a comma: keys, versions and our own file names.
         writeln!(
             text,
-            "{},{},{},{},{},{},{}",
-            r.index, r.source_scene, r.file, r.photons_per_unit, r.seed, r.task_key, r.renderer
+            "{},{},{},{},{},{},{},{}",
+            r.index,
+            r.source_scene,
+            r.file,
+            r.photons_per_unit,
+            r.seed,
+            r.task_key,
+            r.renderer,
+            r.missing.join(" ")
         )
         .expect("a string takes everything");
     }
@@ -261,13 +275,21 @@ fn readme(name: &str, format: ExportFormat, spec: &DatasetSpec, rows: &[Row]) ->
     let mut made: Vec<&str> = rows.iter().map(|r| &*r.renderer).collect();
     made.sort_unstable();
     made.dedup();
+    let lacking = rows.iter().filter(|r| !r.missing.is_empty()).count();
+    let unknown = match lacking {
+        0 => String::new(),
+        n => format!(
+            "Of {n} of the scenes not everything is known: the column `missing` of `scenes.csv` lists what. Do not read \
+             values of it.\n\n"
+        ),
+    };
     format!(
         "---\npretty_name: {name}\nlicense: unknown\ntags:\n- transient-imaging\n- single-photon-lidar\n- time-of-flight\n\
          size_categories:\n- {size}\nconfigs:\n- config_name: scenes\n  data_files: scenes.csv\n---\n\n\
          # {name}\n\n{}\n\n`scenes.csv` lists the scenes with the seeds and task keys that they were made of; `croissant.json` says the \
          same to machines. Bin b holds optical path lengths from {} + b·{} m on; light goes 299,792,458 m in a second. \
          No one set a licence here: say which before you publish.\n\n\
-         ## Open it\n\n```python\n{}\n```\n\n## Arrays\n\n| name | what it holds |\n| --- | --- |\n{arrays}\n\
+         ## Open it\n\n```python\n{}\n```\n\n## Arrays\n\n| name | what it holds |\n| --- | --- |\n{arrays}\n{unknown}\
          In tar and HDF5 files, `scale` is called `photons_per_unit`, normals are floats, and `visibility` has a byte a pixel and spot.\n\n\
          ## Made by\n\n{}\n",
         description(spec, rows.len()),

@@ -61,7 +61,8 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
 }
 
 impl Dataset {
-    /// All arrays of a scene, decoded.
+    /// All arrays of a scene, decoded; those of which the scene's source had nothing are left out, and what it did not say
+    /// of the spots is NaN.
     pub(super) async fn plain(&self, scene: u64) -> Result<PlainScene, DatasetError> {
         let manifest = self.manifest(scene).await?;
         let spec = *self.spec();
@@ -71,8 +72,12 @@ impl Dataset {
             spec.spots as usize,
         );
         let bins = spec.gate.bins as usize;
-        let mut arrays = Vec::new();
+        let (mut arrays, missing) = (Vec::new(), manifest.missing());
+        let lacks = |name: &str| missing.iter().any(|m| m == name);
         for quantity in spec.quantities() {
+            if lacks(quantity.name()) {
+                continue;
+            }
             let (shape, values) = match quantity {
                 q if q.is_transient() => {
                     let values = self.read_histogram(scene, q).await?;
@@ -87,7 +92,18 @@ impl Dataset {
                 Quantity::Specular => (vec![h, w], Values::U8(self.read(scene, quantity).await?)),
                 Quantity::Label => (vec![h, w], Values::U16(self.read(scene, quantity).await?)),
                 Quantity::Instance => (vec![h, w], Values::U32(self.read(scene, quantity).await?)),
-                Quantity::Spots => (vec![s, 7], Values::F32(self.read(scene, quantity).await?)),
+                Quantity::Spots => {
+                    let mut rows = self.read::<f32>(scene, quantity).await?;
+                    for row in rows.chunks_exact_mut(7) {
+                        if lacks("spots.normal") {
+                            row[3..6].fill(f32::NAN);
+                        }
+                        if lacks("spots.path") {
+                            row[6] = f32::NAN;
+                        }
+                    }
+                    (vec![s, 7], Values::F32(rows))
+                }
                 Quantity::Intrinsics => (vec![4], Values::F32(self.read(scene, quantity).await?)),
                 Quantity::Camera => (vec![4, 4], Values::F32(self.read(scene, quantity).await?)),
                 Quantity::Laser => (vec![3], Values::F32(self.read(scene, quantity).await?)),

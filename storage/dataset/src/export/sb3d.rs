@@ -49,6 +49,9 @@ pub(crate) struct Aside {
     pub photons_per_unit: f32,
     /// Key of the task that made the scene.
     pub task_key: String,
+    /// What is not known of the scene, as [`crate::Manifest::missing`] has it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub missing: Vec<String>,
 }
 
 impl Aside {
@@ -77,6 +80,7 @@ impl Dataset {
         let spec = self.spec();
         let mut out = Out::default();
         let manifest = self.manifest(scene).await?;
+        check_known(scene, &manifest.missing())?;
         let mut factor = None;
         let histograms = [
             Quantity::Transient,
@@ -138,6 +142,7 @@ impl Dataset {
             laser: [laser[0], laser[1], laser[2]],
             spots: spots.iter().map(|s| s.map(|s| s.row())).collect(),
             photons_per_unit: manifest.scale,
+            missing: manifest.missing(),
             task_key: manifest.provenance.task_key,
         };
         let mut text = serde_json::to_vec_pretty(&aside).expect("plain data");
@@ -166,6 +171,24 @@ pub(super) fn check(spec: &DatasetSpec) -> Result<(), DatasetError> {
         spec.spots
     );
     Err(DatasetError::invalid("spec.spots", what))
+}
+
+/// A scene has what the layout has files of: a file of fill values could not be told from the truth.
+fn check_known(scene: u64, missing: &[String]) -> Result<(), DatasetError> {
+    let filed = ["depth", "specular", "visibility"];
+    let lacking: Vec<&str> = filed
+        .into_iter()
+        .filter(|name| missing.iter().any(|m| m == name))
+        .collect();
+    if lacking.is_empty() {
+        return Ok(());
+    }
+    let what = format!(
+        "the paper's layout has files of depth, mirrors and shadows, but of scene {scene} these were not imported: {}; leave \
+         the scene out, import it with them, or choose zarr, webdataset or hdf5",
+        lacking.join(", ")
+    );
+    Err(DatasetError::invalid("scenes", what))
 }
 
 /// The power of two that brings the brightest value to (BRIGHTEST/2, BRIGHTEST].
@@ -240,6 +263,17 @@ fn zipped(name: &str, array: &[u8]) -> Result<Vec<u8>, DatasetError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_scene_without_what_the_layout_has_files_of_is_refused() {
+        let missing = ["normal", "depth", "spots.path", "visibility"].map(str::to_owned);
+        let said = check_known(7, &missing).unwrap_err().to_string();
+        assert!(
+            said.contains("scene 7") && said.contains(": depth, visibility;"),
+            "{said}"
+        );
+        assert!(check_known(7, &["rgb".to_owned()]).is_ok());
+    }
 
     #[test]
     fn the_brightest_bin_comes_close_to_the_top_by_a_power_of_two() {

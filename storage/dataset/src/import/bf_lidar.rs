@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
+use picofarm_files::Opener;
+
 use super::files::{self, Files};
 use super::mat::Mat;
 use super::platonerf::along;
@@ -66,14 +68,18 @@ fn scan_file(folder: &Path) -> Result<Option<PathBuf>, ImportError> {
     }
 }
 
-pub(super) fn find(root: &Path, options: &ImportOptions) -> Result<Vec<Item>, ImportError> {
+pub(super) fn find(
+    root: &Path,
+    options: &ImportOptions,
+    opener: &Opener,
+) -> Result<Vec<Item>, ImportError> {
     let is_scene = |folder: &Path| {
         matches!(
             scan_file(folder),
             Ok(Some(_)) | Err(ImportError::Refused { .. })
         ) && captures(folder).is_ok_and(|c| !c.is_empty())
     };
-    let folders = super::folders_with(root, is_scene)?;
+    let folders = super::folders_with(root, opener, is_scene)?;
     if options.captures == Captures::Sum {
         return Ok(folders);
     }
@@ -84,6 +90,7 @@ pub(super) fn find(root: &Path, options: &ImportOptions) -> Result<Vec<Item>, Im
                 name: format!("{}/spot_{number}", item.name),
                 folder: item.folder.clone(),
                 capture: Some(capture),
+                opener: opener.clone(),
             });
         }
     }
@@ -99,7 +106,7 @@ fn chosen(item: &Item) -> Result<Vec<PathBuf>, ImportError> {
 }
 
 pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, ImportError> {
-    let files = Files::new(&item.folder);
+    let files = item.files();
     let scan = Scan::read(&item.folder, &files)?;
     let paths = chosen(item)?;
     let Some(first) = paths.first() else {
@@ -279,7 +286,9 @@ pub(super) fn read(
     }
     scene.conversions = conversions;
     scene.laser = laser.map(|x| x as f32);
-    scene.set_spots(&positions, None);
+    scene.set_spots(&positions);
+    // The spots were found along straight beams.
+    scene.judge_beams(true);
     // They are counts.
     scene.scale = Some(1.0);
     scene.check = Value::Array(checks);
@@ -323,7 +332,7 @@ impl Scan {
         let mat = Mat::open(&file, files)?;
         let (width, height) = (mat.number("num_u")? as usize, mat.number("num_v")? as usize);
         let (theta, phi) = (mat.matrix("thetaMap")?.values, mat.matrix("phiMap")?.values);
-        let pixels = width * height;
+        let pixels = width.saturating_mul(height);
         if width < 2 || height < 2 || theta.len() != pixels || phi.len() != pixels {
             let expected =
                 format!("{pixels} angles for num_u = {width}, num_v = {height}, at least 2 each");
@@ -341,13 +350,13 @@ impl Scan {
             let forward = libm::cos(*phi) * libm::sin(*theta);
             if forward.is_nan() || forward <= 0.0 {
                 let found = format!("theta = {theta}, phi = {phi}");
-                let mend = "give angles in radians";
+                let hint = "give angles in radians";
                 return Err(ImportError::refused(
                     &file,
                     "thetaMap and phiMap",
                     "rays that go forward",
                     found,
-                    mend,
+                    hint,
                 ));
             }
             slopes[0].push(-libm::cos(*theta) / forward);

@@ -10,6 +10,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use super::ImportError;
+use super::masks::{self, Masks};
 use super::scene::{Shape, direction};
 use crate::record::{Intrinsics, Spot};
 
@@ -22,11 +23,11 @@ const TOLERANCE: isize = 1;
 /// A step is a bin, or as many bins as are about so long: pulses of real lasers are longer than their bins.
 const STEP_M: f64 = 0.0384;
 /// Pairs of pixel and spot for a judgement.
-const MIN_PAIRS: usize = 200;
+pub(super) const MIN_PAIRS: usize = 200;
 /// The peak stands out from its surroundings by this factor at least.
-const CONTRAST: f64 = 1.3;
+pub(super) const CONTRAST: f64 = 1.3;
 /// Another reading must fit better by this factor to be believed.
-const BETTER: f64 = 1.15;
+pub(super) const BETTER: f64 = 1.15;
 /// Spots may lie so far off the surface that the depth image shows, relative to their depth.
 const OFF_SURFACE: f64 = 0.05;
 
@@ -54,24 +55,25 @@ pub(super) struct Blame<'a> {
     pub spots: &'a Path,
     pub visibility: &'a Path,
     /// How geometry and gate are given in this format.
-    pub mend: &'a str,
+    pub hint: &'a str,
     /// How the masks' polarity is given.
     pub polarity: &'a str,
 }
 
 /// Another way to read the same files.
 #[derive(Debug, Clone, Copy, Default)]
-struct Reading {
+pub(super) struct Reading {
     /// The depth image holds the other kind of depth.
-    other_depth: bool,
-    flip_spots: [bool; 2],
-    flip_image: [bool; 2],
+    pub other_depth: bool,
+    pub flip_spots: [bool; 2],
+    pub flip_image: [bool; 2],
+    pub masks: Masks,
 }
 
 /// Energy around the predicted bin, averaged over pairs of pixel and spot.
-struct Profile {
+pub(super) struct Profile {
     energy: Vec<f64>,
-    pairs: usize,
+    pub pairs: usize,
 }
 
 impl Profile {
@@ -86,18 +88,18 @@ impl Profile {
     }
 
     /// The best of the tolerated shifts.
-    fn hit(&self) -> f64 {
+    pub fn hit(&self) -> f64 {
         let near = (-TOLERANCE..=TOLERANCE).map(|s| self.at(s));
         near.fold(0.0, f64::max)
     }
 
     /// What stands out at the prediction.
-    fn excess(&self) -> f64 {
+    pub fn excess(&self) -> f64 {
         self.hit() - self.background()
     }
 
     /// Median of the shifts farther off.
-    fn background(&self) -> f64 {
+    pub fn background(&self) -> f64 {
         let far = (-REACH..=REACH).filter(|s| s.abs() > 2 * TOLERANCE + 2);
         let mut far: Vec<f64> = far.map(|s| self.at(s)).collect();
         far.sort_by(f64::total_cmp);
@@ -112,7 +114,7 @@ impl Profile {
 pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, ImportError> {
     let surface = on_surface(g, blame)?;
     let own = Reading::default();
-    let mend = "see whether the files belong together, or import them as they are with --unchecked";
+    let hint = "see whether the files belong together, or import them as they are with --unchecked";
     let all = profile(g, own, Which::All);
     if all.pairs < MIN_PAIRS {
         let expected = format!(
@@ -124,7 +126,7 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             "light",
             expected,
             found,
-            mend,
+            hint,
         ));
     }
     // Masks of the wrong polarity must not make the gate look wrong: they come last.
@@ -141,21 +143,22 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             peak.unsigned_abs() as f64 * step,
             if peak > 0 { "after" } else { "before" }
         );
-        let mend = format!(
+        let hint = format!(
             "the gate may be another one: {}; or import as it is with --unchecked",
-            blame.mend
+            blame.hint
         );
         return Err(ImportError::refused(
             blame.histogram,
             "gate",
             expected,
             found,
-            mend,
+            hint,
         ));
     }
     readings(g, blame, all.excess())?;
     let lit = profile(g, own, Which::Lit);
-    polarity(g, blame, &lit)?;
+    masks::polarity(g, blame, &lit)?;
+    let separation = masks::order(g, blame, &lit)?;
     if lit.pairs < MIN_PAIRS {
         let expected =
             format!("at least {MIN_PAIRS} pairs of a sampled pixel and a spot that lights it");
@@ -165,7 +168,7 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             "lit pixels",
             expected,
             found,
-            mend,
+            hint,
         ));
     }
     let (hit, background) = (lit.hit(), lit.background());
@@ -181,46 +184,20 @@ pub(super) fn check(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Value, Import
             found,
             format!(
                 "units, gate, intrinsics or the number of spots may be others: {}; or import as it is with --unchecked",
-                blame.mend
+                blame.hint
             ),
         ));
     }
     Ok(json!({
         "pairs": lit.pairs, "tolerance_m": TOLERANCE as f64 * step, "peak_shift_m": peak as f64 * step,
         "energy_at_prediction": round(hit), "energy_around": round(background),
-        "spots_off_surface": surface.map(round),
+        "spots_off_surface": surface.map(round), "lit_over_shadow": separation.map(round),
     }))
 }
 
 /// Few digits: the manifest is for people, too.
 fn round(x: f64) -> f64 {
     libm::round(x * 1e6) / 1e6
-}
-
-/// Masks the wrong way round light up where no light arrives.
-fn polarity(g: &Geometry<'_>, blame: &Blame<'_>, lit: &Profile) -> Result<(), ImportError> {
-    if g.visibility.is_none() {
-        return Ok(());
-    }
-    let dark = profile(g, Reading::default(), Which::Dark);
-    let clear = dark.hit() > dark.background() * CONTRAST;
-    if dark.pairs < MIN_PAIRS || !clear || dark.excess() <= lit.excess().max(0.0) * BETTER {
-        return Ok(());
-    }
-    Err(ImportError::refused(
-        blame.visibility,
-        "polarity of the visibility masks",
-        "more two-bounce light where a mask says lit",
-        format!(
-            "{:.5} of a pixel's energy there, {:.5} where it says shadow",
-            lit.excess().max(0.0),
-            dark.excess()
-        ),
-        format!(
-            "the masks may be the other way round: {}; or import as they are with --unchecked",
-            blame.polarity
-        ),
-    ))
 }
 
 /// Whether another reading fits better.
@@ -305,26 +282,26 @@ fn readings(g: &Geometry<'_>, blame: &Blame<'_>, own: f64) -> Result<(), ImportE
         ),
     ];
     let mut best: Option<(f64, &Path, &str, &str, &str, &str)> = None;
-    for (reading, file, field, expected, found, mend) in others {
+    for (reading, file, field, expected, found, hint) in others {
         let other = profile(g, reading, Which::All);
         let excess = other.excess();
         let beaten = best.as_ref().is_none_or(|(e, ..)| excess > *e);
         if other.pairs >= MIN_PAIRS && excess > own.max(0.0) * BETTER + 1e-6 && beaten {
             let clear = other.hit() > other.background() * CONTRAST;
             if clear {
-                best = Some((excess, file, field, expected, found, mend));
+                best = Some((excess, file, field, expected, found, hint));
             }
         }
     }
     match best {
         None => Ok(()),
-        Some((excess, file, field, expected, found, mend)) => {
+        Some((excess, file, field, expected, found, hint)) => {
             let found = format!(
                 "{found} ({:.5} of a pixel's energy stands out at the predicted bins, instead of {:.5})",
                 excess,
                 own.max(0.0)
             );
-            Err(ImportError::refused(file, field, expected, found, mend))
+            Err(ImportError::refused(file, field, expected, found, hint))
         }
     }
 }
@@ -386,7 +363,7 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
             ),
             format!(
                 "units or axes may be others: {}; or import as they are with --unchecked",
-                blame.mend
+                blame.hint
             ),
         ));
     }
@@ -394,7 +371,7 @@ fn on_surface(g: &Geometry<'_>, blame: &Blame<'_>) -> Result<Option<f64>, Import
 }
 
 #[derive(Clone, Copy, PartialEq)]
-enum Which {
+pub(super) enum Which {
     All,
     Lit,
     Dark,
@@ -406,7 +383,7 @@ fn step(g: &Geometry<'_>) -> usize {
     (libm::round(STEP_M / width) as usize).clamp(1, g.shape.gate.bins as usize)
 }
 
-fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
+pub(super) fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
     let shape = g.shape;
     let (w, h, bins) = (
         shape.width as usize,
@@ -442,7 +419,12 @@ fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
             let x = d.map(|c| c * z);
             for (index, spot) in g.spots.iter().enumerate() {
                 let Some(spot) = spot else { continue };
-                let lit = g.visibility.is_none_or(|v| v[index * w * h + pixel] == 1);
+                let lit = g.visibility.is_none_or(|v| {
+                    let at = reading
+                        .masks
+                        .place(index, (row, column), (g.spots.len(), h, w));
+                    v[at] == 1
+                });
                 if which != Which::All && lit != (which == Which::Lit) {
                     continue;
                 }
@@ -473,7 +455,7 @@ fn profile(g: &Geometry<'_>, reading: Reading, which: Which) -> Profile {
     Profile { energy: sum, pairs }
 }
 
-fn flipped(at: usize, size: usize, flip: bool) -> usize {
+pub(super) fn flipped(at: usize, size: usize, flip: bool) -> usize {
     if flip { size - 1 - at } else { at }
 }
 

@@ -1,4 +1,4 @@
-//! Why something cannot be imported: which file, which field, what was expected, and how to mend it.
+//! Why something cannot be imported: which file, which field, what was expected, and how to correct it.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::store::io_hint;
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
     /// The files say something else than they must, or than what was asked for.
-    #[error("{file}: {field}: expected {expected}, found {found}; {mend}")]
+    #[error("{file}: {field}: expected {expected}, found {found}; {hint}")]
     Refused {
         /// The file or folder.
         file: String,
@@ -20,17 +20,17 @@ pub enum ImportError {
         /// What it is.
         found: String,
         /// What to do: an option that overrides, or how to convert the file.
-        mend: String,
+        hint: String,
     },
     /// A file cannot be decoded.
-    #[error("{file}: {what}; {mend}")]
+    #[error("{file}: {what}; {hint}")]
     Unreadable {
         /// The file.
         file: String,
         /// What is wrong with it.
         what: String,
-        /// How to mend or convert it.
-        mend: String,
+        /// How to repair or convert it.
+        hint: String,
     },
     /// An option that the format has no use for.
     #[error(
@@ -41,6 +41,13 @@ pub enum ImportError {
         option: &'static str,
         /// The format's name.
         format: &'static str,
+    },
+    /// A file that may not be opened, or cannot be.
+    #[error("{error}{}", file_hint(error))]
+    File {
+        /// Which and why.
+        #[from]
+        error: picofarm_files::FileError,
     },
     /// A file operation failed.
     #[error("cannot {action} {path}{}: {source}", io_hint(source).map(|h| format!(" ({h})")).unwrap_or_default())]
@@ -57,32 +64,41 @@ pub enum ImportError {
     Dataset(#[from] DatasetError),
 }
 
+fn file_hint(error: &picofarm_files::FileError) -> String {
+    match error {
+        picofarm_files::FileError::Io { source, .. } => {
+            io_hint(source).map_or_else(String::new, |h| format!(" ({h})"))
+        }
+        _ => String::new(),
+    }
+}
+
 impl ImportError {
     pub(super) fn refused(
         file: impl AsRef<Path>,
         field: impl Into<String>,
         expected: impl Into<String>,
         found: impl Into<String>,
-        mend: impl Into<String>,
+        hint: impl Into<String>,
     ) -> Self {
         Self::Refused {
             file: file.as_ref().display().to_string(),
             field: field.into(),
             expected: expected.into(),
             found: found.into(),
-            mend: mend.into(),
+            hint: hint.into(),
         }
     }
 
     pub(super) fn unreadable(
         file: impl AsRef<Path>,
         what: impl ToString,
-        mend: impl Into<String>,
+        hint: impl Into<String>,
     ) -> Self {
         Self::Unreadable {
             file: file.as_ref().display().to_string(),
             what: what.to_string(),
-            mend: mend.into(),
+            hint: hint.into(),
         }
     }
 

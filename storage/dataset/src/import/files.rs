@@ -1,13 +1,18 @@
 //! The files of a scene: read whole, and remembered with their SHA-256.
 
 use std::cell::RefCell;
+use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use picofarm_files::{FileError, Opener};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::ImportError;
+
+/// Largest file that is read whole, bytes.
+const MOST: u64 = 16 << 30;
 
 /// A file that a scene was made of.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -23,20 +28,42 @@ pub struct SourceFile {
 /// The files of one scene that were read so far.
 pub(super) struct Files {
     root: PathBuf,
+    opener: Opener,
     read: RefCell<Vec<SourceFile>>,
 }
 
 impl Files {
-    pub fn new(root: &Path) -> Self {
+    pub fn new(root: &Path, opener: &Opener) -> Self {
         Self {
             root: root.to_owned(),
+            opener: opener.clone(),
             read: RefCell::default(),
         }
     }
 
+    /// The path of the file that a file in `folder` names: below the folder, without `..`.
+    pub fn named(&self, folder: &Path, name: &str) -> Result<PathBuf, ImportError> {
+        use std::path::Component::{CurDir, Normal};
+        let path = Opener::named(folder, name)?;
+        let plain = |c| matches!(c, CurDir | Normal(_));
+        if !Path::new(name).components().all(plain) {
+            return Err(FileError::Outside {
+                path,
+                allowed: folder.display().to_string(),
+            }
+            .into());
+        }
+        Ok(path)
+    }
+
+    /// An open file.
+    pub fn open(&self, path: &Path) -> Result<File, ImportError> {
+        Ok(self.opener.open(path)?)
+    }
+
     /// The bytes of a file; `what` it is for goes into the error.
     pub fn bytes(&self, path: &Path) -> Result<Vec<u8>, ImportError> {
-        let bytes = std::fs::read(path).map_err(|e| ImportError::io("read", path, e))?;
+        let bytes = self.opener.read(path, MOST)?;
         self.remember(path, bytes.len() as u64, &Sha256::digest(&bytes));
         Ok(bytes)
     }
@@ -44,7 +71,7 @@ impl Files {
     /// Remembers a file that its decoder reads by itself, piece by piece.
     pub fn hash(&self, path: &Path) -> Result<(), ImportError> {
         let failed = |e| ImportError::io("read", path, e);
-        let mut file = std::fs::File::open(path).map_err(failed)?;
+        let mut file = self.open(path)?;
         let (mut digest, mut total) = (Sha256::new(), 0);
         let mut buffer = vec![0; 1 << 20];
         loop {

@@ -9,10 +9,14 @@ use half::f16;
 use rayon::prelude::*;
 
 use super::ImportError;
+use super::files::Files;
 
 const MEND_EXR: &str = "convert it to scan lines of one resolution with ZIP compression, e.g. in Python: \
                         import OpenEXR; f = OpenEXR.File(path); f.header()['compression'] = OpenEXR.ZIP_COMPRESSION; \
                         f.write(path)";
+
+/// Values that a byte of an OpenEXR file stands for at most: images of one colour under the best of its compressions.
+const RATIO: usize = 1 << 12;
 
 /// A channel of an OpenEXR file, `[row][column]`.
 #[derive(Debug, Clone)]
@@ -34,8 +38,9 @@ pub(super) struct Exr {
 }
 
 /// Width and height of an OpenEXR file's only layer.
-pub(super) fn exr_size(file: &Path) -> Result<(usize, usize), ImportError> {
-    let meta = exr::meta::MetaData::read_from_file(file, false);
+pub(super) fn exr_size(file: &Path, files: &Files) -> Result<(usize, usize), ImportError> {
+    let reader = std::io::BufReader::new(files.open(file)?);
+    let meta = exr::meta::MetaData::read_from_buffered(reader, false);
     let meta = meta.map_err(|e| match e {
         exr::error::Error::Io(e) => ImportError::io("read", file, e),
         e => ImportError::unreadable(file, e, MEND_EXR),
@@ -45,6 +50,8 @@ pub(super) fn exr_size(file: &Path) -> Result<(usize, usize), ImportError> {
 }
 
 /// Decodes an OpenEXR file on rayon's threads.
+///
+/// Room is made for at most [`RATIO`] times the file's size.
 pub(super) fn exr(file: &Path, bytes: &[u8]) -> Result<Exr, ImportError> {
     let failed = |e: exr::error::Error| ImportError::unreadable(file, e, MEND_EXR);
     let reader = exr::block::read(Cursor::new(bytes), false).map_err(failed)?;
@@ -55,6 +62,15 @@ pub(super) fn exr(file: &Path, bytes: &[u8]) -> Result<Exr, ImportError> {
         return Err(ImportError::unreadable(file, what, MEND_EXR));
     }
     let (width, height) = (header.layer_size.width(), header.layer_size.height());
+    let count = header.channels.list.len().max(1);
+    let values = width.saturating_mul(height).saturating_mul(count);
+    if values > bytes.len().saturating_mul(RATIO) {
+        let what = format!(
+            "announces {count} channels of {width}x{height} pixels, more than {} bytes can hold",
+            bytes.len()
+        );
+        return Err(ImportError::unreadable(file, what, MEND_EXR));
+    }
     let mut chunks = reader.all_chunks(false).map_err(failed)?;
     let meta = exr::block::reader::ChunksReader::meta_data(&chunks).clone();
     let all: Vec<Chunk> = (&mut chunks).collect::<Result<_, _>>().map_err(failed)?;
@@ -137,13 +153,25 @@ fn fill<const N: usize>(out: &mut [f32], raw: &[u8], value: impl Fn([u8; N]) -> 
     }
 }
 
-/// The first channel of an 8-bit PNG as (width, height, values); grey is its only one.
-pub(super) fn png(file: &Path, bytes: &[u8]) -> Result<(usize, usize, Vec<u8>), ImportError> {
-    let mend = "save it again as an 8-bit grey PNG";
-    let failed = |e: png::DecodingError| ImportError::unreadable(file, e, mend);
+/// The first channel of an 8-bit PNG of `width` × `height` pixels; grey is its only one. An image of another size is
+/// refused before it is unpacked.
+pub(super) fn png(
+    file: &Path,
+    bytes: &[u8],
+    (width, height): (usize, usize),
+) -> Result<Vec<u8>, ImportError> {
+    let hint = "save it again as an 8-bit grey PNG";
+    let failed = |e: png::DecodingError| ImportError::unreadable(file, e, hint);
     let mut decoder = png::Decoder::new(Cursor::new(bytes));
     decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
     let mut reader = decoder.read_info().map_err(failed)?;
+    let size = reader.info().size();
+    if (size.0 as usize, size.1 as usize) != (width, height) {
+        let expected = format!("{width}x{height}, as depth.exr");
+        let found = format!("{}x{}", size.0, size.1);
+        let hint = "see whether the files belong together";
+        return Err(ImportError::refused(file, "size", expected, found, hint));
+    }
     let size = reader.output_buffer_size();
     let mut buffer = vec![0; size.filter(|n| *n <= 1 << 30).unwrap_or(0)];
     let info = reader.next_frame(&mut buffer).map_err(failed)?;
@@ -152,5 +180,55 @@ pub(super) fn png(file: &Path, bytes: &[u8]) -> Result<(usize, usize, Vec<u8>), 
         .chunks_exact(samples)
         .map(|pixel| pixel[0])
         .collect();
-    Ok((info.width as usize, info.height as usize, values))
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_png_of_another_size_is_refused_before_it_is_unpacked() {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, 8192, 8192);
+        encoder.set_color(png::ColorType::Grayscale);
+        let mut writer = encoder.write_header().unwrap();
+        writer.write_image_data(&vec![0; 8192 * 8192]).unwrap();
+        writer.finish().unwrap();
+        assert!(bytes.len() < 1 << 18, "{}", bytes.len());
+        let said = png(Path::new("a.png"), &bytes, (4, 4))
+            .unwrap_err()
+            .to_string();
+        assert!(said.contains("8192x8192") && said.contains("4x4"), "{said}");
+    }
+
+    #[test]
+    fn an_exr_that_announces_more_than_it_can_hold_is_refused_before_room_is_made() {
+        use exr::prelude::{Encoding, SpecificChannels, WritableImage};
+        let mut bytes = Cursor::new(Vec::new());
+        let channels = SpecificChannels::build()
+            .with_channel("Y")
+            .with_pixel_fn(|_| (0.5f32,));
+        let image =
+            exr::prelude::Image::from_encoded_channels((4, 4), Encoding::UNCOMPRESSED, channels);
+        image.write().to_buffered(&mut bytes).unwrap();
+        let whole = bytes.into_inner();
+        assert_eq!(
+            exr(Path::new("a.exr"), &whole).unwrap().channels[0].values,
+            [0.5; 16]
+        );
+        // Both windows: their last corner is x and y, 4 bytes each.
+        let mut bomb = whole.clone();
+        for window in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
+            let found = whole.windows(window.len()).position(|w| w == window);
+            let corner = found.unwrap() + window.len() + 4 + 8;
+            for at in [corner, corner + 4] {
+                bomb[at..at + 4].copy_from_slice(&30_000i32.to_le_bytes());
+            }
+        }
+        let said = exr(Path::new("a.exr"), &bomb).unwrap_err().to_string();
+        assert!(said.contains("a.exr"), "{said}");
+        // The library notices first that the chunks are too few for such an image.
+        assert!(said.contains("chunk count"), "{said}");
+    }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use super::ImportError;
 use super::files::Files;
 
-const MEND: &str = "save it again with save('file.mat', '-v7'), or in Python with scipy.io.savemat";
+const HINT: &str = "save it again with save('file.mat', '-v7'), or in Python with scipy.io.savemat";
 
 /// A numeric array, first index fastest.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,22 +32,22 @@ impl Mat {
     /// Opens a file; version 7.3 stays on disk until an array is read.
     pub fn open(path: &Path, files: &Files) -> Result<Self, ImportError> {
         let mut head = [0; 128];
-        let mut file = std::fs::File::open(path).map_err(|e| ImportError::io("read", path, e))?;
+        let mut file = files.open(path)?;
         let whole_head = file.read_exact(&mut head).is_ok();
         let hdf5 = hdf5_pure::is_hdf5(path).map_err(|e| ImportError::io("read", path, e))?;
         let content = if hdf5 {
             files.hash(path)?;
             let opened = hdf5_pure::File::open_streaming(path);
             Content::V73(Box::new(
-                opened.map_err(|e| ImportError::unreadable(path, e, MEND))?,
+                opened.map_err(|e| ImportError::unreadable(path, e, HINT))?,
             ))
         } else if whole_head && matches!(&head[126..128], b"IM" | b"MI") {
             let bytes = files.bytes(path)?;
-            let arrays = version_5(&bytes).map_err(|e| ImportError::unreadable(path, e, MEND))?;
+            let arrays = version_5(&bytes).map_err(|e| ImportError::unreadable(path, e, HINT))?;
             Content::V5(arrays)
         } else {
             let what = "neither a MATLAB file of version 5 nor one of version 7.3 (HDF5)";
-            return Err(ImportError::unreadable(path, what, MEND));
+            return Err(ImportError::unreadable(path, what, HINT));
         };
         Ok(Self {
             path: path.to_owned(),
@@ -76,6 +76,7 @@ impl Mat {
         match &self.content {
             Content::V5(arrays) => Ok(arrays[name].clone()),
             Content::V73(file) => {
+                self.check_size(name, &dims)?;
                 let set = file.dataset(name).map_err(|_| self.absent(name))?;
                 let values = set.read_f64().map_err(|e| self.broken(name, e))?;
                 Ok(Matrix { dims, values })
@@ -105,6 +106,7 @@ impl Mat {
     pub fn columns(&self, name: &str, columns: Range<usize>) -> Result<Vec<f32>, ImportError> {
         let dims = self.dims(name)?;
         let rows = dims[0];
+        self.check_size(name, &[rows, columns.len()])?;
         let mut out = vec![0.0; rows * columns.len()];
         let mut put = |column: usize, values: &[f64]| {
             for (row, x) in values.iter().enumerate() {
@@ -134,6 +136,16 @@ impl Mat {
         Ok(out)
     }
 
+    /// Refuses to make room for what is announced and too much: nothing of it need be in the file.
+    fn check_size(&self, name: &str, dims: &[usize]) -> Result<(), ImportError> {
+        let count = dims.iter().try_fold(1usize, |n, d| n.checked_mul(*d));
+        if count.is_some_and(|count| count <= MAX_VALUES) {
+            return Ok(());
+        }
+        let what = format!("{name}: announces {dims:?} values, more than {MAX_VALUES}");
+        Err(ImportError::unreadable(&self.path, what, HINT))
+    }
+
     fn absent(&self, name: &str) -> ImportError {
         let found = match &self.content {
             Content::V5(arrays) => format!("{:?}", arrays.keys().collect::<Vec<_>>()),
@@ -149,7 +161,7 @@ impl Mat {
     }
 
     fn broken(&self, name: &str, error: hdf5_pure::Error) -> ImportError {
-        ImportError::unreadable(&self.path, format!("{name}: {error}"), MEND)
+        ImportError::unreadable(&self.path, format!("{name}: {error}"), HINT)
     }
 }
 
@@ -212,8 +224,10 @@ impl<'a> Elements<'a> {
 
 const MATRIX: u32 = 14;
 const COMPRESSED: u32 = 15;
-/// An element may grow to so many bytes.
-const MAX: u64 = 1 << 33;
+/// A compressed element may grow to so many bytes.
+const MAX: u64 = 1 << 32;
+/// Most values that are read of an array.
+const MAX_VALUES: usize = 1 << 28;
 
 /// The numeric arrays of a version 5 file; others (text, structures, cells) are passed over.
 fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
@@ -224,14 +238,10 @@ fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
         big,
     };
     while let Some(element) = elements.next()? {
-        let mut inflated = Vec::new();
+        let inflated;
         let element = match element.kind {
             COMPRESSED => {
-                let reader = flate2::read::ZlibDecoder::new(element.data);
-                reader
-                    .take(MAX)
-                    .read_to_end(&mut inflated)
-                    .map_err(|e| format!("a compressed element: {e}"))?;
+                inflated = inflate(element.data, big)?;
                 Elements {
                     rest: &inflated,
                     big,
@@ -247,6 +257,24 @@ fn version_5(bytes: &[u8]) -> Result<BTreeMap<String, Matrix>, String> {
         }
     }
     Ok(arrays)
+}
+
+/// Unpacks a compressed element, whose first eight bytes announce what follows.
+fn inflate(packed: &[u8], big: bool) -> Result<Vec<u8>, String> {
+    let failed = |e: std::io::Error| format!("a compressed element {e}");
+    let mut reader = flate2::read::ZlibDecoder::new(packed);
+    let mut tag = [0; 8];
+    reader.read_exact(&mut tag).map_err(failed)?;
+    let size: [u8; 4] = tag[4..].try_into().expect("a tag has eight bytes");
+    let size = u64::from(if big {
+        u32::from_be_bytes(size)
+    } else {
+        u32::from_le_bytes(size)
+    });
+    // Deflate packs no better: a larger announcement is none that is kept.
+    let most = (packed.len() as u64).saturating_mul(1032).min(MAX);
+    let rest = picofarm_files::read_entry(reader.take(size), size, most).map_err(failed)?;
+    Ok([&tag[..], &rest].concat())
 }
 
 fn matrix(data: &[u8], big: bool) -> Result<Option<(String, Matrix)>, String> {
@@ -306,5 +334,30 @@ fn numbers(element: &Element<'_>, big: bool) -> Result<Vec<f64>, String> {
         12 => read!(i64),
         13 => read!(u64),
         other => Err(format!("numbers of unknown type {other}")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_compressed_element_that_announces_what_it_cannot_hold_is_not_unpacked() {
+        let packed = |announced: u32, holds: usize| {
+            let mut zlib = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+            zlib.write_all(&MATRIX.to_le_bytes()).unwrap();
+            zlib.write_all(&announced.to_le_bytes()).unwrap();
+            zlib.write_all(&vec![0; holds]).unwrap();
+            zlib.finish().unwrap()
+        };
+        assert_eq!(inflate(&packed(64, 64), false).unwrap().len(), 72);
+        // What stands behind is not unpacked at all.
+        assert_eq!(inflate(&packed(64, 64 << 20), false).unwrap().len(), 72);
+        for (announced, holds) in [(4_000_000_000, 64), (1 << 20, 64)] {
+            let said = inflate(&packed(announced, holds), false).unwrap_err();
+            assert!(said.contains("announces"), "{said}");
+        }
     }
 }

@@ -9,6 +9,7 @@ mod check;
 mod error;
 mod files;
 mod image;
+mod masks;
 mod mat;
 pub(crate) mod npy;
 mod npy_folder;
@@ -19,6 +20,8 @@ mod sb3d;
 mod scene;
 
 use std::path::{Path, PathBuf};
+
+use picofarm_files::Opener;
 
 pub use error::ImportError;
 pub use files::SourceFile;
@@ -31,12 +34,13 @@ use scene::Shape;
 use crate::spec::{DatasetSpec, Profile};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
-pub const IMPORT_VERSION: &str = "import-2";
+pub const IMPORT_VERSION: &str = "import-3";
 
 /// Scenes in a folder that can be imported.
 #[derive(Debug, Clone)]
 pub struct Source {
     root: PathBuf,
+    opener: Opener,
     format: Format,
     options: ImportOptions,
     items: Vec<Item>,
@@ -51,19 +55,26 @@ struct Item {
     folder: PathBuf,
     /// Which capture of the folder; `None` = all of it.
     capture: Option<usize>,
+    opener: Opener,
 }
 
 impl Item {
-    fn new(root: &Path, folder: PathBuf) -> Self {
+    fn new(root: &Path, folder: PathBuf, opener: &Opener) -> Self {
         let name = match folder == root {
             true => ".".into(),
-            false => Files::new(root).name(&folder),
+            false => Files::new(root, opener).name(&folder),
         };
         Self {
             name,
             folder,
             capture: None,
+            opener: opener.clone(),
         }
+    }
+
+    /// The files of its folder.
+    fn files(&self) -> Files {
+        Files::new(&self.folder, &self.opener)
     }
 }
 
@@ -81,9 +92,24 @@ impl Source {
         options: ImportOptions,
         names: Option<&[String]>,
     ) -> Result<Self, ImportError> {
+        Self::open_within(root, format, options, names, &Opener::anywhere())
+    }
+
+    /// As [`Self::open`], where only files that `opener` opens are read, wherever links in the folder lead.
+    ///
+    /// # Errors
+    /// Also [`ImportError::File`].
+    pub fn open_within(
+        root: &Path,
+        format: Option<Format>,
+        options: ImportOptions,
+        names: Option<&[String]>,
+        opener: &Opener,
+    ) -> Result<Self, ImportError> {
+        opener.check(root)?;
         let (format, mut items) = match format {
-            Some(format) => (format, find(root, format, &options)?),
-            None => detect(root, &options)?,
+            Some(format) => (format, find(root, format, &options, opener)?),
+            None => detect(root, &options, opener)?,
         };
         options.check(format)?;
         if let Some(names) = names {
@@ -111,6 +137,7 @@ impl Source {
         }?;
         Ok(Self {
             root: root.to_owned(),
+            opener: opener.clone(),
             format,
             options,
             items,
@@ -173,7 +200,7 @@ pub fn import_scene(source: &Source, index: u64) -> Result<ImportedScene, Import
             "choose another one",
         ));
     };
-    let (options, files) = (&source.options, Files::new(&source.root));
+    let (options, files) = (&source.options, Files::new(&source.root, &source.opener));
     let mut scene = match source.format {
         Format::Sb3d => sb3d::read(item, options, &files),
         Format::Platonerf => platonerf::read(item, options, &files),
@@ -183,31 +210,40 @@ pub fn import_scene(source: &Source, index: u64) -> Result<ImportedScene, Import
     scene.files = files.into_list();
     if let Some((field, first, this)) = source.shape.difference(&scene.shape) {
         let expected = format!("{first}, as in scene {}", source.items[0].name);
-        let mend = "import scenes of other shapes into a data set of their own";
+        let hint = "import scenes of other shapes into a data set of their own";
         return Err(ImportError::refused(
             &item.folder,
             field,
             expected,
             this,
-            mend,
+            hint,
         ));
     }
     Ok(scene)
 }
 
-fn find(root: &Path, format: Format, options: &ImportOptions) -> Result<Vec<Item>, ImportError> {
+fn find(
+    root: &Path,
+    format: Format,
+    options: &ImportOptions,
+    opener: &Opener,
+) -> Result<Vec<Item>, ImportError> {
     match format {
-        Format::Sb3d => sb3d::find(root),
-        Format::Platonerf => platonerf::find(root, options),
-        Format::BfLidar => bf_lidar::find(root, options),
-        Format::Npy => npy_folder::find(root),
+        Format::Sb3d => sb3d::find(root, opener),
+        Format::Platonerf => platonerf::find(root, options, opener),
+        Format::BfLidar => bf_lidar::find(root, options, opener),
+        Format::Npy => npy_folder::find(root, opener),
     }
 }
 
-fn detect(root: &Path, options: &ImportOptions) -> Result<(Format, Vec<Item>), ImportError> {
+fn detect(
+    root: &Path,
+    options: &ImportOptions,
+    opener: &Opener,
+) -> Result<(Format, Vec<Item>), ImportError> {
     let mut found = Vec::new();
     for format in Format::ALL {
-        let items = find(root, format, options)?;
+        let items = find(root, format, options, opener)?;
         if !items.is_empty() {
             found.push((format, items));
         }
@@ -225,9 +261,9 @@ fn detect(root: &Path, options: &ImportOptions) -> Result<(Format, Vec<Item>), I
         true => "none of them".into(),
         false => names.join(" and "),
     };
-    let mend = "check the folder, or say which with --format";
+    let hint = "check the folder, or say which with --format";
     Err(ImportError::refused(
-        root, "contents", expected, found, mend,
+        root, "contents", expected, found, hint,
     ))
 }
 
@@ -241,13 +277,21 @@ fn looks_like(format: Format) -> &'static str {
 }
 
 /// The folders that `is_scene`: the root itself, or those in it.
-fn folders_with(root: &Path, is_scene: impl Fn(&Path) -> bool) -> Result<Vec<Item>, ImportError> {
+fn folders_with(
+    root: &Path,
+    opener: &Opener,
+    is_scene: impl Fn(&Path) -> bool,
+) -> Result<Vec<Item>, ImportError> {
     if is_scene(root) {
-        return Ok(vec![Item::new(root, root.to_owned())]);
+        return Ok(vec![Item::new(root, root.to_owned(), opener)]);
     }
     let (folders, _) = files::entries(root)?;
-    let scenes = folders.into_iter().filter(|f| is_scene(f));
-    Ok(scenes.map(|folder| Item::new(root, folder)).collect())
+    let mut scenes = Vec::new();
+    for folder in folders.into_iter().filter(|f| is_scene(f)) {
+        opener.check(&folder)?;
+        scenes.push(Item::new(root, folder, opener));
+    }
+    Ok(scenes)
 }
 
 /// The named ones, in that order.
@@ -256,13 +300,13 @@ fn choose(root: &Path, items: Vec<Item>, names: &[String]) -> Result<Vec<Item>, 
         items.into_iter().map(|i| (i.name.clone(), i)).collect();
     let take = |name: &String| {
         by_name.remove(name).ok_or_else(|| {
-            let mend = "correct the list: each scene once, named by its folder";
+            let hint = "correct the list: each scene once, named by its folder";
             ImportError::refused(
                 root,
                 "scene",
                 format!("{name:?}"),
                 "no such folder, or listed twice",
-                mend,
+                hint,
             )
         })
     };

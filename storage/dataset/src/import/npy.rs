@@ -7,6 +7,7 @@ use half::f16;
 use rayon::prelude::*;
 
 use super::ImportError;
+use super::files::Files;
 
 /// An array of numbers in C order.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,7 +21,7 @@ pub(crate) struct Array {
 
 /// Magic number, version, header length (two bytes in version 1).
 const FIXED: usize = 10;
-const MEND: &str = "save it again with numpy.save, as an array of numbers";
+const HINT: &str = "save it again with numpy.save, as an array of numbers";
 
 /// What a header says.
 struct Header {
@@ -32,9 +33,9 @@ struct Header {
 }
 
 /// The shape of the array in a `.npy` file.
-pub(super) fn peek(file: &Path) -> Result<Vec<usize>, ImportError> {
+pub(super) fn peek(file: &Path, files: &Files) -> Result<Vec<usize>, ImportError> {
     let failed = |e| ImportError::io("read", file, e);
-    let opened = std::fs::File::open(file).map_err(failed)?;
+    let opened = files.open(file)?;
     let mut head = Vec::new();
     opened
         .take(1 << 16)
@@ -45,7 +46,7 @@ pub(super) fn peek(file: &Path) -> Result<Vec<usize>, ImportError> {
 
 /// Reads a `.npy` file.
 pub(crate) fn parse(file: &Path, bytes: &[u8]) -> Result<Array, ImportError> {
-    let damaged = |what: String| ImportError::unreadable(file, what, MEND);
+    let damaged = |what: String| ImportError::unreadable(file, what, HINT);
     let Header {
         shape,
         stored,
@@ -70,7 +71,7 @@ pub(crate) fn parse(file: &Path, bytes: &[u8]) -> Result<Array, ImportError> {
 }
 
 fn header(file: &Path, bytes: &[u8]) -> Result<Header, ImportError> {
-    let damaged = |what: String| ImportError::unreadable(file, what, MEND);
+    let damaged = |what: String| ImportError::unreadable(file, what, HINT);
     if bytes.len() < FIXED || &bytes[..6] != b"\x93NUMPY" {
         return Err(damaged("not a .npy file".into()));
     }
@@ -103,7 +104,14 @@ fn header(file: &Path, bytes: &[u8]) -> Result<Header, ImportError> {
 }
 
 /// Reads the array `name` of a `.npz` file.
-pub(super) fn parse_npz(file: &Path, bytes: &[u8], name: &str) -> Result<Array, ImportError> {
+///
+/// What it holds is unpacked only if it announces at most `values` numbers.
+pub(super) fn parse_npz(
+    file: &Path,
+    bytes: &[u8],
+    name: &str,
+    values: usize,
+) -> Result<Array, ImportError> {
     let damaged = |what: String| {
         ImportError::unreadable(file, what, "save it again with numpy.savez_compressed")
     };
@@ -123,11 +131,13 @@ pub(super) fn parse_npz(file: &Path, bytes: &[u8], name: &str) -> Result<Array, 
             "rename the array",
         ));
     }
-    let mut inner = Vec::new();
-    archive
+    let packed = archive
         .by_name(&entry)
-        .map_err(|e| damaged(format!("{entry}: {e}")))?
-        .read_to_end(&mut inner)
+        .map_err(|e| damaged(format!("{entry}: {e}")))?;
+    // The widest numbers, and a header.
+    let most = (values as u64).saturating_mul(8).saturating_add(1 << 20);
+    let announced = packed.size();
+    let inner = picofarm_files::read_entry(packed, announced, most)
         .map_err(|e| damaged(format!("{entry}: {e}")))?;
     parse(&file.join(entry), &inner)
 }
@@ -238,6 +248,28 @@ pub(super) fn from_fortran(shape: &[usize], values: &[f32]) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_archive_that_announces_more_numbers_than_wanted_is_not_unpacked() {
+        use std::io::Write;
+        let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+        let options = zip::write::SimpleFileOptions::default();
+        zip.start_file("shadows.npy", options).unwrap();
+        zip.write_all(&write("|u1", &[64 << 20], &vec![0u8; 64 << 20]))
+            .unwrap();
+        let bytes = zip.finish().unwrap().into_inner();
+        assert!(bytes.len() < 1 << 18, "{}", bytes.len());
+        let file = Path::new("a.npz");
+        let said = parse_npz(file, &bytes, "shadows", 1000)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            said.contains("announces") && said.contains("a.npz"),
+            "{said}"
+        );
+        let whole = parse_npz(file, &bytes, "shadows", 64 << 20).unwrap();
+        assert_eq!(whole.values.len(), 64 << 20);
+    }
 
     #[test]
     fn what_is_written_is_read() {

@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use picofarm_files::Opener;
+
 use super::check::{Blame, Geometry, check};
 use super::files::Files;
 use super::npy::{self, Array};
@@ -28,7 +30,7 @@ struct Description {
     /// Laser origin in the camera's axes.
     laser: [f64; 3],
     /// `[spot][3]`: where the beams meet the scene, in the camera's axes; NaN where one meets nothing.
-    spots: File,
+    spots: Spots,
     depth: Depth,
     /// `[spot][row][column]`.
     visibility: Option<Visibility>,
@@ -50,6 +52,14 @@ struct Description {
 #[serde(deny_unknown_fields)]
 struct File {
     file: String,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Spots {
+    file: String,
+    /// `[spot]`: length of each beam from the laser, in the length unit; with the reflections, where mirrors fold it.
+    paths: Option<String>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -94,16 +104,17 @@ struct Visibility {
     one_means: Polarity,
 }
 
-pub(super) fn find(root: &Path) -> Result<Vec<Item>, ImportError> {
-    super::folders_with(root, |folder| folder.join(SCENE).is_file())
+pub(super) fn find(root: &Path, opener: &Opener) -> Result<Vec<Item>, ImportError> {
+    super::folders_with(root, opener, |folder| folder.join(SCENE).is_file())
 }
 
 pub(super) fn shape(item: &Item) -> Result<Shape, ImportError> {
-    let files = Files::new(&item.folder);
+    let files = item.files();
     let about = About::read(&item.folder, &files)?;
-    let histogram = about.folder.join(&about.is.histogram.file);
-    let shape = npy::peek(&histogram)?;
-    let spots = npy::peek(&about.folder.join(&about.is.spots.file))?;
+    let histogram = files.named(&about.folder, &about.is.histogram.file)?;
+    let shape = npy::peek(&histogram, &files)?;
+    let spots = files.named(&about.folder, &about.is.spots.file)?;
+    let spots = npy::peek(&spots, &files)?;
     about.shape(&histogram, &shape, &spots)
 }
 
@@ -114,7 +125,7 @@ pub(super) fn read(
 ) -> Result<ImportedScene, ImportError> {
     let about = About::read(&item.folder, files)?;
     let is = &about.is;
-    let path = about.folder.join(&is.histogram.file);
+    let path = files.named(&about.folder, &is.histogram.file)?;
     let histogram = npy::parse(&path, &files.bytes(&path)?)?;
     let spots = about.array(&is.spots.file, files)?;
     let shape = about.shape(&path, &histogram.shape, &spots.shape)?;
@@ -151,7 +162,7 @@ pub(super) fn read(
         .into_iter()
         .map(|p| to_ours(p, unit))
         .collect();
-    scene.set_spots(&positions, None);
+    scene.set_spots(&positions);
     let depth_path = about.folder.join(&is.depth.file);
     let depth = about.sized(&is.depth.file, &[h, w], files)?;
     let metres: Vec<f32> = depth
@@ -176,6 +187,23 @@ pub(super) fn read(
         None => scene.missing.push("specular"),
         Some(f) => {
             scene.specular = about.bits(&f.file, &about.sized(&f.file, &[h, w], files)?, false)?
+        }
+    }
+    match &is.spots.paths {
+        None => scene.judge_beams(options.straight_beams),
+        Some(file) => {
+            let paths = about.sized(file, &[n], files)?;
+            let metres = paths.values.iter().map(|x| (f64::from(*x) * unit) as f32);
+            let set = scene.set_paths(&metres.collect::<Vec<_>>());
+            set.map_err(|(beam, straight)| {
+                ImportError::refused(
+                    about.folder.join(file),
+                    format!("length of beam {beam}"),
+                    format!("{straight} m at least, the straight line from the laser to its spot"),
+                    format!("{} m", f64::from(paths.values[beam]) * unit),
+                    "correct the length, or leave spots.paths out",
+                )
+            })?;
         }
     }
     match &is.normal {
@@ -230,7 +258,7 @@ pub(super) fn read(
                 .visibility
                 .as_ref()
                 .map_or_else(|| path.clone(), |v| file(&v.file)),
-            mend: "correct scene.json",
+            hint: "correct scene.json",
             polarity: "visibility.one_means in scene.json",
         };
         scene.check = check(&geometry, &blame)?;
@@ -355,7 +383,7 @@ impl About {
         histogram: &[usize],
         spots: &[usize],
     ) -> Result<Shape, ImportError> {
-        let mend = "save the arrays as scene.json says, or correct it";
+        let hint = "save the arrays as scene.json says, or correct it";
         if histogram.len() != 3 {
             let found = format!("{histogram:?}");
             return Err(ImportError::refused(
@@ -363,7 +391,7 @@ impl About {
                 "shape",
                 "three axes: row, column, bin",
                 found,
-                mend,
+                hint,
             ));
         }
         if spots.len() != 2 || spots[1] != 3 {
@@ -373,7 +401,7 @@ impl About {
                 "shape",
                 "[spots, 3]",
                 found,
-                mend,
+                hint,
             ));
         }
         Ok(Shape {
@@ -415,7 +443,7 @@ impl About {
     }
 
     fn array(&self, name: &str, files: &Files) -> Result<Array, ImportError> {
-        let path = self.folder.join(name);
+        let path = files.named(&self.folder, name)?;
         npy::parse(&path, &files.bytes(&path)?)
     }
 
@@ -443,8 +471,8 @@ impl About {
         bits.ok_or_else(|| {
             let odd = array.values.iter().find(|x| bit(x).is_none());
             let found = format!("{}", odd.copied().unwrap_or_default());
-            let mend = "threshold the mask before saving it";
-            ImportError::refused(self.folder.join(name), "values", "0 and 1", found, mend)
+            let hint = "threshold the mask before saving it";
+            ImportError::refused(self.folder.join(name), "values", "0 and 1", found, hint)
         })
     }
 
@@ -462,13 +490,13 @@ impl About {
             .find(|x| !(0.0..=max).contains(*x) || x.fract() != 0.0)
         {
             let expected = format!("whole numbers from 0 to {max}");
-            let mend = "number them anew, 0 for nothing";
+            let hint = "number them anew, 0 for nothing";
             return Err(ImportError::refused(
                 self.folder.join(name),
                 "values",
                 expected,
                 odd.to_string(),
-                mend,
+                hint,
             ));
         }
         Ok(array.values.into_iter().map(|x| x as u32).collect())

@@ -113,6 +113,9 @@ pub struct ImportOptions {
     pub t0_s: Option<f64>,
     /// How captures become scenes.
     pub captures: Captures,
+    /// No mirror folds a beam: each goes straight from the laser to its spot.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub straight_beams: bool,
     /// Leave the cross-check of histograms against geometry out.
     pub unchecked: bool,
 }
@@ -121,7 +124,7 @@ impl ImportOptions {
     /// Refuses options without a use for the format, and values that cannot be.
     pub(super) fn check(&self, format: Format) -> Result<(), ImportError> {
         use Format::{BfLidar, Npy, Platonerf, Sb3d};
-        let given: [(&'static str, bool, &[Format]); 11] = [
+        let given: [(&'static str, bool, &[Format]); 12] = [
             (
                 "--gate-start-m",
                 self.gate_start_m.is_some(),
@@ -140,13 +143,13 @@ impl ImportOptions {
             ("--spots", self.spots.is_some(), &[Sb3d]),
             ("--laser-m", self.laser_m.is_some(), &[BfLidar]),
             ("--t0-s", self.t0_s.is_some(), &[BfLidar]),
+            ("--straight-beams", self.straight_beams, &[Sb3d, Npy]),
             (
                 "--captures",
                 self.captures != Captures::Separate,
                 &[Platonerf, BfLidar],
             ),
         ];
-        debug_assert!(given.iter().all(|g| !g.2.contains(&Npy)));
         for (option, given, formats) in given {
             if given && !formats.contains(&format) {
                 return Err(ImportError::UselessOption {

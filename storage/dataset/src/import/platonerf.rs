@@ -11,6 +11,8 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
+use picofarm_files::Opener;
+
 use super::check::norm;
 use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
@@ -48,20 +50,25 @@ struct Wall {
     point: Vec<f64>,
 }
 
-pub(super) fn find(root: &Path, options: &ImportOptions) -> Result<Vec<Item>, ImportError> {
-    let folders = super::folders_with(root, |folder| folder.join(TRANSFORMS).is_file())?;
+pub(super) fn find(
+    root: &Path,
+    options: &ImportOptions,
+    opener: &Opener,
+) -> Result<Vec<Item>, ImportError> {
+    let folders = super::folders_with(root, opener, |folder| folder.join(TRANSFORMS).is_file())?;
     if options.captures == Captures::Sum {
         return Ok(folders);
     }
     let mut items = Vec::new();
     for item in folders {
-        let (_, transforms) = read_transforms(&item.folder, &Files::new(root))?;
+        let (_, transforms) = read_transforms(&item.folder, &item.files())?;
         for (capture, frame) in transforms.frames.iter().enumerate() {
             let short = frame.file_path.rsplit('/').next().unwrap_or_default();
             items.push(Item {
                 name: format!("{}/{short}", item.name),
                 folder: item.folder.clone(),
                 capture: Some(capture),
+                opener: opener.clone(),
             });
         }
     }
@@ -89,12 +96,9 @@ fn read_transforms(folder: &Path, files: &Files) -> Result<(PathBuf, Transforms)
     Ok((path, transforms))
 }
 
-fn histogram_file(folder: &Path, frame: &Frame) -> PathBuf {
-    let below = frame.file_path.trim_start_matches("./");
-    below
-        .split('/')
-        .fold(folder.to_owned(), |p, part| p.join(part))
-        .with_extension("npy")
+fn histogram_file(folder: &Path, frame: &Frame, files: &Files) -> Result<PathBuf, ImportError> {
+    let path = files.named(folder, &frame.file_path)?;
+    Ok(path.with_extension("npy"))
 }
 
 fn chosen(item: &Item, transforms: &Transforms) -> Vec<Frame> {
@@ -110,7 +114,8 @@ fn chosen(item: &Item, transforms: &Transforms) -> Vec<Frame> {
 }
 
 pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, ImportError> {
-    let (path, transforms) = read_transforms(&item.folder, &Files::new(&item.folder))?;
+    let files = item.files();
+    let (path, transforms) = read_transforms(&item.folder, &files)?;
     let frames = chosen(item, &transforms);
     let Some(first) = frames.first() else {
         return Err(ImportError::refused(
@@ -121,8 +126,8 @@ pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, Impor
             "open the source again",
         ));
     };
-    let file = histogram_file(&item.folder, first);
-    shape_of(&file, &npy::peek(&file)?, frames.len(), options)
+    let file = histogram_file(&item.folder, first, &files)?;
+    shape_of(&file, &npy::peek(&file, &files)?, frames.len(), options)
 }
 
 fn shape_of(
@@ -188,20 +193,20 @@ pub(super) fn read(
     let mut total: Option<(Shape, Vec<f32>)> = None;
     let (mut positions, mut checks, mut pose) = (Vec::new(), Vec::new(), None);
     for frame in &frames {
-        let file = histogram_file(&item.folder, frame);
+        let file = histogram_file(&item.folder, frame, files)?;
         let array = npy::parse(&file, &files.bytes(&file)?)?;
         let shape = shape_of(&file, &array.shape, frames.len(), options)?;
         let mut h = array.values;
         clean(&file, &mut h, shape.gate.bins as usize, &mut conversions)?;
         let camera = Pose::of(&path, frame)?;
         if *pose.get_or_insert(camera) != camera {
-            let mend = "import captures as scenes of their own: --captures separate";
+            let hint = "import captures as scenes of their own: --captures separate";
             return Err(ImportError::refused(
                 &path,
                 "transform_matrix",
                 "the same for all summed captures",
                 "others",
-                mend,
+                hint,
             ));
         }
         let intrinsics = of_fov(shape.width, shape.height, degrees);
@@ -254,7 +259,9 @@ pub(super) fn read(
     }
     scene.conversions = conversions;
     scene.laser = pose.in_camera(frames[0].light_origin).map(|x| x as f32);
-    scene.set_spots(&positions, None);
+    scene.set_spots(&positions);
+    // The spots were found along straight beams.
+    scene.judge_beams(true);
     scene.camera = pose.ours();
     scene.missing.extend([
         "depth",
@@ -301,7 +308,7 @@ impl Pose {
                 "transform_matrix",
                 "a rotation and a translation",
                 found,
-                "mend the file",
+                "correct the file",
             ));
         }
         Ok(Self {

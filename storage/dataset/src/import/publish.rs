@@ -100,11 +100,10 @@ impl Source {
         file: &SourceFile,
         rehash: bool,
     ) -> Result<(), ImportError> {
-        let path = file
-            .name
-            .split('/')
-            .fold(self.root.clone(), |p, part| p.join(part));
-        let now = std::fs::metadata(&path).map_err(|e| ImportError::io("look up", &path, e))?;
+        let files = super::Files::new(&self.root, &self.opener);
+        let path = files.named(&self.root, &file.name)?;
+        let now = files.open(&path)?.metadata();
+        let now = now.map_err(|e| ImportError::io("look up", &path, e))?;
         if now.len() != file.bytes {
             let (now, then) = (json!(now.len()), json!(file.bytes));
             return Err(self.other(
@@ -116,7 +115,6 @@ impl Source {
             ));
         }
         if rehash {
-            let files = super::Files::new(&self.root);
             files.hash(&path)?;
             let now = files.into_list().remove(0).sha256;
             if now != file.sha256 {

@@ -8,6 +8,8 @@
 
 use std::path::{Path, PathBuf};
 
+use picofarm_files::Opener;
+
 use super::check::{Blame, Geometry, check};
 use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
@@ -42,8 +44,8 @@ fn counts_there(folder: &Path) -> Vec<u32> {
         .collect()
 }
 
-pub(super) fn find(root: &Path) -> Result<Vec<Item>, ImportError> {
-    super::folders_with(root, |folder| !counts_there(folder).is_empty())
+pub(super) fn find(root: &Path, opener: &Opener) -> Result<Vec<Item>, ImportError> {
+    super::folders_with(root, opener, |folder| !counts_there(folder).is_empty())
 }
 
 /// Which histograms become the scene's: its own, and the subsets'.
@@ -82,26 +84,27 @@ fn aside(item: &Item, files: &Files) -> Result<Option<Aside>, ImportError> {
     if !path.is_file() {
         return Ok(None);
     }
-    let mend = "export the scene again, or remove the file and give the gate as options";
+    let hint = "export the scene again, or remove the file and give the gate as options";
     let aside: Aside = serde_json::from_slice(&files.bytes(&path)?)
-        .map_err(|e| ImportError::unreadable(&path, e, mend))?;
+        .map_err(|e| ImportError::unreadable(&path, e, hint))?;
     if aside.format != Aside::FORMAT || !(aside.factor.is_normal() && aside.factor > 0.0) {
         let expected = format!("{}, with a positive factor", Aside::FORMAT);
         let found = format!("{} with {}", aside.format, aside.factor);
-        return Err(ImportError::refused(path, "format", expected, found, mend));
+        return Err(ImportError::refused(path, "format", expected, found, hint));
     }
     Ok(Some(aside))
 }
 
 pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, ImportError> {
     let (spots, subsets) = chosen(item, options)?;
-    let (width, height) = image::exr_size(&item.folder.join(DEPTH))?;
+    let files = item.files();
+    let (width, height) = image::exr_size(&item.folder.join(DEPTH), &files)?;
     let file = lidar(&item.folder, spots);
-    let (bins, lines) = image::exr_size(&file)?;
+    let (bins, lines) = image::exr_size(&file, &files)?;
     if lines != width * height {
         return Err(lines_differ(&file, lines, width, height));
     }
-    let gate = aside(item, &Files::new(&item.folder))?.map_or(PAPER, |a| a.gate);
+    let gate = aside(item, &files)?.map_or(PAPER, |a| a.gate);
     Ok(Shape {
         height: height as u32,
         width: width as u32,
@@ -195,23 +198,28 @@ pub(super) fn read(
     match &aside {
         None => {
             scene.missing.push("camera");
-            scene.set_spots(&lights, None);
+            scene.set_spots(&lights);
+            scene.judge_beams(options.straight_beams);
         }
         Some(aside) => {
             if aside.spots.len() != shape.spots as usize {
                 let (expected, found) = (shape.spots.to_string(), aside.spots.len().to_string());
-                let mend = "see whether the files belong together";
+                let hint = "see whether the files belong together";
                 return Err(ImportError::refused(
                     path(ASIDE),
                     "spots",
                     expected,
                     found,
-                    mend,
+                    hint,
                 ));
             }
             (scene.laser, scene.camera) = (aside.laser, aside.camera);
             scene.scale = Some(aside.photons_per_unit);
             scene.spots = aside.spots();
+            // The layout's files tell of nothing else.
+            let of_spots = ["spots.normal", "spots.path", "camera"].into_iter();
+            let unknown = of_spots.filter(|name| aside.missing.iter().any(|m| m == name));
+            scene.missing.extend(unknown);
             scene.conversions.push(format!(
                 "histograms divided by {}, spots taken from {ASIDE}",
                 aside.factor
@@ -238,7 +246,7 @@ pub(super) fn read(
             depth: &path(DEPTH),
             spots: &path(LIGHTS),
             visibility: &path(SHADOWS),
-            mend: OPTIONS,
+            hint: OPTIONS,
             polarity: "--visibility shadow (or lit, if that was given)",
         };
         scene.check = check(&geometry, &blame)?;
@@ -355,21 +363,8 @@ fn depth(file: &Path, files: &Files) -> Result<Vec<f32>, ImportError> {
 }
 
 fn specular(file: &Path, scene: &mut ImportedScene, files: &Files) -> Result<(), ImportError> {
-    let (w, h, grey) = image::png(file, &files.bytes(file)?)?;
-    let expected = (scene.shape.width as usize, scene.shape.height as usize);
-    if (w, h) != expected {
-        let (expected, found) = (
-            format!("{}x{}, as {DEPTH}", expected.0, expected.1),
-            format!("{w}x{h}"),
-        );
-        return Err(ImportError::refused(
-            file,
-            "size",
-            expected,
-            found,
-            "see whether the files belong together",
-        ));
-    }
+    let size = (scene.shape.width as usize, scene.shape.height as usize);
+    let grey = image::png(file, &files.bytes(file)?, size)?;
     let between = grey.iter().filter(|g| !matches!(g, 0 | 255)).count();
     if between > 0 {
         scene.conversions.push(format!(
@@ -415,12 +410,13 @@ fn shadows(
     options: &ImportOptions,
     files: &Files,
 ) -> Result<(), ImportError> {
-    let array = npy::parse_npz(file, &files.bytes(file)?, "shadows")?;
     let (w, h, spots) = (
         scene.shape.width as usize,
         scene.shape.height as usize,
         scene.shape.spots,
     );
+    let most = w * h * GRID.max(spots as usize) * 3;
+    let array = npy::parse_npz(file, &files.bytes(file)?, "shadows", most)?;
     let (n, colours) = match array.shape[..] {
         [n, rows, columns] if (rows, columns) == (h, w) => (n, 1),
         [n, rows, columns, c @ (1 | 3)] if (rows, columns) == (h, w) => (n, c),

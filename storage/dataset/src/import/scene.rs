@@ -15,6 +15,8 @@ use crate::squareroot::photon_scale;
 const PEAK_PHOTONS: f32 = 400.0;
 /// Negative energy, relative to the whole, that a lossy code may have left.
 const NEGATIVE: f64 = 0.01;
+/// The name under which lengths of beams are listed as missing.
+const PATHS: &str = "spots.path";
 /// Depths beyond are the sky.
 const SKY_M: f32 = 1e4;
 
@@ -136,7 +138,7 @@ impl ImportedScene {
                     format!("pixel ({}, {})", pixel % w, pixel / w),
                     "a depth of at least 0 (0, infinity or more than 10 km where there is nothing)",
                     value.to_string(),
-                    "mend the file",
+                    "correct the file",
                 ));
             }
             let value = match *value > SKY_M {
@@ -167,20 +169,53 @@ impl ImportedScene {
         Ok(())
     }
 
-    /// Sets spots that the laser reaches directly.
-    pub(super) fn set_spots(&mut self, positions: &[[f32; 3]], normals: Option<&[[f32; 3]]>) {
+    /// Sets spots, their beams taken as straight lines from the laser. Normals are not known.
+    pub(super) fn set_spots(&mut self, positions: &[[f32; 3]]) {
         let laser = self.laser.map(f64::from);
-        let spot = |(index, p): (usize, &[f32; 3])| {
+        let spot = |p: &[f32; 3]| {
             p.iter().all(|x| x.is_finite()).then(|| Spot {
                 position: *p,
-                normal: normals.map_or([0.0; 3], |n| n[index]),
+                normal: [0.0; 3],
                 path_m: distance(p.map(f64::from), laser) as f32,
             })
         };
-        self.spots = positions.iter().enumerate().map(spot).collect();
-        if normals.is_none() {
-            self.missing.push("spots.normal");
+        self.spots = positions.iter().map(spot).collect();
+        self.missing.push("spots.normal");
+    }
+
+    /// Says whether the straight beams of [`Self::set_spots`] are right, once the mirrors are known. They are where the
+    /// camera sees no mirror, and where `stated`; otherwise the lengths are listed as missing: a beam that a mirror folds
+    /// is longer than the straight line.
+    pub(super) fn judge_beams(&mut self, stated: bool) {
+        let mirrors = match self.missing.contains(&"specular") {
+            true => None,
+            false => Some(self.specular.contains(&1)),
+        };
+        let why = match (stated, mirrors) {
+            (true, _) => "as stated",
+            (false, Some(false)) => "the camera sees no mirror",
+            (false, _) => return self.missing.push(PATHS),
+        };
+        self.conversions.push(format!(
+            "paths of the beams computed as straight lines from the laser: {why}"
+        ));
+    }
+
+    /// Sets the lengths of the beams, metres; one that meets nothing has none.
+    ///
+    /// # Errors
+    /// The first beam that is shorter than the straight line, or has no length: its number, and the least that it could have.
+    pub(super) fn set_paths(&mut self, paths_m: &[f32]) -> Result<(), (usize, f32)> {
+        for (beam, (spot, path)) in self.spots.iter_mut().zip(paths_m).enumerate() {
+            let Some(spot) = spot else { continue };
+            let straight = spot.path_m;
+            let long_enough = *path >= straight - (1e-3 * straight).max(1e-4);
+            if !(long_enough && path.is_finite()) {
+                return Err((beam, straight));
+            }
+            spot.path_m = *path;
         }
+        Ok(())
     }
 
     /// The record that the encoder takes.
@@ -259,7 +294,7 @@ pub(super) fn clean(
                 format!("bin {} of pixel {}", at % bins, at / bins),
                 "a finite number",
                 x.to_string(),
-                "mend or leave out this scene",
+                "correct or leave out this scene",
             ));
         }
         match *x < 0.0 {

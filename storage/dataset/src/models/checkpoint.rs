@@ -18,7 +18,7 @@ const HEAD: usize = MAGIC.len() + 32;
 /// Checkpoints that are kept.
 const KEPT: usize = 2;
 /// Folder of a model's checkpoints.
-const FOLDER: &str = "checkpoints";
+pub(super) const FOLDER: &str = "checkpoints";
 
 /// A checkpoint as it is listed.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -161,7 +161,7 @@ fn checkpoint(object: ObjectMeta) -> Option<Checkpoint> {
 }
 
 /// The content of a checkpoint that has its checksum.
-fn whole(bytes: Bytes) -> Option<Bytes> {
+pub(super) fn whole(bytes: Bytes) -> Option<Bytes> {
     if bytes.len() < HEAD || bytes[..MAGIC.len()] != *MAGIC {
         return None;
     }

@@ -12,7 +12,7 @@ use bytes::Bytes;
 use object_store::ObjectMeta;
 use object_store::path::Path;
 
-use super::{Models, object_folder};
+use super::{Models, key_below, object_folder};
 use crate::collect::Orphan;
 use crate::error::DatasetError;
 use crate::objects;
@@ -80,7 +80,7 @@ impl Models {
     }
 
     /// `false` if a manifest names it by now.
-    async fn delete_object(
+    pub(super) async fn delete_object(
         &self,
         name: &str,
         key: &str,
@@ -113,10 +113,4 @@ impl Models {
             scene: None,
         }
     }
-}
-
-fn key_below(folder: &Path, path: &Path) -> Option<String> {
-    let parts: Vec<_> = path.prefix_match(folder)?.collect();
-    let parts: Vec<&str> = parts.iter().map(AsRef::as_ref).collect();
-    Some(parts.join("/"))
 }

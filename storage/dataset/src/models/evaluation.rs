@@ -6,6 +6,7 @@ use serde_json::Value;
 
 use super::{Models, SplitUsed, check_name};
 use crate::error::DatasetError;
+use crate::manifest::{seal, unseal};
 use crate::objects;
 
 /// A model's figures on scenes. A pure function of model, scenes and code.
@@ -36,14 +37,24 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Its bytes as they lie in the store.
+    /// Its bytes as they lie in the store: with their checksum, as [`crate::manifest::seal`] has it.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut sorted = self.clone();
         sorted.metrics.sort_all_objects();
         let mut bytes = serde_json::to_vec_pretty(&sorted)
             .expect("an evaluation has only string keys and finite numbers");
         bytes.push(b'\n');
-        bytes
+        seal(&bytes)
+    }
+
+    fn parse(bytes: &[u8]) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        struct Head {
+            checksum: String,
+        }
+        let not = |e: serde_json::Error| format!("not an evaluation: {e}");
+        let head: Head = serde_json::from_slice(bytes).map_err(not)?;
+        serde_json::from_slice(&unseal(bytes, &head.checksum)?).map_err(not)
     }
 }
 
@@ -72,9 +83,9 @@ impl Models {
         let Some(bytes) = objects::get(&*self.store, &path).await? else {
             return Ok(None);
         };
-        let parsed = serde_json::from_slice(&bytes).map_err(|e| DatasetError::Damaged {
+        let parsed = Evaluation::parse(&bytes).map_err(|what| DatasetError::Damaged {
             object: self.shown(&path),
-            what: format!("not an evaluation: {e}"),
+            what,
         });
         parsed.map(Some)
     }

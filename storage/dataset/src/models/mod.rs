@@ -10,8 +10,11 @@ mod checkpoint;
 mod collect;
 mod evaluation;
 mod manifest;
+mod remove;
+mod repair;
 mod speed;
 mod sweep;
+mod verify;
 
 use std::sync::Arc;
 
@@ -27,8 +30,11 @@ use crate::objects;
 pub use checkpoint::Checkpoint;
 pub use evaluation::Evaluation;
 pub use manifest::{Lineage, ModelManifest, Promoted, SplitUsed};
+pub use remove::{Dependents, Removed};
+pub use repair::ModelRepair;
 pub use speed::TrainingSpeed;
 pub use sweep::{Rung, TrialEnd, TrialRecord};
+pub use verify::ModelCheck;
 
 /// The folder of models in a store; no data set has this name.
 pub const MODELS: &str = "models";
@@ -81,10 +87,15 @@ impl Models {
     pub async fn names(&self) -> Result<Vec<String>, DatasetError> {
         let listed = self.store.list_with_delimiter(Some(&self.folder)).await;
         let listed = listed.map_err(|e| self.failed("list", &self.folder, e))?;
-        let folders = listed.common_prefixes.iter();
-        let mut names: Vec<String> = folders
-            .filter_map(|path| path.filename().map(str::to_owned))
-            .collect();
+        let mut names = Vec::new();
+        for path in &listed.common_prefixes {
+            // On a disk, the folder of a model that was removed stays.
+            let on_disk = objects::folder(&*self.store, path).is_some();
+            if on_disk && self.list(path).await?.is_empty() {
+                continue;
+            }
+            names.extend(path.filename().map(str::to_owned));
+        }
         names.sort();
         Ok(names)
     }
@@ -132,12 +143,12 @@ impl Models {
         Err(DatasetError::invalid("model", what))
     }
 
-    /// The manifest of a model that this very training has published, after checking that each of its objects exists with
-    /// the stated size; `None` where it is not published.
+    /// The manifest of a model that this very training has published, after checking that each of its objects has the
+    /// stated SHA-256; `None` where it is not published.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] where the name is another training's; [`DatasetError::Damaged`] where an object is missing
-    /// or has another size; [`DatasetError::Store`].
+    /// or changed; [`DatasetError::Store`].
     pub async fn finished(
         &self,
         name: &str,
@@ -151,7 +162,14 @@ impl Models {
         for object in &manifest.objects {
             let path = self.path(name, &object.key);
             let what = match objects::size(&*self.store, &path).await? {
-                Some(size) if size == object.size => continue,
+                // Reading it is cheap beside making it.
+                Some(size) if size == object.size => {
+                    let bytes = objects::require(&*self.store, &path).await?;
+                    if sha256_hex(&bytes) == object.sha256 {
+                        continue;
+                    }
+                    "its SHA-256 is not the manifest's".into()
+                }
                 Some(size) => format!("expected {} bytes, found {size}", object.size),
                 None => "the object is missing".into(),
             };
@@ -162,7 +180,7 @@ impl Models {
     }
 
     /// Publishes a model: objects first, the manifest last, all create-only; what exists with equal bytes counts as
-    /// written. Where another run of the same training came to other bits and was faster, its model stands, unless
+    /// written. Where its manifest stands and says the same, what is missing or changed of its objects is put back. Where another run of the same training came to other bits and was faster, its model stands, unless
     /// `exact` asks for an error.
     ///
     /// # Errors
@@ -184,9 +202,17 @@ impl Models {
         let entries = entries.into_iter().map(in_folder).collect();
         let manifest = manifest.with_objects(entries);
         let bytes: Vec<Bytes> = objects.into_iter().map(|(_, bytes)| bytes).collect();
-        self.put_objects(&manifest, &bytes).await?;
         let path = self.path(&name, MANIFEST);
         let ours = manifest.to_bytes();
+        if objects::get(&*self.store, &path).await?.as_deref() == Some(&ours[..]) {
+            // It was published before: what is damaged of it since is put back.
+            self.restore(&manifest, &bytes).await?;
+            return Ok(Published {
+                manifest,
+                adopted: false,
+            });
+        }
+        self.put_objects(&manifest, &bytes).await?;
         if !objects::create(&*self.store, &path, ours.clone().into()).await? {
             let stored = objects::require(&*self.store, &path).await?;
             if stored != ours {
@@ -224,6 +250,8 @@ impl Models {
             self.delete(&self.path(&ours.name, &object.key)).await?;
         }
         same?;
+        // What is damaged of it cannot be put back from other bits.
+        self.finished(&ours.name, &ours.training_key).await?;
         Ok(Published {
             manifest: theirs,
             adopted: true,
@@ -247,7 +275,10 @@ impl Models {
             true => Ok(bytes),
             false => Err(DatasetError::Damaged {
                 object: self.shown(&path),
-                what: "its SHA-256 is not the manifest's".into(),
+                what: format!(
+                    "its SHA-256 is not the manifest's; `picofarm model repair` says how to get it back ({})",
+                    manifest.name
+                ),
             }),
         }
     }
@@ -340,4 +371,11 @@ fn check_name(name: &str) -> Result<(), DatasetError> {
         "{name:?} must be up to 128 letters, digits, '-', '_' and '.', and not begin with '.'"
     );
     Err(DatasetError::invalid("model", what))
+}
+
+/// The key of an object below a folder.
+fn key_below(folder: &Path, path: &Path) -> Option<String> {
+    let parts: Vec<_> = path.prefix_match(folder)?.collect();
+    let parts: Vec<&str> = parts.iter().map(AsRef::as_ref).collect();
+    Some(parts.join("/"))
 }

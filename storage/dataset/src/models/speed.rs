@@ -5,10 +5,10 @@ use serde::{Deserialize, Serialize};
 
 use super::{Models, check_name};
 use crate::error::DatasetError;
-use crate::manifest::sha256_hex;
+use crate::manifest::{read_unsealed, seal, sha256_hex};
 use crate::objects;
 
-const FILE: &str = "speed.json";
+pub(super) const FILE: &str = "speed.json";
 
 /// How fast a model was trained, by the worker that ended it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -34,7 +34,7 @@ impl TrainingSpeed {
     fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = serde_json::to_vec_pretty(self).expect("finite numbers");
         bytes.push(b'\n');
-        bytes
+        seal(&bytes)
     }
 }
 
@@ -64,10 +64,7 @@ impl Models {
             return Ok(None);
         };
         let speed: TrainingSpeed =
-            serde_json::from_slice(&bytes).map_err(|e| DatasetError::Damaged {
-                object: self.shown(&path),
-                what: format!("does not tell how fast a training was: {e}"),
-            })?;
+            read_unsealed(&bytes, "the speed of a training", self.shown(&path))?;
         Ok(Some(speed).filter(|speed| speed.training_key == training_key))
     }
 }

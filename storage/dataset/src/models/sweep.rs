@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use super::{Models, check_name};
 use crate::error::DatasetError;
-use crate::manifest::sha256_hex;
+use crate::manifest::{read_unsealed, seal, sha256_hex};
 use crate::objects;
 
 /// Folder of sweeps below a name.
@@ -188,10 +188,7 @@ impl Models {
     }
 
     fn parse<T: DeserializeOwned>(&self, path: &Path, bytes: &Bytes) -> Result<T, DatasetError> {
-        serde_json::from_slice(bytes).map_err(|e| DatasetError::Damaged {
-            object: self.shown(path),
-            what: format!("is not what a trial tells of itself: {e}"),
-        })
+        read_unsealed(bytes, "the record of a trial", self.shown(path))
     }
 
     fn sweep_path(&self, sweep: &str, id: &str, key: &str) -> Result<Path, DatasetError> {
@@ -204,5 +201,5 @@ impl Models {
 fn json<T: Serialize>(document: &T) -> Vec<u8> {
     let mut bytes = serde_json::to_vec_pretty(document).expect("finite numbers and string keys");
     bytes.push(b'\n');
-    bytes
+    seal(&bytes)
 }

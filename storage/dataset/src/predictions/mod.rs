@@ -6,6 +6,7 @@
 
 mod array;
 mod manifest;
+mod restore;
 mod verify;
 
 use std::sync::Arc;
@@ -22,7 +23,7 @@ use crate::error::DatasetError;
 use crate::group::create_metadata;
 use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
 use crate::objects;
-use crate::publish::{CONCURRENCY, check_size, put_again, put_all};
+use crate::publish::{CONCURRENCY, put_again, put_all};
 use crate::read::scenes_in;
 use array::{Plate, plates};
 use manifest::FORMAT;
@@ -195,12 +196,12 @@ impl Predictions {
         }
     }
 
-    /// The manifest of a scene that this very task has published, after checking that each of its objects exists with the
-    /// stated size; `None` where it is not published.
+    /// The manifest of a scene that this very task has published, after checking that each of its objects has the stated
+    /// SHA-256: predictions are small, and reading them is cheap beside making them. `None` where it is not published.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] where another task has published it; [`DatasetError::Damaged`] where an object is missing or
-    /// has another size (publishing again restores it); [`DatasetError::Store`].
+    /// changed ([`Self::restore`] puts it back); [`DatasetError::Store`].
     pub async fn finished(
         &self,
         scene: u64,
@@ -211,22 +212,40 @@ impl Predictions {
             Err(DatasetError::NotPublished { .. }) => return Ok(None),
             Err(error) => return Err(error),
         };
-        if manifest.task_key != task_key {
-            let what = format!(
-                "{} holds what other models predict of scene {scene}, or of another form of it (task key {}, this task's is \
-                 {task_key}); choose another folder",
-                self.place(),
-                manifest.task_key
-            );
-            return Err(DatasetError::invalid("output.dataset", what));
-        }
-        let sizes = manifest.objects.iter();
+        self.check_owner(&manifest, task_key)?;
+        let objects = manifest.objects.iter();
         let mut checks =
-            stream::iter(sizes.map(|o| check_size(&*self.store, self.path(&o.key), o.size)))
-                .buffer_unordered(CONCURRENCY);
+            stream::iter(objects.map(|o| self.check_hash(o))).buffer_unordered(CONCURRENCY);
         while checks.try_next().await?.is_some() {}
         drop(checks);
         Ok(Some(manifest))
+    }
+
+    /// Refuses what another task has published.
+    fn check_owner(&self, found: &PredictionManifest, task_key: &str) -> Result<(), DatasetError> {
+        if found.task_key == task_key {
+            return Ok(());
+        }
+        let what = format!(
+            "{} holds what other models predict of scene {}, or of another form of it (task key {}, this task's is \
+             {task_key}); choose another folder",
+            self.place(),
+            found.scene,
+            found.task_key
+        );
+        Err(DatasetError::invalid("output.dataset", what))
+    }
+
+    async fn check_hash(&self, object: &ObjectEntry) -> Result<(), DatasetError> {
+        let path = self.path(&object.key);
+        let bytes = objects::require(&*self.store, &path).await?;
+        match sha256_hex(&bytes) == object.sha256 {
+            true => Ok(()),
+            false => Err(DatasetError::Damaged {
+                object: self.shown(&path),
+                what: "its SHA-256 is not the manifest's".into(),
+            }),
+        }
     }
 
     /// Codes what is predicted of the scene that `manifest` names; its format, objects and checksum are filled in.

@@ -11,7 +11,7 @@ use super::place::Service;
 pub(crate) struct Failure {
     /// What happened.
     pub account: String,
-    /// How to mend it, where known.
+    /// How to repair it, where known.
     pub hint: Option<&'static str>,
 }
 
@@ -96,19 +96,27 @@ impl Request {
                 "check that the server is well, then run it again",
             ),
         };
-        // Where machines of the services are told who they are.
-        let role = ["latest/", "computeMetadata/", "metadata/identity/"]
-            .iter()
-            .any(|start| self.path.starts_with(start));
         Failure {
             account: format!("{} {what}: {cause}", self.server),
-            hint: Some(if role { hints.anonymous } else { hint }),
+            hint: Some(match self.asks_who() {
+                true => hints.anonymous,
+                false => hint,
+            }),
         }
+    }
+
+    /// Whether it was for credentials, where machines of the services are told who they are: nobody asks there who was
+    /// given any.
+    fn asks_who(&self) -> bool {
+        ["latest/", "computeMetadata/", "metadata/identity/"]
+            .iter()
+            .any(|start| self.path.starts_with(start))
     }
 
     /// The server said no.
     fn refused(&self, service: Service) -> Failure {
         let hint = match (self.code.as_deref(), self.status) {
+            _ if self.asks_who() => hints(service).anonymous,
             (Some("NoSuchBucket"), _) => {
                 "the bucket does not exist: create it, or correct the store's URL"
             }

@@ -16,6 +16,11 @@ pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
         url: url_or_path.to_string(),
         what: what.to_string(),
     };
+    if let Some(meant) = mistyped(url_or_path) {
+        return Err(unsupported(&format!(
+            "is no folder and no URL; did you mean {meant}? (a folder of that name is ./{url_or_path})"
+        )));
+    }
     let path = match url_or_path.split_once("://") {
         None => PathBuf::from(url_or_path),
         Some(("file", rest)) if rest.starts_with('/') => {
@@ -38,6 +43,25 @@ pub(super) fn local_path(url_or_path: &str) -> Result<PathBuf, DatasetError> {
         return Err(unsupported("expected a path, found nothing"));
     }
     std::path::absolute(&path).map_err(|e| DatasetError::io("resolve", &path, e))
+}
+
+/// The URL that was probably meant where a text begins like one, but lacks slashes: `s3:/bucket/x` would be a folder
+/// called `s3:`.
+fn mistyped(text: &str) -> Option<String> {
+    let (scheme, rest) = text.split_once(':')?;
+    let slashes = match &*scheme.to_ascii_lowercase() {
+        "s3" | "gs" | "az" => "//",
+        "file" => "///",
+        _ => return None,
+    };
+    let known = scheme
+        .chars()
+        .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit());
+    let whole = known && rest.starts_with("//");
+    (!whole).then(|| {
+        let scheme = scheme.to_ascii_lowercase();
+        format!("{scheme}:{slashes}{}", rest.trim_start_matches('/'))
+    })
 }
 
 /// The unfinished files that killed writers left in a local data set, of at least the given age, with their sizes. A

@@ -9,6 +9,7 @@ mod local;
 mod place;
 mod probe;
 mod s3;
+mod writable;
 
 use std::sync::Arc;
 
@@ -24,7 +25,8 @@ pub(crate) use failure::{Failure, io_hint, no_bucket};
 pub(crate) use local::{leftovers, probe_leftovers};
 pub(crate) use place::Service;
 pub(crate) use probe::PROBE;
-pub use probe::probe;
+pub use probe::{PROBE_WITHIN, probe};
+pub use writable::{Writable, check_writable, local_ground};
 
 use bandwidth::Limited;
 use client::{CONCURRENCY, Settings};
@@ -34,7 +36,7 @@ use place::Place;
 /// `az://container/prefix` (Azure). Neither folder, nor prefix need exist. Nothing is asked of the store yet.
 ///
 /// Local writes are flushed to the disk before they count, so that a manifest that exists after a power cut has its
-/// objects. Other stores are told where and who by the environment, as docs/storage.md lists. A store from here keeps its
+/// objects. Other stores are told where and who by the environment, as docs/stores.md lists. A store from here keeps its
 /// connections and the limit of its requests in flight: open once, use for long. See [`limit_bandwidth`] too.
 ///
 /// # Errors

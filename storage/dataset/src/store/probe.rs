@@ -1,5 +1,7 @@
 //! The check that a store is safe for several writers.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 use futures::future::join_all;
 use object_store::path::Path;
@@ -8,6 +10,10 @@ use object_store::{ObjectStore, ObjectStoreExt};
 use crate::error::DatasetError;
 use crate::objects;
 
+/// Longest that a store is waited for, where nobody waits for the answer.
+pub const PROBE_WITHIN: Duration = Duration::from_secs(30);
+/// Longest that deleting the probe's objects is waited for.
+const DELETE_WITHIN: Duration = Duration::from_secs(5);
 /// Writers racing.
 const RACERS: usize = 16;
 /// Repetitions when an answer was lost on the way.
@@ -25,32 +31,43 @@ enum Finding {
 }
 
 /// Checks that the store keeps the promise on which publishing rests: of several create-only puts to one key exactly
-/// one succeeds, and its bytes stay. One after the other, then sixteen at once. Leaves nothing behind.
+/// one succeeds, and its bytes stay. One after the other, then sixteen at once. Leaves nothing behind, also where the store
+/// does not answer `within` that time; only puts that a stalled server carries out later stay, for
+/// [`crate::Dataset::collect`].
 ///
 /// # Errors
 /// [`DatasetError::UnsafeStore`] says which promise was broken; [`DatasetError::Store`] where the store refuses
-/// altogether (read-only, full, no permission) or loses answer after answer.
-pub async fn probe(store: &dyn ObjectStore, prefix: &Path) -> Result<(), DatasetError> {
+/// altogether (read-only, full, no permission), loses answer after answer or does not answer in time.
+pub async fn probe(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    within: Duration,
+) -> Result<(), DatasetError> {
+    let failed = |account: String| DatasetError::Store {
+        action: "probe",
+        object: objects::shown(store, prefix),
+        hint: None,
+        account,
+    };
+    let end = tokio::time::Instant::now() + within;
     for _ in 0..ATTEMPTS {
         let id = uuid::Uuid::new_v4();
         let name = |part: &str| prefix.clone().join(format!("{PROBE}{id}-{part}"));
         let (sequential, race) = (name("sequential"), name("race"));
-        let result = probe_at(store, &sequential, &race).await;
-        for path in [&sequential, &race] {
-            match store.delete(path).await {
-                Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
-                // The probe's own finding comes first.
-                Err(e) if result.is_ok() => {
-                    return Err(DatasetError::store(
-                        "delete",
-                        objects::shown(store, path),
-                        e,
-                    ));
-                }
-                Err(_) => {}
-            }
-        }
-        match result? {
+        let answer = tokio::time::timeout_at(end, probe_at(store, &sequential, &race)).await;
+        let result = answer.unwrap_or_else(|_| {
+            let seconds = within.as_secs_f64();
+            Err(failed(format!("it did not answer within {seconds} s")))
+        });
+        let deleted = tokio::time::timeout(DELETE_WITHIN, delete(store, [&sequential, &race]));
+        let deleted = deleted.await.unwrap_or_else(|_| {
+            let seconds = DELETE_WITHIN.as_secs();
+            Err(failed(format!("it did not delete within {seconds} s")))
+        });
+        // The probe's own finding comes first.
+        let finding = result?;
+        deleted?;
+        match finding {
             Finding::Safe => return Ok(()),
             Finding::Broken(what) => {
                 return Err(DatasetError::UnsafeStore {
@@ -61,14 +78,27 @@ pub async fn probe(store: &dyn ObjectStore, prefix: &Path) -> Result<(), Dataset
             Finding::Unclear => {}
         }
     }
-    Err(DatasetError::Store {
-        action: "probe",
-        object: objects::shown(store, prefix),
-        hint: None,
-        account: format!(
-            "answers to writes were lost {ATTEMPTS} times in a row, so it could not be shown to be safe"
-        ),
-    })
+    Err(failed(format!(
+        "answers to writes were lost {ATTEMPTS} times in a row, so it could not be shown to be safe"
+    )))
+}
+
+/// Deletes objects that may not be there, each of them whatever becomes of the others.
+async fn delete(store: &dyn ObjectStore, paths: [&Path; 2]) -> Result<(), DatasetError> {
+    let mut result = Ok(());
+    for path in paths {
+        match store.delete(path).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
+            Err(e) => {
+                result = result.and(Err(DatasetError::store(
+                    "delete",
+                    objects::shown(store, path),
+                    e,
+                )));
+            }
+        }
+    }
+    result
 }
 
 async fn probe_at(

@@ -1,4 +1,4 @@
-//! Checking what is no scene: metadata, snapshots, recipes.
+//! Checking what is no scene: metadata, snapshots, recipes, splits.
 
 use serde_json::Value;
 
@@ -8,7 +8,7 @@ use crate::error::DatasetError;
 use crate::listing::Listing;
 use crate::objects;
 use crate::snapshot::Snapshot;
-use crate::{recipe, snapshot};
+use crate::{recipe, snapshot, splits};
 
 impl Dataset {
     /// Metadata must be those that the specification asks for.
@@ -43,7 +43,7 @@ impl Dataset {
             .collect()
     }
 
-    /// Snapshots and recipes must be what was written.
+    /// Snapshots, recipes and splits must be what was written.
     pub(super) async fn verify_records(
         &self,
         listing: &Listing,
@@ -56,6 +56,7 @@ impl Dataset {
             };
             let checked = match snapshot::is_snapshot(key) {
                 true => Snapshot::parse(&bytes).map(drop),
+                false if splits::is_split(key) => splits::check(key, &bytes).map(drop),
                 false => recipe::parse(&bytes).map(drop),
             };
             report.problems.extend(checked.err().map(|why| Problem {

@@ -114,8 +114,8 @@ impl fmt::Display for Fault {
 }
 
 impl Problem {
-    /// How it is mended.
-    pub fn mend(&self) -> &'static str {
+    /// How it is repaired.
+    pub fn hint(&self) -> &'static str {
         match (&self.fault, self.scene) {
             (Fault::Foreign, _) => "move it elsewhere; nothing reads it, nothing here deletes it",
             (Fault::BadRecord(_), _) => {

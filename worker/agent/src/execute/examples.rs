@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{Dataset, DatasetError, Quantity, SplitUsed, Spot, sha256_hex};
+use picofarm_dataset::{Dataset, DatasetError, Quantity, SplitUsed, sha256_hex};
 use picofarm_model::scene::{Scene, Scenes};
 use picofarm_proto::{
     model::Histogram,
@@ -14,10 +14,11 @@ use picofarm_proto::{
 use picofarm_transient::sensor::Multiplex;
 use tokio::runtime::Handle;
 
-use super::{Control, TaskError, memory::memory_mib, output::Stores, reprocess::quantity};
+#[cfg(test)]
+mod folded;
 
-/// A beam whose path from the laser is longer than the straight line by more than this, in metres, met a mirror.
-const STRAIGHT_M: f32 = 1e-3;
+use super::{Control, TaskError, output::Stores, reprocess::quantity};
+use crate::machine::memory_mib;
 
 /// One part of so many of the memory holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
@@ -43,8 +44,7 @@ struct Kept {
 
 impl Kept {
     fn keep(&mut self, index: usize, scene: &Arc<Scene>) {
-        let values = scene.histogram.len() + scene.depth_m.len() + scene.tof_m.len();
-        let bytes = 4 * values + scene.specular.len() + scene.lit.len();
+        let bytes = scene.bytes();
         if bytes <= self.room && self.scenes.insert(index, scene.clone()).is_none() {
             self.room -= bytes;
         }
@@ -139,15 +139,15 @@ impl Examples {
     async fn scene(&self, scene: u64) -> Result<Scene, DatasetError> {
         let dataset = &self.dataset;
         let spec = dataset.spec();
-        let (histogram, depth, specular, lit, spots, intrinsics, laser) = futures::try_join!(
+        let (histogram, depth, specular, lit, spots, intrinsics) = futures::try_join!(
             self.histogram(scene),
             dataset.read::<f32>(scene, Quantity::Depth),
             dataset.read::<u8>(scene, Quantity::Specular),
             dataset.read_visibility(scene),
             dataset.read_spots(scene),
             dataset.read_intrinsics(scene),
-            dataset.read::<f32>(scene, Quantity::Laser),
         )?;
+        check_light(&dataset.place(), scene, &histogram)?;
         // Nothing is seen there: infinitely far, not at the camera.
         let depth_m: Vec<f32> = depth
             .into_iter()
@@ -162,13 +162,10 @@ impl Examples {
                 (chosen.iter().map(|s| spots[*s as usize]).collect(), lit)
             }
         };
-        let laser = [laser[0], laser[1], laser[2]];
         let intrinsics = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy];
-        let width = spec.width as usize;
-        let tof_m = two_bounce_m(&spots, laser, &depth_m, width, intrinsics);
         Ok(Scene {
             height: spec.height as usize,
-            width,
+            width: spec.width as usize,
             bins: spec.gate.bins as usize,
             histogram,
             first_m: spec.gate.start_m,
@@ -179,10 +176,12 @@ impl Examples {
                 .iter()
                 .map(|spot| spot.map_or([f32::NAN; 3], |s| s.position))
                 .collect(),
+            beams_m: spots
+                .iter()
+                .map(|spot| spot.map_or(f32::NAN, |s| s.path_m))
+                .collect(),
             lit,
-            tof_m,
             intrinsics: intrinsics.map(f64::from),
-            laser,
         })
     }
 }
@@ -203,36 +202,22 @@ impl Scenes for Examples {
     }
 }
 
-/// Path of two-bounce light, metres: `[spot][row][column]`. Empty where every beam goes straight to its spot, so that it
-/// follows from spots and depth; NaN for a beam that meets nothing.
-fn two_bounce_m(
-    spots: &[Option<Spot>],
-    laser: [f32; 3],
-    depth_m: &[f32],
-    width: usize,
-    [fx, fy, cx, cy]: [f32; 4],
-) -> Vec<f32> {
-    let bent = |s: &Spot| (s.path_m - distance(s.position, laser)).abs() > STRAIGHT_M;
-    if !spots.iter().flatten().any(bent) {
-        return Vec::new();
-    }
-    let path = |spot: &Option<Spot>, pixel: usize| {
-        let Some(spot) = spot else { return f32::NAN };
-        let (row, column) = ((pixel / width) as f32, (pixel % width) as f32);
-        let z = depth_m[pixel];
-        let point = [(column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z, z];
-        spot.path_m + distance(spot.position, point) + distance(point, [0.0; 3])
+/// Refuses a histogram that tells nothing, or holds what is no number: a network would take both for what is seen.
+fn check_light(place: &str, scene: u64, histogram: &[f32]) -> Result<(), DatasetError> {
+    let odd = histogram.iter().find(|h| !(h.is_finite() && **h >= 0.0));
+    let what = match odd {
+        Some(odd) => format!(
+            "a bin of scene {scene}'s histogram is {odd}; expected finite numbers of at least 0"
+        ),
+        None if histogram.iter().all(|h| *h == 0.0) => {
+            format!("every bin of scene {scene}'s histogram is 0: no light arrives within the gate")
+        }
+        None => return Ok(()),
     };
-    let pixels = 0..depth_m.len();
-    spots
-        .iter()
-        .flat_map(|spot| pixels.clone().map(move |pixel| path(spot, pixel)))
-        .collect()
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    let d = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-    (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt()
+    Err(DatasetError::Invalid {
+        field: "source".into(),
+        what: format!("{place}: {what}; render or import the scene again"),
+    })
 }
 
 /// The scenes of the given sides of a split's newest version, in the order in which it was cut: the first so many are
@@ -295,23 +280,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_bounce_times_are_told_where_a_beam_met_a_mirror() {
-        let spot = |path_m| {
-            Some(Spot {
-                position: [0.0, 0.0, 3.0],
-                normal: [0.0, 0.0, -1.0],
-                path_m,
-            })
-        };
-        let of = |spots: &[Option<Spot>]| {
-            two_bounce_m(spots, [0.0; 3], &[1.0, 1.0], 2, [1.0, 1.0, 0.5, 0.5])
-        };
-        assert_eq!(of(&[spot(3.0), None]), Vec::<f32>::new());
-        let told = of(&[spot(4.0), None]);
-        assert_eq!(told.len(), 4);
-        assert_eq!(told[0], 4.0 + 2.0 + 1.0);
-        assert_eq!(told[1], 4.0 + 5.0f32.sqrt() + 2.0f32.sqrt());
-        assert!(told[2].is_nan() && told[3].is_nan());
+    fn a_histogram_without_light_or_with_what_is_no_number_is_refused_by_its_scene() {
+        assert!(check_light("a/b", 7, &[0.0, 1e-30, 2.0]).is_ok());
+        let said = |h: &[f32]| check_light("a/b", 7, h).unwrap_err().to_string();
+        assert!(said(&[0.0; 4]).contains("a/b: every bin of scene 7's histogram is 0"));
+        for odd in [f32::NAN, f32::INFINITY, -1.0] {
+            let said = said(&[1.0, odd]);
+            assert!(
+                said.contains(&format!("is {odd}; expected finite")),
+                "{said}"
+            );
+        }
     }
 
     #[test]

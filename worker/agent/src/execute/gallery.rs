@@ -14,7 +14,8 @@ use super::{
     evaluate::trained,
     examples::{Examples, sides},
     output::Stores,
-    train::{Known, of_model},
+    train::{Known, of_model, pin},
+    truth,
 };
 
 /// A model's pictures, and the size of its scenes.
@@ -48,6 +49,12 @@ pub(super) fn show(
     let known = read(&evaluation.model)?;
     let settings = trained(&known.manifest.settings)
         .map_err(|what| TaskError::User(format!("{}: its settings: {what}", evaluation.model)))?;
+    let pinned = pin(stores, &dataset, &scenes, control)?;
+    truth::check(
+        &dataset.place(),
+        &truth::of_training(&settings),
+        &pinned.missing,
+    )?;
     let guide = match &*settings.shadow.tof {
         TRUTH => None,
         tof => Some(read(tof)?),

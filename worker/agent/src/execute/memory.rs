@@ -1,69 +1,92 @@
-//! How much memory a render takes, and whether this machine has it.
+//! Whether a task fits into the memory that this worker's tasks may take; [`picofarm_proto::model::memory`] says how much
+//! that is.
 
-use std::fs;
-
+use picofarm_dataset::DatasetSpec;
+use picofarm_proto::model::{
+    TaskSpec,
+    memory::{Known, Rendering, Shape, gib, peak_bytes},
+};
 use picofarm_transient::Settings;
 
-/// Share of the machine's memory that a render may take.
-const SHARE: f64 = 0.75;
-/// Pixels of the tiles that each thread works on, and the sums it keeps of each slot.
-const TILE_PIXELS: u64 = 256;
-const TILE_SUMS: u64 = 3;
+use super::TaskError;
+use crate::machine::Memory;
 
-/// Bytes that the histograms of a render of `width`×`height` pixels take, those of its threads' tiles included.
-pub fn render_bytes(settings: &Settings, width: u32, height: u32, threads: usize) -> u64 {
-    let histogram = 4 * u64::from(settings.gate.bins);
-    let (groups, pixels) = (
-        settings.groups.len() as u64,
-        u64::from(width) * u64::from(height),
-    );
-    let parts = if settings.split { 5 } else { 0 };
-    let image = pixels * histogram * (1 + groups + parts);
-    let tile = TILE_PIXELS.min(pixels) * histogram * (1 + groups) * TILE_SUMS;
-    image + tile * threads as u64
+/// The scenes of a data set, as far as memory depends on them.
+pub(super) fn shape(spec: &DatasetSpec) -> Shape {
+    Shape {
+        height: spec.height,
+        width: spec.width,
+        bins: spec.gate.bins,
+        spots: spec.spots,
+    }
 }
 
-/// Checks that a render fits into three quarters of this machine's memory, where the system tells how much there is.
+/// Refuses a task that takes more than `limit_mib`; 0 = not known, which refuses nothing.
 ///
 /// # Errors
-/// A message with what is needed, what is there, and how to mend it.
-pub fn check_memory(
-    settings: &Settings,
-    width: u32,
-    height: u32,
-    threads: usize,
-) -> Result<(), String> {
-    let needed = render_bytes(settings, width, height, threads);
-    match memory() {
-        Some(there) if needed as f64 > SHARE * there as f64 => Err(format!(
-            "{} histograms of {width}x{height} pixels x {} bins take {:.1} GB of memory, more than three quarters of \
-             this machine's {:.1} GB; ask for fewer of them, or for fewer pixels or bins",
-            1 + settings.groups.len(),
+/// [`TaskError::User`] with what it takes, what there is, and what to do.
+pub(super) fn check(task: &TaskSpec, known: &Known, limit_mib: u64) -> Result<(), TaskError> {
+    let threads = rayon::current_num_threads() as u32;
+    let Some(needed) = peak_bytes(task, known, threads) else {
+        return Ok(());
+    };
+    let limit = limit_mib << 20;
+    if limit == 0 || needed <= limit {
+        return Ok(());
+    }
+    Err(TaskError::User(format!(
+        "a {} task like this takes about {} of memory, but tasks of this worker may take {}; run it on a larger machine, \
+         or ask for fewer pixels, bins or histograms",
+        task.kind(),
+        gib(needed),
+        gib(limit),
+    )))
+}
+
+fn rendering(settings: &Settings, (width, height): (u32, u32), threads: usize) -> Rendering {
+    Rendering {
+        shape: Shape {
+            height,
+            width,
+            bins: settings.gate.bins,
+            spots: 25,
+        },
+        histograms: 1 + settings.groups.len() as u32,
+        split: settings.split,
+        light_paths: settings.strategy.caustics != Some(false)
+            && settings.max_bounces.is_none_or(|most| most >= 3),
+        threads: threads as u32,
+    }
+}
+
+/// Bytes that a render of an image of `size` (width and height) takes at most.
+pub fn render_bytes(settings: &Settings, size: (u32, u32), threads: usize) -> u64 {
+    rendering(settings, size, threads).peak_bytes()
+}
+
+/// Checks that a render fits into what tasks may take here, where the system tells how much that is.
+///
+/// # Errors
+/// A message with what is needed, what is there, and what to do.
+pub fn check_memory(settings: &Settings, size: (u32, u32), threads: usize) -> Result<(), String> {
+    let needed = render_bytes(settings, size, threads);
+    match Memory::here() {
+        Some(there) if needed > there.for_tasks_mib() << 20 => Err(format!(
+            "{} histograms of {}x{} pixels x {} bins take about {} of memory, but there is {there}; ask for fewer of \
+             them, or for fewer pixels or bins",
+            rendering(settings, size, threads).histograms + if settings.split { 5 } else { 0 },
+            size.0,
+            size.1,
             settings.gate.bins,
-            needed as f64 / 1e9,
-            there as f64 / 1e9,
+            gib(needed),
         )),
         _ => Ok(()),
     }
 }
 
-/// MiB of memory that tasks may take on this machine; 0 where the system does not tell.
-pub fn memory_mib() -> u64 {
-    memory().map_or(0, |bytes| (SHARE * bytes as f64) as u64 >> 20)
-}
-
-/// Bytes of memory of this machine, or of the control group that this process is in, whichever is less.
-fn memory() -> Option<u64> {
-    let text = fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|l| l.strip_prefix("MemTotal:"))?;
-    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    let limit = fs::read_to_string("/sys/fs/cgroup/memory.max").ok();
-    let limit = limit.and_then(|l| l.trim().parse().ok());
-    Some((kib * 1024).min(limit.unwrap_or(u64::MAX)))
-}
-
 #[cfg(test)]
 mod tests {
+    use picofarm_proto::model::JobSpec;
     use picofarm_transient::{Budget, Gate, Strategy};
 
     use super::*;
@@ -84,16 +107,29 @@ mod tests {
             groups: vec![],
             strategy: Strategy::default(),
         };
-        assert_eq!(check_memory(&settings, 16, 16, 2), Ok(()));
+        assert_eq!(check_memory(&settings, (16, 16), 2), Ok(()));
         settings.groups = (0..100).map(|beam| vec![beam]).collect();
-        let bytes = render_bytes(&settings, 256, 256, 1) as f64;
-        assert!((16.8e9..17.2e9).contains(&bytes), "{bytes}");
-        if memory().is_some() {
-            let refused = check_memory(&settings, 16_384, 16_384, 1).unwrap_err();
+        let bytes = render_bytes(&settings, (256, 256), 1) as f64;
+        assert!((16.8e9..30e9).contains(&bytes), "{bytes}");
+        if Memory::here().is_some() {
+            let refused = check_memory(&settings, (16_384, 16_384), 1).unwrap_err();
             assert!(
                 refused.contains("101 histograms of 16384x16384"),
                 "{refused}"
             );
         }
+    }
+
+    #[test]
+    fn a_task_is_refused_by_the_workers_own_limit() {
+        let job = r#"{"name": "m", "stage": [{"scenes": {"kind": "primitive", "count": 1},
+            "render": {"renderer": "r", "resolution": 1024}, "output": {"store": "/s", "dataset": "d"}}]}"#;
+        let job: JobSpec = serde_json::from_str(job).unwrap();
+        let of = |limit| check(&job.stages[0].task, &Known::default(), limit);
+        let refused = of(1024).unwrap_err().to_string();
+        assert!(refused.contains("GiB of memory"), "{refused}");
+        assert!(refused.contains("may take 1.0 GiB"), "{refused}");
+        assert_eq!(of(1 << 20), Ok(()));
+        assert_eq!(of(0), Ok(()));
     }
 }

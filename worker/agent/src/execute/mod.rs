@@ -1,27 +1,17 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
-mod evaluate;
 mod examples;
-pub mod export;
 mod gallery;
-mod generate;
-mod import;
-mod infer;
+mod kinds;
 mod memory;
 mod output;
-mod parts;
-mod promote;
 mod recipe;
-mod render;
 pub mod repair;
-pub mod report;
-pub mod reprocess;
 mod runner;
 mod scenes;
-pub mod split;
+mod submission;
 mod subsets;
-mod tasks;
-mod train;
+mod truth;
 
 use std::{
     collections::BTreeMap,
@@ -30,6 +20,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, AtomicU32, Ordering},
     },
+    time::{Duration, Instant},
 };
 
 use picofarm_proto::{
@@ -38,15 +29,15 @@ use picofarm_proto::{
     model::{StageSpec, TaskAt},
 };
 
-pub use generate::generator_version;
-pub use import::{import_options, import_version};
-pub use infer::infer_version;
-pub use memory::{check_memory, memory_mib, render_bytes};
-pub use render::renderer_version;
+use kinds::{Context, RunTask, STORE_PATIENCE, evaluate, part, render, train};
+pub use kinds::{
+    TaskExecutor, export, infer::infer_version, render::renderer_version, report, reprocess,
+    resolve, split, train::model_version,
+};
+pub use memory::{check_memory, render_bytes};
 pub(crate) use runner::Runner;
+pub use submission::{Submission, absolute};
 pub use subsets::{strategy, strategy_names};
-pub use tasks::TaskExecutor;
-pub use train::model_version;
 
 /// One task to run.
 #[derive(Debug, Clone)]
@@ -88,9 +79,12 @@ pub enum TaskError {
     /// The executor broke down.
     #[error("{0}")]
     Crash(String),
-    /// Nothing is wrong with the task: the store cannot be reached or is full.
+    /// Nothing is wrong with the task, but with this machine.
     #[error("{0}")]
     Interrupted(String),
+    /// Nothing is wrong with the task: its store cannot be reached, or takes nothing.
+    #[error("{0}")]
+    Store(String),
     /// [`Control::stop`] was called.
     #[error("stopped on request")]
     Stopped,
@@ -113,15 +107,34 @@ pub trait Executor: Send + Sync + 'static {
 }
 
 /// Between the session and the running task: how far it is, and whether it is still wanted.
-#[derive(Default)]
 pub struct Control {
+    begun: Instant,
     /// Bits of an f32 in [0, 1]: for non-negative floats the order of the bits is that of the values.
     fraction: AtomicU32,
     at: Mutex<TaskAt>,
     stop: AtomicBool,
+    /// What it has done is not wanted either.
+    unwanted: AtomicBool,
+}
+
+impl Default for Control {
+    fn default() -> Self {
+        Self {
+            begun: Instant::now(),
+            fraction: AtomicU32::default(),
+            at: Mutex::default(),
+            stop: AtomicBool::default(),
+            unwanted: AtomicBool::default(),
+        }
+    }
 }
 
 impl Control {
+    /// How long the task has been running.
+    pub fn elapsed(&self) -> Duration {
+        self.begun.elapsed()
+    }
+
     /// Tells how far the task is, in [0, 1]; a smaller value than before changes nothing. `false` if the
     /// task shall stop.
     pub fn at(&self, fraction: f32) -> bool {
@@ -158,6 +171,17 @@ impl Control {
     /// Asks the task to stop as soon as it can.
     pub fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// Asks the task to stop as soon as it can, and to save nothing: it is another worker's, or nobody's.
+    pub fn give_up(&self) {
+        self.unwanted.store(true, Ordering::Relaxed);
+        self.stop();
+    }
+
+    /// Whether nobody waits for what it has done.
+    pub fn unwanted(&self) -> bool {
+        self.unwanted.load(Ordering::Relaxed)
     }
 
     /// Whether the task shall stop.

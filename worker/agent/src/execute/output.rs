@@ -2,27 +2,36 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Models, Profile, Subsets,
-    open_store, probe,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Models, PROBE_WITHIN,
+    Profile, Subsets, open_store, probe,
 };
-use picofarm_proto::{key::TaskKey, model::RenderTask, trace};
+use picofarm_proto::{
+    key::TaskKey,
+    model::{RenderTask, TaskSpec, memory::Known},
+    trace,
+};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::{debug_span, warn};
 
-use super::{Control, TaskError};
-use crate::session::backoff::{Backoff, random};
+use super::{Control, TaskError, memory};
+use crate::{
+    machine::memory_mib,
+    session::backoff::{Backoff, random},
+};
 
 /// A store and the prefix in it.
 type Place = (Arc<dyn ObjectStore>, Path);
 
+/// How long what is finished is held at least for a store that does not take it.
+const LEAST_PATIENCE: Duration = Duration::from_secs(3);
 /// How often a task that waits for its store is asked whether it shall stop.
 const STOP_LOOK: Duration = Duration::from_millis(50);
 
@@ -33,10 +42,10 @@ pub(super) struct Stores {
     probed: Mutex<BTreeMap<String, Place>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<String, Place>>,
-    /// Recipes known to be stored: data set and key.
-    noted: Mutex<BTreeSet<(String, String)>>,
-    /// How long a rendered scene is held for a store that does not take it.
+    /// How long a rendered scene is held at most for a store that does not take it.
     patience: Duration,
+    /// Memory that tasks may take, MiB; 0 = not known.
+    memory_mib: u64,
 }
 
 impl Stores {
@@ -45,9 +54,28 @@ impl Stores {
             runtime,
             probed: Mutex::default(),
             sources: Mutex::default(),
-            noted: Mutex::default(),
             patience,
+            memory_mib: memory_mib(),
         }
+    }
+
+    /// The same for tasks that may take so much memory, MiB; 0 = not known.
+    pub(super) fn with_memory(self, memory_mib: u64) -> Self {
+        Self { memory_mib, ..self }
+    }
+
+    /// Refuses a task that takes more memory than tasks may take here. `source` is the data set that it reads, where its
+    /// size depends on one.
+    pub(super) fn fits(
+        &self,
+        task: TaskSpec,
+        source: Option<&DatasetSpec>,
+    ) -> Result<(), TaskError> {
+        let known = Known {
+            source: source.map(memory::shape),
+            networks: Vec::new(),
+        };
+        memory::check(&task, &known, self.memory_mib)
     }
 
     /// What reaches stores, for threads other than the executor's.
@@ -109,7 +137,8 @@ impl Stores {
         Ok(place)
     }
 
-    /// Stores a recipe where there is none yet; one of all scenes is looked for once.
+    /// Stores a recipe where there is none yet. It is looked for with every scene: who deletes a data set while this worker
+    /// runs gets a whole one again.
     pub(super) fn note_recipe(
         &self,
         dataset: &Dataset,
@@ -118,15 +147,7 @@ impl Stores {
         content: &serde_json::Value,
         control: &Control,
     ) -> Result<(), TaskError> {
-        let known = || self.noted.lock().expect("no panic while locked");
-        let name = (dataset.place(), key.to_owned());
-        if scene.is_none() && known().contains(&name) {
-            return Ok(());
-        }
         self.wait(control, dataset.create_recipe(key, scene, content))?;
-        if scene.is_none() {
-            known().insert(name);
-        }
         Ok(())
     }
 
@@ -137,7 +158,7 @@ impl Stores {
             return Ok(place.clone());
         }
         let (store, prefix) = open_store(location).map_err(of_dataset)?;
-        self.wait(control, probe(&*store, &prefix))?;
+        self.wait(control, probe(&*store, &prefix, PROBE_WITHIN))?;
         known().insert(location.to_owned(), (store.clone(), prefix.clone()));
         Ok((store, prefix))
     }
@@ -183,7 +204,7 @@ impl Stores {
         let looked = async {
             match dataset.published(index).await {
                 Err(error @ DatasetError::Damaged { .. }) => {
-                    warn!(%error, task = index, "a published scene is damaged; it is made again to mend it");
+                    warn!(%error, task = index, "a published scene is damaged; it is made again to repair it");
                     Ok(None)
                 }
                 other => other,
@@ -217,20 +238,27 @@ impl Stores {
     }
 
     /// Asks a store that fails (unreachable, full) again for a while, so that what is rendered is not lost with the
-    /// first hiccup.
+    /// first hiccup: for as long as the task has taken, since so long it takes to do it again. After that the worker is
+    /// worth more to others.
     pub(super) fn patiently<T>(
         &self,
         control: &Control,
         mut request: impl AsyncFnMut() -> Result<T, DatasetError>,
     ) -> Result<T, TaskError> {
-        let until = Instant::now() + self.patience;
+        let patience = control.elapsed().max(LEAST_PATIENCE).min(self.patience);
+        let until = Instant::now() + patience;
         let mut backoff = Backoff::new(Duration::from_millis(250), Duration::from_secs(15));
         loop {
             let error = match self.wait(control, request()) {
                 Ok(done) => return Ok(done),
                 Err(error) => error,
             };
-            if !matches!(error, TaskError::Interrupted(_)) || Instant::now() >= until {
+            if !matches!(error, TaskError::Store(_)) {
+                return Err(error);
+            }
+            if Instant::now() >= until {
+                // The next task looks whether it can store before it computes.
+                self.probed.lock().expect("no panic while locked").clear();
                 return Err(error);
             }
             let wait = backoff.next(random());
@@ -279,7 +307,7 @@ pub(super) fn of_dataset(error: DatasetError) -> TaskError {
         // Of the settings, the worker's environment is to blame: another one may have them.
         DatasetError::Store { .. }
         | DatasetError::StoreSettings { .. }
-        | DatasetError::Io { .. } => TaskError::Interrupted(text),
+        | DatasetError::Io { .. } => TaskError::Store(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }

@@ -4,7 +4,7 @@
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
-    key::{StageKey, render_stage_key, reprocess_stage_key},
+    key::{StageKey, reprocess_stage_key},
     model::{OutputSettings, ReprocessTask, SceneKind, StageSpec, TaskSpec},
 };
 use serde_json::json;
@@ -84,7 +84,7 @@ pub(super) fn read(
             render.output.dataset = dataset.to_owned();
             match render.scenes.kind {
                 SceneKind::Files { .. } => key,
-                _ => render_stage_key(render),
+                _ => render.stage_key(),
             }
         }
         TaskSpec::Reprocess(task) => {

@@ -9,6 +9,7 @@ use picofarm_dataset::{
     import::{Format, ImportOptions, Source, import_scene},
     open_store, remains, restore_root,
 };
+use picofarm_files::Opener;
 use picofarm_proto::{
     key::{StageKey, TaskKey, stage_key, task_key},
     model::{
@@ -21,10 +22,9 @@ use serde_json::Value;
 use tokio::runtime::Handle;
 
 use super::{
-    Control, TaskError,
+    Control, STORE_PATIENCE, TaskError,
     output::{Stores, dataset_spec, of_dataset},
     recipe, render, reprocess, scenes,
-    tasks::STORE_PATIENCE,
 };
 
 /// What a person says of how the data set was made, beyond what it says itself.
@@ -209,7 +209,14 @@ impl Repairer {
                     unreachable!("only renderings are ways of rendering");
                 };
                 let key = key.expect("a rendering has a key");
-                render::make(dataset, &self.libraries, &task, scene, &key, control)
+                render::make(
+                    dataset,
+                    (&self.libraries, &Opener::anywhere()),
+                    &task,
+                    scene,
+                    &key,
+                    control,
+                )
             }
             Way::Reprocess(task) => {
                 let made = reprocess::Made::of(&self.stores, &task, scene, control)?;

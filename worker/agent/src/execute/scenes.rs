@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use picofarm_files::Opener;
 use picofarm_proto::{
     key::scene_seed,
     model::{SceneFile, SceneKind, SceneSource},
@@ -9,12 +10,15 @@ use picofarm_proto::{
 use picofarm_scene::{
     AssetLibrary, LaserGrid, Scene, SceneError,
     furnished::{self, FurnishedSettings},
-    import::{self, ImportOptions},
+    import::{self, Bounds, ImportOptions},
     primitive::{self, PrimitiveSettings},
 };
 use tracing::{info, warn};
 
 use super::TaskError;
+
+/// What scenes are made with: the furniture at hand, and what opens scene files.
+pub(super) type With<'a> = (&'a [AssetLibrary], &'a Opener);
 
 /// Names of the furniture libraries that this program knows.
 const LIBRARIES: [&str; 3] = ["parametric", "sweethome3d", "gltf"];
@@ -47,7 +51,7 @@ pub(super) fn scene(
     source: &SceneSource,
     side: u32,
     index: u64,
-    libraries: &[AssetLibrary],
+    (libraries, files): With<'_>,
 ) -> Result<Scene, TaskError> {
     let seed = scene_seed(source.seed, index);
     match &source.kind {
@@ -76,12 +80,16 @@ pub(super) fn scene(
             };
             primitive::generate(seed, &settings).map_err(of_scene)
         }
-        SceneKind::Files { .. } => {
+        SceneKind::Files { root, .. } => {
+            let bounds = Bounds {
+                files: files.clone(),
+                root: root.as_ref().map(PathBuf::from),
+            };
             let at = format!("scenes.files[{index}]");
             let file = source.kind.file(index).ok_or_else(|| {
                 TaskError::User(format!("{at}: the job lists no such file; submit it again"))
             })?;
-            read(file, &at, (source.spots, side))
+            read(file, &at, (source.spots, side), &bounds)
         }
     }
 }
@@ -102,9 +110,14 @@ fn library<'a>(
 }
 
 /// Reads a scene file after checking its hash, and gives it the job's resolution.
-fn read(file: &SceneFile, at: &str, (spots, side): (u32, u32)) -> Result<Scene, TaskError> {
+fn read(
+    file: &SceneFile,
+    at: &str,
+    (spots, side): (u32, u32),
+    bounds: &Bounds,
+) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
-    let found = import::fingerprint(path).map_err(|e| named(at, e))?;
+    let found = import::fingerprint(path, bounds).map_err(|e| named(at, e))?;
     if found != file.sha256 {
         return Err(TaskError::User(format!(
             "{at}: {} has SHA-256 {found}, but the job was submitted with {}; put the old file back, or submit \
@@ -112,7 +125,7 @@ fn read(file: &SceneFile, at: &str, (spots, side): (u32, u32)) -> Result<Scene, 
             file.path, file.sha256
         )));
     }
-    let mut scene = with_laser(path, spots).map_err(|e| named(at, e))?;
+    let mut scene = with_laser(path, spots, bounds).map_err(|e| named(at, e))?;
     scene.camera.intrinsics = scene.camera.intrinsics.resized(side, side);
     let beams = scene.laser.beams.len();
     if beams != spots as usize {
@@ -126,16 +139,16 @@ fn read(file: &SceneFile, at: &str, (spots, side): (u32, u32)) -> Result<Scene, 
 }
 
 /// Reads a scene with its own laser, or the grid of `spots` where it has none.
-fn with_laser(path: &Path, spots: u32) -> Result<Scene, SceneError> {
-    match import::read_scene(path) {
-        // The importer's word for a file without a laser; one with an unusable laser is not mended here.
+fn with_laser(path: &Path, spots: u32, bounds: &Bounds) -> Result<Scene, SceneError> {
+    match import::read_scene_with(path, &ImportOptions::default(), bounds) {
+        // The importer's word for a file without a laser; one with an unusable laser is not repaired here.
         Err(SceneError::Format { what, .. }) if what.starts_with("laser: ") => {
             warn!(path = %path.display(), spots, "the file has no laser; the job's grid is used");
             let options = ImportOptions {
                 laser: LaserGrid::new(spots),
                 ..ImportOptions::default()
             };
-            import::read_scene_with(path, &options)
+            import::read_scene_with(path, &options, bounds)
         }
         read => read,
     }

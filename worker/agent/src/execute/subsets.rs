@@ -114,21 +114,24 @@ mod tests {
     fn strategies_are_chosen_by_name() {
         let one = |name: &str, choice| strategy(&BTreeMap::from([(name.to_owned(), choice)]));
         assert_eq!(strategy(&BTreeMap::new()), Ok(Strategy::default()));
-        assert_eq!(one("share", Choice::Size(3)).unwrap().share, Some(3));
-        let off = one("image_lobes", Choice::On(false)).unwrap();
-        assert_eq!(off.image_lobes, Some(false));
+        assert_eq!(
+            one("path_reuse", Choice::Size(3)).unwrap().path_reuse,
+            Some(3)
+        );
+        let off = one("mirror_images", Choice::On(false)).unwrap();
+        assert_eq!(off.mirror_images, Some(false));
         let unknown = one("lobes", Choice::On(true)).unwrap_err();
         assert!(
-            unknown.contains("\"lobes\"") && unknown.contains("share, light_vertices"),
+            unknown.contains("\"lobes\"") && unknown.contains("path_reuse, light_vertices"),
             "{unknown}"
         );
         assert!(
-            one("share", Choice::On(true))
+            one("path_reuse", Choice::On(true))
                 .unwrap_err()
                 .contains("number")
         );
         assert!(
-            one("image_lobes", Choice::Size(1))
+            one("mirror_images", Choice::Size(1))
                 .unwrap_err()
                 .contains("off")
         );

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     ids::LeaseRef,
-    model::{Failure, Finished, Lease, TaskLog, TaskProgress},
+    model::{Failure, Finished, Lease, TaskLog, TaskProgress, bounds},
     wire::{self, session_request, session_response},
 };
 
@@ -99,7 +99,7 @@ impl From<Outgoing> for wire::SessionRequest {
             Outgoing::Report(Report::Failed(failed)) => M::Failed(failed.into()),
             Outgoing::Report(Report::Release { lease, reason }) => M::Release(wire::Release {
                 lease: Some(lease.into()),
-                reason,
+                reason: bounds::message(&reason),
             }),
         };
         Self {

@@ -10,7 +10,7 @@
 //!
 //! # Self-fencing
 //! A lease that has not been renewed for two thirds of its time to live, on this machine's monotonic
-//! clock, is *fenced*: no further task of it is **started** until the coordinator renews it ([`desk`]). A
+//! clock, is *fenced*: no further task of it is **started** until the coordinator renews it ([`assignments`]). A
 //! task already running goes on and may publish, because publishing cannot do harm: the put is create-only
 //! and an honest rival would have written the same bytes. What fencing prevents is waste: a worker cut off
 //! from the farm working through a range that has long been given to another.
@@ -20,10 +20,10 @@
 //! since its result can still be adopted. A lease revoked while its time still runs is not *wanted* any more
 //! (a cancelled job): its running task is stopped.
 
-pub(crate) mod backoff;
-pub(crate) mod desk;
+pub(crate) mod assignments;
 #[cfg(test)]
-mod desk_laws;
+mod assignments_laws;
+pub(crate) mod backoff;
 pub(crate) mod message;
 pub(crate) mod outbox;
 
@@ -52,7 +52,7 @@ const MAX_MESSAGE: usize = 256 << 20;
 pub(crate) enum LinkError {
     /// Try again later.
     Down(String),
-    /// Somebody must mend a setting here or there.
+    /// Somebody must repair a setting here or there.
     Mismatch(String),
     /// Trying again would not help.
     Refused(String),

@@ -8,6 +8,7 @@ use picofarm_agent::{
     split::Splitter,
 };
 use picofarm_dataset::*;
+use picofarm_files::Opener;
 use picofarm_proto::{
     ids::JobId,
     key::{TaskKey, stage_key},
@@ -46,12 +47,37 @@ impl Place {
         place
     }
 
+    /// The same, where three scenes lack the named quantities.
+    pub async fn lacking(missing: &[&str]) -> Self {
+        let place = Self {
+            dir: tempfile::tempdir().unwrap(),
+        };
+        for scene in 0..SCENES {
+            let lacks = if scene % 3 == 0 { missing } else { &[] };
+            let size = [SIDE, BINS];
+            place.publish_without("rooms", scene, size, lacks).await;
+        }
+        place.split("default", Parts::Counts([5, 2, 1])).await;
+        place
+    }
+
     pub fn store(&self) -> String {
         self.dir.path().to_str().unwrap().to_owned()
     }
 
     /// Publishes a scene of images with so many rows and columns, and histograms with so many bins (8 at least).
-    pub async fn publish(&self, dataset: &str, scene: u64, [side, bins]: [u32; 2]) {
+    pub async fn publish(&self, dataset: &str, scene: u64, size: [u32; 2]) {
+        self.publish_without(dataset, scene, size, &[]).await;
+    }
+
+    /// The same, of which the manifest lists something as missing.
+    pub async fn publish_without(
+        &self,
+        dataset: &str,
+        scene: u64,
+        [side, bins]: [u32; 2],
+        missing: &[&str],
+    ) {
         let spec = DatasetSpec {
             scenes: SCENES,
             height: side,
@@ -122,7 +148,10 @@ impl Place {
             task_key: TaskKey([scene as u8 + 1; 32]).to_string(),
             renderer: "transient-1".into(),
             seed: 7,
-            plan: json!({}),
+            plan: match missing {
+                [] => json!({}),
+                names => json!({"kind": "import", "missing": names}),
+            },
         };
         let (store, prefix) = open_store(&self.store()).unwrap();
         let rooms = Dataset::create_or_open(store, prefix.join(dataset), &spec)
@@ -159,7 +188,7 @@ impl Place {
 
     pub fn training(&self, more: serde_json::Value) -> StageSpec {
         let mut settings = json!({
-            "task": "tof", "model": "m", "version": model_version(), "seed": 5,
+            "target": "tof", "model": "m", "version": model_version(), "seed": 5,
             "net": {"width": 2, "levels": 2}, "optimise": {"epochs": 40, "batch": 2},
             // A checkpoint each 600 ms.
             "checkpoint_minutes": 0.01,
@@ -216,8 +245,8 @@ impl Place {
         let short = json!({"epochs": 10, "batch": 2});
         for settings in [
             json!({"optimise": short}),
-            json!({"task": "shadow", "model": "sh", "shadow": {"tof": "m"}, "optimise": short}),
-            json!({"task": "specular", "model": "s", "specular": {"on": "m"}, "optimise": short}),
+            json!({"target": "shadow", "model": "sh", "shadow": {"tof": "m"}, "optimise": short}),
+            json!({"target": "specular", "model": "s", "specular": {"on": "m"}, "optimise": short}),
         ] {
             run(self.training(settings)).await.unwrap();
         }
@@ -282,7 +311,7 @@ pub async fn run_at(
     };
     let runtime = Handle::current();
     let work = move || {
-        let executor = TaskExecutor::new(&[], runtime);
+        let executor = TaskExecutor::new(&[], runtime, Opener::anywhere());
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(2)
             .build()

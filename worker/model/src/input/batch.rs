@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::{DEPTH_SCALE_M, Question, ShadowVariant, Task, intensity, planes};
+use super::{DEPTH_SCALE_M, Question, ShadowVariant, Target, intensity, merged, planes};
 use crate::{ModelError, net::Input, scene::Scene};
 
 /// How a scene is looked at once.
@@ -92,13 +92,13 @@ pub fn example(
         flip(plane, scene.width, visit);
     }
     let at = batch.target.len();
-    match question.task {
-        Task::Tof => batch.target.extend(scene.depth_m.iter().map(depth_target)),
-        Task::Specular => {
+    match question.target {
+        Target::Tof => batch.target.extend(scene.depth_m.iter().map(depth_target)),
+        Target::Specular => {
             let mirrors = scene.specular.iter().map(|s| f32::from(*s));
             batch.target.extend(mirrors);
         }
-        Task::Shadow => {
+        Target::Shadow => {
             let spots = match question.by_spot() {
                 true => visit.spot..visit.spot + 1,
                 false => 0..question.spots,
@@ -145,19 +145,10 @@ fn flip<T>(plane: &mut [T], width: usize, visit: Visit) {
 
 fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelError> {
     let pixels = scene.pixels();
-    let size = (scene.height, scene.width);
-    if batch.images > 0 && (batch.height, batch.width) != size {
-        let what = format!(
-            "one scene has {}×{} pixels, another {}×{}; a batch needs one size",
-            batch.height, batch.width, scene.height, scene.width
-        );
-        return Err(ModelError::invalid("source", what));
+    if batch.images > 0 {
+        check_size((batch.height, batch.width), (scene.height, scene.width))?;
     }
-    if question.bins > scene.bins {
-        let what = format!(
-            "{} bins are asked of a data set with {}; give fewer, or 0 for all",
-            question.bins, scene.bins
-        );
+    if let Err(what) = merged(scene.bins, question.bins) {
         return Err(ModelError::invalid("input.bins", what));
     }
     let wanted = [
@@ -166,20 +157,27 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
         (
             "specular mask",
             scene.specular.len(),
-            match question.task {
-                Task::Specular => pixels,
+            match question.target {
+                Target::Specular => pixels,
                 _ => scene.specular.len(),
             },
         ),
         (
             "visibility",
             scene.lit.len(),
-            match question.task {
-                Task::Shadow => pixels * question.spots,
+            match question.target {
+                Target::Shadow => pixels * question.spots,
                 _ => scene.lit.len(),
             },
         ),
     ];
+    let beams = match question.timed() {
+        true => question.spots,
+        false => scene.beams_m.len(),
+    };
+    let wanted = wanted
+        .into_iter()
+        .chain([("beams", scene.beams_m.len(), beams)]);
     for (name, there, needed) in wanted {
         if there != needed {
             let what = format!(
@@ -192,18 +190,68 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
 }
 
 impl Batch {
-    /// On a device: what the network sees.
-    pub fn input(&self, device: &Device) -> Input {
+    /// About how much memory it takes.
+    pub fn bytes(&self) -> usize {
+        4 * (self.dense.len() + self.one_hot.len() + self.target.len())
+    }
+
+    /// Appends another one, of `of` that will be joined in all.
+    ///
+    /// # Errors
+    /// [`ModelError::Invalid`] where it has another size.
+    pub(crate) fn join(&mut self, mut other: Self, of: usize) -> Result<(), ModelError> {
+        if self.images == 0 {
+            // The first one's room is the whole's.
+            let more = of.saturating_sub(other.images);
+            if more > 0 {
+                other.dense.reserve_exact(more * other.dense.len());
+                other.one_hot.reserve_exact(more * other.one_hot.len());
+                other.target.reserve_exact(more * other.target.len());
+            }
+            *self = other;
+            return Ok(());
+        }
+        check_size((self.height, self.width), (other.height, other.width))?;
+        self.images += other.images;
+        self.dense.append(&mut other.dense);
+        self.one_hot.append(&mut other.one_hot);
+        self.target.append(&mut other.target);
+        Ok(())
+    }
+
+    /// On a device: what the network sees, and what it should say.
+    pub fn into_input(self, device: &Device) -> (Input, Vec<f32>) {
         let (n, h, w) = (self.images, self.height, self.width);
         let channels = self.dense.len() / (n * h * w);
-        let dense = TensorData::new(self.dense.clone(), [n, channels, h, w]);
+        let dense = TensorData::new(self.dense, [n, channels, h, w]);
         let one_hot = (!self.one_hot.is_empty()).then(|| {
-            let bins = TensorData::new(self.one_hot.clone(), [n, h, w]);
+            let bins = TensorData::new(self.one_hot, [n, h, w]);
             Tensor::<3, Int>::from_data(bins, device)
         });
-        Input {
+        let input = Input {
             dense: Tensor::from_data(dense, device),
             one_hot,
-        }
+        };
+        (input, self.target)
     }
+
+    /// The same where the batch is still needed.
+    pub fn input(&self, device: &Device) -> Input {
+        let seen = Self {
+            target: Vec::new(),
+            ..self.clone()
+        };
+        seen.into_input(device).0
+    }
+}
+
+fn check_size(one: (usize, usize), other: (usize, usize)) -> Result<(), ModelError> {
+    if one == other {
+        return Ok(());
+    }
+    let what = format!(
+        "one scene has {}×{} pixels, another {}×{}; a batch needs one size",
+        one.0, one.1, other.0, other.1
+    );
+    Err(ModelError::invalid("source", what))
 }

@@ -7,14 +7,14 @@ mod normalise;
 use serde::{Deserialize, Serialize};
 
 pub use batch::{Batch, Visit, example};
-pub use normalise::{intensity, planes};
+pub use normalise::{intensity, merged, planes};
 
 use crate::{ModelError, net::NetSpec};
 
 /// What a network learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Task {
+pub enum Target {
     /// Depth, from which two-bounce times follow.
     Tof,
     /// Which pixels a spot lights.
@@ -60,7 +60,7 @@ pub const DEPTH_SCALE_M: f32 = 4.5;
 #[serde(deny_unknown_fields)]
 pub struct Question {
     /// What.
-    pub task: Task,
+    pub target: Target,
     /// For shadows: how.
     #[serde(default)]
     pub variant: ShadowVariant,
@@ -81,34 +81,43 @@ impl Question {
     /// Dense channels, one-hot channels, outputs of a network for it.
     pub fn channels(&self) -> (usize, usize, usize) {
         let seen = if self.intensity_only { 1 } else { self.bins };
-        match (self.task, self.variant) {
-            (Task::Tof | Task::Specular, _) | (Task::Shadow, ShadowVariant::Difference) => {
+        match (self.target, self.variant) {
+            (Target::Tof | Target::Specular, _) | (Target::Shadow, ShadowVariant::Difference) => {
                 (seen, 0, 1)
             }
-            (Task::Shadow, ShadowVariant::Concat) => (seen, self.bins, 1),
-            (Task::Shadow, ShadowVariant::Index) => (seen + self.spots, 0, 1),
-            (Task::Shadow, ShadowVariant::All) => (seen, 0, self.spots),
+            (Target::Shadow, ShadowVariant::Concat) => (seen, self.bins, 1),
+            (Target::Shadow, ShadowVariant::Index) => (seen + self.spots, 0, 1),
+            (Target::Shadow, ShadowVariant::All) => (seen, 0, self.spots),
         }
     }
 
     /// What a combined checkpoint of the released code calls the network for it.
     pub fn part(&self) -> &'static str {
-        match self.task {
-            Task::Shadow => "shadow",
-            Task::Tof | Task::Specular => "depth",
+        match self.target {
+            Target::Shadow => "shadow",
+            Target::Tof | Target::Specular => "depth",
         }
     }
 
     /// Whether a scene is visited once for each spot.
     pub fn by_spot(&self) -> bool {
-        self.task == Task::Shadow && self.variant != ShadowVariant::All
+        self.target == Target::Shadow && self.variant != ShadowVariant::All
+    }
+
+    /// Whether it is given two-bounce times.
+    pub fn timed(&self) -> bool {
+        let given = matches!(
+            self.variant,
+            ShadowVariant::Concat | ShadowVariant::Difference
+        );
+        self.target == Target::Shadow && given
     }
 
     /// Whether mirrored scenes may be shown: not where spots are known by their number, because a mirrored spot is at
     /// another spot's place.
     pub fn may_flip(&self) -> bool {
         let numbered = matches!(self.variant, ShadowVariant::Index | ShadowVariant::All);
-        self.task != Task::Shadow || !numbered
+        self.target != Target::Shadow || !numbered
     }
 
     /// Checks it against itself and the network.
@@ -119,11 +128,11 @@ impl Question {
         if self.bins == 0 {
             return Err(ModelError::invalid("input.bins", "0 bins; give at least 1"));
         }
-        if self.task == Task::Shadow && self.spots == 0 {
+        if self.target == Target::Shadow && self.spots == 0 {
             let what = "the data set has no spots; shadows are asked spot by spot";
             return Err(ModelError::invalid("shadow", what));
         }
-        if self.task == Task::Shadow
+        if self.target == Target::Shadow
             && self.variant == ShadowVariant::Difference
             && self.intensity_only
         {
@@ -133,7 +142,7 @@ impl Question {
         let (dense, one_hot, outputs) = self.channels();
         if (net.dense, net.one_hot, net.outputs) != (dense, one_hot, outputs) {
             let what = format!(
-                "the network has {} + {} inputs and {} outputs, the task wants {dense} + {one_hot} and {outputs}",
+                "the network has {} + {} inputs and {} outputs, the target wants {dense} + {one_hot} and {outputs}",
                 net.dense, net.one_hot, net.outputs
             );
             return Err(ModelError::invalid("net", what));

@@ -3,8 +3,36 @@
 use super::Normalise;
 use crate::scene::Scene;
 
+/// Pixels that change from pixel by pixel to bin by bin together: they fill a cache line of each bin's plane.
+const BLOCK: usize = 16;
+
+/// How many adjacent bins of `stored` are summed for one of `bins`. What is left over at the end, and dropped, must be fewer
+/// than are summed: otherwise most of a gate could go without a word.
+///
+/// # Errors
+/// What is wrong, with the nearest numbers of bins that will do.
+pub fn merged(stored: usize, bins: usize) -> Result<usize, String> {
+    if bins == 0 || bins > stored {
+        return Err(format!(
+            "{bins} is more than the data set's {stored} bins, or none at all; give fewer, or 0 for all"
+        ));
+    }
+    let merged = stored / bins;
+    let left = stored - merged * bins;
+    if left < merged {
+        return Ok(merged);
+    }
+    Err(format!(
+        "{bins} bins of {merged} adjacent ones each leave out {left} of the data set's {stored}; give {} (sums of {merged}) or {} \
+         (sums of {}), or 0 for all",
+        stored / merged,
+        stored / (merged + 1),
+        merged + 1
+    ))
+}
+
 /// m of a scene, `[bin][row][column]`, with `bins` bins: adjacent ones are summed, those left over at the end dropped, then
-/// scaled.
+/// scaled; see [`merged`].
 ///
 /// # Panics
 /// Where the scene has fewer.
@@ -13,14 +41,23 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
     assert!(bins <= scene.bins, "bins are summed, not divided");
     assert_eq!(out.len(), bins * pixels, "room for each bin of each pixel");
     let merged = scene.bins / bins;
-    let mut pixel = vec![0.0f32; bins];
-    for (p, stored) in scene.histogram.chunks_exact(scene.bins).enumerate() {
-        for (bin, of) in pixel.iter_mut().zip(stored.chunks_exact(merged)) {
-            *bin = of.iter().sum();
+    let mut block = vec![0.0f32; BLOCK * bins];
+    for (k, stored) in scene.histogram.chunks(BLOCK * scene.bins).enumerate() {
+        let here = stored.len() / scene.bins;
+        for (pixel, stored) in block
+            .chunks_exact_mut(bins)
+            .zip(stored.chunks_exact(scene.bins))
+        {
+            for (bin, of) in pixel.iter_mut().zip(stored.chunks_exact(merged)) {
+                *bin = of.iter().sum();
+            }
+            scale(pixel, normalise);
         }
-        scale(&mut pixel, normalise);
-        for (b, value) in pixel.iter().enumerate() {
-            out[b * pixels + p] = *value;
+        for b in 0..bins {
+            let row = &mut out[b * pixels + k * BLOCK..][..here];
+            for (i, value) in row.iter_mut().enumerate() {
+                *value = block[i * bins + b];
+            }
         }
     }
 }
@@ -91,6 +128,34 @@ mod tests {
         assert_eq!(scaled(&[1.0, f32::MAX, 1.0, 1.0], 4), [0.0, 1.0, 0.0, 0.0]);
         assert_eq!(scaled(&[1.0, f32::INFINITY], 2), [0.0, 0.0]);
         assert_eq!(scaled(&[1e-30, 2e-30], 2), [0.0, 1.0]);
+    }
+
+    #[test]
+    fn bins_that_leave_out_a_part_of_the_gate_are_refused_with_those_that_do_not() {
+        for (stored, bins, sums) in [
+            (637, 637, 1),
+            (637, 318, 2),
+            (637, 127, 5),
+            (1502, 375, 4),
+            (64, 16, 4),
+            (7, 1, 7),
+        ] {
+            assert_eq!(merged(stored, bins), Ok(sums), "{bins} of {stored}");
+        }
+        let said = merged(637, 320).unwrap_err();
+        assert!(
+            said.contains("leave out 317") && said.contains("637 (sums of 1) or 318 (sums of 2)"),
+            "{said}"
+        );
+        for (stored, bins) in [(637, 128), (10, 6), (8, 0), (8, 9)] {
+            assert!(merged(stored, bins).is_err(), "{bins} of {stored}");
+        }
+        // Those that an error names are right themselves.
+        for (stored, bins) in [(637, 320), (637, 128), (100, 30)] {
+            let k = stored / bins;
+            assert_eq!(merged(stored, stored / k), Ok(k));
+            assert_eq!(merged(stored, stored / (k + 1)), Ok(k + 1));
+        }
     }
 
     #[test]

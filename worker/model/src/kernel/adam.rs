@@ -14,7 +14,7 @@ const PART: usize = 1 << 16;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdamW {
     /// Learning rate of this step.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Decay of the first moment.
     pub beta1: f64,
     /// Decay of the second moment.
@@ -37,13 +37,13 @@ impl Kernels {
         );
         assert!(a.step > 0, "steps count from 1");
         let factors = Factors {
-            keep: (1.0 - a.rate * a.decay) as f32,
+            keep: (1.0 - a.learning_rate * a.decay) as f32,
             lean: (1.0 - a.beta1) as f32,
             beta2: a.beta2 as f32,
             square: (1.0 - a.beta2) as f32,
             root: (1.0 / (1.0 - power(a.beta2, a.step)).sqrt()) as f32,
             eps: a.eps as f32,
-            rate: (-a.rate / (1.0 - power(a.beta1, a.step))) as f32,
+            rate: (-a.learning_rate / (1.0 - power(a.beta1, a.step))) as f32,
         };
         p.par_chunks_mut(PART)
             .zip(g.par_chunks(PART))

@@ -85,7 +85,7 @@ pub fn adamw(
     let v = v.mul_scalar(a.beta2) + gradient.square().mul_scalar(1.0 - a.beta2);
     let steps = i32::try_from(a.step).unwrap_or(i32::MAX);
     let root = (v.clone() / (1.0 - a.beta2.powi(steps))).sqrt() + a.eps;
-    let step = (m.clone() / root).mul_scalar(a.rate / (1.0 - a.beta1.powi(steps)));
-    let parameter = parameter.mul_scalar(1.0 - a.rate * a.decay) - step;
+    let step = (m.clone() / root).mul_scalar(a.learning_rate / (1.0 - a.beta1.powi(steps)));
+    let parameter = parameter.mul_scalar(1.0 - a.learning_rate * a.decay) - step;
     (parameter, [m, v])
 }

@@ -4,11 +4,11 @@ use super::{
     Group, Report, Summary,
     chart::{Axis, Series, chart, legend},
     number::short,
-    summary::TASKS,
-    table::{error_name, task_name},
+    summary::TARGETS,
+    table::{error_name, target_name},
 };
 use crate::{
-    input::{DEPTH_SCALE_M, Task},
+    input::{DEPTH_SCALE_M, Target},
     metric::Metrics,
     train::Line,
 };
@@ -16,22 +16,26 @@ use crate::{
 /// Charts of all tasks.
 pub(super) fn curves(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
-    for task in TASKS {
-        let groups: Vec<&Group> = summary.groups.iter().filter(|g| g.task == task).collect();
+    for target in TARGETS {
+        let groups: Vec<&Group> = summary
+            .groups
+            .iter()
+            .filter(|g| g.target == target)
+            .collect();
         if groups.is_empty() {
             continue;
         }
         let of = |value: &dyn Fn(&Line) -> f64| series(report, &groups, value);
         let scale = f64::from(DEPTH_SCALE_M);
-        let (loss, label) = match task {
-            Task::Tof => (of(&|line| line.loss * scale), "training L1 (m)"),
-            Task::Shadow | Task::Specular => {
+        let (loss, label) = match target {
+            Target::Tof => (of(&|line| line.loss * scale), "training L1 (m)"),
+            Target::Shadow | Target::Specular => {
                 (of(&|line| line.loss), "training cross-entropy (nats)")
             }
         };
         let seen = of(&|line| line.validation.as_ref().map_or(f64::NAN, Metrics::loss));
-        let name = task_name(task);
-        let validation = format!("validation {}", error_name(task));
+        let name = target_name(target);
+        let validation = format!("validation {}", error_name(target));
         out.push_str("<div class=\"charts\">");
         out.push_str(&over_epochs(
             &format!("{name}: training loss"),

@@ -7,10 +7,10 @@ use super::{
     colour::{GREY, INFERNO, OVERLAP, Rgb, UNKNOWN, VIRIDIS, colour, css, gradient},
     image::data_url,
     number::{metres, share, short},
-    table::task_name,
+    table::target_name,
     text::Safe,
 };
-use crate::{input::Task, metric::Metrics};
+use crate::{input::Target, metric::Metrics};
 
 /// Examples of all models that have some.
 pub(super) fn maps(report: &Report) -> String {
@@ -22,7 +22,9 @@ pub(super) fn maps(report: &Report) -> String {
     if with.is_empty() {
         return "<p class=\"none\">There are no example pictures in this report.</p>".to_owned();
     }
-    let of_depth = with.iter().filter(|m| m.plan.question.task == Task::Tof);
+    let of_depth = with
+        .iter()
+        .filter(|m| m.plan.question.target == Target::Tof);
     let depths = depths(of_depth.flat_map(|m| &m.pictures));
     with.into_iter().map(|m| of_model(m, &depths)).collect()
 }
@@ -35,15 +37,15 @@ struct Depths {
 }
 
 fn of_model(entry: &Entry, depths: &Depths) -> String {
-    let task = entry.plan.question.task;
+    let target = entry.plan.question.target;
     let mut out = format!(
         "<section class=\"maps\"><h3>{} <small>{}</small></h3><div class=\"rows\">",
         Safe(&entry.name),
-        task_name(task)
+        target_name(target)
     );
     for picture in &entry.pictures {
-        let [truth, said, error] = match task {
-            Task::Tof => {
+        let [truth, said, error] = match target {
+            Target::Tof => {
                 let range = |z: f64| (z - depths.low) / (depths.high - depths.low);
                 [
                     painted(&picture.truth, |z| colour(&VIRIDIS, range(z))),
@@ -53,14 +55,14 @@ fn of_model(entry: &Entry, depths: &Depths) -> String {
                     }),
                 ]
             }
-            Task::Shadow | Task::Specular => [
+            Target::Shadow | Target::Specular => [
                 painted(&picture.truth, |v| colour(&GREY, v)),
                 painted(&picture.said, |v| colour(&GREY, v)),
                 differing(picture, overlap),
             ],
         };
         let seen = painted(&picture.intensity, |v| colour(&GREY, v.max(0.0).sqrt()));
-        let said_name = if task == Task::Tof {
+        let said_name = if target == Target::Tof {
             "predicted"
         } else {
             "predicted probability"
@@ -77,13 +79,13 @@ fn of_model(entry: &Entry, depths: &Depths) -> String {
         );
     }
     out.push_str("</div>");
-    out.push_str(&match task {
-        Task::Tof => {
+    out.push_str(&match target {
+        Target::Tof => {
             bar("depth (m)", &VIRIDIS, depths.low, depths.high)
                 + &bar("error of depth (m)", &INFERNO, 0.0, depths.error)
         }
-        Task::Shadow => key(["shadow", "lit"], "lit"),
-        Task::Specular => key(["no mirror", "mirror"], "mirror"),
+        Target::Shadow => key(["shadow", "lit"], "lit"),
+        Target::Specular => key(["no mirror", "mirror"], "mirror"),
     });
     if unknown(&entry.pictures) {
         let _ = write!(

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::{Bounces, Entry};
 use crate::{
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     net::Architecture,
 };
 
@@ -39,18 +39,18 @@ pub fn published(entry: &Entry) -> Option<Published> {
     }
     let two = entry.data.bounces == Bounces::Two;
     let concat = question.variant == ShadowVariant::Concat;
-    let (experiment, mae, iou) = match (question.task, question.intensity_only, two) {
+    let (experiment, mae, iou) = match (question.target, question.intensity_only, two) {
         (_, true, true) => return None,
-        (Task::Tof, true, _) => ("A.3 intensity only", Some(0.174), None),
-        (Task::Specular, true, _) => ("A.3 intensity only", None, Some(0.703)),
-        (Task::Shadow, true, _) => ("A.3 intensity only", None, Some(0.700)),
-        (Task::Tof, _, true) => ("A.4 two bounces only", Some(0.0255), None),
-        (Task::Tof, ..) => ("all bounces", Some(0.0228), None),
-        (Task::Specular, _, true) => ("A.4 two bounces only", None, Some(0.767)),
-        (Task::Specular, ..) => ("all bounces", None, Some(0.865)),
-        (Task::Shadow, _, true) if concat => ("A.4 two bounces only", None, Some(0.964)),
-        (Task::Shadow, _, true) => return None,
-        (Task::Shadow, ..) => match question.variant {
+        (Target::Tof, true, _) => ("A.3 intensity only", Some(0.174), None),
+        (Target::Specular, true, _) => ("A.3 intensity only", None, Some(0.703)),
+        (Target::Shadow, true, _) => ("A.3 intensity only", None, Some(0.700)),
+        (Target::Tof, _, true) => ("A.4 two bounces only", Some(0.0255), None),
+        (Target::Tof, ..) => ("all bounces", Some(0.0228), None),
+        (Target::Specular, _, true) => ("A.4 two bounces only", None, Some(0.767)),
+        (Target::Specular, ..) => ("all bounces", None, Some(0.865)),
+        (Target::Shadow, _, true) if concat => ("A.4 two bounces only", None, Some(0.964)),
+        (Target::Shadow, _, true) => return None,
+        (Target::Shadow, ..) => match question.variant {
             ShadowVariant::Concat => ("A.1 concat", Some(0.0186), Some(0.959)),
             ShadowVariant::Difference => ("A.1 difference", Some(0.0231), Some(0.950)),
             ShadowVariant::Index => ("A.1 index", Some(0.0896), Some(0.799)),

@@ -5,7 +5,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
 use crate::{
     ModelError, answers,
-    input::{DEPTH_SCALE_M, Task, intensity},
+    input::{DEPTH_SCALE_M, Target, intensity},
     metric::{Metrics, Tally},
     model::Model,
     scene::Scenes,
@@ -118,7 +118,7 @@ pub fn pictures(
     indices: &[usize],
     spots: usize,
 ) -> Result<Vec<Picture>, ModelError> {
-    let task = model.question().task;
+    let target = model.question().target;
     let mut out = Vec::new();
     for index in indices.iter().copied() {
         if index >= scenes.len() {
@@ -137,7 +137,7 @@ pub fn pictures(
             let both = said
                 .chunks_exact(pixels)
                 .zip(batch.target.chunks_exact(pixels));
-            let wanted = if task == Task::Shadow { spots } else { 1 };
+            let wanted = if target == Target::Shadow { spots } else { 1 };
             planes.extend(
                 both.take(wanted - planes.len().min(wanted))
                     .map(|(s, t)| (s.to_vec(), t.to_vec())),
@@ -145,21 +145,23 @@ pub fn pictures(
         })?;
         for (spot, (said, truth)) in planes.into_iter().enumerate() {
             let mut tally = Tally::default();
-            tally.add(task, &said, &truth);
-            let label = match task {
-                Task::Shadow => format!("scene {index}, spot {spot}"),
-                Task::Tof | Task::Specular => format!("scene {index}"),
+            tally.add(target, &said, &truth);
+            let label = match target {
+                Target::Shadow => format!("scene {index}, spot {spot}"),
+                Target::Tof | Target::Specular => format!("scene {index}"),
             };
-            let (said, truth) = match task {
-                Task::Tof => (metres(&said), metres(&truth)),
-                Task::Shadow | Task::Specular => (said.iter().map(probability).collect(), truth),
+            let (said, truth) = match target {
+                Target::Tof => (metres(&said), metres(&truth)),
+                Target::Shadow | Target::Specular => {
+                    (said.iter().map(probability).collect(), truth)
+                }
             };
             out.push(Picture {
                 label,
                 intensity: plane(seen.clone())?,
                 truth: plane(truth)?,
                 said: plane(said)?,
-                metrics: tally.metrics(task),
+                metrics: tally.metrics(target),
             });
         }
     }

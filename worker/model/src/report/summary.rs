@@ -9,7 +9,7 @@ use super::{
     Data, Entry, Published, Report, Speed,
     paper::{self, published},
 };
-use crate::{Evaluated, input::Task, metric::Metrics, train::Line, train::Plan};
+use crate::{Evaluated, input::Target, metric::Metrics, train::Line, train::Plan};
 
 /// Figures by name: `mae_m` and `rmse_m` of depths in metres; `iou`, `mae` and `f1` of masks.
 pub type Figures = BTreeMap<&'static str, Spread>;
@@ -31,7 +31,7 @@ pub struct Group {
     /// What its models' names have in common.
     pub label: String,
     /// What is learned.
-    pub task: Task,
+    pub target: Target,
     /// Its models, as indices into the report's.
     pub models: Vec<usize>,
     /// Their seeds, each once.
@@ -55,8 +55,8 @@ pub struct Group {
 /// Whether experiments stand in the order that was published.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Order {
-    /// Of this task.
-    pub task: Task,
+    /// Of this target.
+    pub target: Target,
     /// Pairs of experiments that have a figure here and a published one.
     pub pairs: usize,
     /// Those in the published order.
@@ -73,7 +73,7 @@ pub struct Scaling {
     /// What their names have in common.
     pub label: String,
     /// What is learned.
-    pub task: Task,
+    pub target: Target,
     /// Number of scenes and error, ascending.
     pub points: Vec<(u64, Spread)>,
 }
@@ -81,7 +81,7 @@ pub struct Scaling {
 /// All of that.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
-    /// Experiments, by task, then in the report's order.
+    /// Experiments, by target, then in the report's order.
     pub groups: Vec<Group>,
     /// Order of experiments, where there are two to compare.
     pub orders: Vec<Order>,
@@ -89,7 +89,7 @@ pub struct Summary {
     pub scalings: Vec<Scaling>,
 }
 
-pub(super) const TASKS: [Task; 3] = [Task::Tof, Task::Shadow, Task::Specular];
+pub(super) const TARGETS: [Target; 3] = [Target::Tof, Target::Shadow, Target::Specular];
 
 impl Spread {
     /// Of values; none of no values.
@@ -108,16 +108,16 @@ impl Spread {
 /// What the models of a report say together.
 pub fn summary(report: &Report) -> Summary {
     let mut groups = Vec::new();
-    for task in TASKS {
-        let same = partition(&report.models, task, |e| {
+    for target in TARGETS {
+        let same = partition(&report.models, target, |e| {
             (unseeded(e), e.data.clone(), e.conditions.clone())
         });
-        groups.extend(same.into_iter().map(|models| group(report, task, models)));
+        groups.extend(same.into_iter().map(|models| group(report, target, models)));
     }
     tell_apart(report, &mut groups);
-    let orders = TASKS
+    let orders = TARGETS
         .into_iter()
-        .filter_map(|task| order(report, task, &groups));
+        .filter_map(|target| order(report, target, &groups));
     Summary {
         orders: orders.collect(),
         scalings: scalings(report, &groups),
@@ -135,15 +135,15 @@ fn tell_apart(report: &Report, groups: &mut [Group]) {
     }
 }
 
-/// Models of a task that have the same key, in order.
+/// Models of a target that have the same key, in order.
 fn partition<K: PartialEq>(
     models: &[Entry],
-    task: Task,
+    target: Target,
     key: impl Fn(&Entry) -> K,
 ) -> Vec<Vec<usize>> {
     let mut out: Vec<(K, Vec<usize>)> = Vec::new();
     for (index, entry) in models.iter().enumerate() {
-        if entry.plan.question.task != task {
+        if entry.plan.question.target != target {
             continue;
         }
         let key = key(entry);
@@ -162,7 +162,7 @@ fn unseeded(entry: &Entry) -> Plan {
     }
 }
 
-fn group(report: &Report, task: Task, models: Vec<usize>) -> Group {
+fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
     let of = || models.iter().map(|i| &report.models[*i]);
     let evaluated: Vec<&Evaluated> = of().filter_map(|e| e.evaluated.as_ref()).collect();
     let mut trivial: BTreeMap<String, Vec<Metrics>> = BTreeMap::new();
@@ -195,7 +195,7 @@ fn group(report: &Report, task: Task, models: Vec<usize>) -> Group {
     let metrics: Vec<Metrics> = evaluated.iter().map(|e| e.metrics).collect();
     Group {
         label: common(&names),
-        task,
+        target,
         seeds,
         figures: figures(&metrics),
         baselines: trivial
@@ -262,15 +262,15 @@ fn common(names: &[&str]) -> String {
     text.to_owned()
 }
 
-fn order(report: &Report, task: Task, groups: &[Group]) -> Option<Order> {
+fn order(report: &Report, target: Target, groups: &[Group]) -> Option<Order> {
     let known: Vec<(&Group, Spread, f64)> = groups
         .iter()
-        .filter(|g| g.task == task)
+        .filter(|g| g.target == target)
         .filter_map(|g| Some((g, g.error?, g.published?.loss()?)))
         .filter(|(_, error, _)| error.mean.is_finite())
         .collect();
     let mut out = Order {
-        task,
+        target,
         pairs: 0,
         kept: 0,
         turned: Vec::new(),
@@ -303,8 +303,8 @@ fn order(report: &Report, task: Task, groups: &[Group]) -> Option<Order> {
 
 fn scalings(report: &Report, groups: &[Group]) -> Vec<Scaling> {
     let mut out = Vec::new();
-    for task in TASKS {
-        let same = partition(&report.models, task, |e| {
+    for target in TARGETS {
+        let same = partition(&report.models, target, |e| {
             let data = Data {
                 scenes: None,
                 ..e.data.clone()
@@ -321,7 +321,7 @@ fn scalings(report: &Report, groups: &[Group]) -> Vec<Scaling> {
             if points.len() > 1 {
                 out.push(Scaling {
                     label: common(&names),
-                    task,
+                    target,
                     points,
                 });
             }

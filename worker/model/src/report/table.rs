@@ -6,52 +6,52 @@ use super::{
     Group, Order, Published, Report, Spread, Summary,
     number::{digits, metres, share, thousands},
     paper,
-    summary::{Figures, TASKS},
+    summary::{Figures, TARGETS},
     text::Safe,
 };
 use crate::{
-    input::{ShadowVariant, Task},
+    input::{ShadowVariant, Target},
     net::Architecture,
 };
 
-/// What a task is called.
-pub(super) fn task_name(task: Task) -> &'static str {
-    match task {
-        Task::Tof => "Depth",
-        Task::Shadow => "Shadows",
-        Task::Specular => "Mirrors",
+/// What a target is called.
+pub(super) fn target_name(target: Target) -> &'static str {
+    match target {
+        Target::Tof => "Depth",
+        Target::Shadow => "Shadows",
+        Target::Specular => "Mirrors",
     }
 }
 
-/// What errors of a task are, with their unit.
-pub(super) fn error_name(task: Task) -> &'static str {
-    match task {
-        Task::Tof => "depth MAE (m)",
-        Task::Shadow | Task::Specular => "1 − IoU",
+/// What errors of a target are, with their unit.
+pub(super) fn error_name(target: Target) -> &'static str {
+    match target {
+        Target::Tof => "depth MAE (m)",
+        Target::Shadow | Target::Specular => "1 − IoU",
     }
 }
 
-/// Columns of a task's figures: name, heading.
-fn columns(task: Task) -> &'static [(&'static str, &'static str)] {
-    match task {
-        Task::Tof => &[("mae_m", "MAE (m)"), ("rmse_m", "RMSE (m)")],
-        Task::Shadow | Task::Specular => &[("iou", "IoU"), ("mae", "MAE"), ("f1", "F1")],
+/// Columns of a target's figures: name, heading.
+fn columns(target: Target) -> &'static [(&'static str, &'static str)] {
+    match target {
+        Target::Tof => &[("mae_m", "MAE (m)"), ("rmse_m", "RMSE (m)")],
+        Target::Shadow | Target::Specular => &[("iou", "IoU"), ("mae", "MAE"), ("f1", "F1")],
     }
 }
 
 /// A figure as it is written in its column.
-fn write(task: Task, value: f64) -> String {
-    match task {
-        Task::Tof => metres(value),
-        Task::Shadow | Task::Specular => share(value),
+fn write(target: Target, value: f64) -> String {
+    match target {
+        Target::Tof => metres(value),
+        Target::Shadow | Target::Specular => share(value),
     }
 }
 
 /// Mean ± spread.
-pub(super) fn spread(task: Task, figure: Spread) -> String {
-    let mean = write(task, figure.mean);
+pub(super) fn spread(target: Target, figure: Spread) -> String {
+    let mean = write(target, figure.mean);
     match figure.deviation {
-        Some(deviation) if task == Task::Tof => format!("{mean} ± {}", digits(deviation, 2)),
+        Some(deviation) if target == Target::Tof => format!("{mean} ± {}", digits(deviation, 2)),
         Some(deviation) => format!("{mean} ± {}", share(deviation)),
         None => mean,
     }
@@ -79,12 +79,16 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
             );
         }
     }
-    for task in TASKS {
-        let groups: Vec<&Group> = summary.groups.iter().filter(|g| g.task == task).collect();
+    for target in TARGETS {
+        let groups: Vec<&Group> = summary
+            .groups
+            .iter()
+            .filter(|g| g.target == target)
+            .collect();
         if !groups.is_empty() {
-            let _ = write!(out, "<h3>{}</h3>", task_name(task));
-            out.push_str(&table(report, task, &groups));
-            for order in summary.orders.iter().filter(|o| o.task == task) {
+            let _ = write!(out, "<h3>{}</h3>", target_name(target));
+            out.push_str(&table(report, target, &groups));
+            for order in summary.orders.iter().filter(|o| o.target == target) {
                 out.push_str(&ordered(order));
             }
         }
@@ -95,24 +99,24 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
     out
 }
 
-/// The table of one task.
-pub(super) fn table(report: &Report, task: Task, groups: &[&Group]) -> String {
+/// The table of one target.
+pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> String {
     let mut trivial: Vec<&String> = groups.iter().flat_map(|g| g.baselines.keys()).collect();
     trivial.sort_unstable();
     trivial.dedup();
     let published = groups.iter().any(|g| g.published.is_some());
-    let main = columns(task)[0].0;
+    let main = columns(target)[0].0;
     let mut out = String::from(
         "<div class=\"wide\"><table class=\"figures\"><thead><tr><th>experiment</th><th>seeds</th>",
     );
-    for (_, heading) in columns(task) {
+    for (_, heading) in columns(target) {
         let _ = write!(out, "<th class=\"n\">{heading}</th>");
     }
     if published {
         let _ = write!(
             out,
             "<th class=\"n paper\">published<br>{}</th>",
-            columns(task)[0].1
+            columns(target)[0].1
         );
     }
     for name in &trivial {
@@ -120,14 +124,14 @@ pub(super) fn table(report: &Report, task: Task, groups: &[&Group]) -> String {
             out,
             "<th class=\"n base\">{}:<br>{}</th>",
             Safe(name),
-            columns(task)[0].1
+            columns(target)[0].1
         );
     }
     let _ = write!(
         out,
         "<th class=\"n\" title=\"error over that of the best trivial answer\">error ÷<br>best trivial</th>\
          <th class=\"n\" title=\"what 10, 50 and 90 % of single scenes stay below\">{} of scenes<br>10 · 50 · 90 %</th>",
-        error_name(task)
+        error_name(target)
     );
     out.push_str("</tr></thead><tbody>");
     for group in groups {
@@ -144,7 +148,7 @@ fn row(
     trivial: &[&String],
     with_published: bool,
 ) {
-    let task = group.task;
+    let target = group.target;
     let _ = write!(
         out,
         "<tr><th scope=\"row\">{}<small>{}</small></th><td>{}</td>",
@@ -154,23 +158,23 @@ fn row(
     );
     let cell = |figures: Option<&Figures>, name: &str| {
         let figure = figures.and_then(|f| f.get(name));
-        figure.map_or_else(|| "–".to_owned(), |f| spread(task, *f))
+        figure.map_or_else(|| "–".to_owned(), |f| spread(target, *f))
     };
     if group.figures.is_empty() {
         let _ = write!(
             out,
             "<td class=\"none\" colspan=\"{}\">not evaluated</td>",
-            columns(task).len()
+            columns(target).len()
         );
     } else {
-        for (name, _) in columns(task) {
+        for (name, _) in columns(target) {
             let class = if *name == main { "n main" } else { "n" };
             let figure = cell(Some(&group.figures), name);
             let _ = write!(out, "<td class=\"{class}\">{figure}</td>");
         }
     }
     if with_published {
-        let published = shown(task, group.published);
+        let published = shown(target, group.published);
         let _ = write!(out, "<td class=\"n paper\">{published}</td>");
     }
     for name in trivial {
@@ -195,12 +199,12 @@ fn row(
     out.push_str("</tr>");
 }
 
-fn shown(task: Task, published: Option<Published>) -> String {
+fn shown(target: Target, published: Option<Published>) -> String {
     let Some(published) = published else {
         return "–".to_owned();
     };
-    let figures = match (task, published.mae, published.iou) {
-        (Task::Tof, Some(mae), _) => mae.to_string(),
+    let figures = match (target, published.mae, published.iou) {
+        (Target::Tof, Some(mae), _) => mae.to_string(),
         (_, mae, Some(iou)) => {
             let mae = mae.map_or_else(String::new, |mae| format!("<small>MAE {mae}</small>"));
             format!("{iou:.3}{mae}")
@@ -228,7 +232,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         true => "intensity only".to_owned(),
         false => format!("{} bins", question.bins),
     }];
-    if question.task == Task::Shadow {
+    if question.target == Target::Shadow {
         let variant = match question.variant {
             ShadowVariant::Concat => "concat",
             ShadowVariant::Difference => "difference",

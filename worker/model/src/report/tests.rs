@@ -8,15 +8,15 @@ use super::{
 };
 use crate::{
     Evaluated,
-    input::{Normalise, Question, ShadowVariant, Task},
+    input::{Normalise, Question, ShadowVariant, Target},
     metric::Metrics,
     net::{Architecture, NetSpec},
     train::{Line, Plan, Schedule},
 };
 
-fn entry(name: &str, task: Task, variant: ShadowVariant, seed: u64, metrics: Metrics) -> Entry {
+fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics: Metrics) -> Entry {
     let question = Question {
-        task,
+        target,
         variant,
         normalise: Normalise::MinMax,
         bins: 64,
@@ -76,7 +76,7 @@ fn entry(name: &str, task: Task, variant: ShadowVariant, seed: u64, metrics: Met
             epoch: 1,
             step: 12,
             loss: 0.5,
-            rate: 1e-2,
+            learning_rate: 1e-2,
             validation: Some(metrics),
         }],
         evaluated: Some(Evaluated {
@@ -97,7 +97,7 @@ fn entry(name: &str, task: Task, variant: ShadowVariant, seed: u64, metrics: Met
             epochs: 1,
             batch: 2,
             accumulate: 1,
-            rate: 1e-2,
+            learning_rate: 1e-2,
             decay: 1e-3,
             schedule: Schedule::Onecycle,
             augment: true,
@@ -112,7 +112,7 @@ fn depth(name: &str, seed: u64, mae_m: f64) -> Entry {
         mae_m,
         rmse_m: 2.0 * mae_m,
     };
-    entry(name, Task::Tof, ShadowVariant::Concat, seed, metrics)
+    entry(name, Target::Tof, ShadowVariant::Concat, seed, metrics)
 }
 
 fn shadow(name: &str, variant: ShadowVariant, seed: u64, iou: f64) -> Entry {
@@ -121,7 +121,7 @@ fn shadow(name: &str, variant: ShadowVariant, seed: u64, iou: f64) -> Entry {
         iou,
         f1: iou,
     };
-    entry(name, Task::Shadow, variant, seed, metrics)
+    entry(name, Target::Shadow, variant, seed, metrics)
 }
 
 fn report(models: Vec<Entry>) -> Report {
@@ -148,7 +148,7 @@ fn seeds_of_an_experiment_are_one_row_beside_trivial_and_published_figures() {
     let tables = said
         .groups
         .iter()
-        .map(|g| table(&all, g.task, &[g]).replace("<t", "\n<t"));
+        .map(|g| table(&all, g.target, &[g]).replace("<t", "\n<t"));
     insta::assert_snapshot!(tables.collect::<Vec<_>>().join("\n"));
 }
 

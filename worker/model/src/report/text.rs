@@ -2,7 +2,7 @@
 
 use std::fmt::{self, Display, Write};
 
-/// Displays with everything escaped that HTML would understand; control characters become U+FFFD.
+/// Displays with everything escaped that HTML would understand; control and directional characters become U+FFFD.
 pub(super) struct Safe<T>(pub T);
 
 impl<T: Display> Display for Safe<T> {
@@ -23,6 +23,14 @@ impl Write for Escape<'_, '_> {
                 '"' => self.0.write_str("&quot;")?,
                 '\'' => self.0.write_str("&#39;")?,
                 '\n' | '\t' => self.0.write_char(c)?,
+                // Directional characters would show the text in another order.
+                '\u{61c}'
+                | '\u{200e}'
+                | '\u{200f}'
+                | '\u{2028}'..='\u{202e}'
+                | '\u{2066}'..='\u{2069}' => {
+                    self.0.write_char('\u{fffd}')?;
+                }
                 c if c.is_control() => self.0.write_char('\u{fffd}')?,
                 c => self.0.write_char(c)?,
             }
@@ -37,9 +45,21 @@ mod tests {
 
     use super::Safe;
 
+    #[test]
+    fn controls_and_directional_characters_do_not_reach_a_page() {
+        let evil = "a\u{1b}]0;t\u{7}\u{9b}31m\u{202e}b\u{2069}<i>";
+        let safe = Safe(evil).to_string();
+        assert_eq!(
+            safe,
+            "a\u{fffd}]0;t\u{fffd}\u{fffd}31m\u{fffd}b\u{fffd}&lt;i&gt;"
+        );
+    }
+
     proptest! {
         #[test]
         fn nothing_that_is_escaped_opens_a_tag_or_ends_an_attribute(text in "\\PC*[<>&\"']\\PC*") {
+            // Those become U+FFFD.
+            prop_assume!(!text.contains(['\u{2028}', '\u{2029}']));
             let safe = Safe(&text).to_string();
             prop_assert!(!safe.contains(['<', '>', '"', '\'']));
             let back = safe.replace("&lt;", "<").replace("&gt;", ">").replace("&quot;", "\"");

@@ -6,8 +6,8 @@ use super::{
     Entry, Group, Report, Scaling, Spread, Summary,
     chart::{Axis, Series, chart, legend},
     number::{digits, duration, prefixed, prefixed_short, short, thousands},
-    summary::TASKS,
-    table::{error_name, spread, task_name},
+    summary::TARGETS,
+    table::{error_name, spread, target_name},
     text::Safe,
 };
 
@@ -17,8 +17,12 @@ type Across<'a> = &'a dyn Fn(&Group) -> Option<f64>;
 /// Speed against error.
 pub(super) fn speed(report: &Report, summary: &Summary) -> String {
     let mut out = String::new();
-    for task in TASKS {
-        let groups: Vec<&Group> = summary.groups.iter().filter(|g| g.task == task).collect();
+    for target in TARGETS {
+        let groups: Vec<&Group> = summary
+            .groups
+            .iter()
+            .filter(|g| g.target == target)
+            .collect();
         if groups.iter().all(|g| g.error.is_none()) {
             continue;
         }
@@ -33,7 +37,7 @@ pub(super) fn speed(report: &Report, summary: &Summary) -> String {
             let points = groups.iter().enumerate().filter_map(|(style, g)| {
                 let (x, error) = (of(g)?, g.error?);
                 Some(Series {
-                    label: format!("{}: {}, {}", g.label, prefixed(x), spread(task, error)),
+                    label: format!("{}: {}, {}", g.label, prefixed(x), spread(target, error)),
                     style,
                     points: vec![point(x, error)],
                     joined: false,
@@ -41,12 +45,12 @@ pub(super) fn speed(report: &Report, summary: &Summary) -> String {
                 })
             });
             let points: Vec<Series> = points.collect();
-            let title = format!("{}: error against {label}", task_name(task));
+            let title = format!("{}: error against {label}", target_name(target));
             out.push_str(&both_log(
                 &title,
                 label,
                 prefixed_short,
-                error_name(task),
+                error_name(target),
                 &points,
             ));
         }
@@ -78,7 +82,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
         return String::new();
     }
     let mut out = String::from(
-        "<div class=\"wide\"><table><thead><tr><th>experiment</th><th>task</th><th class=\"n\">parameters</th>\
+        "<div class=\"wide\"><table><thead><tr><th>experiment</th><th>target</th><th class=\"n\">parameters</th>\
          <th class=\"n\">multiply-adds<br>an image</th><th class=\"n\">samples/s<br>in training</th>\
          <th class=\"n\">training time</th><th class=\"n\">error</th></tr></thead><tbody>",
     );
@@ -97,7 +101,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
                 None => digits(s.mean, 3),
             });
         let error = match group.error {
-            Some(error) => format!("{} {}", spread(group.task, error), unit(group)),
+            Some(error) => format!("{} {}", spread(group.target, error), unit(group)),
             None => "not evaluated".to_owned(),
         };
         let _ = write!(
@@ -105,7 +109,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
             "<tr><th scope=\"row\">{}</th><td>{}</td><td class=\"n\">{}</td><td class=\"n\">{}</td>\
              <td class=\"n\">{speed}</td><td class=\"n\">{}</td><td class=\"n\">{error}</td></tr>",
             Safe(&group.label),
-            task_name(group.task),
+            target_name(group.target),
             thousands(entry.parameters),
             entry.multiply_adds.map_or_else(none, prefixed),
             seconds.map_or_else(none, |s| duration(s.mean)),
@@ -116,7 +120,7 @@ fn costs(report: &Report, summary: &Summary) -> String {
 }
 
 fn unit(group: &Group) -> &'static str {
-    if group.task == crate::input::Task::Tof {
+    if group.target == crate::input::Target::Tof {
         "m"
     } else {
         "(1 − IoU)"
@@ -130,8 +134,12 @@ pub(super) fn scale(summary: &Summary) -> String {
             .to_owned();
     }
     let mut out = String::new();
-    for task in TASKS {
-        let of: Vec<&Scaling> = summary.scalings.iter().filter(|s| s.task == task).collect();
+    for target in TARGETS {
+        let of: Vec<&Scaling> = summary
+            .scalings
+            .iter()
+            .filter(|s| s.target == target)
+            .collect();
         if of.is_empty() {
             continue;
         }
@@ -153,13 +161,13 @@ pub(super) fn scale(summary: &Summary) -> String {
             zero: true,
             write,
         };
-        let title = format!("{}: error against scenes", task_name(task));
+        let title = format!("{}: error against scenes", target_name(target));
         out.push_str("<div class=\"charts\">");
         let x = axis("scenes to learn from", true, short);
         out.push_str(&chart(
             &title,
             &x,
-            &axis(error_name(task), false, short),
+            &axis(error_name(target), false, short),
             &series,
         ));
         out.push_str("<table><thead><tr><th>experiment</th><th class=\"n\">scenes</th><th class=\"n\">error</th></tr></thead><tbody>");
@@ -171,7 +179,7 @@ pub(super) fn scale(summary: &Summary) -> String {
                 "<tr><th scope=\"row\">{}</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>",
                 Safe(&scaling.label),
                 thousands(*scenes),
-                spread(task, *error)
+                spread(target, *error)
             );
         }
         out.push_str("</tbody></table></div>");

@@ -333,7 +333,7 @@ mod tests {
             epoch: i as u64 + 1,
             step: i as u64 + 1,
             loss: *mae_m,
-            rate: lr,
+            learning_rate: lr,
             validation: Some(Metrics::Depth {
                 mae_m: *mae_m,
                 rmse_m: *mae_m,

@@ -6,14 +6,21 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
-use super::{learner::Learner, run::Position};
+use super::{
+    learner::Learner,
+    run::{Line, Position},
+};
 use crate::{
     ModelError,
+    model::PLAN,
     parameters::{Named, Parameters, download, upload},
     weights,
 };
 
-const FORMAT: &str = "picofarm-checkpoint-1";
+const FORMAT: &str = "picofarm-checkpoint-2";
+
+/// Before the names of kept values.
+const KEPT: &str = "kept/";
 
 /// What a checkpoint holds beside tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -25,10 +32,19 @@ pub(super) struct Header {
     pub(super) plan: String,
 }
 
-pub(super) fn write(learner: &Learner, position: &Position, plan: &str) -> Vec<u8> {
+/// `kept` are the values after the epoch whose validation was the best, where those count at the end.
+pub(super) fn write(
+    learner: &Learner,
+    position: &Position,
+    kept: Option<&Parameters>,
+    plan: &str,
+) -> Vec<u8> {
     let mut named = Named::new();
     for (name, value) in learner.parameters.to_named() {
         named.insert(format!("weights/{name}"), value);
+    }
+    for (name, value) in kept.into_iter().flat_map(Parameters::to_named) {
+        named.insert(format!("{KEPT}{name}"), value);
     }
     for (d, moments) in learner.net.declared().iter().zip(&learner.moments) {
         if d.learned {
@@ -48,12 +64,12 @@ pub(super) fn write(learner: &Learner, position: &Position, plan: &str) -> Vec<u
     weights::write(&named, &BTreeMap::from([("checkpoint".into(), header)]))
 }
 
-/// Puts a learner where a checkpoint was made.
+/// Puts a learner where a checkpoint was made, and gives the values that were kept.
 pub(super) fn read(
     bytes: &[u8],
     learner: &mut Learner,
     device: &Device,
-) -> Result<Header, ModelError> {
+) -> Result<(Header, Option<Parameters>), ModelError> {
     let (mut named, metadata) = weights::read(bytes)?;
     let none = || ModelError::weights("these are no checkpoint of a training, only weights");
     let header = metadata.get("checkpoint").ok_or_else(none)?;
@@ -80,11 +96,40 @@ pub(super) fn read(
             learner.moments[i][k] = upload(value, device);
         }
     }
-    let named = named
-        .into_iter()
-        .map(|(name, value)| (name.trim_start_matches("weights/").to_owned(), value))
-        .collect();
-    learner.parameters = Parameters::from_named(learner.net.declared().to_vec(), named, device)?;
+    let (mut weights, mut kept) = (Named::new(), Named::new());
+    for (name, value) in named {
+        match name.strip_prefix(KEPT) {
+            Some(name) => kept.insert(name.to_owned(), value),
+            None => weights.insert(name.trim_start_matches("weights/").to_owned(), value),
+        };
+    }
+    let declared = || learner.net.declared().to_vec();
+    let kept = match kept.is_empty() {
+        true => None,
+        false => Some(Parameters::from_named(declared(), kept, device)?),
+    };
+    learner.parameters = Parameters::from_named(declared(), weights, device)?;
     learner.steps = header.steps;
-    Ok(header)
+    Ok((header, kept))
+}
+
+/// What a training would leave if it ended where a checkpoint was made: the weights, as safetensors, and the line of each epoch.
+///
+/// # Errors
+/// [`ModelError::Weights`] where it is no checkpoint.
+pub fn left_by(bytes: &[u8]) -> Result<(Vec<u8>, Vec<Line>), ModelError> {
+    let (named, metadata) = weights::read(bytes)?;
+    let none = || ModelError::weights("these are no checkpoint of a training, only weights");
+    let header = metadata.get("checkpoint").ok_or_else(none)?;
+    let header: Header = serde_json::from_str(header)
+        .map_err(|e| ModelError::weights(format!("the checkpoint's header: {e}")))?;
+    let part = match named.keys().any(|name| name.starts_with(KEPT)) {
+        true => KEPT,
+        false => "weights/",
+    };
+    let of_part = named.into_iter();
+    let of_part = of_part.filter_map(|(name, v)| Some((name.strip_prefix(part)?.to_owned(), v)));
+    let named = weights::to_torch(of_part.collect());
+    let plan = BTreeMap::from([(PLAN.to_owned(), header.plan)]);
+    Ok((weights::write(&named, &plan), header.position.history))
 }

@@ -5,7 +5,7 @@ use burn::tensor::{Device, Tensor};
 use super::{loss::loss, schedule::Pace};
 use crate::{
     ModelError,
-    input::{Batch, Task},
+    input::{Batch, Target},
     kernel::AdamW,
     net::{Net, Pass},
     ops,
@@ -25,14 +25,23 @@ pub struct Learner {
     pub(super) moments: Vec<[Tensor<1>; 2]>,
     /// Steps taken.
     pub(super) steps: u64,
-    task: Task,
+    target: Target,
     decay: f64,
     device: Device,
 }
 
+/// Gradients of a step's batches, summed in their order: as much memory as one batch's.
+#[derive(Default)]
+pub struct Gradients {
+    /// Of every parameter by declaration; none of those that are not learned.
+    sums: Vec<Option<Tensor<1>>>,
+    losses: f32,
+    batches: usize,
+}
+
 impl Learner {
     /// A learner that has taken no step; without autodiff on `device`.
-    pub fn new(net: Net, parameters: Parameters, task: Task, decay: f64) -> Self {
+    pub fn new(net: Net, parameters: Parameters, target: Target, decay: f64) -> Self {
         let device = parameters.values()[0].device();
         let zeros = |d: &Declared| {
             let len = if d.learned { d.len() } else { 0 };
@@ -44,7 +53,7 @@ impl Learner {
             parameters,
             moments,
             steps: 0,
-            task,
+            target,
             decay,
             device,
         }
@@ -67,13 +76,13 @@ impl Learner {
 
     /// What the network said, loss, and the gradient of every learned parameter by declaration; moves the running
     /// statistics.
-    pub(crate) fn gradients(&mut self, batch: &Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
+    pub(crate) fn gradients(&mut self, batch: Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
         let (output, loss, gradients) = self.backward(batch);
         let said = output.into_data_as::<f32>();
         (said.try_into_vec().expect("asked for f32"), loss, gradients)
     }
 
-    fn backward(&mut self, batch: &Batch) -> (Tensor<4>, f32, Vec<Option<Tensor<1>>>) {
+    fn backward(&mut self, batch: Batch) -> (Tensor<4>, f32, Vec<Option<Tensor<1>>>) {
         let device = self.device.clone().autodiff();
         let leaves: Vec<Tensor<1>> = self
             .net
@@ -86,9 +95,10 @@ impl Learner {
             })
             .collect();
         let mut pass = Pass::training(self.net.declared(), &leaves);
-        let output = self.net.forward(&mut pass, batch.input(&device));
+        let (input, target) = batch.into_input(&device);
+        let output = self.net.forward(&mut pass, input);
         let moved = pass.into_moved();
-        let (loss, root) = loss(self.task, output.clone(), &batch.target);
+        let (loss, root) = loss(self.target, output.clone(), &target);
         let mut gradients = root.backward();
         let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
         let of = of.collect();
@@ -103,38 +113,56 @@ impl Learner {
     /// # Errors
     /// [`ModelError::NotFinite`]; the parameters are then as before, the running statistics are not.
     pub fn step(&mut self, batches: &[Batch], pace: Pace) -> Result<f32, ModelError> {
-        let mut sum: Vec<Option<Tensor<1>>> = Vec::new();
-        let mut losses = 0.0;
-        for (i, batch) in batches.iter().enumerate() {
-            let (_, loss, gradients) = self.backward(batch);
-            if !loss.is_finite() {
-                return Err(self.not_finite(loss));
-            }
-            losses += loss;
-            sum = match i {
-                0 => gradients,
-                _ => sum
-                    .into_iter()
-                    .zip(gradients)
-                    .map(|(a, b)| Some(a? + b?))
-                    .collect(),
-            };
+        let mut sum = Gradients::default();
+        for batch in batches {
+            self.add(&mut sum, batch.clone())?;
         }
-        let share = 1.0 / batches.len() as f32;
+        Ok(self.finish(sum, pace))
+    }
+
+    /// Adds a batch's gradients to those of a step, and lets go of the batch.
+    ///
+    /// # Errors
+    /// [`ModelError::NotFinite`]; the parameters are then as before, the running statistics are not.
+    pub fn add(&mut self, sum: &mut Gradients, batch: Batch) -> Result<(), ModelError> {
+        let (_, loss, gradients) = self.backward(batch);
+        if !loss.is_finite() {
+            return Err(self.not_finite(loss));
+        }
+        sum.losses += loss;
+        sum.sums = match sum.batches {
+            0 => gradients,
+            _ => std::mem::take(&mut sum.sums)
+                .into_iter()
+                .zip(gradients)
+                .map(|(a, b)| Some(a? + b?))
+                .collect(),
+        };
+        sum.batches += 1;
+        Ok(())
+    }
+
+    /// Takes the step of the optimiser along the mean of gradients. Returns the mean loss.
+    ///
+    /// # Panics
+    /// Where there are none.
+    pub fn finish(&mut self, sum: Gradients, pace: Pace) -> f32 {
+        assert!(sum.batches > 0, "a step has a batch");
+        let share = 1.0 / sum.batches as f32;
         self.steps += 1;
         let settings = AdamW {
-            rate: pace.rate,
+            learning_rate: pace.learning_rate,
             beta1: pace.beta1,
             beta2: BETA2,
             eps: EPSILON,
             decay: self.decay,
             step: u32::try_from(self.steps).unwrap_or(u32::MAX),
         };
-        for (i, gradient) in sum.into_iter().enumerate() {
+        for (i, gradient) in sum.sums.into_iter().enumerate() {
             let Some(mut gradient) = gradient else {
                 continue;
             };
-            if batches.len() > 1 {
+            if sum.batches > 1 {
                 gradient = gradient.mul_scalar(share);
             }
             let value = self.parameters.take(Id(i));
@@ -144,7 +172,7 @@ impl Learner {
             self.parameters.set(Id(i), value);
             self.moments[i] = moments;
         }
-        Ok(losses * share)
+        sum.losses * share
     }
 
     /// What the network says in evaluation: (N, outputs, H, W), row by row.

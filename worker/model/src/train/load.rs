@@ -1,8 +1,12 @@
-//! Batches ahead of the network: one thread reads and prepares what comes next while it learns.
+//! Examples ahead of the network: threads read and prepare what comes next while it learns, as far ahead as memory allows.
+//!
+//! Each thread takes the next visit in order and works on it alone; the network gets examples in that order. So what comes
+//! out does not depend on the number of threads.
 
 use std::{
-    collections::HashMap,
-    sync::{Arc, Mutex, PoisonError, mpsc::SyncSender},
+    collections::{BTreeMap, HashMap},
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    thread,
 };
 
 use super::{Plan, order, run::Position};
@@ -13,11 +17,30 @@ use crate::{
     scene::{Scene, Scenes},
 };
 
-/// Batches that wait for the network.
-pub(super) const AHEAD: usize = 2;
+/// Batches of examples that wait for the network, at most.
+const AHEAD: usize = 2;
 
 /// Depths that a guide keeps: 1 GiB of them.
 const MOST_KNOWN: usize = 1 << 28;
+
+/// How examples are made ready for the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Loading {
+    /// Threads that read and prepare scenes.
+    pub threads: usize,
+    /// Bytes of scenes in hand and of examples that wait; one scene is always in hand.
+    pub room: usize,
+}
+
+impl Default for Loading {
+    /// The threads of the pool in which it is called, and 1 GiB.
+    fn default() -> Self {
+        Self {
+            threads: rayon::current_num_threads(),
+            room: 1 << 30,
+        }
+    }
+}
 
 /// A depth network that two-bounce times follow from, instead of from the truth.
 pub struct Guide {
@@ -49,54 +72,260 @@ impl Guide {
     }
 }
 
-/// Visits as a batch.
-pub(super) fn batch(
-    plan: &Plan,
-    guide: Option<&Guide>,
-    scenes: &dyn Scenes,
-    visits: &[(usize, Visit)],
-) -> Result<Batch, ModelError> {
-    let mut batch = Batch::default();
-    for (index, visit) in visits {
-        let scene = scenes.load(*index).map_err(|source| ModelError::Scene {
-            scene: *index,
+/// The visits of a training from a position on, in order.
+pub(super) struct Course<'a> {
+    plan: &'a Plan,
+    scenes: usize,
+    /// Visits of an epoch.
+    each: u64,
+    /// Visits done.
+    first: u64,
+    /// The orders of the epochs asked for last.
+    orders: Mutex<BTreeMap<u64, Arc<Vec<usize>>>>,
+}
+
+impl<'a> Course<'a> {
+    pub(super) fn new(plan: &'a Plan, scenes: usize, from: &Position) -> Self {
+        let each = plan.batches(scenes) * plan.batch as u64;
+        Self {
+            plan,
+            scenes,
+            each,
+            first: from.epoch * each + from.batches * plan.batch as u64,
+            orders: Mutex::default(),
+        }
+    }
+
+    /// How many are left.
+    pub(super) fn len(&self) -> u64 {
+        self.plan.epochs * self.each - self.first
+    }
+
+    /// One of them: the scene's index, and how it is visited.
+    pub(super) fn visit(&self, which: u64) -> (usize, Visit) {
+        let (plan, which) = (self.plan, self.first + which);
+        let (epoch, at) = (which / self.each, which % self.each);
+        let mut orders = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
+        let order = orders
+            .entry(epoch)
+            .or_insert_with(|| Arc::new(order::epoch(plan.seed, epoch, self.scenes)));
+        let scene = order[at as usize];
+        while orders.len() > 2 {
+            orders.pop_first();
+        }
+        let visit = order::visit(plan.seed, epoch, at, &plan.question, plan.augment);
+        (scene, visit)
+    }
+}
+
+/// What examples are made of.
+pub(super) struct Making<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) guide: Option<&'a Guide>,
+    pub(super) scenes: &'a dyn Scenes,
+    /// The visits, in order: which scene, and how.
+    pub(super) visit: &'a (dyn Fn(u64) -> (usize, Visit) + Sync),
+    /// How many visits.
+    pub(super) count: u64,
+    pub(super) loading: Loading,
+}
+
+impl Making<'_> {
+    /// Makes examples ready while `use_them` runs, and ends with it.
+    pub(super) fn ahead<R>(&self, use_them: impl FnOnce(&Ready<'_>) -> R) -> R {
+        let shelf = Shelf::default();
+        thread::scope(|scope| {
+            for _ in 0..self.loading.threads.max(1) {
+                scope.spawn(|| self.serve(&shelf));
+            }
+            let ready = Ready {
+                shelf: &shelf,
+                batch: self.plan.batch as u64,
+                count: self.count,
+            };
+            // However it ends, the threads do.
+            let _over = Closing(&shelf);
+            use_them(&ready)
+        })
+    }
+
+    /// A thread's work. Its own pool has one thread, so that a scene is decoded where it was taken up: in a pool of more,
+    /// whoever waits for a part would begin with another scene in the middle of this one.
+    fn serve(&self, shelf: &Shelf) {
+        let broken = Broken(shelf);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+        match pool {
+            Ok(pool) => pool.install(|| self.work(shelf)),
+            // Without one, the process's own pool decodes.
+            Err(_) => self.work(shelf),
+        }
+        drop(broken);
+    }
+
+    fn work(&self, shelf: &Shelf) {
+        while let Some(which) = shelf.take(self) {
+            let mut bytes = 0;
+            let made = self.example(which, &mut bytes);
+            shelf.put(which, made, bytes);
+        }
+    }
+
+    /// The example of a visit alone; `bytes` becomes what it took to make it.
+    fn example(&self, which: u64, bytes: &mut usize) -> Result<Batch, ModelError> {
+        let (index, visit) = (self.visit)(which);
+        let scene = self.scenes.load(index);
+        let scene = scene.map_err(|source| ModelError::Scene {
+            scene: index,
             source,
         })?;
-        let depth = match guide {
-            Some(guide) => Some(guide.depth_m(*index, &scene)?),
+        let depth = match self.guide {
+            Some(guide) => Some(guide.depth_m(index, &scene)?),
             None => None,
         };
         let depth = depth.as_ref().map(|d| d.as_slice());
-        example(&mut batch, &plan.question, &scene, depth, *visit)?;
+        let mut made = Batch::default();
+        example(&mut made, &self.plan.question, &scene, depth, visit)?;
+        *bytes = scene.bytes() + made.bytes();
+        Ok(made)
     }
-    Ok(batch)
 }
 
-/// Prepares the batches from a position on and sends them in order, until nobody listens.
-pub(super) fn ahead(
-    plan: &Plan,
-    guide: Option<&Guide>,
-    scenes: &dyn Scenes,
-    from: &Position,
-    to: &SyncSender<Result<Batch, ModelError>>,
-) {
-    let mut first = from.batches;
-    for epoch in from.epoch..plan.epochs {
-        let order = order::epoch(plan.seed, epoch, scenes.len());
-        for b in first..plan.batches(scenes.len()) {
-            let places = b * plan.batch as u64..(b + 1) * plan.batch as u64;
-            let visits: Vec<_> = places
-                .map(|at| {
-                    let visit = order::visit(plan.seed, epoch, at, &plan.question, plan.augment);
-                    (order[at as usize], visit)
-                })
-                .collect();
-            let batch = batch(plan, guide, scenes, &visits);
-            let failed = batch.is_err();
-            if to.send(batch).is_err() || failed {
-                return;
+/// Examples between the threads that make them and the network.
+#[derive(Default)]
+struct Shelf {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// The next visit that nobody has taken up.
+    next: u64,
+    /// Visits that the network has got.
+    taken: u64,
+    in_hand: usize,
+    /// Examples that are made, and their bytes.
+    made: BTreeMap<u64, Result<Batch, ModelError>>,
+    waiting: usize,
+    /// The most bytes that it took to make one; 0 = none is made yet.
+    largest: usize,
+    closed: bool,
+    broken: bool,
+}
+
+impl State {
+    /// Whether another scene may be taken up.
+    fn may_begin(&self, making: &Making<'_>) -> bool {
+        let idle = self.in_hand == 0 && self.made.is_empty();
+        let loading = making.loading;
+        let most = AHEAD as u64 * making.plan.batch as u64 + loading.threads as u64;
+        let needed = self
+            .waiting
+            .saturating_add((self.in_hand + 1).saturating_mul(self.largest));
+        let known = self.largest > 0 && needed <= loading.room;
+        idle || (known && self.next < self.taken + most)
+    }
+}
+
+impl Shelf {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wait<'a>(&self, state: MutexGuard<'a, State>) -> MutexGuard<'a, State> {
+        let woken = self.changed.wait(state);
+        woken.unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The next visit to make an example of; `None` where there is none, or nobody wants one any more.
+    fn take(&self, making: &Making<'_>) -> Option<u64> {
+        let mut state = self.lock();
+        loop {
+            if state.closed || state.broken || state.next >= making.count {
+                return None;
             }
+            if state.may_begin(making) {
+                state.next += 1;
+                state.in_hand += 1;
+                return Some(state.next - 1);
+            }
+            state = self.wait(state);
         }
-        first = 0;
+    }
+
+    fn put(&self, which: u64, made: Result<Batch, ModelError>, bytes: usize) {
+        let mut state = self.lock();
+        state.in_hand -= 1;
+        state.largest = state.largest.max(bytes).max(1);
+        state.waiting += made.as_ref().map_or(0, Batch::bytes);
+        state.made.insert(which, made);
+        drop(state);
+        self.changed.notify_all();
+    }
+}
+
+/// Nobody wants examples any more.
+struct Closing<'a>(&'a Shelf);
+
+impl Drop for Closing<'_> {
+    fn drop(&mut self) {
+        self.0.lock().closed = true;
+        self.0.changed.notify_all();
+    }
+}
+
+/// Tells the network where a thread panicked; it would wait for ever for what that thread had in hand.
+struct Broken<'a>(&'a Shelf);
+
+impl Drop for Broken<'_> {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            self.0.lock().broken = true;
+            self.0.changed.notify_all();
+        }
+    }
+}
+
+/// Where the network gets its examples.
+pub(super) struct Ready<'a> {
+    shelf: &'a Shelf,
+    batch: u64,
+    count: u64,
+}
+
+impl Ready<'_> {
+    /// The next batch; a smaller one at the very end, if visits are left over.
+    ///
+    /// # Errors
+    /// What kept one of its examples from being made.
+    ///
+    /// # Panics
+    /// Where a thread that makes examples did, and where there are no more.
+    pub(super) fn next(&self) -> Result<Batch, ModelError> {
+        let begun = self.shelf.lock().taken;
+        let size = self.batch.min(self.count - begun);
+        assert!(size > 0, "a batch is asked for each step and no more");
+        let mut batch = Batch::default();
+        for which in begun..begun + size {
+            let example = self.example(which)?;
+            batch.join(example, size as usize)?;
+        }
+        Ok(batch)
+    }
+
+    fn example(&self, which: u64) -> Result<Batch, ModelError> {
+        let mut state = self.shelf.lock();
+        let made = loop {
+            if let Some(made) = state.made.remove(&which) {
+                break made;
+            }
+            assert!(!state.broken, "a thread that prepares scenes panicked");
+            state = self.shelf.wait(state);
+        };
+        state.taken += 1;
+        state.waiting -= made.as_ref().map_or(0, Batch::bytes);
+        drop(state);
+        self.shelf.changed.notify_all();
+        made
     }
 }

@@ -2,35 +2,35 @@
 
 use burn::tensor::{Tensor, TensorData};
 
-use crate::{input::Task, ops};
+use crate::{input::Target, ops};
 
 /// Mean loss of a batch, and what to go backward from: outputs and truth (N, C, H, W).
 ///
 /// On the CPU both are computed here, in a fixed order and with `libm`, so that neither the instruction set nor the
 /// system's mathematics changes a bit; elsewhere by the device.
-pub fn loss(task: Task, output: Tensor<4>, truth: &[f32]) -> (f32, Tensor<1>) {
+pub fn loss(target: Target, output: Tensor<4>, truth: &[f32]) -> (f32, Tensor<1>) {
     if !ops::has_kernels(&output.device()) {
         let truth = TensorData::new(truth.to_vec(), output.dims());
         let truth = Tensor::from_data(truth, &output.device());
-        let loss = on_device(task, output, truth);
+        let loss = on_device(target, output, truth);
         return (loss.clone().inner().into_scalar::<f32>(), loss);
     }
     let said = output.clone().inner().into_data_as::<f32>();
     let said: Vec<f32> = said.try_into_vec().expect("asked for f32");
-    let (loss, gradient) = by_hand(task, &said, truth);
+    let (loss, gradient) = by_hand(target, &said, truth);
     let gradient = TensorData::new(gradient, output.dims());
     let gradient = Tensor::<4>::from_data(gradient, &output.device());
     (loss, (output * gradient).sum())
 }
 
 /// Loss and gradient, value by value.
-fn by_hand(task: Task, said: &[f32], truth: &[f32]) -> (f32, Vec<f32>) {
+fn by_hand(target: Target, said: &[f32], truth: &[f32]) -> (f32, Vec<f32>) {
     let share = 1.0 / said.len() as f32;
     let mut sum = 0.0f64;
     let pairs = said.iter().zip(truth);
     let gradient = pairs
-        .map(|(x, t)| match task {
-            Task::Tof => {
+        .map(|(x, t)| match target {
+            Target::Tof => {
                 let off = x - t;
                 sum += f64::from(off.abs());
                 match off.partial_cmp(&0.0) {
@@ -40,7 +40,7 @@ fn by_hand(task: Task, said: &[f32], truth: &[f32]) -> (f32, Vec<f32>) {
                     None => f32::NAN,
                 }
             }
-            Task::Shadow | Task::Specular => {
+            Target::Shadow | Target::Specular => {
                 let small = libm::expf(-x.abs());
                 sum += f64::from(x.max(0.0) - x * t + libm::log1pf(small));
                 // 1/(1 + exp(−x)), without overflow on either side.
@@ -52,11 +52,11 @@ fn by_hand(task: Task, said: &[f32], truth: &[f32]) -> (f32, Vec<f32>) {
     ((sum / said.len() as f64) as f32, gradient)
 }
 
-fn on_device(task: Task, x: Tensor<4>, t: Tensor<4>) -> Tensor<1> {
-    match task {
-        Task::Tof => (x - t).abs().mean(),
+fn on_device(target: Target, x: Tensor<4>, t: Tensor<4>) -> Tensor<1> {
+    match target {
+        Target::Tof => (x - t).abs().mean(),
         // max(x, 0) − x·t + log(1 + exp(−|x|)), which no logit overflows.
-        Task::Shadow | Task::Specular => {
+        Target::Shadow | Target::Specular => {
             let rest = x.clone().abs().neg().exp().log1p();
             (x.clone().clamp_min(0.0) - x * t + rest).mean()
         }
@@ -73,22 +73,22 @@ mod tests {
     fn by_hand_is_what_the_device_says_and_no_logit_overflows() {
         let said = [-200.0, -3.0, -1e-4, 0.5, 0.25, 80.0];
         let truth = [1.0, 0.0, 1.0, 0.0, 1.0, 1.0];
-        for task in [Task::Tof, Task::Shadow] {
-            let (loss, gradient) = by_hand(task, &said, &truth);
+        for target in [Target::Tof, Target::Shadow] {
+            let (loss, gradient) = by_hand(target, &said, &truth);
             let device = Device::flex().autodiff();
             let tensor = |values: [f32; 6]| {
                 Tensor::<4>::from_data(TensorData::new(values.to_vec(), [1, 1, 2, 3]), &device)
             };
             let x = tensor(said).require_grad();
-            let theirs = on_device(task, x.clone(), tensor(truth));
+            let theirs = on_device(target, x.clone(), tensor(truth));
             let by = x.grad(&theirs.backward()).unwrap().into_data_as::<f32>();
             let theirs = theirs.inner().into_scalar::<f32>();
             assert!(
                 (loss - theirs).abs() < 1e-5 * theirs,
-                "{task:?}: {loss} and {theirs}"
+                "{target:?}: {loss} and {theirs}"
             );
             for (a, b) in gradient.iter().zip(by.iter::<f32>()) {
-                assert!((a - b).abs() < 1e-6, "{task:?}: {a} and {b}");
+                assert!((a - b).abs() < 1e-6, "{target:?}: {a} and {b}");
             }
         }
     }

@@ -10,8 +10,9 @@ mod schedule;
 
 use serde::{Deserialize, Serialize};
 
-pub use learner::{Learner, predict};
-pub use load::Guide;
+pub use checkpoint::left_by;
+pub use learner::{Gradients, Learner, predict};
+pub use load::{Guide, Loading};
 pub use run::{Control, Ended, Event, Line, Position, Sources, Trained, Training};
 pub use schedule::{Pace, Schedule};
 
@@ -32,12 +33,12 @@ pub struct Plan {
     /// Batches a step.
     pub accumulate: usize,
     /// Greatest learning rate.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Weight decay.
     pub decay: f64,
     /// How the rate moves.
     pub schedule: Schedule,
-    /// Mirrored scenes are shown too, where the task allows it.
+    /// Mirrored scenes are shown too, where the target allows it.
     pub augment: bool,
     /// Validations without improvement after which it ends; 0 = never.
     pub early_stop: u64,
@@ -75,9 +76,9 @@ impl Plan {
             );
             return Err(ModelError::invalid("optimise.batch", what));
         }
-        let positive = self.rate > 0.0 && self.rate.is_finite();
+        let positive = self.learning_rate > 0.0 && self.learning_rate.is_finite();
         if !positive || !(0.0..1.0).contains(&self.decay) {
-            let what = "rate must be positive, weight_decay in 0..1";
+            let what = "learning_rate must be positive, weight_decay in 0..1";
             return Err(ModelError::invalid("optimise", what));
         }
         self.schedule.check(self.steps(scenes))

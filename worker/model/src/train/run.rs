@@ -1,8 +1,7 @@
 //! A training from where it stands to its end.
 
 use std::{
-    sync::{Arc, mpsc::sync_channel},
-    thread,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -11,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     Plan, checkpoint,
-    learner::Learner,
-    load::{self, AHEAD, Guide},
+    learner::{Gradients, Learner},
+    load::{Course, Guide, Loading, Making, Ready},
 };
 use crate::{
     ModelError,
@@ -40,6 +39,9 @@ pub struct Position {
     pub best: Option<f64>,
     /// Validations since then.
     pub since_best: u64,
+    /// The epoch, from 1, after which the weights are kept that count at the end; 0 = the last one.
+    #[serde(default)]
+    pub kept_epoch: u64,
     /// A line for each epoch done.
     pub history: Vec<Line>,
     /// It ended before its last epoch, because it no longer became better.
@@ -56,7 +58,7 @@ pub struct Line {
     /// Mean loss of its steps.
     pub loss: f64,
     /// Learning rate of its last step.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// On the validation scenes, where there are any.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub validation: Option<Metrics>,
@@ -117,7 +119,10 @@ pub struct Training {
     plan: Plan,
     learner: Learner,
     position: Position,
+    /// With `early_stop`: the values after the epoch whose validation was the best.
+    kept: Option<Parameters>,
     sources: Sources,
+    loading: Loading,
 }
 
 /// What comes out.
@@ -129,6 +134,18 @@ pub struct Trained {
     pub history: Vec<Line>,
     /// It ended before its last epoch.
     pub stopped_early: bool,
+    /// The epoch, from 1, after which the network had these weights: with `early_stop` the one whose validation was the best,
+    /// else the last.
+    pub kept_epoch: u64,
+}
+
+impl Trained {
+    /// The line of the epoch whose weights these are.
+    pub fn kept(&self) -> Option<&Line> {
+        self.history
+            .iter()
+            .find(|line| line.epoch == self.kept_epoch)
+    }
 }
 
 impl Training {
@@ -158,12 +175,14 @@ impl Training {
                 true => parameters.with_encoder_of(named, device)?,
             };
         }
-        let learner = Learner::new(net, parameters, plan.question.task, plan.decay);
+        let learner = Learner::new(net, parameters, plan.question.target, plan.decay);
         Ok(Self {
             plan,
             learner,
             position: Position::default(),
+            kept: None,
             sources,
+            loading: Loading::default(),
         })
     }
 
@@ -180,8 +199,8 @@ impl Training {
         plan.check(sources.train.len())?;
         let net = Net::new(plan.net.clone())?;
         let parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
-        let mut learner = Learner::new(net, parameters, plan.question.task, plan.decay);
-        let header = checkpoint::read(checkpoint, &mut learner, device)?;
+        let mut learner = Learner::new(net, parameters, plan.question.target, plan.decay);
+        let (header, kept) = checkpoint::read(checkpoint, &mut learner, device)?;
         if header.plan != plan.text() {
             let what =
                 "the checkpoint was made with other settings; remove it, or train with those";
@@ -191,13 +210,28 @@ impl Training {
             plan,
             learner,
             position: header.position,
+            kept,
             sources,
+            loading: Loading::default(),
         })
+    }
+
+    /// The same with scenes made ready in another way: it changes how long it takes and how much memory, and no bit of what
+    /// comes out.
+    #[must_use]
+    pub fn loading(mut self, loading: Loading) -> Self {
+        self.loading = loading;
+        self
     }
 
     /// The training as bytes, to go on from.
     pub fn checkpoint(&self) -> Vec<u8> {
-        checkpoint::write(&self.learner, &self.position, &self.plan.text())
+        checkpoint::write(
+            &self.learner,
+            &self.position,
+            self.kept.as_ref(),
+            &self.plan.text(),
+        )
     }
 
     /// Where it stands.
@@ -227,49 +261,46 @@ impl Training {
         if self.is_over() {
             return Ok(Ended::Finished);
         }
-        let (plan, from) = (self.plan.clone(), self.position.clone());
+        let plan = self.plan.clone();
         let train = Arc::clone(&self.sources.train);
         // One for each set of scenes: what it knows of them is kept by their number.
         let [guide, of_validation] = [(); 2].map(|()| self.sources.guide.clone().map(Guide::new));
-        let guide = guide.as_ref();
-        thread::scope(|scope| {
-            let (to, ready) = sync_channel(AHEAD);
-            scope.spawn(move || load::ahead(&plan, guide, &*train, &from, &to));
-            let mut clock = Clock::new();
-            let next = || {
-                let since = Instant::now();
-                let batch = ready
-                    .recv()
-                    .expect("the loader sends a batch for each step, or an error");
-                batch.map(|batch| (batch, since.elapsed()))
-            };
-            self.learn(&mut clock, &next, of_validation.as_ref(), say)
-        })
+        let course = Course::new(&plan, train.len(), &self.position);
+        let making = Making {
+            plan: &plan,
+            guide: guide.as_ref(),
+            scenes: &*train,
+            visit: &|which| course.visit(which),
+            count: course.len(),
+            loading: self.loading,
+        };
+        making.ahead(|ready| self.learn(ready, of_validation.as_ref(), say))
     }
 
     fn learn(
         &mut self,
-        clock: &mut Clock,
-        next: &dyn Fn() -> Result<(crate::input::Batch, Duration), ModelError>,
+        ready: &Ready<'_>,
         guide: Option<&Guide>,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
     ) -> Result<Ended, ModelError> {
+        let mut clock = Clock::new();
         let (of, per_epoch) = (self.steps(), self.plan.batches(self.sources.train.len()));
         while !self.is_over() {
-            let mut batches = Vec::with_capacity(self.plan.accumulate);
+            let mut sum = Gradients::default();
             for _ in 0..self.plan.accumulate {
-                let (batch, waited) = next()?;
-                clock.waited += waited;
+                let since = Instant::now();
+                let batch = ready.next()?;
+                clock.waited += since.elapsed();
                 clock.samples += batch.images;
-                batches.push(batch);
+                self.learner.add(&mut sum, batch)?;
             }
             let pace = self
                 .plan
                 .schedule
-                .pace(self.learner.steps(), of, self.plan.rate);
-            let loss = self.learner.step(&batches, pace)?;
+                .pace(self.learner.steps(), of, self.plan.learning_rate);
+            let loss = self.learner.finish(sum, pace);
             let position = &mut self.position;
-            position.batches += batches.len() as u64;
+            position.batches += self.plan.accumulate as u64;
             position.losses += f64::from(loss);
             position.steps += 1;
             let epoch = position.epoch + 1;
@@ -283,7 +314,7 @@ impl Training {
             }];
             if self.position.batches == per_epoch {
                 let since = Instant::now();
-                events.push(Event::Epoch(self.end_epoch(pace.rate, guide)?));
+                events.push(Event::Epoch(self.end_epoch(pace.learning_rate, guide)?));
                 clock.began += since.elapsed();
             }
             for event in &events {
@@ -299,7 +330,7 @@ impl Training {
         self.position.epoch == self.plan.epochs || self.position.stopped_early
     }
 
-    fn end_epoch(&mut self, rate: f64, guide: Option<&Guide>) -> Result<Line, ModelError> {
+    fn end_epoch(&mut self, learning_rate: f64, guide: Option<&Guide>) -> Result<Line, ModelError> {
         let validation = match self.sources.validation.is_empty() {
             true => None,
             false => Some(self.validate(guide)?),
@@ -309,7 +340,7 @@ impl Training {
             epoch: position.epoch + 1,
             step: self.learner.steps(),
             loss: position.losses / position.steps as f64,
-            rate,
+            learning_rate,
             validation,
         };
         position.history.push(line);
@@ -317,9 +348,14 @@ impl Training {
         position.epoch += 1;
         position.batches = 0;
         if let Some(loss) = validation.map(|m| m.loss()) {
-            if position.best.is_none_or(|best| loss < best) {
+            // A loss that is no number is never the best.
+            if loss.is_finite() && position.best.is_none_or(|best| loss < best) {
                 position.best = Some(loss);
                 position.since_best = 0;
+                if self.plan.early_stop > 0 {
+                    position.kept_epoch = position.epoch;
+                    self.kept = Some(self.learner.parameters().clone());
+                }
             } else {
                 position.since_best += 1;
             }
@@ -333,33 +369,48 @@ impl Training {
     fn validate(&self, guide: Option<&Guide>) -> Result<Metrics, ModelError> {
         let scenes = &*self.sources.validation;
         let mut tally = Tally::default();
-        let visits: Vec<(usize, Visit)> = (0..scenes.len())
-            .map(|index| {
-                let spot = match self.plan.question.by_spot() {
-                    true => index % self.plan.question.spots,
-                    false => 0,
-                };
-                (
-                    index,
-                    Visit {
-                        spot,
-                        ..Visit::default()
-                    },
-                )
-            })
-            .collect();
-        for visits in visits.chunks(self.plan.batch) {
-            let batch = load::batch(&self.plan, guide, scenes, visits)?;
-            let said = self.learner.predict(&batch);
-            tally.add(self.plan.question.task, &said, &batch.target);
-        }
-        Ok(tally.metrics(self.plan.question.task))
+        let question = &self.plan.question;
+        let visit = |which: u64| {
+            let index = which as usize;
+            let spot = match question.by_spot() {
+                true => index % question.spots,
+                false => 0,
+            };
+            let visit = Visit {
+                spot,
+                ..Visit::default()
+            };
+            (index, visit)
+        };
+        let making = Making {
+            plan: &self.plan,
+            guide,
+            scenes,
+            visit: &visit,
+            count: scenes.len() as u64,
+            loading: self.loading,
+        };
+        making.ahead(|ready| {
+            for _ in 0..scenes.len().div_ceil(self.plan.batch) {
+                let batch = ready.next()?;
+                let said = self.learner.predict(&batch);
+                tally.add(question.target, &said, &batch.target);
+            }
+            Ok::<(), ModelError>(())
+        })?;
+        Ok(tally.metrics(self.plan.question.target))
     }
 
     /// What came out.
     pub fn finish(self) -> Trained {
-        let named = weights::to_torch(self.learner.parameters().to_named());
+        let parameters = self.kept.as_ref().unwrap_or(self.learner.parameters());
+        let named = weights::to_torch(parameters.to_named());
+        let kept_epoch = match self.kept {
+            Some(_) => self.position.kept_epoch,
+            None => self.position.epoch,
+        };
         Trained {
+            kept_epoch,
             weights: weights::write(&named, &[(PLAN.to_owned(), self.plan.text())].into()),
             history: self.position.history,
             stopped_early: self.position.stopped_early,

@@ -23,7 +23,7 @@ pub enum Schedule {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pace {
     /// Learning rate.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// β₁ of AdamW. PyTorch's one cycle moves it too, against the rate.
     pub beta1: f64,
 }
@@ -55,19 +55,26 @@ impl Schedule {
     }
 
     /// The pace at a step (from 0) of a run of `steps`, with the greatest rate `rate`.
-    pub fn pace(self, step: u64, steps: u64, rate: f64) -> Pace {
-        let constant = |rate| Pace { rate, beta1: 0.9 };
+    pub fn pace(self, step: u64, steps: u64, learning_rate: f64) -> Pace {
+        let constant = |learning_rate| Pace {
+            learning_rate,
+            beta1: 0.9,
+        };
         match self {
-            Self::Constant => constant(rate),
-            Self::Cosine => constant(between(rate, 0.0, step as f64 / steps.max(1) as f64)),
-            Self::Onecycle => cycle(step, steps, rate),
-            Self::OnecyclePaper => cycle(step, PAPER_STEPS, rate),
+            Self::Constant => constant(learning_rate),
+            Self::Cosine => constant(between(
+                learning_rate,
+                0.0,
+                step as f64 / steps.max(1) as f64,
+            )),
+            Self::Onecycle => cycle(step, steps, learning_rate),
+            Self::OnecyclePaper => cycle(step, PAPER_STEPS, learning_rate),
         }
     }
 }
 
-fn cycle(step: u64, steps: u64, rate: f64) -> Pace {
-    let (first, step) = (rate / START, step as f64);
+fn cycle(step: u64, steps: u64, learning_rate: f64) -> Pace {
+    let (first, step) = (learning_rate / START, step as f64);
     let (slow, fast) = BETA1;
     // The last steps of the two phases, counted from 0, as PyTorch counts them.
     let top = WARM_UP * steps as f64 - 1.0;
@@ -76,7 +83,7 @@ fn cycle(step: u64, steps: u64, rate: f64) -> Pace {
         // Of a run of 100 steps the first is the top.
         let at = if top > 0.0 { step / top } else { 1.0 };
         return Pace {
-            rate: between(first, rate, at),
+            learning_rate: between(first, learning_rate, at),
             beta1: between(fast, slow, at),
         };
     }
@@ -86,7 +93,7 @@ fn cycle(step: u64, steps: u64, rate: f64) -> Pace {
         1.0
     };
     Pace {
-        rate: between(rate, first / END, at.min(1.0)),
+        learning_rate: between(learning_rate, first / END, at.min(1.0)),
         beta1: between(slow, fast, at.min(1.0)),
     }
 }
@@ -103,7 +110,11 @@ mod tests {
     #[test]
     fn the_papers_cycle_begins_at_4e_4_peaks_at_1e_2_and_stands_at_9_9e_3_where_the_real_run_ends()
     {
-        let at = |step| Schedule::OnecyclePaper.pace(step, 68_500, 1e-2).rate;
+        let at = |step| {
+            Schedule::OnecyclePaper
+                .pace(step, 68_500, 1e-2)
+                .learning_rate
+        };
         assert!((at(0) - 4e-4).abs() < 1e-12);
         assert!((at(9_999) - 1e-2).abs() < 1e-12);
         assert!((at(68_499) - 9.9e-3).abs() < 1e-4, "{}", at(68_499));
@@ -115,12 +126,14 @@ mod tests {
             for step in 0..steps {
                 let pace = Schedule::Onecycle.pace(step, steps, 1e-2);
                 assert!(
-                    pace.rate > 0.0 && pace.rate <= 1e-2,
+                    pace.learning_rate > 0.0 && pace.learning_rate <= 1e-2,
                     "{steps} {step} {pace:?}"
                 );
                 assert!((0.85..=0.95).contains(&pace.beta1));
             }
-            let last = Schedule::Onecycle.pace(steps - 1, steps, 1e-2).rate;
+            let last = Schedule::Onecycle
+                .pace(steps - 1, steps, 1e-2)
+                .learning_rate;
             assert!((last - 4e-8).abs() < 1e-12 || steps == 1, "{steps}: {last}");
         }
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use picofarm_model::{
     Random,
-    input::{Normalise, Question, ShadowVariant, Task},
+    input::{Normalise, Question, ShadowVariant, Target},
     net::{Architecture, NetSpec},
     scene::Scene,
     train::{Plan, Schedule, Sources},
@@ -27,6 +27,7 @@ pub fn scene(seed: u64) -> Arc<Scene> {
         bin_width_m: 0.75,
         specular: (0..pixels).map(|p| u8::from(p % width == 3)).collect(),
         spots: vec![[-0.3, 0.0, near], [0.3, 0.0, near]],
+        beams_m: vec![(0.09 + near * near).sqrt(); 2],
         lit: (0..2 * pixels)
             .map(|p| u8::from((p % width < 4) == (p < pixels)))
             .collect(),
@@ -58,9 +59,9 @@ pub fn sources() -> Sources {
     }
 }
 
-pub fn plan(task: Task, variant: ShadowVariant) -> Plan {
+pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
     let question = Question {
-        task,
+        target,
         variant,
         normalise: Normalise::MinMax,
         bins: 16,
@@ -85,7 +86,7 @@ pub fn plan(task: Task, variant: ShadowVariant) -> Plan {
         epochs: 3,
         batch: 2,
         accumulate: 2,
-        rate: 1e-2,
+        learning_rate: 1e-2,
         decay: 1e-3,
         schedule: Schedule::Onecycle,
         augment: true,

@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     fs::File,
-    io::{BufReader, Read},
+    io::BufReader,
     path::{Path, PathBuf},
     sync::Mutex,
 };
@@ -16,6 +16,8 @@ use crate::SceneError;
 use super::category::category_of;
 
 const CATALOGUE: &str = "PluginFurnitureCatalog.properties";
+/// Largest entry read, bytes: catalogues have some hundred kilobytes.
+const MAX_ENTRY: u64 = 64 << 20;
 
 /// An open `.sh3f` file, shared by the threads that load models.
 #[derive(Debug)]
@@ -75,10 +77,9 @@ impl Archive {
     /// The bytes of one entry.
     pub(super) fn read(&self, entry: &str) -> Result<Vec<u8>, SceneError> {
         let bytes = self.with_zip(|zip| {
-            let mut file = zip.by_name(entry).map_err(|e| e.to_string())?;
-            let mut bytes = Vec::with_capacity(file.size() as usize);
-            file.read_to_end(&mut bytes).map_err(|e| e.to_string())?;
-            Ok::<_, String>(bytes)
+            let file = zip.by_name(entry).map_err(|e| e.to_string())?;
+            let announced = file.size();
+            picofarm_files::read_entry(file, announced, MAX_ENTRY).map_err(|e| e.to_string())
         });
         bytes.map_err(|e| SceneError::Format {
             path: self.path.clone(),

@@ -1,11 +1,11 @@
 //! A folder of glTF models and its list, as one would make for the Amazon Berkeley Objects.
 
 use std::{
-    fs::File,
     io::{Read, Seek, SeekFrom},
     path::{Path, PathBuf},
 };
 
+use picofarm_files::{FileError, Opener};
 use sha2::{Digest, Sha256};
 
 use crate::{LABELS, Mesh, SceneError, Vec3, import};
@@ -27,6 +27,8 @@ const NEEDED: [&str; 5] = ["path", "label", "up", "front", "scale"];
 #[derive(Debug, Clone)]
 pub(super) struct Row {
     pub(super) file: PathBuf,
+    /// Opens it and what it names: the list's folder.
+    files: Opener,
     pub(super) name: String,
     pub(super) label: &'static str,
     pub(super) elevation: f32,
@@ -51,24 +53,17 @@ pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
         return Err(SceneError::Assets {
             name: super::GLTF.into(),
             looked: format!("no {LIST} in {}", dir.display()),
-            mend: WRITE,
+            hint: WRITE,
         });
     }
-    let read = |source| SceneError::Read {
-        path: path.clone(),
-        source,
-    };
     let fail = |what: String| SceneError::Format {
         path: path.clone(),
         what,
     };
-    let length = std::fs::metadata(&path).map_err(read)?.len();
-    if length > MAX_LIST {
-        return Err(fail(format!(
-            "{length} bytes are more than {MAX_LIST}; split the list"
-        )));
-    }
-    let text = std::fs::read(&path).map_err(read)?;
+    let files = Opener::anywhere().within([dir]);
+    let text = files
+        .read(&path, MAX_LIST)
+        .map_err(|e| fail(format!("{e}; a longer list can be split")))?;
     let text = String::from_utf8(text).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
     let mut hash = Sha256::new_with_prefix(&text);
     let records = records(text.trim_start_matches('\u{feff}')).map_err(fail)?;
@@ -76,12 +71,11 @@ pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
     let columns = Columns::of(records.next()).map_err(fail)?;
     let mut rows = Vec::new();
     for record in records {
-        let row = columns.row(dir, &record).map_err(fail)?;
-        sample(&row.file, &mut hash).map_err(|e| {
+        let row = columns.row((dir, &files), &record).map_err(fail)?;
+        sample(&row, &mut hash).map_err(|e| {
             let line = record.line;
             fail(format!(
-                "line {line}, column path: {}: {e}",
-                row.file.display()
+                "line {line}, column path: {e}; keep models in the list's folder"
             ))
         })?;
         rows.push(row);
@@ -97,18 +91,19 @@ pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
 }
 
 /// Feeds a file's length, start and end to `hash`.
-fn sample(path: &Path, hash: &mut Sha256) -> std::io::Result<()> {
-    let mut file = File::open(path)?;
-    let about = file.metadata()?;
-    if !about.is_file() {
-        return Err(std::io::Error::other("is not a file"));
-    }
-    let length = about.len();
+fn sample(row: &Row, hash: &mut Sha256) -> Result<(), FileError> {
+    let mut file = row.files.open(&row.file)?;
+    let failed = |source| FileError::Io {
+        path: row.file.clone(),
+        source,
+    };
+    let length = file.metadata().map_err(failed)?.len();
     hash.update(length.to_le_bytes());
     for start in [0, length.saturating_sub(SAMPLE)] {
         let mut part = Vec::new();
-        file.seek(SeekFrom::Start(start))?;
-        file.by_ref().take(SAMPLE).read_to_end(&mut part)?;
+        file.seek(SeekFrom::Start(start)).map_err(failed)?;
+        let read = file.by_ref().take(SAMPLE).read_to_end(&mut part);
+        read.map_err(failed)?;
         hash.update(&part);
     }
     Ok(())
@@ -199,7 +194,7 @@ impl Columns {
         }
     }
 
-    fn row(&self, dir: &Path, record: &Record) -> Result<Row, String> {
+    fn row(&self, (dir, files): (&Path, &Opener), record: &Record) -> Result<Row, String> {
         let optional = |name: &str| {
             let k = self.0.iter().position(|c| c == name)?;
             record
@@ -243,7 +238,9 @@ impl Columns {
             Some(_) => return fail("elevation", "expected metres over the floor".into()),
         };
         Ok(Row {
-            file: dir.join(path),
+            file: Opener::named(dir, path)
+                .map_err(|e| format!("line {}, column path: {e}", record.line))?,
+            files: files.clone(),
             name: optional("name").unwrap_or(path).to_owned(),
             label: known,
             elevation,
@@ -279,7 +276,7 @@ pub(super) fn load(row: &Row) -> Option<(Mesh, bool)> {
 }
 
 fn parse(row: &Row) -> Result<(Mesh, bool), String> {
-    let (mut mesh, notes) = import::read_model(&row.file).map_err(|e| e.to_string())?;
+    let (mut mesh, notes) = import::read_model(&row.file, &row.files).map_err(|e| e.to_string())?;
     if mesh.triangles.len() > MAX_TRIANGLES {
         let count = mesh.triangles.len();
         return Err(format!("{count} triangles, more than {MAX_TRIANGLES}"));

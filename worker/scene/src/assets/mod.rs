@@ -111,7 +111,7 @@ impl AssetLibrary {
             return Err(SceneError::Assets {
                 name: SWEETHOME3D.into(),
                 looked: format!("no .sh3f file in {}", dir.display()),
-                mend: INSTALL,
+                hint: INSTALL,
             });
         }
         let (mut assets, mut hash, mut newest) = (Vec::new(), Sha256::new(), String::new());
@@ -161,6 +161,36 @@ impl AssetLibrary {
         Ok(Self::new(GLTF, fingerprint, assets.collect()))
     }
 
+    /// The libraries there are, by name.
+    pub const NAMES: [&str; 3] = ["sweethome3d", "parametric", "gltf"];
+    /// Those that `auto` chooses among, best first: a folder of somebody's own models is asked for by name.
+    const AUTO: [&str; 2] = ["sweethome3d", "parametric"];
+
+    /// The library that a job's `assets` names: a name, a fingerprint, or `auto` for the best installed. Files are looked
+    /// for as by [`Self::find`].
+    ///
+    /// # Errors
+    /// As [`Self::find`].
+    pub fn named(name: &str, dirs: &[PathBuf]) -> Result<Self, SceneError> {
+        if name == "auto" {
+            for name in Self::AUTO {
+                match Self::find(name, dirs) {
+                    Err(SceneError::Assets { .. }) => {}
+                    found => return found,
+                }
+            }
+        }
+        for known in Self::NAMES {
+            if name != known && name.starts_with(known) {
+                let library = Self::find(known, dirs)?;
+                if library.fingerprint() == name {
+                    return Ok(library);
+                }
+            }
+        }
+        Self::find(name, dirs)
+    }
+
     /// The library called `name` (`parametric`, `sweethome3d` or `gltf`). Files are looked for in each of `dirs`
     /// and its subfolder of the library's name; those of Sweet Home 3D also where Debian installs them.
     ///
@@ -191,7 +221,7 @@ impl AssetLibrary {
                     None => Err(SceneError::Assets {
                         name: name.into(),
                         looked: format!("no .sh3f file in {folders:?}"),
-                        mend: INSTALL,
+                        hint: INSTALL,
                     }),
                 }
             }
@@ -206,7 +236,7 @@ impl AssetLibrary {
                         Err(SceneError::Assets {
                             name: name.into(),
                             looked: format!("no {} in {folders:?}", folder::LIST),
-                            mend: folder::WRITE,
+                            hint: folder::WRITE,
                         })
                     },
                     |folder| Self::gltf(folder),

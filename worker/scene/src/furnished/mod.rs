@@ -116,7 +116,7 @@ impl FurnishedSettings {
             return Err(SceneError::Assets {
                 name: self.assets.clone(),
                 looked: format!("the library at hand is {:?}", assets.name()),
-                mend: "pass the library that the settings name",
+                hint: "pass the library that the settings name",
             });
         }
         let specular = if self.specular_at_least > 4 {

@@ -10,7 +10,7 @@ use gltf::{
 
 use crate::SceneError;
 
-use super::{format_error, read_file};
+use super::{Opener, format_error, of_file, read_file};
 
 /// Bytes of every buffer, by index.
 #[derive(Debug)]
@@ -22,18 +22,19 @@ impl Buffers {
         path: &Path,
         document: &Document,
         mut blob: Option<Vec<u8>>,
+        files: &Opener,
     ) -> Result<Self, SceneError> {
-        let base = path.parent();
         let read = |buffer: gltf::Buffer<'_>| {
             let at = format!("buffers[{}]", buffer.index());
             let source = buffer.source();
             if let Source::Uri(uri) = source
-                && let Some(file) = buffer_file(path, uri)
+                && let Some(file) = buffer_file(path, uri)?
             {
-                return read_file(&file).and_then(|data| checked(path, &at, data, buffer.length()));
+                return read_file(files, &file)
+                    .and_then(|data| checked(path, &at, data, buffer.length()));
             }
             let data =
-                gltf::buffer::Data::from_source_and_blob(source, base, &mut blob).map_err(|e| {
+                gltf::buffer::Data::from_source_and_blob(source, None, &mut blob).map_err(|e| {
                     format_error(
                         path,
                         format!("{at}: cannot be read ({e}); export the file again"),
@@ -129,9 +130,16 @@ fn checked(path: &Path, at: &str, data: Vec<u8>, length: usize) -> Result<Vec<u8
 }
 
 /// The file that a buffer's URI names beside the glTF file `path`; `None` for data within the URI.
-pub(super) fn buffer_file(path: &Path, uri: &str) -> Option<PathBuf> {
+///
+/// # Errors
+/// A name that is no plain path once it is decoded.
+pub(super) fn buffer_file(path: &Path, uri: &str) -> Result<Option<PathBuf>, SceneError> {
     let base = path.parent().unwrap_or(Path::new(""));
-    (!uri.starts_with("data:")).then(|| base.join(percent_decoded(uri)))
+    if uri.starts_with("data:") {
+        return Ok(None);
+    }
+    let named = Opener::named(base, &percent_decoded(uri));
+    named.map(Some).map_err(of_file)
 }
 
 /// File names in glTF are URIs: `%20` stands for a space.

@@ -9,7 +9,9 @@ mod mitsuba;
 mod ply;
 mod reference;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+use picofarm_files::{FileError, Opener};
 
 use crate::{Affine, Camera, LaserGrid, Scene, SceneError, Vec3};
 
@@ -27,12 +29,35 @@ pub struct ImportOptions {
     pub frame: bool,
 }
 
-/// Reads a scene with its own camera and laser; see [`read_scene_with`].
+/// Where a scene file may lie, and where the files that it names.
+#[derive(Debug, Clone, Default)]
+pub struct Bounds {
+    /// Opens the scene file, and what it names.
+    pub files: Opener,
+    /// The folder that also holds everything the scene file names; `None` = the scene file's own folder.
+    pub root: Option<PathBuf>,
+}
+
+impl Bounds {
+    /// What opens the files that the scene file at `path` names.
+    fn of_scene(&self, path: &Path) -> Opener {
+        let own = path.parent().unwrap_or(Path::new(""));
+        // The parent of a bare name is the current folder.
+        let own = if own.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            own
+        };
+        self.files.within([self.root.as_deref().unwrap_or(own)])
+    }
+}
+
+/// Reads a scene with its own camera and laser, and files from its own folder only; see [`read_scene_with`].
 ///
 /// # Errors
 /// As [`read_scene_with`].
 pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
-    read_scene_with(path, &ImportOptions::default())
+    read_scene_with(path, &ImportOptions::default(), &Bounds::default())
 }
 
 /// Reads a scene by its content: `glTF` magic or a JSON object with `asset` is glTF, `ply` a lone mesh, XML or a
@@ -52,21 +77,26 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 /// start with `import.`, or refused.
 ///
 /// # Errors
-/// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Format`]
-/// naming file and field otherwise.
-pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, SceneError> {
-    let bytes = read_file(path)?;
+/// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Refused`] for one outside
+/// `bounds`, [`SceneError::Format`] naming file and field otherwise. No error quotes a file that is none of these formats.
+pub fn read_scene_with(
+    path: &Path,
+    options: &ImportOptions,
+    bounds: &Bounds,
+) -> Result<Scene, SceneError> {
+    let bytes = read_file(&bounds.files, path)?;
+    let files = &bounds.of_scene(path);
     let mut scene = if bytes.starts_with(b"glTF") {
-        gltf_file::read(path, &bytes, options)?
+        gltf_file::read(path, &bytes, options, files)?
     } else if ply::is_ply(&bytes) {
         ply::read(path, &bytes, options)?
     } else if is_xml(&bytes) {
-        mitsuba::read_xml(path, &bytes, options)?
+        mitsuba::read_xml(path, &bytes, options, files)?
     } else {
         match sniff(path, &bytes)? {
-            Kind::Gltf => gltf_file::read(path, &bytes, options)?,
+            Kind::Gltf => gltf_file::read(path, &bytes, options, files)?,
             Kind::Reference => reference::parse(path, &bytes)?,
-            Kind::Mitsuba => mitsuba::read_dictionary(path, &bytes, options)?,
+            Kind::Mitsuba => mitsuba::read_dictionary(path, &bytes, options, files)?,
         }
     };
     if let Some(camera) = options.camera {
@@ -81,8 +111,9 @@ pub fn read_scene_with(path: &Path, options: &ImportOptions) -> Result<Scene, Sc
 /// One glTF file as one mesh in its own frame, with the notes on what was dropped; its numbers are unchecked.
 pub(crate) fn read_model(
     path: &Path,
+    files: &Opener,
 ) -> Result<(crate::Mesh, std::collections::BTreeMap<String, String>), SceneError> {
-    gltf_file::read_model(path, &read_file(path)?)
+    gltf_file::read_model(path, &read_file(files, path)?, files)
 }
 
 enum Kind {
@@ -127,18 +158,15 @@ fn sniff(path: &Path, bytes: &[u8]) -> Result<Kind, SceneError> {
 const MAX_FILE_BYTES: u64 = 8 << 30;
 
 /// A regular file's bytes: a path inside a scene file may name anything, devices too.
-fn read_file(path: &Path) -> Result<Vec<u8>, SceneError> {
-    let read = || {
-        let about = std::fs::metadata(path)?;
-        if !about.is_file() || about.len() > MAX_FILE_BYTES {
-            return Err(std::io::Error::other("not a file of at most 8 GiB"));
-        }
-        std::fs::read(path)
-    };
-    read().map_err(|source| SceneError::Read {
-        path: path.to_path_buf(),
-        source,
-    })
+fn read_file(files: &Opener, path: &Path) -> Result<Vec<u8>, SceneError> {
+    files.read(path, MAX_FILE_BYTES).map_err(of_file)
+}
+
+fn of_file(error: FileError) -> SceneError {
+    match error {
+        FileError::Io { path, source } => SceneError::Read { path, source },
+        refused => SceneError::Refused(refused),
+    }
 }
 
 fn format_error(path: &Path, what: impl Into<String>) -> SceneError {

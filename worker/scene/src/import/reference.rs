@@ -9,7 +9,7 @@ use crate::{
     Provenance, Scene, SceneError, Spot, Vec3,
 };
 
-use super::{format_error, read_file, validated};
+use super::{Opener, format_error, read_file, validated};
 
 /// Resolution given to a camera whose file states none; callers resize.
 const DEFAULT_PIXELS: u32 = 64;
@@ -69,13 +69,20 @@ struct FileBsdf {
 /// # Errors
 /// [`SceneError::Read`] or [`SceneError::Format`] naming file and field.
 pub fn read_reference_json(path: &Path) -> Result<Scene, SceneError> {
-    validated(path, parse(path, &read_file(path)?)?)
+    validated(path, parse(path, &read_file(&Opener::anywhere(), path)?)?)
 }
 
 pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Scene, SceneError> {
     let file: File = serde_json::from_slice(bytes)
         .map_err(|e| format_error(path, format!("is not a reference scene: {e}")))?;
     let c = &file.camera;
+    if !(0.001..=179.0).contains(&c.fov_x_deg) {
+        let what = format!(
+            "camera.fov_x_deg: {} lies outside 0.001..=179 degrees from left to right",
+            c.fov_x_deg
+        );
+        return Err(format_error(path, what));
+    }
     let camera = Camera {
         intrinsics: Intrinsics::from_fov(c.fov_x_deg, DEFAULT_PIXELS, DEFAULT_PIXELS),
         origin: c.origin,

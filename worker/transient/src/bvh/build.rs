@@ -1,7 +1,18 @@
 //! Building: a binary tree from `obvhs`, collapsed to eight children a node as [`Plan`] says.
 
-use obvhs::{BvhBuildParams, bvh2::builder::build_bvh2, triangle::Triangle};
+use std::{
+    sync::mpsc::{self, RecvTimeoutError},
+    time::Duration,
+};
+
+use obvhs::{
+    BvhBuildParams,
+    bvh2::{Bvh2, builder::build_bvh2},
+    triangle::Triangle,
+};
 use picofarm_scene::Vec3;
+
+use crate::api::{RenderError, Stop};
 
 use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, plan::Plan, simd};
 
@@ -17,7 +28,12 @@ const NO_NODE: Node = Node {
     child: [EMPTY; 8],
 };
 
-pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
+/// Triangles from which the binary tree is built on a thread of its own, which can be left to itself.
+const MANY: usize = 1 << 17;
+/// How often it is asked meanwhile whether to stop.
+const LOOK: Duration = Duration::from_millis(50);
+
+pub(super) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Bvh, RenderError> {
     let mut bvh = Bvh {
         nodes: vec![],
         packs: vec![],
@@ -32,7 +48,7 @@ pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
         .filter(|&i| normal(&triangles[i as usize]).is_some())
         .collect();
     if used.is_empty() {
-        return bvh;
+        return Ok(bvh);
     }
     let input: Vec<Triangle> = used
         .iter()
@@ -43,17 +59,20 @@ pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
             t
         })
         .collect();
-    let mut params = BvhBuildParams::medium_build();
-    params.pre_split = false;
-    params.max_prims_per_leaf = 1;
-    params.reinsertion_batch_ratio = 0.1;
-    params.post_collapse_reinsertion_batch_ratio_multiplier = 0.0;
-    let tree = build_bvh2(&input, params, &mut std::time::Duration::default());
+    let tree = match input.len() < MANY {
+        true => binary(&input),
+        false => apart(input, stop)?,
+    };
     let plan = Plan::new(&tree);
     bvh.nodes.push(NO_NODE);
     let mut open = vec![(0usize, 0usize, 1usize)];
     let (mut children, mut held) = (vec![], vec![]);
+    let mut steps = 0u32;
     while let Some((node, slot, depth)) = open.pop() {
+        steps += 1;
+        if steps.is_multiple_of(4096) {
+            stop.check()?;
+        }
         bvh.depth = bvh.depth.max(depth);
         plan.children(&tree, node, &mut children);
         let mut wide = NO_NODE;
@@ -78,7 +97,38 @@ pub(super) fn build(triangles: &[[Vec3; 3]]) -> Bvh {
         }
         bvh.nodes[slot] = wide;
     }
-    bvh
+    Ok(bvh)
+}
+
+fn binary(input: &[Triangle]) -> Bvh2 {
+    let mut params = BvhBuildParams::medium_build();
+    params.pre_split = false;
+    params.max_prims_per_leaf = 1;
+    params.reinsertion_batch_ratio = 0.1;
+    params.post_collapse_reinsertion_batch_ratio_multiplier = 0.0;
+    build_bvh2(input, params, &mut Duration::default())
+}
+
+/// The same tree, built on a thread of its own: the library's builder cannot be stopped, but it can be left alone. It then
+/// ends by itself, and its tree is dropped.
+fn apart(input: Vec<Triangle>, stop: Stop) -> Result<Bvh2, RenderError> {
+    let (done, tree) = mpsc::channel();
+    let builder = move || {
+        // Nobody waits for it any more where the render was stopped.
+        let _ = done.send(binary(&input));
+    };
+    let named = std::thread::Builder::new().name("bvh".into());
+    named.spawn(builder).map_err(|e| RenderError::Invalid {
+        field: "threads".into(),
+        what: format!("cannot start one to build a large scene's tree: {e}"),
+    })?;
+    loop {
+        match tree.recv_timeout(LOOK) {
+            Ok(tree) => return Ok(tree),
+            Err(RecvTimeoutError::Timeout) => stop.check()?,
+            Err(RecvTimeoutError::Disconnected) => panic!("the tree's builder broke"),
+        }
+    }
 }
 
 fn array(p: Vec3) -> [f32; 3] {

@@ -18,6 +18,8 @@ use picofarm_scene::Vec3;
 
 pub(crate) use build::normal;
 
+use crate::api::{RenderError, Stop, Unstopped};
+
 /// Bounds of eight children (min xyz, max xyz), and what they are.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy)]
@@ -87,7 +89,12 @@ pub struct Stack {
 impl Bvh {
     /// Builds the hierarchy; triangles without area or with vertices that are not finite are left out.
     pub fn build(triangles: &[[Vec3; 3]]) -> Self {
-        build::build(triangles)
+        build::build_unless(triangles, Stop(&Unstopped)).expect("nobody stops it")
+    }
+
+    /// The same, unless it is asked to stop.
+    pub(crate) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Self, RenderError> {
+        build::build_unless(triangles, stop)
     }
 
     /// The same tree traversed by another kernel; `None` where this machine lacks it.

@@ -29,6 +29,8 @@ pub struct Forecast {
     pub error: f32,
     /// Rays of the whole render.
     pub rays: u64,
+    /// What is wrong with scene or gate, as far as it is certain beforehand; empty if nothing.
+    pub warnings: Vec<String>,
 }
 
 /// Renders a few tiles with a few passes and scales up; `rays` are those of the ground truth.
@@ -43,6 +45,7 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
             passes: 0,
             error: relative_median(found.tiles.concat().into_iter()) as f32,
             rays: rays + (found.rays * all) as u64,
+            warnings: vec![],
         };
     }
     let (one, found) = (look(frame, 1), look(frame, PASSES));
@@ -72,6 +75,7 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
         passes,
         error: error as f32,
         rays: rays + (of_pixel * all) as u64,
+        warnings: vec![],
     }
 }
 

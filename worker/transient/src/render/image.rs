@@ -90,6 +90,11 @@ impl<'a> Watch<'a> {
         self.ask(1, 0.0)
     }
 
+    /// Whether anyone has heard that the render shall stop.
+    pub fn stopped(&self) -> bool {
+        self.stopped.load(Ordering::Relaxed)
+    }
+
     /// False to stop. Asked often, since a tile of many passes takes long.
     fn ask(&self, count: usize, share: f32) -> bool {
         let done = self.tiles.load(Ordering::Relaxed);
@@ -101,12 +106,40 @@ impl<'a> Watch<'a> {
     }
 }
 
+/// Whether so many values find room, all at once.
+///
+/// # Errors
+/// [`RenderError::Memory`].
+pub(super) fn room<T>(count: usize, what: &str) -> Result<(), RenderError> {
+    let mut all = Vec::<T>::new();
+    all.try_reserve_exact(count)
+        .map_err(|_| RenderError::Memory {
+            what: what.to_owned(),
+            gib: count as f64 * size_of::<T>() as f64 / (1u64 << 30) as f64,
+        })
+}
+
+/// So many zeros. Pages that nobody writes to take no memory, which is why they are not written here.
+///
+/// # Errors
+/// [`RenderError::Memory`].
+pub(super) fn zeros(count: usize, what: &str) -> Result<Vec<f32>, RenderError> {
+    room::<f32>(count, what)?;
+    Ok(vec![0.0; count])
+}
+
 impl Image {
-    pub fn new(frame: &Frame) -> Self {
+    /// An image that nothing was found in yet.
+    ///
+    /// # Errors
+    /// [`RenderError::Memory`].
+    pub fn new(frame: &Frame) -> Result<Self, RenderError> {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
-        let empty = || vec![0.0f32; pixels * bins];
+        let all = frame.film.channels + if frame.split { 5 } else { 0 };
+        room::<f32>(pixels * bins * all, "the histograms of the image")?;
+        let empty = || zeros(pixels * bins, "the histograms of the image");
         let side = if pixels >= LARGE && frame.film.channels < MANY {
             LARGE_TILE
         } else {
@@ -123,16 +156,21 @@ impl Image {
                 })
             })
             .collect();
-        Self {
-            transient: empty(),
-            split: frame.split.then(|| Parts {
-                two: empty(),
-                two_se: empty(),
-                multi: empty(),
-                multi_se: empty(),
-                multi_noise: empty(),
+        let split = match frame.split {
+            true => Some(Parts {
+                two: empty()?,
+                two_se: empty()?,
+                multi: empty()?,
+                multi_se: empty()?,
+                multi_noise: empty()?,
             }),
-            groups: (1..frame.film.channels).map(|_| empty()).collect(),
+            false => None,
+        };
+        let groups: Result<_, RenderError> = (1..frame.film.channels).map(|_| empty()).collect();
+        Ok(Self {
+            transient: empty()?,
+            split,
+            groups: groups?,
             stats: vec![Stat::default(); pixels],
             total_variance: 0.0,
             overflow: 0.0,
@@ -142,7 +180,7 @@ impl Image {
             tiles,
             width: width as usize,
             bins,
-        }
+        })
     }
 
     /// How many tiles there are.

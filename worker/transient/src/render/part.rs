@@ -17,7 +17,7 @@ use super::{
     ready::{Ready, prepare},
     splat::Splats,
 };
-use crate::api::{Budget, Progress, RenderError, Rendered, Settings};
+use crate::api::{Budget, Progress, RenderError, Rendered, Settings, Stop};
 
 /// Most ranges of tiles.
 const MAX_RANGES: u32 = 4096;
@@ -136,18 +136,18 @@ pub fn render_part(
         );
         return Err(wrong("part", what));
     }
-    prepare(scene, settings, |ready| {
+    prepare(scene, settings, Stop(progress), |ready| {
         let frame = &ready.frame;
         let shape = Shape::of(ready);
         let watch = Watch::new(progress, 0.0, 1.0);
         let (found, rays) = if index < of {
-            let mut image = Image::new(frame);
+            let mut image = Image::new(frame)?;
             let range = which.range(image.tiles());
             let waves = vec![shape.passes; image.tiles()];
             let rays = image.round(frame, range.clone(), &waves, &watch)?;
             (Found::Tiles(image.take(range)), rays)
         } else if let Some(caustics) = frame.walk.caustics {
-            let mut splats = Splats::new(frame);
+            let mut splats = Splats::new(frame)?;
             let rays = splats.round((frame, caustics), shape.passes, &watch)?;
             (Found::Paths(Some(splats)), rays)
         } else {
@@ -175,14 +175,11 @@ pub fn join_parts(
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
     divisible(settings)?;
-    prepare(scene, settings, |ready| {
-        if !progress.at(0.0) {
-            return Err(RenderError::Stopped);
-        }
-        let seen = ready.seen();
-        let frame = &ready.frame;
+    prepare(scene, settings, Stop(progress), |ready| {
+        let (frame, stop) = (&ready.frame, Stop(progress));
+        let mut image = Image::new(frame)?;
+        let seen = ready.seen(stop)?;
         let shape = Shape::of(ready);
-        let mut image = Image::new(frame);
         let (mut splats, mut rays) = (None, 0);
         let mut there: Vec<bool> = vec![];
         for part in parts {
@@ -229,9 +226,9 @@ pub fn join_parts(
         image.total();
         let error = match &splats {
             None => estimate(&image.stats, image.total_variance, image.mean_passes()),
-            Some(splats) => splats.estimate(frame, &image),
+            Some(splats) => splats.estimate(frame, &image, stop)?,
         };
         let plan = ready.plan(shape.passes);
-        Ok(ready.finish((image, splats), seen, (error, rays), plan))
+        ready.finish((image, splats), seen, (error, rays), (plan, stop))
     })
 }

@@ -3,27 +3,31 @@
 
 use picofarm_scene::{Scene, Spot};
 
-use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame};
+use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
 use crate::{
     api::{
         Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
+        Stop,
     },
     caustic::Caustics,
     ellipsoid::{self, Patches, Window},
     emitter::{Emitters, find_spots},
     film::Film,
-    lobe::Mirrors,
-    one, photo,
+    mirror_images::Mirrors,
+    one_bounce,
+    path_reuse::Effort,
+    photo,
     plan::plan as decide,
-    share::Effort,
     truth::{self, Centres},
-    two::Sampling,
+    two_bounce::Sampling,
     walk::Walk,
     world::World,
 };
 
 /// Side in pixels of the tiles that share vertices.
-const SHARE: u32 = 8;
+const REUSE: u32 = 8;
+/// Rows from which the rays of the ground truth are forecast.
+const ROWS: usize = 128;
 
 /// A scene that is ready to be traced.
 pub(super) struct Ready<'a> {
@@ -38,20 +42,22 @@ pub(super) struct Ready<'a> {
 pub(super) fn prepare<R>(
     scene: &Scene,
     settings: &Settings,
+    stop: Stop,
     then: impl FnOnce(&Ready) -> Result<R, RenderError>,
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let world = World::new(scene)?;
+    let world = World::new(scene, stop)?;
     let spots = find_spots(&world, &scene.laser.beams);
     let emitters = Emitters::new(scene, &world, &spots)?;
-    let mirrors = if settings.strategy.image_lobes.unwrap_or(true) {
-        Mirrors::find(&world, &emitters)
+    let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {
+        Mirrors::find(&world, &emitters, stop)
     } else {
         Mirrors::default()
     };
-    let centres = truth::centres(&world);
-    let sampling = Sampling::plan(&world, &emitters, &centres);
+    let centres = truth::centres(&world, stop)?;
+    let sampling = Sampling::plan(&world, &emitters, &centres, stop);
+    stop.check()?;
     let of_spot = groups_of(settings, &emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
@@ -59,6 +65,7 @@ pub(super) fn prepare<R>(
         .ellipsoidal
         .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world));
     let patches = narrow.then(|| Patches::new(&world, &emitters));
+    stop.check()?;
     let mut walk = Walk {
         world: &world,
         emitters: &emitters,
@@ -76,15 +83,16 @@ pub(super) fn prepare<R>(
     };
     let caustics = match strategy.caustics {
         Some(false) => None,
-        wanted => Caustics::find(&world, &emitters)
+        wanted => Caustics::find(&world, &emitters, stop)
             .filter(|c| walk.max_bounces >= 3 && (wanted.is_some() || c.pay(&walk, settings.seed))),
     };
+    stop.check()?;
     walk.caustics = caustics.as_ref();
     let frame = Frame {
         walk,
         film: &film,
         sampling: &sampling,
-        effort: Effort::new(strategy.share.unwrap_or(SHARE), narrow),
+        effort: Effort::new(strategy.path_reuse.unwrap_or(REUSE), narrow),
         seed: settings.seed,
         width: scene.camera.intrinsics.width,
         height: scene.camera.intrinsics.height,
@@ -121,28 +129,69 @@ impl Ready<'_> {
     }
 
     /// The ground truth, and the rays it took.
-    pub fn seen(&self) -> (GroundTruth, u64) {
+    ///
+    /// # Errors
+    /// [`RenderError::Stopped`].
+    pub fn seen(&self, stop: Stop) -> Result<(GroundTruth, u64), RenderError> {
         let walk = &self.frame.walk;
-        let beams = self.spots.len();
-        let (mut truth, rays) =
-            truth::ground_truth(self.scene, walk.world, walk.emitters, self.centres, beams);
-        let (rgb, photo_rays) = photo::photo(walk.world, self.settings.seed);
+        let (beams, of) = (self.spots.len(), (walk.world, walk.emitters));
+        let (mut truth, rays) = truth::ground_truth(self.scene, of, self.centres, beams, stop)?;
+        let (rgb, photo_rays) = photo::photo(walk.world, self.settings.seed, stop)?;
         truth.rgb = rgb;
-        (truth, self.centres.rays + rays + photo_rays)
+        Ok((truth, self.centres.rays + rays + photo_rays))
+    }
+
+    /// About how many rays the ground truth takes, from some rows of a large image.
+    pub fn seen_rays(&self) -> u64 {
+        let walk = &self.frame.walk;
+        let step = (self.frame.height as usize / ROWS).max(1);
+        let truth = truth::rays(walk.world, walk.emitters, self.centres, step);
+        self.centres.rays + truth + photo::rays(walk.world, self.settings.seed, step)
+    }
+
+    /// What is wrong with scene or gate, as far as it is certain before rendering.
+    pub fn foreseen(&self) -> Vec<String> {
+        let walk = &self.frame.walk;
+        let mut warnings = warn::beams(self.spots);
+        let any = warn::arrivals(walk.world, walk.emitters, self.centres, |_, _| true);
+        if any.is_none() && !walk.emitters.list.is_empty() {
+            warnings.push("the camera sees no surface".into());
+        }
+        warnings.extend(warn::before_light(&self.settings.gate, any));
+        warnings
+    }
+
+    /// The same of a finished image, whose light is known.
+    fn warnings(&self, truth: &GroundTruth, inside: f64, outside: f64) -> Vec<String> {
+        let mut warnings = warn::beams(self.spots);
+        if inside > 0.0 {
+            return warnings;
+        }
+        let walk = &self.frame.walk;
+        let pixels = self.centres.hits.len();
+        let seen = |beam: usize, pixel: usize| truth.visibility[beam * pixels + pixel] != 0;
+        let lit = warn::arrivals(walk.world, walk.emitters, self.centres, seen);
+        let any = warn::arrivals(walk.world, walk.emitters, self.centres, |_, _| true);
+        let gate = &self.settings.gate;
+        warnings.push(warn::empty(gate, self.spots, (lit, any), outside > 0.0));
+        warnings
     }
 
     /// The result: the image with what was drawn into it and with the one-bounce peaks.
+    ///
+    /// # Errors
+    /// [`RenderError::Stopped`].
     pub fn finish(
         &self,
         (mut image, splats): (Image, Option<Splats>),
         (truth, seen): (GroundTruth, u64),
         (error, mut rays): (ErrorEstimate, u64),
-        plan: Plan,
-    ) -> Rendered {
+        (plan, stop): (Plan, Stop),
+    ) -> Result<Rendered, RenderError> {
         let (frame, settings) = (&self.frame, self.settings);
         let (walk, film) = (&frame.walk, frame.film);
         if let Some(splats) = &splats {
-            splats.join(frame, &mut image);
+            splats.join(frame, &mut image, stop)?;
         }
         let mut overflow = Overflow {
             energy: image.overflow,
@@ -150,14 +199,14 @@ impl Ready<'_> {
         };
         if settings.one_bounce && walk.max_bounces >= 1 {
             let mut stack = walk.world.bvh.stack();
-            let peaks = one::peaks(walk.world, &mut stack, walk.emitters);
+            let peaks = one_bounce::peaks(walk.world, &mut stack, walk.emitters);
             for peak in &peaks {
-                if !one::add(peak, &settings.gate, &mut image.transient) {
+                if !one_bounce::add(peak, &settings.gate, &mut image.transient) {
                     overflow.energy += f64::from(peak.value);
                 }
                 for &channel in &film.of_spot[peak.spot] {
                     let group = &mut image.groups[usize::from(channel) - 1];
-                    one::add(peak, &settings.gate, group);
+                    one_bounce::add(peak, &settings.gate, group);
                 }
             }
             rays += stack.rays;
@@ -168,7 +217,9 @@ impl Ready<'_> {
         } else {
             0.0
         };
-        Rendered {
+        let warnings = self.warnings(&truth, inside, overflow.energy);
+        Ok(Rendered {
+            warnings,
             width: frame.width,
             height: frame.height,
             gate: settings.gate,
@@ -187,7 +238,7 @@ impl Ready<'_> {
             error,
             plan,
             rays: rays + seen,
-        }
+        })
     }
 }
 
@@ -241,11 +292,11 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
     }
     if settings
         .strategy
-        .share
+        .path_reuse
         .is_some_and(|s| !(1..=16).contains(&s))
     {
         return bad(
-            "strategy.share",
+            "strategy.path_reuse",
             "expected a tile of 1 to 16 pixels a side".into(),
         );
     }

@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     error::{MULTI_REACH, Stat, estimate, pool},
-    image::{Image, Watch},
+    image::{Image, Watch, zeros},
     tile::{Frame, Region},
 };
 use crate::{
-    api::{ErrorEstimate, RenderError},
+    api::{ErrorEstimate, RenderError, Stop},
     caustic::{Caustics, Splat, splat},
     rng::{Rng, Stream},
 };
@@ -35,15 +35,16 @@ pub(super) struct Splats {
 }
 
 impl Splats {
-    pub fn new(frame: &Frame) -> Self {
+    pub fn new(frame: &Frame) -> Result<Self, RenderError> {
         let [sum, square, alternating] = Self::lengths(frame);
-        Self {
-            sum: vec![0.0; sum],
-            square: vec![0.0; square],
-            alternating: vec![0.0; alternating],
+        let zeros = |count| zeros(count, "the sums over light paths");
+        Ok(Self {
+            sum: zeros(sum)?,
+            square: zeros(square)?,
+            alternating: zeros(alternating)?,
             all: (0.0, 0.0),
             passes: 0,
-        }
+        })
     }
 
     /// Of the three sums.
@@ -77,6 +78,9 @@ impl Splats {
                 .map_init(
                     || walk.world.bvh.stack(),
                     |stack, chunk| {
+                        if !watch.go_on() {
+                            return (vec![], 0);
+                        }
                         let before = stack.rays;
                         let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
                         let paths = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
@@ -88,6 +92,9 @@ impl Splats {
                     },
                 )
                 .collect();
+            if watch.stopped() {
+                return Err(RenderError::Stopped);
+            }
             rays += found.iter().map(|f| f.1).sum::<u64>();
             let mut all: Vec<Splat> = found.into_iter().flat_map(|f| f.0).collect();
             self.add(frame, &mut all);
@@ -132,7 +139,12 @@ impl Splats {
     }
 
     /// Mean, its variance, and a draw of its error, by pixel and bin, in metres; pooled as the tiles are.
-    fn each(&self, frame: &Frame, mut each: impl FnMut(usize, usize, [f64; 3])) {
+    fn each(
+        &self,
+        frame: &Frame,
+        stop: Stop,
+        mut each: impl FnMut(usize, usize, [f64; 3]),
+    ) -> Result<(), RenderError> {
         let slots = frame.film.slots;
         let n = f64::from(self.passes.max(1));
         let unit = unit(frame);
@@ -142,6 +154,7 @@ impl Splats {
         let rows = 16;
         let mut variance = vec![];
         for row in (0..frame.height).step_by(rows) {
+            stop.check()?;
             let region = Region {
                 row,
                 col: 0,
@@ -173,6 +186,7 @@ impl Splats {
                 }
             }
         }
+        Ok(())
     }
 
     /// Variance of the whole image's energy.
@@ -184,24 +198,29 @@ impl Splats {
     }
 
     /// The error of the image with these passes.
-    pub fn estimate(&self, frame: &Frame, image: &Image) -> ErrorEstimate {
+    pub fn estimate(
+        &self,
+        frame: &Frame,
+        image: &Image,
+        stop: Stop,
+    ) -> Result<ErrorEstimate, RenderError> {
         let bins = frame.film.gate.bins as usize;
         let mut stats: Vec<Stat> = image.stats.clone();
-        self.each(frame, |pixel, bin, [mean, variance, _]| {
+        self.each(frame, stop, |pixel, bin, [mean, variance, _]| {
             let (stat, h) = (&mut stats[pixel], image.transient[pixel * bins + bin]);
             stat.norm2 += mean * (mean + 2.0 * f64::from(h));
             stat.total += mean;
             stat.multi_variance += variance;
-        });
+        })?;
         let variance = image.total_variance + self.total_variance(frame);
-        estimate(&stats, variance, image.mean_passes())
+        Ok(estimate(&stats, variance, image.mean_passes()))
     }
 
     /// Adds these passes to the finished image.
-    pub fn join(&self, frame: &Frame, image: &mut Image) {
+    pub fn join(&self, frame: &Frame, image: &mut Image, stop: Stop) -> Result<(), RenderError> {
         let film = frame.film;
         let bins = film.gate.bins as usize;
-        self.each(frame, |pixel, bin, [mean, variance, noise]| {
+        self.each(frame, stop, |pixel, bin, [mean, variance, noise]| {
             let at = pixel * bins + bin;
             image.transient[at] += mean as f32;
             if let Some(s) = &mut image.split {
@@ -210,10 +229,13 @@ impl Splats {
                 s.multi_se[at] = (old * old + variance).sqrt() as f32;
                 s.multi_noise[at] += noise as f32;
             }
-        });
+        })?;
         let (size, slots) = (film.pixel(), film.slots);
         let factor = unit(frame) / f64::from(self.passes.max(1));
         for (pixel, sums) in self.sum.chunks(size).enumerate() {
+            if pixel % 1024 == 0 {
+                stop.check()?;
+            }
             for (group, sums) in image.groups.iter_mut().zip(sums.chunks(slots).skip(1)) {
                 let out = &mut group[pixel * bins..(pixel + 1) * bins];
                 for (out, &x) in out.iter_mut().zip(&sums[1..slots - 1]) {
@@ -223,6 +245,7 @@ impl Splats {
             let outside = f64::from(sums[0]) + f64::from(sums[slots - 1]);
             image.overflow += outside * factor;
         }
+        Ok(())
     }
 }
 

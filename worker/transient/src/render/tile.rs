@@ -5,9 +5,9 @@ use super::error::{MULTI_REACH, TWO_REACH, pool, shut_out};
 use crate::{
     api::Overflow,
     film::{Blocks, Film},
+    path_reuse::{Effort, Sharing, Tile},
     rng::{Rng, Stream},
-    share::{Effort, Sharing, Tile},
-    two::{Sampling, Strata},
+    two_bounce::{Sampling, Strata},
     walk::{Scratch, Walk},
 };
 

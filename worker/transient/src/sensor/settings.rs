@@ -162,7 +162,7 @@ pub enum SensorError {
     Invalid {
         /// The field, e.g. `sensor.pulse.fwhm_ps` or `transient`.
         field: String,
-        /// What was expected, what was found and how to mend it.
+        /// What was expected, what was found and how to correct it.
         what: String,
     },
 }

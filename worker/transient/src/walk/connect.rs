@@ -4,7 +4,7 @@ use std::f32::consts::PI;
 
 use super::{ALL, Lights, Scratch, Sink, Step, Vertex, Walk};
 use crate::{
-    pool,
+    light_vertices,
     rng::Rng,
     world::{Hit, lift},
 };
@@ -91,7 +91,7 @@ impl Walk<'_> {
         if h.surface.diffuse() {
             // Both Lambertian: weight = strength · f · cos cos / d², and the light vertex' density is
             // share(cos / π) · cos / d².
-            let light = pool::share(self.emitters, 1.0 / (PI * h.surface.strength));
+            let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.strength));
             for (w, &s) in weights.iter_mut().zip(strength) {
                 let weighed = *w * plain / (plain + light * *w / s);
                 *w = if s > 0.0 { weighed } else { *w };
@@ -104,7 +104,7 @@ impl Walk<'_> {
                 let d2 = to.dot(to);
                 let dir = to / d2.sqrt();
                 let pdf = e.surface.pdf(e.n, e.back, dir);
-                let light = pool::share(self.emitters, pdf) * h.n.dot(dir).abs() / d2;
+                let light = light_vertices::share(self.emitters, pdf) * h.n.dot(dir).abs() / d2;
                 *w *= plain / (plain + light);
             }
         }
@@ -188,35 +188,35 @@ impl Walk<'_> {
         let Scratch {
             stack,
             lights,
-            pool,
+            vertices,
             caustics,
             ..
         } = scratch;
-        let pool = match which {
+        let vertices = match which {
             Lights::Beyond => caustics,
-            _ => pool,
+            _ => vertices,
         };
         let wanted = match which {
             Lights::All => self.lights,
-            Lights::Glossy => self.lights && pool.has_gloss(),
-            Lights::Beyond => self.caustics.is_some() && !pool.list.is_empty(),
+            Lights::Glossy => self.lights && vertices.has_gloss(),
+            Lights::Beyond => self.caustics.is_some() && !vertices.list.is_empty(),
         };
         if !wanted {
             return;
         }
         if which == Lights::Glossy {
-            pool.glossy_weights(h, v.wo, lights);
+            vertices.glossy_weights(h, v.wo, lights);
         } else {
-            pool.weights(h, v.wo, lights);
+            vertices.weights(h, v.wo, lights);
         }
         if let Some(window) = &self.window {
-            for (w, y) in lights.iter_mut().zip(&pool.list) {
+            for (w, y) in lights.iter_mut().zip(&vertices.list) {
                 let path = v.length_m + self.world.metres((y.hit.p - h.p).length()) + y.path_m;
                 *w = if window.holds(path) { *w } else { 0.0 };
             }
         }
         draw(lights, count, rng.uniform(), |i, value| {
-            let y = &pool.list[i];
+            let y = &vertices.list[i];
             let (there, bounces) = (&y.hit, v.bounce + y.bounces);
             if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
                 let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;

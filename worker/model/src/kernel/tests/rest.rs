@@ -62,7 +62,7 @@ proptest! {
 
     #[test]
     fn adamw_follows_its_formula(len in 1usize..100, step in 1u32..2000, seed in 0u64..1000) {
-        let a = AdamW { rate: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, decay: 1e-2, step };
+        let a = AdamW { learning_rate: 1e-2, beta1: 0.9, beta2: 0.999, eps: 1e-8, decay: 1e-2, step };
         let (p, g, m) = (noise(len, seed), noise(len, seed + 1), noise(len, seed + 2));
         let v: Vec<f32> = noise(len, seed + 3).iter().map(|x| x * x + 0.01).collect();
         let got = same_bits(|k| {
@@ -77,7 +77,7 @@ proptest! {
             let v = a.beta2 * v + (1.0 - a.beta2) * g * g;
             let fix = |b: f64| 1.0 - b.powi(step as i32);
             let below = (v / fix(a.beta2)).sqrt() + a.eps;
-            want[0].push(p * (1.0 - a.rate * a.decay) - a.rate * (m / fix(a.beta1)) / below);
+            want[0].push(p * (1.0 - a.learning_rate * a.decay) - a.learning_rate * (m / fix(a.beta1)) / below);
             want[1].push(m);
             want[2].push(v);
         }

@@ -273,13 +273,13 @@ impl Walk<'_> {
             format_error(path, format!("{at}: {what}"))
         };
         let external = match image.source() {
-            Source::Uri { uri, .. } => buffer_file(path, uri),
+            Source::Uri { uri, .. } => buffer_file(path, uri)?,
             Source::View { .. } => None,
         };
         let held;
         let bytes: &[u8] = match (&external, image.source()) {
             (Some(file), _) => {
-                held = read_file(file)?;
+                held = read_file(self.files, file)?;
                 &held
             }
             (None, Source::View { view, .. }) => buffers.view(&view).map_err(fail)?,

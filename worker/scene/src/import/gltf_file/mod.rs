@@ -16,7 +16,7 @@ use crate::{
 
 use parts::laser_of;
 
-use super::{ImportOptions, buffers::Buffers, compose, format_error, image::Images};
+use super::{ImportOptions, Opener, buffers::Buffers, compose, format_error, image::Images};
 
 /// Deepest nesting of nodes.
 const MAX_DEPTH: usize = 1000;
@@ -28,8 +28,9 @@ pub(super) fn read(
     path: &Path,
     bytes: &[u8],
     options: &ImportOptions,
+    files: &Opener,
 ) -> Result<Scene, SceneError> {
-    let (document, buffers) = open(path, bytes)?;
+    let (document, buffers) = open(path, bytes, files)?;
     let root = root(path, &document)?;
     let ours: Option<SceneExtras> = keyed(
         path,
@@ -48,7 +49,7 @@ pub(super) fn read(
         ));
     }
     let labels = ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone());
-    let walk = Walk::over(path, &document, &buffers, labels)?;
+    let walk = Walk::over((path, files), &document, &buffers, labels)?;
     walk.finish(&root, ours, options)
 }
 
@@ -57,9 +58,10 @@ pub(super) fn read(
 pub(super) fn read_model(
     path: &Path,
     bytes: &[u8],
+    files: &Opener,
 ) -> Result<(Mesh, BTreeMap<String, String>), SceneError> {
-    let (document, buffers) = open(path, bytes)?;
-    let walk = Walk::over(path, &document, &buffers, Vec::new())?;
+    let (document, buffers) = open(path, bytes, files)?;
+    let walk = Walk::over((path, files), &document, &buffers, Vec::new())?;
     let mut all = Mesh {
         name: path
             .file_stem()
@@ -90,7 +92,11 @@ pub(super) fn read_model(
     Ok((all, walk.notes))
 }
 
-fn open(path: &Path, bytes: &[u8]) -> Result<(gltf::Document, Buffers), SceneError> {
+fn open(
+    path: &Path,
+    bytes: &[u8],
+    files: &Opener,
+) -> Result<(gltf::Document, Buffers), SceneError> {
     let fail = |e: gltf::Error| {
         let what = format!("is not readable glTF 2.0 ({e}); copy or export it again");
         format_error(path, what)
@@ -99,7 +105,7 @@ fn open(path: &Path, bytes: &[u8]) -> Result<(gltf::Document, Buffers), SceneErr
     let json = document.into_json();
     unguarded(&json).map_err(|what| format_error(path, what))?;
     let document = gltf::Document::from_json(json).map_err(fail)?;
-    let buffers = Buffers::read(path, &document, blob)?;
+    let buffers = Buffers::read(path, &document, blob, files)?;
     Ok((document, buffers))
 }
 
@@ -182,6 +188,7 @@ fn keyed<T: DeserializeOwned>(
 
 struct Walk<'a> {
     path: &'a Path,
+    files: &'a Opener,
     buffers: &'a Buffers,
     images: Images<(usize, Wrap)>,
     /// Vertices and corners read so far.
@@ -197,7 +204,7 @@ struct Walk<'a> {
 impl<'a> Walk<'a> {
     /// Everything that the document's scene places.
     fn over(
-        path: &'a Path,
+        (path, files): (&'a Path, &'a Opener),
         document: &gltf::Document,
         buffers: &'a Buffers,
         labels: Vec<String>,
@@ -206,6 +213,7 @@ impl<'a> Walk<'a> {
         is_a_forest(path, document, &root)?;
         let mut walk = Walk {
             path,
+            files,
             buffers,
             images: Images::default(),
             corners: 0,

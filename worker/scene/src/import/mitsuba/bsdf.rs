@@ -98,7 +98,7 @@ impl Reader<'_> {
         let texture = match texture {
             None => None,
             Some(t) => {
-                let file = self.folder.join(&t.file);
+                let file = self.named(node, &t.file)?;
                 Some(self.image(node, &file, &t.name, t.wrap, false)?)
             }
         };
@@ -326,7 +326,7 @@ impl Reader<'_> {
         if node.text("filter_type")? == Some("nearest") {
             self.note("textures.filter", "nearest; bilinear used");
         }
-        let file = self.folder.join(filename);
+        let file = self.named(node, filename)?;
         let stem = file.file_stem().unwrap_or_default().to_string_lossy();
         let raw = node.switch("raw")?.unwrap_or(false);
         let texture = self.image(node, &file, &stem, wrap, raw)?;
@@ -341,8 +341,9 @@ impl Reader<'_> {
         wrap: Wrap,
         raw: bool,
     ) -> Result<Arc<Texture>, String> {
+        let files = self.files;
         let decode = || {
-            let bytes = read_file(file).map_err(|e| e.to_string())?;
+            let bytes = read_file(files, file).map_err(|e| e.to_string())?;
             let texture = image::decode(name, &bytes, wrap)?;
             if !raw {
                 return Ok(texture);

@@ -39,7 +39,7 @@ use crate::{
     export::mitsuba::text::Extras,
 };
 
-use super::{ImportOptions, format_error, image::Images};
+use super::{ImportOptions, Opener, format_error, image::Images, of_file};
 use bsdf::Look;
 use node::{Child, Node};
 use shape::Geometry;
@@ -55,6 +55,7 @@ pub(super) fn read_xml(
     path: &Path,
     bytes: &[u8],
     options: &ImportOptions,
+    files: &Opener,
 ) -> Result<Scene, SceneError> {
     let fail = |what: String| format_error(path, what);
     let text = std::str::from_utf8(bytes).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
@@ -63,7 +64,9 @@ pub(super) fn read_xml(
         .map(|text| serde_json::from_str::<Extras>(&text))
         .transpose()
         .map_err(|e| fail(format!("comment picofarm: {e}; remove it, or export again")))?;
-    Reader::new(path, root, extras).scene(options).map_err(fail)
+    Reader::new((path, files), root, extras)
+        .scene(options)
+        .map_err(fail)
 }
 
 /// Reads a scene from its dictionary in JSON; the caller validates the result.
@@ -71,14 +74,20 @@ pub(super) fn read_dictionary(
     path: &Path,
     bytes: &[u8],
     options: &ImportOptions,
+    files: &Opener,
 ) -> Result<Scene, SceneError> {
     let fail = |what: String| format_error(path, what);
     let root = dictionary::parse(bytes).map_err(fail)?;
-    Reader::new(path, root, None).scene(options).map_err(fail)
+    Reader::new((path, files), root, None)
+        .scene(options)
+        .map_err(fail)
 }
 
 /// The files that a scene in XML or JSON refers to, in order of their names.
-pub(super) fn files(path: &Path, bytes: &[u8]) -> Vec<PathBuf> {
+///
+/// # Errors
+/// A name that is no plain path.
+pub(super) fn files(path: &Path, bytes: &[u8]) -> Result<Vec<PathBuf>, SceneError> {
     let root = match std::str::from_utf8(bytes) {
         Ok(text) if text.trim_start().starts_with('{') => dictionary::parse(bytes).ok(),
         Ok(text) => xml::parse(text.trim_start_matches('\u{feff}'))
@@ -90,7 +99,7 @@ pub(super) fn files(path: &Path, bytes: &[u8]) -> Vec<PathBuf> {
     let mut open: Vec<Rc<Node>> = root.map(Rc::new).into_iter().collect();
     while let Some(node) = open.pop() {
         if let Ok(Some(name)) = node.text("filename") {
-            names.push(folder(path).join(name));
+            names.push(Opener::named(folder(path), name).map_err(of_file)?);
         }
         for (_, child) in &node.children {
             if let Child::Node(child) = child {
@@ -100,7 +109,7 @@ pub(super) fn files(path: &Path, bytes: &[u8]) -> Vec<PathBuf> {
     }
     names.sort();
     names.dedup();
-    names
+    Ok(names)
 }
 
 fn folder(path: &Path) -> &Path {
@@ -109,7 +118,7 @@ fn folder(path: &Path) -> &Path {
 
 struct Reader<'a> {
     path: &'a Path,
-    folder: &'a Path,
+    files: &'a Opener,
     root: Rc<Node>,
     ids: BTreeMap<String, Rc<Node>>,
     extras: Option<Extras>,
@@ -121,7 +130,7 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn new(path: &'a Path, root: Node, extras: Option<Extras>) -> Self {
+    fn new((path, files): (&'a Path, &'a Opener), root: Node, extras: Option<Extras>) -> Self {
         let root = Rc::new(root);
         let mut ids = BTreeMap::new();
         let mut open = vec![root.clone()];
@@ -137,7 +146,7 @@ impl<'a> Reader<'a> {
         }
         Self {
             path,
-            folder: folder(path),
+            files,
             root,
             ids,
             extras,
@@ -146,6 +155,11 @@ impl<'a> Reader<'a> {
             geometries: BTreeMap::new(),
             notes: BTreeMap::new(),
         }
+    }
+
+    /// The file that an element names.
+    fn named(&self, node: &Node, name: &str) -> Result<PathBuf, String> {
+        Opener::named(folder(self.path), name).map_err(|e| node.fail(e))
     }
 
     fn note(&mut self, key: &str, what: impl Into<String>) {

@@ -124,14 +124,14 @@ impl Reader<'_> {
         let filename = node
             .text("filename")?
             .ok_or_else(|| node.fail("needs a filename"))?;
-        let path = self.folder.join(filename);
+        let path = self.named(node, filename)?;
         // OBJ counts v upwards, PLY as we do.
         let obj = node.kind == "obj";
         let flip = node.switch("flip_tex_coords")?.unwrap_or(obj);
         let mut geometry = match self.geometries.get(&path) {
             Some(known) => known.clone(),
             None => {
-                let bytes = read_file(&path).map_err(|e| node.fail(e))?;
+                let bytes = read_file(self.files, &path).map_err(|e| node.fail(e))?;
                 let read = if obj {
                     read_obj(&bytes)
                 } else {

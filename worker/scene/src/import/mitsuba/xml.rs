@@ -37,13 +37,17 @@ pub(super) fn parse(text: &str) -> Result<(Node, Option<String>), String> {
         ..ParsingOptions::default()
     };
     let document = Document::parse_with_options(text, options)
-        .map_err(|e| format!("is not readable XML: {e}"))?;
+        // What the parser says quotes the file.
+        .map_err(|e| {
+            format!(
+                "is not readable XML: line {}, column {}",
+                e.pos().row,
+                e.pos().col
+            )
+        })?;
     let root = document.root_element();
     if root.tag_name().name() != "scene" {
-        return Err(format!(
-            "expected <scene>, found <{}>: not a Mitsuba scene",
-            root.tag_name().name()
-        ));
+        return Err("expected <scene> as the outermost element: not a Mitsuba scene".into());
     }
     let mut parser = Parser {
         document: &document,

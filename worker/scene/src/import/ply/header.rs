@@ -86,7 +86,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<(Encoding, Vec<Element>, usize), Str
             .trim();
         at += end + 1;
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
-        let fail = |what: &str| Err(format!("header line {number} ({line:?}): {what}"));
+        let fail = |what: &str| Err(format!("header line {number}: {what}"));
         match words.as_slice() {
             [] | ["ply" | "comment" | "obj_info", ..] => {}
             ["format", format, ..] => {

@@ -118,8 +118,11 @@ fn frame(mesh: &Mesh) -> Option<Camera> {
     Some(camera)
 }
 
-/// Reads a whole file; the message names the element.
+/// Reads a whole file; the message names the element and quotes nothing: the file may be something else.
 pub(super) fn parse(bytes: &[u8]) -> Result<Ply, String> {
+    if !is_ply(bytes) {
+        return Err("is not PLY: its first line is not `ply`".into());
+    }
     let (encoding, elements, start) = header::parse(bytes)?;
     let mut body = Body {
         encoding,
@@ -315,9 +318,7 @@ impl Body<'_> {
             let (word, rest) = rest.split_at(end.unwrap_or(rest.len()));
             self.rest = rest;
             let text = std::str::from_utf8(word).unwrap_or("?");
-            return text
-                .parse()
-                .map_err(|_| format!("expected a number, found {text:?}"));
+            return text.parse().map_err(|_| "expected a number".to_owned());
         }
         let (word, rest) = self.rest.split_at_checked(number.size()).ok_or(SHORT)?;
         self.rest = rest;

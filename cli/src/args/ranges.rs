@@ -1,0 +1,154 @@
+//! Numbers on the command line: what each may be. Those that jobs have too are as there.
+
+use std::{fmt::Display, ops::RangeInclusive, str::FromStr};
+
+use picofarm_proto::model::SceneSource;
+
+fn within<T: FromStr + PartialOrd + Display>(
+    text: &str,
+    range: RangeInclusive<T>,
+    what: &str,
+) -> Result<T, String> {
+    let expected = || format!("expected {} to {} {what}", range.start(), range.end());
+    let value: T = text.trim().parse().map_err(|_| expected())?;
+    match range.contains(&value) {
+        true => Ok(value),
+        false => Err(expected()),
+    }
+}
+
+/// Seeds, and numbers that count from 0.
+pub fn whole(text: &str) -> Result<u64, String> {
+    within(text, 0..=u64::MAX, "(a whole number)")
+}
+
+/// Scenes of a job.
+pub fn scenes(text: &str) -> Result<u64, String> {
+    within(text, 1..=100_000_000, "scenes")
+}
+
+/// Threads of a pool. More than a machine has cores is slow, but works; thousands exhaust it.
+pub fn threads(text: &str) -> Result<usize, String> {
+    within(text, 1..=1024, "threads; leave it out for all cores")
+}
+
+/// Workers of one process.
+pub fn workers(text: &str) -> Result<usize, String> {
+    within(
+        text,
+        1..=1024,
+        "workers; for a coordinator alone: picofarm coordinator",
+    )
+}
+
+/// Simulated workers.
+pub fn simulated(text: &str) -> Result<usize, String> {
+    within(text, 1..=100_000, "simulated workers")
+}
+
+/// Memory of a worker.
+pub fn gib(text: &str) -> Result<f64, String> {
+    within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
+}
+
+/// A time that somebody waits.
+pub fn seconds(text: &str) -> Result<f64, String> {
+    within(text, 0.0..=1e9, "seconds")
+}
+
+/// Life of a lease: shorter than a heartbeat's way it would always run out, longer than a day it would never.
+pub fn lease(text: &str) -> Result<f64, String> {
+    within(text, 0.1..=86_400.0, "seconds")
+}
+
+/// Days that jobs are kept.
+pub fn days(text: &str) -> Result<f64, String> {
+    within(text, 0.0..=36_500.0, "days")
+}
+
+/// Rows of a picture, of 20 or more pixels each.
+pub fn rows(text: &str) -> Result<usize, String> {
+    within(text, 1..=1000, "rows")
+}
+
+/// Pictures of a model on a page.
+pub fn pictures(text: &str) -> Result<usize, String> {
+    within(text, 0..=100, "scenes of each model")
+}
+
+/// A limit that leaves something.
+pub fn at_least_one(text: &str) -> Result<usize, String> {
+    within(text, 1..=1_000_000_000, "").map_err(|said| said.trim_end().to_owned())
+}
+
+/// Laser spots of a grid.
+pub fn spots(text: &str) -> Result<u32, String> {
+    let number = text.trim().parse();
+    let number = number.map_err(|_| "expected 1, 4, 16, 25 or 100".to_owned())?;
+    SceneSource::check_spots(number).map(|()| number)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::error::ErrorKind;
+
+    /// A command line, and what its refusal says.
+    const REFUSED: [(&str, &str); 31] = [
+        ("up --workers 0", "expected 1 to 1024 workers"),
+        ("demo --workers 0", "expected 1 to 1024 workers"),
+        ("demo --samples 0", "2..=1048576"),
+        ("demo --samples 1", "2..=1048576"),
+        ("demo --resolution 0", "1..=4096"),
+        ("demo --spots 9", "1, 4, 16, 25 and 100"),
+        ("demo --scenes 0", "expected 1 to 100000000 scenes"),
+        ("demo --scenes -5", "expected 1 to 100000000 scenes"),
+        ("demo --seed -1", "expected 0 to 18446744073709551615"),
+        (
+            "scene generate --seed one",
+            "expected 0 to 18446744073709551615",
+        ),
+        ("dataset show rooms -1", "a whole number"),
+        ("worker --threads 0", "expected 1 to 1024 threads"),
+        ("worker --memory-gib 0", "expected 0.05 to 1000000 GiB"),
+        ("worker --memory-gib nan", "GiB"),
+        ("worker --gpus 5000", "0..=1024"),
+        ("scene generate --spots 9", "1, 4, 16, 25 and 100"),
+        ("scene generate --resolution 99999", "1..=4096"),
+        (
+            "scene render a.glb --out b --error 10",
+            "did you mean \"10%\"?",
+        ),
+        ("scene render a.glb --out b --threads 0", "threads"),
+        (
+            "scene export a.ply --out b.glb --spots 3",
+            "1, 4, 16, 25 and 100",
+        ),
+        ("dataset picture rooms --rows 0", "expected 1 to 1000 rows"),
+        ("dataset reprocess a b --threads 0", "threads"),
+        ("dataset info s3:/b/x", "did you mean s3://b/x?"),
+        ("dataset export rooms s3:b/x", "did you mean s3://b/x?"),
+        ("events --last 0", "1..="),
+        ("job logs j --last 0", "1..="),
+        (
+            "job wait j --timeout-s -1",
+            "expected 0 to 1000000000 seconds",
+        ),
+        ("job wait j --timeout-s nan", "seconds"),
+        ("model report s --pictures 101", "expected 0 to 100 scenes"),
+        ("bench queue --workers 0", "simulated workers"),
+        ("coordinator --lease-s 0", "expected 0.1 to 86400 seconds"),
+    ];
+
+    #[test]
+    fn numbers_that_cannot_be_meant_are_refused_with_their_range() {
+        for (line, part) in REFUSED {
+            let words = ["picofarm"].into_iter().chain(line.split(' '));
+            let error = super::super::command()
+                .try_get_matches_from(words)
+                .expect_err(line);
+            assert_eq!(error.kind(), ErrorKind::ValueValidation, "{line}: {error}");
+            let said = error.to_string();
+            assert!(said.contains(part), "{line}: {part:?} is not in {said}");
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! Scenes without light: their tasks warn of it in their logs. Where many do, the whole job is told about it.
+
+use std::collections::BTreeSet;
+
+use picofarm_proto::{
+    model::{EventKind, JobStatus},
+    show,
+};
+
+use crate::client::{Client, Page};
+
+/// As the renderer says it.
+const EMPTY: &str = "the histogram is empty";
+/// Lines of history that are searched.
+const LINES: u32 = 10_000;
+
+/// What to say of a job whose scenes are without light, as far as its latest history tells.
+pub async fn warning(client: &mut Client, status: &JobStatus) -> Option<String> {
+    let renders = |kind: &str| matches!(kind, "render");
+    let rendered: u64 = status
+        .stages
+        .iter()
+        .filter(|stage| renders(&stage.kind))
+        .map(|stage| stage.tasks.done - stage.tasks.reused.min(stage.tasks.done))
+        .sum();
+    if rendered == 0 {
+        return None;
+    }
+    let page = Page {
+        job: Some(status.id),
+        stage: None,
+        task: None,
+        after: 0,
+        limit: LINES,
+        newest: true,
+        logs: true,
+    };
+    // It is a remark: where the history cannot be read, others say so.
+    let (events, _) = client.history(page).await.ok()?;
+    let mut tasks = BTreeSet::new();
+    let mut example = None;
+    for event in &events {
+        if event.kind == EventKind::Log && event.message.contains(EMPTY) {
+            tasks.insert((event.stage, event.task));
+            example.get_or_insert(event);
+        }
+    }
+    let example = example?;
+    let task = example.task.unwrap_or_default();
+    let all = match tasks.len() as u64 {
+        all if all >= rendered => format!("all {rendered} scenes rendered are without light"),
+        some => format!("{some} of {rendered} scenes rendered are without light"),
+    };
+    Some(format!(
+        "warning: {all}, e.g. task {task}: {}",
+        show::line(&example.message)
+    ))
+}

@@ -1,0 +1,215 @@
+//! Jobs, plans and events in words.
+
+use picofarm_proto::{
+    model::{Event, JobPlan, JobSpec, JobStatus, memory::gib},
+    show,
+};
+
+use crate::output::{duration, table};
+
+pub fn describe_plan(plan: &JobPlan) -> String {
+    let mut text = format!(
+        "{} tasks: {} reuse, {} run\n",
+        plan.total, plan.reuse, plan.run
+    );
+    let several = plan.stages.len() > 1;
+    for stage in &plan.stages {
+        if several {
+            text += &format!(
+                "  {} ({}): {} reuse, {} run\n",
+                show::line(&stage.name),
+                show::line(&stage.kind),
+                stage.reuse,
+                stage.run
+            );
+        }
+        let indent = if several { "    " } else { "  " };
+        for reason in &stage.reasons {
+            text += &format!("{indent}{}\n", show::line(reason));
+        }
+        if stage.run > 0 && stage.memory_bytes > 0 {
+            let memory = gib(stage.memory_bytes);
+            text += &format!("{indent}each takes about {memory} of memory\n");
+        }
+    }
+    if let Some(job) = plan.existing_job {
+        text += &format!("  job {job} has this exact spec\n");
+    }
+    text
+}
+
+pub fn state(status: &JobStatus) -> String {
+    match status.paused {
+        true => "held".into(),
+        false => format!("{:?}", status.state).to_lowercase(),
+    }
+}
+
+pub fn describe(s: &JobStatus) -> String {
+    let mut text = format!(
+        "job {} \"{}\": {}\n  {}\n",
+        s.id,
+        show::line(&s.name),
+        state(s),
+        counts(s)
+    );
+    if let Some(mean) = s.mean_task_seconds {
+        text += &format!("  {} a task on average\n", duration(mean));
+    }
+    if let Some(end) = s.ended_at_ms {
+        text += &format!(
+            "  took {}\n",
+            duration((end - s.submitted_at_ms) as f64 / 1000.0)
+        );
+    }
+    let several = s.stages.len() > 1;
+    if several {
+        text += &describe_stages(s);
+    }
+    for r in &s.running {
+        let of = match s.stages.get(r.stage as usize) {
+            Some(stage) if several => format!("{} ", show::line(&stage.name)),
+            _ => String::new(),
+        };
+        text += &format!(
+            "  {of}task {} on {}: {:.0} % after {}{}\n",
+            r.index,
+            show::line(&r.worker),
+            r.fraction * 100.0,
+            duration(r.seconds),
+            match &*r.text {
+                "" => String::new(),
+                text => format!(": {}", show::line(text)),
+            }
+        );
+    }
+    text + &places(&s.spec)
+}
+
+/// Where the results of a job are.
+fn places(spec: &JobSpec) -> String {
+    const SHOWN: usize = 4;
+    let mut text = String::new();
+    let mut models: Vec<(&String, Vec<&str>)> = Vec::new();
+    for stage in &spec.stages {
+        if let Some((store, dataset)) = stage.task.writes() {
+            let line = format!("data set {store}/{dataset}");
+            text += &format!("  {}\n", show::line(&line));
+        }
+        if let Some((store, model)) = stage.task.trains() {
+            match models.iter_mut().find(|(other, _)| *other == store) {
+                Some((_, names)) => names.push(model),
+                None => models.push((store, vec![model])),
+            }
+        }
+        if let Some((store, report)) = stage.task.reports() {
+            let line = format!("report {store}/reports/{report}");
+            text += &format!("  {}\n", show::line(&line));
+        }
+    }
+    for (store, names) in models {
+        let more = if names.len() > SHOWN { ", …" } else { "" };
+        let names = names[..names.len().min(SHOWN)].join(", ");
+        let line = format!("models in {store}: {names}{more}");
+        text += &format!("  {}\n", show::line(&line));
+    }
+    text
+}
+
+/// The tasks of a job by what becomes of them. A lease may hold many tasks, of which its worker runs one.
+pub fn counts(s: &JobStatus) -> String {
+    let t = &s.tasks;
+    let running = s.running.len() as u64;
+    let leased = match t.leased.saturating_sub(running) {
+        0 => String::new(),
+        waiting => format!("{waiting} leased and not begun, "),
+    };
+    format!(
+        "{} tasks: {} done ({} reused), {running} running, {leased}{} pending, {} dead",
+        t.total, t.done, t.reused, t.pending, t.dead
+    )
+}
+
+fn describe_stages(s: &JobStatus) -> String {
+    let header = [
+        "  stage", "kind", "state", "done", "running", "leased", "pending", "dead", "needs",
+    ];
+    let rows = s.stages.iter().enumerate().map(|(at, stage)| {
+        let t = &stage.tasks;
+        let running = s.running.iter().filter(|r| r.stage as usize == at).count();
+        vec![
+            format!("  {}", stage.name),
+            stage.kind.clone(),
+            format!("{:?}", stage.state).to_lowercase(),
+            format!("{}/{}", t.done, t.total),
+            running.to_string(),
+            t.leased.to_string(),
+            t.pending.to_string(),
+            t.dead.to_string(),
+            stage.needs.join(", "),
+        ]
+    });
+    let header = header.map(String::from).to_vec();
+    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
+}
+
+pub fn describe_event(e: &Event) -> String {
+    let stage = match e.stage {
+        Some(stage) if stage > 0 => format!("stage {stage} "),
+        _ => String::new(),
+    };
+    let task = match (e.task, e.lo, e.hi) {
+        (Some(task), ..) => format!("{stage}task {task} "),
+        (None, Some(lo), Some(hi)) => format!("{stage}tasks {lo}..{hi} "),
+        _ => stage,
+    };
+    let worker = if e.worker.is_empty() {
+        String::new()
+    } else {
+        format!("on {} ", e.worker)
+    };
+    let took = if e.seconds > 0.0 {
+        format!("in {} ", duration(e.seconds))
+    } else {
+        String::new()
+    };
+    let kind = format!("{:?}", e.kind).to_lowercase();
+    let text = format!(
+        "{} {task}{kind} {worker}{took}{}",
+        clock(e.at_ms),
+        e.message
+    );
+    // Names and messages are others': an event is one line, whatever they hold.
+    show::line(text.trim_end()).into_owned() + "\n"
+}
+
+/// Unix milliseconds as UTC, e.g. `2026-11-21T10:15:30Z`.
+pub fn clock(ms: i64) -> String {
+    let (days, second) = (ms.div_euclid(86_400_000), ms.rem_euclid(86_400_000) / 1000);
+    // Civil date from days since 1970-01-01 (Hinnant's algorithm).
+    let z = days + 719_468;
+    let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
+    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
+    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
+    let mp = (5 * doy + 2) / 153;
+    let (day, month) = (
+        doy - (153 * mp + 2) / 5 + 1,
+        if mp < 10 { mp + 3 } else { mp - 9 },
+    );
+    let year = yoe + era * 400 + i64::from(month <= 2);
+    format!(
+        "{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z",
+        second / 3600,
+        second / 60 % 60,
+        second % 60
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn clock_is_utc() {
+        assert_eq!(super::clock(0), "1970-01-01T00:00:00Z");
+        assert_eq!(super::clock(1_795_255_530_000), "2026-11-21T10:05:30Z");
+    }
+}

@@ -1,0 +1,83 @@
+//! What is said of a submission, and of a job that has the same spec already.
+
+use picofarm_proto::model::{JobPlan, JobState, JobStatus};
+use serde_json::json;
+
+use super::{counts, describe_plan, finish};
+use crate::{
+    client::{Client, Submitted},
+    error::Result,
+    follow::{Show, follow, verdict},
+    output::Output,
+};
+
+/// What the job with the same spec does, where there is one: a submission answers with it.
+pub async fn twin(client: &mut Client, plan: &JobPlan) -> String {
+    let Some(job) = plan.existing_job else {
+        return String::new();
+    };
+    match client.status(job).await {
+        Ok(status) => told(&status),
+        // It may be somebody else's, of which only its id is known.
+        Err(_) => String::new(),
+    }
+}
+
+fn told(s: &JobStatus) -> String {
+    let (id, counts) = (s.id, counts(s));
+    match s.state {
+        JobState::Active if s.paused => format!(
+            "  it is held ({counts}): submitting begins nothing; let it go on with `picofarm job resume {id}`\n"
+        ),
+        JobState::Active => format!(
+            "  it is active ({counts}): submitting answers with it, and runs nothing twice\n"
+        ),
+        JobState::Done => "  it is done; its results are reused\n".to_owned(),
+        JobState::Failed => format!(
+            "  it has ended with dead tasks ({counts}): submitting runs nothing; `picofarm job retry {id}` runs those again, \
+             and `--again` makes a new job of it\n"
+        ),
+        JobState::Cancelled => {
+            format!("  it was cancelled ({counts}): submitting runs nothing unless with --again\n")
+        }
+    }
+}
+
+/// Says what became of a submission, and follows the job if asked to.
+///
+/// # Errors
+/// A job that was there already and has ended badly: nothing runs, unless it is submitted with --again.
+pub async fn answer(
+    client: &mut Client,
+    submitted: Submitted,
+    watch: bool,
+    output: Output,
+) -> Result<()> {
+    let Submitted { job, existed, plan } = submitted;
+    let there = match existed {
+        true => client.status(job).await.ok(),
+        false => None,
+    };
+    output.result(
+        &json!({"job": job, "existed": existed, "plan": plan}),
+        || match &there {
+            Some(status) => {
+                let state = super::state(status);
+                format!("job {job} was there already: {state}; {}\n", counts(status))
+            }
+            None if existed => format!("job {job} was there already\n"),
+            None => format!("job {job}\n{}", describe_plan(&plan)),
+        },
+    );
+    if let Some(status) = there
+        && matches!(status.state, JobState::Failed | JobState::Cancelled)
+    {
+        return verdict(&status);
+    }
+    if watch {
+        let status = follow(client, job, output, Show::Progress).await?;
+        return finish(client, &status, output).await;
+    }
+    output.say(format!("follow it with `picofarm job watch {job}`"));
+    Ok(())
+}

@@ -1,0 +1,68 @@
+//! `picofarm job list`: a page of the jobs there are.
+
+use picofarm_proto::{
+    model::{JobState, JobSummary},
+    show,
+};
+use serde_json::json;
+
+use crate::{
+    args::ListedState,
+    client::{Client, Listing},
+    error::Result,
+    output::{Output, table},
+};
+
+impl From<ListedState> for JobState {
+    fn from(state: ListedState) -> Self {
+        match state {
+            ListedState::Active => Self::Active,
+            ListedState::Done => Self::Done,
+            ListedState::Failed => Self::Failed,
+            ListedState::Cancelled => Self::Cancelled,
+        }
+    }
+}
+
+/// Shows the jobs that `ask` asks for, and how to see more of them.
+pub async fn run(client: &mut Client, ask: &Listing<'_>, output: Output) -> Result<()> {
+    let (jobs, next) = client.list(ask).await?;
+    output.result(&json!({"jobs": jobs, "next_page": next}), || {
+        describe(&jobs)
+    });
+    if let Some(next) = next {
+        let mut command = format!("picofarm job list --page {next} --limit {}", ask.limit);
+        if let Some(state) = ask.state {
+            command += &format!(" --state {}", format!("{state:?}").to_lowercase());
+        }
+        if let Some(user) = ask.user {
+            command += &format!(" --user {user:?}");
+        }
+        output.say(format!("there are earlier ones: `{command}`"));
+    }
+    Ok(())
+}
+
+fn describe(jobs: &[JobSummary]) -> String {
+    if jobs.is_empty() {
+        return "no jobs; submit one with `picofarm job submit FILE`".into();
+    }
+    let header = ["job", "name", "state", "done", "dead", "total"]
+        .map(String::from)
+        .to_vec();
+    let rows = jobs.iter().map(|j| {
+        let state = match j.paused {
+            true => "held".into(),
+            false => format!("{:?}", j.state).to_lowercase(),
+        };
+        vec![
+            j.id.to_string(),
+            show::line(&j.name).into_owned(),
+            state,
+            j.tasks.done.to_string(),
+            j.tasks.dead.to_string(),
+            j.tasks.total.to_string(),
+        ]
+    });
+    table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
+}

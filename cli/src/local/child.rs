@@ -1,0 +1,181 @@
+//! The process of a worker whose parent is `demo` or `up`. It reads one line that says everything, and then until the line
+//! `stop` (an orderly end) or the end of its input (the parent is gone: it ends at once).
+
+use std::io::{BufRead, Write};
+
+use picofarm_agent::{Access, AgentConfig};
+use picofarm_proto::ids::WorkerId;
+use rustix::process::{Signal, set_parent_process_death_signal};
+use serde::{Deserialize, Serialize};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use crate::{
+    error::{CliError, Code, Result, io},
+    roles,
+    settings::Settings,
+};
+
+/// Name of the hidden command.
+pub(super) const COMMAND: &str = "local-worker";
+/// The line that asks for an orderly end.
+pub(super) const STOP: &str = "stop";
+/// The kernel's score (−1000 to 1000) by which it chooses what to kill when memory runs out: rather a worker than the
+/// coordinator or anything else.
+const OOM_SCORE: &str = "800";
+
+/// What a worker's process is told.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Order {
+    /// The parent's settings.
+    pub settings: Settings,
+    /// URL of the coordinator.
+    pub coordinator: String,
+    /// The coordinator asks nobody who they are.
+    pub open: bool,
+    /// Name, for people.
+    pub name: String,
+    /// The worker, whichever process it is.
+    pub worker_id: WorkerId,
+    /// Threads to render with.
+    pub threads: usize,
+    /// Memory that tasks may take, MiB.
+    pub memory_mib: u64,
+    /// Where that number comes from.
+    pub memory_from: String,
+    /// Where traces go.
+    pub otlp: Option<String>,
+    /// How the process before this one ended; empty for the first.
+    pub ended: String,
+}
+
+/// The last line that a worker's process writes: how it ended.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Verdict {
+    /// Exit code of an error; 0 = it was told to end.
+    code: u8,
+    message: String,
+    hint: Option<String>,
+}
+
+impl From<Verdict> for Result<()> {
+    fn from(verdict: Verdict) -> Self {
+        let code = match verdict.code {
+            0 => return Ok(()),
+            3 => Code::Input,
+            4 => Code::Coordinator,
+            7 => Code::Resource,
+            _ => Code::Failed,
+        };
+        let mut error = CliError::new(code, verdict.message);
+        error.hint = verdict.hint;
+        Err(error)
+    }
+}
+
+/// Reads the parent's order.
+///
+/// # Errors
+/// There is none: a person has called this.
+pub fn received() -> Result<Order> {
+    let mut line = String::new();
+    let read = std::io::stdin().lock().read_line(&mut line);
+    read.map_err(|e| io("standard input", &e))?;
+    serde_json::from_str(&line).map_err(|e| {
+        CliError::input(format!("{COMMAND}: standard input holds no order ({e})"))
+            .hint("this command is for `picofarm up` and `picofarm demo`; use `picofarm worker`")
+    })
+}
+
+/// Runs the worker until its parent ends it.
+///
+/// # Errors
+/// None: what goes wrong is written for the parent.
+pub async fn serve(order: Order) -> Result<()> {
+    let verdict = match work(order).await {
+        Ok(()) => Verdict {
+            code: 0,
+            message: String::new(),
+            hint: None,
+        },
+        Err(e) => Verdict {
+            code: e.code as u8,
+            message: e.message,
+            hint: e.hint,
+        },
+    };
+    let text = serde_json::to_string(&verdict).expect("a verdict is plain data");
+    // Without a parent there is nobody to tell.
+    let _ = writeln!(std::io::stdout(), "{text}");
+    Ok(())
+}
+
+async fn work(order: Order) -> Result<()> {
+    // Beside the end of the input, which a process that is frozen does not notice. Where there is no such thing, that
+    // is all.
+    let _ = set_parent_process_death_signal(Some(Signal::KILL));
+    // Raising it needs no rights; a system without it has another way to choose.
+    let _ = std::fs::write("/proc/self/oom_score_adj", OOM_SCORE);
+    let stop = CancellationToken::new();
+    listen(stop.clone())?;
+    heed_signals(stop.clone())?;
+    let access = match order.open {
+        true => Access::default(),
+        false => order.settings.access()?,
+    };
+    let config = AgentConfig {
+        coordinator: order.coordinator,
+        name: order.name,
+        worker_id: Some(order.worker_id),
+        ended: order.ended,
+        threads: order.threads,
+        memory_mib: order.memory_mib,
+        memory_from: order.memory_from,
+        gpus: 0,
+        labels: Vec::new(),
+        exit_idle: None,
+        asset_dirs: vec![order.settings.assets],
+        access,
+        store_prefixes: Vec::new(),
+    };
+    let summary = picofarm_agent::run(config, stop).await;
+    summary.map(|_| ()).map_err(|e| roles::agent_error(&e))
+}
+
+/// Listens to the parent, on a thread that nothing else can hold up.
+fn listen(stop: CancellationToken) -> Result<()> {
+    let listener = move || {
+        for line in std::io::stdin().lock().lines() {
+            match line {
+                Ok(line) if line.trim() == STOP => stop.cancel(),
+                Ok(_) => {}
+                Err(_) => break,
+            }
+        }
+        // Nobody is left to give work or to take it.
+        std::process::exit(Code::Failed as i32);
+    };
+    std::thread::Builder::new()
+        .name("parent".into())
+        .spawn(listener)
+        .map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;
+    Ok(())
+}
+
+/// Ctrl-C in a terminal reaches the parent, too, which says what is to be done. A SIGTERM may be meant for this process
+/// alone.
+fn heed_signals(stop: CancellationToken) -> Result<()> {
+    let refused =
+        |e: std::io::Error| CliError::new(Code::Failed, format!("cannot listen for signals: {e}"));
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(refused)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(refused)?;
+    tokio::spawn(async move {
+        loop {
+            tokio::select! {
+                _ = interrupt.recv() => {}
+                _ = terminate.recv() => stop.cancel(),
+            }
+        }
+    });
+    Ok(())
+}

@@ -1,0 +1,134 @@
+//! A coordinator in this process and workers in processes of their own, for `demo` and `up`.
+
+mod child;
+mod keeper;
+
+use std::{net::SocketAddr, path::Path, time::Duration};
+
+use picofarm_agent::Memory;
+use picofarm_proto::ids::WorkerId;
+use tokio::task::JoinSet;
+use uuid::Uuid;
+
+pub use self::child::{Order, received, serve};
+use self::keeper::Keeper;
+use crate::{
+    error::{CliError, Code, Result},
+    roles,
+    settings::Settings,
+    stored::StoreReader,
+};
+
+/// Life of a lease: short, since after a `kill -9` of this one process the next run waits for it to end, and no network
+/// can delay a heartbeat.
+const LEASE: Duration = Duration::from_secs(20);
+
+/// A farm on this machine.
+pub struct Local {
+    pub url: String,
+    /// Where its health and metrics are served.
+    pub http: Option<String>,
+    coordinator: roles::Coordinator,
+    keepers: Vec<Keeper>,
+    workers: JoinSet<Result<()>>,
+}
+
+impl Local {
+    /// Starts a coordinator on `catalog` and `workers` workers that share the cores, each in a process of its own: what
+    /// ends one of them, ends neither the coordinator nor the others.
+    ///
+    /// # Errors
+    /// The catalog is in use or unreadable, the address is taken, or no process can be started.
+    pub async fn start(
+        catalog: &Path,
+        listen: SocketAddr,
+        workers: usize,
+        settings: &Settings,
+        guarded: roles::Guarded,
+        http: Option<SocketAddr>,
+        otlp: Option<String>,
+    ) -> Result<Self> {
+        let open = guarded.is_open();
+        if !open {
+            // What is wrong with it is said here, and not by each worker.
+            settings.access()?;
+        }
+        let coordinator = roles::Coordinator::start(
+            catalog.to_owned().into(),
+            listen,
+            LEASE,
+            guarded,
+            http,
+            None,
+            // Its workers run here, too: as this user, and they read and write whatever stores a job names.
+            Some(StoreReader::anywhere()?),
+        )
+        .await?;
+        let (url, http) = (coordinator.url(), coordinator.http());
+        let mut local = Self {
+            url: url.clone(),
+            http,
+            coordinator,
+            keepers: Vec::new(),
+            workers: JoinSet::new(),
+        };
+        let cores = roles::cores();
+        let memory = Memory::here();
+        for i in 0..workers {
+            let order = Order {
+                settings: settings.clone(),
+                coordinator: url.clone(),
+                open,
+                name: format!("local-{}", i + 1),
+                worker_id: WorkerId::from_uuid(Uuid::new_v4()),
+                threads: (cores / workers + usize::from(i < cores % workers)).max(1),
+                memory_mib: memory.as_ref().map_or(0, Memory::for_tasks_mib)
+                    / workers.max(1) as u64,
+                memory_from: match &memory {
+                    Some(memory) => format!("{memory}, shared by {workers} worker(s)"),
+                    None => String::new(),
+                },
+                otlp: otlp.clone(),
+                ended: String::new(),
+            };
+            let (keeper, ended) = Keeper::start(order)?;
+            local.keepers.push(keeper);
+            local.workers.spawn(async move {
+                let broke = |_| CliError::new(Code::Failed, "the thread of a worker broke");
+                ended.await.map_err(broke)?
+            });
+        }
+        Ok(local)
+    }
+
+    /// Resolves when a worker is refused or cannot be started, which none should be while the farm runs.
+    pub async fn worker_lost(&mut self) -> CliError {
+        loop {
+            match self.workers.join_next().await {
+                // It was drained: the others go on, and without any the farm waits for some from elsewhere.
+                Some(Ok(Ok(()))) => tracing::info!("a worker has ended"),
+                Some(Ok(Err(e))) => return e,
+                Some(Err(e)) => {
+                    return CliError::new(Code::Failed, format!("a worker broke: {e}"));
+                }
+                None => std::future::pending::<()>().await,
+            }
+        }
+    }
+
+    /// Stops the workers, which hand back or finish their work, then the coordinator.
+    ///
+    /// # Errors
+    /// The coordinator ended with an error.
+    pub async fn stop(mut self) -> Result<()> {
+        for keeper in &self.keepers {
+            keeper.stop();
+        }
+        while let Some(ended) = self.workers.join_next().await {
+            if let Ok(Err(e)) = ended {
+                tracing::warn!("worker: {}", e.message);
+            }
+        }
+        self.coordinator.stop().await
+    }
+}

@@ -1,0 +1,291 @@
+//! Looks into stores for a coordinator: whether they hold what workers have reported. Only into those that the operator
+//! allows: a submitter names a store's place, and must not make the coordinator ask any host or read any folder.
+
+use std::{
+    collections::HashMap,
+    fmt,
+    sync::{Arc, Mutex},
+};
+
+use futures::future::BoxFuture;
+use object_store::{ObjectStore, path::Path};
+use picofarm_agent::StorePrefixes;
+use picofarm_coordinator::{Found, Stored};
+use picofarm_dataset::{DatasetError, Held, Holdings, PartName, open_store};
+use picofarm_proto::{
+    key::task_key,
+    model::{StageSpec, kinds::Manifest},
+};
+use tokio::runtime::{Builder, Runtime};
+use tokio_util::task::AbortOnDropHandle;
+
+use crate::error::{CliError, Code, Result};
+
+/// Stores kept open.
+const STORES: usize = 64;
+/// Threads that a store on a disk that hangs can hold. Nothing else uses them.
+const THREADS: usize = 64;
+/// In an object store, the objects of one scene in so many are looked up; in a folder, those of all.
+const ONE_IN: u64 = 8;
+
+/// What reads stores, on a runtime of its own.
+pub struct StoreReader {
+    /// `None`: any store.
+    allowed: Option<StorePrefixes>,
+    opened: Mutex<HashMap<String, Place>>,
+    /// Taken when dropped.
+    runtime: Option<Runtime>,
+}
+
+type Place = (Arc<dyn ObjectStore>, Path);
+
+impl StoreReader {
+    /// Reads stores below these prefixes.
+    ///
+    /// # Errors
+    /// A prefix that is none; no threads.
+    pub fn below(prefixes: &[String]) -> Result<Self> {
+        let allowed = StorePrefixes::new(prefixes)
+            .map_err(|e| CliError::input(format!("--check-stores: {e}")))?;
+        Self::new(Some(allowed))
+    }
+
+    /// Reads any store: for a process that runs the tasks as well, and so reads and writes whatever store they name.
+    ///
+    /// # Errors
+    /// No threads.
+    pub fn anywhere() -> Result<Self> {
+        Self::new(None)
+    }
+
+    fn new(allowed: Option<StorePrefixes>) -> Result<Self> {
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .max_blocking_threads(THREADS)
+            .thread_name("stores")
+            .enable_all()
+            .build()
+            .map_err(|e| CliError::new(Code::Resource, format!("threads to read stores: {e}")))?;
+        Ok(Self {
+            allowed,
+            opened: Mutex::default(),
+            runtime: Some(runtime),
+        })
+    }
+
+    fn open(&self, location: &str) -> std::result::Result<Place, String> {
+        if let Some(allowed) = &self.allowed
+            && !allowed.hold(location)
+        {
+            return Err(
+                "it lies in none of the places that --check-stores names to the coordinator".into(),
+            );
+        }
+        let mut opened = self.opened.lock().expect("no panic while locked");
+        if let Some(place) = opened.get(location) {
+            return Ok(place.clone());
+        }
+        if opened.len() >= STORES {
+            opened.clear();
+        }
+        let place = open_store(location).map_err(|e| unreadable(&e))?;
+        opened.insert(location.to_owned(), place.clone());
+        Ok(place)
+    }
+}
+
+/// The tasks of a question, each with the SHA-256 that was reported.
+type Results = Vec<(u64, [u8; 32])>;
+
+/// What a store is asked, as its data set or model knows it.
+enum Question {
+    Scenes(String, Results),
+    Parts(String, Vec<PartName>),
+    Gltf(Results),
+    Model(String, Results),
+    /// Sweep, its id, and the trial.
+    Trial(String, String, u64, Results),
+    Report(String, Results),
+    Split(String, String, Results),
+}
+
+impl Question {
+    /// The question about results of a stage, and the store that is asked; or why there is none.
+    fn of(
+        stage: &StageSpec,
+        results: &[(u64, [u8; 32])],
+    ) -> std::result::Result<(String, Self), String> {
+        let place = stage.task.results();
+        let results = results.to_vec();
+        let question = match place.manifest {
+            Manifest::Scene { dataset } => Self::Scenes(dataset.to_owned(), results),
+            Manifest::Part {
+                dataset,
+                joined_by,
+                task,
+            } => {
+                let Some(stage) = joined_by else {
+                    return Err("its joining stage has no key".into());
+                };
+                let name = |(index, _): &(u64, [u8; 32])| {
+                    let (scene, part) = task.split(*index);
+                    PartName {
+                        scene,
+                        task_key: task_key(&stage, scene).to_string(),
+                        part: (part, task.whole.parts),
+                    }
+                };
+                Self::Parts(dataset.to_owned(), results.iter().map(name).collect())
+            }
+            Manifest::Gltf => Self::Gltf(results),
+            Manifest::Model { name } => Self::Model(name.to_owned(), results),
+            Manifest::Trial(trial) => {
+                Self::Trial(trial.sweep.clone(), trial.id.clone(), trial.index, results)
+            }
+            Manifest::Report { name } => Self::Report(name.to_owned(), results),
+            Manifest::Split { dataset, name } => {
+                Self::Split(dataset.to_owned(), name.to_owned(), results)
+            }
+            Manifest::None => {
+                let kind = stage.task.kind();
+                return Err(format!(
+                    "a stage of kind {kind:?} leaves no manifest to compare with"
+                ));
+            }
+        };
+        Ok((place.store.to_owned(), question))
+    }
+
+    /// Asks; `thorough` says of which scenes the objects are looked up, too.
+    async fn ask(
+        self,
+        holdings: &Holdings,
+        thorough: impl Fn(u64) -> bool,
+    ) -> std::result::Result<Vec<Held>, DatasetError> {
+        let mut held = Vec::new();
+        match self {
+            Self::Scenes(dataset, results) => {
+                return holdings.scenes(&dataset, &results, thorough).await;
+            }
+            Self::Parts(dataset, parts) => return holdings.parts(&dataset, &parts).await,
+            Self::Gltf(results) => return holdings.gltf_scenes(&results).await,
+            Self::Model(name, results) => {
+                for (_, sha256) in results {
+                    held.push(holdings.model(&name, sha256).await?);
+                }
+            }
+            Self::Trial(sweep, id, index, results) => {
+                for (_, sha256) in results {
+                    held.push(holdings.trial((&sweep, &id, index), sha256).await?);
+                }
+            }
+            Self::Report(name, results) => {
+                for (_, sha256) in results {
+                    held.push(holdings.report(&name, sha256).await?);
+                }
+            }
+            Self::Split(dataset, name, results) => {
+                for (_, sha256) in results {
+                    held.push(holdings.split(&dataset, &name, sha256).await?);
+                }
+            }
+        }
+        Ok(held)
+    }
+}
+
+impl Stored for StoreReader {
+    fn look<'a>(
+        &'a self,
+        stage: &'a StageSpec,
+        results: &'a [(u64, [u8; 32])],
+    ) -> BoxFuture<'a, std::result::Result<Vec<Found>, String>> {
+        Box::pin(async move {
+            let (location, question) = Question::of(stage, results)?;
+            let (store, prefix) = self.open(&location)?;
+            let folder = !location.contains("://") || location.starts_with("file:");
+            let asked = async move {
+                let thorough = |task: u64| folder || task.is_multiple_of(ONE_IN);
+                let holdings = Holdings::new(store, prefix);
+                question.ask(&holdings, thorough).await
+            };
+            let runtime = self.runtime.as_ref().expect("there until it is dropped");
+            // It ends with whoever waits for it.
+            let running = AbortOnDropHandle::new(runtime.spawn(asked));
+            let held = match running.await {
+                Ok(Ok(held)) => held,
+                Ok(Err(error)) => return Err(unreadable(&error)),
+                Err(error) => return Err(format!("looking into the store failed: {error}")),
+            };
+            let found = held.into_iter().map(|held| match held {
+                Held::Equal => Found::Equal,
+                Held::Gone => Found::Gone,
+                Held::Other => Found::Differs,
+            });
+            Ok(found.collect())
+        })
+    }
+}
+
+impl fmt::Debug for StoreReader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("StoreReader")
+            .field("allowed", &self.allowed)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Drop for StoreReader {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            // A thread that a hanging disk holds is not waited for.
+            runtime.shutdown_background();
+        }
+    }
+}
+
+fn unreadable(error: &DatasetError) -> String {
+    format!("this coordinator cannot read it: {error}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stage(store: &str) -> StageSpec {
+        let text = format!(
+            r#"{{"name": "test", "scenes": {{"kind": "primitive", "count": 2}},
+                "render": {{"renderer": "r1"}}, "output": {{"store": "{store}", "dataset": "d"}}}}"#
+        );
+        let spec: picofarm_proto::model::JobSpec = serde_json::from_str(&text).unwrap();
+        spec.stages[0].clone()
+    }
+
+    #[tokio::test]
+    async fn only_stores_below_the_prefixes_are_looked_into() {
+        let folder = tempfile::tempdir().unwrap();
+        let inside = folder.path().join("mine");
+        std::fs::create_dir_all(&inside).unwrap();
+        let reader = StoreReader::below(&[inside.display().to_string()]).unwrap();
+        let results = [(0, [0; 32])];
+        let at = stage(&format!("file://{}/store", inside.display()));
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        for store in [
+            "file:///etc",
+            "s3://bucket/a",
+            "http://169.254.169.254/latest",
+        ] {
+            let why = reader.look(&stage(store), &results).await.unwrap_err();
+            assert!(why.contains("--check-stores"), "{store}: {why}");
+        }
+        assert!(StoreReader::below(&["relative".into()]).is_err());
+    }
+
+    #[tokio::test]
+    async fn a_store_without_credentials_is_said_to_be_unreadable() {
+        let reader = StoreReader::anywhere().unwrap();
+        let at = stage("ftp://host/a");
+        let why = reader.look(&at, &[(0, [0; 32])]).await.unwrap_err();
+        assert!(why.contains("cannot read it"), "{why}");
+    }
+}

@@ -1,0 +1,369 @@
+//! Who holds the places that there are for connections. Where none is free, the connection goes that has waited longest
+//! for its first request: whoever means it is done with that within moments, so silent ones shut nobody out.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    net::IpAddr,
+    sync::{Arc, Mutex},
+    time::{Duration, Instant},
+};
+
+use tokio_util::sync::CancellationToken;
+
+/// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, of which one machine has all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+struct Group([u8; 8]);
+
+impl From<IpAddr> for Group {
+    fn from(address: IpAddr) -> Self {
+        let mut group = [0; 8];
+        match address.to_canonical() {
+            // 0xff begins no unicast network.
+            IpAddr::V4(v4) => {
+                group[0] = 0xff;
+                group[4..].copy_from_slice(&v4.octets());
+            }
+            IpAddr::V6(v6) => group.copy_from_slice(&v6.octets()[..8]),
+        }
+        Self(group)
+    }
+}
+
+/// The places.
+pub(crate) struct Doors(Mutex<State>);
+
+struct State {
+    all: usize,
+    per_address: usize,
+    next: u64,
+    open: BTreeMap<u64, (Group, CancellationToken)>,
+    of: HashMap<Group, usize>,
+    /// Those that wait for their first request, the oldest first; of all, and of each group.
+    waiting: BTreeSet<u64>,
+    waiting_of: HashMap<Group, BTreeSet<u64>>,
+    counts: Counts,
+}
+
+/// What became of connections.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Counts {
+    /// Open now.
+    pub open: u64,
+    /// Refused, because there was no place.
+    pub refused: u64,
+    /// Closed before their first request, to make place for others.
+    pub displaced: u64,
+}
+
+/// Why there is no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Full {
+    /// As many connections as there may be have requests.
+    All,
+    /// As many of this address as there may be have requests.
+    Address,
+}
+
+impl Doors {
+    /// So many places, and so many of one address.
+    pub(crate) fn new(all: usize, per_address: usize) -> Self {
+        Self(Mutex::new(State {
+            all,
+            per_address,
+            next: 0,
+            open: BTreeMap::new(),
+            of: HashMap::new(),
+            waiting: BTreeSet::new(),
+            waiting_of: HashMap::new(),
+            counts: Counts::default(),
+        }))
+    }
+
+    /// What became of connections until now.
+    pub(crate) fn counts(&self) -> Counts {
+        let state = self.lock();
+        Counts {
+            open: state.open.len() as u64,
+            ..state.counts
+        }
+    }
+
+    /// Places of all, and of one address.
+    pub(crate) fn bounds(&self) -> (usize, usize) {
+        let state = self.lock();
+        (state.all, state.per_address)
+    }
+
+    /// Takes a place until the value is dropped.
+    ///
+    /// # Errors
+    /// There is none, and none can be made.
+    pub(crate) fn enter(self: &Arc<Self>, address: IpAddr) -> Result<Held, Full> {
+        let group = Group::from(address);
+        let mut state = self.lock();
+        if state.of.get(&group).copied().unwrap_or(0) >= state.per_address {
+            let mine = state.waiting_of.get(&group);
+            let oldest = mine.and_then(|ids| ids.first().copied());
+            state.make_room(oldest, Full::Address)?;
+        }
+        if state.open.len() >= state.all {
+            let oldest = state.waiting.first().copied();
+            state.make_room(oldest, Full::All)?;
+        }
+        let id = state.next;
+        state.next += 1;
+        let closed = CancellationToken::new();
+        state.open.insert(id, (group, closed.clone()));
+        *state.of.entry(group).or_default() += 1;
+        state.waiting.insert(id);
+        state.waiting_of.entry(group).or_default().insert(id);
+        drop(state);
+        let now = Instant::now();
+        Ok(Held(Arc::new(Place {
+            doors: Arc::clone(self),
+            id,
+            closed,
+            use_: Mutex::new(Use {
+                admitted: false,
+                streams: 0,
+                since: now,
+            }),
+        })))
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.0.lock().expect("no panic while locked")
+    }
+}
+
+impl State {
+    /// Closes the connection that has waited longest, if one waits.
+    fn make_room(&mut self, oldest: Option<u64>, full: Full) -> Result<(), Full> {
+        let Some(closed) = oldest.and_then(|id| self.leave(id)) else {
+            self.counts.refused += 1;
+            return Err(full);
+        };
+        self.counts.displaced += 1;
+        closed.cancel();
+        Ok(())
+    }
+
+    fn leave(&mut self, id: u64) -> Option<CancellationToken> {
+        let (group, closed) = self.open.remove(&id)?;
+        let count = self.of.get_mut(&group).expect("counted when it came");
+        *count -= 1;
+        if *count == 0 {
+            self.of.remove(&group);
+        }
+        self.admit(id, group);
+        Some(closed)
+    }
+
+    fn admit(&mut self, id: u64, group: Group) {
+        self.waiting.remove(&id);
+        if let Some(ids) = self.waiting_of.get_mut(&group) {
+            ids.remove(&id);
+            if ids.is_empty() {
+                self.waiting_of.remove(&group);
+            }
+        }
+    }
+}
+
+/// A connection's place; its owner gives it back by dropping it.
+pub(crate) struct Held(Arc<Place>);
+
+impl Held {
+    pub(crate) fn place(&self) -> &Arc<Place> {
+        &self.0
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.0.doors.lock().leave(self.0.id);
+    }
+}
+
+/// What is known of a connection while it is open.
+pub(crate) struct Place {
+    doors: Arc<Doors>,
+    id: u64,
+    closed: CancellationToken,
+    use_: Mutex<Use>,
+}
+
+struct Use {
+    /// A request was let in.
+    admitted: bool,
+    streams: usize,
+    /// Of the connection's beginning, or of the end of its last stream.
+    since: Instant,
+}
+
+impl Place {
+    /// A request was let in; it is open until the value is dropped.
+    pub(crate) fn stream(self: &Arc<Self>) -> Stream {
+        let first = {
+            let mut use_ = self.lock();
+            use_.streams += 1;
+            !std::mem::replace(&mut use_.admitted, true)
+        };
+        if first {
+            let mut state = self.doors.lock();
+            if let Some((group, _)) = state.open.get(&self.id) {
+                let group = *group;
+                state.admit(self.id, group);
+            }
+        }
+        Stream(Arc::clone(self))
+    }
+
+    /// Ends when the connection shall: its place went to another, no request was let in in time, or there were no streams
+    /// for too long. Says why.
+    pub(crate) async fn over(
+        self: Arc<Self>,
+        first_request: Duration,
+        idle: Duration,
+    ) -> &'static str {
+        let late = async {
+            loop {
+                let (left, why) = self.left(first_request, idle);
+                if left.is_zero() {
+                    return why;
+                }
+                tokio::time::sleep(left).await;
+            }
+        };
+        tokio::select! {
+            why = late => why,
+            () = self.closed.cancelled() => "others wait for its place, and it has sent no request",
+        }
+    }
+
+    /// How long it may stay, as things are.
+    fn left(&self, first_request: Duration, idle: Duration) -> (Duration, &'static str) {
+        let use_ = self.lock();
+        let gone = use_.since.elapsed();
+        if !use_.admitted {
+            return (
+                first_request.saturating_sub(gone),
+                "it has sent no request that is let in",
+            );
+        }
+        let left = match use_.streams {
+            0 => idle.saturating_sub(gone),
+            _ => idle,
+        };
+        (left, "it was idle")
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Use> {
+        self.use_.lock().expect("no panic while locked")
+    }
+}
+
+/// An open request.
+pub(crate) struct Stream(Arc<Place>);
+
+impl Drop for Stream {
+    fn drop(&mut self) {
+        let mut use_ = self.0.lock();
+        use_.streams -= 1;
+        use_.since = Instant::now();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn doors(all: usize, per_address: usize) -> Arc<Doors> {
+        Arc::new(Doors::new(all, per_address))
+    }
+
+    fn ip(text: &str) -> IpAddr {
+        text.parse().unwrap()
+    }
+
+    fn evicted(held: &Held) -> bool {
+        held.place().closed.is_cancelled()
+    }
+
+    #[test]
+    fn silent_connections_make_way_the_oldest_first_and_those_with_requests_stay() {
+        let doors = doors(3, 3);
+        let a = doors.enter(ip("10.0.0.1")).unwrap();
+        let b = doors.enter(ip("10.0.0.2")).unwrap();
+        let c = doors.enter(ip("10.0.0.3")).unwrap();
+        let request = a.place().stream();
+        let d = doors.enter(ip("10.0.0.4")).unwrap();
+        assert_eq!([&a, &b, &c, &d].map(evicted), [false, true, false, false]);
+        let (_c, _d) = (c.place().stream(), d.place().stream());
+        assert_eq!(doors.enter(ip("10.0.0.5")).err(), Some(Full::All));
+        let counts = doors.counts();
+        assert_eq!((counts.open, counts.refused, counts.displaced), (3, 1, 1));
+        // One that has had its request stays although it has none now.
+        drop(request);
+        assert_eq!(doors.enter(ip("10.0.0.5")).err(), Some(Full::All));
+        drop(a);
+        drop(b);
+        let e = doors.enter(ip("10.0.0.5"));
+        assert!(e.is_ok());
+    }
+
+    #[test]
+    fn one_address_leaves_room_for_others_and_a_network_of_ipv6_is_one_address() {
+        let doors = doors(10, 2);
+        let mine: Vec<_> = ["2001:db8::1", "2001:db8::2"]
+            .map(|a| doors.enter(ip(a)).unwrap())
+            .into();
+        let _streams: Vec<_> = mine.iter().map(|held| held.place().stream()).collect();
+        assert_eq!(doors.enter(ip("2001:db8::3")).err(), Some(Full::Address));
+        assert!(doors.enter(ip("2001:db8:0:1::3")).is_ok());
+        let first = doors.enter(ip("10.0.0.1")).unwrap();
+        let _second = doors.enter(ip("::ffff:10.0.0.1")).unwrap();
+        let _third = doors.enter(ip("10.0.0.1")).unwrap();
+        assert!(evicted(&first), "it is silent, and of the same address");
+        assert!(!mine.iter().any(evicted));
+    }
+
+    #[test]
+    fn places_are_counted_exactly() {
+        let doors = doors(4, 4);
+        for round in 0..100 {
+            let held: Vec<_> = (0..6).map(|_| doors.enter(ip("10.0.0.1"))).collect();
+            assert!(held.iter().all(Result::is_ok));
+            let streams: Vec<_> = held
+                .iter()
+                .filter_map(|h| h.as_ref().ok())
+                .map(|h| h.place().stream())
+                .collect();
+            if round % 2 == 0 {
+                drop(streams);
+                drop(held);
+            } else {
+                drop(held);
+                drop(streams);
+            }
+            let state = doors.lock();
+            assert!(state.open.is_empty() && state.of.is_empty());
+            assert!(state.waiting.is_empty() && state.waiting_of.is_empty());
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn silence_ends_a_connection_and_a_stream_keeps_it() {
+        let doors = doors(9, 9);
+        let (first, idle) = (Duration::from_millis(50), Duration::from_millis(100));
+        let silent = doors.enter(ip("10.0.0.1")).unwrap();
+        let why = Arc::clone(silent.place()).over(Duration::ZERO, idle).await;
+        assert!(why.contains("no request"), "{why}");
+        let busy = doors.enter(ip("10.0.0.1")).unwrap();
+        let stream = busy.place().stream();
+        assert_eq!(busy.place().left(Duration::ZERO, idle).0, idle);
+        drop(stream);
+        let (left, why) = busy.place().left(first, Duration::ZERO);
+        assert!(left.is_zero() && why.contains("idle"), "{why}");
+    }
+}

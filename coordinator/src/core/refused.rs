@@ -1,0 +1,209 @@
+//! What a database refuses for its content is taken out of a change set, so that the rest becomes durable: a task whose result
+//! cannot be recorded is given up with the reason; a message that cannot be recorded gives way to the reason.
+
+use picofarm_catalog::{Changes, Culprit, Exception, Mark, NewEvent, Range, RangeState, Row, Run};
+use picofarm_proto::{
+    ids::{LeaseRef, RangeId, StageRef, WorkerId},
+    model::{EventKind, bounds},
+};
+
+use super::{Core, Say, SessionId};
+
+impl Core {
+    /// Changes what was just taken ([`Core::take`]) so that it no longer holds these rows as they are. `again`: they were
+    /// refused in words of ours too, and are left out.
+    pub(crate) fn refused(
+        &mut self,
+        changes: &mut Changes,
+        say: &mut [(SessionId, Say)],
+        culprits: &[Culprit],
+        again: bool,
+        now_ms: i64,
+    ) {
+        let (mut outputs, mut events) = (Vec::new(), Vec::new());
+        for Culprit { row, why } in culprits {
+            let why = bounds::message(why);
+            tracing::error!(?row, why, "the catalog refuses a row; the others are kept");
+            match row {
+                Row::Output(at) => outputs.push((*at, why)),
+                Row::Event(at) => events.push((*at, why)),
+                Row::Worker(id) => self.rename(changes, *id, again),
+                Row::Exception(stage, task) => {
+                    let said = format!("the worker's error message could not be recorded: {why}");
+                    if let Some(exception) = changes.exceptions.get_mut(&(*stage, *task)) {
+                        exception.last_error.clone_from(&said);
+                    }
+                    if again {
+                        changes.exceptions.remove(&(*stage, *task));
+                    }
+                    let entry = self.stages.get_mut(stage);
+                    if let Some(known) = entry.and_then(|e| e.exceptions.get_mut(task)) {
+                        known.last_error = said;
+                    }
+                }
+            }
+        }
+        // From the last, so that positions stay what they are.
+        for (at, why) in events.into_iter().rev() {
+            if again {
+                changes.events.remove(at);
+                continue;
+            }
+            let event = &mut changes.events[at];
+            event.message = format!("what happened could not be recorded as it was said: {why}");
+            event.worker = bounds::cut(&event.worker, bounds::NAME_BYTES);
+            event.seconds = bounds::seconds(event.seconds).unwrap_or(0.0);
+        }
+        for (at, why) in outputs.into_iter().rev() {
+            let output = changes.outputs.remove(at);
+            self.give_up(changes, say, (output.stage, output.task), &why, now_ms);
+        }
+    }
+
+    /// A worker whose name is refused goes by its id.
+    fn rename(&mut self, changes: &mut Changes, id: WorkerId, again: bool) {
+        if again {
+            changes.workers.remove(&id);
+        }
+        self.names.insert(id, id.to_string());
+        if let Some(worker) = changes.workers.get_mut(&id) {
+            worker.name = id.to_string();
+        }
+        if let Some(worker) = self.workers.get_mut(&id) {
+            worker.name = id.to_string();
+        }
+    }
+
+    /// A task's result cannot be recorded: it is not done but given up.
+    fn give_up(
+        &mut self,
+        changes: &mut Changes,
+        say: &mut [(SessionId, Say)],
+        (stage, task): (StageRef, u64),
+        why: &str,
+        now_ms: i64,
+    ) {
+        let why = format!("the result cannot be recorded: {why}");
+        if let Some(lease) = self.undo(changes, stage, task) {
+            for (_, say) in say.iter_mut() {
+                if let Say::Acknowledge {
+                    lease: of,
+                    index,
+                    accepted,
+                    reason,
+                } = say
+                    && (*of, *index) == (lease, task)
+                {
+                    *accepted = false;
+                    reason.clone_from(&why);
+                }
+            }
+        }
+        let Some(entry) = self.stages.get_mut(&stage) else {
+            return;
+        };
+        let exception = entry.exceptions.entry(task).or_insert(Exception {
+            stage,
+            task,
+            failures: 0,
+            crashes: 0,
+            dead: true,
+            last_error: String::new(),
+        });
+        exception.failures += 1;
+        exception.dead = true;
+        exception.last_error.clone_from(&why);
+        let exception = exception.clone();
+        changes.exceptions.insert((stage, task), exception);
+        let worker = unsay(&mut changes.events, stage, task);
+        changes.events.push(NewEvent {
+            stage: Some(stage.stage),
+            tasks: Some(Run {
+                lo: task,
+                hi: task + 1,
+            }),
+            worker,
+            ..NewEvent::of(stage.job, now_ms, EventKind::Dead, why)
+        });
+        if entry.stage.is_empty() {
+            changes.perhaps_over.insert(stage, now_ms);
+        }
+    }
+
+    /// Makes one task of a range that is to be written as done one that is given up; returns the lease under which it was
+    /// done.
+    fn undo(&mut self, changes: &mut Changes, stage: StageRef, task: u64) -> Option<LeaseRef> {
+        let of_stage = |range: &Range| range.stage == stage && (range.lo..range.hi).contains(&task);
+        let done = |range: &Range| match &range.state {
+            RangeState::Leased(lease) => {
+                let mark = lease.marks.get((task - range.lo) as usize);
+                matches!(mark, Some(Mark::Done | Mark::Reused))
+            }
+            RangeState::Done { .. } => true,
+            _ => false,
+        };
+        let mut all = changes.ranges.values().chain(changes.free.values());
+        let range = all.find(|range| of_stage(range) && done(range))?.clone();
+        if let RangeState::Leased(_) = range.state {
+            let entry = self.stages.get_mut(&stage)?;
+            if let Some(left) = entry.stage.leave(range.id, task) {
+                changes.put(left);
+            }
+        } else {
+            changes.remove(range.id);
+            for (lo, hi) in [(range.lo, task), (task + 1, range.hi)] {
+                if lo < hi {
+                    let piece = Range {
+                        lo,
+                        hi,
+                        ..range.clone()
+                    };
+                    self.give_new(changes, piece);
+                }
+            }
+        }
+        let dead = Range {
+            lo: task,
+            hi: task + 1,
+            crashes: 0,
+            state: RangeState::Dead,
+            ..range.clone()
+        };
+        self.give_new(changes, dead);
+        Some(range.lease())
+    }
+
+    /// Gives out a range under an id of its own.
+    fn give_new(&mut self, changes: &mut Changes, mut range: Range) {
+        range.id = RangeId::from_uuid((self.make_id)());
+        changes.minted.insert(range.id);
+        changes.give(range);
+    }
+}
+
+/// Takes back the line of history that says that a task was done; returns the worker it names.
+fn unsay(events: &mut Vec<NewEvent>, stage: StageRef, task: u64) -> String {
+    let says = |event: &NewEvent| {
+        (event.job, event.stage) == (stage.job, Some(stage.stage))
+            && matches!(event.kind, EventKind::Committed | EventKind::Reused)
+            && event.tasks.is_some_and(|t| (t.lo..t.hi).contains(&task))
+    };
+    let Some(at) = events.iter().rposition(says) else {
+        return String::new();
+    };
+    let event = events.remove(at);
+    let tasks = event.tasks.expect("it names the task");
+    for (lo, hi) in [(task + 1, tasks.hi), (tasks.lo, task)] {
+        if lo < hi {
+            let tasks = Some(Run { lo, hi });
+            events.insert(
+                at,
+                NewEvent {
+                    tasks,
+                    ..event.clone()
+                },
+            );
+        }
+    }
+    event.worker
+}

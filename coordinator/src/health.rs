@@ -1,0 +1,178 @@
+//! How the actor does, and how with its catalog: what `/healthz` and `/readyz` tell. Read without asking the actor.
+
+use std::{
+    fmt,
+    sync::{
+        Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+/// The actor is thought stuck when its loop has not turned for so long.
+const ALIVE: Duration = Duration::from_secs(30);
+/// The catalog is thought gone when it has not answered for so long.
+const READY: Duration = Duration::from_secs(10);
+
+/// How the actor does, and how with its catalog.
+pub(crate) struct Health {
+    catalog: Mutex<State>,
+    began: Instant,
+    /// When its loop turned last, milliseconds after `began`.
+    turned: AtomicU64,
+}
+
+impl Default for Health {
+    fn default() -> Self {
+        Self {
+            catalog: Mutex::default(),
+            began: Instant::now(),
+            turned: AtomicU64::new(0),
+        }
+    }
+}
+
+#[derive(Default)]
+struct State {
+    beaten: Option<Instant>,
+    /// In a few words for anyone, and in full for this machine.
+    fault: Option<(&'static str, String)>,
+}
+
+/// Why no work can be taken: for anyone, and for people on this machine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Unready {
+    pub what: String,
+    /// It may name files and hosts.
+    pub detail: Option<String>,
+}
+
+impl fmt::Display for Unready {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)
+    }
+}
+
+impl Health {
+    /// The actor's loop turns.
+    pub(crate) fn turn(&self) {
+        let now = u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX);
+        self.turned.store(now, Ordering::Relaxed);
+    }
+
+    /// How long ago it turned; or since the start.
+    fn since_turn(&self) -> Duration {
+        let turned = Duration::from_millis(self.turned.load(Ordering::Relaxed));
+        self.began.elapsed().saturating_sub(turned)
+    }
+
+    /// The catalog has answered.
+    pub(crate) fn beat(&self) {
+        *self.lock() = State {
+            beaten: Some(Instant::now()),
+            fault: None,
+        };
+    }
+
+    /// A life of the actor has ended for this reason; another will be tried.
+    pub(crate) fn fault(&self, brief: &'static str, why: &str) {
+        self.lock().fault = Some((brief, why.to_owned()));
+    }
+
+    /// Whether jobs and reports can be taken.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(crate) fn ready(&self) -> Result<(), Unready> {
+        let state = self.lock();
+        if let Some((brief, why)) = &state.fault {
+            return Err(Unready {
+                what: format!("{brief}; nothing is taken until it can be used again"),
+                detail: Some(why.clone()),
+            });
+        }
+        let what = match state.beaten.map(|at| at.elapsed()) {
+            None => "the catalog has not answered yet".into(),
+            Some(age) if age > READY => {
+                format!("the catalog has not answered for {} s", age.as_secs())
+            }
+            Some(_) => return Ok(()),
+        };
+        Err(Unready { what, detail: None })
+    }
+
+    /// Whether the process does its work; one that waits for its catalog does. In words either way.
+    ///
+    /// # Errors
+    /// It does not.
+    pub(crate) fn alive(&self) -> Result<String, String> {
+        let since = self.since_turn();
+        if self.waits() {
+            return Ok("ok, waiting for the catalog".into());
+        }
+        if since > ALIVE {
+            let seconds = since.as_secs();
+            return Err(format!(
+                "the coordinator's loop has not turned for {seconds} s"
+            ));
+        }
+        Ok(format!("ok, the loop turned {} ms ago", since.as_millis()))
+    }
+
+    /// Whether the actor is between two lives: its silence is the catalog's.
+    fn waits(&self) -> bool {
+        self.lock().fault.is_some()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.catalog.lock().expect("no panic while locked")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn readiness_follows_the_catalog() {
+        let health = Health::default();
+        assert!(
+            health
+                .ready()
+                .unwrap_err()
+                .to_string()
+                .contains("not answered yet")
+        );
+        health.beat();
+        assert_eq!(health.ready(), Ok(()));
+        health.fault("the catalog failed", "no route to db.example");
+        let why = health.ready().unwrap_err();
+        assert!(
+            !why.to_string().contains("db.example"),
+            "hosts are for this machine alone"
+        );
+        assert_eq!(why.detail.as_deref(), Some("no route to db.example"));
+        assert!(health.waits());
+        health.beat();
+        assert_eq!(health.ready(), Ok(()));
+        let long_ago = Instant::now().checked_sub(2 * READY);
+        health.lock().beaten = long_ago;
+        assert_eq!(health.ready().is_err(), long_ago.is_some());
+    }
+
+    #[test]
+    fn health_follows_the_loop_and_not_the_catalog() {
+        let mut health = Health::default();
+        let ok = |health: &Health| health.alive().is_ok();
+        assert!(ok(&health), "it has just begun");
+        health.began = Instant::now().checked_sub(2 * ALIVE).unwrap();
+        let why = health.alive().unwrap_err();
+        assert!(why.contains("not turned for 60 s"), "{why}");
+        health.fault("the catalog failed", "no route to db.example");
+        assert!(ok(&health), "it waits for the catalog");
+        health.beat();
+        assert!(!ok(&health));
+        health.turn();
+        assert!(ok(&health));
+    }
+}

@@ -1,0 +1,89 @@
+//! The gate before jobs: who may see and change which, and the note of it in the audit log.
+
+use picofarm_catalog::Owner;
+use picofarm_proto::{ids::JobId, model::Act};
+use tonic::Status;
+
+use super::Link;
+use crate::{
+    actor::{Command, Reply},
+    auth::Caller,
+};
+
+impl Link {
+    async fn owner(&self, job: JobId) -> Result<Owner, Status> {
+        let found = self.catalog.owner(job).await;
+        let found = found.map_err(|e| Status::unavailable(e.to_string()))?;
+        found.ok_or_else(|| no_such_job(job))
+    }
+
+    /// Checks that a caller may see a job.
+    ///
+    /// # Errors
+    /// NOT_FOUND, in the words for a job that there is not.
+    pub(super) async fn may_see(&self, caller: &Caller, job: JobId) -> Result<(), Status> {
+        let sight = caller.sight(self.visibility);
+        if sight == picofarm_catalog::Sight::All {
+            return Ok(());
+        }
+        match sight.sees(&self.owner(job).await?) {
+            true => Ok(()),
+            false => Err(no_such_job(job)),
+        }
+    }
+
+    /// Checks that a caller may change a job.
+    ///
+    /// # Errors
+    /// PERMISSION_DENIED; NOT_FOUND for a job that it may not see.
+    async fn may_change(&self, caller: &Caller, job: JobId) -> Result<(), Status> {
+        if caller.is_admin() {
+            return Ok(());
+        }
+        let owner = self.owner(job).await?;
+        if caller.may_change(&owner) {
+            return Ok(());
+        }
+        if !caller.sight(self.visibility).sees(&owner) {
+            return Err(no_such_job(job));
+        }
+        Err(Status::permission_denied(not_yours(&job, &owner)))
+    }
+
+    /// Lets the actor do something to a job, if the caller may, and notes it.
+    pub(super) async fn steer<T>(
+        &self,
+        caller: &Caller,
+        act: Act,
+        job: JobId,
+        command: impl FnOnce(Reply<T>) -> Command,
+    ) -> Result<T, Status> {
+        let answer = match self.may_change(caller, job).await {
+            Ok(()) => self.ask(command).await,
+            Err(refused) => Err(refused),
+        };
+        self.audit
+            .record(&caller.name, act, Some(job), &answer, "")
+            .await;
+        answer
+    }
+}
+
+/// The answer for a job that there is not, or that the caller may not see.
+pub(super) fn no_such_job(job: JobId) -> Status {
+    Status::not_found(format!(
+        "there is no job {job}; list the jobs to see their ids"
+    ))
+}
+
+/// Why a caller may not change a job that it sees.
+pub(crate) fn not_yours(job: &JobId, owner: &Owner) -> String {
+    let maintainers = match owner.project.as_str() {
+        "" => String::new(),
+        project => format!(", a maintainer of project {project:?}"),
+    };
+    format!(
+        "job {job} is {:?}'s: only its owner{maintainers} or an administrator may change it",
+        owner.user
+    )
+}

@@ -1,0 +1,58 @@
+//! The sessions of a life of the actor: where to speak to them, and whose heartbeats wait to be handled.
+
+use std::{
+    collections::HashMap,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
+};
+
+use tokio::sync::mpsc;
+
+use crate::core::{Say, SessionId};
+
+/// Counts the heartbeats of a session that have arrived and are not handled yet.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Waiting(Arc<AtomicU32>);
+
+impl Waiting {
+    /// One has arrived.
+    pub(crate) fn arrived(&self) {
+        self.0.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// The open sessions.
+#[derive(Debug, Default)]
+pub(crate) struct Sessions(HashMap<SessionId, (mpsc::Sender<Say>, Waiting)>);
+
+impl Sessions {
+    pub(crate) fn open(&mut self, session: SessionId, say: mpsc::Sender<Say>, waiting: Waiting) {
+        self.0.insert(session, (say, waiting));
+    }
+
+    pub(crate) fn close(&mut self, session: SessionId) {
+        self.0.remove(&session);
+    }
+
+    pub(crate) fn get(&self, session: SessionId) -> Option<&mpsc::Sender<Say>> {
+        self.0.get(&session).map(|(say, _)| say)
+    }
+
+    /// A heartbeat of this session is handled.
+    pub(crate) fn heard(&self, session: SessionId) {
+        if let Some((_, waiting)) = self.0.get(&session) {
+            waiting.0.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+
+    /// The sessions whose heartbeats wait.
+    pub(crate) fn waiting(&self) -> impl Iterator<Item = SessionId> + '_ {
+        let waits = self
+            .0
+            .iter()
+            .filter(|(_, (_, w))| w.0.load(Ordering::Relaxed) > 0);
+        waits.map(|(session, _)| *session)
+    }
+}

@@ -1,0 +1,209 @@
+//! Which recorded outputs a store is asked about, and which of them count. Pure.
+
+use std::collections::BTreeMap;
+
+use picofarm_catalog::{Gone, Recorded, ResultSet, Run};
+use picofarm_proto::model::StageSpec;
+use sha2::{Digest, Sha256};
+
+use crate::stored::Found;
+
+/// Outputs of a stage that are all looked at; of more, those that were found before are sampled.
+pub(crate) const ALL: usize = 1_000;
+/// Size of the sample.
+const SAMPLE: usize = 64;
+
+/// What is known of a stage's recorded outputs once its store was asked.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Findings {
+    /// How many are recorded.
+    pub recorded: u64,
+    /// Those that count, ascending.
+    pub counts: Vec<Run>,
+    /// Those that are gone.
+    pub gone: Vec<Recorded>,
+    /// Those in whose place the store holds something else.
+    pub differ: Vec<Recorded>,
+    /// How many nobody has ever looked at, and could not be looked at now.
+    pub unseen: u64,
+    /// Why some could not be looked at.
+    pub why: Option<String>,
+}
+
+impl Findings {
+    /// The records that must go before these tasks can run again.
+    pub(crate) fn dropped(&self, set: &ResultSet) -> Vec<Gone> {
+        let lost = self.gone.iter().chain(&self.differ);
+        lost.map(|output| Gone {
+            set: set.clone(),
+            task: output.task,
+            manifest: output.manifest,
+        })
+        .collect()
+    }
+
+    /// Whether a job that is done has lost results by what was found. `trusted`: who asks is who had the job run.
+    pub(crate) fn lost(&self, tasks: u64, trusted: bool) -> bool {
+        !self.gone.is_empty()
+            || !self.differ.is_empty()
+            || self.recorded < tasks
+            || (!trusted && self.unseen > 0)
+    }
+
+    /// The same in words, for a plan.
+    pub(crate) fn words(&self, stage: &StageSpec, set: &ResultSet) -> Vec<String> {
+        let what = match stage.task.writes().is_some() {
+            true => "scenes",
+            false => "results",
+        };
+        let mut words = Vec::new();
+        let (recorded, place) = (self.recorded, &set.store);
+        if !self.gone.is_empty() {
+            let gone = self.gone.len();
+            words.push(format!(
+                "{gone} of {recorded} {what} recorded as done are gone from {place}: they will run again"
+            ));
+        }
+        if !self.differ.is_empty() {
+            let differ = self.differ.len();
+            words.push(format!(
+                "{differ} of {recorded} {what} recorded as done are not what lies in {place}: they will run again"
+            ));
+        }
+        if let Some(why) = &self.why {
+            words.push(match self.unseen {
+                0 => format!("{place} was not looked into, because {why}: {what} found there before count as done"),
+                n => format!(
+                    "{n} of {recorded} {what} recorded as done were never looked at, and cannot be now, because {why}: \
+                     workers look for them before they run"
+                ),
+            });
+        }
+        words
+    }
+}
+
+/// The outputs to ask the store about, by position: those that nobody has looked at, and of the others all or a sample.
+/// `seed` decides the sample.
+pub(crate) fn choose(recorded: &[Recorded], seed: &str) -> Vec<usize> {
+    let (known, unknown): (Vec<usize>, Vec<usize>) =
+        (0..recorded.len()).partition(|i| recorded[*i].checked);
+    let mut chosen = match recorded.len() <= ALL {
+        true => known,
+        false => sample(known, seed),
+    };
+    chosen.extend(unknown);
+    chosen.sort_unstable();
+    chosen
+}
+
+/// Those whose hashes with the seed are smallest.
+fn sample(mut from: Vec<usize>, seed: &str) -> Vec<usize> {
+    if from.len() > SAMPLE {
+        from.sort_by_cached_key(|i| {
+            let mut hash = Sha256::new();
+            hash.update(seed);
+            hash.update(i.to_le_bytes());
+            <[u8; 32]>::from(hash.finalize())
+        });
+        from.truncate(SAMPLE);
+    }
+    from
+}
+
+/// Whether the outputs that were passed over must be asked about too: one of the sample is not there.
+pub(crate) fn suspicious(recorded: &[Recorded], found: &BTreeMap<u64, Found>) -> bool {
+    recorded
+        .iter()
+        .any(|o| o.checked && found.get(&o.task).is_some_and(|f| *f != Found::Equal))
+}
+
+/// What follows from the store's answers, by task.
+pub(crate) fn judge(
+    recorded: &[Recorded],
+    found: &BTreeMap<u64, Found>,
+    why: Option<String>,
+) -> Findings {
+    let mut findings = Findings {
+        recorded: recorded.len() as u64,
+        why,
+        ..Findings::default()
+    };
+    for output in recorded {
+        match found.get(&output.task) {
+            Some(Found::Gone) => findings.gone.push(*output),
+            Some(Found::Differs) => findings.differ.push(*output),
+            None if !output.checked => findings.unseen += 1,
+            Some(Found::Equal) | None => match findings.counts.last_mut() {
+                Some(run) if run.hi == output.task => run.hi += 1,
+                _ => findings.counts.push(Run {
+                    lo: output.task,
+                    hi: output.task + 1,
+                }),
+            },
+        }
+    }
+    findings
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn recorded(n: u64, checked: impl Fn(u64) -> bool) -> Vec<Recorded> {
+        let one = |task| Recorded {
+            task,
+            manifest: [task as u8; 32],
+            checked: checked(task),
+        };
+        (0..n).map(one).collect()
+    }
+
+    #[test]
+    fn few_outputs_are_all_looked_at_and_of_many_a_sample_and_what_nobody_has_seen() {
+        assert_eq!(choose(&recorded(1_000, |_| true), "a").len(), 1_000);
+        let many = recorded(5_000, |task| task >= 100);
+        let chosen = choose(&many, "a");
+        assert_eq!(chosen.len(), 100 + SAMPLE);
+        assert!((0..100).all(|i| chosen.contains(&i)));
+        assert_eq!(chosen, choose(&many, "a"), "the seed decides");
+        assert_ne!(chosen, choose(&many, "b"));
+    }
+
+    #[test]
+    fn a_reported_output_that_nobody_could_look_at_does_not_count() {
+        let outputs = recorded(4, |task| task < 2);
+        let findings = judge(&outputs, &BTreeMap::new(), Some("it is far".into()));
+        assert_eq!(findings.counts, [Run { lo: 0, hi: 2 }]);
+        assert_eq!(findings.unseen, 2);
+        assert!(!findings.lost(4, true));
+        assert!(findings.lost(4, false), "another's job is not believed");
+        assert!(findings.lost(5, true), "one is not recorded at all");
+    }
+
+    proptest! {
+        #[test]
+        fn every_output_counts_or_is_gone_or_differs_or_was_not_seen(
+            all in prop::collection::vec((any::<bool>(), prop::option::of(0..3u8)), 0..50),
+        ) {
+            let outputs = recorded(all.len() as u64, |task| all[task as usize].0);
+            let of = |n| [Found::Equal, Found::Gone, Found::Differs][usize::from(n)];
+            let found: BTreeMap<u64, Found> = (0u64..)
+                .zip(&all)
+                .filter_map(|(task, (_, found))| Some((task, of((*found)?))))
+                .collect();
+            let findings = judge(&outputs, &found, None);
+            let counts: u64 = findings.counts.iter().map(|r| r.hi - r.lo).sum();
+            let lost = (findings.gone.len() + findings.differ.len()) as u64;
+            prop_assert_eq!(counts + lost + findings.unseen, outputs.len() as u64);
+            for run in &findings.counts {
+                for task in run.lo..run.hi {
+                    let seen = found.get(&task) == Some(&Found::Equal);
+                    prop_assert!(seen || (outputs[task as usize].checked && !found.contains_key(&task)));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! A spec that was read and checked, with what follows from it and takes long to find out: once.
+
+use std::sync::Arc;
+
+use picofarm_catalog::{Job, StageRecord};
+use picofarm_proto::{
+    ids::JobId,
+    key::spec_hash,
+    model::{JobSpec, JobState},
+};
+use sha2::{Digest, Sha256};
+use uuid::Uuid;
+
+/// A job that may be submitted.
+#[derive(Debug, Clone)]
+pub(crate) struct Draft {
+    pub spec: Arc<JobSpec>,
+    /// SHA-256 of the spec, hexadecimal.
+    pub hash: String,
+    /// Its stages, whose job has no id yet.
+    stages: Vec<StageRecord>,
+    /// Size of the spec as it was sent.
+    pub bytes: usize,
+}
+
+impl Draft {
+    /// Hashes the spec: seconds for one of some ten megabytes.
+    pub(crate) fn new(spec: JobSpec, bytes: usize) -> Self {
+        let hash = spec_hash(&spec);
+        let spec = Arc::new(spec);
+        let job = Job {
+            id: JobId::from_uuid(Uuid::nil()),
+            spec_hash: hash.clone(),
+            spec: Arc::clone(&spec),
+            state: JobState::Active,
+            submitted_ms: 0,
+            ended_ms: None,
+            paused: false,
+            user: String::new(),
+        };
+        Self {
+            spec,
+            hash,
+            stages: job.stages(),
+            bytes,
+        }
+    }
+
+    /// What tells whether two submissions are the same job: the whole spec, and among whose jobs an equal one is looked for
+    /// (empty = among all).
+    pub(crate) fn identity(&self, circle: &str) -> String {
+        match circle {
+            "" => self.hash.clone(),
+            _ => hex::encode(Sha256::digest(format!("{} {circle}", self.hash))),
+        }
+    }
+
+    /// Its stages.
+    pub(crate) fn stages(&self) -> &[StageRecord] {
+        &self.stages
+    }
+
+    /// The job that it becomes, and that job's stages.
+    /// An equal job is looked for in `circle`.
+    pub(crate) fn job(
+        &self,
+        id: JobId,
+        user: String,
+        circle: &str,
+        now_ms: i64,
+    ) -> (Job, Vec<StageRecord>) {
+        let job = Job {
+            id,
+            spec_hash: self.identity(circle),
+            spec: Arc::clone(&self.spec),
+            state: JobState::Active,
+            submitted_ms: now_ms,
+            ended_ms: None,
+            paused: false,
+            user,
+        };
+        let mut stages = self.stages.clone();
+        for stage in &mut stages {
+            stage.id.job = id;
+        }
+        (job, stages)
+    }
+}

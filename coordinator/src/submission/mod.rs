@@ -1,0 +1,380 @@
+//! Planning and submitting, beside the actor: a spec is compared with what the catalog holds and what the stores hold, and
+//! recorded in one transaction. The actor only hears that there is a job.
+//!
+//! An output counts for a new job if its store was found to hold it. What a worker has reported and nobody has seen since
+//! is laid out as pending, and a worker looks for it. So is what is committed while a job is being planned.
+
+mod check;
+mod draft;
+mod judge;
+mod look;
+mod report;
+
+use std::sync::Arc;
+
+use picofarm_catalog::{
+    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, StageRecord, Submission,
+};
+use picofarm_proto::{
+    ids::JobId,
+    model::{JobPlan, JobState},
+};
+use tokio::sync::{Mutex, mpsc};
+use uuid::Uuid;
+
+use crate::{
+    actor::{Command, Refusal, Submitted},
+    auth::{Caller, Visibility},
+    clock::Clock,
+    core::{Learnt, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
+    lanes::Lanes,
+    rpc::not_yours,
+    stored::{Found, Stored},
+};
+use check::Findings;
+use look::Stores;
+
+pub(crate) use draft::Draft;
+
+/// Jobs that a new one is compared with.
+const RECENT: u32 = 50;
+/// How often a submission is planned anew because what it counted on has changed meanwhile.
+const ATTEMPTS: usize = 4;
+
+/// Plans and submits.
+#[derive(Clone)]
+pub(crate) struct Submissions {
+    catalog: Arc<dyn Catalog>,
+    lanes: Lanes,
+    stores: Stores,
+    commands: mpsc::Sender<Command>,
+    clock: Clock,
+    /// What callers see of others' jobs.
+    visibility: Visibility,
+    /// Held while a job is counted against its user's quota and recorded.
+    turn: Arc<Mutex<()>>,
+}
+
+/// What the catalog holds of a draft.
+struct Facts {
+    /// By stage.
+    recorded: Vec<Vec<Recorded>>,
+    latest: Option<Latest>,
+}
+
+/// The latest job with the same spec.
+#[derive(Debug, Clone)]
+struct Latest {
+    id: JobId,
+    state: JobState,
+    owner: Owner,
+}
+
+/// A draft, considered.
+struct Considered {
+    plan: JobPlan,
+    latest: Option<Latest>,
+    /// The latest job is done, but its results are not all there.
+    lost: bool,
+    /// By stage.
+    findings: Vec<Findings>,
+}
+
+impl Submissions {
+    pub(crate) fn new(
+        catalog: Arc<dyn Catalog>,
+        lanes: Lanes,
+        stored: Option<Arc<dyn Stored>>,
+        commands: mpsc::Sender<Command>,
+        clock: Clock,
+        visibility: Visibility,
+    ) -> Self {
+        Self {
+            catalog,
+            lanes,
+            stores: Stores::new(stored),
+            commands,
+            clock,
+            visibility,
+            turn: Arc::default(),
+        }
+    }
+
+    /// What submitting would do.
+    pub(crate) async fn plan(&self, draft: &Arc<Draft>, by: &Caller) -> Result<JobPlan, Refusal> {
+        Ok(self.consider(draft, by).await?.plan)
+    }
+
+    /// Records a job, unless there is one that stands for it. `most`: jobs that the caller may have that have not ended.
+    pub(crate) async fn submit(
+        &self,
+        draft: &Arc<Draft>,
+        by: &Caller,
+        most: u64,
+        again: bool,
+    ) -> Result<Submitted, Refusal> {
+        for _ in 0..ATTEMPTS {
+            let considered = self.consider(draft, by).await?;
+            let latest = considered.latest.as_ref();
+            let stands = latest.filter(|job| !considered.lost && stands_for(job.state, again));
+            if let Some(job) = stands {
+                return Ok(Submitted {
+                    job: job.id,
+                    existed: true,
+                    plan: considered.plan,
+                });
+            }
+            // It failed or was cancelled, and is asked for again.
+            if let Some(job) = latest.filter(|job| job.state != JobState::Done)
+                && !by.may_change(&job.owner)
+            {
+                return Err(Refusal::Denied(not_yours(&job.id, &job.owner)));
+            }
+            if let Some(submitted) = self.record(draft, by, most, considered).await? {
+                return Ok(submitted);
+            }
+        }
+        Err(Refusal::NotNow(
+            "what the job would reuse, or the same job of someone else, kept changing; try again"
+                .into(),
+        ))
+    }
+
+    async fn consider(&self, draft: &Arc<Draft>, by: &Caller) -> Result<Considered, Refusal> {
+        let sight = by.sight(self.visibility);
+        let whose = by.clone();
+        let facts = self
+            .heavy(
+                draft,
+                |it, draft| async move { it.facts(&draft, &whose).await },
+            )
+            .await?;
+        let Facts { recorded, latest } = facts;
+        let until = look::deadline();
+        let mut findings = Vec::with_capacity(recorded.len());
+        for (position, recorded) in recorded.into_iter().enumerate() {
+            findings.push(self.look(draft, position, recorded, until).await?);
+        }
+        let lost = latest.as_ref().is_some_and(|job| {
+            let stages = draft.stages().iter().zip(&findings);
+            let mut lost = stages.map(|(stage, f)| f.lost(stage.tasks, job.owner.user == *by.name));
+            job.state == JobState::Done && lost.any(|lost| lost)
+        });
+        let existing = latest.as_ref().map(|job| job.id);
+        let (plan, findings) = self
+            .heavy(draft, move |it, draft| async move {
+                let catalog = Arc::clone(&it.catalog);
+                let recent = catalog.recent(RECENT, &sight).await.map_err(broken)?;
+                Ok((report::plan(&draft, &findings, existing, &recent), findings))
+            })
+            .await?;
+        Ok(Considered {
+            plan,
+            latest,
+            lost,
+            findings,
+        })
+    }
+
+    /// What the catalog holds of it.
+    async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
+        let catalog = &self.catalog;
+        let sight = by.sight(self.visibility);
+        let mut recorded = Vec::with_capacity(draft.stages().len());
+        for (stage, record) in draft.spec.stages.iter().zip(draft.stages()) {
+            let set = &record.set;
+            let writes = stage.task.writes().is_some();
+            if writes || stage.force {
+                let others = catalog.jobs_at(&set.store, &set.dataset).await;
+                let others = others.map_err(broken)?;
+                if writes {
+                    place_is_free(stage, set, &others, &sight)
+                        .map_err(|why| Refusal::Spec(draft.spec.at(stage, why)))?;
+                }
+                if stage.force {
+                    may_force(stage, set, &others, by, &sight).map_err(Refusal::Denied)?;
+                }
+            }
+            recorded.push(catalog.recorded(set, record.tasks).await.map_err(broken)?);
+        }
+        let circle = self.visibility.circle(by, &draft.spec);
+        let latest = catalog.job_with(&draft.identity(&circle)).await;
+        let latest = latest.map_err(broken)?;
+        Ok(Facts {
+            recorded,
+            latest: latest.map(|job| Latest {
+                owner: Owner::from(&job),
+                id: job.id,
+                state: job.state,
+            }),
+        })
+    }
+
+    /// Asks the store of a stage about its recorded outputs.
+    async fn look(
+        &self,
+        draft: &Draft,
+        position: usize,
+        recorded: Vec<Recorded>,
+        until: tokio::time::Instant,
+    ) -> Result<Findings, Refusal> {
+        let (stage, set) = (&draft.spec.stages[position], &draft.stages()[position].set);
+        let chosen = check::choose(&recorded, &draft.hash);
+        let some: Vec<Recorded> = chosen.iter().map(|i| recorded[*i]).collect();
+        let (mut found, mut why) = self.stores.look(stage, set, &some, until).await;
+        if why.is_none() && check::suspicious(&recorded, &found) {
+            let passed = recorded.iter().filter(|o| !found.contains_key(&o.task));
+            let passed: Vec<Recorded> = passed.copied().collect();
+            let (more, stopped) = self.stores.look(stage, set, &passed, until).await;
+            found.extend(more);
+            why = stopped;
+        }
+        let is_new = |o: &&Recorded| !o.checked && found.get(&o.task) == Some(&Found::Equal);
+        let new: Vec<Recorded> = recorded.iter().filter(is_new).copied().collect();
+        if !new.is_empty()
+            && let Err(error) = self.catalog.mark_checked(set, &new).await
+        {
+            return Err(self.unwritable(error).await);
+        }
+        Ok(check::judge(&recorded, &found, why))
+    }
+
+    /// Records the job; `None` where something has changed since it was considered.
+    async fn record(
+        &self,
+        draft: &Arc<Draft>,
+        by: &Caller,
+        most: u64,
+        considered: Considered,
+    ) -> Result<Option<Submitted>, Refusal> {
+        let (plan, owner) = (considered.plan, by.name.to_string());
+        let circle = self.visibility.circle(by, &draft.spec);
+        let instead_of = considered
+            .latest
+            .filter(|_| considered.lost)
+            .map(|job| job.id);
+        let findings = considered.findings;
+        let recorded = self.heavy(draft, move |it, draft| async move {
+            let _turn = it.turn.lock().await;
+            if it.catalog.jobs_of(&owner).await.map_err(broken)? >= most {
+                return Err(Refusal::TooMany(format!(
+                    "{owner:?} has {most} jobs that have not ended, the most that --max-jobs-per-user allows; wait for \
+                     some to end, or cancel some"
+                )));
+            }
+            let counts: Vec<Vec<Run>> = findings.iter().map(|f| f.counts.clone()).collect();
+            let mut make_id = Uuid::now_v7;
+            let prepared = prepare(&draft, owner, &circle, &counts, &mut make_id, it.clock.now_ms());
+            let dropped = findings.iter().zip(draft.stages());
+            let gone: Vec<Gone> = dropped.flat_map(|(f, stage)| f.dropped(&stage.set)).collect();
+            it.commit(prepared, &gone, instead_of).await
+        });
+        let Some(job) = recorded.await? else {
+            return Ok(None);
+        };
+        Ok(Some(Submitted {
+            job,
+            existed: false,
+            plan,
+        }))
+    }
+
+    async fn commit(
+        &self,
+        prepared: Prepared,
+        gone: &[Gone],
+        instead_of: Option<JobId>,
+    ) -> Result<Option<JobId>, Refusal> {
+        let Prepared {
+            job,
+            stages,
+            ranges,
+            events,
+        } = prepared;
+        let submission = Submission {
+            gone,
+            instead_of,
+            ..Submission::new(&job, &stages, &ranges, &events)
+        };
+        match self.catalog.record(&submission).await {
+            Ok(Outcome::New) => {}
+            Ok(Outcome::Exists | Outcome::Changed) => return Ok(None),
+            Err(error) => return Err(self.unwritable(error).await),
+        }
+        let id = job.id;
+        self.announce(job, stages).await?;
+        Ok(Some(id))
+    }
+
+    /// What is said when the catalog could not be written; the actor hears of it, unless what was to be written is at fault.
+    async fn unwritable(&self, error: CatalogError) -> Refusal {
+        if matches!(error, CatalogError::Refused { .. }) {
+            return broken(error);
+        }
+        let why = Refusal::Catalog(error.to_string());
+        // An actor that is gone has heard it already.
+        let _ = self.commands.send(Command::Broken(error)).await;
+        why
+    }
+
+    /// Tells the actor of a job that is recorded, and waits until it knows.
+    async fn announce(&self, job: Job, stages: Vec<StageRecord>) -> Result<(), Refusal> {
+        let mut timings = Timings::new();
+        for stage in &stages {
+            let timing = self.catalog.timing(&stage.set).await.map_err(broken)?;
+            timings.insert(stage.set.clone(), timing);
+        }
+        // A job without anything to run has ended by now.
+        let state = self.catalog.state(job.id).await.map_err(broken)?;
+        let learnt = Learnt {
+            job,
+            stages,
+            timings,
+        };
+        let learnt = (state == Some(JobState::Active)).then_some(learnt);
+        let (reply, told) = tokio::sync::oneshot::channel();
+        let command = Command::Learn(learnt.map(Box::new), reply);
+        if self.commands.send(command).await.is_ok() {
+            // An actor between two lives finds the job in the catalog.
+            let _ = told.await;
+        }
+        Ok(())
+    }
+
+    /// Tells the actor of a job that it has heard of, if the job is active.
+    pub(crate) async fn learn(&self, id: JobId) -> Result<(), Refusal> {
+        let it = self.clone();
+        self.lanes
+            .read(move || async move {
+                match it.catalog.job(id).await.map_err(broken)? {
+                    Some(record) => {
+                        let stages = record.job.stages();
+                        it.announce(record.job, stages).await
+                    }
+                    None => Ok(()),
+                }
+            })
+            .await
+    }
+
+    /// Runs work on a draft beside everything else.
+    async fn heavy<T, F>(
+        &self,
+        draft: &Arc<Draft>,
+        work: impl FnOnce(Self, Arc<Draft>) -> F + Send + 'static,
+    ) -> T
+    where
+        T: Send + 'static,
+        F: Future<Output = T>,
+    {
+        let (it, draft) = (self.clone(), Arc::clone(draft));
+        self.lanes.heavy(draft.bytes, move || work(it, draft)).await
+    }
+}
+
+fn broken(error: CatalogError) -> Refusal {
+    match error {
+        CatalogError::Refused { what, .. } => Refusal::Content(what),
+        error => Refusal::Catalog(error.to_string()),
+    }
+}

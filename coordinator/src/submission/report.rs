@@ -1,0 +1,29 @@
+//! What submitting a draft would do, in the words of a plan.
+
+use picofarm_catalog::Job;
+use picofarm_proto::{ids::JobId, model::JobPlan};
+
+use super::{Draft, check::Findings};
+use crate::plan;
+
+/// The plan, given for each stage what was found of its outputs, the job that has this spec, and recent jobs.
+pub(super) fn plan(
+    draft: &Draft,
+    findings: &[Findings],
+    existing_job: Option<JobId>,
+    recent: &[Job],
+) -> JobPlan {
+    let counts: Vec<_> = findings.iter().map(|f| f.counts.clone()).collect();
+    let mut plan = plan::plan(&draft.spec, &draft.hash, &counts, existing_job, recent);
+    let stages = plan.stages.iter_mut().zip(&draft.spec.stages);
+    for ((told, stage), (record, found)) in stages.zip(draft.stages().iter().zip(findings)) {
+        let words = found.words(stage, &record.set);
+        // Why the rest runs is said by these words alone, where all of it was recorded.
+        let explained = found.recorded >= told.total && !stage.force;
+        if explained && !words.is_empty() {
+            told.reasons.retain(|reason| !reason.contains(" run: "));
+        }
+        told.reasons.extend(words);
+    }
+    plan
+}

@@ -1,0 +1,102 @@
+//! The list of jobs over the wire: by pages, the latest first, without specs.
+
+use picofarm_proto::{model::bounds, wire};
+use prost::Message;
+use tonic::Code;
+
+use crate::harness::{Farm, rendering, spec};
+
+async fn list(
+    farm: &mut Farm,
+    request: wire::ListJobsRequest,
+) -> Result<wire::ListJobsResponse, tonic::Status> {
+    Ok(farm.jobs.list_jobs(request).await?.into_inner())
+}
+
+#[tokio::test]
+async fn jobs_come_in_pages_and_the_answer_says_where_the_next_begins() {
+    for mut farm in Farm::start_on_each().await {
+        let mut ids = Vec::new();
+        for n in 0..5 {
+            let mut job = spec(3);
+            // As long as a name may be.
+            job.name = format!("{n}{}", "x".repeat(bounds::NAME_BYTES - 1));
+            rendering(&mut job).output.dataset = format!("d{n}");
+            ids.push(farm.submit(&job).await.job_id);
+        }
+        ids.reverse();
+        let mut seen = Vec::new();
+        let mut request = wire::ListJobsRequest {
+            page_size: 2,
+            ..Default::default()
+        };
+        loop {
+            let page = list(&mut farm, request.clone()).await.unwrap();
+            assert!(page.jobs.len() <= 2);
+            for job in &page.jobs {
+                assert!(
+                    job.encoded_len() < 1_000,
+                    "a thousand of them stay below 1 MB"
+                );
+                assert_eq!(job.tasks.unwrap().pending, 3);
+            }
+            seen.extend(page.jobs.into_iter().map(|job| job.id));
+            request.page_token = page.next_page_token;
+            if request.page_token.is_empty() {
+                break;
+            }
+        }
+        assert_eq!(seen, ids);
+        let cancel = wire::CancelJobRequest {
+            job_id: ids[1].clone(),
+        };
+        farm.jobs.cancel_job(cancel).await.unwrap();
+        let cancelled = wire::ListJobsRequest {
+            state: wire::JobState::Cancelled.into(),
+            ..Default::default()
+        };
+        let page = list(&mut farm, cancelled).await.unwrap();
+        assert_eq!((page.jobs.len(), &page.jobs[0].id), (1, &ids[1]));
+        let found = wire::ListJobsRequest {
+            find: ids[2][..30].into(),
+            ..Default::default()
+        };
+        // Ids of one moment begin alike.
+        let page = list(&mut farm, found).await.unwrap();
+        assert!(page.jobs.iter().any(|job| job.id == ids[2]));
+    }
+}
+
+#[tokio::test]
+async fn a_request_for_a_list_that_makes_no_sense_is_refused_by_its_field() {
+    let mut farm = Farm::start().await;
+    let any = wire::ListJobsRequest::default;
+    for (request, field) in [
+        (
+            wire::ListJobsRequest {
+                page_token: "yesterday".into(),
+                ..any()
+            },
+            "page_token",
+        ),
+        (wire::ListJobsRequest { state: 77, ..any() }, "state"),
+        (
+            wire::ListJobsRequest {
+                user: "a\0b".into(),
+                ..any()
+            },
+            "user",
+        ),
+        (
+            wire::ListJobsRequest {
+                find: "x".repeat(10_000),
+                ..any()
+            },
+            "find",
+        ),
+    ] {
+        let refused = list(&mut farm, request).await.unwrap_err();
+        assert_eq!(refused.code(), Code::InvalidArgument, "{refused:?}");
+        assert!(refused.message().starts_with(field), "{refused:?}");
+    }
+}

@@ -1,0 +1,68 @@
+//! A process that has no file left to open goes on when there is one again. A test program of its own: the limit is of
+//! the whole process.
+
+use std::time::Duration;
+
+use picofarm_coordinator::{CoordinatorConfig, serve};
+use picofarm_proto::wire::{self, jobs_client::JobsClient};
+use rustix::process::{Resource, Rlimit, setrlimit};
+use tokio::{
+    io::{AsyncReadExt, AsyncWriteExt},
+    net::TcpStream,
+    time::timeout,
+};
+use tokio_util::sync::CancellationToken;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+const FILES: u64 = 240;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_listener_without_a_file_left_goes_on_when_there_are_some_again() {
+    let limit = Rlimit {
+        current: Some(FILES / 2),
+        maximum: Some(FILES),
+    };
+    setrlimit(Resource::Nofile, limit).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let any = "127.0.0.1:0".parse().unwrap();
+    let mut config = CoordinatorConfig::new(folder.path().join("catalog.sqlite"), any);
+    config.http = Some(any);
+    let running = serve(config, CancellationToken::new()).await.unwrap();
+    // Clients of this same process: half of the connections' files are theirs.
+    let mut sockets = Vec::new();
+    let full = loop {
+        match TcpStream::connect(running.address).await {
+            Ok(socket) => sockets.push(socket),
+            Err(error) => break error,
+        }
+        assert!(sockets.len() < FILES as usize, "there is no limit");
+    };
+    assert_eq!(
+        full.raw_os_error(),
+        Some(rustix::io::Errno::MFILE.raw_os_error())
+    );
+    assert!(
+        sockets.len() > FILES as usize / 4,
+        "the limit was not raised: {}",
+        sockets.len()
+    );
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    drop(sockets);
+
+    let asked = async {
+        let mut stream = TcpStream::connect(running.http.unwrap()).await.unwrap();
+        stream
+            .write_all(b"GET /healthz HTTP/1.1\r\n\r\n")
+            .await
+            .unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).await.unwrap();
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+        let url = format!("http://{}", running.address);
+        let mut jobs = JobsClient::connect(url).await.unwrap();
+        jobs.get_server_info(wire::GetServerInfoRequest {})
+            .await
+            .unwrap();
+    };
+    timeout(PATIENCE, asked).await.expect("answers in time");
+}

@@ -1,0 +1,177 @@
+//! Evaluation: trained models meet scenes that they have not seen. One task; what it finds is kept beside each model.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{
+    Declared, Fields, Manifest, ModelNames, Results, TaskKind,
+    reprocess::Histogram,
+    train::{check_model, check_split, check_spots, is_zero},
+};
+use crate::{
+    model::{
+        job::{SourceSettings, SpecError, check_count, check_source},
+        memory::{BASE, Known},
+    },
+    show,
+    split::SIDES,
+};
+
+/// Most models in one evaluation, or in one report.
+pub(super) const MAX_MODELS: usize = 1_000;
+
+/// Evaluating models: one task.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EvaluateTask {
+    /// The data set whose scenes they meet. The models are kept in the same store.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// Which models, and which scenes.
+    pub evaluate: EvaluateSettings,
+}
+
+/// Which models meet which scenes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluateSettings {
+    /// Names of models, or of stages that train them (of a matrix: the name before the bracket means all of it).
+    pub models: Vec<String>,
+    /// The split of the data set.
+    #[serde(default = "default_split")]
+    pub split: String,
+    /// `test` (default), `validation` or `train`.
+    #[serde(default = "test")]
+    pub side: String,
+    /// Only so many scenes of that side, the first by the split's order; 0 = all.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub scenes: u64,
+    /// Which of the data set's histograms; left out: for each model that which it was trained on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub histogram: Option<Histogram>,
+    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub spots: Vec<u32>,
+    /// Version of networks and metrics, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+fn default_split() -> String {
+    "default".into()
+}
+
+fn test() -> String {
+    "test".into()
+}
+
+impl Declared for EvaluateTask {
+    const NAME: &'static str = "evaluate";
+    const FIELDS: &'static [&'static str] = &["source", "count", "evaluate"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            evaluate: fields.required("evaluate")?,
+        })
+    }
+}
+
+impl TaskKind for EvaluateTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("evaluate.version", &self.evaluate.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.evaluate.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        self.evaluate.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "evaluate",
+            "source": self.source.shaping(),
+            "count": self.count,
+            "settings": self.evaluate,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results {
+            field: "source.store",
+            store: &self.source.store,
+            folder: format!("{}/evaluate", self.source.dataset),
+            manifest: Manifest::None,
+        }
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        let asked = known.networks.iter().map(|n| n.ask(source));
+        Some(BASE + source.two() + asked.fold(0.0, f64::max))
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn split(&self) -> Option<&String> {
+        Some(&self.evaluate.split)
+    }
+
+    fn evaluates(&self) -> &[String] {
+        &self.evaluate.models
+    }
+
+    fn models(&self) -> Vec<(&'static str, &String)> {
+        let models = self.evaluate.models.iter();
+        models.map(|m| ("evaluate.models", m)).collect()
+    }
+
+    fn models_mut(&mut self) -> ModelNames<'_> {
+        ModelNames::List("evaluate.models", &mut self.evaluate.models)
+    }
+}
+
+impl EvaluateSettings {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("evaluate.{field}"), what));
+        if self.models.is_empty() || self.models.len() > MAX_MODELS {
+            let what = format!("names {} models; name 1 to {MAX_MODELS}", self.models.len());
+            return fail("models", what);
+        }
+        for (i, model) in self.models.iter().enumerate() {
+            check_model(&format!("evaluate.models[{i}]"), model)?;
+            if self.models[..i].contains(model) {
+                return fail(&format!("models[{i}]"), format!("{model:?} is named twice"));
+            }
+        }
+        check_split("evaluate.split", &self.split)?;
+        if !SIDES.contains(&&*self.side) {
+            return fail("side", show::unknown(&self.side, &SIDES));
+        }
+        match self.histogram {
+            None if !self.spots.is_empty() => fail(
+                "spots",
+                "need histogram = \"transient_spots\"; give it, or remove them".into(),
+            ),
+            None => Ok(()),
+            Some(histogram) => check_spots("evaluate.spots", histogram, &self.spots),
+        }
+    }
+}

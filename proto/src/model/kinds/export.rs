@@ -1,0 +1,110 @@
+//! Exports: a data set is packed for sharing. One task.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{Declared, Fields, Manifest, Results, TaskKind};
+use crate::model::{
+    job::{SourceSettings, SpecError, check_count, check_source},
+    memory::{BASE, Known},
+};
+
+/// Packing a data set: one task.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ExportTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// What is packed, and where it goes.
+    pub export: ExportSettings,
+}
+
+/// What is packed, and where it goes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExportSettings {
+    /// A path or URL that every worker can reach.
+    pub dest: String,
+    /// `a..b`, `split:SIDE` or `split:NAME:SIDE`; empty = every scene.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub scenes: String,
+    /// `zarr` (default), `sb3d`, `webdataset` or `hdf5`.
+    #[serde(default = "zarr")]
+    pub format: String,
+}
+
+fn zarr() -> String {
+    "zarr".into()
+}
+
+impl ExportTask {
+    /// Version of the task.
+    pub const VERSION: &'static str = "export-2";
+}
+
+impl Declared for ExportTask {
+    const NAME: &'static str = "export";
+    const FIELDS: &'static [&'static str] = &["source", "count", "export"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            export: fields.required("export")?,
+        })
+    }
+}
+
+impl TaskKind for ExportTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("export.version", Self::VERSION)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        match self.export.dest.is_empty() {
+            true => Err(SpecError::new(
+                "export.dest",
+                "is empty; give a path or URL",
+            )),
+            false => Ok(()),
+        }
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": Self::VERSION,
+            "source": self.source.shaping(),
+            "count": self.count,
+            "settings": self.export,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results {
+            field: "export.dest",
+            store: &self.export.dest,
+            folder: "/export".into(),
+            manifest: Manifest::None,
+        }
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        Some(BASE + source.truth() + 3.5 * source.histogram())
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("export.dest", &mut self.export.dest)]
+    }
+}

@@ -1,0 +1,143 @@
+//! What a generate task does: a scene, written as a file for other programs. (Rendering needs no such files: it makes its
+//! scenes itself, and names its results by what makes them.)
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{
+    Declared, Fields, Manifest, Results, TaskKind,
+    render::{RenderSettings, SceneKind, SceneSource},
+};
+use crate::{
+    model::{
+        job::{SpecError, within},
+        memory::{BASE, Known},
+    },
+    show,
+};
+
+/// Writing generated scenes as files: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct GenerateTask {
+    /// Which scenes; not files.
+    pub scenes: SceneSource,
+    /// Where and how they are written.
+    pub generate: GenerateSettings,
+}
+
+/// Where and how generated scenes are written.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GenerateSettings {
+    /// A path or URL that every worker can reach; scene 7 becomes `000007.glb` or `000007/scene.xml` in it.
+    pub dest: String,
+    /// `glb` (default) or `mitsuba`.
+    #[serde(default = "glb")]
+    pub format: String,
+    /// Width and height of the camera's image in pixels (default 256).
+    #[serde(default = "side")]
+    pub resolution: u32,
+    /// Version of generators and writers, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+const FORMATS: [&str; 2] = ["glb", "mitsuba"];
+
+fn glb() -> String {
+    "glb".into()
+}
+
+fn side() -> u32 {
+    256
+}
+
+impl Declared for GenerateTask {
+    const NAME: &'static str = "generate";
+    const FIELDS: &'static [&'static str] = &["scenes", "generate"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            scenes: fields.required("scenes")?,
+            generate: fields.required("generate")?,
+        })
+    }
+}
+
+impl TaskKind for GenerateTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("generate.version", &self.generate.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.generate.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        self.scenes.check()?;
+        let fail = |field: &str, what: String| Err(SpecError::new(field, what));
+        if let SceneKind::Files { .. } = self.scenes.kind {
+            return fail(
+                "scenes.kind",
+                "\"files\" are there already; `picofarm scene export` converts one".into(),
+            );
+        }
+        let GenerateSettings {
+            dest,
+            format,
+            resolution,
+            ..
+        } = &self.generate;
+        if !FORMATS.contains(&&**format) {
+            return fail("generate.format", show::unknown(format, &FORMATS));
+        }
+        let side = (1, RenderSettings::MAX_SIDE);
+        within("generate.resolution", *resolution, side, "pixels a side")?;
+        match dest.is_empty() {
+            true => fail("generate.dest", "is empty; give a path or URL".into()),
+            false => Ok(()),
+        }
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "generate",
+            "scenes": self.scenes.shaping(),
+            "seed": self.scenes.seed,
+            "fov_deg": self.scenes.fov_deg,
+            "spots": self.scenes.spots,
+            "format": self.generate.format,
+            "resolution": self.generate.resolution,
+            "version": self.generate.version,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results {
+            field: "generate.dest",
+            store: &self.generate.dest,
+            folder: "/scenes".into(),
+            manifest: match &*self.generate.format {
+                "glb" => Manifest::Gltf,
+                _ => Manifest::None,
+            },
+        }
+    }
+
+    /// The scene is counted with the program.
+    fn memory(&self, _known: &Known, _threads: u32) -> Option<f64> {
+        Some(BASE)
+    }
+
+    fn tasks(&self) -> u64 {
+        self.scenes.count
+    }
+
+    fn scenes(&self) -> Option<&SceneSource> {
+        Some(&self.scenes)
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("generate.dest", &mut self.generate.dest)]
+    }
+}

@@ -1,0 +1,157 @@
+//! What an import task does: a scene of other people's data, converted into a data set.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use super::{Declared, Fields, Results, TaskKind, TaskSpec};
+use crate::model::{
+    job::{MAX_TASKS, OutputSettings, SpecError},
+    memory::{BASE, Known},
+};
+
+/// Importing scenes into a data set: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ImportTask {
+    /// Which scenes, and how they are read.
+    pub import: ImportSettings,
+    /// Where results go.
+    pub output: OutputSettings,
+}
+
+/// Which scenes, and how they are read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImportSettings {
+    /// The folder with the files, as the workers see it.
+    pub folder: String,
+    /// Their layout; filled in at submission where left out.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub format: String,
+    /// What overrides the files, by name; the importer knows the names.
+    #[serde(default, skip_serializing_if = "Map::is_empty")]
+    pub options: Map<String, Value>,
+    /// The scenes, by name, in the order of their indices; filled in at submission where left out (all of them).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub scenes: Vec<String>,
+    /// Index of the first of them: 0 but in a lease, which brings only its own.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub first: u64,
+    /// Number of scenes; follows from the list.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub count: u64,
+    /// Version of the importer, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u64) -> bool {
+    *n == 0
+}
+
+impl ImportSettings {
+    /// The name of scene `index`, where it is listed.
+    pub fn name(&self, index: u64) -> Option<&str> {
+        let at = usize::try_from(index.checked_sub(self.first)?).ok()?;
+        self.scenes.get(at).map(String::as_str)
+    }
+}
+
+impl Declared for ImportTask {
+    const NAME: &'static str = "import";
+    const FIELDS: &'static [&'static str] = &["import", "output"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            import: fields.required("import")?,
+            output: fields.required("output")?,
+        })
+    }
+}
+
+impl TaskKind for ImportTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("import.version", &self.import.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.import.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        let import = &self.import;
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("import.{field}"), what));
+        if import.folder.is_empty() {
+            return fail("folder", "is empty; give the folder with the files".into());
+        }
+        if import.first != 0 {
+            return fail("first", "is only for leases; remove it".into());
+        }
+        let listed = import.scenes.len() as u64;
+        if listed == 0 || listed > MAX_TASKS {
+            return fail(
+                "scenes",
+                format!("lists {listed} scenes, expected 1 to {MAX_TASKS}"),
+            );
+        }
+        if import.count != listed {
+            let what = format!(
+                "{} differs from the {listed} scenes listed; leave it out",
+                import.count
+            );
+            return fail("count", what);
+        }
+        self.output.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "import",
+            "import": self.import,
+            "profile": self.output.profile,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results::scenes(&self.output)
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        Some(BASE + source.truth() + 3.2 * source.histogram())
+    }
+
+    fn tasks(&self) -> u64 {
+        self.import.count
+    }
+
+    fn only(&self, lo: u64, hi: u64) -> Option<TaskSpec> {
+        let import = &self.import;
+        let at = |i: u64| usize::try_from(i.saturating_sub(import.first)).unwrap_or(usize::MAX);
+        let own = import.scenes.get(at(lo)..at(hi).min(import.scenes.len()));
+        Some(TaskSpec::Import(Self {
+            import: ImportSettings {
+                folder: import.folder.clone(),
+                format: import.format.clone(),
+                options: import.options.clone(),
+                scenes: own.unwrap_or_default().to_vec(),
+                first: lo.max(import.first),
+                count: import.count,
+                version: import.version.clone(),
+            },
+            output: self.output.clone(),
+        }))
+    }
+
+    fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {
+        vec![("import.folder".into(), &self.import.folder)]
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("output.store", &mut self.output.store)]
+    }
+
+    fn writes(&self) -> Option<(&String, &String)> {
+        Some((&self.output.store, &self.output.dataset))
+    }
+}

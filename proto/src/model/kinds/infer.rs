@@ -1,0 +1,201 @@
+//! Inference: trained models say what they see in the scenes of a data set, and it is kept. One task a scene.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{
+    Declared, Fields, ModelNames, Results, TaskKind,
+    reprocess::Histogram,
+    train::{check_model, check_spots},
+};
+use crate::model::{
+    job::{
+        OutputSettings, SourceSettings, SpecError, StageSpec, check_count, check_source,
+        default_profile,
+    },
+    memory::{BASE, Known, Network},
+};
+
+/// Most models in one inference: one of each kind.
+const MAX_MODELS: usize = 3;
+
+/// What trained models see in each scene of a data set: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InferTask {
+    /// The data set whose scenes they see. The models are kept in the same store.
+    pub source: SourceSettings,
+    /// The number of scenes that the source has room for.
+    pub count: u64,
+    /// Which models.
+    pub infer: InferSettings,
+    /// Where predictions go: a folder of their own, beside data sets. They have no histograms, so no profile either.
+    pub output: OutputSettings,
+}
+
+/// Which models see the scenes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InferSettings {
+    /// Names of models, or of stages that train them: at most one of each kind (`tof`, `shadow`, `specular`).
+    pub models: Vec<String>,
+    /// Which of the data set's histograms; left out: for each model that which it was trained on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub histogram: Option<Histogram>,
+    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub spots: Vec<u32>,
+    /// Version of networks and encoder, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+impl Declared for InferTask {
+    const NAME: &'static str = "infer";
+    const FIELDS: &'static [&'static str] = &["source", "count", "infer", "output"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            infer: fields.required("infer")?,
+            output: fields.required("output")?,
+        })
+    }
+}
+
+impl TaskKind for InferTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("infer.version", &self.infer.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.infer.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        self.infer.check()?;
+        let (from, to) = (&self.source, &self.output);
+        if (&from.store, &from.dataset) == (&to.store, &to.dataset) {
+            let what = format!(
+                "{:?} is the source itself; choose another folder for what is predicted of it",
+                to.dataset
+            );
+            return Err(SpecError::new("output.dataset", what));
+        }
+        if to.profile != default_profile() {
+            let what = format!(
+                "{:?} is how histograms are coded, and predictions have none; remove it",
+                to.profile
+            );
+            return Err(SpecError::new("output.profile", what));
+        }
+        to.check()
+    }
+
+    /// No two models, as far as stages before it train them, predict the same.
+    fn check_among(&self, before: &[StageSpec]) -> Result<(), SpecError> {
+        let mut kinds = BTreeMap::new();
+        for model in &self.infer.models {
+            let place = Some((&self.source.store, model));
+            let trained = before.iter().find(|s| s.task.trains() == place);
+            let Some(kind) = trained.and_then(|s| s.task.predicts()) else {
+                continue;
+            };
+            if let Some(other) = kinds.insert(kind, model) {
+                let what = format!(
+                    "{other:?} and {model:?} both predict {kind:?}; name one of each kind, and give the other a stage of \
+                     its own"
+                );
+                return Err(SpecError::new("infer.models", what));
+            }
+        }
+        Ok(())
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "infer",
+            "source": self.source.shaping(),
+            "settings": self.infer,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results::scenes(&self.output)
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        let weights: f64 = known.networks.iter().map(Network::weights).sum();
+        let asked = known.networks.iter().map(|n| n.ask(source) - n.weights());
+        Some(BASE + source.two() + weights + asked.fold(0.0, f64::max))
+    }
+
+    fn tasks(&self) -> u64 {
+        self.count
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("output.store", &mut self.output.store)]
+    }
+
+    fn writes(&self) -> Option<(&String, &String)> {
+        Some((&self.output.store, &self.output.dataset))
+    }
+
+    fn makes(&self) -> Option<(&String, &String)> {
+        None
+    }
+
+    fn models(&self) -> Vec<(&'static str, &String)> {
+        let models = self.infer.models.iter();
+        models.map(|m| ("infer.models", m)).collect()
+    }
+
+    fn models_mut(&mut self) -> ModelNames<'_> {
+        ModelNames::List("infer.models", &mut self.infer.models)
+    }
+}
+
+impl InferSettings {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("infer.{field}"), what));
+        if self.models.is_empty() || self.models.len() > MAX_MODELS {
+            let what = format!(
+                "names {} models; name 1 to {MAX_MODELS}, at most one of each kind (tof, shadow, specular)",
+                self.models.len()
+            );
+            return fail("models", what);
+        }
+        for (i, model) in self.models.iter().enumerate() {
+            check_model(&format!("infer.models[{i}]"), model)?;
+            if self.models[..i].contains(model) {
+                return fail(&format!("models[{i}]"), format!("{model:?} is named twice"));
+            }
+        }
+        match self.histogram {
+            None if !self.spots.is_empty() => fail(
+                "spots",
+                "need histogram = \"transient_spots\"; give it, or remove them".into(),
+            ),
+            None => Ok(()),
+            Some(histogram) => check_spots("infer.spots", histogram, &self.spots),
+        }
+    }
+}

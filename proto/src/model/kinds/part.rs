@@ -1,0 +1,133 @@
+//! Parts of heavy scenes: several workers share one scene, whose render stage joins what they make.
+
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::{
+    Declared, Fields, Manifest, RenderTask, Results, TaskKind, TaskSpec, render::SceneSource,
+};
+use crate::{
+    key::StageKey,
+    model::{
+        job::SpecError,
+        memory::{BASE, Known, LIGHT_PATHS, Rendering},
+    },
+};
+
+/// Rendering parts of scenes, which the stage that needs it joins: one task a part. Task `i` is part
+/// `i % tasks_per_scene` of scene `i / tasks_per_scene`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PartTask {
+    /// The rendering.
+    #[serde(flatten)]
+    pub whole: RenderTask,
+    /// Key of the stage that joins the parts, hexadecimal; filled in at submission.
+    pub joined_by: String,
+}
+
+impl PartTask {
+    /// Tasks of each scene: the ranges of tiles, and the light paths that cross them.
+    pub fn tasks_per_scene(&self) -> u64 {
+        u64::from(self.whole.parts) + 1
+    }
+
+    /// The scene and the part that task `index` is.
+    pub fn split(&self, index: u64) -> (u64, u32) {
+        let part = index % self.tasks_per_scene();
+        (index / self.tasks_per_scene(), part as u32)
+    }
+}
+
+impl Declared for PartTask {
+    const NAME: &'static str = "part";
+    const FIELDS: &'static [&'static str] = &["scenes", "render", "output", "parts", "joined_by"];
+    /// A rendering with `parts` stands for it.
+    const WRITTEN: bool = false;
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            joined_by: fields.or_default("joined_by")?,
+            whole: RenderTask::read(fields)?,
+        })
+    }
+}
+
+impl TaskKind for PartTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        self.whole.versioned()
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        self.whole.version_mut()
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        self.whole.check()
+    }
+
+    fn check_resolved(&self) -> Result<(), SpecError> {
+        if StageKey::parse(&self.joined_by) == Some(self.whole.stage_key()) {
+            return Ok(());
+        }
+        let what = format!(
+            "{:?} is not the key of such a render stage; the client must fill it in",
+            self.joined_by
+        );
+        Err(SpecError::new("joined_by", what))
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "part",
+            "whole": self.whole.stage_key().to_string(),
+            "parts": self.whole.parts,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        let whole = &self.whole.output;
+        Results {
+            field: "output.store",
+            store: &whole.store,
+            folder: format!("{}/parts", whole.dataset),
+            manifest: Manifest::Part {
+                dataset: &whole.dataset,
+                joined_by: StageKey::parse(&self.joined_by),
+                task: self,
+            },
+        }
+    }
+
+    fn memory(&self, _known: &Known, threads: u32) -> Option<f64> {
+        let rendering = Rendering::of(&self.whole, threads);
+        let share = 1.0 / f64::from(self.whole.parts.max(1));
+        // Cut out of the image, and written.
+        let tiles = 3.0 * share * rendering.images() + rendering.tiles();
+        let paths = 3.0 * LIGHT_PATHS * rendering.paths();
+        Some(BASE + rendering.shape.truth() + tiles.max(paths))
+    }
+
+    fn tasks(&self) -> u64 {
+        self.whole.scenes.count * self.tasks_per_scene()
+    }
+
+    fn only(&self, lo: u64, hi: u64) -> Option<TaskSpec> {
+        let each = self.tasks_per_scene();
+        Some(TaskSpec::Part(Self {
+            whole: self.whole.some(lo / each, hi.div_ceil(each)),
+            joined_by: self.joined_by.clone(),
+        }))
+    }
+
+    fn scenes(&self) -> Option<&SceneSource> {
+        Some(&self.whole.scenes)
+    }
+
+    fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {
+        self.whole.inputs(task.map(|task| self.split(task).0))
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        self.whole.stores_mut()
+    }
+}

@@ -1,0 +1,126 @@
+//! Promotion: the best of several models gets a name of its own. One task; sweeps end with one.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{Declared, Fields, Manifest, ModelNames, Results, TaskKind, train::check_model};
+use crate::model::{
+    job::{MAX_STAGES, MODELS, SourceSettings, SpecError, check_count, check_source},
+    memory::{BASE, Known, Network},
+};
+
+/// Giving the best of several models a name: one task.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PromoteTask {
+    /// The data set that they learnt from, in whose store they are kept.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// Which models.
+    pub promote: PromoteSettings,
+}
+
+/// The best of which models gets which name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PromoteSettings {
+    /// The name that the best gets.
+    pub model: String,
+    /// The models among which it is chosen, or stages that train them. Trials that stopped on their way are passed over.
+    pub among: Vec<String>,
+    /// Models that were never made are passed over, too.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub tolerate_missing: bool,
+    /// Version of networks and training, part of every task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+impl Declared for PromoteTask {
+    const NAME: &'static str = "promote";
+    const FIELDS: &'static [&'static str] = &["source", "count", "promote"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            promote: fields.required("promote")?,
+        })
+    }
+}
+
+impl TaskKind for PromoteTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("promote.version", &self.promote.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.promote.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        let settings = &self.promote;
+        check_model("promote.model", &settings.model)?;
+        if settings.among.is_empty() || settings.among.len() > MAX_STAGES {
+            let what = format!(
+                "names {} models; name 1 to {MAX_STAGES}",
+                settings.among.len()
+            );
+            return Err(SpecError::new("promote.among", what));
+        }
+        for (i, model) in settings.among.iter().enumerate() {
+            check_model(&format!("promote.among[{i}]"), model)?;
+            if settings.among[..i].contains(model) || *model == settings.model {
+                let what = format!("{model:?} is named twice");
+                return Err(SpecError::new(format!("promote.among[{i}]"), what));
+            }
+        }
+        Ok(())
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "promote",
+            "source": self.source.shaping(),
+            "settings": self.promote,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        let name = &*self.promote.model;
+        Results {
+            field: "source.store",
+            store: &self.source.store,
+            folder: format!("{MODELS}/{name}"),
+            manifest: Manifest::Model { name },
+        }
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let weights = known.networks.iter().map(Network::weights);
+        Some(BASE + 2.0 * weights.fold(0.0, f64::max))
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn trains(&self) -> Option<(&String, &String)> {
+        Some((&self.source.store, &self.promote.model))
+    }
+
+    fn models(&self) -> Vec<(&'static str, &String)> {
+        let models = self.promote.among.iter();
+        models.map(|m| ("promote.among", m)).collect()
+    }
+
+    fn models_mut(&mut self) -> ModelNames<'_> {
+        ModelNames::List("promote.among", &mut self.promote.among)
+    }
+}

@@ -1,0 +1,155 @@
+//! Reports: what trained models came to, as one page and as JSON, kept in their store. One task.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{
+    Declared, Fields, Manifest, ModelNames, Results, TaskKind, evaluate::MAX_MODELS,
+    train::check_model,
+};
+use crate::model::{
+    job::{REPORTS, SpecError, within},
+    memory::{BASE, Known},
+};
+
+/// Most scenes of each model that a report shows.
+pub const MAX_PICTURES: u32 = 100;
+
+/// A report about models: one task.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ReportTask {
+    /// What it is about.
+    pub report: ReportSettings,
+}
+
+/// What a report is about.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReportSettings {
+    /// Its name, under which it is kept in the store: letters, digits, `-`, `_` and `.`.
+    pub name: String,
+    /// Names of models, or of stages that train them (of a matrix: the name before the bracket means all of it).
+    pub models: Vec<String>,
+    /// The store that keeps the models, and the report; where left out, that in which stages before it train them.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub store: String,
+    /// Title of the page.
+    #[serde(default = "title")]
+    pub title: String,
+    /// Scenes of each model to show.
+    #[serde(default = "two")]
+    pub pictures: u32,
+    /// Version of networks and metrics, part of the task key; filled in at submission where left out.
+    #[serde(default)]
+    pub version: String,
+}
+
+fn title() -> String {
+    "Trained networks".into()
+}
+
+fn two() -> u32 {
+    2
+}
+
+impl Declared for ReportTask {
+    const NAME: &'static str = "report";
+    const FIELDS: &'static [&'static str] = &["report"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            report: fields.required("report")?,
+        })
+    }
+}
+
+impl TaskKind for ReportTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("report.version", &self.report.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.report.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        self.report.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({"stage": "report", "settings": self.report})
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results {
+            field: "report.store",
+            store: &self.report.store,
+            folder: format!("{REPORTS}/{}", self.report.name),
+            manifest: Manifest::Report {
+                name: &self.report.name,
+            },
+        }
+    }
+
+    /// Its pictures are of scenes that its models look at.
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let asked = known
+            .networks
+            .iter()
+            .map(|n| n.scene.two() + n.ask(&n.scene));
+        Some(BASE + asked.reduce(f64::max)?)
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("report.store", &mut self.report.store)]
+    }
+
+    fn reports(&self) -> Option<(&String, &String)> {
+        Some((&self.report.store, &self.report.name))
+    }
+
+    fn shelf(&self) -> Option<&String> {
+        Some(&self.report.store)
+    }
+
+    fn shelf_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.report.store)
+    }
+
+    fn models(&self) -> Vec<(&'static str, &String)> {
+        let models = self.report.models.iter();
+        models.map(|m| ("report.models", m)).collect()
+    }
+
+    fn models_mut(&mut self) -> ModelNames<'_> {
+        ModelNames::List("report.models", &mut self.report.models)
+    }
+}
+
+impl ReportSettings {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("report.{field}"), what));
+        check_model("report.name", &self.name)?;
+        if self.models.is_empty() || self.models.len() > MAX_MODELS {
+            let what = format!("names {} models; name 1 to {MAX_MODELS}", self.models.len());
+            return fail("models", what);
+        }
+        for (i, model) in self.models.iter().enumerate() {
+            check_model(&format!("report.models[{i}]"), model)?;
+            if self.models[..i].contains(model) {
+                return fail(&format!("models[{i}]"), format!("{model:?} is named twice"));
+            }
+        }
+        if self.store.is_empty() {
+            let what =
+                "is missing: no stage before this one trains any of the models; give a path or URL";
+            return fail("store", what.into());
+        }
+        let unit = "scenes of each model on the page";
+        within("report.pictures", self.pictures, (0, MAX_PICTURES), unit)
+    }
+}

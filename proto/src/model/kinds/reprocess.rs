@@ -1,0 +1,244 @@
+//! Reprocessing: the histograms of a finished data set through a sensor, into another data set. One task a scene;
+//! nothing is rendered.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{Declared, Fields, Results, TaskKind};
+use crate::{
+    key::reprocess_stage_key,
+    model::{
+        job::{OutputSettings, SourceSettings, SpecError, check_count, check_source},
+        memory::{BASE, Known, Shape},
+        sensor::SensorSettings,
+    },
+    show,
+};
+
+/// Reprocessing a data set into another: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReprocessTask {
+    /// The data set that is read. Its place is not part of a result's name: that follows from the names of its scenes.
+    pub source: SourceSettings,
+    /// The number of scenes that the source has room for.
+    pub count: u64,
+    /// What is done to each scene.
+    pub reprocess: ReprocessSettings,
+    /// Where results go.
+    pub output: OutputSettings,
+}
+
+impl Declared for ReprocessTask {
+    const NAME: &'static str = "reprocess";
+    const FIELDS: &'static [&'static str] = &["source", "count", "reprocess", "output"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            reprocess: fields.or_default("reprocess")?,
+            output: fields.required("output")?,
+        })
+    }
+}
+
+impl TaskKind for ReprocessTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("reprocess.version", &self.reprocess.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.reprocess.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        let (from, to) = (&self.source, &self.output);
+        if (&from.store, &from.dataset) == (&to.store, &to.dataset) {
+            let what = format!(
+                "{:?} is the source itself; choose another data set for the results",
+                to.dataset
+            );
+            return Err(SpecError::new("output.dataset", what));
+        }
+        self.reprocess.check(&to.profile)?;
+        to.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "reprocess",
+            "source": self.source.shaping(),
+            "settings": reprocess_stage_key(&self.reprocess, &self.output.profile).to_string(),
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results::scenes(&self.output)
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        let spots = self.reprocess.histogram == Histogram::TransientSpots;
+        let histograms = if spots { 4.6 } else { 2.6 };
+        Some(BASE + source.truth() + histograms * source.histogram())
+    }
+
+    fn tasks(&self) -> u64 {
+        self.count
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("output.store", &mut self.output.store)]
+    }
+
+    fn writes(&self) -> Option<(&String, &String)> {
+        Some((&self.output.store, &self.output.dataset))
+    }
+
+    fn shape(&self, source: Option<Shape>) -> Option<Shape> {
+        let source = source?;
+        let spots = match self.reprocess.histogram {
+            Histogram::Transient => source.spots,
+            Histogram::Transient4 => 4,
+            Histogram::Transient25 => 25,
+            Histogram::TransientSpots => self.reprocess.spots.len() as u32,
+        };
+        Some(Shape {
+            bins: source.bins / self.reprocess.sensor.rebin.max(1),
+            spots,
+            ..source
+        })
+    }
+}
+
+/// What is done to each scene.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReprocessSettings {
+    /// Which of its histograms.
+    pub histogram: Histogram,
+    /// Only these spots, summed: multiplexing. Only with `histogram = "transient_spots"`, which needs it; ascending.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub spots: Vec<u32>,
+    /// The sensor.
+    pub sensor: SensorSettings,
+    /// Bins that `sensor.rebin` leaves over at the end of the gate are dropped; otherwise it must divide the bins.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub drop_left_over: bool,
+    /// Chooses another draw of the same noise (default 0).
+    pub seed: u64,
+    /// Version of the sensor model and the encoder, part of every task key; filled in at submission where left out.
+    pub version: String,
+}
+
+/// The histograms that a data set may have, by the names of their arrays.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Histogram {
+    /// All spots at once.
+    #[default]
+    Transient,
+    /// 4 of the 100 spots.
+    #[serde(rename = "transient_4")]
+    Transient4,
+    /// 25 of the 100 spots.
+    #[serde(rename = "transient_25")]
+    Transient25,
+    /// Each spot alone; [`ReprocessSettings::spots`] are summed.
+    TransientSpots,
+}
+
+impl Histogram {
+    /// All there are.
+    pub const ALL: [Self; 4] = [
+        Self::Transient,
+        Self::Transient4,
+        Self::Transient25,
+        Self::TransientSpots,
+    ];
+
+    /// Name of the array.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Transient => "transient",
+            Self::Transient4 => "transient_4",
+            Self::Transient25 => "transient_25",
+            Self::TransientSpots => "transient_spots",
+        }
+    }
+
+    /// The histogram of this name.
+    ///
+    /// # Errors
+    /// A message that lists those there are.
+    pub fn parse(name: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|h| h.name() == name);
+        found.ok_or_else(|| show::unknown(name, &Self::ALL.map(Self::name)))
+    }
+}
+
+impl ReprocessSettings {
+    /// The codec profile that loses nothing that matters: whole counts are kept exactly, rates to a fraction of the
+    /// photon noise.
+    pub fn natural_profile(&self) -> &'static str {
+        if self.sensor.poisson {
+            "counts-u16"
+        } else {
+            "sqrt-u16"
+        }
+    }
+
+    /// Puts the spots in order: the order in which somebody names them shall not make other results of them.
+    pub fn normalise(&mut self) {
+        self.spots.sort_unstable();
+    }
+
+    /// Checks every field against its limits, and the codec profile of the target against the sensor.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self, profile: &str) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("reprocess.{field}"), what));
+        if self.histogram == Histogram::TransientSpots && self.spots.is_empty() {
+            return fail(
+                "spots",
+                "is empty; name the spots to sum, or take histogram = \"transient\" for all".into(),
+            );
+        }
+        if self.histogram != Histogram::TransientSpots && !self.spots.is_empty() {
+            return fail(
+                "spots",
+                format!(
+                    "are summed from histogram = \"transient_spots\"; remove them from histogram = {:?}",
+                    self.histogram.name()
+                ),
+            );
+        }
+        if !self.spots.is_sorted_by(|a, b| a < b) {
+            return fail(
+                "spots",
+                format!("{:?} must name each once, ascending", self.spots),
+            );
+        }
+        self.sensor.check("reprocess.sensor")?;
+        if profile == "counts-u16" && !self.sensor.poisson {
+            return Err(SpecError::new(
+                "output.profile",
+                "\"counts-u16\" holds whole counts, but reprocess.sensor.poisson = false gives rates; use \"sqrt-u16\" \
+                 or \"lossless\"",
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,228 @@
+//! What a training's settings may be.
+
+use super::{
+    Architecture, InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, Target,
+    TrainSettings,
+};
+use crate::model::{
+    job::{SpecError, within},
+    kinds::reprocess::Histogram,
+};
+
+impl TrainSettings {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("train.{field}"), what));
+        check_model("train.model", &self.model)?;
+        for (field, model) in self.models() {
+            check_model(field, model)?;
+            if *model == self.model {
+                let what = format!("{model:?} is the model itself; name another one");
+                return Err(SpecError::new(field, what));
+            }
+        }
+        check_split("train.split", &self.split)?;
+        check_spots("train.spots", self.histogram, &self.spots)?;
+        if self.target != Target::Shadow && self.shadow != ShadowSettings::default() {
+            return fail(
+                "shadow",
+                format!("is not for target = {:?}; remove it", self.target.name()),
+            );
+        }
+        if self.target != Target::Specular && !self.specular.on.is_empty() {
+            return fail(
+                "specular",
+                format!("is not for target = {:?}; remove it", self.target.name()),
+            );
+        }
+        if !self.specular.on.is_empty() && !self.from.is_empty() {
+            let what = "is not for a network on the features of another (train.specular.on); remove one of them";
+            return fail("from", what.into());
+        }
+        if self.shadow.tof.is_empty() {
+            let what = "is empty; give \"truth\" or a trained ToF model".into();
+            return fail("shadow.tof", what);
+        }
+        if let Some(trial) = &self.trial {
+            trial.check()?;
+        }
+        self.input.check()?;
+        self.net.check()?;
+        self.optimise.check()?;
+        let minutes = self.checkpoint_minutes;
+        within(
+            "train.checkpoint_minutes",
+            minutes,
+            (0.01, 10_000.0),
+            "minutes",
+        )
+    }
+}
+
+impl InputSettings {
+    fn check(&self) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("train.input.{field}"), what));
+        if !(self.max.is_finite() && self.max >= 0.0) {
+            return fail("max", format!("{} is no size of a bin", self.max));
+        }
+        if self.max > 0.0 && self.normalise != Normalise::Log {
+            return fail("max", "is for normalise = \"log\"; remove it".into());
+        }
+        within("train.input.bins", self.bins, (0, 65_536), "bins; 0 is all")
+    }
+}
+
+impl NetSettings {
+    fn check(&self) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("train.net.{field}"), what));
+        let limits = [
+            ("width", self.width, 1, 1024, "channels"),
+            (
+                "levels",
+                self.levels,
+                2,
+                8,
+                "levels, each half the size of the one before",
+            ),
+            ("stem", self.stem, 0, 4096, "channels; 0 is none"),
+            (
+                "time_features",
+                self.time_features,
+                0,
+                4096,
+                "bins of time; 0 is none",
+            ),
+        ];
+        for (field, value, low, high, unit) in limits {
+            within(format!("train.net.{field}"), value, (low, high), unit)?;
+        }
+        match (self.architecture, self.time_features) {
+            (Architecture::Unet2d, 1..) => fail(
+                "time_features",
+                "is for architecture = \"unet25d\"; remove it".into(),
+            ),
+            (Architecture::Unet25d, t) if t == 0 || t % (1 << (self.levels - 1)) != 0 => fail(
+                "time_features",
+                format!(
+                    "{t} must be a multiple of {}, so that each of {} levels can halve it (160 in the paper)",
+                    1 << (self.levels - 1),
+                    self.levels
+                ),
+            ),
+            (Architecture::Unet25d, _) if self.stem > 0 => {
+                fail("stem", "is for architecture = \"unet2d\"; remove it".into())
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl OptimiseSettings {
+    fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| {
+            Err(SpecError::new(format!("train.optimise.{field}"), what))
+        };
+        let limits = [
+            (
+                "epochs",
+                self.epochs,
+                1,
+                1_000_000,
+                "times that each scene is seen",
+            ),
+            ("batch", self.batch, 1, 65_536, "scenes a step"),
+            (
+                "accumulate",
+                self.accumulate,
+                1,
+                self.batch.max(1),
+                "parts of a batch",
+            ),
+            (
+                "early_stop",
+                self.early_stop,
+                0,
+                1_000_000,
+                "validations; 0 is never",
+            ),
+        ];
+        for (field, value, low, high, unit) in limits {
+            within(format!("train.optimise.{field}"), value, (low, high), unit)?;
+        }
+        if !self.batch.is_multiple_of(self.accumulate) {
+            let what = format!(
+                "{} does not divide the batch of {}",
+                self.accumulate, self.batch
+            );
+            return fail("accumulate", what);
+        }
+        let unit = "(the largest learning rate of AdamW); 0.01 is usual";
+        within(
+            "train.optimise.learning_rate",
+            self.learning_rate,
+            (1e-8, 10.0),
+            unit,
+        )?;
+        let unit = "(of AdamW); 0.001 is usual";
+        within(
+            "train.optimise.weight_decay",
+            self.weight_decay,
+            (0.0, 0.999),
+            unit,
+        )
+    }
+}
+
+/// Checks the name of a model: it is a folder's.
+///
+/// # Errors
+/// [`SpecError`] naming the field.
+pub fn check_model(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if (1..=128).contains(&name.len()) && !name.starts_with('.') && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!(
+        "{name:?} must be up to 128 letters, digits, '-', '_' and '.', and not begin with '.'"
+    );
+    Err(SpecError::new(field, what))
+}
+
+pub(in crate::model::kinds) fn check_split(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+    if (1..=64).contains(&name.len()) && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!("{name:?} must be up to 64 letters, digits, '-' and '_'");
+    Err(SpecError::new(field, what))
+}
+
+pub(in crate::model::kinds) fn check_spots(
+    field: &str,
+    histogram: Histogram,
+    spots: &[u32],
+) -> Result<(), SpecError> {
+    let fail = |what: String| Err(SpecError::new(field, what));
+    // Indices of the spots of a data set: how many it has is known when it is read.
+    if let Some(spot) = spots.iter().find(|spot| **spot >= 1024) {
+        return fail(format!("{spot} lies outside 0..=1023 (spots count from 0)"));
+    }
+    match (histogram, spots) {
+        (Histogram::TransientSpots, []) => fail(
+            "is empty; name the spots to sum, or take histogram = \"transient\" for all".into(),
+        ),
+        (Histogram::TransientSpots, _) if !spots.is_sorted_by(|a, b| a < b) => {
+            fail(format!("{spots:?} must name each once, ascending"))
+        }
+        (Histogram::TransientSpots, _) | (_, []) => Ok(()),
+        (other, _) => fail(format!(
+            "are summed from histogram = \"transient_spots\"; remove them from histogram = {:?}",
+            other.name()
+        )),
+    }
+}

@@ -1,0 +1,92 @@
+//! Verification: every scene of a data set is read and compared with its manifest. One task a scene; nothing is written.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{Declared, Fields, Manifest, Results, TaskKind};
+use crate::model::{
+    job::{SourceSettings, SpecError, check_count, check_source},
+    memory::{BASE, Known},
+};
+
+/// Verifying a data set: one task a scene. It is over when the scene is sound, and fails when it is not.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct VerifyTask {
+    /// The data set.
+    pub source: SourceSettings,
+    /// Its number of scenes.
+    pub count: u64,
+    /// How thoroughly.
+    pub verify: VerifySettings,
+}
+
+/// How thoroughly a data set is verified.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VerifySettings {
+    /// Only that each object is there and has its size; otherwise also its SHA-256, and that it decodes.
+    pub fast: bool,
+}
+
+impl VerifyTask {
+    /// Version of the task.
+    pub const VERSION: &'static str = "verify-1";
+}
+
+impl Declared for VerifyTask {
+    const NAME: &'static str = "verify";
+    const FIELDS: &'static [&'static str] = &["source", "count", "verify"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            verify: fields.or_default("verify")?,
+        })
+    }
+}
+
+impl TaskKind for VerifyTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("verify.version", Self::VERSION)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": Self::VERSION,
+            "source": self.source.shaping(),
+            "settings": self.verify,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results {
+            field: "source.store",
+            store: &self.source.store,
+            folder: format!("{}/verify", self.source.dataset),
+            manifest: Manifest::None,
+        }
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        Some(BASE + source.truth() + 1.6 * source.histogram())
+    }
+
+    fn tasks(&self) -> u64 {
+        self.count
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+}

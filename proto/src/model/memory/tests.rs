@@ -1,0 +1,80 @@
+//! That estimates follow the settings, and are known where they can be.
+
+use super::*;
+
+fn job(stages: &str) -> JobSpec {
+    serde_json::from_str(&format!(r#"{{"name": "m", "stage": [{stages}]}}"#)).unwrap()
+}
+
+fn rendering(resolution: u32, more: &str) -> String {
+    format!(
+        r#"{{"scenes": {{"kind": "primitive", "count": 2, "spots": 100}},
+            "render": {{"renderer": "r", "resolution": {resolution}{more}}},
+            "output": {{"store": "/s", "dataset": "d"}}}}"#
+    )
+}
+
+fn of(job: &JobSpec, stage: usize) -> Option<u64> {
+    peak_bytes(&job.stages[stage].task, &job.known(stage), 2)
+}
+
+#[test]
+fn the_greatest_image_takes_more_than_its_histogram() {
+    let histogram = 4 * 4096 * 4096 * 637;
+    let job = job(&rendering(4096, ""));
+    let found = of(&job, 0).unwrap();
+    assert!((histogram..3 * histogram).contains(&found), "{found}");
+}
+
+#[test]
+fn more_pixels_bins_or_histograms_take_more() {
+    let base = of(&job(&rendering(256, "")), 0);
+    for more in [
+        rendering(512, ""),
+        rendering(256, r#", "bins": 2000"#),
+        rendering(256, r#", "per_spot": true"#),
+        rendering(256, r#", "subsets": [4, 25]"#),
+    ] {
+        assert!(of(&job(&more), 0) > base, "{more}");
+    }
+    let without = rendering(256, r#", "strategy": {"caustics": false}"#);
+    assert!(of(&job(&without), 0) < base);
+}
+
+#[test]
+fn stages_that_read_what_the_job_makes_are_known_and_others_are_not() {
+    let reads = |source: &str| {
+        format!(
+            r#"{{"kind": "reprocess", "source": {source}, "count": 2,
+                "reprocess": {{"version": "r", "sensor": {{"rebin": 7}}}},
+                "output": {{"store": "/s", "dataset": "e"}}}}"#
+        )
+    };
+    let own = job(&format!("{}, {}", rendering(256, ""), reads("\"render\"")));
+    let source = own.known(1).source.unwrap();
+    assert_eq!((source.width, source.bins, source.spots), (256, 637, 100));
+    assert!(of(&own, 1).unwrap() > 300_000_000);
+    let made = super::made(&own.stages, (&"/s".into(), &"e".into())).unwrap();
+    assert_eq!(made.bins, 91);
+    let other = job(&reads(r#"{"store": "/s", "dataset": "other"}"#));
+    assert_eq!(of(&other, 0), None);
+}
+
+#[test]
+fn the_released_network_takes_what_is_known_of_it() {
+    let settings = r#"{"target": "tof", "model": "m"}"#;
+    let settings: crate::model::TrainSettings = serde_json::from_str(settings).unwrap();
+    let source = Shape {
+        height: 256,
+        width: 256,
+        bins: 637,
+        spots: 25,
+    };
+    let net = Network::of(&settings, &source);
+    // 356,404,556 parameters.
+    let share = net.weights() / (4.0 * 356_404_556.0);
+    assert!((0.98..1.02).contains(&share), "{share}");
+    let learns = net.learn(&source, 32);
+    assert!(learns > 50e9, "{learns}");
+    assert!(net.ask(&source) < 0.1 * learns);
+}

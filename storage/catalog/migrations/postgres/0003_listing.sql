@@ -1,0 +1,4 @@
+-- What a list of jobs shows without their specs, which may be long; and jobs by their end, for those that are forgotten.
+ALTER TABLE job ADD COLUMN name TEXT NOT NULL DEFAULT '';
+CREATE INDEX job_by_name ON job (name);
+CREATE INDEX job_by_end ON job (ended_ms) WHERE state <> 0;

@@ -1,0 +1,137 @@
+//! Whose jobs are, who may see them, and the record of who did what.
+
+use std::borrow::Cow;
+
+use async_trait::async_trait;
+use picofarm_proto::{
+    ids::JobId,
+    model::{Act, AuditEntry, Outcome},
+};
+
+use crate::{CatalogError, Job};
+
+/// Of whom a job is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Owner {
+    /// Name of the caller that submitted it.
+    pub user: String,
+    /// Its project; empty = none.
+    pub project: String,
+}
+
+impl From<&Job> for Owner {
+    fn from(job: &Job) -> Self {
+        Self {
+            user: job.user.clone(),
+            project: job.spec.project.clone(),
+        }
+    }
+}
+
+/// Whose jobs a reader may see.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Sight {
+    /// Everybody's.
+    #[default]
+    All,
+    /// One's own and those of some projects.
+    Of {
+        /// Name of the reader.
+        user: String,
+        /// Names of projects, none of which holds a comma.
+        projects: Vec<String>,
+    },
+}
+
+impl Sight {
+    /// Whether a job of this owner may be seen.
+    pub fn sees(&self, owner: &Owner) -> bool {
+        match self {
+            Self::All => true,
+            Self::Of { user, projects } => {
+                owner.user == *user
+                    || (!owner.project.is_empty() && projects.contains(&owner.project))
+            }
+        }
+    }
+
+    /// What [`seen!`] compares the columns of a job with.
+    pub(crate) fn columns(&self) -> [Cow<'static, str>; 3] {
+        match self {
+            Self::All => ["all".into(), "".into(), "".into()],
+            Self::Of { user, projects } => [
+                "some".into(),
+                user.clone().into(),
+                format!(",{},", projects.join(",")).into(),
+            ],
+        }
+    }
+}
+
+/// The condition that a job may be seen, given the names of three arguments ([`Sight::columns`]). Both databases
+/// understand it: neither has arrays and `replace` is in both.
+macro_rules! seen {
+    ($all:literal, $user:literal, $projects:literal) => {
+        concat!(
+            "(",
+            $all,
+            " = 'all' OR job.username = ",
+            $user,
+            " OR (job.project <> '' AND replace(",
+            $projects,
+            ", ',' || job.project || ',', '') <> ",
+            $projects,
+            "))"
+        )
+    };
+}
+pub(crate) use seen;
+
+/// A line for the audit log; its sequence number is given by the catalog.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NewAudit {
+    /// Unix time, milliseconds.
+    pub at_ms: i64,
+    /// Name of the caller, without NUL.
+    pub who: String,
+    /// What was done or attempted.
+    pub act: Act,
+    /// The job, where it concerns one.
+    pub job: Option<JobId>,
+    /// What became of it.
+    pub outcome: Outcome,
+    /// In words, without NUL.
+    pub detail: String,
+}
+
+/// Which part of the audit log.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct AuditQuery {
+    /// Only lines with smaller sequence numbers.
+    pub before: Option<u64>,
+    /// At most so many.
+    pub limit: u32,
+    /// Only acts of this caller.
+    pub who: Option<String>,
+    /// Only acts on this job.
+    pub job: Option<JobId>,
+}
+
+/// Whose jobs are, and who did what. The log is independent of coordinators' lives and of forgotten jobs.
+///
+/// # Errors
+/// All methods give a [`CatalogError`] when the database cannot be read or written; then nothing changed.
+#[async_trait]
+pub trait Rights: Send + Sync + 'static {
+    /// Of whom a job is; `None` where there is no such job.
+    async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError>;
+
+    /// Appends lines to the audit log, all of them or none.
+    async fn audit(&self, lines: &[NewAudit]) -> Result<(), CatalogError>;
+
+    /// Lines of the audit log, newest first.
+    async fn audited(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, CatalogError>;
+
+    /// Removes lines older than this Unix time (milliseconds); returns how many.
+    async fn forget_audit(&self, before_ms: i64) -> Result<u64, CatalogError>;
+}

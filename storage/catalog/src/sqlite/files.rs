@@ -1,0 +1,104 @@
+//! Whether the files of an open database are still those at its path. On Unix a file that is deleted or replaced lives on for
+//! those who have it open: SQLite would go on writing into it, and nobody would ever read what it wrote.
+//!
+//! Such a catalog is not used: nothing is answered that only such a file holds, and the coordinator is not ready. It goes on
+//! by itself when the very same files are back (moved away and back again). A file of another content in their place is left
+//! alone: it may be a copy that is still being written, or older than what was promised to workers. Whoever put it there
+//! starts the coordinator again.
+
+use std::{
+    io,
+    os::unix::fs::MetadataExt,
+    path::{Path, PathBuf},
+};
+
+/// Device and number of a file.
+type Identity = (u64, u64);
+
+/// The files of an open database.
+#[derive(Debug)]
+pub(super) struct Files {
+    path: PathBuf,
+    main: Option<Identity>,
+    /// The write-ahead log: what was committed last is there alone.
+    log: Option<Identity>,
+}
+
+fn identity(path: &Path) -> Result<Option<Identity>, String> {
+    match std::fs::metadata(path) {
+        Ok(file) => Ok(Some((file.dev(), file.ino()))),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(format!("{} cannot be seen ({error})", path.display())),
+    }
+}
+
+fn log_of(path: &Path) -> PathBuf {
+    let mut log = path.as_os_str().to_owned();
+    log.push("-wal");
+    log.into()
+}
+
+impl Files {
+    /// The files that have just been opened.
+    pub(super) fn of(path: &Path) -> Result<Self, String> {
+        Ok(Self {
+            path: path.to_owned(),
+            main: identity(path)?,
+            log: identity(&log_of(path))?,
+        })
+    }
+
+    /// Checks that the files at the path are those that were opened.
+    ///
+    /// # Errors
+    /// What is not, and what to do about it.
+    pub(super) fn check(&self) -> Result<(), String> {
+        let now = identity(&self.path)?;
+        if now.is_none() {
+            return Err(
+                "the file was deleted or moved away while the coordinator has it open; put that file back, or stop the \
+                 coordinator and restore a backup: a new one would know nothing of what was done"
+                    .into(),
+            );
+        }
+        if now != self.main {
+            return Err(
+                "another file has taken its place while the coordinator has it open; put the former one back, or stop the \
+                 coordinator and start it again to use the new one"
+                    .into(),
+            );
+        }
+        if self.log.is_some() && identity(&log_of(&self.path))? != self.log {
+            return Err(
+                "its write-ahead log (-wal) was deleted or replaced while the coordinator has it open; stop the coordinator, \
+                 which writes what the log held into the database, and start it again"
+                    .into(),
+            );
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_very_same_files_will_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("c.db");
+        std::fs::write(&path, "a").unwrap();
+        std::fs::write(log_of(&path), "b").unwrap();
+        let files = Files::of(&path).unwrap();
+        assert_eq!(files.check(), Ok(()));
+        let away = folder.path().join("away");
+        std::fs::rename(&path, &away).unwrap();
+        assert!(files.check().unwrap_err().contains("deleted"));
+        std::fs::copy(&away, &path).unwrap();
+        assert!(files.check().unwrap_err().contains("another file"));
+        std::fs::rename(&away, &path).unwrap();
+        assert_eq!(files.check(), Ok(()), "back again");
+        std::fs::remove_file(log_of(&path)).unwrap();
+        assert!(files.check().unwrap_err().contains("-wal"));
+    }
+}

@@ -1,0 +1,175 @@
+//! Do the visibility masks fit the histograms? Two-bounce light of a spot arrives where its mask says lit, and not where it
+//! says shadow. Masks of the wrong polarity, order of spots, or order of rows and columns mix both.
+
+use super::ImportError;
+use super::check::{
+    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Profile, Reading, Which, flipped, profile,
+};
+
+/// Share of the lit pixels' light by which another order must separate lit from shadow to be believed.
+const CLEAR: f64 = 0.25;
+
+/// The order in which the masks' entries are taken.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) enum Masks {
+    /// As they stand.
+    #[default]
+    AsTheyStand,
+    /// Rows for columns.
+    Transposed,
+    /// Columns, rows or both from their other end.
+    Turned([bool; 2]),
+    /// The last spot first.
+    LastSpotFirst,
+    /// The spots of a square grid, rows for columns.
+    SpotsTransposed,
+}
+
+impl Masks {
+    /// Where the entry of a spot and a pixel (row, column) stands in masks of (spots, rows, columns).
+    pub fn place(
+        self,
+        spot: usize,
+        (row, column): (usize, usize),
+        (spots, h, w): (usize, usize, usize),
+    ) -> usize {
+        let (spot, row, column) = match self {
+            Self::AsTheyStand => (spot, row, column),
+            // Only where both sides are equal.
+            Self::Transposed => (spot, column, row),
+            Self::Turned([x, y]) => (spot, flipped(row, h, y), flipped(column, w, x)),
+            Self::LastSpotFirst => (spots - 1 - spot, row, column),
+            Self::SpotsTransposed => {
+                let side = spots.isqrt();
+                (spot % side * side + spot / side, row, column)
+            }
+        };
+        (spot * h + row) * w + column
+    }
+
+    /// The other orders that masks of this shape could have.
+    fn others(spots: usize, h: usize, w: usize) -> Vec<(Self, &'static str)> {
+        let mut all = vec![
+            (Self::Turned([true, false]), "columns from right to left"),
+            (Self::Turned([false, true]), "rows from bottom to top"),
+            (
+                Self::Turned([true, true]),
+                "rows and columns from their other ends",
+            ),
+        ];
+        if h == w {
+            all.push((Self::Transposed, "rows and columns exchanged"));
+        }
+        if spots > 1 {
+            all.push((Self::LastSpotFirst, "the last spot first"));
+        }
+        if spots > 1 && spots.isqrt().pow(2) == spots {
+            all.push((Self::SpotsTransposed, "the spots' grid by columns"));
+        }
+        all
+    }
+}
+
+/// Masks the wrong way round light up where no light arrives.
+pub(super) fn polarity(
+    g: &Geometry<'_>,
+    blame: &Blame<'_>,
+    lit: &Profile,
+) -> Result<(), ImportError> {
+    if g.visibility.is_none() {
+        return Ok(());
+    }
+    let dark = profile(g, Reading::default(), Which::Dark);
+    let clear = dark.hit() > dark.background() * CONTRAST;
+    if dark.pairs < MIN_PAIRS || !clear || dark.excess() <= lit.excess().max(0.0) * BETTER {
+        return Ok(());
+    }
+    Err(ImportError::refused(
+        blame.visibility,
+        "polarity of the visibility masks",
+        "more two-bounce light where a mask says lit",
+        format!(
+            "{:.5} of a pixel's energy there, {:.5} where it says shadow",
+            lit.excess().max(0.0),
+            dark.excess()
+        ),
+        format!(
+            "the masks may be the other way round: {}; or import as they are with --unchecked",
+            blame.polarity
+        ),
+    ))
+}
+
+/// Whether the masks separate lit from shadow better in another order. By how much they do as they stand: the light that
+/// stands out at lit pixels, less that at pixels in shadow; `None` where there are no masks, or no shadows.
+///
+/// # Errors
+/// [`ImportError::Refused`] with the order that fits better.
+pub(super) fn order(
+    g: &Geometry<'_>,
+    blame: &Blame<'_>,
+    lit: &Profile,
+) -> Result<Option<f64>, ImportError> {
+    let separation = |masks| {
+        let reading = Reading {
+            masks,
+            ..Reading::default()
+        };
+        let (lit, dark) = (
+            profile(g, reading, Which::Lit),
+            profile(g, reading, Which::Dark),
+        );
+        let enough = lit.pairs >= MIN_PAIRS && dark.pairs >= MIN_PAIRS;
+        enough.then(|| lit.excess() - dark.excess().max(0.0))
+    };
+    if g.visibility.is_none() {
+        return Ok(None);
+    }
+    let Some(own) = separation(Masks::AsTheyStand) else {
+        return Ok(None);
+    };
+    let (h, w) = (g.shape.height as usize, g.shape.width as usize);
+    let mut best: Option<(f64, &str)> = None;
+    for (masks, words) in Masks::others(g.spots.len(), h, w) {
+        let Some(other) = separation(masks) else {
+            continue;
+        };
+        let better = other > own.max(0.0) * BETTER && other > lit.excess().max(0.0) * CLEAR;
+        if better && best.is_none_or(|(most, _)| other > most) {
+            best = Some((other, words));
+        }
+    }
+    match best {
+        None => Ok(Some(own)),
+        Some((other, words)) => Err(ImportError::refused(
+            blame.visibility,
+            "order of the visibility masks",
+            "more two-bounce light at the pixels that each spot's mask calls lit than at those in shadow, spots, rows and \
+             columns in the histogram's order",
+            format!(
+                "a difference of {own:.5} of a pixel's energy so, and of {other:.5} with {words}"
+            ),
+            "put the masks in order, or import them as they are with --unchecked",
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_order_is_a_permutation() {
+        for (spots, h, w) in [(4, 3, 3), (9, 2, 5), (1, 1, 1)] {
+            for (masks, words) in Masks::others(spots, h, w) {
+                let mut seen = vec![false; spots * h * w];
+                for spot in 0..spots {
+                    for at in 0..h * w {
+                        seen[masks.place(spot, (at / w, at % w), (spots, h, w))] = true;
+                    }
+                }
+                assert!(seen.into_iter().all(|s| s), "{words}");
+            }
+        }
+    }
+}

@@ -1,0 +1,323 @@
+//! Removing a model: a note of what goes, then the manifest, then the objects, then the note. Whoever finds the note goes on
+//! from there. Nothing goes but what the note names, and no object that a manifest names.
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt, stream};
+use serde::{Deserialize, Serialize};
+
+use super::{MANIFEST, MODELS, ModelManifest, Models, check_name, speed};
+use crate::error::DatasetError;
+use crate::objects;
+use crate::predictions::{ModelUsed, PredictionManifest, Predictions, TimesUsed};
+use crate::reports::REPORTS;
+
+/// The object that says what is being removed.
+pub(super) const REMOVING: &str = "removing.json";
+/// Manifests read at a time.
+const AT_ONCE: usize = 16;
+
+/// What goes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct Note {
+    /// SHA-256 of the manifest; empty where it could not be read.
+    manifest_sha256: String,
+    training_key: String,
+    /// Keys below the model.
+    objects: Vec<String>,
+}
+
+/// What builds on a model.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Dependents {
+    /// Models that were trained with it.
+    pub models: Vec<String>,
+    /// Groups of predictions that it made, or whose two-bounce times follow from it.
+    pub predictions: Vec<String>,
+}
+
+impl Dependents {
+    /// Whether nothing does.
+    pub fn is_empty(&self) -> bool {
+        self.models.is_empty() && self.predictions.is_empty()
+    }
+}
+
+/// What was removed of a model.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Removed {
+    /// Objects, in the order in which they went.
+    pub deleted: Vec<String>,
+    /// What still lies under the name: of other trainings, sweeps, and what nobody knows.
+    pub left: Vec<String>,
+}
+
+impl Models {
+    /// What builds on a model. A manifest that cannot be read may build on anything.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
+    pub async fn dependents(&self, name: &str) -> Result<Dependents, DatasetError> {
+        check_name(name)?;
+        let sha256 = match self.look(name).await {
+            Ok(manifest) => manifest.map(|m| m.sha256()),
+            Err(DatasetError::Damaged { .. }) => None,
+            Err(error) => return Err(error),
+        };
+        let is =
+            |other: &str, hash: &str| other == name && sha256.as_deref().is_none_or(|s| s == hash);
+        let mut found = Dependents::default();
+        for other in self.names().await? {
+            if other == name {
+                continue;
+            }
+            match self.look(&other).await {
+                Ok(None) => {}
+                Ok(Some(manifest)) => {
+                    if manifest.lineage.models.iter().any(|(n, hash)| is(n, hash)) {
+                        found.models.push(other);
+                    }
+                }
+                Err(DatasetError::Damaged { .. }) => {
+                    found
+                        .models
+                        .push(format!("{other} (its manifest cannot be read)"));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        let parts: Vec<_> = self.folder.parts().collect();
+        let root: object_store::path::Path = parts[..parts.len() - 1]
+            .iter()
+            .map(|p| p.as_ref().to_owned())
+            .collect();
+        let listed = self.store.list_with_delimiter(Some(&root)).await;
+        let listed = listed.map_err(|e| self.failed("list", &root, e))?;
+        for group in listed.common_prefixes {
+            if [MODELS, REPORTS].map(Some).contains(&group.filename()) {
+                continue;
+            }
+            let Some(there) = Predictions::find(self.store.clone(), group.clone()).await? else {
+                continue;
+            };
+            let scenes = there.scenes_present().await?;
+            let looks = scenes.iter().map(|scene| there.manifest(*scene));
+            let mut looks = stream::iter(looks.collect::<Vec<_>>()).buffer_unordered(AT_ONCE);
+            while let Some(looked) = looks.next().await {
+                let builds = match looked {
+                    Ok(manifest) => used(&manifest).any(|m| is(&m.name, &m.manifest_sha256)),
+                    Err(DatasetError::Damaged { .. } | DatasetError::NotPublished { .. }) => false,
+                    Err(error) => return Err(error),
+                };
+                if builds {
+                    found.predictions.push(there.place());
+                    break;
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Removes a model: its manifest first, then its objects, evaluations, checkpoints and speed. A removal that was
+    /// interrupted goes on. Who depends on it is not looked at: see [`Self::dependents`].
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there is nothing of this name, or it is still trained (no manifest, and no removal
+    /// under way) and `unfinished` does not ask for its end; [`DatasetError::Store`].
+    pub async fn remove(&self, name: &str, unfinished: bool) -> Result<Removed, DatasetError> {
+        check_name(name)?;
+        let note_path = self.path(name, REMOVING);
+        let mut removed = Removed::default();
+        let note = match objects::get(&*self.store, &note_path).await? {
+            Some(bytes) => self.note_of(&bytes),
+            None => None,
+        };
+        let note = match note {
+            Some(note) => note,
+            None => {
+                let note = self.note(name, unfinished).await?;
+                let bytes = serde_json::to_vec_pretty(&note).expect("plain data");
+                objects::overwrite(&*self.store, &note_path, Bytes::from(bytes)).await?;
+                note
+            }
+        };
+        let manifest_path = self.path(name, MANIFEST);
+        if let Some(bytes) = objects::get(&*self.store, &manifest_path).await? {
+            let hash = crate::manifest::sha256_hex(&bytes);
+            if hash == note.manifest_sha256 {
+                self.remove_one(&manifest_path, &mut removed).await?;
+            }
+        }
+        for key in &note.objects {
+            let path = self.path(name, key);
+            let there = objects::size(&*self.store, &path).await?.is_some();
+            if there
+                && !self.named(name, key).await?
+                && self.delete_object(name, key, &path).await?
+            {
+                removed.deleted.push(self.shown(&path));
+            }
+        }
+        self.remove_records(name, &note, &mut removed).await?;
+        self.delete(&note_path).await?;
+        let left = self.list(&self.folder.clone().join(name)).await?;
+        removed.left = left.iter().map(|o| self.shown(&o.location)).collect();
+        removed.left.sort();
+        Ok(removed)
+    }
+
+    /// What a removal that begins now takes.
+    async fn note(&self, name: &str, unfinished: bool) -> Result<Note, DatasetError> {
+        let folder = self.folder.clone().join(name);
+        let there = self.list(&folder).await?;
+        let keys = there
+            .iter()
+            .filter_map(|o| super::key_below(&folder, &o.location));
+        let keys: Vec<String> = keys
+            .filter(|key| super::object_folder(key).is_some())
+            .collect();
+        let looked = match self.look(name).await {
+            Err(DatasetError::Damaged { .. }) if unfinished => Err(()),
+            found => Ok(found?),
+        };
+        match looked {
+            Ok(Some(manifest)) => Ok(Note {
+                manifest_sha256: manifest.sha256(),
+                training_key: manifest.training_key.clone(),
+                objects: manifest.objects.into_iter().map(|o| o.key).collect(),
+            }),
+            Err(()) => {
+                // Nobody can say what it names: all that lies there goes.
+                let bytes = objects::require(&*self.store, &self.path(name, MANIFEST)).await?;
+                Ok(Note {
+                    manifest_sha256: crate::manifest::sha256_hex(&bytes),
+                    training_key: String::new(),
+                    objects: keys,
+                })
+            }
+            Ok(None) if unfinished && !there.is_empty() => Ok(Note {
+                manifest_sha256: String::new(),
+                training_key: String::new(),
+                objects: keys,
+            }),
+            Ok(None) => {
+                // Says which there are, and whether it is still trained.
+                self.manifest(name).await?;
+                Err(DatasetError::invalid(
+                    "model",
+                    format!("{name:?} appeared just now; try again"),
+                ))
+            }
+        }
+    }
+
+    fn note_of(&self, bytes: &[u8]) -> Option<Note> {
+        // One that was torn is written again: nothing went before it stood.
+        serde_json::from_slice(bytes).ok()
+    }
+
+    /// Whether a manifest that stands now names an object: of the same training, run again since.
+    async fn named(&self, name: &str, key: &str) -> Result<bool, DatasetError> {
+        match self.look(name).await {
+            Ok(manifest) => Ok(manifest.is_some_and(|m| m.objects.iter().any(|o| o.key == key))),
+            Err(DatasetError::Damaged { .. }) => Ok(true),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Evaluations, checkpoints and speed of what goes.
+    async fn remove_records(
+        &self,
+        name: &str,
+        note: &Note,
+        removed: &mut Removed,
+    ) -> Result<(), DatasetError> {
+        let all = note.training_key.is_empty();
+        // The same training, run again since, has the same evaluations and speed.
+        if self
+            .look(name)
+            .await
+            .is_ok_and(|m: Option<ModelManifest>| m.is_some())
+        {
+            return Ok(());
+        }
+        for object in self.list(&self.path(name, "evaluations")).await? {
+            let key = object
+                .location
+                .filename()
+                .and_then(|f| f.strip_suffix(".json"));
+            let of_it = match self.evaluation(name, key.unwrap_or_default()).await {
+                Ok(found) => found.is_none_or(|e| e.model_sha256 == note.manifest_sha256),
+                Err(DatasetError::Damaged { .. }) => true,
+                Err(error) => return Err(error),
+            };
+            if all || of_it {
+                self.remove_one(&object.location, removed).await?;
+            }
+        }
+        for checkpoint in self.checkpoints(name).await? {
+            if all || checkpoint.training_key == note.training_key {
+                self.remove_one(&checkpoint.object.location, removed)
+                    .await?;
+            }
+        }
+        let path = self.path(name, speed::FILE);
+        if objects::size(&*self.store, &path).await?.is_some() {
+            self.remove_one(&path, removed).await?;
+        }
+        Ok(())
+    }
+
+    async fn remove_one(
+        &self,
+        path: &object_store::path::Path,
+        removed: &mut Removed,
+    ) -> Result<(), DatasetError> {
+        self.delete(path).await?;
+        removed.deleted.push(self.shown(path));
+        Ok(())
+    }
+
+    /// Reports that say something of a model; they stay as they are.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn reports_of(&self, name: &str) -> Result<Vec<String>, DatasetError> {
+        let parts: Vec<_> = self.folder.parts().collect();
+        let root: object_store::path::Path = parts[..parts.len() - 1]
+            .iter()
+            .map(|p| p.as_ref().to_owned())
+            .chain([REPORTS.to_owned()])
+            .collect();
+        let objects: Vec<_> = self
+            .store
+            .list(Some(&root))
+            .try_collect()
+            .await
+            .map_err(|e| self.failed("list", &root, e))?;
+        let mut found = Vec::new();
+        for object in objects
+            .iter()
+            .filter(|o: &&object_store::ObjectMeta| o.location.filename() == Some(MANIFEST))
+        {
+            let bytes = objects::get(&*self.store, &object.location)
+                .await?
+                .unwrap_or_default();
+            let report: Option<crate::reports::ReportManifest> =
+                serde_json::from_slice(&bytes).ok();
+            if let Some(report) = report.filter(|r| r.models.iter().any(|m| m.name == name)) {
+                found.push(report.name);
+            }
+        }
+        found.sort();
+        Ok(found)
+    }
+}
+
+/// The models that predictions were made with.
+fn used(manifest: &PredictionManifest) -> impl Iterator<Item = &ModelUsed> {
+    let times = match &manifest.two_bounce_times {
+        Some(TimesUsed::Model(model)) => Some(model),
+        _ => None,
+    };
+    manifest.models.values().chain(times)
+}

@@ -1,0 +1,170 @@
+//! Checking a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and what trials told.
+
+use object_store::ObjectMeta;
+
+use super::{
+    Evaluation, MANIFEST, ModelManifest, Models, Rung, TrainingSpeed, TrialRecord, check_name,
+    checkpoint, key_below, object_folder, remove::REMOVING,
+};
+use crate::error::DatasetError;
+use crate::manifest::sha256_hex;
+use crate::objects;
+use crate::verify::{Fault, Problem};
+
+/// What a check of a model found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ModelCheck {
+    /// Its manifest, where it can be read; a model that is still trained has none.
+    pub manifest: Option<ModelManifest>,
+    /// Objects of the manifest that were checked.
+    pub objects: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Evaluations that were checked.
+    pub evaluations: u64,
+    /// Checkpoints that were checked.
+    pub checkpoints: u64,
+    /// What is wrong, ordered by key.
+    pub problems: Vec<Problem>,
+    /// Objects that the manifest does not name: of a killed training; `dataset gc` deletes them.
+    pub unused: Vec<String>,
+    /// Somebody began to remove the model, and did not come to the end.
+    pub removing: bool,
+}
+
+impl ModelCheck {
+    /// Whether nothing is wrong.
+    pub fn is_sound(&self) -> bool {
+        self.problems.is_empty() && !self.removing
+    }
+}
+
+impl Models {
+    /// Checks everything that lies under a model's name.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where nothing does; [`DatasetError::Store`].
+    pub async fn verify(&self, name: &str) -> Result<ModelCheck, DatasetError> {
+        check_name(name)?;
+        let folder = self.folder.clone().join(name);
+        let there = self.list(&folder).await?;
+        if there.is_empty() {
+            // Says which there are.
+            self.manifest(name).await?;
+        }
+        let mut check = ModelCheck::default();
+        match self.look(name).await {
+            Ok(manifest) => check.manifest = manifest,
+            Err(DatasetError::Damaged { object, what }) => check.problems.push(Problem {
+                object,
+                scene: None,
+                fault: Fault::BadManifest(what),
+            }),
+            Err(error) => return Err(error),
+        }
+        let manifest = check.manifest.clone();
+        for object in manifest.iter().flat_map(|m| &m.objects) {
+            let path = self.path(name, &object.key);
+            check.objects += 1;
+            check.bytes += object.size;
+            let fault = match objects::get(&*self.store, &path).await? {
+                None => Fault::Missing,
+                Some(bytes) if bytes.len() as u64 != object.size => Fault::WrongSize {
+                    expected: object.size,
+                    found: bytes.len() as u64,
+                },
+                Some(bytes) => match sha256_hex(&bytes) {
+                    found if found == object.sha256 => continue,
+                    found => Fault::WrongHash {
+                        expected: object.sha256.clone(),
+                        found,
+                    },
+                },
+            };
+            check.problems.push(Problem {
+                object: self.shown(&path),
+                scene: None,
+                fault,
+            });
+        }
+        for object in there {
+            if let Some(key) = key_below(&folder, &object.location) {
+                self.check_other(name, &key, &object, &mut check).await?;
+            }
+        }
+        check.problems.sort_by(|a, b| a.object.cmp(&b.object));
+        Ok(check)
+    }
+
+    /// Checks what no manifest names.
+    async fn check_other(
+        &self,
+        name: &str,
+        key: &str,
+        object: &ObjectMeta,
+        check: &mut ModelCheck,
+    ) -> Result<(), DatasetError> {
+        let at = self.shown(&object.location);
+        let bad = |what: &str| Some(Fault::BadRecord(what.to_owned()));
+        let fault = match key.split_once('/') {
+            None if key == MANIFEST => None,
+            None if key == REMOVING => {
+                check.removing = true;
+                None
+            }
+            None if key == super::speed::FILE => {
+                let bytes = objects::require(&*self.store, &object.location).await?;
+                match serde_json::from_slice::<TrainingSpeed>(&bytes) {
+                    Ok(_) => None,
+                    Err(e) => bad(&format!("does not say how fast a training was: {e}")),
+                }
+            }
+            Some(("evaluations", file)) => {
+                check.evaluations += 1;
+                let evaluation = file.strip_suffix(".json").unwrap_or(file);
+                match self.evaluation(name, evaluation).await {
+                    Ok(found) => found.and_then(|found| misplaced(&found, name, evaluation)),
+                    Err(DatasetError::Damaged { what, .. }) => bad(&what),
+                    Err(error) => return Err(error),
+                }
+            }
+            Some((checkpoint::FOLDER, _)) => {
+                check.checkpoints += 1;
+                let bytes = objects::require(&*self.store, &object.location).await?;
+                match checkpoint::whole(bytes) {
+                    Some(_) => None,
+                    None => bad("its content has not the checkpoint's checksum"),
+                }
+            }
+            Some(("sweeps", _)) => {
+                let bytes = objects::require(&*self.store, &object.location).await?;
+                let told = match key.contains("/trials/") {
+                    true => serde_json::from_slice::<TrialRecord>(&bytes).map(drop),
+                    false => serde_json::from_slice::<Rung>(&bytes).map(drop),
+                };
+                told.err()
+                    .and_then(|e| bad(&format!("is not what a trial says of itself: {e}")))
+            }
+            Some(_) if object_folder(key).is_some() => {
+                let manifest = check.manifest.as_ref();
+                if !manifest.is_some_and(|m| m.objects.iter().any(|o| o.key == key)) {
+                    check.unused.push(at.clone());
+                }
+                None
+            }
+            _ => Some(Fault::Foreign),
+        };
+        check.problems.extend(fault.map(|fault| Problem {
+            object: at,
+            scene: None,
+            fault,
+        }));
+        Ok(())
+    }
+}
+
+/// An evaluation that lies in another's place.
+fn misplaced(found: &Evaluation, name: &str, key: &str) -> Option<Fault> {
+    let here = found.key == key && found.model == name;
+    (!here).then(|| Fault::BadRecord(format!("is that of {:?}, key {}", found.model, found.key)))
+}

@@ -1,0 +1,299 @@
+//! What a new user types, and what goes wrong on an ordinary day.
+
+use std::fs;
+
+use picofarm_tests::{Cli, Farm, Job, Scratch, poison, store, wait::until};
+
+/// A small demo.
+fn demo(cli: &Cli, resolution: &str) -> serde_json::Value {
+    let args = ["demo", "--scenes", "1", "--samples", "4", "--spots", "4"];
+    let more = ["--assets", "parametric", "--workers", "1", "--resolution"];
+    cli.json(&[&args[..], &more, &[resolution]].concat())
+}
+
+/// A generated scene, `room.glb`.
+fn room(cli: &Cli) {
+    let args = ["scene", "generate", "--kind", "primitive", "--seed", "5"];
+    cli.run(
+        &[
+            &args[..],
+            &["--spots", "4", "--resolution", "16", "--out", "room.glb"],
+        ]
+        .concat(),
+    )
+    .ok();
+}
+
+#[test]
+fn a_demo_of_other_settings_gets_a_data_set_of_its_own_and_paths_may_climb() {
+    let scratch = Scratch::new("demo-settings");
+    let cli = Cli::new(scratch.path());
+    let first = demo(&cli, "16");
+    let place = scratch.join("picofarm-demo/store/rooms");
+    let hashes = store::hashes(&place);
+    // Another resolution, as other furniture, is another data set.
+    let second = demo(&cli, "8");
+    assert_ne!(first["dataset"], second["dataset"]);
+    let other = second["dataset"].as_str().unwrap();
+    assert!(other.contains("/store/rooms-"), "{other}");
+    assert_eq!(store::hashes(&place), hashes, "the first stays as it is");
+    // Each is found again.
+    assert_eq!(demo(&cli, "8")["dataset"], second["dataset"]);
+    assert_eq!(demo(&cli, "16")["dataset"], first["dataset"]);
+
+    fs::create_dir(scratch.join("inner")).unwrap();
+    let inner = Cli::new(&scratch.join("inner"));
+    let climbs = "../picofarm-demo/store/rooms";
+    inner.run(&["dataset", "info", climbs]).ok();
+    inner.run(&["dataset", "verify", climbs]).ok();
+    inner
+        .run(&["dataset", "split", climbs, "--fractions", "1,0,0"])
+        .ok();
+    inner
+        .run(&["model", "list", "../picofarm-demo/store"])
+        .fails(3, &["no models in", "picofarm-demo/store/models", "hint:"]);
+    inner
+        .run(&["model", "list", "../nowhere"])
+        .fails(3, &["nowhere: there is no such folder"]);
+    inner
+        .run(&["dataset", "info", "s3:/bucket/rooms"])
+        .fails(2, &["s3://bucket/rooms"]);
+}
+
+#[test]
+fn a_second_job_file_gets_a_name_of_its_own() {
+    let scratch = Scratch::new("init");
+    let cli = Cli::new(scratch.path());
+    cli.run(&["job", "init"]).ok();
+    let ended = cli.run(&["job", "init", "--kind", "train"]).ok();
+    assert!(
+        ended.stdout.contains("picofarm job plan train.toml"),
+        "{}",
+        ended.stdout
+    );
+    assert!(scratch.join("job.toml").exists() && scratch.join("train.toml").exists());
+    cli.run(&["job", "init", "my jobs.toml"]).ok();
+    cli.run(&["job", "init", "my jobs.toml", "--kind", "graph"])
+        .fails(
+            3,
+            &[
+                "my jobs.toml exists",
+                "picofarm job init 'my jobs-2.toml' --kind graph",
+            ],
+        );
+    cli.run(&["demo", "--seed", "-1"])
+        .fails(2, &["-1", "--seed"]);
+}
+
+#[test]
+fn a_followed_job_outlives_its_coordinator() {
+    let mut farm = Farm::start("watch");
+    let job = Job::quick(&farm.store(), 2);
+    let id = farm.submit(&job);
+    let watching = farm.cli().start("watch", &["job", "watch", &id]);
+    // It is connected when the history says that it waits; killing the coordinator before that shows nothing.
+    until("the watcher's first line", || {
+        let log = fs::read_dir(farm.scratch.path()).unwrap();
+        log.map(|e| e.unwrap().path())
+            .filter(|p| p.to_string_lossy().ends_with("-watch.stderr"))
+            .any(|p| fs::read_to_string(p).unwrap().contains("0/2 scenes"))
+            .then_some(())
+    });
+    farm.kill_coordinator();
+    farm.start_coordinator();
+    let _worker = farm.worker("worker");
+    let ended = watching.end().ok();
+    assert!(ended.stderr.contains("is away"), "{}", ended.stderr);
+    assert!(ended.stdout.contains("2 done"), "{}", ended.stdout);
+}
+
+#[test]
+fn a_followed_job_whose_coordinator_stays_away_ends_with_a_code_of_its_own_and_says_how_to_go_on() {
+    let mut farm = Farm::start("away");
+    let id = farm.submit(&Job::quick(&farm.store(), 2));
+    let mut watching = farm.cli().start("watch", &["job", "watch", &id]);
+    watching.until_says("0/2 scenes");
+    farm.kill_coordinator();
+    let ended = watching.end().fails(4, &["stayed away for"]);
+    let way_on = format!("picofarm job watch {id}");
+    assert!(ended.stderr.contains(&way_on), "{}", ended.stderr);
+}
+
+#[test]
+fn a_lost_worker_is_named_with_its_task() {
+    let farm = Farm::with_lease("lost", 2.0);
+    let id = farm.submit(&Job::slow(&farm.store(), 1));
+    let worker = farm.worker("unlucky");
+    assert!(farm.until_busy(&id, &["unlucky"]));
+    worker.kill();
+    let said = until("a word on the worker", || {
+        let said = farm.run(&["job", "logs", &id]).ok().stdout;
+        said.contains("unlucky was lost").then_some(said)
+    });
+    assert!(
+        said.contains("worker unlucky was lost (connection closed) while it ran task 0"),
+        "{said}"
+    );
+    let said = farm.run(&["job", "explain", &id]).ok().stdout;
+    assert!(said.contains("worker unlucky was lost"), "{said}");
+}
+
+#[test]
+fn a_cancelled_job_submitted_again_is_not_said_to_run() {
+    let farm = Farm::start("again");
+    let job = Job::quick(&farm.store(), 3);
+    let id = farm.submit(&job);
+    let file = farm.scratch.join("quick.toml").display().to_string();
+    let plan = farm.run(&["job", "plan", &file]).ok();
+    assert!(plan.stdout.contains("it is active"), "{}", plan.stdout);
+    let again = farm.run(&["job", "submit", &file]).ok();
+    assert!(
+        again.stdout.contains("was there already: active"),
+        "{}",
+        again.stdout
+    );
+    farm.run(&["job", "cancel", &id]).ok();
+    let ended = farm
+        .run(&["job", "submit", &file])
+        .fails(5, &["was cancelled", "--again"]);
+    assert!(!ended.stdout.contains("3 run"), "{}", ended.stdout);
+    assert!(!ended.stderr.contains("follow it"), "{}", ended.stderr);
+    let plan = farm.run(&["job", "plan", &file]).ok();
+    assert!(plan.stdout.contains("it was cancelled"), "{}", plan.stdout);
+    let _worker = farm.worker("worker");
+    farm.run(&["job", "submit", &file, "--again", "--watch"])
+        .ok();
+}
+
+#[test]
+fn scenes_without_light_say_why() {
+    let farm = Farm::start("dark");
+    let cli = farm.cli();
+    room(&cli);
+    let render = [
+        "scene",
+        "render",
+        "room.glb",
+        "--resolution",
+        "8",
+        "--samples",
+        "2",
+    ];
+    for (gate, why) in [
+        (
+            ["--gate-start-m", "1000", "--bins", "8"],
+            "gate starts at 1000.00 m",
+        ),
+        (
+            ["--bin-width-m", "0.001", "--bins", "8"],
+            "gate ends at 1.01 m",
+        ),
+    ] {
+        let out = gate[1].replace('.', "-");
+        let ended = cli
+            .run(&[&render[..], &gate, &["--out", &out]].concat())
+            .ok();
+        let said = ended.stdout;
+        assert!(said.contains("warning: the histogram is empty"), "{said}");
+        assert!(said.contains(why), "{said}");
+    }
+    let plan = [
+        "scene",
+        "plan",
+        "room.glb",
+        "--resolution",
+        "8",
+        "--samples",
+        "2",
+    ];
+    let narrow = ["--bin-width-m", "0.001", "--bins", "8"];
+    let ended = cli.run(&[&plan[..], &narrow].concat()).ok();
+    assert!(
+        ended
+            .stdout
+            .contains("warning: no light arrives within the gate: first light at"),
+        "{}",
+        ended.stdout
+    );
+    let ended = cli.run(&plan).ok();
+    assert!(!ended.stdout.contains("warning"), "{}", ended.stdout);
+
+    let job = Job {
+        gate_start_m: 1000.0,
+        ..Job::quick(&farm.store(), 2)
+    };
+    job.write(&farm.scratch.join("dark.toml"));
+    let _worker = farm.worker("worker");
+    let ended = farm.run(&["job", "submit", "dark.toml", "--watch"]).ok();
+    assert!(
+        ended
+            .stderr
+            .contains("warning: all 2 scenes rendered are without light"),
+        "{}",
+        ended.stderr
+    );
+}
+
+/// Whether a text moves no cursor, and no line of it pretends to be of this program.
+fn assert_harmless(text: &str) {
+    let bad = |c: char| (c.is_control() && c != '\n') || ('\u{202a}'..='\u{202e}').contains(&c);
+    assert!(!text.contains(bad), "{text:?}");
+    let forged = |line: &str| line.starts_with("error: forged") || line.starts_with("forged");
+    assert!(!text.lines().any(forged), "{text}");
+}
+
+#[test]
+fn what_workers_and_scenes_send_reaches_no_terminal_unescaped() {
+    let mut farm = Farm::start("terminal-farm");
+    let _worker = farm.worker("honest");
+    poison::lie(farm.url());
+    let job = poison::job(&farm.store(), farm.scratch.path(), 0);
+    let id = farm.submit(&job);
+    assert_eq!(farm.until_ended(&id)["state"], "failed");
+    poison::assert_told(&farm.events(&id));
+    for args in [
+        &["workers"][..],
+        &["events", "--last", "100"],
+        &["job", "list"],
+        &["job", "status", &id],
+        &["job", "logs", &id],
+        &["job", "explain", &id],
+        &["job", "logs", &id, "--task", "0"],
+    ] {
+        let ended = farm.run(args).ok();
+        assert_harmless(&ended.stdout);
+        assert_harmless(&ended.stderr);
+    }
+    let log = farm.coordinator().stderr();
+    assert!(log.contains("owned"), "{log}");
+    assert_harmless(&log);
+}
+
+#[test]
+fn names_from_elsewhere_move_no_cursor_and_forge_no_line() {
+    let scratch = Scratch::new("terminal");
+    let cli = Cli::new(scratch.path());
+    let evil = "x\u{1b}]0;owned\u{7}\u{1b}[2J\u{9b}1A\nerror: forged\u{202e}.glb";
+    let ended = cli.run(&["scene", "show", evil]).code(3);
+    assert_harmless(&ended.stderr);
+    let ended = cli.run(&["scene", "show", evil, "--json"]).code(3);
+    assert_harmless(&ended.stderr);
+    assert!(
+        ended.error()["message"].as_str().unwrap().contains(evil),
+        "JSON says the same"
+    );
+    // A file's content is somebody else's too.
+    let json = format!(
+        "{{\"asset\": {{\"version\": \"2.0\"}}, \"extensionsRequired\": [{}]}}",
+        serde_json::to_string(evil).unwrap()
+    );
+    fs::write(scratch.join("evil.gltf"), json).unwrap();
+    assert_harmless(&cli.run(&["scene", "show", "evil.gltf"]).code(3).stderr);
+    fs::write(
+        scratch.join("job.toml"),
+        format!("name = \"n\"\n{:?} = 1\n", "evil\u{9b}31m"),
+    )
+    .unwrap();
+    assert_harmless(&cli.run(&["job", "plan", "job.toml"]).code(3).stderr);
+    assert_harmless(&cli.run(&["dataset", "info", evil]).stderr);
+}

@@ -1,0 +1,178 @@
+//! A room in which a mirror folds a beam: two-bounce times of its data set are those of the rendered light.
+
+use std::sync::Arc;
+
+use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, open_store};
+use picofarm_model::scene::{Scene as Seen, Scenes};
+use picofarm_proto::{key::TaskKey, model::Histogram};
+use picofarm_scene::{
+    Affine, Beam, Camera, Intrinsics, Laser, Material, Mesh, Object, Scene, Vec3,
+};
+use picofarm_transient::{Budget, Progress, Settings, Strategy};
+use serde_json::json;
+use tokio::runtime::Runtime;
+
+use super::Examples;
+use crate::execute::{
+    output::Stores,
+    render::{in_camera, record},
+};
+
+const SIDE: u32 = 16;
+const BIN_M: f64 = 0.02;
+
+struct Quiet;
+
+impl Progress for Quiet {
+    fn at(&self, _done: f32) -> bool {
+        true
+    }
+}
+
+fn v(x: f32, y: f32, z: f32) -> Vec3 {
+    Vec3::new(x, y, z)
+}
+
+fn quad(name: &str, [corner, a, b]: [Vec3; 3], material: Material) -> Object {
+    Object {
+        mesh: Arc::new(Mesh {
+            name: name.into(),
+            triangle_material: vec![0; 2],
+            positions: vec![corner, corner + a, corner + a + b, corner + b],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            materials: vec![material],
+            uv: vec![],
+        }),
+        to_world: Affine::IDENTITY,
+        label: 0,
+        name: name.into(),
+    }
+}
+
+fn grey() -> Material {
+    Material {
+        name: "grey".into(),
+        bsdf: picofarm_scene::Bsdf::Diffuse { reflectance: 0.5 },
+        rgb: [0.5; 3],
+        texture: None,
+        two_sided: true,
+    }
+}
+
+/// Floor, back wall and a mirror on the right; the beam goes to the mirror and from there to the wall. The camera sees a
+/// patch of the floor.
+fn room() -> Scene {
+    let floor = [v(-2.0, -1.5, 0.0), v(4.0, 0.0, 0.0), v(0.0, 0.0, -4.0)];
+    let wall = [v(-2.0, -1.5, -4.0), v(4.0, 0.0, 0.0), v(0.0, 3.0, 0.0)];
+    let mirror = [v(1.2, -1.0, -1.0), v(0.0, 2.0, 0.0), v(0.0, 0.0, -2.0)];
+    let intrinsics = Intrinsics::from_fov(4.0, SIDE, SIDE);
+    Scene {
+        name: "folded".into(),
+        objects: vec![
+            quad("floor", floor, grey()),
+            quad("wall", wall, grey()),
+            quad("mirror", mirror, Material::mirror("mirror", 0.01)),
+        ],
+        labels: vec!["thing".into()],
+        camera: Camera::look_at(Vec3::ZERO, v(-0.5, -1.5, -2.5), intrinsics),
+        laser: Laser {
+            origin: Vec3::ZERO,
+            beams: vec![Beam {
+                direction: v(0.6, 0.05, -1.0).normalized(),
+                spot: None,
+            }],
+        },
+        provenance: Default::default(),
+    }
+}
+
+/// The rendered room as a stage reads it from a data set.
+fn seen() -> Arc<Seen> {
+    let (folder, runtime) = (tempfile::tempdir().unwrap(), Runtime::new().unwrap());
+    let gate = Gate {
+        start_m: 4.0,
+        bin_width_m: BIN_M,
+        bins: 400,
+    };
+    let spec = DatasetSpec {
+        scenes: 1,
+        height: SIDE,
+        width: SIDE,
+        spots: 1,
+        subsets: Subsets::NONE,
+        per_spot: false,
+        gate,
+        profile: Profile::LOSSLESS,
+    };
+    let scene = room();
+    let settings = Settings {
+        gate: picofarm_transient::Gate {
+            start_m: gate.start_m,
+            bin_width_m: gate.bin_width_m,
+            bins: gate.bins,
+        },
+        budget: Budget::Samples(64),
+        max_bounces: Some(2),
+        one_bounce: false,
+        seed: 1,
+        split: false,
+        groups: vec![],
+        strategy: Strategy::default(),
+    };
+    let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
+    let spots = rendered.spots.iter();
+    let spots: Vec<_> = spots
+        .map(|spot| spot.as_ref().map(|s| in_camera(s, &scene.camera)))
+        .collect();
+    let provenance = Provenance {
+        task_key: TaskKey([1; 32]).to_string(),
+        renderer: "test".into(),
+        seed: 1,
+        plan: json!({}),
+    };
+    let (store, prefix) = open_store(folder.path().to_str().unwrap()).unwrap();
+    let dataset = runtime.block_on(async {
+        let opened = Dataset::create_or_open(store, prefix.join("folded"), &spec);
+        let dataset = opened.await.unwrap();
+        let record = record(&scene, &rendered, &[], &spots);
+        dataset.publish(0, &record, &provenance).await.unwrap();
+        dataset
+    });
+    let stores = Stores::new(runtime.handle().clone(), std::time::Duration::ZERO);
+    let shown = (Histogram::Transient, &[][..]);
+    let Ok(examples) = Examples::new(&stores, &dataset, shown, vec![0], "test") else {
+        panic!("the data set has that histogram")
+    };
+    examples.load(0).unwrap()
+}
+
+#[test]
+fn two_bounce_times_from_any_depth_begin_with_the_folded_beams_length() {
+    let scene = seen();
+    let [x, y, z] = scene.spots[0];
+    let straight = (x * x + y * y + z * z).sqrt();
+    assert!(
+        scene.beams_m[0] > straight + 20.0 * BIN_M as f32,
+        "the beam is folded: {} m, straight {straight} m",
+        scene.beams_m[0]
+    );
+    // A network that is right in every pixel.
+    let predicted = scene.depth_m.clone();
+    let (mut pixels, bins) = (0, scene.bins);
+    for (p, tof) in scene.tof_of(0, &predicted).into_iter().enumerate() {
+        let h = &scene.histogram[p * bins..][..bins];
+        let Some(onset) = h.iter().position(|h| *h > 0.0) else {
+            continue;
+        };
+        let last = bins - 1 - h.iter().rev().position(|h| *h > 0.0).unwrap();
+        let bin = ((f64::from(tof) - scene.first_m) / scene.bin_width_m).floor() as usize;
+        // A pixel sees a patch, and its centre is within.
+        assert!(
+            (onset..=last).contains(&bin) && last - onset <= 4,
+            "pixel {p}: computed bin {bin}, rendered {onset} to {last}"
+        );
+        pixels += 1;
+    }
+    assert_eq!(pixels, (SIDE * SIDE) as usize, "the whole patch is lit");
+    assert_eq!(scene.tof(0), scene.tof_of(0, &predicted));
+}

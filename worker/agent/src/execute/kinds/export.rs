@@ -1,0 +1,177 @@
+//! Packing a data set for sharing, or a part of it.
+
+use std::ops::Range;
+
+use picofarm_dataset::{Dataset, DatasetError, ExportFormat, Exporter, open_store};
+use picofarm_proto::{
+    model::{ExportTask, SpecError, TaskSpec},
+    split::{SIDES, SplitRecord},
+};
+use tracing::info;
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Submission, Task, TaskError, output::of_dataset,
+};
+
+/// Which scenes of a data set.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Scenes {
+    /// All that are published.
+    All,
+    /// Those of them in an interval.
+    Range(Range<u64>),
+    /// Those of them on a side of a split.
+    Split {
+        /// The split.
+        name: String,
+        /// The side.
+        side: String,
+    },
+}
+
+impl Scenes {
+    /// Reads nothing, `a..b`, `split:SIDE` or `split:NAME:SIDE`.
+    ///
+    /// # Errors
+    /// It is none of them.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let expected =
+            || "expected A..B, split:train, split:validation, split:test or split:NAME:SIDE";
+        if text.is_empty() {
+            return Ok(Self::All);
+        }
+        if let Some(split) = text.strip_prefix("split:") {
+            let (name, side) = split.split_once(':').unwrap_or(("default", split));
+            if !SIDES.contains(&side) {
+                return Err(expected().into());
+            }
+            return Ok(Self::Split {
+                name: name.into(),
+                side: side.into(),
+            });
+        }
+        let (low, high) = text.split_once("..").ok_or_else(expected)?;
+        let number = |text: &str| {
+            let number = text.trim().parse::<u64>();
+            number.map_err(|_| expected().to_owned())
+        };
+        let range = number(low)?..number(high)?;
+        match range.is_empty() {
+            true => Err(expected().into()),
+            false => Ok(Self::Range(range)),
+        }
+    }
+
+    /// The published scenes among them, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there is no such split; others where the store cannot be read.
+    pub async fn of(&self, dataset: &Dataset) -> Result<Vec<u64>, DatasetError> {
+        let mut scenes = dataset.scenes_present().await?;
+        match self {
+            Self::All => {}
+            Self::Range(range) => scenes.retain(|s| range.contains(s)),
+            Self::Split { name, side } => {
+                let side = of_split(dataset, name, side).await?;
+                scenes.retain(|s| side.binary_search(s).is_ok());
+            }
+        }
+        Ok(scenes)
+    }
+}
+
+/// The scenes of a side of the newest version of a split, ascending.
+async fn of_split(dataset: &Dataset, name: &str, side: &str) -> Result<Vec<u64>, DatasetError> {
+    let versions = dataset.split_versions(name).await?;
+    let Some(version) = versions.last() else {
+        return Err(DatasetError::Invalid {
+            field: "scenes".into(),
+            what: format!(
+                "{} has no split {name:?}; make it with a split task or `picofarm dataset split`",
+                dataset.prefix()
+            ),
+        });
+    };
+    let bytes = dataset.read_split(name, *version).await?;
+    let record = SplitRecord::parse(&bytes).map_err(|what| DatasetError::Damaged {
+        object: dataset.split_place(name, *version),
+        what,
+    })?;
+    Ok(record.scenes(side))
+}
+
+impl RunTask for ExportTask {
+    fn code_version() -> String {
+        Self::VERSION.to_owned()
+    }
+
+    /// Packs what the job names. Files that are there already are kept.
+    fn run(&self, context: &Context, _task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (stores, spec) = (&context.stores, self);
+        let field = |e: TaskError, field: &str| match e {
+            TaskError::User(text) => TaskError::User(format!("{field}: {text}")),
+            other => other,
+        };
+        let which = Scenes::parse(&spec.export.scenes)
+            .map_err(|what| TaskError::User(format!("export.scenes: {what}")))?;
+        let place = &spec.source;
+        let source = stores
+            .open_source(&place.store, &place.dataset, control)
+            .map_err(|e| field(e, "source"))?;
+        stores.fits(TaskSpec::Export(spec.clone()), Some(source.spec()))?;
+        let scenes = stores
+            .wait(control, which.of(&source))
+            .map_err(|e| field(e, "export.scenes"))?;
+        let (store, prefix) =
+            open_store(&spec.export.dest).map_err(|e| field(of_dataset(e), "export.dest"))?;
+        let format = ExportFormat::parse(&spec.export.format)
+            .map_err(|what| TaskError::User(format!("export.format: {what}")))?;
+        let mut export =
+            Exporter::new(format, &source, &scenes, &*store, prefix).map_err(of_dataset)?;
+        let steps = export.steps();
+        for k in 0..steps {
+            stores.wait(control, export.step(k))?;
+            info!("step {} of {steps} written", k + 1);
+            if !control.at((k + 1) as f32 / (steps + 1) as f32) {
+                return Err(TaskError::Stopped);
+            }
+        }
+        let done = stores.wait(control, export.finish())?;
+        control.at(1.0);
+        Ok(Output {
+            manifest_sha256: hex::encode(done.sha256),
+            bytes: done.bytes,
+            adopted: false,
+        })
+    }
+
+    fn resolve(&mut self, _here: &Submission<'_>) -> Result<(), SpecError> {
+        ExportFormat::parse(&self.export.format).map_err(|e| SpecError::new("export.format", e))?;
+        Scenes::parse(&self.export.scenes).map_err(|e| SpecError::new("export.scenes", e))?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scenes_are_chosen_by_range_or_by_split() {
+        assert_eq!(Scenes::parse(""), Ok(Scenes::All));
+        assert_eq!(Scenes::parse("3..7"), Ok(Scenes::Range(3..7)));
+        let split = |name: &str, side: &str| Scenes::Split {
+            name: name.into(),
+            side: side.into(),
+        };
+        assert_eq!(Scenes::parse("split:train"), Ok(split("default", "train")));
+        let half = Scenes::parse("split:half:test");
+        assert_eq!(half, Ok(split("half", "test")));
+        for bad in ["3", "7..3", "split:", "split:training", "a..b"] {
+            assert!(
+                Scenes::parse(bad).unwrap_err().starts_with("expected"),
+                "{bad}"
+            );
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! Generating: a scene as a file for other programs. Made anew each time and compared with what is there: that takes less
+//! than to trust it.
+
+use bytes::Bytes;
+use picofarm_dataset::publish_files;
+use picofarm_files::Opener;
+use picofarm_proto::model::{GenerateTask, SceneSource, SpecError};
+use picofarm_scene::{Scene, SceneError, export};
+use sha2::{Digest, Sha256};
+use tracing::info;
+
+use crate::execute::{Context, Control, Output, RunTask, Submission, Task, TaskError, scenes};
+
+/// Version of the files that are written of a scene.
+const FILES_VERSION: &str = "scene-files-1";
+
+/// Everything of this program that decides a scene file's bytes.
+pub fn generator_version() -> String {
+    format!(
+        "{}/{}/{FILES_VERSION}",
+        picofarm_scene::furnished::GENERATOR_VERSION,
+        picofarm_scene::primitive::GENERATOR_VERSION,
+    )
+}
+
+impl RunTask for GenerateTask {
+    fn code_version() -> String {
+        generator_version()
+    }
+
+    /// Writes scene `task.index` of the job.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (stores, libraries, spec) = (&context.stores, &context.libraries, self);
+        let settings = &spec.generate;
+        let source: &SceneSource = &spec.scenes;
+        let scene = scenes::scene(
+            source,
+            settings.resolution,
+            task.index,
+            // Generated scenes name no files.
+            (libraries, &Opener::anywhere()),
+        )?;
+        if !control.at(0.5) {
+            return Err(TaskError::Stopped);
+        }
+        let name = format!("{:06}", task.index);
+        let files = match &*settings.format {
+            "mitsuba" => mitsuba(&scene, &name)?,
+            _ => {
+                let bytes = export::glb_bytes(&scene).map_err(scenes::of_scene)?;
+                vec![(format!("{name}.glb"), bytes.into())]
+            }
+        };
+        let (store, prefix) = stores.probed(&settings.dest, control)?;
+        stores.patiently(control, async || {
+            publish_files(&*store, &prefix, &files).await
+        })?;
+        let mut hash = Sha256::new();
+        for (name, bytes) in &files {
+            hash.update(name);
+            hash.update(Sha256::digest(bytes));
+        }
+        info!(scene = scene.name, files = files.len(), "scene written");
+        control.at(1.0);
+        Ok(Output {
+            manifest_sha256: hex::encode(hash.finalize()),
+            bytes: files.iter().map(|(_, bytes)| bytes.len() as u64).sum(),
+            adopted: false,
+        })
+    }
+
+    fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
+        here.scenes(&mut self.scenes)
+    }
+}
+
+/// The files of a scene for Mitsuba, below `name`; the one that names the others comes last.
+fn mitsuba(scene: &Scene, name: &str) -> Result<Vec<(String, Bytes)>, TaskError> {
+    let failed = |e: std::io::Error| {
+        TaskError::Interrupted(format!(
+            "a folder for temporary files: {e}; set TMPDIR to one that has room"
+        ))
+    };
+    let folder = tempfile::tempdir().map_err(failed)?;
+    let of_write = |e: SceneError| match e {
+        SceneError::Write { .. } => TaskError::Interrupted(e.to_string()),
+        other => scenes::of_scene(other),
+    };
+    export::write_mitsuba(scene, &folder.path().join("scene.xml")).map_err(of_write)?;
+    let mut files = Vec::new();
+    for part in ["meshes", "textures", ""] {
+        let mut paths = Vec::new();
+        for entry in std::fs::read_dir(folder.path().join(part)).map_err(failed)? {
+            let path = entry.map_err(failed)?.path();
+            if path.is_file() {
+                paths.push(path);
+            }
+        }
+        paths.sort();
+        for path in paths {
+            let below = path.strip_prefix(folder.path()).expect("it lies in it");
+            let below = below.to_str().expect("we named it");
+            files.push((
+                format!("{name}/{below}"),
+                std::fs::read(&path).map_err(failed)?.into(),
+            ));
+        }
+    }
+    Ok(files)
+}

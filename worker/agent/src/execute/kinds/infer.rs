@@ -1,0 +1,248 @@
+//! Inference: what trained models see in a scene, kept beside the data set. Adopt, or ask each model and publish.
+//!
+//! A shadow network that is given two-bounce times is given those that follow from the depths of the stage's own ToF model;
+//! where the stage has none, those it is evaluated with: of the ToF model that it was trained with, or the truth's.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex},
+};
+
+use picofarm_dataset::{
+    Dataset, DatasetError, ENCODER_VERSION, Models, Predicted, PredictionManifest, Predictions,
+};
+use picofarm_model::{
+    Model, ModelError, masks,
+    scene::{Scene, Scenes},
+};
+use picofarm_proto::model::{InferTask, TaskSpec};
+use tracing::{info, warn};
+
+mod panel;
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Task, TaskError,
+    examples::Examples,
+    output::{Stores, of_dataset},
+    reprocess::source_manifest,
+    train::{at, model_version, of_model},
+    truth,
+};
+use panel::{Member, Panel, Shown, Times};
+
+/// Progress once everything is asked.
+const ASKED: f32 = 0.95;
+
+/// Everything of this program that decides the bytes of predictions: networks and encoder. Part of every key.
+pub fn infer_version() -> String {
+    format!("{}/{ENCODER_VERSION}", model_version())
+}
+
+/// Models that are kept from task to task: those of the latest one, by the SHA-256 of their manifests.
+#[derive(Default)]
+pub(in crate::execute) struct ModelCache(Mutex<BTreeMap<String, Arc<Model>>>);
+
+impl RunTask for InferTask {
+    fn code_version() -> String {
+        infer_version()
+    }
+
+    /// Lets models see scene `index`; with `force` although what they see is there.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (stores, cache) = (&context.stores, &context.models);
+        let (force, index) = (task.spec.force, task.index);
+        let task = self;
+        let place = &task.source;
+        let dataset = stores
+            .open_source(&place.store, &place.dataset, control)
+            .map_err(|e| at("source", e))?;
+        stores.fits(TaskSpec::Infer(task.clone()), Some(dataset.spec()))?;
+        let found = source_manifest(stores, &dataset, index, control)?;
+        let models = stores
+            .source_models(&place.store)
+            .map_err(|e| at("source.store", e))?;
+        let panel = Panel::of(stores, &models, &dataset, task, control)?;
+        truth::check(
+            &dataset.place(),
+            &panel.needs(),
+            &[(index, found.missing())],
+        )?;
+        let manifest = panel.manifest(task, index, &found);
+        let (store, prefix) = stores.probed(&task.output.store, control)?;
+        let prefix = prefix.join(&*task.output.dataset);
+        let spec = panel.spec(&dataset);
+        let opened = Predictions::create_or_open(store, prefix, &spec);
+        let predictions = stores
+            .wait(control, opened)
+            .map_err(|e| at("output.dataset", e))?;
+        let finished = match force {
+            true => None,
+            false => finished(stores, &predictions, &manifest, control)?,
+        };
+        if let Some(there) = finished {
+            return Ok(output(&there, true));
+        }
+        let predicted = panel.ask(stores, (&models, cache), &dataset, index, control)?;
+        let encoded = predictions
+            .encode(manifest, &predicted)
+            .map_err(of_dataset)?;
+        let written = stores.patiently(control, async || predictions.restore(&encoded).await)?;
+        for object in written {
+            info!(%object, "was missing or changed, and is put back");
+        }
+        control.at(1.0);
+        Ok(output(&encoded.manifest, false))
+    }
+}
+
+fn output(manifest: &PredictionManifest, adopted: bool) -> Output {
+    Output {
+        manifest_sha256: manifest.sha256(),
+        bytes: manifest.total_bytes(),
+        adopted,
+    }
+}
+
+/// What is there if this very task has published it.
+fn finished(
+    stores: &Stores,
+    predictions: &Predictions,
+    ours: &PredictionManifest,
+    control: &Control,
+) -> Result<Option<PredictionManifest>, TaskError> {
+    let looked = async {
+        match predictions.finished(ours.scene, &ours.task_key).await {
+            Err(error @ DatasetError::Damaged { .. }) => {
+                warn!(%error, "what was predicted is damaged; it is predicted again and put back");
+                Ok(None)
+            }
+            other => other,
+        }
+    };
+    stores.wait(control, looked)
+}
+
+impl Panel {
+    /// Asks all models of a scene.
+    fn ask(
+        &self,
+        stores: &Stores,
+        (models, cache): (&Models, &ModelCache),
+        dataset: &Dataset,
+        index: u64,
+        control: &Control,
+    ) -> Result<Predicted, TaskError> {
+        let mut asked = Asked {
+            stores,
+            models,
+            dataset,
+            index,
+            control,
+            cache: cache.0.lock().expect("no panic while locked").clone(),
+            used: BTreeMap::new(),
+            seen: Vec::new(),
+        };
+        let mut predicted = Predicted::default();
+        if let Some(tof) = &self.tof {
+            predicted.depth_m = asked.depth(tof)?;
+            asked.proceed(0.3)?;
+        }
+        if let Some(shadow) = &self.shadow {
+            let depth = match &self.times {
+                None | Some(Times::Truth) => None,
+                Some(Times::Own) => Some(predicted.depth_m.clone()),
+                Some(Times::Other(tof)) => Some(asked.depth(tof)?),
+            };
+            predicted.lit = asked.masks(shadow, depth.as_deref(), 0.3..0.8)?;
+        }
+        if let Some(specular) = &self.specular {
+            predicted.specular = asked.masks(specular, None, 0.8..ASKED)?;
+        }
+        *cache.0.lock().expect("no panic while locked") = asked.used;
+        Ok(predicted)
+    }
+}
+
+/// Models being asked of a scene.
+struct Asked<'a> {
+    stores: &'a Stores,
+    models: &'a Models,
+    dataset: &'a Dataset,
+    index: u64,
+    control: &'a Control,
+    /// Models at hand, and those that were asked.
+    cache: BTreeMap<String, Arc<Model>>,
+    used: BTreeMap<String, Arc<Model>>,
+    /// The scene with each histogram that was read.
+    seen: Vec<(Shown, Arc<Scene>)>,
+}
+
+impl Asked<'_> {
+    fn model(&mut self, member: &Member) -> Result<Arc<Model>, TaskError> {
+        let sha256 = member.checked.manifest.sha256();
+        let model = match self.cache.get(&sha256) {
+            Some(model) => model.clone(),
+            None => {
+                let (stores, models, control) = (self.stores, self.models, self.control);
+                let read = member.checked.model(stores, models, &member.field, control);
+                Arc::new(read?)
+            }
+        };
+        self.used.insert(sha256, model.clone());
+        Ok(model)
+    }
+
+    fn scene(&mut self, member: &Member) -> Result<Arc<Scene>, TaskError> {
+        let shown = (member.histogram, member.spots.clone());
+        if let Some((_, scene)) = self.seen.iter().find(|(other, _)| *other == shown) {
+            return Ok(scene.clone());
+        }
+        let (stores, dataset) = (self.stores, self.dataset);
+        let histogram = (shown.0, &*shown.1);
+        let scenes = Examples::new(stores, dataset, histogram, vec![self.index], "infer")?;
+        let scene = scenes.load(0).map_err(|source| {
+            of_model(ModelError::Scene {
+                scene: self.index as usize,
+                source,
+            })
+        })?;
+        self.seen.push((shown, scene.clone()));
+        Ok(scene)
+    }
+
+    fn depth(&mut self, tof: &Member) -> Result<Vec<f32>, TaskError> {
+        self.control
+            .say(format!("asks {}", tof.checked.manifest.name), &[]);
+        let (model, scene) = (self.model(tof)?, self.scene(tof)?);
+        model.depth_m(&scene).map_err(of_model)
+    }
+
+    fn masks(
+        &mut self,
+        member: &Member,
+        depth_m: Option<&[f32]>,
+        share: std::ops::Range<f32>,
+    ) -> Result<Vec<u8>, TaskError> {
+        let (model, scene) = (self.model(member)?, self.scene(member)?);
+        let name = &member.checked.manifest.name;
+        let mut tell = |mask: usize, of: usize| {
+            let text = match of {
+                1 => format!("asks {name}"),
+                _ => format!("asks {name}: spot {mask}/{of}"),
+            };
+            self.control.say(text, &[]);
+            let part = mask as f32 / of as f32;
+            self.control
+                .at(share.start + part * (share.end - share.start))
+        };
+        let said = masks(&model, depth_m, &scene, &mut tell).map_err(of_model)?;
+        said.ok_or(TaskError::Stopped)
+    }
+
+    fn proceed(&self, fraction: f32) -> Result<(), TaskError> {
+        match self.control.at(fraction) {
+            true => Ok(()),
+            false => Err(TaskError::Stopped),
+        }
+    }
+}

@@ -1,0 +1,238 @@
+//! The models of an inference: looked at before anything is read or made, and what names their answers.
+
+use std::collections::BTreeMap;
+
+use picofarm_dataset::{
+    Dataset, Manifest, ModelUsed, Models, PredictionManifest, PredictionSpec, SceneUsed, TimesUsed,
+};
+use picofarm_model::input::ShadowVariant;
+use picofarm_proto::{
+    key::inference_key,
+    model::{
+        Histogram, InferTask,
+        train::{TRUTH, Target},
+    },
+};
+
+use crate::execute::{
+    Control, TaskError,
+    evaluate::trained,
+    examples::Examples,
+    output::{Stores, manifest_sha256},
+    train::CheckedModel,
+    truth::{self, Need},
+};
+
+/// A histogram, and the spots that are summed of `transient_spots`.
+pub(super) type Shown = (Histogram, Vec<u32>);
+
+/// A model, and what it is shown.
+pub(super) struct Member {
+    /// The field of the job that names it.
+    pub(super) field: String,
+    pub(super) checked: CheckedModel,
+    pub(super) histogram: Histogram,
+    pub(super) spots: Vec<u32>,
+    /// What the histogram is the light of, of the source's spots.
+    lit_by: Vec<u32>,
+}
+
+/// The models of a stage: at most one of each kind.
+pub(super) struct Panel {
+    pub(super) tof: Option<Member>,
+    pub(super) shadow: Option<Member>,
+    pub(super) specular: Option<Member>,
+    /// Whether the shadow network is given two-bounce times, and by which model where by none of the stage's.
+    pub(super) times: Option<Times>,
+}
+
+/// What two-bounce times follow from.
+pub(super) enum Times {
+    Truth,
+    /// The stage's own ToF model.
+    Own,
+    /// The one that the shadow network was trained with.
+    Other(Box<Member>),
+}
+
+impl Panel {
+    pub(super) fn of(
+        stores: &Stores,
+        models: &Models,
+        dataset: &Dataset,
+        task: &InferTask,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let mut by_kind: BTreeMap<String, Member> = BTreeMap::new();
+        let mut tof_of_shadow = TRUTH.to_owned();
+        for (i, name) in task.infer.models.iter().enumerate() {
+            let field = format!("infer.models[{i}]");
+            let checked =
+                CheckedModel::look(stores, models, (&field, name), dataset.spec(), control)?;
+            let settings = trained(&checked.manifest.settings).map_err(|what| {
+                TaskError::User(format!(
+                    "{field}: the settings of {name:?} are not known: {what}"
+                ))
+            })?;
+            let (histogram, spots) = match task.infer.histogram {
+                Some(histogram) => (histogram, task.infer.spots.clone()),
+                None => (settings.histogram, settings.spots),
+            };
+            let kind = checked.manifest.kind.clone();
+            if kind == Target::Shadow.name() {
+                tof_of_shadow = settings.shadow.tof;
+            }
+            let member = Member::new(stores, dataset, field, checked, (histogram, spots))?;
+            if let Some(other) = by_kind.insert(kind.clone(), member) {
+                return Err(TaskError::User(format!(
+                    "infer.models: {:?} and {name:?} both predict {kind:?}; name one of each kind, and give the other a \
+                     stage of its own",
+                    other.checked.manifest.name
+                )));
+            }
+        }
+        let mut take = |kind: Target| by_kind.remove(kind.name());
+        let (tof, shadow, specular) = (
+            take(Target::Tof),
+            take(Target::Shadow),
+            take(Target::Specular),
+        );
+        let timed = |member: &&Member| {
+            let variant = member.checked.plan.question.variant;
+            matches!(variant, ShadowVariant::Concat | ShadowVariant::Difference)
+        };
+        let times = match (shadow.as_ref().filter(timed), &tof) {
+            (None, _) => None,
+            (Some(_), Some(_)) => Some(Times::Own),
+            (Some(_), None) if tof_of_shadow == TRUTH => Some(Times::Truth),
+            (Some(shadow), None) => {
+                let field = format!("{}: its two-bounce times", shadow.field);
+                let at = (&*field, &*tof_of_shadow);
+                let checked = CheckedModel::look(stores, models, at, dataset.spec(), control)?;
+                let shown = (shadow.histogram, shadow.spots.clone());
+                let member = Member::new(stores, dataset, field, checked, shown)?;
+                Some(Times::Other(Box::new(member)))
+            }
+        };
+        Ok(Self {
+            tof,
+            shadow,
+            specular,
+            times,
+        })
+    }
+
+    fn members(&self) -> impl Iterator<Item = (Target, &Member)> {
+        [
+            (Target::Tof, &self.tof),
+            (Target::Shadow, &self.shadow),
+            (Target::Specular, &self.specular),
+        ]
+        .into_iter()
+        .filter_map(|(kind, member)| Some((kind, member.as_ref()?)))
+    }
+
+    /// What must be known of a scene.
+    pub(super) fn needs(&self) -> Vec<Need> {
+        let from_truth = matches!(self.times, Some(Times::Truth));
+        truth::of_times(self.times.is_some(), from_truth)
+    }
+
+    /// What the group of predictions holds.
+    pub(super) fn spec(&self, dataset: &Dataset) -> PredictionSpec {
+        let source = dataset.spec();
+        PredictionSpec {
+            scenes: source.scenes,
+            height: source.height,
+            width: source.width,
+            depth: self.tof.is_some(),
+            spots: self
+                .shadow
+                .as_ref()
+                .map_or(Vec::new(), |m| m.lit_by.clone()),
+            specular: self.specular.is_some(),
+        }
+    }
+
+    /// The manifest of what is predicted of a scene, but for its objects.
+    pub(super) fn manifest(
+        &self,
+        task: &InferTask,
+        index: u64,
+        found: &Manifest,
+    ) -> PredictionManifest {
+        let times = match &self.times {
+            None => None,
+            Some(Times::Truth) => Some(TimesUsed::Truth),
+            Some(Times::Own) => self.tof.as_ref().map(|tof| TimesUsed::Model(tof.used())),
+            Some(Times::Other(tof)) => Some(TimesUsed::Model(tof.used())),
+        };
+        let source = SceneUsed {
+            dataset: task.source.dataset.clone(),
+            task_key: found.provenance.task_key.clone(),
+            manifest_sha256: manifest_sha256(found),
+        };
+        let shown = self.members().map(|(kind, member)| {
+            let sha256 = member.checked.manifest.sha256();
+            (
+                kind.name(),
+                (sha256, member.histogram, member.spots.clone()),
+            )
+        });
+        let times_of = match &times {
+            None => "",
+            Some(TimesUsed::Truth) => TRUTH,
+            Some(TimesUsed::Model(model)) => &model.manifest_sha256,
+        };
+        let version = &task.infer.version;
+        let shown = shown.collect();
+        let key = inference_key(&source.manifest_sha256, &shown, times_of, version);
+        PredictionManifest {
+            scene: index,
+            task_key: key.to_string(),
+            code: version.clone(),
+            source,
+            models: self
+                .members()
+                .map(|(kind, member)| (kind.name().to_owned(), member.used()))
+                .collect(),
+            two_bounce_times: times,
+            ..PredictionManifest::default()
+        }
+    }
+}
+
+impl Member {
+    fn new(
+        stores: &Stores,
+        dataset: &Dataset,
+        field: String,
+        checked: CheckedModel,
+        (histogram, spots): Shown,
+    ) -> Result<Self, TaskError> {
+        let scenes = Examples::new(stores, dataset, (histogram, &spots), Vec::new(), "infer")?;
+        let (wanted, there) = (checked.plan.question.spots, scenes.spots());
+        if wanted > 0 && wanted != there {
+            return Err(TaskError::User(format!(
+                "{field}: {:?} was trained on histograms of {wanted} spots, these are of {there}",
+                checked.manifest.name
+            )));
+        }
+        Ok(Self {
+            lit_by: scenes.spot_numbers(),
+            field,
+            checked,
+            histogram,
+            spots,
+        })
+    }
+
+    fn used(&self) -> ModelUsed {
+        ModelUsed {
+            name: self.checked.manifest.name.clone(),
+            manifest_sha256: self.checked.manifest.sha256(),
+            histogram: self.histogram.name().to_owned(),
+            spots: self.spots.clone(),
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! Rendering: adopt, or make the scene, render it, code it and publish it.
+
+use std::time::Instant;
+
+use picofarm_dataset::{
+    Dataset, DatasetSpec, EncodedScene, Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord,
+    photon_scale,
+};
+use picofarm_proto::{
+    key::TaskKey,
+    model::{Budget, RenderTask, SpecError, TaskKind},
+    trace,
+};
+use picofarm_scene::{Camera, Scene};
+use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
+use serde_json::json;
+use tracing::{debug_span, info, warn};
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Submission, Task, TaskError,
+    output::{manifest_sha256, of_dataset},
+    part::Parts,
+    recipe,
+    scenes::{self, With},
+    subsets,
+};
+
+/// Photons in the median pixel's brightest bin: the measurement's convention for the stored scale.
+const PEAK_PHOTONS: f32 = 400.0;
+/// Share of a task's progress that is rendering; the rest is coding and storing.
+const RENDER_SHARE: f32 = 0.95;
+/// Everything of this program that decides a task's bytes: renderer, generators and encoder. Part of every task
+/// key, so that a change of any of them renames the results.
+pub fn renderer_version() -> String {
+    format!(
+        "{RENDERER_VERSION}/{}/{}/{}",
+        picofarm_scene::furnished::GENERATOR_VERSION,
+        picofarm_scene::primitive::GENERATOR_VERSION,
+        picofarm_dataset::ENCODER_VERSION
+    )
+}
+
+impl RunTask for RenderTask {
+    fn code_version() -> String {
+        renderer_version()
+    }
+
+    /// Renders scene `task.index` of the job into its data set.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (stores, with, spec) = (&context.stores, context.scenes(), self);
+        let key = task.key();
+        let dataset = stores.open(spec, control)?;
+        if !task.spec.force
+            && let Some(manifest) = stores.finished(&dataset, task.index, &key, control)?
+        {
+            return Ok(Output {
+                manifest_sha256: manifest_sha256(&manifest),
+                bytes: manifest.total_bytes(),
+                adopted: true,
+            });
+        }
+        recipe::note(stores, &dataset, task, control)?;
+        let render = |scene: &Scene, settings: &Settings| match spec.parts {
+            1 => picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render),
+            _ => {
+                let parts = Parts::new(stores, &dataset, spec, task.index, key);
+                parts.join(scene, settings, control)
+            }
+        };
+        let encoded = make_by(&dataset, with, spec, task.index, &key, render)?;
+        control.at((1.0 + RENDER_SHARE) / 2.0);
+        let manifest = stores.publish(&dataset, encoded, control)?;
+        if spec.parts > 1 {
+            Parts::new(stores, &dataset, spec, task.index, key).delete(control);
+        }
+        control.at(1.0);
+        Ok(Output {
+            manifest_sha256: manifest_sha256(&manifest),
+            bytes: manifest.total_bytes(),
+            adopted: false,
+        })
+    }
+
+    fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
+        self.check()?;
+        subsets::strategy(&self.render.strategy)
+            .map_err(|e| SpecError::new("render.strategy", e))?;
+        here.profile(&self.output.profile)?;
+        here.scenes(&mut self.scenes)
+    }
+}
+
+/// Scene `index` rendered in one piece and coded for the data set; `key` is its task's.
+pub(in crate::execute) fn make(
+    dataset: &Dataset,
+    with: With<'_>,
+    spec: &RenderTask,
+    index: u64,
+    key: &TaskKey,
+    control: &Control,
+) -> Result<EncodedScene, TaskError> {
+    check_version(spec)?;
+    let render = |scene: &Scene, settings: &Settings| {
+        picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render)
+    };
+    make_by(dataset, with, spec, index, key, render)
+}
+
+/// The same, rendered as told.
+fn make_by(
+    dataset: &Dataset,
+    with: With<'_>,
+    spec: &RenderTask,
+    index: u64,
+    key: &TaskKey,
+    render: impl FnOnce(&Scene, &Settings) -> Result<Rendered, TaskError>,
+) -> Result<EncodedScene, TaskError> {
+    let (scene, settings) = prepare(with, spec, dataset, index, key)?;
+    let begun = Instant::now();
+    let rendered =
+        debug_span!(target: trace::TARGET, "render").in_scope(|| render(&scene, &settings))?;
+    info!(
+        samples = rendered.error.samples,
+        median_error = rendered.error.median_relative,
+        rays = rendered.rays,
+        seconds = begun.elapsed().as_secs_f32(),
+        "rendered"
+    );
+    for warning in &rendered.warnings {
+        warn!("{warning}");
+    }
+    let camera = &scene.camera;
+    let spots: Vec<_> = rendered
+        .spots
+        .iter()
+        .map(|spot| spot.as_ref().map(|s| in_camera(s, camera)))
+        .collect();
+    let subsets = subsets::records(dataset.spec(), &rendered);
+    let record = record(&scene, &rendered, &subsets, &spots);
+    let provenance = Provenance {
+        task_key: key.to_string(),
+        renderer: spec.render.renderer.clone(),
+        seed: settings.seed,
+        plan: account(&scene, &rendered),
+    };
+    debug_span!(target: trace::TARGET, "encode")
+        .in_scope(|| dataset.encode(index, &record, &provenance))
+        .map_err(of_dataset)
+}
+
+/// The job must ask for this renderer.
+pub(in crate::execute) fn check_version(spec: &RenderTask) -> Result<(), TaskError> {
+    let ours = renderer_version();
+    if spec.render.renderer == ours {
+        return Ok(());
+    }
+    Err(TaskError::User(format!(
+        "render.renderer: the job asks for {:?}, this worker renders {ours:?}; submit the job again with this \
+         version, or run workers of the other one",
+        spec.render.renderer
+    )))
+}
+
+/// Makes scene `index`, with the settings to render it by `key`.
+pub(in crate::execute) fn prepare(
+    with: With<'_>,
+    spec: &RenderTask,
+    dataset: &Dataset,
+    index: u64,
+    key: &TaskKey,
+) -> Result<(Scene, Settings), TaskError> {
+    let begun = Instant::now();
+    let scene = debug_span!(target: trace::TARGET, "scene")
+        .in_scope(|| scenes::scene(&spec.scenes, spec.render.resolution, index, with))?;
+    info!(
+        scene = scene.name,
+        triangles = scene.triangle_count(),
+        seconds = begun.elapsed().as_secs_f32(),
+        "scene made"
+    );
+    let settings = settings(spec, dataset.spec(), key)?;
+    Ok((scene, settings))
+}
+
+/// Carries the renderer's progress to the task's control.
+pub(in crate::execute) struct Watched<'a>(pub &'a Control);
+
+impl Progress for Watched<'_> {
+    fn at(&self, done: f32) -> bool {
+        self.0.at(done * RENDER_SHARE)
+    }
+}
+
+/// The renderer's settings for a task. The seed is the head of the task's key, so that nothing but the task
+/// decides the numbers.
+fn settings(
+    spec: &RenderTask,
+    dataset: &DatasetSpec,
+    key: &TaskKey,
+) -> Result<Settings, TaskError> {
+    let render = &spec.render;
+    let head = key.0[..8].try_into().expect("a key has 32 bytes");
+    let strategy = subsets::strategy(&render.strategy)
+        .map_err(|what| TaskError::User(format!("render.strategy: {what}")))?;
+    Ok(Settings {
+        gate: Gate {
+            start_m: render.gate_start_m,
+            bin_width_m: render.bin_width_m,
+            bins: render.bins,
+        },
+        budget: match render.budget {
+            Budget::Samples(n) => picofarm_transient::Budget::Samples(n),
+            Budget::Error(share) => picofarm_transient::Budget::Error(share as f32),
+        },
+        max_bounces: (render.max_bounces != 0).then_some(render.max_bounces),
+        one_bounce: true,
+        seed: u64::from_le_bytes(head),
+        split: false,
+        groups: subsets::groups(dataset),
+        strategy,
+    })
+}
+
+/// The render as the data set takes it.
+pub(in crate::execute) fn record<'a>(
+    scene: &Scene,
+    rendered: &'a Rendered,
+    subsets: &'a [SubsetRecord<'a>],
+    spots: &'a [Option<Spot>],
+) -> SceneRecord<'a> {
+    let (camera, truth) = (&scene.camera, &rendered.truth);
+    let i = camera.intrinsics;
+    let (r, d, f, o) = (camera.right, camera.down, camera.forward, camera.origin);
+    SceneRecord {
+        transient: &rendered.transient,
+        subsets,
+        depth: &truth.depth,
+        range: &truth.range,
+        normal: &truth.normal,
+        instance: &truth.instance,
+        label: &truth.label,
+        specular: &truth.specular,
+        visibility: &truth.visibility,
+        rgb: &truth.rgb,
+        spots,
+        intrinsics: Intrinsics {
+            fx: i.fx,
+            fy: i.fy,
+            cx: i.cx,
+            cy: i.cy,
+        },
+        camera: [
+            [r.x, d.x, f.x, o.x],
+            [r.y, d.y, f.y, o.y],
+            [r.z, d.z, f.z, o.z],
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        laser: camera.to_camera(scene.laser.origin).into(),
+        scale: photon_scale(
+            &rendered.transient,
+            rendered.gate.bins as usize,
+            PEAK_PHOTONS,
+        ),
+    }
+}
+
+pub(in crate::execute) fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera) -> Spot {
+    Spot {
+        position: camera.to_camera(spot.point).into(),
+        normal: camera.direction_to_camera(spot.normal).into(),
+        path_m: spot.path_m,
+    }
+}
+
+/// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine, and
+/// not the scene's name, which may be that of a file, while the task's key holds only the file's content.
+fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
+    json!({
+        "scene": scene.provenance,
+        "labels": scene.labels,
+        "strategies": rendered.plan.strategies,
+        "approximations": rendered.plan.approximations,
+        "overflow": rendered.overflow,
+        "error": rendered.error,
+        "rays": rendered.rays,
+    })
+}
+
+pub(in crate::execute) fn of_render(error: RenderError) -> TaskError {
+    match error {
+        RenderError::Stopped => TaskError::Stopped,
+        RenderError::Scene(error) => scenes::of_scene(error),
+        RenderError::Invalid { .. } => TaskError::User(format!("render.{error}")),
+        RenderError::Memory { .. } => TaskError::Crash(error.to_string()),
+    }
+}

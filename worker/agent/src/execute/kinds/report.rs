@@ -1,0 +1,305 @@
+//! Reports: what a store holds of models, collected for a page; and the task that keeps such a page in the store.
+//!
+//! The page of a task is a pure function of what the store holds: models, evaluations, and how fast trainings were. It bears no
+//! date.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use picofarm_dataset::{
+    DatasetError, Evaluation, ModelManifest, Models, ReportManifest, ReportedModel, Reports,
+    TrainingSpeed,
+};
+use picofarm_model::{
+    Evaluated, Model,
+    metric::Metrics,
+    report::{Data, Entry, Report, Speed, html, json},
+    train::Line,
+};
+use picofarm_proto::{
+    key::report_key,
+    model::{ReportTask, train::TRUTH},
+};
+use serde_json::Value;
+use tokio::runtime::Handle;
+use tracing::warn;
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Task, TaskError, gallery,
+    output::Stores,
+    train::{WEIGHTS, at, model_version, of_model},
+};
+
+/// Collects what a store holds of models.
+pub struct Collector {
+    stores: Stores,
+}
+
+impl Collector {
+    /// Stores are reached through `runtime`, which must not be a thread that calls this.
+    pub fn new(runtime: Handle) -> Self {
+        Self {
+            stores: Stores::new(runtime, Duration::ZERO),
+        }
+    }
+
+    /// What a report tells of a model; it shows what the model says of `pictures` scenes, where it was evaluated.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] where there is no such model, or its data set or split is not there any more.
+    pub fn entry(
+        &self,
+        store: &str,
+        name: &str,
+        pictures: usize,
+        control: &Control,
+    ) -> Result<Entry, TaskError> {
+        let models = self.stores.source_models(store)?;
+        let subject = Subject::find(&self.stores, &models, name, control)?;
+        subject.entry(&self.stores, (store, &models), pictures, control)
+    }
+}
+
+impl RunTask for ReportTask {
+    fn code_version() -> String {
+        model_version()
+    }
+
+    /// Makes the report that `task` names and keeps it; with `force` although it is there.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let stores = &context.stores;
+        let force = task.spec.force;
+        let task = self;
+        let settings = &task.report;
+        let (store, prefix) = stores
+            .probed(&settings.store, control)
+            .map_err(|e| at("report.store", e))?;
+        let (models, reports) = (
+            Models::new(store.clone(), &prefix),
+            Reports::new(store, &prefix),
+        );
+        let mut subjects = Vec::new();
+        for (i, name) in settings.models.iter().enumerate() {
+            let found = Subject::find(stores, &models, name, control);
+            subjects.push(found.map_err(|e| at(&format!("report.models[{i}]"), e))?);
+        }
+        let told: Vec<ReportedModel> = subjects.iter().map(Subject::told).collect();
+        let pins = told.iter().map(|model| {
+            let evaluation = model.evaluation.as_deref().unwrap_or_default();
+            let speed = model.speed.as_deref().unwrap_or_default();
+            format!("{} {evaluation} {speed}", model.manifest_sha256)
+        });
+        let key = report_key(settings, &pins.collect::<Vec<_>>()).to_string();
+        let finished = match force {
+            true => None,
+            false => finished(stores, &reports, &settings.name, &key, control)?,
+        };
+        if let Some(manifest) = finished {
+            return Ok(output(&manifest, true));
+        }
+        let mut report = Report {
+            title: settings.title.clone(),
+            ..Report::default()
+        };
+        let (place, count) = (&settings.store, subjects.len());
+        for (i, subject) in subjects.iter().enumerate() {
+            let text = format!("{} ({} of {count})", subject.manifest.name, i + 1);
+            control.say(text, &[]);
+            let entry = subject.entry(
+                stores,
+                (place, &models),
+                settings.pictures as usize,
+                control,
+            )?;
+            report.models.push(entry);
+            if !control.at((i + 1) as f32 / (count + 1) as f32) {
+                return Err(TaskError::Stopped);
+            }
+        }
+        let manifest = ReportManifest {
+            name: settings.name.clone(),
+            task_key: key,
+            code: settings.version.clone(),
+            models: told,
+            ..ReportManifest::default()
+        };
+        let objects = [
+            ("report.html", html(&report).into()),
+            ("report.json", json(&report).into()),
+        ];
+        let published = stores.patiently(control, async || {
+            reports.publish(manifest.clone(), &objects).await
+        })?;
+        control.at(1.0);
+        Ok(output(&published, false))
+    }
+}
+
+fn output(manifest: &ReportManifest, adopted: bool) -> Output {
+    Output {
+        manifest_sha256: manifest.sha256(),
+        bytes: manifest.total_bytes(),
+        adopted,
+    }
+}
+
+/// The report if this very task has published it.
+fn finished(
+    stores: &Stores,
+    reports: &Reports,
+    name: &str,
+    key: &str,
+    control: &Control,
+) -> Result<Option<ReportManifest>, TaskError> {
+    let looked = async {
+        match reports.finished(name, key).await {
+            Err(error @ DatasetError::Damaged { .. }) => {
+                warn!(%error, "a report is damaged; it is made again to repair it");
+                Ok(None)
+            }
+            other => other,
+        }
+    };
+    stores.wait(control, looked)
+}
+
+/// A model that a report tells of.
+struct Subject {
+    manifest: ModelManifest,
+    /// That of its evaluations with the most scenes.
+    evaluation: Option<Evaluation>,
+    speed: Option<TrainingSpeed>,
+}
+
+impl Subject {
+    fn find(
+        stores: &Stores,
+        models: &Models,
+        name: &str,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let manifest = stores.wait(control, models.manifest(name))?;
+        let mut evaluations = stores.wait(control, models.evaluations(name))?;
+        let sha256 = manifest.sha256();
+        evaluations.retain(|e| e.model_sha256 == sha256);
+        let speed = stores.wait(control, models.speed(name, &manifest.training_key))?;
+        Ok(Self {
+            speed,
+            evaluation: evaluations.into_iter().max_by_key(|e| e.scenes),
+            manifest,
+        })
+    }
+
+    fn told(&self) -> ReportedModel {
+        ReportedModel {
+            name: self.manifest.name.clone(),
+            manifest_sha256: self.manifest.sha256(),
+            evaluation: self.evaluation.as_ref().map(|e| e.key.clone()),
+            speed: self.speed.as_ref().map(TrainingSpeed::sha256),
+        }
+    }
+
+    fn entry(
+        &self,
+        stores: &Stores,
+        (store, models): (&str, &Models),
+        pictures: usize,
+        control: &Control,
+    ) -> Result<Entry, TaskError> {
+        let (manifest, name) = (&self.manifest, &*self.manifest.name);
+        // What is in the store has its checksum: this program made it, and does not know it again.
+        let broken = |what: String| TaskError::Crash(format!("model {name:?}: {what}"));
+        let mut entry = match &self.evaluation {
+            Some(evaluation) => {
+                let shown = gallery::show(stores, store, evaluation, pictures, control)?;
+                Entry {
+                    pictures: shown.pictures,
+                    ..Entry::new(name, &shown.model, shown.side)
+                }
+            }
+            None => {
+                let weights = stores.wait(control, models.read(manifest, WEIGHTS))?;
+                let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
+                let mut entry = Entry::new(name, &model, 0);
+                entry.multiply_adds = None;
+                entry
+            }
+        };
+        let history = stores.wait(control, models.read(manifest, "history.jsonl"))?;
+        let lines = String::from_utf8_lossy(&history);
+        let lines = lines.lines().map(serde_json::from_str::<Line>);
+        entry.history = lines
+            .collect::<Result<_, _>>()
+            .map_err(|e| broken(format!("history.jsonl: {e}")))?;
+        let found = self.evaluation.as_ref().map(|e| evaluated(&e.metrics));
+        entry.evaluated = found
+            .transpose()
+            .map_err(|e| broken(format!("its evaluation: {e}")))?;
+        entry.speed = self.speed.as_ref().map(|speed| Speed {
+            samples_per_s: speed.samples_per_s,
+            seconds: None,
+        });
+        describe(&mut entry, manifest, self.evaluation.as_ref());
+        Ok(entry)
+    }
+}
+
+/// An evaluation's figures as they lie in the store: those of all scenes, beside them those of trivial answers, by name, and
+/// of each scene.
+fn evaluated(found: &Value) -> serde_json::Result<Evaluated> {
+    let part = |name: &str| found.get(name).cloned().unwrap_or_default();
+    let baselines: BTreeMap<String, Metrics> = serde_json::from_value(part("baselines"))?;
+    Ok(Evaluated {
+        metrics: serde_json::from_value(found.clone())?,
+        baselines: baselines.into_iter().collect(),
+        scenes: serde_json::from_value(part("by_scene"))?,
+        examples: serde_json::from_value(part("examples"))?,
+    })
+}
+
+/// Where it comes from.
+fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Evaluation>) {
+    let from = &manifest.lineage;
+    entry.data = Data {
+        name: from.dataset.clone(),
+        scenes: Some(from.training_scenes),
+        ..Data::default()
+    };
+    let setting = |path: &str| manifest.settings.pointer(path).and_then(|v| v.as_str());
+    if let Some(histogram) = setting("/histogram") {
+        let histogram = histogram.to_owned();
+        entry.conditions.push(("histogram".into(), histogram));
+    }
+    if let Some(tof) = setting("/shadow/tof") {
+        let tof = if tof == TRUTH {
+            "the truth"
+        } else {
+            "a depth network"
+        };
+        entry
+            .conditions
+            .push(("two-bounce times from".into(), tof.into()));
+    }
+    if setting("/from").is_some() {
+        entry.conditions.push(("begins".into(), "trained".into()));
+    }
+    let line = |name: &str, value: String| (name.to_owned(), value);
+    entry.lineage = vec![
+        line("data", format!("{} ({})", from.dataset, from.data)),
+        line(
+            "split",
+            format!("{} version {}", from.split.name, from.split.version),
+        ),
+        line("code", from.code.clone()),
+        line("training key", manifest.training_key.clone()),
+        line("manifest SHA-256", manifest.sha256()),
+    ];
+    for (name, sha256) in &from.models {
+        entry
+            .lineage
+            .push(line("builds on", format!("{name} ({sha256})")));
+    }
+    if let Some(e) = evaluation {
+        let on = format!("{} {} scenes of {}", e.scenes, e.side, e.dataset);
+        entry.lineage.push(line("evaluated on", on));
+    }
+}

@@ -1,0 +1,520 @@
+//! Reprocessing: a scene of a finished data set through a sensor into another data set. Adopt, or read the histogram,
+//! measure it, and publish it with the source's ground truth. Nothing is rendered.
+//!
+//! A scene that the source does not have is the task's own failure: where another stage makes the source, this one waits
+//! for it, so the scene was given up; where nothing makes it, waiting would have no end.
+
+use picofarm_dataset::{
+    Dataset, DatasetError, DatasetSpec, ENCODER_VERSION, EncodedScene, Gate, Manifest, Profile,
+    Provenance, Quantity, Subsets,
+};
+use picofarm_proto::{
+    key::{TaskKey, derived_key, reprocess_stage_key},
+    model::{
+        Histogram, ReprocessSettings, ReprocessTask, SensorSettings, SourceSettings, SpecError,
+        TaskKind, TaskSpec,
+    },
+    trace,
+};
+use picofarm_transient::sensor::{
+    Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values,
+};
+use serde_json::json;
+use tokio::runtime::Handle;
+use tracing::debug_span;
+
+use crate::execute::{
+    Context, Control, Output, RunTask, STORE_PATIENCE, Submission, Task, TaskError,
+    output::{Stores, manifest_sha256, of_dataset},
+    recipe,
+};
+
+/// Progress once the histogram is read, and once it is measured.
+const READ: f32 = 0.3;
+const MEASURED: f32 = 0.8;
+
+/// Everything of this program that decides a reprocessed scene's bytes: sensor model and encoder. Part of every key.
+pub fn sensor_version() -> String {
+    format!("{SENSOR_VERSION}/{ENCODER_VERSION}")
+}
+
+/// Reprocesses scenes.
+pub struct Reprocessor {
+    stores: Stores,
+}
+
+impl Reprocessor {
+    /// Stores are reached through `runtime`, which must not be a thread that calls [`Self::run`].
+    pub fn new(runtime: Handle) -> Self {
+        Self {
+            stores: Stores::new(runtime, STORE_PATIENCE),
+        }
+    }
+
+    /// The scenes that the source has published, ascending, and how many it has room for: the number of tasks.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] where there is no such data set.
+    pub fn source(
+        &self,
+        source: &SourceSettings,
+        control: &Control,
+    ) -> Result<(Vec<u64>, u64), TaskError> {
+        let source = open_source(&self.stores, source, control)?;
+        let present = self.stores.wait(control, source.scenes_present())?;
+        Ok((present, source.spec().scenes))
+    }
+
+    /// Reprocesses scene `index`. Blocks; works on rayon's current pool.
+    ///
+    /// # Errors
+    /// [`TaskError`], by who is to blame.
+    pub fn run(
+        &self,
+        task: &ReprocessTask,
+        index: u64,
+        control: &Control,
+    ) -> Result<Output, TaskError> {
+        run(&self.stores, task, false, index, control)
+    }
+}
+
+impl RunTask for ReprocessTask {
+    fn code_version() -> String {
+        sensor_version()
+    }
+
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        run(&context.stores, self, task.spec.force, task.index, control)
+    }
+
+    fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
+        self.reprocess.normalise();
+        here.profile(&self.output.profile)?;
+        sensor(&self.reprocess.sensor)
+            .map(|_| ())
+            .map_err(|e| SpecError::new("reprocess.sensor", e.to_string()))
+    }
+}
+
+/// Reprocesses scene `index`; with `force` although it is there.
+fn run(
+    stores: &Stores,
+    task: &ReprocessTask,
+    force: bool,
+    index: u64,
+    control: &Control,
+) -> Result<Output, TaskError> {
+    task.check().map_err(|e| TaskError::User(e.to_string()))?;
+    let target = &task.output;
+    let made = Made::of(stores, task, index, control)?;
+    let dataset = stores.create_or_open(&target.store, &target.dataset, &made.spec, control)?;
+    if !force && let Some(manifest) = stores.finished(&dataset, index, &made.key, control)? {
+        return Ok(Output {
+            manifest_sha256: manifest_sha256(&manifest),
+            bytes: manifest.total_bytes(),
+            adopted: true,
+        });
+    }
+    recipe::note_reprocess(stores, &dataset, task, control)?;
+    let encoded = made.encode(stores, &dataset, &task.reprocess, index, control)?;
+    let manifest = stores.publish(&dataset, encoded, control)?;
+    control.at(1.0);
+    Ok(Output {
+        manifest_sha256: manifest_sha256(&manifest),
+        bytes: manifest.total_bytes(),
+        adopted: false,
+    })
+}
+
+/// What a scene is made of.
+pub(in crate::execute) struct Made {
+    source: Dataset,
+    /// The source's manifest of the scene.
+    found: Manifest,
+    sensor: Sensor,
+    /// The data set that it belongs to.
+    spec: DatasetSpec,
+    /// The task that makes it.
+    pub(in crate::execute) key: TaskKey,
+}
+
+impl Made {
+    /// Looks at the source's scene `index`; nothing of the target is touched.
+    pub(in crate::execute) fn of(
+        stores: &Stores,
+        task: &ReprocessTask,
+        index: u64,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let (settings, profile) = (&task.reprocess, &task.output.profile);
+        let ours = sensor_version();
+        if settings.version != ours {
+            return Err(TaskError::User(format!(
+                "reprocess.version: the job asks for {:?}, this worker's sensor model is {ours:?}; submit the job again with \
+                 this version, or run workers of the other one",
+                settings.version
+            )));
+        }
+        let sensor = sensor(&settings.sensor)?;
+        let source = open_source(stores, &task.source, control)?;
+        stores.fits(TaskSpec::Reprocess(task.clone()), Some(source.spec()))?;
+        let spec = target_spec(source.spec(), settings, profile)?;
+        let found = source_manifest(stores, &source, index, control)?;
+        let source_key = TaskKey::parse(&found.provenance.task_key).ok_or_else(|| {
+            TaskError::User(format!(
+                "source.dataset: the manifest of scene {index} names the task {:?}, which is no key of a task",
+                found.provenance.task_key
+            ))
+        })?;
+        let key = derived_key(&reprocess_stage_key(settings, profile), &source_key);
+        Ok(Self {
+            source,
+            found,
+            sensor,
+            spec,
+            key,
+        })
+    }
+
+    /// Reads, measures and codes the scene for `dataset`.
+    pub(in crate::execute) fn encode(
+        &self,
+        stores: &Stores,
+        dataset: &Dataset,
+        settings: &ReprocessSettings,
+        index: u64,
+        control: &Control,
+    ) -> Result<EncodedScene, TaskError> {
+        let source = &self.source;
+        let h = debug_span!(target: trace::TARGET, "read")
+            .in_scope(|| read(stores, source, settings, index, control))?;
+        proceed(control, READ)?;
+        let input = Histograms {
+            transient: &h,
+            two_bounce: None,
+            bins: source.spec().gate.bins as usize,
+            bin_width_ps: source.spec().gate.bin_width_m * PS_PER_M,
+        };
+        // The key is the seed of everything; the scene's number adds nothing to it.
+        let seed = u64::from_le_bytes(self.key.0[..8].try_into().expect("a key has 32 bytes"));
+        let sensed = debug_span!(target: trace::TARGET, "measure")
+            .in_scope(|| self.sensor.sense(&input, seed, 0))
+            .map_err(of_sensor)?;
+        drop(h);
+        proceed(control, MEASURED)?;
+        let truth = stores.wait(control, source.read_truth(index))?;
+        let truth = match chosen(settings) {
+            None => truth,
+            Some(spots) => truth.of_spots(&spots).map_err(of_dataset)?,
+        };
+        let provenance = Provenance {
+            task_key: self.key.to_string(),
+            renderer: settings.version.clone(),
+            seed,
+            plan: account(settings, &self.found, &sensed),
+        };
+        let (transient, scale) = as_radiance(&sensed);
+        drop(sensed.values);
+        debug_span!(target: trace::TARGET, "encode")
+            .in_scope(|| dataset.encode_derived(index, &truth, &transient, scale, &provenance))
+            .map_err(of_dataset)
+    }
+}
+
+fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
+    match control.at(fraction) {
+        true => Ok(()),
+        false => Err(TaskError::Stopped),
+    }
+}
+
+fn open_source(
+    stores: &Stores,
+    place: &SourceSettings,
+    control: &Control,
+) -> Result<Dataset, TaskError> {
+    let opened = stores.open_source(&place.store, &place.dataset, control);
+    opened.map_err(|error| match error {
+        TaskError::User(text) => TaskError::User(format!("source: {text}")),
+        other => other,
+    })
+}
+
+/// The source's manifest of a scene; see the head of this file for what it means where there is none.
+pub(in crate::execute) fn source_manifest(
+    stores: &Stores,
+    source: &Dataset,
+    index: u64,
+    control: &Control,
+) -> Result<Manifest, TaskError> {
+    if index >= source.spec().scenes {
+        return Err(TaskError::User(format!(
+            "source: scene {index} does not exist: {} has room for {} scenes",
+            source.prefix(),
+            source.spec().scenes
+        )));
+    }
+    let looked = async {
+        match source.manifest(index).await {
+            Ok(manifest) => Ok(Ok(manifest)),
+            Err(error @ DatasetError::NotPublished { .. }) => Ok(Err(error)),
+            Err(error) => Err(error),
+        }
+    };
+    stores
+        .wait(control, looked)?
+        .map_err(|error| TaskError::User(format!("source: scene {index} is not there ({error})")))
+}
+
+/// The data set that a source becomes.
+///
+/// # Errors
+/// [`TaskError::User`] naming the setting that does not fit the source.
+pub fn target_spec(
+    source: &DatasetSpec,
+    settings: &ReprocessSettings,
+    profile: &str,
+) -> Result<DatasetSpec, TaskError> {
+    let user = |field: &str, what: String| TaskError::User(format!("reprocess.{field}: {what}"));
+    let quantity = quantity(settings.histogram);
+    if !source.quantities().contains(&quantity) {
+        let there: Vec<&str> = source
+            .quantities()
+            .into_iter()
+            .filter(|q| q.is_transient())
+            .map(Quantity::name)
+            .collect();
+        let what = format!(
+            "the source has no {}; it has {}",
+            quantity.name(),
+            there.join(", ")
+        );
+        return Err(user("histogram", what));
+    }
+    if let Some(spot) = settings.spots.iter().find(|s| **s >= source.spots) {
+        let what = format!(
+            "{spot}: the source has {} spots, counted from 0",
+            source.spots
+        );
+        return Err(user("spots", what));
+    }
+    let (bins, rebin) = (source.gate.bins, settings.sensor.rebin);
+    if rebin > bins {
+        let what = format!("{rebin} is more than the source's {bins} bins");
+        return Err(user("sensor.rebin", what));
+    }
+    if bins % rebin != 0 && !settings.drop_left_over {
+        let what = format!(
+            "{rebin} does not divide the source's {bins} bins; set drop_left_over (--drop-left-over) to drop the last {}, \
+             or choose a divisor",
+            bins % rebin
+        );
+        return Err(user("sensor.rebin", what));
+    }
+    let profile =
+        Profile::parse(profile).map_err(|e| TaskError::User(format!("output.profile: {e}")))?;
+    Ok(DatasetSpec {
+        spots: chosen(settings).map_or(source.spots, |spots| spots.len() as u32),
+        subsets: Subsets::NONE,
+        per_spot: false,
+        gate: Gate {
+            start_m: source.gate.start_m,
+            bin_width_m: source.gate.bin_width_m * f64::from(rebin),
+            bins: bins / rebin,
+        },
+        profile,
+        ..*source
+    })
+}
+
+pub(in crate::execute) fn quantity(histogram: Histogram) -> Quantity {
+    match histogram {
+        Histogram::Transient => Quantity::Transient,
+        Histogram::Transient4 => Quantity::Transient4,
+        Histogram::Transient25 => Quantity::Transient25,
+        Histogram::TransientSpots => Quantity::TransientSpots,
+    }
+}
+
+/// The source's spots that light the target; `None` = all.
+fn chosen(settings: &ReprocessSettings) -> Option<Vec<u32>> {
+    match settings.histogram {
+        Histogram::Transient => None,
+        Histogram::TransientSpots => Some(settings.spots.clone()),
+        subset => Some(quantity(subset).spots_of_100().to_vec()),
+    }
+}
+
+/// h as chosen, `[row][column][bin]`.
+fn read(
+    stores: &Stores,
+    source: &Dataset,
+    settings: &ReprocessSettings,
+    index: u64,
+    control: &Control,
+) -> Result<Vec<f32>, TaskError> {
+    if settings.histogram != Histogram::TransientSpots {
+        let read = source.read_histogram(index, quantity(settings.histogram));
+        return stores.wait(control, read);
+    }
+    let mut sum = Multiplex::new(source.spec().transient_len());
+    for (done, spot) in settings.spots.iter().enumerate() {
+        proceed(control, READ * done as f32 / settings.spots.len() as f32)?;
+        let h = stores.wait(control, source.read_spot(index, *spot))?;
+        sum.add(&h).map_err(of_sensor)?;
+    }
+    Ok(sum.finish())
+}
+
+/// What was measured in units of h (dark counts included), and the scale that makes photons of it.
+fn as_radiance(sensed: &Sensed) -> (Vec<f32>, f32) {
+    use rayon::prelude::*;
+    let scale = sensed.scale as f32;
+    let h = match &sensed.values {
+        Values::Counts(counts) => counts.par_iter().map(|n| *n as f32 / scale).collect(),
+        Values::Rate(rate) => rate.par_iter().map(|r| r / scale).collect(),
+    };
+    (h, scale)
+}
+
+/// What the manifest tells: the source and what was done to it. Only what the task decides; no place, no time.
+fn account(settings: &ReprocessSettings, source: &Manifest, sensed: &Sensed) -> serde_json::Value {
+    let mut plan = json!({
+        "kind": "reprocess",
+        "source": {
+            "task_key": source.provenance.task_key,
+            "manifest_sha256": manifest_sha256(source),
+            "renderer": source.provenance.renderer,
+            "scale": source.scale,
+        },
+        "histogram": settings.histogram,
+        "spots": chosen(settings),
+        "sensor": settings.sensor,
+        "drop_left_over": settings.drop_left_over,
+        "seed": settings.seed,
+        "value": match sensed.values {
+            Values::Counts(_) => "counts: photons counted in the bin, dark counts included",
+            Values::Rate(_) => "rate: photons expected in the bin, dark counts included",
+        },
+        "photons_per_unit": sensed.scale,
+        "peak_photons": sensed.peak_photons,
+        "shift_bins": sensed.shift_bins,
+        "dropped": sensed.dropped,
+        "labels": source.provenance.plan["labels"],
+        "scene": source.provenance.plan["scene"],
+    });
+    // The truth is copied, and so is what is not known of it.
+    let missing = source.missing();
+    if !missing.is_empty() {
+        plan["missing"] = json!(missing);
+    }
+    plan
+}
+
+/// The sensor model's settings. Both have the same shape, which a test holds them to.
+///
+/// # Errors
+/// [`TaskError::User`] naming the setting that the model refuses.
+pub fn sensor(settings: &SensorSettings) -> Result<Sensor, TaskError> {
+    let value = serde_json::to_value(settings).expect("settings are plain data");
+    let sensor: Sensor = serde_json::from_value(value)
+        .map_err(|e| TaskError::User(format!("reprocess.sensor: {e}")))?;
+    sensor.check().map_err(of_sensor)?;
+    Ok(sensor)
+}
+
+/// A sensor as jobs describe it.
+pub fn sensor_settings(sensor: &Sensor) -> SensorSettings {
+    let value = serde_json::to_value(sensor).expect("settings are plain data");
+    serde_json::from_value(value).expect("both have the same shape")
+}
+
+fn of_sensor(error: SensorError) -> TaskError {
+    TaskError::User(format!("reprocess.{error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale};
+
+    use super::*;
+
+    #[test]
+    fn jobs_and_the_sensor_model_mean_the_same_by_every_setting() {
+        let default = SensorSettings::default();
+        assert_eq!(sensor(&default).unwrap(), Sensor::default());
+        assert_eq!(sensor_settings(&Sensor::default()), default);
+        let with = |change: fn(&mut Sensor)| {
+            let mut sensor = Sensor::default();
+            change(&mut sensor);
+            sensor
+        };
+        let all = [
+            with(|s| s.pulse = Pulse::None {}),
+            with(|s| {
+                s.pulse = Pulse::Sampled {
+                    bin_width_ps: 8.0,
+                    values: vec![0.1, 0.7],
+                    zero_bin: Some(0.5),
+                }
+            }),
+            with(|s| s.jitter = Jitter::Sb3dCompat { sigma_bins: 2.0 }),
+            with(|s| {
+                s.scale = Scale::Fixed {
+                    photons_per_unit: 0.1,
+                }
+            }),
+            with(|s| s.scale = Scale::Peak { photons: 7.0 }),
+            with(|s| {
+                s.dark_per_bin = 0.1;
+                s.poisson = false;
+                s.rebin = 4;
+                s.dead_time = Some(DeadTime::FirstPhoton { pulses: 9 });
+            }),
+        ];
+        for model in all {
+            assert_eq!(sensor(&sensor_settings(&model)).unwrap(), model);
+        }
+    }
+
+    #[test]
+    fn jobs_and_the_sensor_model_refuse_the_same() {
+        let bad: [fn(&mut Sensor); 10] = [
+            |s| s.pulse = Pulse::Analytic { fwhm_ps: 1e-4 },
+            |s| {
+                s.pulse = Pulse::Sampled {
+                    bin_width_ps: 8.0,
+                    values: vec![0.0],
+                    zero_bin: None,
+                }
+            },
+            |s| {
+                s.pulse = Pulse::Sampled {
+                    bin_width_ps: 8.0,
+                    values: vec![1.0],
+                    zero_bin: Some(1.0),
+                }
+            },
+            |s| s.jitter = Jitter::Gaussian { fwhm_ps: -1.0 },
+            |s| s.jitter = Jitter::Sb3dCompat { sigma_bins: 1e4 },
+            |s| s.scale = Scale::Peak { photons: 1e9 },
+            |s| {
+                s.scale = Scale::PeakRange {
+                    low: 3.0,
+                    high: 2.0,
+                }
+            },
+            |s| s.dark_per_bin = 1e9,
+            |s| s.rebin = 0,
+            |s| s.dead_time = Some(DeadTime::FirstPhoton { pulses: 1 << 41 }),
+        ];
+        for change in bad {
+            let mut model = Sensor::default();
+            change(&mut model);
+            let SensorError::Invalid { field, .. } = model.check().unwrap_err();
+            let ours = sensor_settings(&model).check("sensor").unwrap_err();
+            assert_eq!(ours.field, field);
+        }
+    }
+}

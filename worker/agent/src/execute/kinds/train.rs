@@ -1,0 +1,442 @@
+//! Training: adopt, or go on from the newest checkpoint, or begin; save what is reached now and then; publish.
+//!
+//! A training may run for days and on many workers, one after the other. So it is saved every few minutes, when it is told
+//! to stop, and never waits for the store while it computes; a store that is away costs checkpoints, not the training.
+
+use std::{
+    collections::BTreeMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use picofarm_dataset::{
+    Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel, Pinned,
+    Published, TrainingSpeed, TrialEnd,
+};
+use picofarm_model::{
+    Device, ModelError,
+    scene::Scenes,
+    train::{Ended, Event, Line, Plan, Sources, Trained, Training},
+};
+use picofarm_proto::{
+    key::training_key,
+    model::{
+        TaskSpec, TrainSettings, TrainTask,
+        train::{Normalise, Target},
+    },
+};
+use tracing::{info, warn};
+
+mod along;
+mod known;
+mod plan;
+mod results;
+mod trial;
+
+use along::{Saver, Teller, loading};
+pub(in crate::execute) use known::{CheckedModel, Known};
+pub(in crate::execute) use results::WEIGHTS;
+use results::{lines, metrics, output, pretty};
+use trial::{Course, Left};
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Task, TaskError,
+    examples::{Examples, first, sides},
+    output::{Stores, of_dataset},
+    truth,
+};
+
+/// Version of networks, training and metrics.
+pub fn model_version() -> String {
+    picofarm_model::VERSION.to_owned()
+}
+
+impl RunTask for TrainTask {
+    fn code_version() -> String {
+        model_version()
+    }
+
+    /// Trains what `task` names; with `force` although it is there, and on a graphics processor where the job asks for `gpus`.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let stores = &context.stores;
+        let (force, gpus) = (task.spec.force, task.spec.resources.gpus);
+        let task = self;
+        let training = TrainingRun {
+            gpus,
+            ..TrainingRun::of(stores, task, control)?
+        };
+        let Some(trial) = &task.train.trial else {
+            let published = match training.learn(stores, force, None, control)? {
+                Ok(published) => published,
+                Err(_) => unreachable!("only trials are left before their end"),
+            };
+            return Ok(output(&published.manifest, published.adopted));
+        };
+        let mut course = Course::of(stores, &training, trial)?;
+        if let Some(ended) = course.ended(force, control)? {
+            return Ok(trial::adopted(&ended));
+        }
+        match training.learn(stores, force, Some(&course), control)? {
+            Ok(published) => course.finished(&published.manifest, published.adopted, control),
+            Err(left) => course.left(left, control),
+        }
+    }
+}
+
+/// Everything that a training is made of.
+struct TrainingRun<'a> {
+    task: &'a TrainTask,
+    spec: DatasetSpec,
+    models: Models,
+    training: Arc<Examples>,
+    validation: Arc<Examples>,
+    /// The models that it builds on, by field.
+    built: BTreeMap<&'static str, Known>,
+    lineage: Lineage,
+    key: String,
+    /// Graphics processors that the job asks for.
+    gpus: u32,
+}
+
+impl<'a> TrainingRun<'a> {
+    fn of(stores: &Stores, task: &'a TrainTask, control: &Control) -> Result<Self, TaskError> {
+        let (place, settings) = (&task.source, &task.train);
+        let dataset = stores
+            .open_source(&place.store, &place.dataset, control)
+            .map_err(|e| at("source", e))?;
+        stores.fits(TaskSpec::Train(task.clone()), Some(dataset.spec()))?;
+        let models = stores
+            .models(&place.store, control)
+            .map_err(|e| at("source.store", e))?;
+        let split = ("train.split", &*settings.split);
+        let sides = sides(stores, &dataset, split, ["train", "validation"], control)?;
+        let [mut training, validation] = sides.scenes;
+        first(&mut training, settings.scenes, "train.scenes")?;
+        if validation.is_empty() && settings.optimise.early_stop > 0 {
+            return Err(TaskError::User(format!(
+                "train.optimise.early_stop: the split {:?} has no validation scenes to tell when; give it some, or 0",
+                settings.split
+            )));
+        }
+        let spec = *dataset.spec();
+        let built = read_models(stores, &models, settings, &spec, control)?;
+        let pin = |scenes: &[u64]| pin(stores, &dataset, scenes, control);
+        let pins = [pin(&training)?, pin(&validation)?];
+        let needs = truth::of_training(settings);
+        for pinned in &pins {
+            truth::check(&dataset.place(), &needs, &pinned.missing)?;
+        }
+        let mut used: Vec<u64> = training.iter().chain(&validation).copied().collect();
+        used.sort_unstable();
+        let manifests = built.iter().map(|(field, known)| (*field, &known.manifest));
+        let by_field = manifests.clone().map(|(field, m)| (field, m.sha256()));
+        let by_field: BTreeMap<&str, String> = by_field.collect();
+        let key = training_key(settings, [&pins[0].id, &pins[1].id], &by_field).to_string();
+        let lineage = Lineage {
+            dataset: place.dataset.clone(),
+            data: pin(&used)?.id,
+            split: sides.split,
+            training_scenes: training.len() as u64,
+            validation_scenes: validation.len() as u64,
+            code: settings.version.clone(),
+            seed: settings.seed,
+            models: manifests
+                .map(|(_, m)| (m.name.clone(), m.sha256()))
+                .collect(),
+            promoted: None,
+        };
+        let histogram = (settings.histogram, &*settings.spots);
+        let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
+        Ok(Self {
+            task,
+            spec,
+            models,
+            training: examples(training)?,
+            validation: examples(validation)?,
+            built,
+            lineage,
+            key,
+            gpus: 0,
+        })
+    }
+
+    /// Where it is computed. A program without graphics processors trains on its processor, and says so.
+    fn device(&self) -> Result<Device, TaskError> {
+        if self.gpus == 0 {
+            return Ok(picofarm_model::cpu());
+        }
+        match picofarm_model::gpu() {
+            Err(error) if picofarm_model::HAS_GPUS => {
+                Err(TaskError::Interrupted(error.to_string()))
+            }
+            Err(error) => {
+                warn!(%error, "trains on the processor");
+                Ok(picofarm_model::cpu())
+            }
+            Ok(device) => Ok(device),
+        }
+    }
+
+    /// What the model runtime is asked.
+    fn plan(&self, control: &Control) -> Result<Plan, TaskError> {
+        let settings = &self.task.train;
+        let greatest = match (settings.input.normalise, settings.input.max) {
+            (Normalise::Log, 0.0) => plan::largest_bin(&*self.training, control)?,
+            (_, max) => max as f32,
+        };
+        let plan = plan::plan(settings, &self.spec, self.training.spots(), greatest)?;
+        if let Some(on) = self.built.get("train.specular.on") {
+            plan::check_on(&plan, on)?;
+        }
+        Ok(plan)
+    }
+
+    fn settings(&self) -> &TrainSettings {
+        &self.task.train
+    }
+
+    fn split(&self) -> &str {
+        &self.task.train.split
+    }
+
+    fn validation_is_empty(&self) -> bool {
+        self.validation.is_empty()
+    }
+
+    /// Adopts the model that this very training has published before, or trains and publishes.
+    fn learn(
+        &self,
+        stores: &Stores,
+        force: bool,
+        course: Option<&Course<'_>>,
+        control: &Control,
+    ) -> Result<Result<Published, Left>, TaskError> {
+        let (models, name, key) = (&self.models, &self.task.train.model, &self.key);
+        if !force && let Some(manifest) = finished(stores, models, name, key, control)? {
+            // Whoever published it may have died before this.
+            stores.wait(control, models.delete_checkpoints(name, key))?;
+            return Ok(Ok(Published {
+                manifest,
+                adopted: true,
+            }));
+        }
+        let plan = self.plan(control)?;
+        let asked = known::asked(&plan, &self.spec);
+        let trained = match self.train(plan, stores, course, control)? {
+            Ok(trained) => trained,
+            Err(left) => return Ok(Err(left)),
+        };
+        let metrics = metrics(&trained);
+        let new = NewModel {
+            manifest: ModelManifest {
+                name: name.clone(),
+                kind: self.task.train.target.name().to_owned(),
+                training_key: key.clone(),
+                settings: self.task.train.shaping(),
+                plan: asked,
+                lineage: self.lineage.clone(),
+                metrics: metrics.clone(),
+                ..ModelManifest::default()
+            },
+            objects: vec![
+                (WEIGHTS.into(), trained.weights.into()),
+                (trial::HISTORY.into(), lines(&trained.history).into()),
+                ("metrics.json".into(), pretty(&metrics).into()),
+            ],
+        };
+        let published =
+            stores.patiently(control, async || models.publish(new.clone(), force).await)?;
+        stores.wait(control, models.delete_checkpoints(name, key))?;
+        control.at(1.0);
+        Ok(Ok(published))
+    }
+
+    /// Tells how fast it was. Nobody misses it where the store does not take it.
+    fn tell_speed(
+        &self,
+        stores: &Stores,
+        (samples_per_s, data_wait_share): (f64, f64),
+        control: &Control,
+    ) {
+        let speed = TrainingSpeed {
+            training_key: self.key.clone(),
+            samples_per_s,
+            data_wait_share,
+            threads: rayon::current_num_threads(),
+            gpu: self.gpus > 0 && picofarm_model::HAS_GPUS,
+        };
+        let put = self.models.put_speed(&self.task.train.model, &speed);
+        if let Err(error) = stores.wait(control, put) {
+            warn!(%error, "how fast the training was is not kept");
+        }
+    }
+
+    /// Trains; a trial may be left before its end.
+    fn train(
+        &self,
+        plan: Plan,
+        stores: &Stores,
+        course: Option<&Course<'_>>,
+        control: &Control,
+    ) -> Result<Result<Trained, Left>, TaskError> {
+        let (name, key) = (&self.task.train.model, &*self.key);
+        let device = self.device()?;
+        let guide = self.built.get("train.shadow.tof");
+        let sources = Sources {
+            train: self.training.clone(),
+            validation: self.validation.clone(),
+            guide: guide.map(|tof| tof.model.clone()),
+        };
+        let from = ["train.from", "train.specular.on"];
+        let from = from.iter().find_map(|field| self.built.get(*field));
+        let from = from.map(|known| &known.weights[..]);
+        let newest = stores.wait(control, self.models.newest_checkpoint(name, key))?;
+        let mut training = match newest {
+            None => Training::start(plan, from, sources, &device),
+            Some((step, content)) => {
+                info!("goes on from the checkpoint after {step} steps");
+                Training::resume(plan, &content, sources, &device)
+            }
+        }
+        .map_err(of_model)?
+        .loading(loading());
+        let mut saver = Saver::new(stores, &self.models, name, key);
+        let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
+        let mut saved = Instant::now();
+        let epochs = self.task.train.optimise.epochs;
+        let mut teller = Teller::new(control, epochs);
+        // What the trial is told at its latest rung.
+        let mut told = Ok(true);
+        let mut ask = |line: &Line| {
+            told = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));
+            matches!(told, Ok(true))
+        };
+        // It may have been stopped right at a rung.
+        let position = training.position();
+        let at_rung = position.history.last().filter(|_| position.batches == 0);
+        let ended = match at_rung.copied().is_none_or(|line| ask(&line)) {
+            false => Ok(Ended::Stopped),
+            true => training.run(&mut |training, event| {
+                teller.hear(event);
+                if let Event::Epoch(line) = event
+                    && !ask(line)
+                {
+                    return picofarm_model::train::Control::Stop;
+                }
+                if control.stopped() {
+                    return picofarm_model::train::Control::Stop;
+                }
+                if saved.elapsed() >= every {
+                    saver.save(training.learner().steps(), training.checkpoint().into());
+                    saved = Instant::now();
+                }
+                picofarm_model::train::Control::Continue
+            }),
+        };
+        let left = |training: &Training, end| Left {
+            end,
+            history: training.position().history.clone(),
+        };
+        match ended {
+            Err(error @ ModelError::NotFinite { .. }) if course.is_some() => {
+                saver.last();
+                Ok(Err(left(&training, TrialEnd::Diverged(error.to_string()))))
+            }
+            Err(error) => Err(of_model(error)),
+            Ok(Ended::Finished) => {
+                saver.last();
+                if let Some(pace) = teller.pace() {
+                    self.tell_speed(stores, pace, control);
+                }
+                Ok(Ok(training.finish()))
+            }
+            Ok(Ended::Stopped) if matches!(told, Ok(false)) => {
+                saver.last();
+                Ok(Err(left(&training, TrialEnd::Pruned)))
+            }
+            Ok(Ended::Stopped) => {
+                saver.save(training.learner().steps(), training.checkpoint().into());
+                saver.last();
+                // Where the store was away at a rung, the trial goes on from there.
+                told.and(Err(TaskError::Stopped))
+            }
+        }
+    }
+}
+
+/// The model if this very training has published it.
+fn finished(
+    stores: &Stores,
+    models: &Models,
+    name: &str,
+    key: &str,
+    control: &Control,
+) -> Result<Option<ModelManifest>, TaskError> {
+    let looked = async {
+        match models.finished(name, key).await {
+            Err(error @ DatasetError::Damaged { .. }) => {
+                warn!(%error, "a model is damaged; it is trained again to repair it");
+                Ok(None)
+            }
+            other => other,
+        }
+    };
+    stores.wait(control, looked).map_err(|e| at("train", e))
+}
+
+/// The models that a training builds on, by field.
+fn read_models(
+    stores: &Stores,
+    models: &Models,
+    settings: &TrainSettings,
+    spec: &DatasetSpec,
+    control: &Control,
+) -> Result<BTreeMap<&'static str, Known>, TaskError> {
+    let mut built = BTreeMap::new();
+    for (field, name) in settings.models() {
+        let known = Known::read(stores, models, (field, name), spec, control)?;
+        let wanted = match field {
+            "train.from" => settings.target.name(),
+            _ => Target::Tof.name(),
+        };
+        if known.manifest.kind != wanted {
+            return Err(TaskError::User(format!(
+                "{field}: {name:?} predicts {:?}, but one that predicts {wanted:?} is needed",
+                known.manifest.kind
+            )));
+        }
+        built.insert(field, known);
+    }
+    Ok(built)
+}
+
+/// What pins the bytes of scenes, in this order, and what is not known of them.
+pub(in crate::execute) fn pin(
+    stores: &Stores,
+    dataset: &Dataset,
+    scenes: &[u64],
+    control: &Control,
+) -> Result<Pinned, TaskError> {
+    let pinned = stores.wait(control, dataset.pin(scenes));
+    pinned.map_err(|e| at("source", e))
+}
+
+/// Who is to blame for a training's error.
+pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
+    match error {
+        ModelError::Scene { scene, source } => match source.downcast::<DatasetError>() {
+            Ok(error) => of_dataset(*error),
+            Err(error) => TaskError::Crash(format!("scene {scene}: {error}")),
+        },
+        // What is in the store has its checksum: this program made it, and does not know it again.
+        ModelError::Weights { what } => TaskError::Crash(what),
+        other => TaskError::User(other.to_string()),
+    }
+}
+
+pub(in crate::execute) fn at(field: &str, error: TaskError) -> TaskError {
+    match error {
+        TaskError::User(text) => TaskError::User(format!("{field}: {text}")),
+        other => other,
+    }
+}

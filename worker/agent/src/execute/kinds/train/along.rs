@@ -1,0 +1,173 @@
+//! What happens along a training: it is saved, and it tells how far it is.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use picofarm_dataset::{DatasetError, Models};
+use picofarm_model::{
+    metric::Metrics,
+    train::{Event, Line, Loading},
+};
+use tokio::task::JoinHandle;
+use tracing::{info, warn};
+
+use crate::{
+    execute::{Control, output::Stores},
+    machine::memory_mib,
+};
+
+/// How long a training that shall stop may take to save what it has reached.
+const LAST_SAVE: Duration = Duration::from_secs(240);
+/// Share of a task's progress that is training.
+const TRAINED: f32 = 0.99;
+/// Lines of an epoch that a task logs at most: its allowance holds few more.
+const LINES: u32 = 80;
+
+/// One part of so many of the memory holds scenes that are made ready for the network.
+const AHEAD_SHARE: u64 = 8;
+
+/// How scenes are made ready: by as many threads as the task has, in a part of the memory.
+pub(super) fn loading() -> Loading {
+    let standard = Loading::default();
+    match memory_mib() {
+        0 => standard,
+        mib => Loading {
+            room: usize::try_from(mib / AHEAD_SHARE).map_or(usize::MAX, |mib| mib << 20),
+            ..standard
+        },
+    }
+}
+
+/// Saves checkpoints while the training goes on, one at a time.
+pub(super) struct Saver<'a> {
+    stores: &'a Stores,
+    models: &'a Models,
+    name: &'a str,
+    key: &'a str,
+    under_way: Option<JoinHandle<Result<(), DatasetError>>>,
+}
+
+impl<'a> Saver<'a> {
+    pub(super) fn new(stores: &'a Stores, models: &'a Models, name: &'a str, key: &'a str) -> Self {
+        Self {
+            stores,
+            models,
+            name,
+            key,
+            under_way: None,
+        }
+    }
+
+    pub(super) fn save(&mut self, step: u64, content: Bytes) {
+        self.last();
+        let (models, name, key) = (
+            self.models.clone(),
+            self.name.to_owned(),
+            self.key.to_owned(),
+        );
+        let put = async move { models.put_checkpoint(&name, &key, step, content).await };
+        self.under_way = Some(self.stores.runtime().spawn(put));
+    }
+
+    /// Waits for the checkpoint that is under way. Without it, the training goes on from the one before.
+    pub(super) fn last(&mut self) {
+        let Some(under_way) = self.under_way.take() else {
+            return;
+        };
+        let within = async { tokio::time::timeout(LAST_SAVE, under_way).await };
+        match self.stores.runtime().block_on(within) {
+            Ok(Ok(Ok(()))) => {}
+            Ok(Ok(Err(error))) => warn!(%error, "a checkpoint was not saved"),
+            Ok(Err(error)) => warn!(%error, "a checkpoint was not saved: saving broke down"),
+            Err(_) => warn!(
+                "a checkpoint was not saved within {} s",
+                LAST_SAVE.as_secs()
+            ),
+        }
+    }
+}
+
+/// Tells the task's control and its log how far the training is.
+pub(super) struct Teller<'a> {
+    control: &'a Control,
+    epochs: u32,
+    told: u64,
+    /// The latest figure of the validation scenes: MAE in metres, or one less IoU.
+    validation: Option<(&'static str, f64)>,
+    /// Training examples a second, and share of the time in which the network waited for data.
+    pace: Option<(f64, f64)>,
+}
+
+impl<'a> Teller<'a> {
+    pub(super) fn new(control: &'a Control, epochs: u32) -> Self {
+        Self {
+            control,
+            epochs,
+            told: 0,
+            validation: None,
+            pace: None,
+        }
+    }
+
+    /// Training examples a second, and the share of waiting for data, as last heard.
+    pub(super) fn pace(&self) -> Option<(f64, f64)> {
+        self.pace
+    }
+
+    pub(super) fn hear(&mut self, event: &Event) {
+        match event {
+            Event::Step {
+                step,
+                of,
+                epoch,
+                loss,
+                samples_per_s,
+                data_wait_share,
+            } => {
+                self.control
+                    .at(*step as f32 / (*of).max(1) as f32 * TRAINED);
+                self.pace = Some((*samples_per_s, *data_wait_share));
+                let text = format!(
+                    "epoch {epoch}/{}, loss {loss:.4}, {samples_per_s:.1} samples/s",
+                    self.epochs
+                );
+                let figures = [
+                    ("step", *step as f64),
+                    ("steps", *of as f64),
+                    ("epoch", *epoch as f64),
+                    ("loss", f64::from(*loss)),
+                    ("samples_per_s", *samples_per_s),
+                    ("data_wait_share", *data_wait_share),
+                ];
+                let figures: Vec<(&str, f64)> =
+                    figures.into_iter().chain(self.validation).collect();
+                self.control.say(text, &figures);
+            }
+            Event::Epoch(line) => {
+                self.validation = line
+                    .validation
+                    .map(|found| ("validation_loss", found.loss()));
+                // All of few epochs, every so many of many, and the last.
+                let between = u64::from(self.epochs.div_ceil(LINES));
+                if line.epoch >= self.told + between || line.epoch == u64::from(self.epochs) {
+                    self.told = line.epoch;
+                    info!("epoch {}/{}: {}", line.epoch, self.epochs, told(line));
+                }
+            }
+        }
+    }
+}
+
+/// An epoch for people.
+fn told(line: &Line) -> String {
+    let loss = format!("loss {:.4}", line.loss);
+    match line.validation {
+        None => loss,
+        Some(Metrics::Depth { mae_m, rmse_m }) => {
+            format!("{loss}; validation MAE {mae_m:.4} m, RMSE {rmse_m:.4} m")
+        }
+        Some(Metrics::Mask { mae, iou, f1 }) => {
+            format!("{loss}; validation IoU {iou:.4}, MAE {mae:.4}, F1 {f1:.4}")
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! Trained models, read from a store and made ready.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use picofarm_dataset::{DatasetSpec, Gate, ModelManifest, Models};
+use picofarm_model::{Model, train::Plan};
+use serde::{Deserialize, Serialize};
+
+use super::{WEIGHTS, at, of_model};
+use crate::execute::{Control, TaskError, output::Stores};
+
+/// A model from a store.
+pub(in crate::execute) struct Known {
+    pub(in crate::execute) manifest: ModelManifest,
+    pub(in crate::execute) model: Arc<Model>,
+    pub(super) weights: Bytes,
+}
+
+/// What a manifest holds of a model for those who want to know before they read its weights.
+#[derive(Serialize, Deserialize)]
+struct Asked {
+    /// The plan, which the weights hold too.
+    plan: Plan,
+    /// The bins of the histograms that it knows.
+    gate: Gate,
+}
+
+/// What a manifest holds of a model.
+pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
+    let asked = Asked {
+        plan: plan.clone(),
+        gate: spec.gate,
+    };
+    serde_json::to_value(asked).expect("plain data")
+}
+
+/// A model of a store that fits a data set; its weights are not read yet.
+pub(in crate::execute) struct CheckedModel {
+    pub(in crate::execute) manifest: ModelManifest,
+    pub(in crate::execute) plan: Plan,
+}
+
+impl CheckedModel {
+    /// Looks at a model, which must have been trained on histograms like those of `spec` and take images of that size.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    pub(in crate::execute) fn look(
+        stores: &Stores,
+        models: &Models,
+        (field, name): (&str, &str),
+        spec: &DatasetSpec,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let manifest = stores.wait(control, models.manifest(name));
+        let manifest = manifest.map_err(|e| at(field, e))?;
+        let asked = serde_json::from_value(manifest.plan.clone());
+        let Asked { plan, gate } = asked.map_err(|e| {
+            TaskError::User(format!(
+                "{field}: {name:?} was made by {}, and this version does not know how to ask it: {e}",
+                manifest.lineage.code
+            ))
+        })?;
+        if gate != spec.gate {
+            let shown = |g: &Gate| {
+                format!(
+                    "{} bins of {} m from {} m",
+                    g.bins, g.bin_width_m, g.start_m
+                )
+            };
+            return Err(TaskError::User(format!(
+                "{field}: {name:?} was trained on {}, but the data set has {}",
+                shown(&gate),
+                shown(&spec.gate)
+            )));
+        }
+        let multiple = plan.net.multiple() as u32;
+        if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
+            return Err(TaskError::User(format!(
+                "{field}: {name:?} takes images whose sides are multiples of {multiple}; the data set has {}x{} pixels",
+                spec.width, spec.height
+            )));
+        }
+        Ok(Self { manifest, plan })
+    }
+
+    /// Its weights.
+    fn weights(
+        &self,
+        stores: &Stores,
+        models: &Models,
+        field: &str,
+        control: &Control,
+    ) -> Result<Bytes, TaskError> {
+        let weights = stores.wait(control, models.read(&self.manifest, WEIGHTS));
+        weights.map_err(|e| at(field, e))
+    }
+
+    /// The model, ready to be asked.
+    pub(in crate::execute) fn model(
+        &self,
+        stores: &Stores,
+        models: &Models,
+        field: &str,
+        control: &Control,
+    ) -> Result<Model, TaskError> {
+        let weights = self.weights(stores, models, field, control)?;
+        Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)
+    }
+}
+
+impl Known {
+    /// Reads a model; see [`CheckedModel::look`].
+    ///
+    /// # Errors
+    /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
+    pub(in crate::execute) fn read(
+        stores: &Stores,
+        models: &Models,
+        (field, name): (&str, &str),
+        spec: &DatasetSpec,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let checked = CheckedModel::look(stores, models, (field, name), spec, control)?;
+        let weights = checked.weights(stores, models, field, control)?;
+        let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
+        Ok(Self {
+            model: Arc::new(model),
+            weights,
+            manifest: checked.manifest,
+        })
+    }
+}

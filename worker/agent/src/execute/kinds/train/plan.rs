@@ -1,0 +1,177 @@
+//! From a job's settings and a data set to what the model runtime is asked.
+
+use picofarm_dataset::DatasetSpec;
+use picofarm_model::{
+    ModelError,
+    input::{self, Question},
+    net::{self, NetSpec},
+    scene::Scenes,
+    train::{self, Plan},
+};
+use picofarm_proto::model::{
+    TrainSettings,
+    train::{Architecture, Normalise, Precision, Schedule, ShadowVariant, Target},
+};
+
+use super::{known::Known, of_model};
+use crate::execute::{Control, TaskError};
+
+/// What is asked of a network over scenes of a data set, `spots` of which made the histogram. `greatest` is the largest
+/// bin, for the logarithm.
+///
+/// # Errors
+/// [`TaskError::User`] naming the setting that does not fit the data set.
+pub(super) fn plan(
+    settings: &TrainSettings,
+    spec: &DatasetSpec,
+    spots: usize,
+    greatest: f32,
+) -> Result<Plan, TaskError> {
+    let (input, optimise) = (&settings.input, &settings.optimise);
+    let user = |field: &str, what: String| TaskError::User(format!("train.{field}: {what}"));
+    let bins = match input.bins {
+        0 => spec.gate.bins,
+        bins => bins,
+    };
+    input::merged(spec.gate.bins as usize, bins as usize)
+        .map_err(|what| user("input.bins", what))?;
+    let question = Question {
+        target: match settings.target {
+            Target::Tof => input::Target::Tof,
+            Target::Shadow => input::Target::Shadow,
+            Target::Specular => input::Target::Specular,
+        },
+        variant: match settings.shadow.variant {
+            ShadowVariant::Concat => input::ShadowVariant::Concat,
+            ShadowVariant::All => input::ShadowVariant::All,
+            ShadowVariant::Index => input::ShadowVariant::Index,
+            ShadowVariant::Difference => input::ShadowVariant::Difference,
+        },
+        normalise: match input.normalise {
+            Normalise::Minmax => input::Normalise::MinMax,
+            Normalise::Log => input::Normalise::Log { greatest },
+        },
+        bins: bins as usize,
+        intensity_only: input.intensity_only,
+        spots: match settings.target {
+            Target::Shadow => spots,
+            _ => 0,
+        },
+    };
+    let (dense, one_hot, outputs) = question.channels();
+    let wanted = &settings.net;
+    let net = NetSpec {
+        architecture: match wanted.architecture {
+            Architecture::Unet2d => net::Architecture::Unet2d,
+            Architecture::Unet25d => net::Architecture::Unet25d,
+        },
+        dense,
+        one_hot,
+        outputs,
+        width: wanted.width as usize,
+        levels: wanted.levels as usize,
+        stem: wanted.stem as usize,
+        time: wanted.time_features as usize,
+        frozen: !settings.specular.on.is_empty(),
+        precision: match optimise.precision {
+            Precision::F32 => net::Precision::F32,
+            Precision::Bf16 => net::Precision::Bf16,
+        },
+    };
+    let multiple = net.multiple() as u32;
+    if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
+        let what = format!(
+            "{} halve the image {} times, so that its sides must be multiples of {multiple}; the data set has {}x{} pixels",
+            wanted.levels,
+            wanted.levels - 1,
+            spec.width,
+            spec.height
+        );
+        return Err(user("net.levels", what));
+    }
+    Ok(Plan {
+        question,
+        net,
+        epochs: optimise.epochs.into(),
+        batch: (optimise.batch / optimise.accumulate) as usize,
+        accumulate: optimise.accumulate as usize,
+        learning_rate: optimise.learning_rate,
+        decay: optimise.weight_decay,
+        schedule: match optimise.schedule {
+            Schedule::Onecycle => train::Schedule::Onecycle,
+            Schedule::OnecyclePaper => train::Schedule::OnecyclePaper,
+            Schedule::Cosine => train::Schedule::Cosine,
+            Schedule::Constant => train::Schedule::Constant,
+        },
+        augment: settings.augment,
+        early_stop: optimise.early_stop.into(),
+        seed: settings.seed,
+    })
+}
+
+/// Refuses a network on the features of another that sees something else, or has another shape.
+pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
+    let (ours, theirs) = (&plan.question, on.model.question());
+    let (net, under) = (&plan.net, &on.model.plan().net);
+    let text = |value: &dyn std::fmt::Debug| format!("{value:?}");
+    for (field, ours, theirs) in [
+        ("input.bins", text(&ours.bins), text(&theirs.bins)),
+        (
+            "input.normalise",
+            text(&ours.normalise),
+            text(&theirs.normalise),
+        ),
+        (
+            "input.intensity_only",
+            text(&ours.intensity_only),
+            text(&theirs.intensity_only),
+        ),
+        (
+            "net.architecture",
+            text(&net.architecture),
+            text(&under.architecture),
+        ),
+        ("net.width", text(&net.width), text(&under.width)),
+        ("net.levels", text(&net.levels), text(&under.levels)),
+        ("net.stem", text(&net.stem), text(&under.stem)),
+        ("net.time_features", text(&net.time), text(&under.time)),
+    ] {
+        if ours != theirs {
+            return Err(TaskError::User(format!(
+                "train.{field}: is {ours}, but {theirs} in {:?}, whose features it is built on; give both the same",
+                on.manifest.name
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// The largest bin of all scenes.
+pub(super) fn largest_bin(scenes: &dyn Scenes, control: &Control) -> Result<f32, TaskError> {
+    let mut max = 0.0f32;
+    for index in 0..scenes.len() {
+        control.say(
+            format!(
+                "looks for the largest bin: scene {index} of {}",
+                scenes.len()
+            ),
+            &[],
+        );
+        if control.stopped() {
+            return Err(TaskError::Stopped);
+        }
+        let scene = scenes.load(index).map_err(|source| {
+            of_model(ModelError::Scene {
+                scene: index,
+                source,
+            })
+        })?;
+        max = scene.histogram.iter().copied().fold(max, f32::max);
+    }
+    match max > 0.0 {
+        true => Ok(max),
+        false => Err(TaskError::User(
+            "train.input.normalise: \"log\" needs light, but every bin of every training scene is 0".into(),
+        )),
+    }
+}

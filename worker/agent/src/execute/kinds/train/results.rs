@@ -1,0 +1,53 @@
+//! What a training leaves: a model's objects and figures.
+
+use picofarm_dataset::ModelManifest;
+use picofarm_model::train::{Line, Trained};
+use serde_json::{Value, json};
+
+use crate::execute::Output;
+
+/// Name of the object that holds a model's weights.
+pub(in crate::execute) const WEIGHTS: &str = "weights.safetensors";
+/// How good a trained network is, and how it came to that: figures of the epoch whose weights are kept.
+pub(super) fn metrics(trained: &Trained) -> Value {
+    let (last, kept) = (trained.history.last(), trained.kept());
+    let mut metrics = json!({
+        "epochs": trained.history.len(),
+        "steps": last.map(|line| line.step),
+        "stopped_early": trained.stopped_early,
+        "kept_epoch": trained.kept_epoch,
+        "loss": kept.map(|line| line.loss),
+    });
+    metrics["validation"] = json!(kept.and_then(|line| line.validation));
+    metrics
+}
+
+/// A line of JSON for each epoch.
+pub(super) fn lines(history: &[Line]) -> Vec<u8> {
+    let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
+    history.iter().map(line).collect::<String>().into_bytes()
+}
+
+/// The epochs of `history.jsonl`.
+pub(super) fn lines_of(history: &[u8]) -> Result<Vec<Line>, String> {
+    let text = String::from_utf8_lossy(history);
+    let lines = text.lines().map(serde_json::from_str);
+    let lines: Result<_, _> = lines.collect();
+    lines.map_err(|e| format!("history.jsonl: {e}"))
+}
+
+pub(super) fn output(manifest: &ModelManifest, adopted: bool) -> Output {
+    Output {
+        manifest_sha256: manifest.sha256(),
+        bytes: manifest.total_bytes(),
+        adopted,
+    }
+}
+
+pub(super) fn pretty(value: &Value) -> Vec<u8> {
+    let mut value = value.clone();
+    value.sort_all_objects();
+    let mut bytes = serde_json::to_vec_pretty(&value).expect("figures are plain data");
+    bytes.push(b'\n');
+    bytes
+}

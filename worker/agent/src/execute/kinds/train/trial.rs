@@ -1,0 +1,258 @@
+//! A training that is one of a sweep's trials: at rungs it compares itself with those that have been there, and stops if it
+//! has fallen behind; however it ends, it tells so under the sweep's name, and that is the task's result.
+
+use picofarm_dataset::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
+use picofarm_model::{metric::Metrics, train::Line};
+use picofarm_proto::model::Trial;
+use serde_json::Value;
+use tracing::info;
+
+use super::{TrainingRun, results::lines_of};
+use crate::execute::{Control, Output, TaskError, output::Stores};
+
+/// Name of the object that holds a model's epochs.
+pub(super) const HISTORY: &str = "history.jsonl";
+
+/// A trial under way.
+pub(super) struct Course<'a> {
+    stores: &'a Stores,
+    training: &'a TrainingRun<'a>,
+    trial: &'a Trial,
+    /// How it ended before, where it shall end so again.
+    again: Option<TrialRecord>,
+}
+
+/// A training that was left before its end.
+pub(super) struct Left {
+    pub(super) end: TrialEnd,
+    pub(super) history: Vec<Line>,
+}
+
+impl<'a> Course<'a> {
+    /// The trial that the training is, if it is one.
+    pub(super) fn of(
+        stores: &'a Stores,
+        training: &'a TrainingRun<'a>,
+        trial: &'a Trial,
+    ) -> Result<Self, TaskError> {
+        if training.validation_is_empty() {
+            let what = format!(
+                "sweep: the split {:?} has no validation scenes to compare trials by; give it some",
+                training.split()
+            );
+            return Err(TaskError::User(what));
+        }
+        Ok(Self {
+            stores,
+            training,
+            trial,
+            again: None,
+        })
+    }
+
+    /// How it ended, if it has; with `force` it shall come to the same end again.
+    pub(super) fn ended(
+        &mut self,
+        force: bool,
+        control: &Control,
+    ) -> Result<Option<TrialRecord>, TaskError> {
+        let trial = self.trial;
+        let looked = self.models().trial(&trial.sweep, &trial.id, trial.index);
+        let found = self.stores.wait(control, looked)?;
+        if let Some(found) = &found
+            && found.training_key != self.training.key
+        {
+            let what = format!(
+                "sweep: trial {} of {:?} is another training by now (key {}, this one's is {}): the data set has changed; \
+                 choose another name for the model",
+                trial.index, trial.sweep, found.training_key, self.training.key
+            );
+            return Err(TaskError::User(what));
+        }
+        if force {
+            self.again = found;
+            return Ok(None);
+        }
+        if let Some(ended) = &found {
+            // Whoever told may have died right after.
+            self.forget(ended, control)?;
+        }
+        Ok(found)
+    }
+
+    /// Whether it goes on after an epoch of `of`.
+    pub(super) fn goes_on(
+        &self,
+        line: &Line,
+        of: u32,
+        control: &Control,
+    ) -> Result<bool, TaskError> {
+        if let Some(again) = &self.again {
+            return Ok(again.end != TrialEnd::Pruned || again.epochs != line.epoch);
+        }
+        let trial = self.trial;
+        let rung = trial
+            .halving
+            .filter(|halving| halving.is_rung(line.epoch, u64::from(of)));
+        let (Some(halving), Some(found)) = (rung, line.validation) else {
+            return Ok(true);
+        };
+        let ours = Rung {
+            index: trial.index,
+            epochs: line.epoch,
+            loss: found.loss(),
+        };
+        let (models, sweep, id) = (self.models(), &*trial.sweep, &*trial.id);
+        let told = async || models.put_rung(sweep, id, &ours).await;
+        self.stores.patiently(control, told)?;
+        let there = self
+            .stores
+            .wait(control, models.rung(sweep, id, line.epoch))?;
+        let (place, goes_on) = judged(&ours, &there, halving.factor);
+        let (count, then) = (there.len(), if goes_on { "goes on" } else { "stops" });
+        info!(
+            "trial {} after {} epochs is number {place} of {count}: it {then}",
+            trial.index, line.epoch
+        );
+        Ok(goes_on)
+    }
+
+    /// Tells that it came to its end, with the model that stands.
+    pub(super) fn finished(
+        &self,
+        manifest: &ModelManifest,
+        adopted: bool,
+        control: &Control,
+    ) -> Result<Output, TaskError> {
+        let history = self.models().read(manifest, HISTORY);
+        let history = self.stores.wait(control, history)?;
+        let history = lines_of(&history).map_err(TaskError::Crash)?;
+        let mut record = self.record(TrialEnd::Finished, history);
+        // Of the epoch whose weights are kept.
+        let kept = manifest.metrics.get("validation").cloned();
+        let kept = kept.and_then(|found| serde_json::from_value::<Metrics>(found).ok());
+        record.loss = kept.map(|found| found.loss());
+        self.tell(&record, manifest.total_bytes(), adopted, control)
+    }
+
+    /// Tells that it was left before its end, and deletes what it would have gone on from.
+    pub(super) fn left(&self, left: Left, control: &Control) -> Result<Output, TaskError> {
+        let Left { end, history } = left;
+        let record = self.record(end, history);
+        let output = self.tell(&record, record.to_bytes().len() as u64, false, control)?;
+        self.forget(&record, control)?;
+        Ok(output)
+    }
+
+    /// Deletes what a trial that has ended would have gone on from.
+    fn forget(&self, record: &TrialRecord, control: &Control) -> Result<(), TaskError> {
+        let (name, key) = (&record.model, &record.training_key);
+        let deleted = self.models().delete_checkpoints(name, key);
+        self.stores.wait(control, deleted)
+    }
+
+    fn tell(
+        &self,
+        record: &TrialRecord,
+        bytes: u64,
+        adopted: bool,
+        control: &Control,
+    ) -> Result<Output, TaskError> {
+        let put = async || self.models().put_trial(record).await;
+        let stands = self.stores.patiently(control, put)?;
+        if self.again.is_some() && stands != *record {
+            let what = format!(
+                "trial {} of {:?} came to another end than before: {:?} after {} epochs, and {:?} after {} before",
+                record.index, record.sweep, record.end, record.epochs, stands.end, stands.epochs
+            );
+            return Err(TaskError::Crash(what));
+        }
+        control.at(1.0);
+        Ok(Output {
+            manifest_sha256: stands.sha256(),
+            bytes,
+            adopted,
+        })
+    }
+
+    fn record(&self, end: TrialEnd, history: Vec<Line>) -> TrialRecord {
+        let (trial, settings) = (self.trial, self.training.settings());
+        let last = history.last();
+        TrialRecord {
+            sweep: trial.sweep.clone(),
+            id: trial.id.clone(),
+            index: trial.index,
+            values: trial.values.clone(),
+            model: settings.model.clone(),
+            kind: settings.target.name().to_owned(),
+            training_key: self.training.key.clone(),
+            epochs: last.map_or(0, |line| line.epoch),
+            loss: last.and_then(|line| line.validation.as_ref().map(Metrics::loss)),
+            end,
+            history: history.iter().map(of_line).collect(),
+        }
+    }
+
+    fn models(&self) -> &Models {
+        &self.training.models
+    }
+}
+
+/// The output of a trial that has ended before.
+pub(super) fn adopted(record: &TrialRecord) -> Output {
+    Output {
+        manifest_sha256: record.sha256(),
+        bytes: record.to_bytes().len() as u64,
+        adopted: true,
+    }
+}
+
+fn of_line(line: &Line) -> Value {
+    serde_json::to_value(line).expect("figures are plain data")
+}
+
+/// The place of a trial among those that have reached a rung, from 1, and whether it goes on: the best 1/factor of them do,
+/// and at least one.
+fn judged(ours: &Rung, there: &[Rung], factor: u32) -> (usize, bool) {
+    let better = |other: &&Rung| {
+        other.index != ours.index
+            && (other.loss, other.index).partial_cmp(&(ours.loss, ours.index))
+                == Some(std::cmp::Ordering::Less)
+    };
+    let place = 1 + there.iter().filter(better).count();
+    (place, place <= (there.len() / factor as usize).max(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rungs(losses: &[f64]) -> Vec<Rung> {
+        let rung = |(index, loss): (usize, &f64)| Rung {
+            index: index as u64,
+            epochs: 3,
+            loss: *loss,
+        };
+        losses.iter().enumerate().map(rung).collect()
+    }
+
+    #[test]
+    fn the_first_goes_on_and_then_the_best_of_so_many() {
+        let there = rungs(&[0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.1]);
+        let on: Vec<bool> = (0..7)
+            .map(|i| judged(&there[i], &there[..=i], 3).1)
+            .collect();
+        assert_eq!(on, [true, true, false, true, false, true, true]);
+        // Of seven, the two best.
+        let late: Vec<bool> = there.iter().map(|r| judged(r, &there, 3).1).collect();
+        assert_eq!(late, [false, false, false, false, false, true, true]);
+        assert_eq!(judged(&there[0], &there, 3).0, 5);
+    }
+
+    #[test]
+    fn equals_are_told_apart_by_their_number() {
+        let there = rungs(&[0.5; 6]);
+        let on = there.iter().filter(|r| judged(r, &there, 3).1).count();
+        assert_eq!(on, 2);
+    }
+}

@@ -1,0 +1,105 @@
+//! Where a job is submitted: what its tasks must be certain of is filled in there, because only there it is known.
+
+use std::path::{Component, Path, PathBuf};
+
+use picofarm_dataset::{Profile, check_location};
+use picofarm_proto::model::{SceneKind, SceneSource, SpecError};
+use picofarm_scene::{
+    AssetLibrary,
+    import::{Bounds, fingerprint},
+};
+
+/// Where a job is submitted.
+#[derive(Debug, Clone, Copy)]
+pub struct Submission<'a> {
+    /// The folder that relative paths start from.
+    pub base: &'a Path,
+    /// Folders with furniture.
+    pub assets: &'a [PathBuf],
+}
+
+impl Submission<'_> {
+    /// A store's place, absolute; empty stays empty.
+    pub(super) fn store(&self, field: &str, text: &str) -> Result<String, SpecError> {
+        if text.is_empty() {
+            return Ok(String::new());
+        }
+        // As it is written: beside the job file, a mistyped URL would look like a folder.
+        check_location(text).map_err(|e| SpecError::new(field, e.to_string()))?;
+        match text.contains("://") {
+            true => Ok(text.to_owned()),
+            false => Ok(self.path(field, text)?.display().to_string()),
+        }
+    }
+
+    /// A path, absolute.
+    pub(super) fn path(&self, field: &str, text: &str) -> Result<PathBuf, SpecError> {
+        absolute(self.base, text).map_err(|e| SpecError::new(field, e))
+    }
+
+    /// Checks the name of a codec profile.
+    #[expect(clippy::unused_self, reason = "as the other checks are called")]
+    pub(super) fn profile(&self, name: &str) -> Result<(), SpecError> {
+        Profile::parse(name)
+            .map(|_| ())
+            .map_err(|e| SpecError::new("output.profile", e))
+    }
+
+    /// Pins furniture, and the content of files.
+    pub(super) fn scenes(&self, source: &mut SceneSource) -> Result<(), SpecError> {
+        let (files, root) = match &mut source.kind {
+            SceneKind::Furnished { assets, .. } => {
+                let library = AssetLibrary::named(assets, self.assets)
+                    .map_err(|e| SpecError::new("scenes.assets", e.to_string()))?;
+                library.fingerprint().clone_into(assets);
+                return Ok(());
+            }
+            SceneKind::Primitive => return Ok(()),
+            SceneKind::Files { files, root, .. } => (files, root),
+        };
+        if let Some(root) = root {
+            *root = self.path("scenes.root", root)?.display().to_string();
+        }
+        let bounds = Bounds {
+            root: root.as_ref().map(PathBuf::from),
+            ..Bounds::default()
+        };
+        for (i, file) in files.iter_mut().enumerate() {
+            let field = format!("scenes.files[{i}]");
+            let path = self.path(&field, &file.path)?;
+            let hash =
+                fingerprint(&path, &bounds).map_err(|e| SpecError::new(&*field, e.to_string()))?;
+            if !file.sha256.is_empty() && file.sha256 != hash {
+                let what = format!(
+                    "{} has SHA-256 {hash}, the job says {}",
+                    path.display(),
+                    file.sha256
+                );
+                return Err(SpecError::new(field, what));
+            }
+            file.sha256 = hash;
+            file.path = path.display().to_string();
+        }
+        Ok(())
+    }
+}
+
+/// The place that `path` means in `base`, without `.` and `..`: what they mean in a shell. (Jobs on the wire must name
+/// places without them: there they would mean another folder to each machine.)
+///
+/// # Errors
+/// The path is empty, or there is no current folder.
+pub fn absolute(base: &Path, path: &str) -> Result<PathBuf, String> {
+    let whole = std::path::absolute(base.join(path)).map_err(|e| format!("{path:?}: {e}"))?;
+    let mut plain = PathBuf::new();
+    for part in whole.components() {
+        if part == Component::ParentDir {
+            // The folder above a link's target is not the one above the link.
+            plain = plain.canonicalize().unwrap_or(plain);
+            plain.pop();
+        } else {
+            plain.push(part);
+        }
+    }
+    Ok(plain)
+}

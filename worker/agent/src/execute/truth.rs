@@ -1,0 +1,153 @@
+//! What a stage needs to be known of scenes. Imports may lack some of the truth; what is stored in its place stands for
+//! nothing, and a network would learn it as if it were true.
+
+use picofarm_proto::model::{
+    TrainSettings,
+    train::{ShadowVariant, TRUTH, Target},
+};
+
+use super::TaskError;
+
+/// Scenes that an error names.
+const NAMED: usize = 5;
+
+/// A quantity that a stage cannot do without.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Need {
+    /// z-depth that a network learns.
+    Depth,
+    /// z-depth that two-bounce times follow from.
+    DepthOfTimes,
+    /// Which pixels a spot lights.
+    Visibility,
+    /// Which pixels are mirrors.
+    Specular,
+    /// Lengths of the beams, which two-bounce times begin with.
+    Paths,
+}
+
+impl Need {
+    /// Its name in a manifest's list of what is missing.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Depth | Self::DepthOfTimes => "depth",
+            Self::Visibility => "visibility",
+            Self::Specular => "specular",
+            Self::Paths => "spots.path",
+        }
+    }
+
+    /// What it is needed for, and what can be done where it is missing.
+    fn said(self) -> (&'static str, &'static str) {
+        let own = "import these scenes with it, or keep them in a data set of their own";
+        match self {
+            Self::Depth => ("a \"tof\" network learns it and is judged by it", own),
+            Self::DepthOfTimes => (
+                "the shadow network is given two-bounce times that follow from it",
+                "import these scenes with it, or take the times from a \"tof\" model",
+            ),
+            Self::Visibility => ("a \"shadow\" network learns it and is judged by it", own),
+            Self::Specular => ("a \"specular\" network learns it and is judged by it", own),
+            Self::Paths => (
+                "the two-bounce times that the shadow network is given begin with the lengths of the beams",
+                "import these scenes with the lengths, or with straight_beams (--straight-beams) if no mirror folds a beam",
+            ),
+        }
+    }
+}
+
+/// What two-bounce times need that are given to a shadow network; from the truth's depth or a model's.
+pub(super) fn of_times(timed: bool, from_truth: bool) -> Vec<Need> {
+    match (timed, from_truth) {
+        (false, _) => Vec::new(),
+        (true, false) => vec![Need::Paths],
+        (true, true) => vec![Need::DepthOfTimes, Need::Paths],
+    }
+}
+
+/// What a network of these settings is trained and judged with.
+pub(super) fn of_training(settings: &TrainSettings) -> Vec<Need> {
+    match settings.target {
+        Target::Tof => vec![Need::Depth],
+        Target::Specular => vec![Need::Specular],
+        Target::Shadow => {
+            let variant = settings.shadow.variant;
+            let timed = matches!(variant, ShadowVariant::Concat | ShadowVariant::Difference);
+            let mut needs = of_times(timed, settings.shadow.tof == TRUTH);
+            needs.insert(0, Need::Visibility);
+            needs
+        }
+    }
+}
+
+/// Refuses scenes of which something is not known that is needed; `missing` holds what is not known of which.
+///
+/// # Errors
+/// [`TaskError::User`] naming data set, quantity, the first scenes, and what can be done.
+pub(super) fn check(
+    place: &str,
+    needs: &[Need],
+    missing: &[(u64, Vec<String>)],
+) -> Result<(), TaskError> {
+    for need in needs {
+        let lacks = |names: &Vec<String>| names.iter().any(|name| name == need.name());
+        let without = missing.iter().filter(|(_, names)| lacks(names));
+        let without: Vec<u64> = without.map(|(scene, _)| *scene).collect();
+        if without.is_empty() {
+            continue;
+        }
+        let (why, remedy) = need.said();
+        return Err(TaskError::User(format!(
+            "source: {} of {place} lack {} ({}): their import did not have it, and {why}; {remedy}",
+            match without.len() {
+                1 => "1 scene".to_owned(),
+                n => format!("{n} scenes"),
+            },
+            need.name(),
+            named(&without),
+        )));
+    }
+    Ok(())
+}
+
+fn named(scenes: &[u64]) -> String {
+    let first: Vec<String> = scenes.iter().take(NAMED).map(u64::to_string).collect();
+    let more = match scenes.len().saturating_sub(NAMED) {
+        0 => String::new(),
+        n => format!(" and {n} more"),
+    };
+    format!("scene {}{more}", first.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scenes_without_what_is_needed_are_named_with_what_to_do() {
+        let lacking = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
+        let missing: Vec<(u64, Vec<String>)> = (0..8)
+            .map(|scene| (scene, lacking(&["normal", "depth"])))
+            .chain([(9, lacking(&["spots.path"]))])
+            .collect();
+        assert_eq!(
+            check("a/b", &[Need::Visibility, Need::Specular], &missing).ok(),
+            Some(())
+        );
+        let said = check("a/b", &[Need::Depth], &missing)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            said.contains("8 scenes of a/b lack depth (scene 0, 1, 2, 3, 4 and 3 more)"),
+            "{said}"
+        );
+        let times = of_times(true, false);
+        let said = check("a/b", &times, &missing).unwrap_err().to_string();
+        assert!(
+            said.contains("1 scene of a/b lack spots.path (scene 9)"),
+            "{said}"
+        );
+        assert!(said.contains("--straight-beams"), "{said}");
+        assert_eq!(of_times(false, true), []);
+    }
+}

@@ -1,0 +1,348 @@
+//! What every kind of task keeps to, whatever it does. The suite takes the kinds from the executor: one that is not in the
+//! jobs below makes it fail.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs,
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use picofarm_agent::{
+    Control, Executor, Output, StorePrefixes, Submission, Task, TaskError, TaskExecutor, resolve,
+};
+use picofarm_files::Opener;
+use picofarm_proto::{
+    ids::JobId,
+    key::stage_key,
+    model::{
+        JobSpec, StageSpec,
+        memory::{Known, Shape, peak_bytes},
+    },
+};
+use serde_json::{Value, json};
+use tokio::runtime::{Handle, Runtime};
+use uuid::Uuid;
+
+const SCENES: u64 = 4;
+
+/// Every kind but imports, whose scenes the last of them writes.
+fn first_job(store: &str) -> Value {
+    let scenes = json!({"kind": "primitive", "count": SCENES, "seed": 5, "spots": 4});
+    let render = json!({"resolution": 16, "samples": 2});
+    let network = json!({"width": 2, "levels": 2});
+    json!({"name": "kinds", "stage": [
+        {"name": "rooms", "scenes": scenes, "render": render, "output": {"store": store, "dataset": "rooms"}},
+        {"name": "joined", "scenes": scenes, "render": render, "parts": 2,
+         "output": {"store": store, "dataset": "joined"}},
+        {"kind": "generate", "scenes": scenes, "generate": {"dest": format!("{store}/files")}},
+        {"kind": "reprocess", "source": "rooms", "reprocess": {"sensor": {"dark_per_bin": 0.1}},
+         "output": {"store": store, "dataset": "dark", "profile": "counts-u16"}},
+        {"kind": "split", "source": "rooms", "split": {"counts": [2, 1, 1]}},
+        {"kind": "verify", "source": "rooms"},
+        {"kind": "train", "source": "rooms", "needs": ["split"], "train": {"target": "tof", "model": "m",
+         "input": {"bins": 8}, "net": network, "optimise": {"epochs": 2, "batch": 2}}},
+        {"kind": "evaluate", "source": "rooms", "evaluate": {"models": ["train"]}},
+        {"kind": "promote", "source": "rooms", "promote": {"model": "best", "among": ["train"]}},
+        {"kind": "infer", "source": "rooms", "infer": {"models": ["train"]},
+         "output": {"store": store, "dataset": "seen"}},
+        {"kind": "report", "report": {"name": "all", "models": ["train"], "pictures": 1}},
+        {"kind": "export", "source": "rooms", "export": {"dest": format!("{store}/release"), "format": "sb3d"}},
+    ]})
+}
+
+fn import_job(store: &str) -> Value {
+    json!({"name": "import", "stage": [
+        {"kind": "import", "import": {"folder": format!("{store}/release")},
+         "output": {"store": store, "dataset": "back"}},
+    ]})
+}
+
+/// A store, and what runs tasks.
+struct Place {
+    dir: tempfile::TempDir,
+    runtime: Runtime,
+}
+
+impl Place {
+    fn new() -> Self {
+        Self {
+            dir: tempfile::tempdir().unwrap(),
+            runtime: Runtime::new().unwrap(),
+        }
+    }
+
+    fn store(&self) -> String {
+        self.dir.path().display().to_string()
+    }
+
+    /// The stages of a job, as they are submitted.
+    fn stages(&self, job: Value) -> Vec<StageSpec> {
+        let mut spec: JobSpec = serde_json::from_value(job).unwrap();
+        let here = Submission {
+            base: self.dir.path(),
+            assets: &[],
+        };
+        for stage in &mut spec.stages {
+            resolve(&mut stage.task, &here).unwrap();
+        }
+        spec.resolve().unwrap();
+        spec.check().unwrap();
+        spec.check_places().unwrap();
+        for stage in &spec.stages {
+            stage.check_resolved().unwrap();
+        }
+        spec.stages
+    }
+
+    fn executor(&self) -> TaskExecutor {
+        let runtime: Handle = self.runtime.handle().clone();
+        TaskExecutor::new(&[], runtime, Opener::anywhere())
+    }
+
+    /// Runs one task on a worker of so many threads.
+    fn run(
+        &self,
+        stage: &StageSpec,
+        index: u64,
+        (threads, control): (usize, &Control),
+    ) -> Result<Output, TaskError> {
+        let leased = stage.only(index, index + 1);
+        let task = Task {
+            job: JobId::from_uuid(Uuid::nil()),
+            stage: stage_key(stage),
+            spec: Arc::new(leased),
+            index,
+        };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        let pool = pool.build().unwrap();
+        pool.install(|| self.executor().run(&task, control))
+    }
+
+    /// Runs all tasks of a stage: the SHA-256 of each result.
+    fn run_all(&self, stage: &StageSpec, threads: usize) -> Vec<String> {
+        let ran = (0..stage.tasks()).map(|index| {
+            let output = self.run(stage, index, (threads, &Control::default()));
+            let output = output.unwrap_or_else(|e| panic!("{} {index}: {e}", stage.name));
+            output.manifest_sha256
+        });
+        ran.collect()
+    }
+
+    /// All files of the store, but for how fast trainings were, which is no result.
+    fn files(&self) -> BTreeMap<PathBuf, Vec<u8>> {
+        let (mut found, mut folders) = (BTreeMap::new(), vec![self.dir.path().to_owned()]);
+        while let Some(folder) = folders.pop() {
+            for entry in fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() {
+                    folders.push(path);
+                } else if !path.ends_with("speed.json") {
+                    let bytes = fs::read(&path).unwrap();
+                    let name = path.strip_prefix(self.dir.path()).unwrap();
+                    found.insert(name.to_owned(), bytes);
+                }
+            }
+        }
+        found
+    }
+}
+
+fn assert_same(ours: &BTreeMap<PathBuf, Vec<u8>>, theirs: &BTreeMap<PathBuf, Vec<u8>>, what: &str) {
+    let names = |files: &BTreeMap<PathBuf, Vec<u8>>| files.keys().cloned().collect::<Vec<_>>();
+    assert_eq!(names(ours), names(theirs), "{what}");
+    for (name, bytes) in ours {
+        assert!(theirs[name] == *bytes, "{what}: {}", name.display());
+    }
+}
+
+/// Every stage of both jobs, run in turn; `each` is called before and after.
+fn every_kind(
+    place: &Place,
+    mut before: impl FnMut(&StageSpec),
+    mut after: impl FnMut(&StageSpec, Vec<String>),
+) {
+    let mut seen = BTreeSet::new();
+    for job in [first_job, import_job] {
+        for stage in place.stages(job(&place.store())) {
+            before(&stage);
+            let results = place.run_all(&stage, 2);
+            after(&stage, results);
+            seen.insert(stage.task.kind().to_owned());
+        }
+    }
+    let kinds: BTreeSet<String> = place.executor().kinds().into_keys().collect();
+    assert_eq!(seen, kinds, "the suite has a stage of every kind");
+}
+
+#[test]
+fn a_task_run_again_by_force_or_on_another_number_of_threads_gives_the_same_bytes() {
+    let place = Place::new();
+    every_kind(
+        &place,
+        |_| {},
+        |stage, results| {
+            let (name, files) = (&stage.name, place.files());
+            assert_eq!(place.run_all(stage, 1), results, "{name}");
+            assert_same(&place.files(), &files, name);
+            let forced = StageSpec {
+                force: true,
+                ..stage.clone()
+            };
+            assert_eq!(place.run_all(&forced, 3), results, "{name}, forced");
+            assert_same(&place.files(), &files, name);
+        },
+    );
+}
+
+#[test]
+fn a_task_that_is_stopped_first_leaves_what_a_calm_one_does() {
+    let (calm, struck) = (Place::new(), Place::new());
+    let mut expected = Vec::new();
+    every_kind(&calm, |_| {}, |_, results| expected.push(results));
+    let mut expected = expected.into_iter();
+    every_kind(
+        &struck,
+        |stage| {
+            let control = Control::default();
+            control.stop();
+            match struck.run(stage, 0, (2, &control)) {
+                Ok(_) | Err(TaskError::Stopped) => {}
+                Err(other) => panic!("{}: {other}", stage.name),
+            }
+        },
+        |stage, results| {
+            // A report says how fast its models were trained, which is another figure each time.
+            let expected = expected.next().unwrap();
+            if stage.task.kind() != "report" {
+                assert_eq!(results, expected, "{}", stage.name);
+            }
+        },
+    );
+}
+
+#[test]
+fn another_version_is_refused_with_its_field_and_both_versions() {
+    let place = Place::new();
+    every_kind(
+        &place,
+        |stage| {
+            let mut other = stage.clone();
+            let Some(version) = other.task.version_mut() else {
+                return;
+            };
+            *version = "another-1".into();
+            let field = stage.task.versioned().0;
+            match place.run(&other, 0, (1, &Control::default())) {
+                Err(TaskError::User(text)) => assert!(
+                    text.contains(field)
+                        && text.contains("another-1")
+                        && text.contains(stage.task.version()),
+                    "{text}"
+                ),
+                found => panic!("{}: {found:?}", stage.name),
+            }
+            let mut empty = stage.clone();
+            empty.task.version_mut().unwrap().clear();
+            let error = empty.check_resolved().unwrap_err();
+            assert_eq!(error.field, field);
+        },
+        |_, _| {},
+    );
+}
+
+#[test]
+fn a_task_is_allowed_in_its_store_and_refused_outside_of_it() {
+    let place = Place::new();
+    let inside = StorePrefixes::new(&[place.store()]).unwrap();
+    let outside = StorePrefixes::new(&["/elsewhere".to_owned()]).unwrap();
+    every_kind(
+        &place,
+        |stage| {
+            for index in 0..stage.tasks() {
+                let leased = stage.only(index, index + 1);
+                inside.check(&leased, index).unwrap();
+                let why = outside.check(&leased, index).unwrap_err();
+                assert!(why.contains("store prefixes"), "{}: {why}", stage.name);
+            }
+            let results = stage.task.results();
+            assert!(Path::new(results.store).starts_with(place.dir.path()));
+        },
+        |_, _| {},
+    );
+}
+
+#[test]
+fn a_job_survives_the_catalog_and_says_its_memory() {
+    let place = Place::new();
+    every_kind(
+        &place,
+        |stage| {
+            let text = serde_json::to_string(stage).unwrap();
+            let back: StageSpec = serde_json::from_str(&text).unwrap();
+            assert_eq!(&back, stage);
+            assert_eq!(stage_key(&back), stage_key(stage));
+            let shape = Shape {
+                height: 16,
+                width: 16,
+                bins: 637,
+                spots: 4,
+            };
+            let known = Known {
+                source: Some(shape),
+                networks: stage.task.network(&shape).into_iter().collect(),
+            };
+            // A report's depends on its models alone.
+            if stage.task.kind() != "report" {
+                let bytes = peak_bytes(&stage.task, &known, 2).unwrap();
+                assert!(
+                    (50 << 20..2 << 30).contains(&bytes),
+                    "{}: {bytes}",
+                    stage.name
+                );
+            }
+        },
+        |_, _| {},
+    );
+}
+
+#[test]
+fn damaged_histograms_are_the_tasks_own_failure_and_name_the_object() {
+    let place = Place::new();
+    let stages = place.stages(first_job(&place.store()));
+    for stage in &stages {
+        if matches!(stage.task.kind(), "render" | "part" | "split" | "train") {
+            place.run_all(stage, 2);
+        }
+    }
+    for scene in 0..SCENES {
+        let object = place
+            .dir
+            .path()
+            .join(format!("rooms/transient/c/{scene}/0/0/0"));
+        let mut bytes = fs::read(&object).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 0x55;
+        fs::write(&object, bytes).unwrap();
+    }
+    let mut tried = BTreeSet::new();
+    for stage in &stages {
+        let kind = stage.task.kind();
+        // Those that look at no histogram.
+        if stage.task.reads().is_none() || matches!(kind, "split" | "promote") {
+            continue;
+        }
+        let fresh = StageSpec {
+            force: true,
+            ..stage.clone()
+        };
+        match place.run(&fresh, 0, (2, &Control::default())) {
+            Err(TaskError::User(text)) => {
+                assert!(text.contains("rooms/transient/c/"), "{kind}: {text}");
+            }
+            found => panic!("{kind}: {found:?}"),
+        }
+        tried.insert(kind);
+    }
+    assert!(tried.len() >= 5, "{tried:?}");
+}

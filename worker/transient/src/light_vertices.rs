@@ -1,0 +1,199 @@
+//! Light vertices: surface points that spots light directly, drawn along the spots' own scattering and
+//! kept for a batch of camera paths. A camera vertex sees them as points of light. Together with plain
+//! connections, weighed by MIS, they bound both 1/d² singularities of paths of three bounces and more:
+//! the one at the spot and the one at the camera vertex.
+
+use std::f32::consts::PI;
+
+use picofarm_scene::{Material, Vec3};
+
+use crate::{
+    bsdf::Surface,
+    bvh::Stack,
+    caustic::Caustics,
+    emitter::{Columns, Emitters},
+    rng::Rng,
+    walk::Walk,
+    world::{Hit, lift},
+};
+
+/// One light vertex.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LightVertex {
+    pub hit: Hit,
+    /// Unit direction back towards the spot.
+    pub back: Vec3,
+    /// Flux that arrives, divided by the number of vertices drawn.
+    pub flux: f32,
+    /// Density per area of drawing it, times the weight of this technique in MIS.
+    pub density: f32,
+    /// Optical path from the laser, metres.
+    pub path_m: f64,
+    /// Emitter.
+    pub spot: usize,
+    /// Bounces up to and with this vertex, counted from the spot as the first.
+    pub bounces: u32,
+}
+
+/// The light vertices of one batch.
+#[derive(Debug, Default)]
+pub(crate) struct LightVertices {
+    pub list: Vec<LightVertex>,
+    columns: Columns,
+    /// Indices of those that are not Lambertian.
+    glossy: Vec<usize>,
+}
+
+impl LightVertices {
+    /// Draws `count` vertices anew, spread evenly over the spots. Vertices on mirrors are left out: a
+    /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them).
+    pub fn fill(&mut self, walk: &Walk, count: u32, rng: &mut Rng, stack: &mut Stack) {
+        let (world, emitters) = (walk.world, walk.emitters);
+        self.clear();
+        let spots = emitters.list.len();
+        if spots == 0 {
+            return;
+        }
+        let chance = 1.0 / spots as f32;
+        let shift = rng.uniform();
+        for l in 0..count {
+            // Strata over the spots, rotated.
+            let at = (l as f32 + rng.uniform()) / count as f32 + shift;
+            let spot = (((at - at.floor()) * spots as f32) as usize).min(spots - 1);
+            let e = &emitters.list[spot];
+            let Some((w, weight, pdf)) = e.surface.sample(e.n, e.back, rng) else {
+                continue;
+            };
+            let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
+                continue;
+            };
+            walk.choose_lobe(rng, &mut hit);
+            if weight == 0.0 || hit.surface.specular || hit.surface.strength == 0.0 {
+                continue;
+            }
+            let leg = hit.p - e.p;
+            let d2 = leg.dot(leg);
+            let flux = weight / (chance * count as f32);
+            self.push(LightVertex {
+                hit,
+                back: -w,
+                flux,
+                density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
+                path_m: e.path_m + world.metres(d2.sqrt()),
+                spot,
+                bounces: 2,
+            });
+        }
+    }
+
+    /// Draws vertices anew beyond near-mirrors, from `count` light paths.
+    pub fn fill_beyond(
+        &mut self,
+        (walk, caustics): (&Walk, &Caustics),
+        count: u32,
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) {
+        self.clear();
+        for l in 0..count {
+            if let Some(z) = caustics.trace(walk, (l, count), rng, stack) {
+                self.push(z);
+            }
+        }
+    }
+
+    fn clear(&mut self) {
+        self.list.clear();
+        self.glossy.clear();
+        self.columns.clear();
+    }
+
+    fn push(&mut self, y: LightVertex) {
+        let lambert = if y.hit.surface.diffuse() {
+            y.hit.surface.strength
+        } else {
+            self.glossy.push(self.list.len());
+            0.0
+        };
+        self.columns.push(y.hit.p, y.hit.n, y.flux * lambert);
+        self.list.push(y);
+    }
+
+    /// Writes the unshadowed contribution of every vertex to a surface point, MIS weight included.
+    pub fn weights(&self, x: &Hit, wo: Vec3, out: &mut Vec<f32>) {
+        out.clear();
+        out.resize(self.list.len(), 0.0);
+        if x.surface.diffuse() {
+            self.columns.irradiance(x.p, x.n, out);
+            for ((w, y), &s) in out.iter_mut().zip(&self.list).zip(&self.columns.strength) {
+                // irradiance / strength = cos cos / d²: the density of BSDF sampling times π.
+                let plain = *w / (s * PI);
+                let share = y.density / (y.density + plain);
+                *w = if *w > 0.0 {
+                    *w * x.surface.strength * share
+                } else {
+                    0.0
+                };
+            }
+            for &i in &self.glossy {
+                out[i] = self.weight(i, x, wo);
+            }
+        } else {
+            for (i, w) in out.iter_mut().enumerate() {
+                *w = self.weight(i, x, wo);
+            }
+        }
+    }
+
+    /// True where [`LightVertices::glossy_weights`] has something to give.
+    pub fn has_gloss(&self) -> bool {
+        let gloss = |&i: &usize| self.list[i].hit.surface.alpha > Material::SPECULAR_ALPHA;
+        self.glossy.iter().any(gloss)
+    }
+
+    /// As [`LightVertices::weights`], of conductors alone (of a mix its conductor) that are too rough for mirrors:
+    /// what vertices shared by a tile leave out.
+    pub fn glossy_weights(&self, x: &Hit, wo: Vec3, out: &mut Vec<f32>) {
+        out.clear();
+        out.resize(self.list.len(), 0.0);
+        for &i in &self.glossy {
+            let surface = self.list[i].hit.surface;
+            if surface.alpha > Material::SPECULAR_ALPHA {
+                let conductor = Surface {
+                    base: 0.0,
+                    ..surface
+                };
+                out[i] = self.weight_by(i, &conductor, x, wo);
+            }
+        }
+    }
+
+    fn weight(&self, i: usize, x: &Hit, wo: Vec3) -> f32 {
+        self.weight_by(i, &self.list[i].hit.surface, x, wo)
+    }
+
+    /// The weight of a vertex that scatters as `surface`.
+    fn weight_by(&self, i: usize, surface: &Surface, x: &Hit, wo: Vec3) -> f32 {
+        let y = &self.list[i];
+        let to = y.hit.p - x.p;
+        let d2 = to.dot(to);
+        let w = to / d2.sqrt();
+        let cos = -y.hit.n.dot(w);
+        if !(cos > 0.0 && x.n.dot(w) > 0.0) {
+            return 0.0;
+        }
+        let value = x.surface.scatter(x.n, wo, w) * surface.scatter(y.hit.n, y.back, -w);
+        let plain = x.surface.pdf(x.n, wo, w) * cos / d2;
+        value * y.flux / d2 * y.density / (y.density + plain)
+    }
+}
+
+/// Density per steradian at a spot, times this technique's weight in MIS. Both sides of the balance
+/// must use it.
+#[inline(always)]
+pub(crate) fn share(emitters: &Emitters, pdf: f32) -> f32 {
+    LIGHT_WEIGHT * pdf / emitters.list.len() as f32
+}
+
+/// Light vertices count as this many samples against one BSDF sample.
+pub(crate) const LIGHT_WEIGHT: f32 = 8.0;

@@ -1,0 +1,122 @@
+//! What somebody should know of a render before trusting it: beams that meet nothing, and an image without light. The image
+//! is right all the same, so these are words and no errors.
+
+use picofarm_scene::{Spot, Vec3};
+
+use crate::{api::Gate, emitter::Emitters, truth::Centres, world::World};
+
+/// Optical paths of two-bounce light, metres: over the spots and the points seen by the pixels' centres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Arrivals {
+    /// The shortest.
+    pub first: f64,
+    /// The longest.
+    pub last: f64,
+}
+
+/// Between which paths two-bounce light arrives; `None` where no pixel sees a surface, or no beam meets one. `lit(beam,
+/// pixel)` says which pixels a spot lights. No light of three and more bounces comes before the first of all pixels and
+/// spots, lit or not: no path is shorter than a straight one.
+pub(super) fn arrivals(
+    world: &World,
+    emitters: &Emitters,
+    centres: &Centres,
+    lit: impl Fn(usize, usize) -> bool,
+) -> Option<Arrivals> {
+    let mut found: Option<Arrivals> = None;
+    for emitter in &emitters.list {
+        for (pixel, hit) in centres.hits.iter().enumerate() {
+            let Some(hit) = hit.as_ref().filter(|_| lit(emitter.beam, pixel)) else {
+                continue;
+            };
+            let lengths = [emitter.p - hit.p, hit.p - Vec3::ZERO].map(|v| world.metres(v.length()));
+            let path = emitter.path_m + lengths[0] + lengths[1];
+            let all = found.get_or_insert(Arrivals {
+                first: path,
+                last: path,
+            });
+            all.first = all.first.min(path);
+            all.last = all.last.max(path);
+        }
+    }
+    found
+}
+
+/// Beams that meet nothing.
+pub(super) fn beams(spots: &[Option<Spot>]) -> Vec<String> {
+    const SHOWN: usize = 8;
+    let lost = spots.iter().enumerate().filter(|(_, spot)| spot.is_none());
+    let lost: Vec<String> = lost.map(|(beam, _)| beam.to_string()).collect();
+    match &lost[..] {
+        [] if spots.is_empty() => vec!["the laser has no beam: there is no light".into()],
+        [] => vec![],
+        all if all.len() == spots.len() => {
+            vec!["no beam of the laser meets a surface: there is no light".into()]
+        }
+        [one] => vec![format!("spot {one} hits nothing")],
+        many => {
+            let more = if many.len() > SHOWN { ", …" } else { "" };
+            let shown = many[..many.len().min(SHOWN)].join(", ");
+            vec![format!(
+                "{} of {} spots hit nothing: {shown}{more}",
+                many.len(),
+                spots.len()
+            )]
+        }
+    }
+}
+
+/// Why a gate sees no light, where that is certain beforehand: all comes after its end.
+pub(super) fn before_light(gate: &Gate, arrivals: Option<Arrivals>) -> Option<String> {
+    let end = end(gate);
+    let first = arrivals?.first;
+    (first >= end).then(|| {
+        format!(
+            "no light arrives within the gate: first light at {first:.2} m, gate ends at {end:.2} m"
+        )
+    })
+}
+
+/// Why there is no light in an image: `lit` are the arrivals of pixels that a spot lights, `any` those of all.
+pub(super) fn empty(
+    gate: &Gate,
+    spots: &[Option<Spot>],
+    (lit, any): (Option<Arrivals>, Option<Arrivals>),
+    outside: bool,
+) -> String {
+    const WORDS: &str = "the histogram is empty";
+    if spots.iter().all(Option::is_none) {
+        return format!("{WORDS}: no beam of the laser meets a surface");
+    }
+    if any.is_none() {
+        return format!("{WORDS}: the camera sees no surface");
+    }
+    if let Some(Arrivals { first, last }) = lit {
+        if first >= end(gate) {
+            return format!(
+                "{WORDS}: no light arrives within the gate: first light at {first:.2} m, gate ends at {:.2} m",
+                end(gate)
+            );
+        }
+        if last < gate.start_m {
+            return format!(
+                "{WORDS}: no light arrives within the gate: two-bounce light ends at {last:.2} m, gate starts at {:.2} m",
+                gate.start_m
+            );
+        }
+    }
+    match outside {
+        true => format!(
+            "{WORDS}: what light there is arrives outside of the gate, {:.2} to {:.2} m",
+            gate.start_m,
+            end(gate)
+        ),
+        false => format!(
+            "{WORDS}: no light finds a way from the spots to the camera; is the camera enclosed?"
+        ),
+    }
+}
+
+fn end(gate: &Gate) -> f64 {
+    gate.start_m + f64::from(gate.bins) * gate.bin_width_m
+}

@@ -1,0 +1,181 @@
+//! Exactly two bounces: stratified sub-pixel samples, each connected to every spot, a whole
+//! pixel's samples at once. No random walk.
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    api::Stop,
+    emitter::Emitters,
+    film::{Blocks, Film},
+    rng::Rng,
+    truth::Centres,
+    walk::{Scratch, Walk},
+    world::{Hit, World, lift},
+};
+
+/// How finely pixels are sampled.
+#[derive(Debug, Clone)]
+pub(crate) struct Sampling {
+    /// Strata a side in an ordinary pixel beside 64 camera paths, before rounding.
+    base: f32,
+    /// Row-major: the pixel or one of its neighbours shows a mirror or stands in a mirror spot's beam.
+    /// Decided from the centres alone, hence independent of the samples: no bias.
+    pub refined: Vec<bool>,
+}
+
+impl Sampling {
+    pub fn plan(world: &World, emitters: &Emitters, centres: &Centres, stop: Stop) -> Self {
+        let i = world.camera.intrinsics;
+        // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
+        // its width: wider pixels straddle more bins.
+        let pixel = 1.0 / i.fx.min(i.fy);
+        let base = 4.0 * (pixel * 128.0).sqrt();
+        let narrow = |k: usize| {
+            centres.hits[k].as_ref().is_some_and(|h| {
+                h.surface.specular
+                    || emitters.on_mirror.iter().any(|&e| {
+                        let e = &emitters.list[e];
+                        e.intensity((h.p - e.p).normalized()) > 0.0
+                    })
+            })
+        };
+        let (width, height) = (i.width as usize, i.height as usize);
+        let goes_on = |row: &usize| !row.is_multiple_of(64) || !stop.asked();
+        let rows = (0..height).take_while(goes_on);
+        let mut marked: Vec<bool> = rows
+            .flat_map(|row| row * width..(row + 1) * width)
+            .map(narrow)
+            .collect();
+        marked.resize(width * height, false);
+        let refined = (0..width * height)
+            .map(|k| {
+                let (row, col) = (k / width, k % width);
+                let rows = row.saturating_sub(1)..=(row + 1).min(height - 1);
+                rows.into_iter().any(|r| {
+                    let cols = col.saturating_sub(1)..=(col + 1).min(width - 1);
+                    cols.into_iter().any(|c| marked[r * width + c])
+                })
+            })
+            .collect();
+        Self { base, refined }
+    }
+
+    /// Strata a side (even) in ordinary pixels and where a narrow lobe may be seen. They grow with the
+    /// passes so that neither part of the histogram is much noisier than the other; `passes` = 0
+    /// is a render of two bounces only.
+    pub fn sides(&self, passes: u32) -> (u32, u32) {
+        let passes = if passes == 0 { 64 } else { passes };
+        let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
+        let side = 2 * (0.5 * side).round().clamp(1.0, 16.0) as u32;
+        (side, (4 * side).min(64))
+    }
+
+    /// How the two-bounce variance falls with the passes: as n^(−3/2) for n strata, since half of it
+    /// lies on edges between bins.
+    pub fn variance(&self, passes: u32) -> f64 {
+        let side = f64::from(self.sides(passes).0);
+        1.0 / (side * side * side)
+    }
+}
+
+/// Buffers of one thread.
+#[derive(Debug, Default)]
+pub(crate) struct Strata {
+    hits: Vec<Option<Hit>>,
+    /// Places of the hits, lifted off the surface.
+    lifted: Vec<Vec3>,
+    range_m: Vec<f64>,
+    /// `[stratum][spot]`.
+    weights: Vec<f32>,
+    ends: Vec<Vec3>,
+    ends_of: Vec<usize>,
+    blocked: Vec<bool>,
+    /// `[stratum][spot]`: slot, and value where the spot is seen.
+    found: Vec<(u32, f32)>,
+}
+
+impl Strata {
+    /// Adds one pixel's two-bounce samples to `blocks`; returns how many there were. `side` is even.
+    pub fn sample_pixel(
+        &mut self,
+        walk: &Walk,
+        film: &Film,
+        (row, col, side): (u32, u32, u32),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+        blocks: &mut Blocks,
+    ) -> u32 {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let (count, spots) = ((side * side) as usize, emitters.list.len());
+        self.hits.clear();
+        self.lifted.clear();
+        self.range_m.clear();
+        self.weights.clear();
+        self.weights.resize(count * spots, 0.0);
+        self.found.clear();
+        self.found.resize(count * spots, (0, 0.0));
+        for (stratum, weights) in self.weights.chunks_mut(spots).enumerate() {
+            // Four in a row are a block: two above, two below.
+            let (block, corner) = (stratum as u32 / 4, stratum as u32 % 4);
+            let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
+            let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
+            let d = world
+                .camera
+                .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
+            let hit = world
+                .closest(&mut scratch.stack, Vec3::ZERO, d)
+                .filter(|h| h.surface.strength > 0.0);
+            let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
+                let range = h.p.length();
+                emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
+                walk.keep_in_window(h.p, world.metres(range), weights);
+                (lift(h.p, h.n), range)
+            });
+            self.hits.push(hit);
+            self.lifted.push(lifted);
+            self.range_m.push(world.metres(range));
+        }
+        for (spot, e) in emitters.list.iter().enumerate() {
+            self.ends.clear();
+            self.ends_of.clear();
+            for stratum in 0..count {
+                if self.weights[stratum * spots + spot] > 0.0 {
+                    self.ends.push(self.lifted[stratum]);
+                    self.ends_of.push(stratum);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            world.bvh.occluded_bundle(
+                &mut scratch.stack,
+                emitters.lifted[spot],
+                &self.ends,
+                &mut self.blocked,
+            );
+            for (&stratum, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                let hit = self.hits[stratum].as_ref().filter(|_| !blocked);
+                if let Some(h) = hit {
+                    let leg = world.metres((e.p - h.p).length());
+                    let slot = film.slot(e.path_m + leg + self.range_m[stratum]);
+                    let at = stratum * spots + spot;
+                    self.found[at] = (slot as u32, self.weights[at]);
+                }
+            }
+        }
+        for (stratum, found) in self.found.chunks(spots).enumerate() {
+            let sign = if matches!(stratum % 4, 0 | 3) {
+                1.0
+            } else {
+                -1.0
+            };
+            for (spot, &(slot, value)) in found.iter().enumerate() {
+                if value > 0.0 {
+                    blocks.add(film, slot as usize, value, sign, spot);
+                }
+            }
+            if stratum % 4 == 3 {
+                blocks.finish();
+            }
+        }
+        count as u32
+    }
+}
