@@ -25,6 +25,7 @@ pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
+pub use secrets::without_secrets;
 pub use sweep::{Sweep, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.

@@ -158,7 +158,7 @@ fn show_settings(resolved: &Resolved, output: Output) {
         .map(|(name, source)| {
             let value = match &values[name] {
                 serde_json::Value::Null => String::new(),
-                serde_json::Value::String(text) => text.clone(),
+                serde_json::Value::String(text) => args::without_secrets(text),
                 other => other.to_string(),
             };
             vec![(*name).to_owned(), value, source.clone()]

@@ -5,6 +5,8 @@ use std::{
     process::Command,
 };
 
+use crate::wait::until;
+
 /// A tmpfs; unmounted with the value.
 pub struct Tmpfs(PathBuf);
 
@@ -46,7 +48,7 @@ impl Tmpfs {
     ///
     /// # Panics
     /// When there is no `mount`.
-    pub fn try_remount(&self, options: &str) -> bool {
+    fn try_remount(&self, options: &str) -> bool {
         let output = Command::new("mount")
             .args(["-o", &format!("remount,{options}")])
             .arg(&self.0)
@@ -54,12 +56,26 @@ impl Tmpfs {
         output.expect("there is `mount`").status.success()
     }
 
-    /// Leaves `kib` KiB free until [`Tmpfs::widen`].
+    /// Makes it read-only, in a moment in which nobody writes: in others the system refuses.
     ///
     /// # Panics
-    /// When the system refuses.
+    /// When the system refuses for too long.
+    pub fn forbid_writes(&self) {
+        until("a moment in which nobody writes", || {
+            self.try_remount("ro").then_some(())
+        });
+    }
+
+    /// Leaves at most `kib` KiB free until [`Tmpfs::widen`]. Others may be writing: where more was used than had been
+    /// counted, the system refuses the size, and it is counted again.
+    ///
+    /// # Panics
+    /// When the system refuses for too long.
     pub fn fill(&self, kib: u64) {
-        self.remount(&format!("size={}k", self.used_kib() + kib));
+        until("a size that the system takes", || {
+            self.try_remount(&format!("size={}k", self.used_kib() + kib))
+                .then_some(())
+        });
     }
 
     /// Gives it `mib` MiB.

@@ -80,10 +80,7 @@ impl Store {
                 disk.widen(DISK_MIB);
             }
             Self::Disk(disk) => {
-                // While somebody writes, the system refuses.
-                until("a moment in which nobody writes", || {
-                    disk.try_remount("ro").then_some(())
-                });
+                disk.forbid_writes();
                 sleep(Duration::from_secs(1) + millis(rng, 3_000));
                 disk.remount("rw");
             }

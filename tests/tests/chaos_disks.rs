@@ -139,10 +139,7 @@ impl Site {
                 self.store.widen(DISK_MIB);
             }
             5 => {
-                // While somebody writes, the system refuses.
-                until("a moment in which nobody writes", || {
-                    self.store.try_remount("ro").then_some(())
-                });
+                self.store.forbid_writes();
                 sleep(Duration::from_secs(1) + millis(3_000));
                 self.store.remount("rw");
             }

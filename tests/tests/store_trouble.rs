@@ -70,8 +70,7 @@ fn a_full_disk_stops_no_process_and_loses_nothing() {
     let Some(half) = Half::done("disk-full") else {
         return;
     };
-    let room = half.disk.used_kib() + 8;
-    half.disk.remount(&format!("size={room}k"));
+    half.disk.fill(8);
     half.grow_through("full", "size=64m");
 }
 
@@ -80,7 +79,7 @@ fn a_read_only_store_stops_no_process_and_loses_nothing() {
     let Some(half) = Half::done("read-only") else {
         return;
     };
-    half.disk.remount("ro");
+    half.disk.forbid_writes();
     half.grow_through("read-only", "rw");
 }
 

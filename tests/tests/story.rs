@@ -262,6 +262,10 @@ fn settings_come_from_flag_then_environment_then_file() {
     );
     let (value, source) = setting(&set, &["--coordinator", "http://flag:3"]);
     assert_eq!((value.as_str(), source.as_str()), ("http://flag:3", "flag"));
+    let secret = cli
+        .clone()
+        .with("PICOFARM_COORDINATOR", "http://me:hush@environment:2");
+    assert_eq!(setting(&secret, &[]).0, "http://…@environment:2");
 
     fs::write(scratch.join("picofarm.toml"), "cordinator = \"x\"\n").unwrap();
     cli.run(&["config"]).fails(3, &["cordinator"]);

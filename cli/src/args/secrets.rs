@@ -22,7 +22,7 @@ pub(super) fn hidden(mut error: clap::Error) -> clap::Error {
 }
 
 /// A text without what stands before the `@` and after the `?` of a URL.
-fn without_secrets(text: &str) -> String {
+pub fn without_secrets(text: &str) -> String {
     let Some((scheme, rest)) = text.split_once("://") else {
         return text.to_owned();
     };
