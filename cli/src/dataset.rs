@@ -168,7 +168,7 @@ pub async fn open(place: &str) -> Result<Dataset> {
     Dataset::open(store, prefix).await.map_err(failed)
 }
 
-pub(crate) fn failed(error: DatasetError) -> CliError {
+pub fn failed(error: DatasetError) -> CliError {
     let code = match &error {
         DatasetError::Damaged { .. }
         | DatasetError::Conflict { .. }

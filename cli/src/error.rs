@@ -64,6 +64,17 @@ impl CliError {
     }
 }
 
+/// What this program was built without, and how to have it.
+pub fn not_built(feature: &str, what: &str) -> CliError {
+    CliError::new(
+        Code::Resource,
+        format!("this picofarm was built without {what}"),
+    )
+    .hint(format!(
+        "build it with `cargo build --release --features {feature}`, or with `--features full` for everything"
+    ))
+}
+
 /// A text behind its mark; further lines are indented. A message may quote what others wrote, and no line of that shall
 /// look like one of ours.
 fn marked(mark: &str, text: &str) -> String {

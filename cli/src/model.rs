@@ -1,6 +1,7 @@
 //! `picofarm model …`: the models that a store keeps.
 
 mod care;
+#[cfg(feature = "networks")]
 mod report;
 
 use std::{
@@ -12,6 +13,8 @@ use picofarm_dataset::{Checkpoint, Evaluation, ModelManifest, Models, open_store
 use picofarm_proto::show;
 use serde_json::{Value, json};
 
+#[cfg(not(feature = "networks"))]
+use crate::error::not_built;
 use crate::{
     args::Model as Command,
     dataset::failed,
@@ -42,6 +45,9 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             force,
             dry_run,
         } => care::remove(&store, &name, (force, dry_run), output).await,
+        #[cfg(not(feature = "networks"))]
+        Command::Report { .. } => Err(not_built("networks", "reports of models")),
+        #[cfg(feature = "networks")]
         Command::Report {
             store,
             names,

@@ -7,7 +7,7 @@ here=$(cd "$(dirname "$0")" && pwd)
 
 program=${2:-}
 if [ -z "$program" ]; then
-  (cd "$here" && cargo build --release -p picofarm)
+  (cd "$here" && cargo build --release --features full)
   program=${CARGO_TARGET_DIR:-$here/../../target}/release/picofarm
 fi
 tag=${1:-picofarm:$("$program" --version | cut -d' ' -f2)}

@@ -8,7 +8,7 @@ use std::{
 };
 
 use rustls::{
-    crypto::aws_lc_rs,
+    crypto::ring,
     pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
     sign::CertifiedKey,
 };
@@ -192,7 +192,7 @@ impl Pair {
             )
         })?;
         let described = Described::of(&chain[0]).expect("it was described when it was read");
-        let matched = CertifiedKey::from_der(chain, secret, &aws_lc_rs::default_provider());
+        let matched = CertifiedKey::from_der(chain, secret, &ring::default_provider());
         matched.map_err(|e| {
             let what = match e {
                 rustls::Error::InconsistentKeys(_) => format!(

@@ -3,8 +3,8 @@
 //! Cargo tells only the tests of its own package where a binary is (`CARGO_BIN_EXE_…`), and builds it only for them.
 //! So it is asked for it: `cargo build --bin picofarm`, once a test process. That costs a third of a second when
 //! nothing changed, can never test a stale program, and is safe in parallel, because Cargo locks its target folder.
-//! Two arguments keep it from compiling the dependencies a second time with other features: `--workspace`, as the
-//! tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
+//! Three arguments keep it from compiling the dependencies a second time with other features: `--workspace` and
+//! `--features picofarm/full`, as the tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
 
 use std::{
     env,
@@ -48,6 +48,8 @@ fn build() -> PathBuf {
         .args([
             "build",
             "--workspace",
+            "--features",
+            "picofarm/full",
             "--bin",
             "picofarm",
             "--test",

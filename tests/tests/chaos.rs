@@ -12,7 +12,7 @@ use std::{
 
 use picofarm_tests::{
     Cluster, Job, Process, Signal, farm::undisturbed, mount::Tmpfs, poison, proxy::Mode, rng::Rng,
-    s3, store, wait::until,
+    s3, store,
 };
 
 /// Short, so that what is frozen for longer is soon lost.

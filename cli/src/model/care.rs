@@ -154,15 +154,28 @@ async fn made_again(models: &Models, manifest: &ModelManifest) -> Result<Vec<Byt
     let mut made = vec![Bytes::from(pretty(&manifest.metrics))];
     let newest = models.newest_checkpoint(&manifest.name, &manifest.training_key);
     let newest = newest.await.map_err(failed)?;
-    let left = newest.and_then(|(_, content)| picofarm_model::train::left_by(&content).ok());
-    if let Some((weights, history)) = left {
-        made.push(weights.into());
-        let lines = history
-            .iter()
-            .map(|line| serde_json::to_string(line).expect("plain data") + "\n");
-        made.push(lines.collect::<String>().into());
+    if let Some((_, content)) = newest {
+        made.extend(left_by(&content)?);
     }
     Ok(made)
+}
+
+/// The weights and the history that a checkpoint holds; nothing where it cannot be read.
+#[cfg(feature = "networks")]
+fn left_by(checkpoint: &[u8]) -> Result<Vec<Bytes>> {
+    let Ok((weights, history)) = picofarm_model::train::left_by(checkpoint) else {
+        return Ok(Vec::new());
+    };
+    let lines = history
+        .iter()
+        .map(|line| serde_json::to_string(line).expect("plain data") + "\n");
+    Ok(vec![weights.into(), lines.collect::<String>().into()])
+}
+
+#[cfg(not(feature = "networks"))]
+fn left_by(_: &[u8]) -> Result<Vec<Bytes>> {
+    let what = "networks, which read the checkpoint that this repair begins with";
+    Err(crate::error::not_built("networks", what))
 }
 
 /// As trainings write `metrics.json`.

@@ -5,7 +5,7 @@ use std::{fmt, path::PathBuf, sync::Arc};
 use picofarm_proto::credentials::{CredentialError, Described, Pair, certificates};
 use rustls::{
     RootCertStore, ServerConfig,
-    crypto::aws_lc_rs,
+    crypto::ring,
     pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
     server::WebPkiClientVerifier,
 };
@@ -49,7 +49,7 @@ impl TlsFiles {
             digest.update((bytes.len() as u64).to_le_bytes());
             digest.update(bytes);
         }
-        let provider = Arc::new(aws_lc_rs::default_provider());
+        let provider = Arc::new(ring::default_provider());
         let unusable = |path: &PathBuf, e: &dyn fmt::Display| CredentialError::Unusable {
             path: path.clone(),
             what: format!("cannot be used: {e}"),

@@ -10,7 +10,7 @@ use picofarm_proto::{
     credentials::{CredentialError, Described, Secret, private},
     model::check_project,
 };
-use rustls::crypto::aws_lc_rs;
+use rustls::crypto::ring;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
@@ -206,7 +206,7 @@ impl Tokens {
             return Err("a token needs at least one role".into());
         }
         let mut random = [0; 32];
-        aws_lc_rs::default_provider()
+        ring::default_provider()
             .secure_random
             .fill(&mut random)
             .map_err(|_| "the system gives no random numbers")?;

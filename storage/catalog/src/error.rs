@@ -63,6 +63,14 @@ pub enum CatalogError {
         /// The database's words.
         what: String,
     },
+    /// This program has no driver for it.
+    #[error(
+        "catalog {place}: this picofarm was built without Postgres; build it with `--features postgres`, or name a SQLite file"
+    )]
+    NotBuilt {
+        /// The database, without its password.
+        place: String,
+    },
     /// No right to write.
     #[error("catalog {}: cannot be written (read-only file or folder); make it writable for this user or choose another path", path.display())]
     ReadOnly {

@@ -1,5 +1,5 @@
 //! What coordinators must remember: jobs, ranges, outputs, failures and history. One trait, [`Catalog`]; behind it
-//! SQLite for one coordinator and Postgres for several. Rows never leave this crate.
+//! SQLite for one coordinator and, with the feature `postgres`, Postgres for several. Rows never leave this crate.
 //!
 //! # Instances
 //! A *instance* is one life of a coordinator on a catalog. Each range that is pending or leased is some instance's or nobody's;
@@ -18,9 +18,10 @@ mod error;
 mod graph;
 mod listing;
 mod lock;
+mod migrations;
 mod place;
+#[cfg(feature = "postgres")]
 mod postgres;
-mod raw;
 mod record;
 mod refused;
 mod rights;
@@ -43,6 +44,7 @@ pub use changes::Changes;
 pub use error::CatalogError;
 pub use listing::{Forgotten, JobQuery, Page};
 pub use place::CatalogPlace;
+#[cfg(feature = "postgres")]
 pub use postgres::PostgresCatalog;
 pub use record::{
     Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,

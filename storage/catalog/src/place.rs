@@ -2,7 +2,9 @@
 
 use std::{convert::Infallible, fmt, path::PathBuf, str::FromStr, sync::Arc};
 
-use crate::{Catalog, CatalogError, PostgresCatalog, SqliteCatalog};
+#[cfg(feature = "postgres")]
+use crate::PostgresCatalog;
+use crate::{Catalog, CatalogError, SqliteCatalog};
 
 /// The place of a catalog. Its texts never show the password of a URL.
 #[derive(Clone, PartialEq, Eq)]
@@ -17,11 +19,18 @@ impl CatalogPlace {
     /// Opens the catalog, creating what is missing. `holder` tells people who has it.
     ///
     /// # Errors
-    /// As [`SqliteCatalog::open`] and [`PostgresCatalog::open`].
+    /// As `open` of [`SqliteCatalog`] and `PostgresCatalog`; [`CatalogError::NotBuilt`] for Postgres without the feature
+    /// `postgres`.
     pub async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError> {
         Ok(match self {
             Self::Sqlite(path) => Arc::new(SqliteCatalog::open(path, holder).await?),
+            #[cfg(feature = "postgres")]
             Self::Postgres(url) => Arc::new(PostgresCatalog::open(url, holder).await?),
+            #[cfg(not(feature = "postgres"))]
+            Self::Postgres(_) => {
+                let place = self.to_string();
+                return Err(CatalogError::NotBuilt { place });
+            }
         })
     }
 }
@@ -77,6 +86,20 @@ impl fmt::Debug for CatalogPlace {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(not(feature = "postgres"))]
+    #[tokio::test]
+    async fn a_program_without_postgres_says_so_and_how_to_have_it() {
+        let place: CatalogPlace = "postgres://me:secret@host/farm".parse().unwrap();
+        let Err(error) = place.open("a test").await else {
+            panic!("there is no Postgres in this program");
+        };
+        let said = error.to_string();
+        assert!(
+            said.contains("--features postgres") && !said.contains("secret"),
+            "{said}"
+        );
+    }
 
     #[test]
     fn a_url_is_shown_without_its_password() {

@@ -176,7 +176,7 @@ impl Access {
             Some(path) => certificates(path).ok()?.0,
             None => rustls_native_certs::load_native_certs().certs,
         });
-        let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
         let builder = ClientConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()
             .ok()?

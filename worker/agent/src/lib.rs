@@ -2,7 +2,8 @@
 //! into a published scene. Knows the wire, the data set, scenes and the renderer; never the catalog.
 //!
 //! [`run`] is the whole worker; [`run_with`] takes another [`Executor`], which is how tests look at the
-//! session without rendering.
+//! session without rendering. The features `networks` and `clouds` bring the kinds of task that train networks, and stores
+//! over a network.
 
 mod access;
 mod agent;
@@ -20,9 +21,11 @@ pub use allow::StorePrefixes;
 pub use config::{AgentConfig, AgentError, Summary};
 pub use execute::{Control, Executor, Output, Task, TaskError};
 pub use execute::{
-    Submission, TaskExecutor, absolute, check_memory, infer_version, model_version, render_bytes,
-    renderer_version, resolve, strategy, strategy_names,
+    Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version, resolve,
+    strategy, strategy_names,
 };
-pub use execute::{export, repair, report, reprocess, split};
+pub use execute::{export, repair, reprocess, split};
+#[cfg(feature = "networks")]
+pub use execute::{infer_version, model_version, report};
 pub use log::task_logs;
 pub use machine::{Memory, MemoryLimit, cores, memory_mib};

@@ -23,7 +23,7 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, PgPool,
-    migrate::{MigrateError, Migrator},
+    migrate::MigrateError,
     pool::PoolConnection,
     postgres::{PgConnectOptions, PgListener, PgPoolOptions, PgRow},
 };
@@ -32,6 +32,7 @@ use uuid::Uuid;
 use crate::{
     Catalog, CatalogError, Changes, Claim, Forgotten, Gone, Job, JobQuery, JobRecord, News,
     Outcome, Owned, Page, Range, RangeState, Recorded, Settled, Sight, Snapshot, Submission, Want,
+    migrations,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
@@ -44,8 +45,6 @@ crate::sql_listing::listing_queries!(
 );
 crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
-
-static MIGRATIONS: Migrator = sqlx::migrate!("migrations/postgres");
 
 /// Connections of one coordinator: one hears hints, two write, the others read; more than its heavy reads take at a time.
 const CONNECTIONS: u32 = 10;
@@ -201,24 +200,27 @@ async fn listen(pool: &PgPool) -> Result<PgListener, sqlx::Error> {
 }
 
 async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
-    let known = MIGRATIONS.iter().map(|m| m.version).max().unwrap_or(0);
+    let known = migrations::latest(&migrations::POSTGRES);
     // Several coordinators may start at once: the migrator takes an advisory lock.
-    MIGRATIONS.run(pool).await.map_err(|error| match error {
-        MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
-            CatalogError::Newer {
-                place: place.to_owned(),
-                found,
-                known,
+    migrations::POSTGRES
+        .run(pool)
+        .await
+        .map_err(|error| match error {
+            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
+                CatalogError::Newer {
+                    place: place.to_owned(),
+                    found,
+                    known,
+                }
             }
-        }
-        MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
-            errors::classify(place, e)
-        }
-        other => CatalogError::Unusable {
-            place: place.to_owned(),
-            what: format!("its schema is not this program's ({other})"),
-        },
-    })
+            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
+                errors::classify(place, e)
+            }
+            other => CatalogError::Unusable {
+                place: place.to_owned(),
+                what: format!("its schema is not this program's ({other})"),
+            },
+        })
 }
 
 #[async_trait]

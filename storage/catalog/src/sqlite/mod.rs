@@ -21,7 +21,7 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
-    migrate::{MigrateError, Migrator},
+    migrate::MigrateError,
     pool::PoolConnection,
     sqlite::{
         SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
@@ -34,6 +34,7 @@ use crate::{
     Catalog, CatalogError, Changes, Claim, Forgotten, Gone, Job, JobQuery, JobRecord, News,
     Outcome, Owned, Page, Recorded, Settled, Sight, Snapshot, Submission, Want,
     lock::CatalogLock,
+    migrations,
     record::{EventQuery, Holdups, ResultSet, Run, TaskRecord, Timing},
 };
 
@@ -41,8 +42,6 @@ crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
 crate::sql_listing::listing_queries!(sqlx::Sqlite, sqlx::SqliteConnection, super::SqliteRow, "");
 crate::sql_jobs::job_queries!(sqlx::SqliteConnection, super::SqliteRow);
 crate::sql_rights::rights_queries!(sqlx::SqliteConnection, super::SqliteRow);
-
-static MIGRATIONS: Migrator = sqlx::migrate!("migrations/sqlite");
 
 /// Read-only connections: more than the coordinator's heavy reads take at a time, so that its short ones need not wait.
 const READERS: u32 = 8;
@@ -152,8 +151,8 @@ impl SqliteCatalog {
 }
 
 async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), CatalogError> {
-    let known = MIGRATIONS.iter().map(|m| m.version).max().unwrap_or(0);
-    MIGRATIONS
+    let known = migrations::latest(&migrations::SQLITE);
+    migrations::SQLITE
         .run_direct(None, connection, false)
         .await
         .map_err(|error| match error {

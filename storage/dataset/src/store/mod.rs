@@ -1,20 +1,17 @@
 //! Stores from a path or URL, the check that a store is safe for several writers, and what killed writers leave.
 
-mod azure;
 mod bandwidth;
-mod client;
+#[cfg(feature = "clouds")]
+mod clouds;
 mod failure;
-mod gcs;
 mod local;
 mod place;
 mod probe;
-mod s3;
 mod writable;
 
 use std::sync::Arc;
 
 use object_store::ObjectStore;
-use object_store::limit::LimitStore;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 
@@ -28,15 +25,13 @@ pub(crate) use probe::PROBE;
 pub use probe::{PROBE_WITHIN, probe};
 pub use writable::{Writable, check_writable, local_ground};
 
-use bandwidth::Limited;
-use client::{CONCURRENCY, Settings};
 use place::Place;
 
 /// The store and the prefix in it for a local path, a `file://` URL, `s3://bucket/prefix`, `gs://bucket/prefix` (Google) or
 /// `az://container/prefix` (Azure). Neither folder, nor prefix need exist. Nothing is asked of the store yet.
 ///
 /// Local writes are flushed to the disk before they count, so that a manifest that exists after a power cut has its
-/// objects. Other stores are told where and who by the environment, as docs/stores.md lists. A store from here keeps its
+/// objects. Other stores need the feature `clouds`, and are told where and who by the environment, as docs/stores.md lists. A store from here keeps its
 /// connections and the limit of its requests in flight: open once, use for long. See [`limit_bandwidth`] too.
 ///
 /// # Errors
@@ -44,15 +39,10 @@ use place::Place;
 /// [`DatasetError::StoreSettings`] names a missing or unusable variable.
 pub fn open_store(url_or_path: &str) -> Result<(Arc<dyn ObjectStore>, Path), DatasetError> {
     if let Some(place) = Place::parse(url_or_path)? {
-        let variables = std::env::vars_os().filter_map(|(name, value)| {
-            Some((name.into_string().ok()?, value.into_string().ok()?))
-        });
-        let settings = Settings::of(&place, variables);
-        let store = match place.service {
-            Service::S3 => shared(s3::connect(&place, &settings)?),
-            Service::Gcs => shared(gcs::connect(&place, &settings)?),
-            Service::Azure => shared(azure::connect(&place, &settings)?),
-        };
+        #[cfg(feature = "clouds")]
+        let store = clouds::connect(&place)?;
+        #[cfg(not(feature = "clouds"))]
+        let store = not_built(&place)?;
         return Ok((store, place.prefix));
     }
     let path = local::local_path(url_or_path)?;
@@ -74,11 +64,12 @@ pub fn check_location(url_or_path: &str) -> Result<(), DatasetError> {
     }
 }
 
-/// A store over a network, as everybody here uses it.
-fn shared(store: impl ObjectStore) -> Arc<dyn ObjectStore> {
-    let store = LimitStore::new(store, CONCURRENCY);
-    match bandwidth::limits() {
-        limits if limits.any() => Arc::new(Limited::new(store, limits)),
-        _ => Arc::new(store),
-    }
+#[cfg(not(feature = "clouds"))]
+fn not_built(place: &Place) -> Result<Arc<dyn ObjectStore>, DatasetError> {
+    let scheme = place.service.scheme();
+    Err(DatasetError::UnsupportedStore {
+        url: format!("{scheme}://{}", place.bucket),
+        what: "this picofarm was built without object stores; build it with `--features clouds`, or name a folder"
+            .into(),
+    })
 }

@@ -34,15 +34,6 @@ impl Service {
         }
     }
 
-    /// How the variables that tell of it begin.
-    pub(super) fn variables(self) -> &'static str {
-        match self {
-            Self::S3 => "AWS_",
-            Self::Gcs => "GOOGLE_",
-            Self::Azure => "AZURE_",
-        }
-    }
-
     /// Where keys and addresses belong, which are no part of a URL.
     fn secrets(self) -> &'static str {
         match self {
@@ -124,14 +115,6 @@ impl Place {
             bucket: bucket.into(),
             prefix,
         }))
-    }
-
-    /// What its variables do not say, or say wrongly.
-    pub(super) fn settings_error(&self, what: impl Into<String>) -> DatasetError {
-        DatasetError::StoreSettings {
-            url: format!("{}://{}", self.service.scheme(), self.bucket),
-            what: what.into(),
-        }
     }
 }
 

@@ -1,6 +1,8 @@
 //! The seam between the session and the work: one [`Executor`] runs one task at a time and says how it ended.
 
+#[cfg(feature = "networks")]
 mod examples;
+#[cfg(feature = "networks")]
 mod gallery;
 mod kinds;
 mod memory;
@@ -11,6 +13,7 @@ mod runner;
 mod scenes;
 mod submission;
 mod subsets;
+#[cfg(feature = "networks")]
 mod truth;
 
 use std::{
@@ -29,11 +32,12 @@ use picofarm_proto::{
     model::{StageSpec, TaskAt},
 };
 
-use kinds::{Context, RunTask, STORE_PATIENCE, evaluate, part, render, train};
-pub use kinds::{
-    TaskExecutor, export, infer::infer_version, render::renderer_version, report, reprocess,
-    resolve, split, train::model_version,
-};
+use kinds::{Context, RunTask, STORE_PATIENCE, part, render};
+pub use kinds::{TaskExecutor, export, render::renderer_version, reprocess, resolve, split};
+#[cfg(feature = "networks")]
+use kinds::{evaluate, train};
+#[cfg(feature = "networks")]
+pub use kinds::{infer::infer_version, report, train::model_version};
 pub use memory::{check_memory, render_bytes};
 pub(crate) use runner::Runner;
 pub use submission::{Submission, absolute};

@@ -9,8 +9,8 @@ use std::{
 
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, Models, PROBE_WITHIN,
-    Profile, Subsets, open_store, probe,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, PROBE_WITHIN, Profile,
+    Subsets, open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -79,14 +79,20 @@ impl Stores {
     }
 
     /// What reaches stores, for threads other than the executor's.
+    #[cfg(feature = "networks")]
     pub(super) fn runtime(&self) -> &Handle {
         &self.runtime
     }
 
     /// The models of a store, to read and to write. The first use of a location proves that it is safe.
-    pub(super) fn models(&self, location: &str, control: &Control) -> Result<Models, TaskError> {
+    #[cfg(feature = "networks")]
+    pub(super) fn models(
+        &self,
+        location: &str,
+        control: &Control,
+    ) -> Result<picofarm_dataset::Models, TaskError> {
         let (store, prefix) = self.probed(location, control)?;
-        Ok(Models::new(store, &prefix))
+        Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
     /// Creates or opens the job's data set. The first use of a location proves that its store is safe.
@@ -121,9 +127,13 @@ impl Stores {
     }
 
     /// The models of a store, to read only; asks of it nothing else.
-    pub(super) fn source_models(&self, location: &str) -> Result<Models, TaskError> {
+    #[cfg(feature = "networks")]
+    pub(super) fn source_models(
+        &self,
+        location: &str,
+    ) -> Result<picofarm_dataset::Models, TaskError> {
         let (store, prefix) = self.source(location)?;
-        Ok(Models::new(store, &prefix))
+        Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
     /// A place to read from.

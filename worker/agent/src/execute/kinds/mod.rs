@@ -1,19 +1,26 @@
 //! The worker's executor: the table of all kinds of task, each of which runs in a file of its own here. What a kind is says
 //! [`picofarm_proto::model::kinds`].
 
+#[cfg(feature = "networks")]
 pub(super) mod evaluate;
 pub mod export;
 mod generate;
 pub(super) mod import;
+#[cfg(feature = "networks")]
 pub(super) mod infer;
 pub(super) mod part;
+#[cfg(feature = "networks")]
 mod promote;
 pub(super) mod render;
+#[cfg(feature = "networks")]
 pub mod report;
 pub mod reprocess;
 pub mod split;
+#[cfg(feature = "networks")]
 pub(super) mod train;
 mod verify;
+#[cfg(not(feature = "networks"))]
+mod without_networks;
 
 use std::{collections::BTreeMap, path::PathBuf, time::Duration};
 
@@ -33,7 +40,7 @@ pub(in crate::execute) const STORE_PATIENCE: Duration = Duration::from_secs(120)
 
 /// How tasks of a kind run.
 pub(in crate::execute) trait RunTask {
-    /// Version of the code that decides the bytes of its results.
+    /// Version of the code that decides the bytes of its results; empty where this program was built without it.
     fn code_version() -> String
     where
         Self: Sized;
@@ -65,6 +72,7 @@ pub(in crate::execute) struct Context {
     /// What opens scene files and imports.
     pub files: Opener,
     /// The networks that were asked last.
+    #[cfg(feature = "networks")]
     pub models: infer::ModelCache,
 }
 
@@ -118,6 +126,13 @@ fn version(kind: &str) -> String {
     found.map_or_else(String::new, |(_, version)| version)
 }
 
+/// Says how to have a kind that this program was built without.
+fn not_built(kind: &str) -> String {
+    format!(
+        "this picofarm was built without networks, which stages of kind {kind:?} need; build it with `--features networks`"
+    )
+}
+
 /// Fills in, where a job is submitted, what its tasks must be certain of: absolute places, this program's version,
 /// furniture, the content of files; and checks what only the code that runs them knows.
 ///
@@ -131,6 +146,9 @@ pub fn resolve(task: &mut TaskSpec, here: &Submission<'_>) -> Result<(), SpecErr
         *store = here.store(field, store)?;
     }
     let (field, ours) = (task.versioned().0, version(task.kind()));
+    if ours.is_empty() {
+        return Err(SpecError::new("kind", not_built(task.kind())));
+    }
     if let Some(asked) = task.version_mut() {
         if !asked.is_empty() && *asked != ours {
             let what = format!(
@@ -156,6 +174,7 @@ impl TaskExecutor {
             libraries: scenes::find_libraries(asset_dirs),
             stores: Stores::new(runtime, STORE_PATIENCE),
             sources: import::Sources::default(),
+            #[cfg(feature = "networks")]
             models: infer::ModelCache::default(),
         })
     }
@@ -172,8 +191,10 @@ impl TaskExecutor {
 
 impl Executor for TaskExecutor {
     fn kinds(&self) -> BTreeMap<String, String> {
-        let kinds = versions().into_iter();
-        kinds
+        let built = versions()
+            .into_iter()
+            .filter(|(_, version)| !version.is_empty());
+        built
             .map(|(kind, version)| (kind.to_owned(), version))
             .collect()
     }
@@ -186,6 +207,9 @@ impl Executor for TaskExecutor {
     fn run(&self, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let spec = &task.spec.task;
         let ((field, asked), ours) = (spec.versioned(), version(spec.kind()));
+        if ours.is_empty() {
+            return Err(TaskError::User(not_built(spec.kind())));
+        }
         if asked != ours {
             return Err(TaskError::User(format!(
                 "{field}: the job asks for {asked:?}, this worker has {ours:?}; submit the job again with this version, or \

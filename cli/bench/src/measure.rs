@@ -1,0 +1,129 @@
+//! One measured render: CPU seconds over all threads, wall seconds, and the render itself.
+
+use std::{
+    sync::Mutex,
+    time::{Duration, Instant},
+};
+
+use picofarm_scene::Scene;
+use picofarm_transient::{Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy};
+use rustix::time::{ClockId, clock_gettime};
+use tokio_util::sync::CancellationToken;
+
+use picofarm_cli::{
+    args::BenchRender,
+    error::{CliError, Code, Result},
+    output::{Meter, Output},
+    roles, signals,
+};
+
+/// What one render took.
+pub struct Measured {
+    /// CPU seconds of this process, user and system, over all threads.
+    pub cpu_s: f64,
+    pub wall_s: f64,
+    pub rendered: Rendered,
+}
+
+/// CPU time that this process has used.
+pub(super) fn cpu_time() -> Duration {
+    let now = clock_gettime(ClockId::ProcessCPUTime);
+    Duration::new(
+        now.tv_sec.unsigned_abs(),
+        u32::try_from(now.tv_nsec).unwrap_or(0),
+    )
+}
+
+/// Settings of a benchmark's renders: without one-bounce peaks, which are analytic.
+pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
+    Settings {
+        gate: Gate {
+            start_m: args.gate.gate_start_m,
+            bin_width_m: args.gate.bin_width_m,
+            bins: args.gate.bins,
+        },
+        budget,
+        max_bounces: None,
+        one_bounce: false,
+        seed,
+        split: false,
+        groups: vec![],
+        strategy: Strategy::default(),
+    }
+}
+
+/// Renders and measures, with a thread pool of its own.
+pub struct Bench<'a> {
+    pool: rayon::ThreadPool,
+    output: Output,
+    stop: &'a CancellationToken,
+}
+
+impl<'a> Bench<'a> {
+    /// With `threads` threads; `None` = all cores.
+    ///
+    /// # Errors
+    /// The threads cannot be started.
+    pub fn new(
+        threads: Option<usize>,
+        output: Output,
+        stop: &'a CancellationToken,
+    ) -> Result<Self> {
+        let threads = threads.unwrap_or_else(roles::cores).max(1);
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .map_err(|e| {
+                let what = format!("cannot start {threads} threads: {e}");
+                CliError::new(Code::Resource, what)
+            })?;
+        Ok(Self { pool, output, stop })
+    }
+
+    /// Renders `scene`; `what` is shown meanwhile.
+    ///
+    /// # Errors
+    /// What the renderer refuses, or an interruption.
+    pub fn render(&self, scene: &Scene, settings: &Settings, what: &str) -> Result<Measured> {
+        let watch = Watch {
+            meter: Mutex::new(Meter::new(self.output)),
+            what,
+            stop: self.stop,
+        };
+        let (cpu, wall) = (cpu_time(), Instant::now());
+        let rendered = self
+            .pool
+            .install(|| picofarm_transient::render(scene, settings, &watch));
+        let (cpu_s, wall_s) = (
+            cpu_time().saturating_sub(cpu).as_secs_f64(),
+            wall.elapsed().as_secs_f64(),
+        );
+        if let Ok(meter) = watch.meter.into_inner() {
+            meter.finish();
+        }
+        let rendered = rendered.map_err(|e| match e {
+            RenderError::Stopped => signals::interrupted("what was measured so far is lost"),
+            e => CliError::input(e),
+        })?;
+        Ok(Measured {
+            cpu_s,
+            wall_s,
+            rendered,
+        })
+    }
+}
+
+struct Watch<'a> {
+    meter: Mutex<Meter>,
+    what: &'a str,
+    stop: &'a CancellationToken,
+}
+
+impl Progress for Watch<'_> {
+    fn at(&self, done: f32) -> bool {
+        if let Ok(mut meter) = self.meter.try_lock() {
+            meter.at(f64::from(done), self.what.to_owned());
+        }
+        !self.stop.is_cancelled()
+    }
+}

@@ -1,0 +1,339 @@
+//! `picofarm bench model`: how long a training step takes, beside other forms and other programs in the same run.
+
+use std::{
+    fs,
+    io::{BufRead, BufReader, Write},
+    path::Path,
+    process::{Child, ChildStdin, ChildStdout, Command, Stdio},
+    time::Instant,
+};
+
+use picofarm_model::{
+    ModelError,
+    input::{Batch, Target},
+    net::{Architecture, NetSpec, Precision},
+    train::Learner,
+    trial::Trial,
+};
+use serde::{Deserialize, Serialize};
+use tokio_util::sync::CancellationToken;
+
+use picofarm_cli::{
+    args::{BenchModel, Kind, Learns, Numbers},
+    error::{CliError, Code, Result, io},
+    output::{Output, bytes, table},
+};
+
+/// Steps of AdamW in a record.
+const RECORDED: usize = 20;
+
+/// What was found.
+#[derive(Serialize)]
+struct Report {
+    trial: Trial,
+    parameters: usize,
+    /// Multiply-adds of a pass forward, a sample; the one-hot channels counted as if they were dense.
+    multiply_adds: Option<f64>,
+    threads: usize,
+    /// On a graphics processor; threads do not count then.
+    gpu: bool,
+    forms: Vec<Form>,
+    /// The largest difference between the outputs of the gather and the dense form.
+    forms_differ: Option<f64>,
+}
+
+/// One way of taking the step.
+#[derive(Serialize)]
+struct Form {
+    name: String,
+    /// Median over rounds, seconds.
+    step_s: f64,
+    samples_per_s: f64,
+    /// Median over rounds of this form's time over ours: above 1, ours is faster.
+    times_ours: f64,
+    /// Memory beyond what was there before, at most; of our own forms.
+    peak_bytes: Option<u64>,
+}
+
+pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Result<()> {
+    let trial = trial(args);
+    let device = match args.gpu {
+        true => picofarm_model::gpu().map_err(of_model)?,
+        false => picofarm_model::cpu(),
+    };
+    if let Some(path) = &args.record {
+        let record = trial.record(RECORDED, &device).map_err(of_model)?;
+        fs::write(path, record).map_err(|e| io(format!("--record {}", path.display()), &e))?;
+        let wrote = serde_json::json!({ "record": path, "trial": trial });
+        output.result(&wrote, || {
+            format!(
+                "wrote {}; python3 tests/peers/model_torch.py parity {} compares",
+                path.display(),
+                path.display()
+            )
+        });
+        return Ok(());
+    }
+    let mut peers = Vec::new();
+    let folder = tempfile::tempdir().map_err(|e| io("a temporary folder", &e))?;
+    if !args.peer.is_empty() {
+        let path = folder.path().join("record.safetensors");
+        let record = trial.record(0, &device).map_err(of_model)?;
+        fs::write(&path, record).map_err(|e| io(path.display(), &e))?;
+        for command in &args.peer {
+            peers.push(Peer::start(command, &path)?);
+        }
+    }
+    let mut forms: Vec<(String, Learner, Batch)> = Vec::new();
+    let (learner, batch) = trial.begin(&device).map_err(of_model)?;
+    let parameters = learner.parameters().learned();
+    let mut forms_differ = None;
+    let name = if trial.net.one_hot > 0 {
+        "ours (gather)"
+    } else {
+        "ours"
+    };
+    if trial.net.one_hot > 0 && trial.net.architecture == Architecture::Unet2d {
+        let (dense, wide) = trial.dense(&device).map_err(of_model)?;
+        let (a, b) = (learner.predict(&batch), dense.predict(&wide));
+        let differ = a.iter().zip(&b).map(|(a, b)| f64::from((a - b).abs()));
+        forms_differ = Some(differ.fold(0.0, f64::max));
+        forms.push((name.into(), learner, batch));
+        forms.push(("ours (dense one-hot)".into(), dense, wide));
+    } else {
+        forms.push((name.into(), learner, batch));
+    }
+    let mut peaks = Vec::new();
+    for (_, learner, batch) in &mut forms {
+        let before = reset_peak();
+        learner
+            .step(std::slice::from_ref(batch), trial.pace())
+            .map_err(of_model)?;
+        peaks.push(before.and_then(|b| Some(peak()?.saturating_sub(b))));
+    }
+    for peer in &mut peers {
+        peer.steps(1)?;
+    }
+    let mut seconds: Vec<Vec<f64>> = vec![Vec::new(); forms.len() + peers.len()];
+    for round in 0..args.rounds {
+        output.say(format!("round {} of {}", round + 1, args.rounds));
+        for ((_, learner, batch), to) in forms.iter_mut().zip(&mut seconds) {
+            let begun = Instant::now();
+            for _ in 0..args.steps {
+                learner
+                    .step(std::slice::from_ref(batch), trial.pace())
+                    .map_err(of_model)?;
+            }
+            to.push(begun.elapsed().as_secs_f64() / args.steps as f64);
+        }
+        for (peer, to) in peers.iter_mut().zip(&mut seconds[forms.len()..]) {
+            to.push(peer.steps(args.steps)? / args.steps as f64);
+        }
+        if stop.is_cancelled() {
+            return Err(CliError::new(Code::Interrupted, "stopped"));
+        }
+    }
+    let names = forms.iter().map(|(name, ..)| name.clone());
+    let names: Vec<String> = names.chain(peers.iter().map(|p| p.name.clone())).collect();
+    let report = Report {
+        parameters,
+        multiply_adds: trial.net.multiply_adds(trial.side),
+        threads: rayon::current_num_threads(),
+        gpu: args.gpu,
+        forms: names
+            .into_iter()
+            .enumerate()
+            .map(|(i, name)| {
+                let step_s = median(&seconds[i]);
+                let ratios: Vec<f64> = seconds[i]
+                    .iter()
+                    .zip(&seconds[0])
+                    .map(|(a, b)| a / b)
+                    .collect();
+                Form {
+                    name,
+                    step_s,
+                    samples_per_s: trial.batch as f64 / step_s,
+                    times_ours: median(&ratios),
+                    peak_bytes: peaks.get(i).copied().flatten(),
+                }
+            })
+            .collect(),
+        forms_differ,
+        trial,
+    };
+    output.result(&report, || text(&report));
+    Ok(())
+}
+
+fn trial(args: &BenchModel) -> Trial {
+    let target = match args.target {
+        Learns::Tof => Target::Tof,
+        Learns::Shadow => Target::Shadow,
+        Learns::Specular => Target::Specular,
+    };
+    let dense = args.bins as usize;
+    Trial {
+        target,
+        net: NetSpec {
+            architecture: match args.net {
+                Kind::Unet2d => Architecture::Unet2d,
+                Kind::Unet25d => Architecture::Unet25d,
+            },
+            dense,
+            one_hot: if target == Target::Shadow { dense } else { 0 },
+            outputs: 1,
+            width: args.width as usize,
+            levels: args.levels as usize,
+            stem: args.stem as usize,
+            time: args.time as usize,
+            frozen: false,
+            precision: match args.precision {
+                Numbers::F32 => Precision::F32,
+                Numbers::Bf16 => Precision::Bf16,
+            },
+        },
+        batch: args.batch as usize,
+        side: args.side as usize,
+        learning_rate: 2e-4,
+        decay: 1e-3,
+        seed: 1,
+    }
+}
+
+fn of_model(error: ModelError) -> CliError {
+    CliError::input(error.to_string())
+}
+
+fn median(values: &[f64]) -> f64 {
+    let mut values = values.to_vec();
+    values.sort_by(f64::total_cmp);
+    let mid = values.len() / 2;
+    if values.len() % 2 == 1 {
+        values[mid]
+    } else {
+        f64::midpoint(values[mid - 1], values[mid])
+    }
+}
+
+fn text(report: &Report) -> String {
+    let mut rows = vec![
+        ["form", "step", "samples/s", "time ÷ ours", "peak memory"]
+            .map(String::from)
+            .to_vec(),
+    ];
+    for form in &report.forms {
+        rows.push(vec![
+            form.name.clone(),
+            format!("{:.1} ms", 1e3 * form.step_s),
+            format!("{:.2}", form.samples_per_s),
+            format!("{:.2}", form.times_ours),
+            form.peak_bytes.map_or_else(String::new, bytes),
+        ]);
+    }
+    let mut out = format!("{} parameters", report.parameters);
+    if let Some(macs) = report.multiply_adds {
+        let rate = 3.0 * macs * report.forms[0].samples_per_s / 1e9;
+        out += &format!(
+            ", {:.2} G multiply-adds a sample forward; ours: {rate:.0} G a second with both gradients",
+            macs / 1e9
+        );
+    }
+    let on = match report.gpu {
+        true => "graphics processor".to_owned(),
+        false => format!("{} threads", report.threads),
+    };
+    out += &format!(", {on}\n\n{}", table(&rows));
+    if let Some(differ) = report.forms_differ {
+        out += &format!("\nlargest difference between gather and dense form: {differ:.1e}");
+    }
+    out
+}
+
+/// Another program that takes steps when told to.
+struct Peer {
+    name: String,
+    child: Child,
+    to: ChildStdin,
+    from: BufReader<ChildStdout>,
+}
+
+#[derive(Deserialize)]
+struct Hello {
+    tool: String,
+}
+
+impl Peer {
+    fn start(command: &str, record: &Path) -> Result<Self> {
+        let mut words = command.split_whitespace();
+        let failed = |what: String| {
+            CliError::input(format!("--peer {command:?}: {what}"))
+                .hint("for PyTorch: --peer \"python3 tests/peers/model_torch.py bench\"")
+        };
+        let program = words.next().ok_or_else(|| failed("no command".into()))?;
+        let mut child = Command::new(program)
+            .args(words)
+            .arg(record)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(|e| failed(e.to_string()))?;
+        let to = child.stdin.take().expect("asked for");
+        let from = BufReader::new(child.stdout.take().expect("asked for"));
+        let mut peer = Self {
+            name: String::new(),
+            child,
+            to,
+            from,
+        };
+        let hello: Hello = serde_json::from_str(&peer.line().map_err(failed)?)
+            .map_err(|e| failed(format!("it did not say its name: {e}")))?;
+        peer.name = hello.tool;
+        Ok(peer)
+    }
+
+    fn line(&mut self) -> std::result::Result<String, String> {
+        let mut line = String::new();
+        match self.from.read_line(&mut line) {
+            Ok(0) => Err("it ended before it answered".into()),
+            Ok(_) => Ok(line),
+            Err(e) => Err(e.to_string()),
+        }
+    }
+
+    /// Seconds that it says so many steps took.
+    fn steps(&mut self, steps: u64) -> Result<f64> {
+        let name = self.name.clone();
+        let failed = |what: String| CliError::new(Code::Failed, format!("{name}: {what}"));
+        writeln!(self.to, "{steps}").map_err(|e| failed(e.to_string()))?;
+        let line = self.line().map_err(failed)?;
+        line.trim()
+            .parse()
+            .map_err(|_| failed(format!("expected seconds, got {line:?}")))
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        // Its input ends with this; what does not end then is ended.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Memory now, from which the peak counts from now on; where the system can say.
+fn reset_peak() -> Option<u64> {
+    fs::write("/proc/self/clear_refs", "5").ok()?;
+    status("VmRSS:")
+}
+
+fn peak() -> Option<u64> {
+    status("VmHWM:")
+}
+
+fn status(field: &str) -> Option<u64> {
+    let text = fs::read_to_string("/proc/self/status").ok()?;
+    let line = text.lines().find_map(|l| l.strip_prefix(field))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024)
+}

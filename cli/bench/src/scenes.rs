@@ -1,0 +1,110 @@
+//! The scenes that a benchmark renders: presets by name, or files.
+
+use std::path::Path;
+
+use picofarm_scene::{
+    AssetLibrary, LaserGrid, Scene,
+    furnished::{self, FurnishedSettings},
+    import,
+    primitive::{self, PrimitiveSettings},
+};
+
+use picofarm_cli::{
+    args::BenchRender,
+    error::{CliError, Result},
+};
+
+use super::tessellate::tessellate;
+
+/// Image width and height where none is given.
+const PIXELS: u32 = 32;
+
+/// The scene that `name` stands for, at the size that the arguments ask for.
+///
+/// # Errors
+/// Neither a preset nor a readable scene file, or a size out of range.
+pub fn load(name: &str, args: &BenchRender) -> Result<Scene> {
+    let pixels = args.resolution.unwrap_or(PIXELS);
+    let mut scene = match preset(name)? {
+        Some((kind, seed)) => generate(kind, seed, args.spots, pixels)?,
+        None => import::read_scene(Path::new(name)).map_err(|e| {
+            CliError::from(e).hint("name a scene file, or one of the presets furnished, primitive")
+        })?,
+    };
+    resize(&mut scene, pixels);
+    if let Some(n) = args.triangles {
+        tessellate(&mut scene, n)?;
+    }
+    Ok(scene)
+}
+
+/// Another resolution, the same view.
+pub fn resize(scene: &mut Scene, pixels: u32) {
+    let i = &mut scene.camera.intrinsics;
+    *i = i.resized(pixels, pixels);
+}
+
+/// Another grid of spots, the same room.
+///
+/// # Errors
+/// There is no such grid.
+pub fn with_spots(scene: &mut Scene, spots: u32) -> Result<()> {
+    let grid = LaserGrid::new(spots).ok_or_else(|| {
+        CliError::input(format!(
+            "{spots} spots: there are grids of 1, 4, 16, 25 and 100 spots"
+        ))
+    })?;
+    scene.laser = grid.laser(&scene.camera);
+    Ok(())
+}
+
+#[derive(Clone, Copy)]
+enum Preset {
+    Furnished,
+    Primitive,
+}
+
+/// `furnished` or `primitive`, with `:SEED` if another than 1 is wanted.
+fn preset(name: &str) -> Result<Option<(Preset, u64)>> {
+    let (kind, seed) = match name.split_once(':') {
+        Some((kind, seed)) => (kind, Some(seed)),
+        None => (name, None),
+    };
+    let kind = match kind {
+        "furnished" => Preset::Furnished,
+        "primitive" => Preset::Primitive,
+        _ => return Ok(None),
+    };
+    let seed = seed.map_or(Ok(1), str::parse).map_err(|_| {
+        CliError::input(format!("{name}: expected a number after the colon"))
+            .hint("write for example furnished:7")
+    })?;
+    Ok(Some((kind, seed)))
+}
+
+/// Parametric furniture: the same scene on every machine.
+fn generate(kind: Preset, seed: u64, spots: u32, pixels: u32) -> Result<Scene> {
+    let mut scene = match kind {
+        Preset::Furnished => {
+            let library = AssetLibrary::parametric();
+            let settings = FurnishedSettings {
+                assets: library.name().to_owned(),
+                specular_at_least: 1,
+                width: pixels,
+                height: pixels,
+                ..Default::default()
+            };
+            furnished::generate(seed, &settings, &library)?
+        }
+        Preset::Primitive => {
+            let settings = PrimitiveSettings {
+                width: pixels,
+                height: pixels,
+                ..Default::default()
+            };
+            primitive::generate(seed, &settings)?
+        }
+    };
+    with_spots(&mut scene, spots)?;
+    Ok(scene)
+}

@@ -1,0 +1,266 @@
+//! `picofarm bench store`: what each way of storing histograms costs and loses, on scenes of this renderer, and how
+//! fast they are read again.
+
+mod chain;
+mod counting;
+mod cpu;
+mod foreign;
+mod method;
+mod plot;
+mod reading;
+mod report;
+mod sample;
+mod scenes;
+mod variant;
+
+use serde::Serialize;
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+
+use picofarm_cli::{
+    args::BenchStore,
+    error::{CliError, Code, Result},
+    output::{Meter, Output},
+    roles,
+    settings::Settings,
+    signals,
+};
+
+use method::{Kind, Method};
+use reading::Reading;
+use sample::{Loss, Sample};
+
+/// Scenes of the whole data set.
+const SCENES: f64 = 97_432.0;
+/// Values of one of its scenes.
+const VALUES: f64 = 256.0 * 256.0 * 637.0;
+/// Times that each scene is coded and decoded; the fastest counts.
+const REPEATS: usize = 2;
+
+/// What was found.
+#[derive(Debug, Serialize)]
+struct Report {
+    machine: Machine,
+    scenes: Vec<Scene>,
+    rows: Vec<Row>,
+    reading: Option<Reading>,
+}
+
+#[derive(Debug, Serialize)]
+struct Machine {
+    processor: String,
+    cores: usize,
+    /// Whether this program is optimised; times of others mean nothing.
+    optimised: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct Scene {
+    scene: u64,
+    size: [usize; 3],
+    photons_per_unit: f32,
+    /// Shares of bins without light, and with less than a photon.
+    dark: f64,
+    below_one_photon: f64,
+    /// Bins of a pixel in which two-bounce light is looked for.
+    arrivals: f64,
+}
+
+/// One way, over all scenes.
+#[derive(Debug, Serialize)]
+struct Row {
+    name: String,
+    kind: Kind,
+    /// Megabytes a scene of 256×256×637, in proportion.
+    mb_a_scene: f64,
+    /// Terabytes of 97,432 of them.
+    tb: f64,
+    /// The largest error, and root mean squares over all scenes.
+    loss: Loss,
+    encode_mb_per_cpu_s: f64,
+    decode_mb_per_cpu_s: f64,
+}
+
+/// Runs the whole bench.
+///
+/// # Errors
+/// Scenes that cannot be had, a codec that fails, or an interruption.
+pub async fn run(
+    args: BenchStore,
+    settings: &Settings,
+    output: Output,
+    stop: &CancellationToken,
+) -> Result<()> {
+    let scratch = tempfile::tempdir()
+        .map_err(|e| CliError::new(Code::Resource, format!("a scratch folder: {e}")))?;
+    let dir = args.keep.clone();
+    let dir = dir.unwrap_or_else(|| scratch.path().join("farm"));
+    let source = scenes::source(&args, &dir, settings, output, stop).await?;
+    let samples = scenes::samples(&source, args.scenes).await?;
+    let methods = method::all(source.spec(), &args.only)?;
+    let (stop, runtime) = (stop.clone(), Handle::current());
+    let work = move || -> Result<Report> {
+        let rows = rows(&methods, &samples, output, &stop)?;
+        let cores = roles::cores();
+        let mut threads = vec![1, 2.min(cores), cores];
+        threads.dedup();
+        let reading = match args.no_reading {
+            true => None,
+            false => {
+                output.say("reading …");
+                let folder = scratch.path().join("read");
+                let threads = &threads;
+                Some(reading::measure(
+                    &samples, &source, &folder, threads, &runtime, &stop,
+                )?)
+            }
+        };
+        let report = Report {
+            machine: machine(cores),
+            scenes: samples.iter().map(scene).collect(),
+            rows,
+            reading,
+        };
+        if let Some(path) = &args.plot {
+            plot::draw(&report, path)?;
+            output.say(format!("drew {}", path.display()));
+        }
+        Ok(report)
+    };
+    let done = tokio::task::spawn_blocking(work).await;
+    let report =
+        done.map_err(|e| CliError::new(Code::Failed, format!("the benchmark broke: {e}")))??;
+    output.result(&report, || report::describe(&report));
+    Ok(())
+}
+
+fn rows(
+    methods: &[Method],
+    samples: &[Sample],
+    output: Output,
+    stop: &CancellationToken,
+) -> Result<Vec<Row>> {
+    // One thread, in whose time everything is.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+    let pool =
+        pool.map_err(|e| CliError::new(Code::Resource, format!("cannot start a thread: {e}")))?;
+    let mut meter = Meter::new(output);
+    let mut rows = Vec::new();
+    for (at, method) in methods.iter().enumerate() {
+        meter.at(at as f64 / methods.len() as f64, method.name.clone());
+        let mut sums = Sums::default();
+        for sample in samples {
+            if stop.is_cancelled() {
+                return Err(signals::interrupted("what was measured so far is lost"));
+            }
+            let one = pool.install(|| measure(method, sample))?;
+            sums.add(&one, &sample.loss(&one.decoded), sample);
+        }
+        rows.push(sums.row(method));
+    }
+    meter.finish();
+    Ok(rows)
+}
+
+struct Measured {
+    bytes: usize,
+    encode_s: f64,
+    decode_s: f64,
+    decoded: Vec<f32>,
+}
+
+/// Codes and decodes one scene on this thread.
+fn measure(method: &Method, sample: &Sample) -> Result<Measured> {
+    // Its pages are touched before the clock runs.
+    let mut decoded = vec![f32::NAN; sample.h.len()];
+    let (mut bytes, mut encode_s, mut decode_s) = (0, f64::INFINITY, f64::INFINITY);
+    for _ in 0..REPEATS {
+        let (coded, seconds) = cpu::of_thread(|| method.encode(sample));
+        let coded = coded?;
+        encode_s = seconds.min(encode_s);
+        bytes = coded.bytes();
+        let (done, seconds) = cpu::of_thread(|| method.decode(&coded, sample, &mut decoded));
+        done?;
+        decode_s = seconds.min(decode_s);
+    }
+    Ok(Measured {
+        bytes,
+        encode_s,
+        decode_s,
+        decoded,
+    })
+}
+
+#[derive(Default)]
+struct Sums {
+    scenes: f64,
+    bytes: f64,
+    raw: f64,
+    encode_s: f64,
+    decode_s: f64,
+    max: f64,
+    squares: f64,
+    moved: f64,
+    peak_squares: f64,
+}
+
+impl Sums {
+    fn add(&mut self, one: &Measured, loss: &Loss, sample: &Sample) {
+        self.scenes += 1.0;
+        self.bytes += one.bytes as f64;
+        self.raw += sample.raw_bytes() as f64;
+        self.encode_s += one.encode_s;
+        self.decode_s += one.decode_s;
+        self.max = self.max.max(loss.max_sigma);
+        self.squares += loss.rms_sigma * loss.rms_sigma;
+        self.moved += loss.peak_moved;
+        self.peak_squares += loss.peak_sigma * loss.peak_sigma;
+    }
+
+    fn row(&self, method: &Method) -> Row {
+        let scene = self.bytes / self.raw * VALUES * 4.0;
+        Row {
+            name: method.name.clone(),
+            kind: method.kind,
+            mb_a_scene: scene / 1e6,
+            tb: scene * SCENES / 1e12,
+            loss: Loss {
+                max_sigma: self.max,
+                rms_sigma: (self.squares / self.scenes).sqrt(),
+                peak_moved: self.moved / self.scenes,
+                peak_sigma: (self.peak_squares / self.scenes).sqrt(),
+            },
+            encode_mb_per_cpu_s: self.raw / 1e6 / self.encode_s,
+            decode_mb_per_cpu_s: self.raw / 1e6 / self.decode_s,
+        }
+    }
+}
+
+fn scene(sample: &Sample) -> Scene {
+    let n = sample.h.len() as f64;
+    let share = |photons: f32| {
+        let below = sample.h.iter().filter(|h| **h * sample.scale <= photons);
+        below.count() as f64 / n
+    };
+    Scene {
+        scene: sample.scene,
+        size: [sample.height, sample.width, sample.bins],
+        photons_per_unit: sample.scale,
+        dark: share(0.0),
+        below_one_photon: share(1.0),
+        arrivals: sample.arrivals(),
+    }
+}
+
+fn machine(cores: usize) -> Machine {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = text.lines().find(|l| l.starts_with("model name"));
+    let name = model
+        .and_then(|l| l.split_once(':'))
+        .map(|(_, name)| name.trim());
+    Machine {
+        processor: name.unwrap_or("unknown").to_owned(),
+        cores,
+        optimised: !cfg!(debug_assertions),
+    }
+}

@@ -1,0 +1,287 @@
+//! How fast scenes are read through data sets' own reader, and how much is fetched for a part of one.
+
+use std::{
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use picofarm_dataset::{
+    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, open_store,
+};
+use serde::Serialize;
+use serde_json::json;
+use tokio_util::sync::CancellationToken;
+
+use super::{counting::Counting, cpu, sample::Sample};
+use picofarm_cli::{
+    error::{CliError, Code, Result},
+    signals,
+};
+
+/// Scenes a second that eight GPUs take: 200 epochs of 87,688 scenes in two days.
+pub const TRAINING: f64 = 101.0;
+/// Side of a crop.
+const CROP: u32 = 64;
+/// Reads of one measurement.
+const READS: usize = 12;
+
+/// What was found.
+#[derive(Debug, Serialize)]
+pub struct Reading {
+    pub profile: String,
+    /// 32-bit floats given out for each second of CPU time, in megabytes, whole scenes.
+    pub whole_mb_per_cpu_s: f64,
+    /// The same into a buffer that is used again.
+    pub reused_mb_per_cpu_s: f64,
+    pub crop: Crop,
+    /// 128 bins of all pixels.
+    pub bins: Fetched,
+    pub loaders: Vec<Loader>,
+}
+
+/// Crops at several places.
+#[derive(Debug, Serialize)]
+pub struct Crop {
+    pub side: u32,
+    /// Along the inner chunks' edges.
+    pub aligned: Fetched,
+    /// Mean over crops at all offsets by multiples of 16 pixels.
+    pub mean: Fetched,
+    /// The worst of these.
+    pub worst: Fetched,
+}
+
+/// What a read fetched.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Fetched {
+    /// Bytes of the transient's object, its index included; the manifest, which every read has, is not.
+    pub bytes: f64,
+    /// Over the part's share of the object.
+    pub of_share: f64,
+    pub requests: f64,
+}
+
+/// Several readers at once, as in a training's loader: each with a thread of its own.
+#[derive(Debug, Serialize)]
+pub struct Loader {
+    pub threads: usize,
+    pub scenes_per_s: f64,
+    pub cpu_s_a_scene: f64,
+    /// Cores that decode [`TRAINING`] scenes a second, by CPU time.
+    pub cores_for_training: f64,
+}
+
+/// Reads scenes of `spec`'s size, coded with the default profile, in `folder`.
+///
+/// # Errors
+/// A folder that cannot be written, or an interruption.
+pub fn measure(
+    samples: &[Sample],
+    source: &Dataset,
+    folder: &Path,
+    threads: &[usize],
+    runtime: &tokio::runtime::Handle,
+    stop: &CancellationToken,
+) -> Result<Reading> {
+    let dataset = runtime
+        .block_on(written(samples, source, folder))
+        .map_err(failed)?;
+    let single = pool(1)?;
+    let scene = |i: usize| (i % samples.len()) as u64;
+    let mut buffer = Vec::new();
+    // The first reads bring files into memory.
+    let mut whole = 0.0;
+    let mut reused = 0.0;
+    for i in 0..samples.len() + READS {
+        stopped(stop)?;
+        let once = || runtime.block_on(dataset.read_transient(scene(i)));
+        let (read, fresh) = cpu::of_process(|| single.install(once));
+        drop(read.map_err(failed)?);
+        let into = || {
+            let into = dataset.read_histogram_into(scene(i), Quantity::Transient, &mut buffer);
+            runtime.block_on(into)
+        };
+        let (read, again) = cpu::of_process(|| single.install(into));
+        read.map_err(failed)?;
+        if i >= samples.len() {
+            whole += fresh;
+            reused += again;
+        }
+    }
+    let megabytes = samples[0].raw_bytes() as f64 * READS as f64 / 1e6;
+    let (crop, bins) = runtime
+        .block_on(fetched(source.spec(), folder))
+        .map_err(failed)?;
+    let mut loaders = Vec::new();
+    for threads in threads {
+        stopped(stop)?;
+        loaders.push(loader(&dataset, samples.len(), *threads, runtime)?);
+    }
+    Ok(Reading {
+        profile: Profile::default().to_string(),
+        whole_mb_per_cpu_s: megabytes / whole,
+        reused_mb_per_cpu_s: megabytes / reused,
+        crop,
+        bins,
+        loaders,
+    })
+}
+
+fn stopped(stop: &CancellationToken) -> Result<()> {
+    match stop.is_cancelled() {
+        true => Err(signals::interrupted("what was measured so far is lost")),
+        false => Ok(()),
+    }
+}
+
+fn failed(e: DatasetError) -> CliError {
+    CliError::new(Code::Failed, e.to_string())
+}
+
+fn pool(threads: usize) -> Result<rayon::ThreadPool> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+    pool.map_err(|e| {
+        CliError::new(
+            Code::Resource,
+            format!("cannot start {threads} threads: {e}"),
+        )
+    })
+}
+
+/// A data set of the samples in the default profile.
+async fn written(
+    samples: &[Sample],
+    source: &Dataset,
+    folder: &Path,
+) -> Result<Dataset, DatasetError> {
+    let spec = DatasetSpec {
+        scenes: samples.len() as u64,
+        profile: Profile::default(),
+        subsets: Subsets::NONE,
+        per_spot: false,
+        ..*source.spec()
+    };
+    let (store, prefix) = open_store(&folder.display().to_string())?;
+    let dataset = Dataset::create_or_open(store, prefix, &spec).await?;
+    let provenance = Provenance {
+        task_key: "bench".into(),
+        renderer: "bench".into(),
+        seed: 0,
+        plan: json!({}),
+    };
+    for (i, sample) in samples.iter().enumerate() {
+        let truth = source.read_truth(sample.scene).await?;
+        let coded =
+            dataset.encode_derived(i as u64, &truth, &sample.h, sample.scale, &provenance)?;
+        dataset.publish_encoded(coded).await?;
+    }
+    Ok(dataset)
+}
+
+async fn fetched(spec: &DatasetSpec, folder: &Path) -> Result<(Crop, Fetched), DatasetError> {
+    let (store, prefix) = open_store(&folder.display().to_string())?;
+    let counting = Arc::new(Counting::new(store));
+    let dataset = Dataset::open(counting.clone(), prefix).await?;
+    counting.take();
+    let manifest = dataset.manifest(0).await?;
+    let (manifest_bytes, _) = counting.take();
+    let object = manifest.objects[0].size as f64;
+    let values = spec.transient_len() as f64;
+    let of = |part: f64| {
+        let (bytes, requests) = counting.take();
+        let bytes = (bytes - manifest_bytes) as f64;
+        Fetched {
+            bytes,
+            of_share: bytes / (object * part / values),
+            requests: requests as f64 - 1.0,
+        }
+    };
+    let bins = spec.gate.bins;
+    let side = CROP.min(spec.height).min(spec.width);
+    let crop_values = f64::from(side * side) * f64::from(bins);
+    let (mut worst, mut sum, mut n) = (Fetched::default(), Fetched::default(), 0.0);
+    let mut aligned = Fetched::default();
+    for top in (0..=spec.height - side).step_by(16) {
+        for left in (0..=spec.width - side).step_by(16) {
+            let crop = dataset.read_transient_crop(0, top..top + side, left..left + side);
+            crop.await?;
+            let found = of(crop_values);
+            if (top, left) == (0, 0) {
+                aligned = found;
+            }
+            if found.of_share > worst.of_share {
+                worst = found;
+            }
+            sum.bytes += found.bytes;
+            sum.of_share += found.of_share;
+            sum.requests += found.requests;
+            n += 1.0;
+        }
+    }
+    let mean = Fetched {
+        bytes: sum.bytes / n,
+        of_share: sum.of_share / n,
+        requests: sum.requests / n,
+    };
+    let first = bins.saturating_sub(1) / 256 * 128;
+    let few = first..(first + 128).min(bins);
+    let share = spec.pixels() as f64 * few.len() as f64;
+    let part = dataset.read_transient_part(0, 0..spec.height, 0..spec.width, few);
+    part.await?;
+    let crop = Crop {
+        side,
+        aligned,
+        mean,
+        worst,
+    };
+    Ok((crop, of(share)))
+}
+
+/// `threads` readers that take turns at the scenes.
+fn loader(
+    dataset: &Dataset,
+    scenes: usize,
+    threads: usize,
+    runtime: &tokio::runtime::Handle,
+) -> Result<Loader> {
+    let pools = (0..threads).map(|_| pool(1)).collect::<Result<Vec<_>>>()?;
+    let next = AtomicUsize::new(0);
+    let total = READS * threads;
+    let one = |pool: &rayon::ThreadPool| -> Result<(), DatasetError> {
+        let mut buffer = Vec::new();
+        loop {
+            let i = next.fetch_add(1, Ordering::Relaxed);
+            if i >= total {
+                return Ok(());
+            }
+            let scene = (i % scenes) as u64;
+            let read = dataset.read_histogram_into(scene, Quantity::Transient, &mut buffer);
+            pool.install(|| runtime.block_on(read))?;
+        }
+    };
+    let start = Instant::now();
+    let (results, cpu_s) = cpu::of_process(|| {
+        std::thread::scope(|scope| {
+            let readers: Vec<_> = pools.iter().map(|p| scope.spawn(|| one(p))).collect();
+            let join = |r: std::thread::ScopedJoinHandle<'_, Result<(), DatasetError>>| r.join();
+            readers.into_iter().map(join).collect::<Vec<_>>()
+        })
+    });
+    let seconds = start.elapsed().max(Duration::from_millis(1)).as_secs_f64();
+    for result in results {
+        result
+            .map_err(|_| CliError::new(Code::Failed, "a reader of the benchmark broke"))?
+            .map_err(failed)?;
+    }
+    let cpu_s_a_scene = cpu_s / total as f64;
+    Ok(Loader {
+        threads,
+        scenes_per_s: total as f64 / seconds,
+        cpu_s_a_scene,
+        cores_for_training: TRAINING * cpu_s_a_scene,
+    })
+}

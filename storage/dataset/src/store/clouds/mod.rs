@@ -1,0 +1,66 @@
+//! Object stores over a network: S3, Google's and Azure's.
+
+mod azure;
+mod client;
+mod failure;
+mod gcs;
+mod limited;
+mod s3;
+
+use std::sync::Arc;
+
+use object_store::ObjectStore;
+use object_store::limit::LimitStore;
+
+use super::place::{self, Place, Service};
+use crate::error::DatasetError;
+
+pub(super) use failure::{failure, no_bucket};
+
+use client::{CONCURRENCY, Settings};
+use limited::Limited;
+
+/// A client of the place's bucket, told where and who by the environment. Asks nothing of the server.
+///
+/// # Errors
+/// [`DatasetError::StoreSettings`] names a missing or unusable variable.
+pub(super) fn connect(place: &Place) -> Result<Arc<dyn ObjectStore>, DatasetError> {
+    let variables = std::env::vars_os()
+        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
+    let settings = Settings::of(place, variables);
+    Ok(match place.service {
+        Service::S3 => shared(s3::connect(place, &settings)?),
+        Service::Gcs => shared(gcs::connect(place, &settings)?),
+        Service::Azure => shared(azure::connect(place, &settings)?),
+    })
+}
+
+/// A store over a network, as everybody here uses it.
+fn shared(store: impl ObjectStore) -> Arc<dyn ObjectStore> {
+    let store = LimitStore::new(store, CONCURRENCY);
+    match limited::limits() {
+        limits if limits.any() => Arc::new(Limited::new(store, limits)),
+        _ => Arc::new(store),
+    }
+}
+
+impl Service {
+    /// How the variables that tell of it begin.
+    pub(super) fn variables(self) -> &'static str {
+        match self {
+            Self::S3 => "AWS_",
+            Self::Gcs => "GOOGLE_",
+            Self::Azure => "AZURE_",
+        }
+    }
+}
+
+impl Place {
+    /// What its variables do not say, or say wrongly.
+    pub(super) fn settings_error(&self, what: impl Into<String>) -> DatasetError {
+        DatasetError::StoreSettings {
+            url: format!("{}://{}", self.service.scheme(), self.bucket),
+            what: what.into(),
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! S3 and servers that speak it: `s3://bucket/prefix`, told where and who by the usual `AWS_…` variables.
+
+use object_store::ClientConfigKey;
+use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
+
+use super::client::{CONNECT_TIMEOUT, Settings, TIMEOUT, choose_cryptography, retries};
+use super::place::Place;
+use crate::error::DatasetError;
+
+/// A client of the bucket. Asks nothing of the server.
+///
+/// # Errors
+/// [`DatasetError::StoreSettings`] names the variable; values are not repeated.
+pub(super) fn connect(place: &Place, settings: &Settings) -> Result<AmazonS3, DatasetError> {
+    choose_cryptography();
+    check(place, settings)?;
+    let client = AmazonS3ConfigKey::Client;
+    let mut builder = AmazonS3Builder::new()
+        .with_config(client(ClientConfigKey::Timeout), TIMEOUT)
+        .with_config(client(ClientConfigKey::ConnectTimeout), CONNECT_TIMEOUT);
+    for (name, value) in settings.iter() {
+        // Variables that it does not know are other programs'.
+        if let Ok(key) = name.to_ascii_lowercase().parse() {
+            builder = builder.with_config(key, value);
+        }
+    }
+    builder
+        .with_bucket_name(&place.bucket)
+        .with_conditional_put(S3ConditionalPut::ETagMatch)
+        // Objects are deleted one by one, and not every server knows the request for many.
+        .with_disable_bulk_delete(true)
+        .with_retry(retries())
+        .build()
+        .map_err(|_| {
+            place.settings_error(format!(
+                "the variables {} do not go together; check each against the documentation of S3",
+                settings.names()
+            ))
+        })
+}
+
+/// What would otherwise fail late and with words that name no variable.
+fn check(place: &Place, settings: &Settings) -> Result<(), DatasetError> {
+    let wrong = |what: &str| Err(place.settings_error(what));
+    let endpoint = settings.first(&["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]);
+    if let Some(name) = endpoint {
+        settings.check_server(place, name, "https://s3.example.org:8333")?;
+    }
+    if settings.is("AWS_SKIP_SIGNATURE") {
+        return Ok(());
+    }
+    match (
+        settings.has("AWS_ACCESS_KEY_ID"),
+        settings.has("AWS_SECRET_ACCESS_KEY"),
+    ) {
+        (true, true) => return Ok(()),
+        (true, false) => {
+            return wrong("AWS_ACCESS_KEY_ID is set, but AWS_SECRET_ACCESS_KEY is not");
+        }
+        (false, true) => {
+            return wrong("AWS_SECRET_ACCESS_KEY is set, but AWS_ACCESS_KEY_ID is not");
+        }
+        (false, false) => {}
+    }
+    let role = settings.has("AWS_WEB_IDENTITY_TOKEN_FILE") && settings.has("AWS_ROLE_ARN")
+        || settings.has("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI")
+        || settings.has("AWS_CONTAINER_CREDENTIALS_FULL_URI")
+        || settings.has("AWS_METADATA_ENDPOINT");
+    // Amazon's own machines have roles that no variable tells of; they are asked when a request is made.
+    if role || endpoint.is_none() {
+        return Ok(());
+    }
+    wrong(
+        "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (profiles in ~/.aws are not read), or \
+         AWS_SKIP_SIGNATURE=true for a server that asks for none",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECRET: &str = "Very/Secret+Key";
+
+    fn place() -> Place {
+        Place::parse("s3://farm/sets").unwrap().unwrap()
+    }
+
+    fn connected(variables: &[(&str, &str)]) -> Result<AmazonS3, DatasetError> {
+        let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
+        connect(&place(), &Settings::of(&place(), variables))
+    }
+
+    fn error(variables: &[(&str, &str)]) -> String {
+        let text = connected(variables).unwrap_err().to_string();
+        assert!(!text.contains(SECRET) && !text.contains("keyid"), "{text}");
+        text
+    }
+
+    #[test]
+    fn each_missing_or_wrong_variable_is_named_and_no_value_repeated() {
+        let endpoint = ("AWS_ENDPOINT_URL", "https://127.0.0.1:1");
+        let (id, key) = (
+            ("AWS_ACCESS_KEY_ID", "keyid"),
+            ("AWS_SECRET_ACCESS_KEY", SECRET),
+        );
+        let with_keys = |name: &str, url: &str| error(&[(name, url), id, key]);
+        assert!(error(&[endpoint]).contains("set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"));
+        assert!(error(&[endpoint, id]).contains("AWS_SECRET_ACCESS_KEY is not"));
+        assert!(error(&[key]).contains("AWS_ACCESS_KEY_ID is not"));
+        assert!(error(&[endpoint, id, ("AWS_SECRET_ACCESS_KEY", "")]).contains("is not"));
+        let http = with_keys("AWS_ENDPOINT_URL", "http://10.0.0.1:8333");
+        assert!(http.contains("set AWS_ALLOW_HTTP=true"), "{http}");
+        let user = format!("https://keyid:{SECRET}@host");
+        let user = with_keys("AWS_ENDPOINT_URL", &user);
+        assert!(user.contains("without user"), "{user}");
+        let url = with_keys("AWS_ENDPOINT", "host:8333");
+        assert!(
+            url.starts_with("s3://farm: AWS_ENDPOINT: expected the server's URL"),
+            "{url}"
+        );
+        let timeout = error(&[endpoint, id, key, ("AWS_TIMEOUT", "soon")]);
+        assert!(timeout.contains("AWS_TIMEOUT"), "{timeout}");
+    }
+
+    #[test]
+    fn credentials_of_every_usual_kind_are_taken() {
+        let endpoint = ("AWS_ENDPOINT_URL", "http://127.0.0.1:1");
+        let kinds: [&[(&str, &str)]; 5] = [
+            &[
+                ("AWS_ACCESS_KEY_ID", "keyid"),
+                ("AWS_SECRET_ACCESS_KEY", SECRET),
+            ],
+            &[("AWS_SKIP_SIGNATURE", "true")],
+            &[
+                ("AWS_WEB_IDENTITY_TOKEN_FILE", "/t"),
+                ("AWS_ROLE_ARN", "arn:aws:iam::1:role/r"),
+            ],
+            &[("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI", "/x")],
+            &[("AWS_METADATA_ENDPOINT", "http://127.0.0.1:2")],
+        ];
+        for kind in kinds {
+            let all = [kind, &[endpoint, ("AWS_ALLOW_HTTP", "true")]].concat();
+            let store = connected(&all).unwrap();
+            assert_eq!(store.to_string(), "AmazonS3(farm)");
+        }
+        assert!(
+            connected(&[]).is_ok(),
+            "an instance's role is not told by variables"
+        );
+    }
+}

@@ -1,0 +1,22 @@
+//! The kinds that need networks, in a program that was built without them: such a worker does not offer them, and such a
+//! program cannot submit them.
+
+use picofarm_proto::model::{EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask};
+
+use crate::execute::{Context, Control, Output, RunTask, Task, TaskError};
+
+macro_rules! absent {
+    ($($task:ident),*) => {$(
+        impl RunTask for $task {
+            fn code_version() -> String {
+                String::new()
+            }
+
+            fn run(&self, _: &Context, task: &Task, _: &Control) -> Result<Output, TaskError> {
+                Err(TaskError::User(super::not_built(task.spec.task.kind())))
+            }
+        }
+    )*};
+}
+
+absent!(TrainTask, EvaluateTask, PromoteTask, InferTask, ReportTask);
