@@ -213,6 +213,8 @@ impl Server {
     }
 
     fn store(&self, bucket: &str) -> Arc<AmazonS3> {
+        // The client takes the provider of cryptography that the process has chosen; the first call chooses.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         let store = AmazonS3Builder::new()
             .with_endpoint(self.endpoint())
             .with_allow_http(true)

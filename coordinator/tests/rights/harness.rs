@@ -50,6 +50,15 @@ pub async fn catalogs(folder: &tempfile::TempDir) -> Vec<CatalogPlace> {
     places
 }
 
+/// A coordinator that the machine kept from its catalog for five seconds begins anew, and says that nothing was done.
+pub fn begins_anew(code: Code) -> bool {
+    code == Code::Unavailable
+}
+
+pub async fn again_soon() {
+    tokio::time::sleep(std::time::Duration::from_millis(200)).await;
+}
+
 impl Farm {
     pub async fn start(catalog: CatalogPlace, visibility: Visibility) -> Self {
         let folder = tempfile::tempdir().unwrap();
@@ -117,7 +126,13 @@ impl Farm {
             spec: Some(spec.clone().into()),
             again,
         };
-        let answer = self.jobs(who).submit_job(request).await?.into_inner();
+        let mut jobs = self.jobs(who);
+        let answer = loop {
+            match jobs.submit_job(request.clone()).await {
+                Err(status) if begins_anew(status.code()) => again_soon().await,
+                answer => break answer?.into_inner(),
+            }
+        };
         Ok(Submitted {
             job: answer.job_id,
             existed: answer.existed,

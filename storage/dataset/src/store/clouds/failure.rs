@@ -216,7 +216,7 @@ mod tests {
             store: "S3",
             source: words.into(),
         };
-        let failure = failure(&[&error], Service::S3).unwrap();
+        let failure = crate::store::Failure::of(&error, Some(Service::S3));
         assert_eq!(
             failure.account,
             "http://127.0.0.1:9 answered 400 InvalidToken: The token is malformed."
