@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use picofarm_proto::show;
 use picofarm_scene::{
-    AssetLibrary, Bsdf, LaserGrid, Scene, export,
+    AssetLibrary, LaserGrid, Scene, export,
     furnished::{self, FurnishedSettings},
     import::{self, ImportOptions},
     primitive::{self, PrimitiveSettings},
@@ -149,12 +149,10 @@ fn facts(scene: &Scene) -> serde_json::Value {
     }
     let materials = || scene.objects.iter().flat_map(|o| &o.mesh.materials);
     let mirrors = materials().filter(|m| m.is_specular()).count();
-    let rough = materials()
-        .filter(|m| matches!(m.bsdf, Bsdf::RoughConductor { .. }))
-        .count();
-    let mixed = materials()
-        .filter(|m| matches!(m.bsdf, Bsdf::Mixed { .. }))
-        .count();
+    let mut kinds = BTreeMap::<&str, u32>::new();
+    for material in materials() {
+        *kinds.entry(material.bsdf.name()).or_default() += 1;
+    }
     let textured = materials().filter(|m| m.texture.is_some()).count();
     json!({
         "name": scene.name,
@@ -162,8 +160,7 @@ fn facts(scene: &Scene) -> serde_json::Value {
         "triangles": scene.triangle_count(),
         "labels": labels,
         "mirror_materials": mirrors,
-        "rough_conductor_materials": rough,
-        "mixed_materials": mixed,
+        "materials": kinds,
         "textured_materials": textured,
         "camera": scene.camera,
         "laser_origin": scene.laser.origin,
@@ -174,23 +171,21 @@ fn facts(scene: &Scene) -> serde_json::Value {
 
 fn describe(scene: &Scene) -> String {
     let f = facts(scene);
-    let labels: Vec<String> = f["labels"]
-        .as_object()
-        .into_iter()
-        .flatten()
-        .map(|(name, n)| format!("{} {n}", show::line(name)))
-        .collect();
+    let counts = |field: &str| {
+        let counts = f[field].as_object().into_iter().flatten();
+        let counts = counts.map(|(name, n)| format!("{} {n}", show::line(name)));
+        counts.collect::<Vec<String>>().join(", ")
+    };
     let i = &scene.camera.intrinsics;
     let mut text = format!(
-        "{}: {} objects, {} triangles\nmaterials: {} mirror, {} rough conductor, {} mixed, {} textured\nlabels: {}\ncamera: {}x{} pixels, focal length {} px, at {:?}\nlaser: {} beams from {:?}\nsource: {}\n",
+        "{}: {} objects, {} triangles\nmaterials: {}; of them {} mirror, {} textured\nlabels: {}\ncamera: {}x{} pixels, focal length {} px, at {:?}\nlaser: {} beams from {:?}\nsource: {}\n",
         show::line(&scene.name),
         scene.objects.len(),
         scene.triangle_count(),
+        counts("materials"),
         f["mirror_materials"],
-        f["rough_conductor_materials"],
-        f["mixed_materials"],
         f["textured_materials"],
-        labels.join(", "),
+        counts("labels"),
         i.width,
         i.height,
         i.fx,

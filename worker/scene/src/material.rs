@@ -52,6 +52,15 @@ pub enum Bsdf {
 }
 
 impl Bsdf {
+    /// Its kind, as scene files name it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Bsdf::Diffuse { .. } => "diffuse",
+            Bsdf::RoughConductor { .. } => "rough_conductor",
+            Bsdf::Mixed { .. } => "mixed",
+        }
+    }
+
     /// The same surface with every reflectance multiplied by `factor`: what a texel does to it.
     pub fn scaled(self, factor: f32) -> Self {
         match self {

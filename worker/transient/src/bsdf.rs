@@ -7,17 +7,28 @@ use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
 use crate::rng::Rng;
 
+/// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
+/// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kind {
+    /// ρ/π.
+    Lambertian,
+    /// A rough conductor.
+    Conductor(Distribution),
+    /// A Lambertian beside a rough conductor.
+    Mixed(Distribution),
+}
+
 /// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Surface {
+    kind: Kind,
     /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
-    pub strength: f32,
-    /// Roughness; 0 for Lambertian surfaces.
-    pub alpha: f32,
-    /// Lambertian part ρ/π of a mix times its share; 0 for pure surfaces.
-    pub base: f32,
-    /// The conductor is GGX, otherwise Beckmann.
-    pub ggx: bool,
+    strength: f32,
+    /// Roughness of a conductor; of others 0.
+    alpha: f32,
+    /// Lambertian part ρ/π of a mix times its share; of others 0.
+    base: f32,
     /// Scatters from both sides.
     pub two_sided: bool,
     /// Counts as a mirror (specular mask).
@@ -26,30 +37,21 @@ pub(crate) struct Surface {
 
 impl Surface {
     pub fn new(m: &Material) -> Self {
-        let pure = Self {
-            strength: 0.0,
-            alpha: 0.0,
-            base: 0.0,
-            ggx: false,
+        let of = |kind, strength, alpha, base| Self {
+            kind,
+            strength,
+            alpha,
+            base,
             two_sided: m.two_sided,
             specular: m.is_specular(),
         };
-        let rough = |alpha, distribution, strength| Self {
-            strength,
-            alpha,
-            ggx: distribution == Distribution::Ggx,
-            ..pure
-        };
         match m.bsdf {
-            Bsdf::Diffuse { reflectance } => Self {
-                strength: reflectance / PI,
-                ..pure
-            },
+            Bsdf::Diffuse { reflectance } => of(Kind::Lambertian, reflectance / PI, 0.0, 0.0),
             Bsdf::RoughConductor {
                 alpha,
                 distribution,
                 reflectance,
-            } => rough(alpha, distribution, reflectance),
+            } => of(Kind::Conductor(distribution), reflectance, alpha, 0.0),
             Bsdf::Mixed {
                 reflectance,
                 alpha,
@@ -59,16 +61,13 @@ impl Surface {
             } => {
                 let strength = weight * specular_reflectance;
                 let base = (1.0 - weight) * reflectance / PI;
-                // A mix has two lobes that scatter; with one it is pure.
-                if strength == 0.0 && base > 0.0 {
-                    return Self {
-                        strength: base,
-                        ..pure
-                    };
-                }
-                Self {
-                    base,
-                    ..rough(alpha, distribution, strength)
+                // A mix has two parts that scatter; with one it is pure.
+                if base == 0.0 {
+                    of(Kind::Conductor(distribution), strength, alpha, 0.0)
+                } else if strength == 0.0 {
+                    of(Kind::Lambertian, base, 0.0, 0.0)
+                } else {
+                    of(Kind::Mixed(distribution), strength, alpha, base)
                 }
             }
         }
@@ -82,29 +81,78 @@ impl Surface {
     /// The same surface, scattering `factor` times as much.
     #[inline(always)]
     pub fn scaled(self, factor: f32) -> Self {
-        Self {
+        let scaled = Self {
             strength: self.strength * factor,
             base: self.base * factor,
             ..self
+        };
+        if scaled.base == 0.0 {
+            scaled.gloss()
+        } else {
+            scaled
         }
+    }
+
+    /// Scatters nothing.
+    #[inline(always)]
+    pub fn is_black(&self) -> bool {
+        self.strength == 0.0
     }
 
     /// True for Lambertian surfaces.
     #[inline(always)]
     pub fn diffuse(&self) -> bool {
-        self.alpha == 0.0
+        matches!(self.kind, Kind::Lambertian)
     }
 
-    /// One lobe of a mix, chosen by `u` in [0, 1) in proportion to the lobes' albedos and divided by the
-    /// chance of that choice, with `specular` as for the lobe alone. Pure surfaces are their own lobe.
+    /// True for a mix of two parts, of which [`Surface::lobe`] chooses.
+    #[inline(always)]
+    pub fn is_mixed(&self) -> bool {
+        matches!(self.kind, Kind::Mixed(_))
+    }
+
+    /// BRDF of a Lambertian surface, ρ/π.
+    #[inline(always)]
+    pub fn lambertian(&self) -> f32 {
+        self.strength
+    }
+
+    /// Roughness α of its conductor, 0 without one.
+    #[inline(always)]
+    pub fn alpha(&self) -> f32 {
+        self.alpha
+    }
+
+    /// Its conductor, if it has one, is GGX.
+    #[inline(always)]
+    pub fn ggx(&self) -> bool {
+        let ggx = Distribution::Ggx;
+        matches!(self.kind, Kind::Conductor(d) | Kind::Mixed(d) if d == ggx)
+    }
+
+    /// Has a conductor that is smooth enough for a mirror, alone or in a mix.
+    #[inline(always)]
+    pub fn has_mirror(&self) -> bool {
+        !self.diffuse() && !self.is_rough() && !self.is_black()
+    }
+
+    /// Has a conductor that is too rough for a mirror.
+    #[inline(always)]
+    pub fn is_rough(&self) -> bool {
+        self.alpha > Material::SPECULAR_ALPHA
+    }
+
+    /// One part of a mix, chosen by `u` in [0, 1) in proportion to the parts' albedos and divided by the
+    /// chance of that choice, with `specular` as for the part alone. Pure surfaces are their own part.
     #[inline]
     pub fn lobe(&self, u: f32) -> Surface {
-        if self.base == 0.0 {
+        let Kind::Mixed(distribution) = self.kind else {
             return *self;
-        }
+        };
         let total = self.strength + self.base * PI;
         if u * total < self.strength {
             return Self {
+                kind: Kind::Conductor(distribution),
                 strength: total,
                 base: 0.0,
                 specular: self.alpha <= Material::SPECULAR_ALPHA,
@@ -112,19 +160,26 @@ impl Surface {
             };
         }
         Self {
+            kind: Kind::Lambertian,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
-            ggx: false,
             specular: false,
             ..*self
         }
     }
 
-    /// The conductor alone, as it is in a mix.
+    /// The conductor alone, as it is in a mix. Pure surfaces stay what they are.
     #[inline(always)]
     pub fn gloss(self) -> Self {
-        Self { base: 0.0, ..self }
+        match self.kind {
+            Kind::Mixed(distribution) => Self {
+                kind: Kind::Conductor(distribution),
+                base: 0.0,
+                ..self
+            },
+            Kind::Lambertian | Kind::Conductor(_) => self,
+        }
     }
 
     /// Chance with which [`Surface::sample`] draws from the conductor of a mix.
@@ -137,7 +192,7 @@ impl Surface {
     #[inline]
     pub fn scatter(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
-        if !(ci > 0.0 && co > 0.0) || self.strength == 0.0 {
+        if !(ci > 0.0 && co > 0.0) || self.is_black() {
             return 0.0;
         }
         if self.diffuse() {
@@ -157,7 +212,7 @@ impl Surface {
             let (o, c) = cosine(n, rng)?;
             return Some((o, self.strength * PI, c / PI));
         }
-        if self.base == 0.0 {
+        if !self.is_mixed() {
             return self.sample_conductor(n, i, rng);
         }
         let o = if rng.uniform() < self.share() {
@@ -173,7 +228,7 @@ impl Surface {
     fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
-        let h = if self.ggx {
+        let h = if self.ggx() {
             visible_ggx(self.alpha, [t.dot(i), b.dot(i), ci], rng)
         } else {
             let (x, y) = rng.circle();
@@ -191,7 +246,7 @@ impl Surface {
             return None;
         }
         let d = self.density(n, i + o);
-        if self.ggx {
+        if self.ggx() {
             let pdf = self.masking(ci) * d / (4.0 * ci);
             return Some((o, self.strength * self.masking(co), pdf));
         }
@@ -210,13 +265,13 @@ impl Surface {
             return co / PI;
         }
         let d = self.density(n, i + o);
-        let conductor = if self.ggx {
+        let conductor = if self.ggx() {
             self.masking(ci) * d / (4.0 * ci)
         } else {
             let h = (i + o).normalized();
             d * n.dot(h) / (4.0 * i.dot(h))
         };
-        if self.base == 0.0 {
+        if !self.is_mixed() {
             return conductor;
         }
         let share = self.share();
@@ -229,7 +284,7 @@ impl Surface {
         let (c, s) = (n.dot(sum), n.cross(sum));
         let (c2, s2) = (c * c, s.dot(s));
         let a2 = self.alpha * self.alpha;
-        if self.ggx {
+        if self.ggx() {
             let r = 1.0 / (c2 + s2);
             let spread = (c2 + s2 / a2) * r;
             return if c > 0.0 {
@@ -252,7 +307,7 @@ impl Surface {
     fn masking(&self, c: f32) -> f32 {
         let tan = (1.0 - c * c).max(0.0).sqrt() / c;
         let slope = self.alpha * tan;
-        if self.ggx {
+        if self.ggx() {
             return 2.0 / (1.0 + (1.0 + slope * slope).sqrt());
         }
         let a = 1.0 / slope;

@@ -18,7 +18,7 @@
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
 //! scattering, joined by the balance heuristic.
 
-use picofarm_scene::{Material, Vec3};
+use picofarm_scene::Vec3;
 
 use crate::{
     api::Stop,
@@ -104,9 +104,8 @@ impl Caustics {
     /// The near-mirrors of a scene; `None` where there are none.
     pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Option<Self> {
         let narrow = |t: usize| {
-            let s = &world.surfaces[world.surface[t] as usize];
-            let lobe = s.alpha > 0.0 && s.alpha <= Material::SPECULAR_ALPHA && s.strength > 0.0;
-            lobe && world.normals[t] != Vec3::ZERO
+            let surface = &world.surfaces[world.surface[t] as usize];
+            surface.has_mirror() && world.normals[t] != Vec3::ZERO
         };
         let all = 0..world.triangles.len();
         let triangles: Vec<u32> = all.filter(|&t| narrow(t)).map(|t| t as u32).collect();
@@ -140,7 +139,7 @@ impl Caustics {
                 return None;
             }
             // A narrow lobe is not to be judged by the middle of a triangle.
-            let wide = e.surface.diffuse() || e.surface.alpha > Material::SPECULAR_ALPHA;
+            let wide = e.surface.diffuse() || e.surface.is_rough();
             let mut sum = 0.0;
             for (&t, &area) in self.triangles.iter().zip(&self.areas) {
                 let [a, b, c] = world.triangles[t as usize];
@@ -243,7 +242,7 @@ impl Caustics {
             walk.choose_lobe(rng, &mut next);
             path_m += world.metres((next.p - hit.p).length());
             (hit, wo) = (next, -w);
-            if hit.surface.strength == 0.0 || flux == 0.0 {
+            if hit.surface.is_black() || flux == 0.0 {
                 return None;
             }
             if hit.surface.specular {
@@ -297,7 +296,7 @@ impl Caustics {
         };
         let k = self.place[hit.triangle as usize];
         walk.choose_lobe(rng, &mut hit);
-        if k == NONE || !hit.surface.specular || hit.surface.strength == 0.0 {
+        if k == NONE || !hit.surface.specular || hit.surface.is_black() {
             return None;
         }
         let e = &emitters.list[spot];

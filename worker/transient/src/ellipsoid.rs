@@ -200,7 +200,7 @@ impl Shells {
         let (r, v) = (rng.uniform().sqrt(), rng.uniform());
         let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
         let hit = world.on(piece.triangle, p, self.towards);
-        (hit.surface.strength > 0.0).then_some(hit)
+        (!hit.surface.is_black()).then_some(hit)
     }
 
     /// Expected number of vertices drawn per area at a point.

@@ -40,7 +40,7 @@ fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
         // Where the beam meets that facet without the lift off the mirror before it.
         hit.p = world.point(hit.triangle, from, direction);
         path += world.metres((hit.p - from).length());
-        if hit.surface.specular && hit.surface.strength > 0.0 {
+        if hit.surface.specular && !hit.surface.is_black() {
             let n = hit.n;
             direction = (direction - n * (2.0 * n.dot(direction))).normalized();
             from = hit.p;
@@ -86,7 +86,7 @@ impl Emitter {
         // It also knows the texture there.
         let beneath = beneath.filter(|h| (h.p - p).length() < 1e-3);
         let surface = match beneath {
-            Some(h) if !surface.two_sided && h.surface.strength == 0.0 => surface.black(),
+            Some(h) if !surface.two_sided && h.surface.is_black() => surface.black(),
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
@@ -224,7 +224,7 @@ impl Emitters {
             let e = Emitter::new(world, &mut stack, beam, spot, surface);
             let index = all.list.len();
             let strength = if e.surface.diffuse() {
-                e.surface.strength
+                e.surface.lambertian()
             } else {
                 0.0
             };
@@ -250,7 +250,7 @@ impl Emitters {
         if surface.diffuse() {
             self.columns.irradiance(x, n, out);
             for w in out.iter_mut() {
-                *w *= surface.strength;
+                *w *= surface.lambertian();
             }
             for &i in &self.glossy {
                 out[i] = self.weight(i, x, n, wo, surface);

@@ -5,7 +5,7 @@
 
 use std::f32::consts::PI;
 
-use picofarm_scene::{Material, Vec3};
+use picofarm_scene::Vec3;
 
 use crate::{
     bsdf::Surface,
@@ -68,7 +68,7 @@ impl LightVertices {
                 continue;
             };
             walk.choose_lobe(rng, &mut hit);
-            if weight == 0.0 || hit.surface.specular || hit.surface.strength == 0.0 {
+            if weight == 0.0 || hit.surface.specular || hit.surface.is_black() {
                 continue;
             }
             let leg = hit.p - e.p;
@@ -110,7 +110,7 @@ impl LightVertices {
 
     fn push(&mut self, y: LightVertex) {
         let lambert = if y.hit.surface.diffuse() {
-            y.hit.surface.strength
+            y.hit.surface.lambertian()
         } else {
             self.glossy.push(self.list.len());
             0.0
@@ -130,7 +130,7 @@ impl LightVertices {
                 let plain = *w / (s * PI);
                 let share = y.density / (y.density + plain);
                 *w = if *w > 0.0 {
-                    *w * x.surface.strength * share
+                    *w * x.surface.lambertian() * share
                 } else {
                     0.0
                 };
@@ -147,7 +147,7 @@ impl LightVertices {
 
     /// True where [`LightVertices::glossy_weights`] has something to give.
     pub fn has_gloss(&self) -> bool {
-        let gloss = |&i: &usize| self.list[i].hit.surface.alpha > Material::SPECULAR_ALPHA;
+        let gloss = |&i: &usize| self.list[i].hit.surface.is_rough();
         self.glossy.iter().any(gloss)
     }
 
@@ -158,12 +158,8 @@ impl LightVertices {
         out.resize(self.list.len(), 0.0);
         for &i in &self.glossy {
             let surface = self.list[i].hit.surface;
-            if surface.alpha > Material::SPECULAR_ALPHA {
-                let conductor = Surface {
-                    base: 0.0,
-                    ..surface
-                };
-                out[i] = self.weight_by(i, &conductor, x, wo);
+            if surface.is_rough() {
+                out[i] = self.weight_by(i, &surface.gloss(), x, wo);
             }
         }
     }

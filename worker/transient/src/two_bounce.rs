@@ -124,7 +124,7 @@ impl Strata {
                 .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
             let hit = world
                 .closest(&mut scratch.stack, Vec3::ZERO, d)
-                .filter(|h| h.surface.strength > 0.0);
+                .filter(|h| !h.surface.is_black());
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
                 emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);

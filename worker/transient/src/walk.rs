@@ -144,7 +144,7 @@ impl Walk<'_> {
     /// True where a path with one more vertex and a spot can still count.
     #[inline]
     pub fn goes_on(&self, v: &Vertex) -> bool {
-        v.hit.surface.strength > 0.0
+        !v.hit.surface.is_black()
             && v.bounce + 2 <= self.max_bounces
             && v.length_m + self.shortest_m < self.gate.end_m()
             && self.in_time(v.hit.p, v.length_m)
@@ -191,7 +191,7 @@ impl Walk<'_> {
     /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
     #[inline]
     pub fn choose_lobe(&self, rng: &mut Rng, hit: &mut Hit) {
-        if hit.surface.base > 0.0 {
+        if hit.surface.is_mixed() {
             hit.surface = hit.surface.lobe(rng.uniform());
         }
     }

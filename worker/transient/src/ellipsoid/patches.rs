@@ -67,7 +67,7 @@ impl Patches {
         let areas: Vec<f32> = (0..world.triangles.len())
             .map(|t| {
                 let surface = &world.surfaces[world.surface[t] as usize];
-                let scatters = surface.strength > 0.0 && (surface.diffuse() || surface.base > 0.0);
+                let scatters = !surface.is_black() && (surface.diffuse() || surface.is_mixed());
                 let area = area(&world.triangles[t]);
                 let counts = scatters && world.normals[t] != Vec3::ZERO && area > 0.0;
                 if counts { area } else { 0.0 }
@@ -197,7 +197,7 @@ impl Patches {
     fn measure(&mut self, world: &World, emitters: &Emitters) {
         for e in &emitters.list {
             let start = (e.path_m * f64::from(world.scale)) as f32;
-            let lit = e.surface.strength > 0.0 && e.n.dot(e.back) > 0.0;
+            let lit = !e.surface.is_black() && e.n.dot(e.back) > 0.0;
             for k in 0..self.len() {
                 let to = self.centre(k) - e.p;
                 let d = to.length();

@@ -102,7 +102,7 @@ impl Sharing {
                     let d = d2.sqrt();
                     let strength = emitters.columns.strength[spot];
                     density += if strength > 0.0 {
-                        w / (strength * h.surface.strength * PI)
+                        w / (strength * h.surface.lambertian() * PI)
                     } else {
                         let out = to / d;
                         e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
@@ -186,7 +186,7 @@ impl Sharing {
                 let d = d2.sqrt();
                 if x.surface.diffuse() {
                     density += *w / PI;
-                    *w *= v.beta * x.surface.strength;
+                    *w *= v.beta * x.surface.lambertian();
                 } else {
                     let w_in = to / d;
                     let cos = h.n.dot(w_in).abs() / d2;

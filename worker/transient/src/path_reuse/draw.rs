@@ -79,7 +79,7 @@ impl Sharing {
                 continue;
             };
             walk.choose_lobe(rng, &mut next.hit);
-            if next.hit.surface.strength == 0.0 {
+            if next.hit.surface.is_black() {
                 continue;
             }
             if next.hit.surface.diffuse() {
@@ -117,7 +117,7 @@ impl Sharing {
                 .filter(|_| weight > 0.0);
             let Some(mut hit) = hit else { continue };
             walk.choose_lobe(rng, &mut hit);
-            if hit.surface.strength > 0.0 && hit.surface.diffuse() {
+            if !hit.surface.is_black() && hit.surface.diffuse() {
                 self.shared.push(Shared {
                     hit,
                     light: 0.0,
@@ -209,7 +209,7 @@ impl Turns {
         let w = t * (r * libm::cosf(angle)) + b * (r * libm::sinf(angle)) + n * z;
         let w = w.normalized();
         let c = n.dot(w);
-        (c > 0.0).then_some((w, surface.strength * PI, c / PI))
+        (c > 0.0).then_some((w, surface.lambertian() * PI, c / PI))
     }
 }
 

@@ -21,7 +21,7 @@ impl Walk<'_> {
         sink: &mut impl Sink,
     ) {
         let h = &v.hit;
-        if h.surface.strength == 0.0 {
+        if h.surface.is_black() {
             return;
         }
         let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
@@ -91,7 +91,7 @@ impl Walk<'_> {
         if h.surface.diffuse() {
             // Both Lambertian: weight = strength · f · cos cos / d², and the light vertex' density is
             // share(cos / π) · cos / d².
-            let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.strength));
+            let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.lambertian()));
             for (w, &s) in weights.iter_mut().zip(strength) {
                 let weighed = *w * plain / (plain + light * *w / s);
                 *w = if s > 0.0 { weighed } else { *w };
@@ -151,7 +151,7 @@ impl Walk<'_> {
         let Some(m) = self.world.closest(&mut scratch.stack, from, to) else {
             return;
         };
-        if self.mirrors.of(m.triangle) != Some(aim.mirror) || m.surface.strength == 0.0 {
+        if self.mirrors.of(m.triangle) != Some(aim.mirror) || m.surface.is_black() {
             return;
         }
         let leg = m.p - h.p;
