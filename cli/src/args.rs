@@ -14,7 +14,7 @@ mod sweep;
 use std::{ffi::OsString, net::SocketAddr, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 
 pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs,

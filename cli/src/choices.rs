@@ -1,9 +1,6 @@
 //! `--strategy` and `--strategies`: the renderer's ways of finding light, chosen by hand.
 
-use std::collections::BTreeMap;
-
-use picofarm_proto::model::Choice;
-use picofarm_transient::Strategy;
+use picofarm_settings::{Choice, Strategy};
 
 use crate::error::{CliError, Result};
 
@@ -27,7 +24,7 @@ pub struct Variant {
 /// A message that lists the names there are.
 pub fn parse(text: &str) -> Result<Chosen, String> {
     let Some((name, value)) = text.split_once('=') else {
-        let all = picofarm_agent::strategy_names().join(", ");
+        let all = Strategy::NAMES.join(", ");
         return Err(format!(
             "expected NAME=VALUE with a number, on or off; the names are {all}"
         ));
@@ -42,7 +39,7 @@ pub fn parse(text: &str) -> Result<Chosen, String> {
                 .map_err(|_| format!("{name} = {number:?}: expected a number, on or off"))?,
         ),
     };
-    picofarm_agent::strategy(&BTreeMap::from([(name.clone(), choice)]))?;
+    Strategy::default().choose(&name, choice)?;
     Ok(Chosen { name, choice })
 }
 
@@ -51,16 +48,16 @@ pub fn parse(text: &str) -> Result<Chosen, String> {
 /// # Errors
 /// One is made twice.
 pub fn together(chosen: &[Chosen]) -> Result<Strategy> {
-    let mut all = BTreeMap::new();
-    for c in chosen {
-        if all.insert(c.name.clone(), c.choice).is_some() {
-            return Err(CliError::input(format!(
-                "--strategy: {} is chosen twice",
-                c.name
-            )));
+    let mut all = Strategy::default();
+    for (i, c) in chosen.iter().enumerate() {
+        if chosen[..i].iter().any(|earlier| earlier.name == c.name) {
+            let what = format!("--strategy: {} is chosen twice", c.name);
+            return Err(CliError::input(what));
         }
+        all.choose(&c.name, c.choice)
+            .map_err(|e| CliError::input(format!("--strategy: {e}")))?;
     }
-    picofarm_agent::strategy(&all).map_err(|e| CliError::input(format!("--strategy: {e}")))
+    Ok(all)
 }
 
 /// What one word of `--strategies` stands for.
@@ -87,12 +84,14 @@ pub fn ways(text: &str) -> Result<Ways, String> {
         "default" => Ok(Ways(vec![default])),
         "each" => {
             // What is no switch is a size, and 1 makes nothing of it.
-            let without = |name: String| {
+            let without = |name: &str| {
                 let name = name.replace('_', "-");
                 of(&format!("{name}=off")).or_else(|_| of(&format!("{name}=1")))
             };
-            let names = picofarm_agent::strategy_names().into_iter();
-            let all = names.map(without).collect::<Result<Vec<_>, _>>()?;
+            let all = Strategy::NAMES
+                .into_iter()
+                .map(without)
+                .collect::<Result<Vec<_>, _>>()?;
             Ok(Ways([vec![default], all].concat()))
         }
         _ => Ok(Ways(vec![of(text)?])),
@@ -165,7 +164,7 @@ mod tests {
         );
 
         let each = all(&["each"]);
-        assert_eq!(each.len(), 1 + picofarm_agent::strategy_names().len());
+        assert_eq!(each.len(), 1 + Strategy::NAMES.len());
         assert_eq!(each[1].name, "path-reuse=1");
         assert!(each.iter().any(|v| v.name == "light-vertices=off"));
     }

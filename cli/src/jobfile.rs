@@ -234,7 +234,8 @@ mod tests {
         };
         assert_eq!(render.subsets, [4, 25]);
         assert!(render.per_spot);
-        assert_eq!(render.strategy.len(), 2);
+        assert_eq!(render.strategy.path_reuse, Some(1));
+        assert!(render.strategy.mirror_images.is_some());
         let wrong = text.replace("mirror_images", "lobes");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(
@@ -250,7 +251,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let text = template(JobKind::Primitive).replace("samples = 32", "error = \"10%\"");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
-        let budget = picofarm_proto::model::Budget::Error(0.1);
+        let budget = picofarm_settings::Budget::Error(0.1);
         let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
             unreachable!("the template renders");
         };

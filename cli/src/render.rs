@@ -18,7 +18,7 @@ use picofarm_scene::{
     Scene,
     import::{self, ImportOptions},
 };
-use picofarm_transient::{Budget, Forecast, Gate, Progress, RenderError, Rendered, Settings};
+use picofarm_transient::{Budget, Forecast, Progress, RenderError, Rendered, Settings};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -70,8 +70,8 @@ impl Order {
             bin_width_m: args.gate.bin_width_m,
             bins: args.gate.bins,
             budget: match args.error {
-                Some(e) => picofarm_proto::model::Budget::Error(e),
-                None => picofarm_proto::model::Budget::Samples(samples),
+                Some(e) => Budget::Error(e),
+                None => Budget::Samples(samples),
             },
             max_bounces: args.max_bounces.unwrap_or(0),
             ..RenderSettings::default()
@@ -87,15 +87,8 @@ impl Order {
         }
         let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
         let settings = Settings {
-            gate: Gate {
-                start_m: args.gate.gate_start_m,
-                bin_width_m: args.gate.bin_width_m,
-                bins: args.gate.bins,
-            },
-            budget: match args.error {
-                Some(e) => Budget::Error(e as f32),
-                None => Budget::Samples(samples),
-            },
+            gate: asked.gate(),
+            budget: asked.budget,
             max_bounces: args.max_bounces.filter(|most| *most != 0),
             one_bounce: true,
             seed: args.seed,

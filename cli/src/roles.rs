@@ -4,10 +4,11 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use picofarm_agent::{AgentConfig, AgentError, Memory};
 use picofarm_coordinator::{
-    CatalogPlace, Connections, CoordinatorConfig, CoordinatorError, Running, Stored,
+    Connections, CoordinatorConfig, CoordinatorError, Running, Stored,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
+use picofarm_database::CatalogPlace;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 

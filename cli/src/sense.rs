@@ -7,7 +7,10 @@ use std::{path::Path, time::Instant};
 use picofarm_dataset::{DatasetError, RenderArray, RenderGroup, write_render_group};
 use picofarm_transient::{
     Gate,
-    sensor::{Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values},
+    sensor::{
+        Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values,
+        sense as measure,
+    },
 };
 use serde_json::{Map, Value, json};
 
@@ -73,8 +76,7 @@ fn sense(args: &SceneSense, sensor: &Sensor) -> Result<Report> {
         bins,
         bin_width_ps: gate.bin_width_m * PS_PER_M,
     };
-    let sensed = sensor
-        .sense(&input, args.seed, args.scene)
+    let sensed = measure(sensor, &input, args.seed, args.scene)
         .map_err(|e: SensorError| CliError::input(format!("{}: {e}", args.render.display())))?;
     let scale_from = match (by_peak, &two) {
         (false, _) => "settings",

@@ -7,8 +7,8 @@ use figment::{
     providers::{Env, Format, Serialized, Toml},
 };
 use picofarm_agent::Access;
+use picofarm_credentials::Secret;
 use picofarm_dataset::Bandwidth;
-use picofarm_proto::credentials::Secret;
 use serde::{Deserialize, Serialize};
 
 use crate::{

@@ -31,7 +31,6 @@ pub mod transition;
 pub use budget::Backoff;
 pub use clock::Clock;
 pub use connections::Connections;
-pub use picofarm_catalog::CatalogPlace;
 pub use server::{CoordinatorConfig, CoordinatorError, MAX_MESSAGE_BYTES, Running, serve};
 pub use stored::{Found, Stored};
 

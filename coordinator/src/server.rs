@@ -2,8 +2,8 @@
 
 use std::{io, net::SocketAddr, sync::Arc, time::Duration};
 
-use picofarm_catalog::{CatalogError, CatalogPlace};
-use picofarm_proto::credentials::CredentialError;
+use picofarm_catalog::{CatalogError, CatalogSource};
+use picofarm_credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
 use tokio::{
     net::TcpListener,
@@ -50,7 +50,7 @@ const KEEPALIVE: Duration = Duration::from_secs(20);
 #[derive(Debug, Clone)]
 pub struct CoordinatorConfig {
     /// The catalog; what is missing is created.
-    pub catalog: CatalogPlace,
+    pub catalog: Arc<dyn CatalogSource>,
     /// Where to listen; port 0 = any free port.
     pub listen: SocketAddr,
     /// Life of a lease without a heartbeat, milliseconds (default 60,000).
@@ -89,9 +89,9 @@ pub struct CoordinatorConfig {
 
 impl CoordinatorConfig {
     /// The defaults, for this catalog and address.
-    pub fn new(catalog: impl Into<CatalogPlace>, listen: SocketAddr) -> Self {
+    pub fn new(catalog: impl CatalogSource + 'static, listen: SocketAddr) -> Self {
         Self {
-            catalog: catalog.into(),
+            catalog: Arc::new(catalog),
             listen,
             lease_ms: 60_000,
             heartbeat_ms: 10_000,

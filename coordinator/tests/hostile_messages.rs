@@ -7,6 +7,7 @@ use std::{
 };
 
 use picofarm_coordinator::{CoordinatorConfig, Running, VERSION, serve};
+use picofarm_database::CatalogPlace;
 use picofarm_proto::{
     PROTOCOL,
     model::{JobSpec, RenderTask, TaskSpec},
@@ -50,7 +51,8 @@ impl Server {
         }));
         let folder = tempfile::tempdir().unwrap();
         let listen = "127.0.0.1:0".parse().unwrap();
-        let config = CoordinatorConfig::new(folder.path().join("catalog.db"), listen);
+        let config =
+            CoordinatorConfig::new(CatalogPlace::from(folder.path().join("catalog.db")), listen);
         let running = serve(config, CancellationToken::new()).await.unwrap();
         let url = format!("http://{}", running.address);
         Self {

@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 use picofarm_coordinator::{CoordinatorConfig, serve};
+use picofarm_database::CatalogPlace;
 use picofarm_proto::wire::{self, jobs_client::JobsClient};
 use rustix::process::{Resource, Rlimit, setrlimit};
 use tokio::{
@@ -25,7 +26,10 @@ async fn a_listener_without_a_file_left_goes_on_when_there_are_some_again() {
     setrlimit(Resource::Nofile, limit).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let any = "127.0.0.1:0".parse().unwrap();
-    let mut config = CoordinatorConfig::new(folder.path().join("catalog.sqlite"), any);
+    let mut config = CoordinatorConfig::new(
+        CatalogPlace::from(folder.path().join("catalog.sqlite")),
+        any,
+    );
     config.http = Some(any);
     let running = serve(config, CancellationToken::new()).await.unwrap();
     // Clients of this same process: half of the connections' files are theirs.

@@ -1,8 +1,7 @@
 //! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
-//! protobuf types with their conversions. No I/O, but for [`credentials`].
+//! protobuf types with their conversions. No I/O.
 
 pub mod convert;
-pub mod credentials;
 pub mod ids;
 pub mod key;
 pub mod model;

@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::{StageKey, spec_hash, stage_key},
-    model::{Choice, JobSpec, RenderTask, SpecError, TaskSpec},
+    model::{JobSpec, RenderTask, SpecError, TaskSpec},
     wire,
 };
 
@@ -69,7 +69,7 @@ fn subsets_and_strategies_survive_the_wire_and_the_catalog() {
         unreachable!("the job renders");
     };
     assert_eq!(render.subsets, [4, 25]);
-    assert_eq!(render.strategy["light_vertices"], Choice::On(false));
+    assert_eq!(render.strategy.light_vertices, Some(false));
     let back = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
     assert_eq!(back, spec);
     let stored = serde_json::to_string(&spec).unwrap();

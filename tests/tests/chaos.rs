@@ -308,7 +308,8 @@ fn a_frozen_workers_late_report_is_refused_and_its_objects_are_those_of_the_othe
     let job = Job::slow(&cluster.scratch.join("store"), 1);
     let id = cluster.submit(&job);
     let mut zombie = cluster.worker("zombie", 0);
-    zombie.until_says("task starts");
+    // Once it renders: before, it would look into the store when it wakes, and find what the other has made.
+    zombie.until_says("scene made");
     zombie.signal(Signal::Stop);
     let _heir = cluster.worker("heir", 1);
     done_once(&cluster, &id, 1);

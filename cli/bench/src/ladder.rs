@@ -132,7 +132,7 @@ pub fn run(
     let ways = variants(&args.strategies);
     let until = Settings {
         strategy: ways[0].strategy,
-        ..settings(args, Budget::Error(target as f32), 1)
+        ..settings(args, Budget::Error(target), 1)
     };
     let until = bench.render(scene, &until, &what)?;
     let truth = match &args.truth {

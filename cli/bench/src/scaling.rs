@@ -123,7 +123,7 @@ struct Study<'a> {
 impl Study<'_> {
     fn size(&self, scene: &Scene, bins: u32, what: &str) -> Result<Size> {
         let target = self.args.error[0];
-        let mut settings = settings(self.args, Budget::Error(target as f32), 1);
+        let mut settings = settings(self.args, Budget::Error(target), 1);
         settings.gate = with_bins(settings.gate, bins);
         let what = format!("{}: {what}, until {} %", scene.name, target * 100.0);
         let measured = self.bench.render(scene, &settings, &what)?;

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 fn main() -> ExitCode {
     #[cfg(feature = "bench")]
     let bench: Option<picofarm_cli::Bench> =
-        Some(|command, settings, output| Box::pin(picofarm_bench::run(command, settings, output)));
+        Some(|command, settings, output| Box::pin(picofarm_perf::run(command, settings, output)));
     #[cfg(not(feature = "bench"))]
     let bench = None;
     picofarm_cli::run_program(bench)

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use picofarm_agent::{
     Control, TaskError,
-    reprocess::{Reprocessor, sensor_settings, sensor_version},
+    reprocess::{Reprocessor, sensor_version},
 };
 use picofarm_proto::model::{
     OutputSettings, ReprocessSettings, ReprocessTask, SourceSettings, TaskKind,
@@ -78,7 +78,7 @@ fn task(args: &DatasetReprocess) -> Result<ReprocessTask> {
     let mut settings = ReprocessSettings {
         histogram: args.histogram,
         spots: args.spots.clone(),
-        sensor: sensor_settings(&options::settings(&args.sensor)?),
+        sensor: options::settings(&args.sensor)?,
         drop_left_over: args.drop_left_over,
         seed: args.seed,
         version: sensor_version(),

@@ -6,7 +6,8 @@ use std::{
 };
 
 use futures::future::{Either, Ready, ready};
-use picofarm_proto::{credentials::Described, model::Outcome};
+use picofarm_credentials::Described;
+use picofarm_proto::model::Outcome;
 use tonic::{Status, body::Body};
 use tower::{Layer, Service};
 

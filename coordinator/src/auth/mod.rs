@@ -10,8 +10,8 @@ mod tokens;
 
 use std::{fmt, path::PathBuf, sync::Arc, time::Duration};
 
+use picofarm_credentials::Described;
 use picofarm_proto::{
-    credentials::Described,
     model::{Act, Outcome, audit::WHO_BYTES},
     show,
 };

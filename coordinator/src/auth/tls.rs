@@ -2,7 +2,7 @@
 
 use std::{fmt, path::PathBuf, sync::Arc};
 
-use picofarm_proto::credentials::{CredentialError, Described, Pair, certificates};
+use picofarm_credentials::{CredentialError, Described, Pair, certificates};
 use rustls::{
     RootCertStore, ServerConfig,
     crypto::ring,

@@ -6,10 +6,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use picofarm_proto::{
-    credentials::{CredentialError, Described, Secret, private},
-    model::check_project,
-};
+use picofarm_credentials::{CredentialError, Described, Secret, private};
+use picofarm_proto::model::check_project;
 use rustls::crypto::ring;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};

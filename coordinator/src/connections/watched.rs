@@ -2,10 +2,8 @@
 
 use std::{sync::Arc, time::Duration};
 
-use picofarm_proto::{
-    credentials::CredentialError,
-    model::{Act, Outcome},
-};
+use picofarm_credentials::CredentialError;
+use picofarm_proto::model::{Act, Outcome};
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;

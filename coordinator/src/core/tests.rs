@@ -8,9 +8,9 @@ use std::{
 };
 
 use picofarm_catalog::{
-    Catalog, CatalogError, EventQuery, Job, Outcome, PostgresCatalog, Recorded, ResultSet, Run,
-    Sight, SqliteCatalog, Submission, testing,
+    Catalog, CatalogError, EventQuery, Job, Outcome, Recorded, ResultSet, Run, Sight, Submission,
 };
+use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, InstanceId, JobId, WorkerId},

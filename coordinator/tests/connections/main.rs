@@ -6,8 +6,9 @@ mod tls;
 
 use std::{path::Path, time::Duration};
 
-use picofarm_catalog::{AuditQuery, Rights, SqliteCatalog};
+use picofarm_catalog::{AuditQuery, Rights};
 use picofarm_coordinator::{Connections, CoordinatorConfig, Running, VERSION, serve};
+use picofarm_database::{CatalogPlace, SqliteCatalog};
 use picofarm_proto::{
     PROTOCOL,
     wire::{
@@ -35,7 +36,7 @@ struct Server {
 
 async fn start(folder: &Path, change: impl FnOnce(&mut CoordinatorConfig)) -> Server {
     let any = "127.0.0.1:0".parse().unwrap();
-    let mut config = CoordinatorConfig::new(folder.join("catalog.sqlite"), any);
+    let mut config = CoordinatorConfig::new(CatalogPlace::from(folder.join("catalog.sqlite")), any);
     config.http = Some(any);
     change(&mut config);
     let stop = CancellationToken::new();

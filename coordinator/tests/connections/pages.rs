@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use picofarm_coordinator::{CoordinatorConfig, Running, serve};
+use picofarm_database::CatalogPlace;
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpStream,
@@ -14,7 +15,10 @@ use super::PATIENCE;
 
 async fn start(folder: &tempfile::TempDir) -> Running {
     let any = "127.0.0.1:0".parse().unwrap();
-    let mut config = CoordinatorConfig::new(folder.path().join("catalog.sqlite"), any);
+    let mut config = CoordinatorConfig::new(
+        CatalogPlace::from(folder.path().join("catalog.sqlite")),
+        any,
+    );
     config.http = Some(any);
     serve(config, CancellationToken::new()).await.unwrap()
 }

@@ -3,7 +3,7 @@
 
 use std::{path::PathBuf, process::Command};
 
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 use picofarm_proto::{model::JobState, wire};
 
 use crate::harness::{Farm, catalog_of, rendering, spec};

@@ -11,9 +11,9 @@ use std::{
 
 use futures::future::BoxFuture;
 use picofarm_coordinator::{
-    Backoff, CatalogPlace, Clock, CoordinatorConfig, CoordinatorError, Found, Running, Stored,
-    VERSION, serve,
+    Backoff, Clock, CoordinatorConfig, CoordinatorError, Found, Running, Stored, VERSION, serve,
 };
+use picofarm_database::CatalogPlace;
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, WorkerId},
@@ -95,6 +95,7 @@ pub struct Farm {
     /// How long the coordinator was suspended.
     slept: Arc<AtomicI64>,
     pub config: CoordinatorConfig,
+    catalog: CatalogPlace,
     stop: CancellationToken,
     running: Option<Running>,
     pub jobs: JobsClient<Channel>,
@@ -108,7 +109,7 @@ impl Farm {
     /// A farm on each kind of catalog: SQLite, and Postgres where there is one for tests.
     pub async fn start_on_each() -> Vec<Self> {
         let mut farms = vec![Self::start().await];
-        if let Some(url) = picofarm_catalog::testing::postgres().await {
+        if let Some(url) = picofarm_database::testing::postgres().await {
             farms.push(Self::start_on(Some(CatalogPlace::Postgres(url))).await);
         }
         farms
@@ -135,7 +136,7 @@ impl Farm {
             ),
             http: Some("127.0.0.1:0".parse().unwrap()),
             stored: Some(Arc::clone(&shelf) as Arc<dyn Stored>),
-            ..CoordinatorConfig::new(catalog, "127.0.0.1:0".parse().unwrap())
+            ..CoordinatorConfig::new(catalog.clone(), "127.0.0.1:0".parse().unwrap())
         };
         let (running, stop, jobs) = run(&config).await.unwrap();
         Self {
@@ -144,6 +145,7 @@ impl Farm {
             clock,
             slept,
             config,
+            catalog,
             stop,
             running: Some(running),
             jobs,
@@ -489,5 +491,5 @@ impl Worker {
 }
 
 pub fn catalog_of(farm: &Farm) -> CatalogPlace {
-    farm.config.catalog.clone()
+    farm.catalog.clone()
 }

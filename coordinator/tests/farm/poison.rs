@@ -1,7 +1,7 @@
 //! Messages that cannot be used, or that a database refuses, cost what they are about and nothing else: no session ends, no
 //! other task or job waits.
 
-use picofarm_catalog::testing;
+use picofarm_database::testing;
 use picofarm_proto::{
     key::task_key,
     model::{JobSpec, JobState, Lease},

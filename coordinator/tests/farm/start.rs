@@ -1,6 +1,7 @@
 //! Starting, stopping and starting again.
 
 use picofarm_coordinator::{CoordinatorConfig, CoordinatorError, serve};
+use picofarm_database::CatalogPlace;
 use picofarm_proto::model::JobState;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -54,7 +55,10 @@ async fn a_worker_of_another_version_is_refused() {
 async fn a_port_in_use_is_said_plainly() {
     let farm = Farm::start().await;
     let folder = tempfile::tempdir().unwrap();
-    let config = CoordinatorConfig::new(folder.path().join("c.db"), farm.address());
+    let config = CoordinatorConfig::new(
+        CatalogPlace::from(folder.path().join("c.db")),
+        farm.address(),
+    );
     let error = serve(config, CancellationToken::new()).await.unwrap_err();
     assert!(matches!(error, CoordinatorError::AddressInUse { .. }));
     assert!(error.to_string().contains("port"), "{error}");

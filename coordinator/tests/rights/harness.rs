@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use picofarm_catalog::testing;
 use picofarm_coordinator::{
-    CatalogPlace, CoordinatorConfig, Running,
+    CoordinatorConfig, Running,
     auth::{Role, Tokens, Visibility},
     serve,
 };
+use picofarm_database::{CatalogPlace, testing};
 use picofarm_proto::{
     model::JobSpec,
     wire::{self, farm_client::FarmClient, jobs_client::JobsClient},

@@ -11,12 +11,12 @@ pub mod log;
 pub mod memory;
 mod refer;
 mod scale;
-pub mod sensor;
 pub mod status;
 pub mod sweep;
 mod text;
 
 pub use audit::{Act, AuditEntry, Outcome};
+// What jobs share with data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::{
     JobSpec, Limits, OutputSettings, Resources, SourceSettings, SpecError, StageSpec, check_label,
@@ -30,7 +30,7 @@ pub use kinds::{
     generate::GenerateSettings,
     import::ImportSettings,
     infer::{self, InferSettings},
-    render::{self, Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource},
+    render::{self, RenderSettings, SceneFile, SceneKind, SceneSource},
     report::{self, ReportSettings},
     reprocess::{self, Histogram, ReprocessSettings},
     train::{self, TrainSettings},
@@ -39,8 +39,8 @@ pub use lease::{
     Abilities, Failure, FailureKind, Finished, Lease, TaskAt, TaskProgress, WorkerHello,
 };
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
+pub use picofarm_settings::{Budget, Choice, Sensor, Strategy};
 pub use scale::scaled;
-pub use sensor::{DeadTimeSettings, JitterSettings, PulseSettings, ScaleSettings, SensorSettings};
 pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,

@@ -3,11 +3,12 @@
 
 use std::collections::BTreeMap;
 
+use picofarm_settings::{Budget, Choice, Strategy};
 use serde::Deserialize;
 
 use super::{
     job::SpecError,
-    kinds::render::{Budget, Choice, RenderSettings, SceneFile, SceneKind, SceneSource},
+    kinds::render::{RenderSettings, SceneFile, SceneKind, SceneSource},
 };
 use crate::show;
 
@@ -169,6 +170,12 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             }
             (None, None) => default.budget,
         };
+        let mut strategy = Strategy::default();
+        for (name, choice) in text.strategy {
+            strategy
+                .choose(&name, choice)
+                .map_err(|what| SpecError::new("render.strategy", what))?;
+        }
         // The order in which somebody names them shall not make other results of them.
         let mut subsets = text.subsets;
         subsets.sort_unstable();
@@ -182,7 +189,7 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             renderer: text.renderer.unwrap_or_default(),
             subsets,
             per_spot: text.per_spot,
-            strategy: text.strategy,
+            strategy,
         })
     }
 }

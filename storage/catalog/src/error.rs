@@ -94,7 +94,7 @@ pub enum CatalogError {
         /// The database.
         place: String,
         /// The database's answer.
-        source: sqlx::Error,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// The database's server does not let us in.
     #[error("catalog {place}: {what}")]
@@ -128,7 +128,7 @@ impl CatalogError {
     }
 
     /// The error a person can act on, for a failure of the file system while doing `what`.
-    pub(crate) fn file(path: &Path, what: &'static str, source: io::Error) -> Self {
+    pub fn file(path: &Path, what: &'static str, source: io::Error) -> Self {
         let path = path.to_owned();
         match source.kind() {
             io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {

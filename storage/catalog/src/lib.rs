@@ -1,5 +1,5 @@
-//! What coordinators must remember: jobs, ranges, outputs, failures and history. One trait, [`Catalog`]; behind it
-//! SQLite for one coordinator and, with the feature `postgres`, Postgres for several. Rows never leave this crate.
+//! What coordinators must remember: jobs, ranges, outputs, failures and history, as plain data and one trait, [`Catalog`].
+//! The databases that keep it are behind the trait, in crates of their own; nothing here reads or writes anything.
 //!
 //! # Instances
 //! A *instance* is one life of a coordinator on a catalog. Each range that is pending or leased is some instance's or nobody's;
@@ -15,24 +15,13 @@
 
 mod changes;
 mod error;
-mod graph;
 mod listing;
-mod lock;
-mod migrations;
-mod place;
-#[cfg(feature = "postgres")]
-mod postgres;
 mod record;
 mod refused;
 mod rights;
-mod sql;
-mod sql_jobs;
-mod sql_listing;
-mod sql_rights;
-mod sqlite;
 mod submission;
-#[cfg(feature = "testing")]
-pub mod testing;
+
+use std::{fmt, sync::Arc};
 
 use async_trait::async_trait;
 use picofarm_proto::{
@@ -43,18 +32,24 @@ use picofarm_proto::{
 pub use changes::Changes;
 pub use error::CatalogError;
 pub use listing::{Forgotten, JobQuery, Page};
-pub use place::CatalogPlace;
-#[cfg(feature = "postgres")]
-pub use postgres::PostgresCatalog;
 pub use record::{
     Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,
     News, Output, Owned, Range, RangeState, ResultSet, Run, Settled, Snapshot, StageCounts,
     StageRecord, TaskRecord, Timing, Want, Worker,
 };
-pub use refused::{Culprit, Row, culprits};
+pub use refused::{Culprit, Row, culprits, verdict};
 pub use rights::{AuditQuery, NewAudit, Owner, Rights, Sight};
-pub use sqlite::SqliteCatalog;
 pub use submission::{Gone, Outcome, Recorded, Submission};
+
+/// A catalog that can be opened: where it lies. Its text never shows a password.
+#[async_trait]
+pub trait CatalogSource: fmt::Display + fmt::Debug + Send + Sync {
+    /// Opens the catalog, creating what is missing. `holder` tells people who has it.
+    ///
+    /// # Errors
+    /// A [`CatalogError`] that says what to do.
+    async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError>;
+}
 
 /// Durable memory of coordinators. All methods may be called concurrently; each is one transaction.
 ///

@@ -321,7 +321,7 @@ impl NewEvent {
     }
 
     /// The end of a job.
-    pub(crate) fn ended(job: JobId, at_ms: i64, counts: &TaskCounts) -> Self {
+    pub fn ended(job: JobId, at_ms: i64, counts: &TaskCounts) -> Self {
         let mut message = format!(
             "{} of {} tasks done, {} dead",
             counts.done, counts.total, counts.dead
@@ -483,7 +483,7 @@ pub struct Settled {
 
 impl Settled {
     /// Adds what came of another part.
-    pub(crate) fn join(&mut self, other: Self) {
+    pub fn join(&mut self, other: Self) {
         self.opened.extend(other.opened);
         self.ends.extend(other.ends);
     }

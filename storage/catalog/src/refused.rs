@@ -96,8 +96,11 @@ pub async fn culprits(
     Ok(found)
 }
 
-/// What a trial shows.
-pub(crate) fn verdict(tried: Result<(), CatalogError>) -> Result<Option<String>, CatalogError> {
+/// What a trial of a change set shows: the words of a refusal, if it was refused by its content.
+///
+/// # Errors
+/// The trial itself failed.
+pub fn verdict(tried: Result<(), CatalogError>) -> Result<Option<String>, CatalogError> {
     match tried {
         // Whether another result is there already, the commit finds.
         Ok(()) | Err(CatalogError::Conflict(_)) => Ok(None),

@@ -1,7 +1,5 @@
 //! Whose jobs are, who may see them, and the record of who did what.
 
-use std::borrow::Cow;
-
 use async_trait::async_trait;
 use picofarm_proto::{
     ids::JobId,
@@ -54,38 +52,7 @@ impl Sight {
             }
         }
     }
-
-    /// What [`seen!`] compares the columns of a job with.
-    pub(crate) fn columns(&self) -> [Cow<'static, str>; 3] {
-        match self {
-            Self::All => ["all".into(), "".into(), "".into()],
-            Self::Of { user, projects } => [
-                "some".into(),
-                user.clone().into(),
-                format!(",{},", projects.join(",")).into(),
-            ],
-        }
-    }
 }
-
-/// The condition that a job may be seen, given the names of three arguments ([`Sight::columns`]). Both databases
-/// understand it: neither has arrays and `replace` is in both.
-macro_rules! seen {
-    ($all:literal, $user:literal, $projects:literal) => {
-        concat!(
-            "(",
-            $all,
-            " = 'all' OR job.username = ",
-            $user,
-            " OR (job.project <> '' AND replace(",
-            $projects,
-            ", ',' || job.project || ',', '') <> ",
-            $projects,
-            "))"
-        )
-    };
-}
-pub(crate) use seen;
 
 /// A line for the audit log; its sequence number is given by the catalog.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -39,7 +39,7 @@ impl<'a> Submission<'a> {
     }
 
     /// The tasks that are laid out as done, by result set.
-    pub(crate) fn done(&self) -> Vec<(&'a ResultSet, Run)> {
+    pub fn done(&self) -> Vec<(&'a ResultSet, Run)> {
         let done = self
             .ranges
             .iter()

@@ -1,20 +1,10 @@
 //! What a data set is: its size, gate and codec profile. Fixed at creation, except that scenes may be added.
 
+pub use picofarm_settings::Gate;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
 use crate::layout::Quantity;
-
-/// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Gate {
-    /// ℓ_min, metres.
-    pub start_m: f64,
-    /// Bin width, metres of path.
-    pub bin_width_m: f64,
-    /// B, number of bins.
-    pub bins: u32,
-}
 
 /// How transients are coded.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

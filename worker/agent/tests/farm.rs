@@ -6,6 +6,7 @@ use std::{fs, net::SocketAddr, path::Path, time::Duration};
 
 use common::{Gate, Worker, config, output, soon, spec, until};
 use picofarm_coordinator::{CoordinatorConfig, Running, serve};
+use picofarm_database::CatalogPlace;
 use picofarm_dataset::{Dataset, VerifyMode, open_store};
 use picofarm_proto::{
     model::{JobSpec, JobState, JobStatus, RenderTask},
@@ -25,7 +26,7 @@ impl Farm {
         let config = CoordinatorConfig {
             lease_ms: 6_000,
             heartbeat_ms: 100,
-            ..CoordinatorConfig::new(dir.join("catalog.sqlite"), listen)
+            ..CoordinatorConfig::new(CatalogPlace::from(dir.join("catalog.sqlite")), listen)
         };
         let running = serve(config, stop.clone()).await.unwrap();
         Self { running, stop }

@@ -10,11 +10,9 @@ use picofarm_agent::{
 use picofarm_dataset::*;
 use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
-    model::{
-        DeadTimeSettings, Histogram, JitterSettings, OutputSettings, PulseSettings,
-        ReprocessSettings, ReprocessTask, ScaleSettings, SensorSettings, SourceSettings,
-    },
+    model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
+use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
 use serde_json::json;
 use sha2::Digest;
 use tempfile::TempDir;
@@ -24,15 +22,15 @@ const BINS: u32 = 48;
 const PIXELS: usize = (SIDE * SIDE) as usize;
 
 /// A sensor that changes nothing but the unit: a photon for each 1/1000 of h.
-fn ideal() -> SensorSettings {
-    SensorSettings {
-        pulse: PulseSettings::None {},
-        jitter: JitterSettings::Gaussian { fwhm_ps: 0.0 },
-        scale: ScaleSettings::Fixed {
+fn ideal() -> Sensor {
+    Sensor {
+        pulse: Pulse::None {},
+        jitter: Jitter::Gaussian { fwhm_ps: 0.0 },
+        scale: Scale::Fixed {
             photons_per_unit: 1000.0,
         },
         poisson: false,
-        ..SensorSettings::default()
+        ..Sensor::default()
     }
 }
 
@@ -43,7 +41,7 @@ struct Place {
 }
 
 impl Place {
-    fn new(sensor: SensorSettings) -> Self {
+    fn new(sensor: Sensor) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let store = dir.path().to_str().unwrap().to_owned();
         let profile = if sensor.poisson {
@@ -272,7 +270,7 @@ async fn left_over_bins_are_dropped_only_on_request() {
 
 #[tokio::test]
 async fn counts_are_whole_and_have_the_mean_and_the_variance_of_poisson() {
-    let place = Place::new(SensorSettings {
+    let place = Place::new(Sensor {
         poisson: true,
         dark_per_bin: 1.5,
         ..ideal()
@@ -293,12 +291,12 @@ async fn counts_are_whole_and_have_the_mean_and_the_variance_of_poisson() {
 
 #[tokio::test]
 async fn a_pulse_moves_light_but_makes_and_loses_none() {
-    let sampled = PulseSettings::Sampled {
+    let sampled = Pulse::Sampled {
         bin_width_ps: 8.0,
         values: vec![1.0, 2.0, 1.0, 0.0, 4.0],
         zero_bin: Some(0.0),
     };
-    let place = Place::new(SensorSettings {
+    let place = Place::new(Sensor {
         pulse: sampled,
         ..ideal()
     });
@@ -323,8 +321,8 @@ async fn a_pulse_moves_light_but_makes_and_loses_none() {
 #[tokio::test]
 async fn pile_up_follows_its_formula() {
     let pulses = 100;
-    let place = Place::new(SensorSettings {
-        dead_time: Some(DeadTimeSettings::FirstPhoton { pulses }),
+    let place = Place::new(Sensor {
+        dead_time: Some(DeadTime::FirstPhoton { pulses }),
         ..ideal()
     });
     // 50 photons would arrive in bin 5, 30 in bin 9.
@@ -349,7 +347,7 @@ async fn pile_up_follows_its_formula() {
 
 #[tokio::test]
 async fn the_same_bytes_on_any_number_of_threads_and_the_second_time_they_are_adopted() {
-    let mut place = Place::new(SensorSettings::default());
+    let mut place = Place::new(Sensor::default());
     place.publish(0, lively).await;
     place.run_on(1, 0).await.unwrap();
     let alone = place.files("target");
@@ -380,7 +378,7 @@ async fn the_same_bytes_on_any_number_of_threads_and_the_second_time_they_are_ad
 
 #[tokio::test]
 async fn the_target_is_usable_alone_and_knows_where_it_comes_from() {
-    let place = Place::new(SensorSettings::default());
+    let place = Place::new(Sensor::default());
     place.publish(2, lively).await;
     place.run(2).await.unwrap();
     let (source, target) = (place.files("source"), place.files("target"));
@@ -488,7 +486,7 @@ async fn chosen_spots_are_summed_and_only_theirs_is_the_truth() {
 
 #[tokio::test]
 async fn counts_beyond_sixteen_bits_are_kept() {
-    let place = Place::new(SensorSettings {
+    let place = Place::new(Sensor {
         poisson: true,
         ..ideal()
     });
@@ -501,7 +499,7 @@ async fn counts_beyond_sixteen_bits_are_kept() {
 
 #[tokio::test]
 async fn a_scene_that_is_not_there_is_named_and_one_that_cannot_be_is_refused() {
-    let mut place = Place::new(SensorSettings::default());
+    let mut place = Place::new(Sensor::default());
     let text = place.complaint(0).await;
     assert!(
         text.starts_with("source: ") && text.contains("no data set here"),
@@ -545,7 +543,7 @@ async fn a_scene_that_is_not_there_is_named_and_one_that_cannot_be_is_refused() 
 
 #[tokio::test]
 async fn a_damaged_source_is_named_and_nothing_is_published_from_it() {
-    let place = Place::new(SensorSettings::default());
+    let place = Place::new(Sensor::default());
     place.publish(0, lively).await;
     let victim = place.dir.path().join("source/depth/c/0/0/0");
     let mut bytes = fs::read(&victim).unwrap();

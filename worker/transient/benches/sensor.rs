@@ -1,7 +1,7 @@
 //! Speed of the sensor model on one thread, a scene of 256×256×637: `cargo bench -p picofarm-transient --bench sensor`.
 
 use picofarm_transient::sensor::{
-    DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values,
+    DeadTime, Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, Values, sense,
 };
 
 /// Something like a furnished room: a dark start, a two-bounce peak, and a tail of many bounces.
@@ -109,7 +109,7 @@ fn main() {
         };
         let start = cpu_seconds();
         let sensed = pool
-            .install(|| sensor.sense(&input, 1, 0))
+            .install(|| sense(&sensor, &input, 1, 0))
             .expect("the settings are sound");
         let seconds = cpu_seconds() - start;
         let photons: f64 = match &sensed.values {

@@ -2,50 +2,11 @@
 //! are `[row][column][bin]`; per-spot images are `[spot][row][column]`.
 
 use picofarm_scene::Spot;
+pub use picofarm_settings::{Budget, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
 pub const RENDERER_VERSION: &str = "transient-3";
-
-/// The recorded interval of optical path length: `bins` bins of `bin_width_m` from `start_m`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Gate {
-    /// ℓ_min, metres.
-    pub start_m: f64,
-    /// Δ, metres.
-    pub bin_width_m: f64,
-    /// B.
-    pub bins: u32,
-}
-
-/// How much multi-bounce work to do.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Budget {
-    /// Camera paths per pixel.
-    Samples(u32),
-    /// Until the median per-pixel relative standard error falls to this share (0.1 = 10 %).
-    Error(f32),
-}
-
-/// Ways of finding light, to be chosen by hand; the default lets the renderer choose by the scene. Every
-/// choice gives the same expected result, some at far more noise.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Strategy {
-    /// Side in pixels of the tiles that share vertices, 1 to 16; 1 = every pixel by itself.
-    pub path_reuse: Option<u32>,
-    /// Walks connect to light vertices drawn from the spots.
-    pub light_vertices: Option<bool>,
-    /// Aim at the spots' mirror images in planar near-mirrors.
-    pub mirror_images: Option<bool>,
-    /// Light paths from the spots for what comes by way of near-mirrors that have no mirror images: curved
-    /// ones, and several in a row.
-    pub caustics: Option<bool>,
-    /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
-    /// unlooked at: [`Overflow`] is then a lower bound.
-    pub ellipsoidal: Option<bool>,
-}
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -5,21 +5,6 @@ use crate::{
     walk::Sink,
 };
 
-impl Gate {
-    /// ℓ_max, metres.
-    pub fn end_m(&self) -> f64 {
-        self.start_m + self.bin_width_m * f64::from(self.bins)
-    }
-
-    /// bin(ℓ) = floor((ℓ − ℓ_min)/Δ); `None` outside the gate.
-    #[inline]
-    pub fn bin(&self, path_m: f64) -> Option<u32> {
-        let b = (path_m - self.start_m) / self.bin_width_m;
-        // `as` would turn negatives and NaN into bin 0.
-        (b >= 0.0 && b < f64::from(self.bins)).then_some(b as u32)
-    }
-}
-
 /// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
 /// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
 /// what comes before the gate and one behind for what comes after.

@@ -102,6 +102,7 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
         let Budget::Error(target) = budget else {
             break error;
         };
+        let target = target as f32;
         if !walks || error.median_relative <= target || error.samples >= MAX_PASSES {
             break error;
         }

@@ -33,7 +33,7 @@ fn sense(sensor: &Sensor, h: &[f32], bins: usize, seed: u64) -> Sensed {
         bins,
         bin_width_ps: FINE_PS,
     };
-    sensor.sense(&h, seed, 0).unwrap()
+    picofarm_transient::sensor::sense(sensor, &h, seed, 0).unwrap()
 }
 
 fn counts(s: &Sensed) -> &[u32] {
@@ -341,7 +341,7 @@ fn the_peak_of_the_median_pixel_is_what_was_asked_for() {
             bins,
             bin_width_ps: FINE_PS,
         };
-        let s = sensor.sense(&input, seed, scene).unwrap();
+        let s = picofarm_transient::sensor::sense(&sensor, &input, seed, scene).unwrap();
         let two = sense(
             &Sensor {
                 poisson: false,

@@ -1,6 +1,6 @@
 //! Sensor settings as files hold them, and what is refused.
 
-use picofarm_transient::sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor};
+use picofarm_transient::sensor::{Histograms, Jitter, PS_PER_M, Pulse, Scale, Sensor, sense};
 
 const FINE_PS: f64 = 8.0;
 
@@ -65,7 +65,7 @@ fn unusable_settings_and_histograms_are_named() {
             bins: 4,
             bin_width_ps: FINE_PS,
         };
-        sensor.sense(&h, 0, 0).unwrap_err().to_string()
+        sense(sensor, &h, 0, 0).unwrap_err().to_string()
     };
     let nan = [0.0, 1.0, 1.0, 1.0, 0.0, 1.0, f32::NAN, 0.0];
     let error = fails(&nan, &fixed(1.0));
@@ -99,8 +99,7 @@ fn unusable_settings_and_histograms_are_named() {
         bins: 4,
         bin_width_ps: FINE_PS,
     };
-    let error = Sensor::default()
-        .sense(&dark, 0, 0)
+    let error = sense(&Sensor::default(), &dark, 0, 0)
         .unwrap_err()
         .to_string();
     assert!(

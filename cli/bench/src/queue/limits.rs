@@ -12,7 +12,7 @@ use sqlx::{
     sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous},
 };
 
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 
 const TABLE: &str = "CREATE TABLE raw_limit (set_key BIGINT NOT NULL, task BIGINT NOT NULL, manifest {bytes} NOT NULL, \
                      bytes BIGINT NOT NULL, seconds DOUBLE PRECISION NOT NULL, PRIMARY KEY (set_key, task))";

@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 use picofarm_proto::model::{JobSpec, JobState};
 use serde::Serialize;
 use tokio::task::JoinSet;

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 use serde::Serialize;
 
 use picofarm_cli::error::{CliError, Code, Result};

@@ -6,7 +6,7 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-use picofarm_coordinator::CatalogPlace;
+use picofarm_database::CatalogPlace;
 
 use picofarm_cli::{
     client::Client,

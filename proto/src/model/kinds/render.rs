@@ -1,7 +1,6 @@
 //! What a render task does: which scenes, rendered how.
 
-use std::collections::BTreeMap;
-
+use picofarm_settings::{Budget, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -304,30 +303,9 @@ pub struct RenderSettings {
     /// Each spot gets a histogram of its own, from the same rays.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
-    /// The renderer's ways of finding light that are chosen by hand, by name; the others are left to the renderer,
-    /// which knows their names.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub strategy: BTreeMap<String, Choice>,
-}
-
-/// A choice by hand, of [`RenderSettings::strategy`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(untagged)]
-pub enum Choice {
-    /// Used or not.
-    On(bool),
-    /// A size, in the unit that the name stands for.
-    Size(u32),
-}
-
-/// How much multi-bounce work to do.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Budget {
-    /// Camera paths per pixel.
-    Samples(u32),
-    /// Until the median per-pixel relative error falls to this share.
-    Error(f64),
+    /// The renderer's ways of finding light that are chosen by hand; the others are left to the renderer.
+    #[serde(skip_serializing_if = "Strategy::is_default")]
+    pub strategy: Strategy,
 }
 
 impl Default for RenderSettings {
@@ -343,7 +321,18 @@ impl Default for RenderSettings {
             renderer: String::new(),
             subsets: vec![],
             per_spot: false,
-            strategy: BTreeMap::new(),
+            strategy: Strategy::default(),
+        }
+    }
+}
+
+impl RenderSettings {
+    /// The recorded interval.
+    pub fn gate(&self) -> Gate {
+        Gate {
+            start_m: self.gate_start_m,
+            bin_width_m: self.bin_width_m,
+            bins: self.bins,
         }
     }
 }
@@ -484,17 +473,6 @@ impl RenderSettings {
             return fail(
                 "subsets",
                 format!("{:?} must name each once, ascending", self.subsets),
-            );
-        }
-        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-        if let Some(name) = self
-            .strategy
-            .keys()
-            .find(|n| n.is_empty() || !n.chars().all(plain))
-        {
-            return fail(
-                "strategy",
-                format!("{name:?} is no name such as light_vertices"),
             );
         }
         match self.budget {

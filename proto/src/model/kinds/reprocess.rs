@@ -1,6 +1,7 @@
 //! Reprocessing: the histograms of a finished data set through a sensor, into another data set. One task a scene;
 //! nothing is rendered.
 
+use picofarm_settings::{Sensor, SensorError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -10,7 +11,6 @@ use crate::{
     model::{
         job::{OutputSettings, SourceSettings, SpecError, check_count, check_source},
         memory::{BASE, Known, Shape},
-        sensor::SensorSettings,
     },
     show,
 };
@@ -131,7 +131,7 @@ pub struct ReprocessSettings {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
     /// The sensor.
-    pub sensor: SensorSettings,
+    pub sensor: Sensor,
     /// Bins that `sensor.rebin` leaves over at the end of the gate are dropped; otherwise it must divide the bins.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub drop_left_over: bool,
@@ -231,7 +231,10 @@ impl ReprocessSettings {
                 format!("{:?} must name each once, ascending", self.spots),
             );
         }
-        self.sensor.check("reprocess.sensor")?;
+        self.sensor.check().map_err(|e| {
+            let SensorError::Invalid { field, what } = e;
+            SpecError::new(format!("reprocess.{field}"), what)
+        })?;
         if profile == "counts-u16" && !self.sensor.poisson {
             return Err(SpecError::new(
                 "output.profile",

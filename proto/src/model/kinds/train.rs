@@ -1,6 +1,7 @@
 //! Training: a network learns from the scenes of a data set and is kept in its store under a name. One task. Defaults are
 //! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
 
+pub use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -83,29 +84,6 @@ pub struct TrainSettings {
     pub version: String,
 }
 
-/// What a network predicts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Target {
-    /// The time of two-bounce light: depth.
-    Tof,
-    /// Which pixels each spot lights.
-    Shadow,
-    /// Which pixels are mirrors.
-    Specular,
-}
-
-impl Target {
-    /// Its name, as in a job file.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Tof => "tof",
-            Self::Shadow => "shadow",
-            Self::Specular => "specular",
-        }
-    }
-}
-
 /// What a network sees of a histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -150,17 +128,6 @@ pub struct NetSettings {
     pub time_features: u32,
 }
 
-/// The kinds of network.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Architecture {
-    /// Bins are channels.
-    #[default]
-    Unet2d,
-    /// Convolutions over bins, too, in the encoder; none in the decoder.
-    Unet25d,
-}
-
 /// How shadows are predicted (appendix A.1 of the paper).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -169,21 +136,6 @@ pub struct ShadowSettings {
     pub variant: ShadowVariant,
     /// Where the two-bounce times come from: `truth`, or a trained ToF model, or the stage that trains it.
     pub tof: String,
-}
-
-/// What a shadow network is given of a spot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ShadowVariant {
-    /// The measurement and the spot's shadow transient, side by side; a spot at random each visit.
-    #[default]
-    Concat,
-    /// Nothing: the masks of all spots at once.
-    All,
-    /// The spot's number.
-    Index,
-    /// The difference of its shadow transient and the measurement.
-    Difference,
 }
 
 /// What mirrors are predicted from.
@@ -215,32 +167,6 @@ pub struct OptimiseSettings {
     pub precision: Precision,
     /// Stop after so many validations (one an epoch) without improvement; 0 = never.
     pub early_stop: u32,
-}
-
-/// How the learning rate changes with the steps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Schedule {
-    /// From 1/25 of the rate up to it within the first hundredth of the steps, then down along a cosine.
-    #[default]
-    Onecycle,
-    /// The same over a million steps, however many are taken: the released code's.
-    OnecyclePaper,
-    /// Down along half a cosine.
-    Cosine,
-    /// Always the same.
-    Constant,
-}
-
-/// Numbers in which a network is computed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Precision {
-    /// 32 bits throughout.
-    #[default]
-    F32,
-    /// bfloat16 for the network, 32 bits for weights and optimiser.
-    Bf16,
 }
 
 impl Default for NetSettings {

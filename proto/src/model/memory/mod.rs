@@ -6,7 +6,7 @@
 
 mod network;
 
-use super::{Choice, JobSpec, RenderTask, StageSpec, TaskSpec};
+use super::{JobSpec, RenderTask, StageSpec, TaskSpec};
 pub use network::Network;
 
 /// The program with its threads, what it has read of furniture, and a scene of some ten thousand triangles.
@@ -99,8 +99,7 @@ impl Rendering {
             },
             histograms: 1 + render.subsets.len() as u32 + spots,
             split: false,
-            light_paths: !matches!(render.strategy.get("caustics"), Some(Choice::On(false)))
-                && render.max_bounces != 2,
+            light_paths: render.strategy.caustics != Some(false) && render.max_bounces != 2,
             threads,
         }
     }

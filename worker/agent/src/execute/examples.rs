@@ -18,7 +18,7 @@ use tokio::runtime::Handle;
 mod folded;
 
 use super::{Control, TaskError, output::Stores, reprocess::quantity};
-use crate::machine::memory_mib;
+use picofarm_session::memory_mib;
 
 /// One part of so many of the memory holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;

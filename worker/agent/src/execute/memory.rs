@@ -9,7 +9,7 @@ use picofarm_proto::model::{
 use picofarm_transient::Settings;
 
 use super::TaskError;
-use crate::machine::Memory;
+use picofarm_session::Memory;
 
 /// The scenes of a data set, as far as memory depends on them.
 pub(super) fn shape(spec: &DatasetSpec) -> Shape {

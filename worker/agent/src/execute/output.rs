@@ -9,23 +9,20 @@ use std::{
 
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, EncodedScene, Gate, Manifest, PROBE_WITHIN, Profile,
-    Subsets, open_store, probe,
+    Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
+    open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
     model::{RenderTask, TaskSpec, memory::Known},
     trace,
 };
+use picofarm_session::{Backoff, memory_mib, random};
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::{debug_span, warn};
 
 use super::{Control, TaskError, memory};
-use crate::{
-    machine::memory_mib,
-    session::backoff::{Backoff, random},
-};
 
 /// A store and the prefix in it.
 type Place = (Arc<dyn ObjectStore>, Path);
@@ -295,11 +292,7 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
         subsets: Subsets::of(&render.subsets)
             .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,
         per_spot: render.per_spot,
-        gate: Gate {
-            start_m: render.gate_start_m,
-            bin_width_m: render.bin_width_m,
-            bins: render.bins,
-        },
+        gate: render.gate(),
         profile: Profile::parse(&spec.output.profile)
             .map_err(|e| TaskError::User(format!("output.profile: {e}")))?,
     })

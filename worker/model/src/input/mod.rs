@@ -4,39 +4,13 @@
 mod batch;
 mod normalise;
 
+pub use picofarm_settings::{ShadowVariant, Target};
 use serde::{Deserialize, Serialize};
 
 pub use batch::{Batch, Visit, example};
 pub use normalise::{intensity, merged, planes};
 
 use crate::{ModelError, net::NetSpec};
-
-/// What a network learns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Target {
-    /// Depth, from which two-bounce times follow.
-    Tof,
-    /// Which pixels a spot lights.
-    Shadow,
-    /// Which pixels are mirrors.
-    Specular,
-}
-
-/// How a shadow network is asked for a spot (A.1).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ShadowVariant {
-    /// concat(m, H_i): the histogram and the spot's two-bounce times as a one-hot histogram.
-    #[default]
-    Concat,
-    /// |H_i − m|.
-    Difference,
-    /// m, and a plane for each spot, all ones for the spot in question.
-    Index,
-    /// m alone; one output a spot.
-    All,
-}
 
 /// How histograms are scaled (appendix B).
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

@@ -1,39 +1,9 @@
 //! What a network looks like: everything that decides its parameters, and nothing else.
 
+pub use picofarm_settings::{Architecture, Precision};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
-
-/// Which network.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Architecture {
-    /// Bins are channels (Shoot-Bounce-3D, released code).
-    #[default]
-    Unet2d,
-    /// Time is a dimension of the encoder (Shoot-Bounce-3D, appendix).
-    Unet25d,
-}
-
-/// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
-/// losses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// 32 bits.
-    #[default]
-    F32,
-    /// Inputs, weights and outputs, and their gradients, are rounded to bfloat16 (PyTorch's autocast). On a processor this
-    /// is rounding alone, no faster than f32: products and sums have 32 bits there as on tensor cores.
-    Bf16,
-}
-
-impl Precision {
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-    fn is_f32(&self) -> bool {
-        *self == Self::F32
-    }
-}
 
 /// Shape of a network.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -59,8 +29,13 @@ pub struct NetSpec {
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
     /// Numbers in which convolutions are computed.
-    #[serde(default, skip_serializing_if = "Precision::is_f32")]
+    #[serde(default, skip_serializing_if = "is_f32")]
     pub precision: Precision,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_f32(precision: &Precision) -> bool {
+    *precision == Precision::F32
 }
 
 impl NetSpec {

@@ -13,8 +13,9 @@ use serde::{Deserialize, Serialize};
 pub use checkpoint::left_by;
 pub use learner::{Gradients, Learner, predict};
 pub use load::{Guide, Loading};
+pub use picofarm_settings::Schedule;
 pub use run::{Control, Ended, Event, Line, Position, Sources, Trained, Training};
-pub use schedule::{Pace, Schedule};
+pub use schedule::Pace;
 
 use crate::{ModelError, input::Question, net::NetSpec};
 
@@ -81,7 +82,7 @@ impl Plan {
             let what = "learning_rate must be positive, weight_decay in 0..1";
             return Err(ModelError::invalid("optimise", what));
         }
-        self.schedule.check(self.steps(scenes))
+        schedule::check(self.schedule, self.steps(scenes))
     }
 
     fn text(&self) -> String {

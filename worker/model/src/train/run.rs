@@ -12,6 +12,7 @@ use super::{
     Plan, checkpoint,
     learner::{Gradients, Learner},
     load::{Course, Guide, Loading, Making, Ready},
+    schedule,
 };
 use crate::{
     ModelError,
@@ -294,10 +295,8 @@ impl Training {
                 clock.samples += batch.images;
                 self.learner.add(&mut sum, batch)?;
             }
-            let pace = self
-                .plan
-                .schedule
-                .pace(self.learner.steps(), of, self.plan.learning_rate);
+            let (plan, step) = (&self.plan, self.learner.steps());
+            let pace = schedule::pace(plan.schedule, step, of, plan.learning_rate);
             let loss = self.learner.finish(sum, pace);
             let position = &mut self.position;
             position.batches += self.plan.accumulate as u64;

@@ -1,23 +1,8 @@
 //! How fast is learned, step by step.
 
-use serde::{Deserialize, Serialize};
+use picofarm_settings::Schedule;
 
 use crate::ModelError;
-
-/// A schedule of learning rates.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Schedule {
-    /// One cycle over the run's real length: warm-up over 1 %, then down (PyTorch's `OneCycleLR`, cosine).
-    #[default]
-    Onecycle,
-    /// One cycle over a million steps, however long the run is: what the released code does.
-    OnecyclePaper,
-    /// From the rate to zero on half a cosine.
-    Cosine,
-    /// The same all the time.
-    Constant,
-}
 
 /// Where the rate and the first moment stand at a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,37 +24,35 @@ const END: f64 = 1e4;
 /// β₁ between these (PyTorch's `base_momentum` and `max_momentum`).
 const BETA1: (f64, f64) = (0.85, 0.95);
 
-impl Schedule {
-    /// Checks the run's length.
-    ///
-    /// # Errors
-    /// [`ModelError::Invalid`] where a cycle is shorter than the run.
-    pub fn check(self, steps: u64) -> Result<(), ModelError> {
-        if self == Self::OnecyclePaper && steps > PAPER_STEPS {
-            let what = format!(
-                "the paper's cycle has {PAPER_STEPS} steps, the run {steps}; use \"onecycle\", which fits the run"
-            );
-            return Err(ModelError::invalid("optimise.schedule", what));
-        }
-        Ok(())
+/// Checks the run's length.
+///
+/// # Errors
+/// [`ModelError::Invalid`] where a cycle is shorter than the run.
+pub(super) fn check(schedule: Schedule, steps: u64) -> Result<(), ModelError> {
+    if schedule == Schedule::OnecyclePaper && steps > PAPER_STEPS {
+        let what = format!(
+            "the paper's cycle has {PAPER_STEPS} steps, the run {steps}; use \"onecycle\", which fits the run"
+        );
+        return Err(ModelError::invalid("optimise.schedule", what));
     }
+    Ok(())
+}
 
-    /// The pace at a step (from 0) of a run of `steps`, with the greatest rate `rate`.
-    pub fn pace(self, step: u64, steps: u64, learning_rate: f64) -> Pace {
-        let constant = |learning_rate| Pace {
+/// The pace at a step (from 0) of a run of `steps`, with the greatest rate `learning_rate`.
+pub(super) fn pace(schedule: Schedule, step: u64, steps: u64, learning_rate: f64) -> Pace {
+    let constant = |learning_rate| Pace {
+        learning_rate,
+        beta1: 0.9,
+    };
+    match schedule {
+        Schedule::Constant => constant(learning_rate),
+        Schedule::Cosine => constant(between(
             learning_rate,
-            beta1: 0.9,
-        };
-        match self {
-            Self::Constant => constant(learning_rate),
-            Self::Cosine => constant(between(
-                learning_rate,
-                0.0,
-                step as f64 / steps.max(1) as f64,
-            )),
-            Self::Onecycle => cycle(step, steps, learning_rate),
-            Self::OnecyclePaper => cycle(step, PAPER_STEPS, learning_rate),
-        }
+            0.0,
+            step as f64 / steps.max(1) as f64,
+        )),
+        Schedule::Onecycle => cycle(step, steps, learning_rate),
+        Schedule::OnecyclePaper => cycle(step, PAPER_STEPS, learning_rate),
     }
 }
 
@@ -110,11 +93,7 @@ mod tests {
     #[test]
     fn the_papers_cycle_begins_at_4e_4_peaks_at_1e_2_and_stands_at_9_9e_3_where_the_real_run_ends()
     {
-        let at = |step| {
-            Schedule::OnecyclePaper
-                .pace(step, 68_500, 1e-2)
-                .learning_rate
-        };
+        let at = |step| pace(Schedule::OnecyclePaper, step, 68_500, 1e-2).learning_rate;
         assert!((at(0) - 4e-4).abs() < 1e-12);
         assert!((at(9_999) - 1e-2).abs() < 1e-12);
         assert!((at(68_499) - 9.9e-3).abs() < 1e-4, "{}", at(68_499));
@@ -124,16 +103,14 @@ mod tests {
     fn a_fitted_cycle_ends_near_zero_and_short_runs_have_one_too() {
         for steps in [1, 2, 5, 99, 100, 101, 1_000] {
             for step in 0..steps {
-                let pace = Schedule::Onecycle.pace(step, steps, 1e-2);
+                let pace = pace(Schedule::Onecycle, step, steps, 1e-2);
                 assert!(
                     pace.learning_rate > 0.0 && pace.learning_rate <= 1e-2,
                     "{steps} {step} {pace:?}"
                 );
                 assert!((0.85..=0.95).contains(&pace.beta1));
             }
-            let last = Schedule::Onecycle
-                .pace(steps - 1, steps, 1e-2)
-                .learning_rate;
+            let last = pace(Schedule::Onecycle, steps - 1, steps, 1e-2).learning_rate;
             assert!((last - 4e-8).abs() < 1e-12 || steps == 1, "{steps}: {last}");
         }
     }

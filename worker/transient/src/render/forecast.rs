@@ -54,6 +54,7 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
     let (passes, error) = match *budget {
         Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
         Budget::Error(target) => {
+            let target = target as f32;
             // As `further` shares them out.
             let most = (FIRST_PASSES, MAX_PASSES);
             let n = passes_for(&stats, PASSES, GOAL * target, most, two);

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::settings::SensorError;
+use picofarm_settings::SensorError;
 
 /// Histograms with fewer, wider bins.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,7 +2,7 @@
 
 use std::f64::consts::{FRAC_PI_2, LN_2, SQRT_2};
 
-use super::settings::{Jitter, Pulse, Sensor, SensorError};
+use picofarm_settings::{Jitter, Pulse, Sensor, SensorError};
 
 /// Share of the energy cut off at each end of a kernel: beside a peak of 4·10⁷ photons less than 0.01 of one.
 const CUT: f64 = 1e-10;

@@ -1,5 +1,6 @@
 //! The whole chain from transients to counts.
 
+use picofarm_settings::{DeadTime, Jitter, Scale, Sensor, SensorError};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +9,6 @@ use super::{
     convolve::Convolver,
     draw::{PixelKey, Purpose, binomial, poisson},
     kernel::Kernel,
-    settings::{DeadTime, Jitter, Scale, Sensor, SensorError},
 };
 
 /// Highest rate a bin may have, photons; sums of bins must fit u32 besides.
@@ -87,88 +87,91 @@ enum Fault {
     TooBright { bin: usize, rate: f64 },
 }
 
-impl Sensor {
-    /// Measures scene `scene`. All random numbers depend on (`seed`, `scene`, pixel, bin) alone. Uses rayon's current pool.
-    ///
-    /// # Errors
-    /// [`SensorError::Invalid`]: an unusable setting, shapes that do not agree, a value of h that is negative or not
-    /// finite, a transient with light but no peak to scale by, or a bin of more than 10⁹ photons (2³² after rebinning).
-    pub fn sense(&self, h: &Histograms<'_>, seed: u64, scene: u64) -> Result<Sensed, SensorError> {
-        let count = check(self, h)?;
-        let kernel = Kernel::new(self, h.bin_width_ps)?;
-        let shift_bins = self.shift(seed, scene);
-        let convolver = Convolver::new(&kernel.shifted(shift_bins), h.bins);
-        let (scale, peak_photons) = self.scale_of(h, &convolver, seed, scene)?;
-        let chain = Chain {
-            sensor: self,
-            h,
-            convolver,
-            scale,
-            factor: self.rebin as usize,
-            out_bins: h.bins / self.rebin as usize,
-            seed,
-            scene,
-        };
-        let len = count * chain.out_bins;
-        let (values, facts) = if self.poisson {
-            let mut counts = vec![0u32; len];
-            let facts = chain.run(&mut counts, Chain::count);
-            (Values::Counts(counts), facts)
-        } else {
-            let mut rate = vec![0f32; len];
-            let facts = chain.run(&mut rate, Chain::expect);
-            (Values::Rate(rate), facts)
-        };
-        Ok(Sensed {
-            values,
-            bins: chain.out_bins,
-            bin_width_ps: h.bin_width_ps * f64::from(self.rebin),
-            scale,
-            peak_photons,
-            shift_bins,
-            dropped: total(&facts, h.bins % chain.factor)?,
-        })
-    }
+/// Measures scene `scene`. All random numbers depend on (`seed`, `scene`, pixel, bin) alone. Uses rayon's current pool.
+///
+/// # Errors
+/// [`SensorError::Invalid`]: an unusable setting, shapes that do not agree, a value of h that is negative or not
+/// finite, a transient with light but no peak to scale by, or a bin of more than 10⁹ photons (2³² after rebinning).
+pub fn sense(
+    sensor: &Sensor,
+    h: &Histograms<'_>,
+    seed: u64,
+    scene: u64,
+) -> Result<Sensed, SensorError> {
+    let count = check(sensor, h)?;
+    let kernel = Kernel::new(sensor, h.bin_width_ps)?;
+    let shift_bins = shift(sensor, seed, scene);
+    let convolver = Convolver::new(&kernel.shifted(shift_bins), h.bins);
+    let (scale, peak_photons) = scale_of(sensor, h, &convolver, seed, scene)?;
+    let chain = Chain {
+        sensor,
+        h,
+        convolver,
+        scale,
+        factor: sensor.rebin as usize,
+        out_bins: h.bins / sensor.rebin as usize,
+        seed,
+        scene,
+    };
+    let len = count * chain.out_bins;
+    let (values, facts) = if sensor.poisson {
+        let mut counts = vec![0u32; len];
+        let facts = chain.run(&mut counts, Chain::count);
+        (Values::Counts(counts), facts)
+    } else {
+        let mut rate = vec![0f32; len];
+        let facts = chain.run(&mut rate, Chain::expect);
+        (Values::Rate(rate), facts)
+    };
+    Ok(Sensed {
+        values,
+        bins: chain.out_bins,
+        bin_width_ps: h.bin_width_ps * f64::from(sensor.rebin),
+        scale,
+        peak_photons,
+        shift_bins,
+        dropped: total(&facts, h.bins % chain.factor)?,
+    })
+}
 
-    fn shift(&self, seed: u64, scene: u64) -> i64 {
-        match self.jitter {
-            Jitter::Gaussian { .. } => 0,
-            Jitter::Sb3dCompat { sigma_bins } => {
-                let mut draws = PixelKey::new(seed, Purpose::Roll, scene, 0).bin(0);
-                (sigma_bins * draws.normal()).floor() as i64
-            }
+fn shift(sensor: &Sensor, seed: u64, scene: u64) -> i64 {
+    match sensor.jitter {
+        Jitter::Gaussian { .. } => 0,
+        Jitter::Sb3dCompat { sigma_bins } => {
+            let mut draws = PixelKey::new(seed, Purpose::Roll, scene, 0).bin(0);
+            (sigma_bins * draws.normal()).floor() as i64
         }
     }
+}
 
-    /// Photons for a unit of h, and the peak that set it.
-    fn scale_of(
-        &self,
-        h: &Histograms<'_>,
-        convolver: &Convolver,
-        seed: u64,
-        scene: u64,
-    ) -> Result<(f64, Option<f64>), SensorError> {
-        let photons = match self.scale {
-            Scale::Fixed { photons_per_unit } => return Ok((photons_per_unit, None)),
-            Scale::Peak { photons } => photons,
-            Scale::PeakRange { low, high } => {
-                let u = PixelKey::new(seed, Purpose::Peak, scene, 0)
-                    .bin(0)
-                    .uniform();
-                low + (high - low) * u
-            }
-        };
-        let part = h.two_bounce.unwrap_or(h.transient);
-        match median_peak(part, h.bins, convolver) {
-            Some(peak) => Ok((photons / peak, Some(photons))),
-            // Nothing to see: any scale gives the same image.
-            None if h.transient.iter().all(|h| *h == 0.0) => Ok((1.0, None)),
-            None => Err(SensorError::new(
-                "sensor.scale",
-                "the two-bounce part has no light although the transient has; \
-                 use a fixed scale (photons_per_unit) for this scene",
-            )),
+/// Photons for a unit of h, and the peak that set it.
+fn scale_of(
+    sensor: &Sensor,
+    h: &Histograms<'_>,
+    convolver: &Convolver,
+    seed: u64,
+    scene: u64,
+) -> Result<(f64, Option<f64>), SensorError> {
+    let photons = match sensor.scale {
+        Scale::Fixed { photons_per_unit } => return Ok((photons_per_unit, None)),
+        Scale::Peak { photons } => photons,
+        Scale::PeakRange { low, high } => {
+            let u = PixelKey::new(seed, Purpose::Peak, scene, 0)
+                .bin(0)
+                .uniform();
+            low + (high - low) * u
         }
+    };
+    let part = h.two_bounce.unwrap_or(h.transient);
+    match median_peak(part, h.bins, convolver) {
+        Some(peak) => Ok((photons / peak, Some(photons))),
+        // Nothing to see: any scale gives the same image.
+        None if h.transient.iter().all(|h| *h == 0.0) => Ok((1.0, None)),
+        None => Err(SensorError::new(
+            "sensor.scale",
+            "the two-bounce part has no light although the transient has; \
+             use a fixed scale (photons_per_unit) for this scene",
+        )),
     }
 }
 

@@ -1,6 +1,6 @@
 //! Multiplexing: all spots flash at once, so their histograms add up.
 
-use super::settings::SensorError;
+use picofarm_settings::SensorError;
 
 /// The 25 of the 100 spots of a 10×10 grid (row by row) that are lit by 25 beams: rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9.
 pub const SPOTS_25_OF_100: [usize; 25] = {

@@ -8,11 +8,11 @@ use picofarm_dataset::{
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{Budget, RenderTask, SpecError, TaskKind},
+    model::{RenderTask, SpecError, TaskKind},
     trace,
 };
 use picofarm_scene::{Camera, Scene};
-use picofarm_transient::{Gate, Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
+use picofarm_transient::{Progress, RENDERER_VERSION, RenderError, Rendered, Settings};
 use serde_json::json;
 use tracing::{debug_span, info, warn};
 
@@ -83,8 +83,6 @@ impl RunTask for RenderTask {
 
     fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
         self.check()?;
-        subsets::strategy(&self.render.strategy)
-            .map_err(|e| SpecError::new("render.strategy", e))?;
         here.profile(&self.output.profile)?;
         here.scenes(&mut self.scenes)
     }
@@ -200,24 +198,15 @@ fn settings(
 ) -> Result<Settings, TaskError> {
     let render = &spec.render;
     let head = key.0[..8].try_into().expect("a key has 32 bytes");
-    let strategy = subsets::strategy(&render.strategy)
-        .map_err(|what| TaskError::User(format!("render.strategy: {what}")))?;
     Ok(Settings {
-        gate: Gate {
-            start_m: render.gate_start_m,
-            bin_width_m: render.bin_width_m,
-            bins: render.bins,
-        },
-        budget: match render.budget {
-            Budget::Samples(n) => picofarm_transient::Budget::Samples(n),
-            Budget::Error(share) => picofarm_transient::Budget::Error(share as f32),
-        },
+        gate: render.gate(),
+        budget: render.budget,
         max_bounces: (render.max_bounces != 0).then_some(render.max_bounces),
         one_bounce: true,
         seed: u64::from_le_bytes(head),
         split: false,
         groups: subsets::groups(dataset),
-        strategy,
+        strategy: render.strategy,
     })
 }
 

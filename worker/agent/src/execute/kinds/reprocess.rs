@@ -11,13 +11,12 @@ use picofarm_dataset::{
 use picofarm_proto::{
     key::{TaskKey, derived_key, reprocess_stage_key},
     model::{
-        Histogram, ReprocessSettings, ReprocessTask, SensorSettings, SourceSettings, SpecError,
-        TaskKind, TaskSpec,
+        Histogram, ReprocessSettings, ReprocessTask, SourceSettings, SpecError, TaskKind, TaskSpec,
     },
     trace,
 };
 use picofarm_transient::sensor::{
-    Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values,
+    Histograms, Multiplex, PS_PER_M, SENSOR_VERSION, Sensed, Sensor, SensorError, Values, sense,
 };
 use serde_json::json;
 use tokio::runtime::Handle;
@@ -90,10 +89,7 @@ impl RunTask for ReprocessTask {
 
     fn resolve(&mut self, here: &Submission<'_>) -> Result<(), SpecError> {
         self.reprocess.normalise();
-        here.profile(&self.output.profile)?;
-        sensor(&self.reprocess.sensor)
-            .map(|_| ())
-            .map_err(|e| SpecError::new("reprocess.sensor", e.to_string()))
+        here.profile(&self.output.profile)
     }
 }
 
@@ -156,7 +152,6 @@ impl Made {
                 settings.version
             )));
         }
-        let sensor = sensor(&settings.sensor)?;
         let source = open_source(stores, &task.source, control)?;
         stores.fits(TaskSpec::Reprocess(task.clone()), Some(source.spec()))?;
         let spec = target_spec(source.spec(), settings, profile)?;
@@ -171,7 +166,7 @@ impl Made {
         Ok(Self {
             source,
             found,
-            sensor,
+            sensor: settings.sensor.clone(),
             spec,
             key,
         })
@@ -199,7 +194,7 @@ impl Made {
         // The key is the seed of everything; the scene's number adds nothing to it.
         let seed = u64::from_le_bytes(self.key.0[..8].try_into().expect("a key has 32 bytes"));
         let sensed = debug_span!(target: trace::TARGET, "measure")
-            .in_scope(|| self.sensor.sense(&input, seed, 0))
+            .in_scope(|| sense(&self.sensor, &input, seed, 0))
             .map_err(of_sensor)?;
         drop(h);
         proceed(control, MEASURED)?;
@@ -412,109 +407,6 @@ fn account(settings: &ReprocessSettings, source: &Manifest, sensed: &Sensed) -> 
     plan
 }
 
-/// The sensor model's settings. Both have the same shape, which a test holds them to.
-///
-/// # Errors
-/// [`TaskError::User`] naming the setting that the model refuses.
-pub fn sensor(settings: &SensorSettings) -> Result<Sensor, TaskError> {
-    let value = serde_json::to_value(settings).expect("settings are plain data");
-    let sensor: Sensor = serde_json::from_value(value)
-        .map_err(|e| TaskError::User(format!("reprocess.sensor: {e}")))?;
-    sensor.check().map_err(of_sensor)?;
-    Ok(sensor)
-}
-
-/// A sensor as jobs describe it.
-pub fn sensor_settings(sensor: &Sensor) -> SensorSettings {
-    let value = serde_json::to_value(sensor).expect("settings are plain data");
-    serde_json::from_value(value).expect("both have the same shape")
-}
-
 fn of_sensor(error: SensorError) -> TaskError {
     TaskError::User(format!("reprocess.{error}"))
-}
-
-#[cfg(test)]
-mod tests {
-    use picofarm_transient::sensor::{DeadTime, Jitter, Pulse, Scale};
-
-    use super::*;
-
-    #[test]
-    fn jobs_and_the_sensor_model_mean_the_same_by_every_setting() {
-        let default = SensorSettings::default();
-        assert_eq!(sensor(&default).unwrap(), Sensor::default());
-        assert_eq!(sensor_settings(&Sensor::default()), default);
-        let with = |change: fn(&mut Sensor)| {
-            let mut sensor = Sensor::default();
-            change(&mut sensor);
-            sensor
-        };
-        let all = [
-            with(|s| s.pulse = Pulse::None {}),
-            with(|s| {
-                s.pulse = Pulse::Sampled {
-                    bin_width_ps: 8.0,
-                    values: vec![0.1, 0.7],
-                    zero_bin: Some(0.5),
-                }
-            }),
-            with(|s| s.jitter = Jitter::Sb3dCompat { sigma_bins: 2.0 }),
-            with(|s| {
-                s.scale = Scale::Fixed {
-                    photons_per_unit: 0.1,
-                }
-            }),
-            with(|s| s.scale = Scale::Peak { photons: 7.0 }),
-            with(|s| {
-                s.dark_per_bin = 0.1;
-                s.poisson = false;
-                s.rebin = 4;
-                s.dead_time = Some(DeadTime::FirstPhoton { pulses: 9 });
-            }),
-        ];
-        for model in all {
-            assert_eq!(sensor(&sensor_settings(&model)).unwrap(), model);
-        }
-    }
-
-    #[test]
-    fn jobs_and_the_sensor_model_refuse_the_same() {
-        let bad: [fn(&mut Sensor); 10] = [
-            |s| s.pulse = Pulse::Analytic { fwhm_ps: 1e-4 },
-            |s| {
-                s.pulse = Pulse::Sampled {
-                    bin_width_ps: 8.0,
-                    values: vec![0.0],
-                    zero_bin: None,
-                }
-            },
-            |s| {
-                s.pulse = Pulse::Sampled {
-                    bin_width_ps: 8.0,
-                    values: vec![1.0],
-                    zero_bin: Some(1.0),
-                }
-            },
-            |s| s.jitter = Jitter::Gaussian { fwhm_ps: -1.0 },
-            |s| s.jitter = Jitter::Sb3dCompat { sigma_bins: 1e4 },
-            |s| s.scale = Scale::Peak { photons: 1e9 },
-            |s| {
-                s.scale = Scale::PeakRange {
-                    low: 3.0,
-                    high: 2.0,
-                }
-            },
-            |s| s.dark_per_bin = 1e9,
-            |s| s.rebin = 0,
-            |s| s.dead_time = Some(DeadTime::FirstPhoton { pulses: 1 << 41 }),
-        ];
-        for change in bad {
-            let mut model = Sensor::default();
-            change(&mut model);
-            let SensorError::Invalid { field, .. } = model.check().unwrap_err();
-            let ours = sensor_settings(&model).check("sensor").unwrap_err();
-            assert_eq!(ours.field, field);
-        }
-    }
 }

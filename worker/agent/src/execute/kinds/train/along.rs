@@ -13,7 +13,7 @@ use tracing::{info, warn};
 
 use crate::{
     execute::{Control, output::Stores},
-    machine::memory_mib,
+    memory_mib,
 };
 
 /// How long a training that shall stop may take to save what it has reached.

@@ -4,13 +4,13 @@ use picofarm_dataset::DatasetSpec;
 use picofarm_model::{
     ModelError,
     input::{self, Question},
-    net::{self, NetSpec},
+    net::NetSpec,
     scene::Scenes,
-    train::{self, Plan},
+    train::Plan,
 };
 use picofarm_proto::model::{
     TrainSettings,
-    train::{Architecture, Normalise, Precision, Schedule, ShadowVariant, Target},
+    train::{Normalise, Target},
 };
 
 use super::{known::Known, of_model};
@@ -36,17 +36,8 @@ pub(super) fn plan(
     input::merged(spec.gate.bins as usize, bins as usize)
         .map_err(|what| user("input.bins", what))?;
     let question = Question {
-        target: match settings.target {
-            Target::Tof => input::Target::Tof,
-            Target::Shadow => input::Target::Shadow,
-            Target::Specular => input::Target::Specular,
-        },
-        variant: match settings.shadow.variant {
-            ShadowVariant::Concat => input::ShadowVariant::Concat,
-            ShadowVariant::All => input::ShadowVariant::All,
-            ShadowVariant::Index => input::ShadowVariant::Index,
-            ShadowVariant::Difference => input::ShadowVariant::Difference,
-        },
+        target: settings.target,
+        variant: settings.shadow.variant,
         normalise: match input.normalise {
             Normalise::Minmax => input::Normalise::MinMax,
             Normalise::Log => input::Normalise::Log { greatest },
@@ -61,10 +52,7 @@ pub(super) fn plan(
     let (dense, one_hot, outputs) = question.channels();
     let wanted = &settings.net;
     let net = NetSpec {
-        architecture: match wanted.architecture {
-            Architecture::Unet2d => net::Architecture::Unet2d,
-            Architecture::Unet25d => net::Architecture::Unet25d,
-        },
+        architecture: wanted.architecture,
         dense,
         one_hot,
         outputs,
@@ -73,10 +61,7 @@ pub(super) fn plan(
         stem: wanted.stem as usize,
         time: wanted.time_features as usize,
         frozen: !settings.specular.on.is_empty(),
-        precision: match optimise.precision {
-            Precision::F32 => net::Precision::F32,
-            Precision::Bf16 => net::Precision::Bf16,
-        },
+        precision: optimise.precision,
     };
     let multiple = net.multiple() as u32;
     if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
@@ -97,12 +82,7 @@ pub(super) fn plan(
         accumulate: optimise.accumulate as usize,
         learning_rate: optimise.learning_rate,
         decay: optimise.weight_decay,
-        schedule: match optimise.schedule {
-            Schedule::Onecycle => train::Schedule::Onecycle,
-            Schedule::OnecyclePaper => train::Schedule::OnecyclePaper,
-            Schedule::Cosine => train::Schedule::Cosine,
-            Schedule::Constant => train::Schedule::Constant,
-        },
+        schedule: optimise.schedule,
         augment: settings.augment,
         early_stop: optimise.early_stop.into(),
         seed: settings.seed,

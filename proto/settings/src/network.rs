@@ -1,0 +1,83 @@
+//! What a network learns, what it is built of and how it is trained (Shoot-Bounce-3D: section 4, appendices A.1 and B, and
+//! the released code).
+
+use serde::{Deserialize, Serialize};
+
+/// What a network predicts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// Depth, from which the times of two-bounce light follow.
+    Tof,
+    /// Which pixels each spot lights.
+    Shadow,
+    /// Which pixels are mirrors.
+    Specular,
+}
+
+impl Target {
+    /// Its name, as in a job file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tof => "tof",
+            Self::Shadow => "shadow",
+            Self::Specular => "specular",
+        }
+    }
+}
+
+/// How a shadow network is asked for a spot (A.1): with m the measurement and H_i the spot's two-bounce times as a one-hot
+/// histogram, its shadow transient.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShadowVariant {
+    /// m and H_i, side by side; a spot at random each visit.
+    #[default]
+    Concat,
+    /// |H_i − m|.
+    Difference,
+    /// m, and a plane for each spot, all ones for the spot in question.
+    Index,
+    /// m alone; the masks of all spots at once.
+    All,
+}
+
+/// The kinds of network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Architecture {
+    /// Bins are channels (released code).
+    #[default]
+    Unet2d,
+    /// Time is a dimension of the encoder; the decoder has none (appendix B).
+    Unet25d,
+}
+
+/// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
+/// losses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// 32 bits.
+    #[default]
+    F32,
+    /// Inputs, weights and outputs, and their gradients, are rounded to bfloat16 (PyTorch's autocast). On a processor this
+    /// is rounding alone, no faster than f32: products and sums have 32 bits there as on tensor cores.
+    Bf16,
+}
+
+/// How the learning rate changes with the steps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Schedule {
+    /// One cycle over the run's real length: from 1/25 of the rate up to it within the first hundredth of the steps, then
+    /// down (PyTorch's `OneCycleLR`, cosine).
+    #[default]
+    Onecycle,
+    /// One cycle over a million steps, however long the run is: what the released code does.
+    OnecyclePaper,
+    /// From the rate to zero on half a cosine.
+    Cosine,
+    /// The same all the time.
+    Constant,
+}

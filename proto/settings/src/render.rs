@@ -1,0 +1,121 @@
+//! How much the renderer does, and which ways of finding light it uses.
+
+use serde::{Deserialize, Serialize};
+
+/// How much multi-bounce work to do.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Budget {
+    /// Camera paths per pixel.
+    Samples(u32),
+    /// Until the median per-pixel relative standard error falls to this share (0.1 = 10 %).
+    Error(f64),
+}
+
+/// Ways of finding light, to be chosen by hand; the default lets the renderer choose by the scene. Every
+/// choice gives the same expected result, some at far more noise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Strategy {
+    /// Side in pixels of the tiles that share vertices, 1 to 16; 1 = every pixel by itself.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub path_reuse: Option<u32>,
+    /// Walks connect to light vertices drawn from the spots.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub light_vertices: Option<bool>,
+    /// Aim at the spots' mirror images in planar near-mirrors.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mirror_images: Option<bool>,
+    /// Light paths from the spots for what comes by way of near-mirrors that have no mirror images: curved
+    /// ones, and several in a row.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub caustics: Option<bool>,
+    /// Look for light in the ellipsoidal shells of a narrow gate, and leave what falls outside the gate
+    /// unlooked at: the overflow that a render states is then a lower bound.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ellipsoidal: Option<bool>,
+}
+
+/// A choice by hand of one of [`Strategy::NAMES`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Choice {
+    /// Used or not.
+    On(bool),
+    /// A size, in the unit that the name stands for.
+    Size(u32),
+}
+
+impl Strategy {
+    /// The names of the ways, as job files and `--strategy` know them.
+    pub const NAMES: [&str; 5] = [
+        "path_reuse",
+        "light_vertices",
+        "mirror_images",
+        "caustics",
+        "ellipsoidal",
+    ];
+
+    /// Whether every way is left to the renderer.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Chooses one way by its name.
+    ///
+    /// # Errors
+    /// A message that names what is unknown or of the wrong kind.
+    pub fn choose(&mut self, name: &str, choice: Choice) -> Result<(), String> {
+        let way = match name {
+            "path_reuse" => {
+                let Choice::Size(side) = choice else {
+                    return Err(format!("{name:?} takes a number"));
+                };
+                self.path_reuse = Some(side);
+                return Ok(());
+            }
+            "light_vertices" => &mut self.light_vertices,
+            "mirror_images" => &mut self.mirror_images,
+            "caustics" => &mut self.caustics,
+            "ellipsoidal" => &mut self.ellipsoidal,
+            _ => {
+                let names = Self::NAMES.join(", ");
+                return Err(format!("{name:?} is unknown; there are {names}"));
+            }
+        };
+        let Choice::On(on) = choice else {
+            return Err(format!("{name:?} is either on (true) or off (false)"));
+        };
+        *way = Some(on);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_field_is_a_name_and_takes_one_kind_of_choice() {
+        let mut all = Strategy::default();
+        for name in Strategy::NAMES {
+            let of = |choice| Strategy::default().choose(name, choice).is_ok();
+            assert!(of(Choice::On(true)) != of(Choice::Size(2)), "{name}");
+            all.choose(name, Choice::On(true))
+                .or_else(|_| all.choose(name, Choice::Size(2)))
+                .unwrap();
+        }
+        let written = serde_json::to_value(all).unwrap();
+        let fields: Vec<_> = written.as_object().unwrap().keys().collect();
+        let mut names = Strategy::NAMES.to_vec();
+        names.sort_unstable();
+        assert_eq!(fields, names);
+        assert_eq!(serde_json::from_value::<Strategy>(written).unwrap(), all);
+    }
+
+    #[test]
+    fn an_unknown_way_is_refused_with_the_names_there_are() {
+        let error = Strategy::default().choose("lobes", Choice::On(true));
+        assert!(error.unwrap_err().contains("path_reuse, light_vertices"));
+    }
+}

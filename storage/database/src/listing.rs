@@ -1,0 +1,39 @@
+//! What the list of jobs and forgetting ask of both databases.
+
+use uuid::Uuid;
+
+/// Jobs or result sets looked at in one transaction of forgetting.
+pub(crate) const JOBS: i64 = 200;
+/// Rows removed in one, at most: some ten milliseconds.
+pub(crate) const ROWS: i64 = 4_000;
+
+/// The first and the last id that begin with this text, if it begins one.
+pub(crate) fn ids(text: &str) -> Option<(Uuid, Uuid)> {
+    let digits: String = text.chars().filter(|c| *c != '-').collect();
+    let hex =
+        !digits.is_empty() && digits.len() <= 32 && digits.chars().all(|c| c.is_ascii_hexdigit());
+    let fill = |with: &str| {
+        let whole = format!("{digits}{}", with.repeat(32 - digits.len()));
+        Uuid::parse_str(&whole).ok()
+    };
+    hex.then(|| Some((fill("0")?, fill("f")?)))?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_beginning_of_an_id_stands_for_all_that_begin_so() {
+        let id = Uuid::from_u128(0x0123_4567_89ab_cdef_0123_4567_89ab_cdef);
+        let text = id.to_string();
+        for end in 1..=text.len() {
+            let (first, last) = ids(&text[..end]).unwrap();
+            assert!((first..=last).contains(&id), "{end}");
+        }
+        assert_eq!(ids(&text), Some((id, id)));
+        for none in ["", "-", "xyz", &"0".repeat(33), "été"] {
+            assert_eq!(ids(none), None, "{none}");
+        }
+    }
+}

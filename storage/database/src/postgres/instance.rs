@@ -1,0 +1,148 @@
+//! The life of an instance: founded, renewed, lost, left; what falls to it from others.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use picofarm_proto::ids::{InstanceId, JobId, RangeId, WorkerId};
+use sqlx::{PgConnection, Row};
+use uuid::Uuid;
+
+use super::write::{RANGE, Result, Sql, WriteError, Writer, ranges};
+use picofarm_catalog::Range;
+
+/// Holds the instance's row until the transaction ends, so that nobody can find it lost meanwhile. A row whose time is over
+/// but that nobody has removed will do: what the instance owns is still its own.
+pub(super) async fn fence(c: &mut PgConnection, instance: InstanceId) -> Result<()> {
+    let alive: Option<i32> =
+        sqlx::query_scalar("SELECT 1 FROM instance WHERE id = $1 FOR KEY SHARE")
+            .bind(instance.uuid())
+            .fetch_optional(c)
+            .await?;
+    alive.map(|_| ()).ok_or(WriteError::Fenced)
+}
+
+/// Founds an instance, which inherits from a former life of the same process.
+pub(super) async fn found(
+    c: &mut PgConnection,
+    instance: InstanceId,
+    former: Option<InstanceId>,
+    name: &str,
+    seconds: f64,
+) -> Sql<()> {
+    sqlx::query(
+        "INSERT INTO instance (id, name, workers, until) \
+         VALUES ($1, $2, 0, clock_timestamp() + make_interval(secs => $3))",
+    )
+    .bind(instance.uuid())
+    .bind(name)
+    .bind(seconds)
+    .execute(&mut *c)
+    .await?;
+    if let Some(former) = former {
+        sqlx::query("DELETE FROM instance WHERE id = $1")
+            .bind(former.uuid())
+            .execute(c)
+            .await?;
+    }
+    Ok(())
+}
+
+/// Prolongs the instance's time; `false` where it was found lost.
+pub(super) async fn renew(
+    c: &mut PgConnection,
+    instance: InstanceId,
+    workers: u32,
+    seconds: f64,
+) -> Sql<bool> {
+    let renewed = sqlx::query(
+        "UPDATE instance SET until = clock_timestamp() + make_interval(secs => $3), workers = $2 \
+         WHERE id = $1",
+    )
+    .bind(instance.uuid())
+    .bind(i64::from(workers))
+    .bind(seconds)
+    .execute(c)
+    .await?;
+    Ok(renewed.rows_affected() == 1)
+}
+
+/// Takes over the ranges of instances whose time is over, or that are no more. An instance that writes just now holds its row,
+/// so this waits for it and then sees what it wrote.
+pub(super) async fn take_lost(c: &mut PgConnection, instance: InstanceId) -> Sql<Vec<Range>> {
+    sqlx::query("DELETE FROM instance WHERE until < clock_timestamp()")
+        .execute(&mut *c)
+        .await?;
+    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+        "UPDATE task_range SET owner = $1 WHERE owner IS NOT NULL \
+         AND NOT EXISTS (SELECT 1 FROM instance WHERE instance.id = owner) RETURNING {RANGE}"
+    )))
+    .bind(instance.uuid())
+    .fetch_all(c)
+    .await?;
+    ranges(&rows)
+}
+
+/// Instances alive and their workers.
+pub(super) async fn count_instances(c: &mut PgConnection) -> Sql<(u32, u32)> {
+    let row = sqlx::query(
+        "SELECT count(*) AS instances, CAST(coalesce(sum(workers), 0) AS BIGINT) AS workers FROM instance \
+         WHERE until > clock_timestamp()",
+    )
+    .fetch_one(c)
+    .await?;
+    let number = |column| {
+        row.try_get::<i64, _>(column)
+            .map(|n| u32::try_from(n).unwrap_or(u32::MAX))
+    };
+    Ok((number("instances")?, number("workers")?))
+}
+
+/// The leased ranges that are this instance's.
+pub(super) async fn leased(c: &mut PgConnection, instance: InstanceId) -> Sql<BTreeSet<RangeId>> {
+    let ids: Vec<Uuid> =
+        sqlx::query_scalar("SELECT id FROM task_range WHERE owner = $1 AND state = 1")
+            .bind(instance.uuid())
+            .fetch_all(c)
+            .await?;
+    Ok(ids.into_iter().map(RangeId::from_uuid).collect())
+}
+
+/// Workers of other instances that have leases, by job.
+pub(super) async fn busy(c: &mut PgConnection, instance: InstanceId) -> Sql<BTreeMap<JobId, u32>> {
+    let rows = sqlx::query(
+        "SELECT job.id, count(DISTINCT worker) AS workers FROM task_range JOIN stage ON stage.key = task_range.stage \
+         JOIN job ON job.key = stage.job WHERE task_range.state = 1 AND owner <> $1 GROUP BY job.id",
+    )
+    .bind(instance.uuid())
+    .fetch_all(c)
+    .await?;
+    rows.iter()
+        .map(|row| {
+            let workers = u32::try_from(row.try_get::<i64, _>("workers")?).unwrap_or(u32::MAX);
+            Ok((JobId::from_uuid(row.try_get("id")?), workers))
+        })
+        .collect()
+}
+
+/// Gives everything up that is not leased, and the instance. Its leases find a new one.
+pub(super) async fn leave(c: &mut PgConnection, instance: InstanceId) -> Sql<()> {
+    sqlx::query("UPDATE task_range SET owner = NULL WHERE owner = $1 AND state = 0")
+        .bind(instance.uuid())
+        .execute(&mut *c)
+        .await?;
+    sqlx::query("DELETE FROM instance WHERE id = $1")
+        .bind(instance.uuid())
+        .execute(c)
+        .await?;
+    Ok(())
+}
+
+pub(super) async fn adopt(writer: &mut Writer<'_>, worker: WorkerId) -> Result<Vec<Range>> {
+    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+        "UPDATE task_range SET owner = $1 WHERE worker = $2 AND state = 1 AND owner <> $1 RETURNING {RANGE}"
+    )))
+    .bind(writer.instance)
+    .bind(worker.uuid())
+    .fetch_all(&mut *writer.c)
+    .await?;
+    Ok(ranges(&rows)?)
+}

@@ -1,0 +1,205 @@
+//! Jobs as a whole: recorded, ended, cancelled, tried again.
+
+use std::collections::HashMap;
+
+use picofarm_proto::{
+    ids::{JobId, StageRef},
+    model::EventKind,
+};
+
+use sqlx::PgConnection;
+
+use super::{
+    job_query, query,
+    write::{RANGE, Result, WriteError, Writer, give, insert_events, insert_ranges, ranges},
+};
+use crate::sql::{self, int};
+use picofarm_catalog::{NewEvent, Outcome, RangeState, Settled, StageRecord, Submission};
+
+/// Where a stage is over, opens those that waited for it and ends the job if that was the last. The job's row is locked
+/// first: of two instances that finish their last tasks at once, the second sees what the first wrote.
+pub(super) async fn stage_over(
+    writer: &mut Writer<'_>,
+    stage: StageRef,
+    at_ms: i64,
+) -> Result<Settled> {
+    let keys = writer.keys(stage).await?;
+    if !hold(writer, keys.job).await? || job_query::is_open(writer.c, keys.stage).await? {
+        return Ok(Settled::default());
+    }
+    settle(writer, stage.job, at_ms).await
+}
+
+/// Locks the row of a job; whether it is active.
+async fn hold(writer: &mut Writer<'_>, key: i64) -> Result<bool> {
+    let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE key = $1 FOR UPDATE")
+        .bind(key)
+        .fetch_optional(&mut *writer.c)
+        .await?;
+    Ok(state == Some(0))
+}
+
+async fn settle(writer: &mut Writer<'_>, id: JobId, at_ms: i64) -> Result<Settled> {
+    let key = writer.job(id).await?;
+    let (settled, events) = job_query::settle(writer.c, key, id, at_ms).await?;
+    insert_events(writer, &events).await?;
+    Ok(settled)
+}
+
+/// Records a job; `spec` is its spec as JSON.
+pub(super) async fn record(
+    writer: &mut Writer<'_>,
+    submission: &Submission<'_>,
+    spec: &str,
+) -> Result<Outcome> {
+    for (set, run) in submission.done() {
+        if query::checked(&mut *writer.c, set, run).await? < run.hi - run.lo {
+            return Ok(Outcome::Changed);
+        }
+    }
+    if let Some(former) = submission.instead_of {
+        job_query::supersede(&mut *writer.c, former).await?;
+    }
+    let job = submission.job;
+    let key: Option<i64> = sqlx::query_scalar(
+        "INSERT INTO job (id, spec_hash, spec, state, submitted_ms, username, project, name) \
+         VALUES ($1, $2, $3, 0, $4, $5, $6, $7) \
+         ON CONFLICT DO NOTHING RETURNING key",
+    )
+    .bind(job.id.uuid())
+    .bind(&job.spec_hash)
+    .bind(spec)
+    .bind(job.submitted_ms)
+    .bind(&job.user)
+    .bind(&job.spec.project)
+    .bind(&job.spec.name)
+    .fetch_optional(&mut *writer.c)
+    .await?;
+    let Some(key) = key else {
+        return Ok(Outcome::Exists);
+    };
+    for gone in submission.gone {
+        query::drop_output(&mut *writer.c, gone).await?;
+    }
+    let mut stages = HashMap::new();
+    for stage in submission.stages {
+        let key = insert_stage(&mut *writer.c, key, stage).await?;
+        stages.insert(stage.id, key);
+    }
+    let rows: Vec<_> = submission
+        .ranges
+        .iter()
+        .map(|r| (stages[&r.stage], r))
+        .collect();
+    insert_ranges(writer, &rows, false).await?;
+    insert_events(writer, submission.events).await?;
+    settle(writer, job.id, job.submitted_ms).await?;
+    Ok(Outcome::New)
+}
+
+/// Records a stage of the job with this key; returns its own.
+async fn insert_stage(c: &mut PgConnection, job: i64, stage: &StageRecord) -> Result<i64> {
+    let set = &stage.set;
+    sqlx::query(
+        // The update locks the row: who forgets results meanwhile waits, rather than take it from under this stage.
+        "INSERT INTO result_set (store, dataset, stage_key) VALUES ($1, $2, $3) \
+         ON CONFLICT (store, dataset, stage_key) DO UPDATE SET store = excluded.store",
+    )
+    .bind(&set.store)
+    .bind(&set.dataset)
+    .bind(&set.stage_key.0[..])
+    .execute(&mut *c)
+    .await?;
+    let key = sqlx::query_scalar(
+        "INSERT INTO stage (job, ordinal, result_set, tasks, state, needs, tolerate_dead) \
+             SELECT $1, $2, key, $3, 0, $7, $8 FROM result_set \
+             WHERE store = $4 AND dataset = $5 AND stage_key = $6 RETURNING key",
+    )
+    .bind(job)
+    .bind(i64::from(stage.id.stage))
+    .bind(int(stage.tasks))
+    .bind(&set.store)
+    .bind(&set.dataset)
+    .bind(&set.stage_key.0[..])
+    .bind(sql::needs_text(&stage.needs))
+    .bind(stage.tolerate_dead)
+    .fetch_one(c)
+    .await?;
+    Ok(key)
+}
+
+pub(super) async fn cancel(
+    writer: &mut Writer<'_>,
+    job: JobId,
+    why: &str,
+    now_ms: i64,
+) -> Result<bool> {
+    let key = writer.job(job).await?;
+    let cancelled = job_query::cancel(writer.c, key, now_ms).await?;
+    if cancelled {
+        let event = NewEvent::of(job, now_ms, EventKind::Cancelled, why.to_owned());
+        insert_events(writer, &[event]).await?;
+    }
+    Ok(cancelled)
+}
+
+pub(super) async fn pause(
+    writer: &mut Writer<'_>,
+    job: JobId,
+    paused: bool,
+    who: &str,
+    now_ms: i64,
+) -> Result<bool> {
+    let key = writer.job(job).await?;
+    let changed = job_query::pause(writer.c, key, paused).await?;
+    if changed {
+        let kind = match paused {
+            true => EventKind::Paused,
+            false => EventKind::Resumed,
+        };
+        let event = NewEvent::of(job, now_ms, kind, who.to_owned());
+        insert_events(writer, &[event]).await?;
+    }
+    Ok(changed)
+}
+
+pub(super) async fn retry(writer: &mut Writer<'_>, job: JobId, now_ms: i64) -> Result<u64> {
+    let key = writer.job(job).await?;
+    // The job's row first, as whoever ends it does.
+    hold(writer, key).await?;
+    let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+        "DELETE FROM task_range WHERE state = 4 AND stage IN (SELECT key FROM stage WHERE job = $1) RETURNING {RANGE}"
+    )))
+    .bind(key)
+    .fetch_all(&mut *writer.c)
+    .await?;
+    let mut retried = 0;
+    for mut range in ranges(&rows)? {
+        retried += range.len();
+        range.crashes = 0;
+        range.state = RangeState::Pending { not_before_ms: 0 };
+        let stage = writer.keys(range.stage).await?.stage;
+        give(writer, stage, &range).await?;
+        sqlx::query("DELETE FROM exception WHERE stage = $1 AND task >= $2 AND task < $3")
+            .bind(stage)
+            .bind(int(range.lo))
+            .bind(int(range.hi))
+            .execute(&mut *writer.c)
+            .await?;
+    }
+    if retried > 0 {
+        sqlx::query("UPDATE job SET state = 0, ended_ms = NULL, tasks = NULL WHERE key = $1")
+            .bind(key)
+            .execute(&mut *writer.c)
+            .await
+            .map_err(|e| match e.as_database_error() {
+                Some(e) if e.is_unique_violation() => WriteError::Conflict(sql::LATER_JOB.into()),
+                _ => WriteError::Sql(e),
+            })?;
+        let message = format!("{retried} dead tasks are pending again");
+        let event = NewEvent::of(job, now_ms, EventKind::Retried, message);
+        insert_events(writer, &[event]).await?;
+        settle(writer, job, now_ms).await?;
+    }
+    Ok(retried)
+}

@@ -1,0 +1,535 @@
+//! The catalog in Postgres, for several coordinators at once; see the crate's documentation for instances.
+//!
+//! Transactions are short and touch few rows: a lease is a row, not a task. Rows of nobody's are taken with
+//! `SKIP LOCKED`, so that instances do not wait for each other. Who waits for news is woken by NOTIFY, which is sent outside
+//! of transactions and at most a few times a second (a NOTIFY in each transaction would put all of them in one queue),
+//! and asks once a second anyway.
+
+mod errors;
+mod instance;
+mod jobs;
+mod rights;
+mod write;
+
+use std::{
+    sync::Mutex,
+    time::{Duration, Instant},
+};
+
+use async_trait::async_trait;
+use picofarm_proto::{
+    ids::{InstanceId, JobId, StageRef, WorkerId},
+    model::{Event, JobState, TaskCounts},
+};
+use sqlx::{
+    ConnectOptions, Connection, PgPool,
+    migrate::MigrateError,
+    pool::PoolConnection,
+    postgres::{PgConnectOptions, PgListener, PgPoolOptions, PgRow},
+};
+use uuid::Uuid;
+
+use crate::migrations;
+use picofarm_catalog::{
+    Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
+    JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
+    Sight, Snapshot, Submission, TaskRecord, Timing, Want,
+};
+
+crate::sql::queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_listing::listing_queries!(
+    sqlx::Postgres,
+    sqlx::PgConnection,
+    super::PgRow,
+    " FOR UPDATE OF result_set SKIP LOCKED"
+);
+crate::sql_jobs::job_queries!(sqlx::PgConnection, super::PgRow);
+crate::sql_rights::rights_queries!(sqlx::PgConnection, super::PgRow);
+
+/// Connections of one coordinator: one hears hints, two write, the others read; more than its heavy reads take at a time.
+const CONNECTIONS: u32 = 10;
+/// How long a connection may take to come about.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// An instance that has not beaten for so long is lost.
+const INSTANCE_SECONDS: f64 = 5.0;
+/// At most one hint to the others in this time.
+const HINTS: Duration = Duration::from_millis(100);
+/// The channel of the hints.
+const CHANNEL: &str = "picofarm";
+
+/// A catalog in a Postgres database.
+pub struct PostgresCatalog {
+    /// The database, without its password.
+    place: String,
+    /// Who we are, for people.
+    name: String,
+    pool: PgPool,
+    /// The present life.
+    instance: Mutex<Option<InstanceId>>,
+    keys: tokio::sync::Mutex<write::Keys>,
+    hints: tokio::sync::Mutex<Option<PgListener>>,
+    hinted: Mutex<Option<Instant>>,
+}
+
+impl PostgresCatalog {
+    /// Connects to the database at `url` (`postgres://user:password@host/database?sslmode=verify-full`; what it leaves
+    /// out is taken from the usual PG variables) and brings its schema up to date. `name` tells people who this is.
+    ///
+    /// # Errors
+    /// [`CatalogError::Server`] when it cannot be reached, [`CatalogError::Newer`] when a later program wrote it.
+    pub async fn open(url: &str, name: &str) -> Result<Self, CatalogError> {
+        let options: PgConnectOptions = url.parse().map_err(|e| errors::bad_url(url, &e))?;
+        let options = options
+            .application_name("picofarm")
+            .disable_statement_logging()
+            .options([
+                // A coordinator that hangs in a transaction must not hold up the others.
+                ("idle_in_transaction_session_timeout", "30s"),
+                ("lock_timeout", "20s"),
+                // A server that is gone shall be noticed.
+                ("tcp_keepalives_idle", "10"),
+            ]);
+        let place = errors::place(&options);
+        let failed = |e| errors::classify(&place, e);
+        let pool = PgPoolOptions::new()
+            .max_connections(CONNECTIONS)
+            .acquire_timeout(PATIENCE)
+            .connect_with(options.clone())
+            .await;
+        let pool = match pool {
+            Ok(pool) => pool,
+            Err(error) => return Err(errors::unconnected(&place, &options, error).await),
+        };
+        migrate(&place, &pool).await?;
+        let listener = listen(&pool).await.map_err(failed)?;
+        Ok(Self {
+            name: name.to_owned(),
+            pool,
+            instance: Mutex::new(None),
+            keys: tokio::sync::Mutex::default(),
+            hints: tokio::sync::Mutex::new(Some(listener)),
+            hinted: Mutex::new(None),
+            place,
+        })
+    }
+
+    fn failed(&self, error: sqlx::Error) -> CatalogError {
+        errors::classify(&self.place, error)
+    }
+
+    async fn reader(&self) -> Result<PoolConnection<sqlx::Postgres>, CatalogError> {
+        match self.pool.acquire().await {
+            Ok(connection) => Ok(connection),
+            Err(error) => {
+                let options = self.pool.connect_options();
+                Err(errors::unconnected(&self.place, &options, error).await)
+            }
+        }
+    }
+
+    fn instance(&self) -> Result<InstanceId, CatalogError> {
+        self.instance
+            .lock()
+            .expect("no panic while locked")
+            .ok_or(CatalogError::Fenced)
+    }
+
+    /// Runs `work` in one transaction, on behalf of an instance that is alive.
+    async fn write<T>(
+        &self,
+        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+    ) -> Result<T, CatalogError> {
+        self.transaction(true, work).await
+    }
+
+    /// As [`Self::write`]; undone at the end if not `keep`.
+    async fn transaction<T>(
+        &self,
+        keep: bool,
+        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+    ) -> Result<T, CatalogError> {
+        let instance = self.instance()?;
+        let mut keys = self.keys.lock().await;
+        let result = async {
+            let mut connection = self.pool.acquire().await?;
+            let mut tx = connection.begin().await?;
+            instance::fence(&mut tx, instance).await?;
+            let mut writer = write::Writer {
+                c: &mut tx,
+                instance: instance.uuid(),
+                keys: &mut keys,
+            };
+            // Dropping the transaction undoes it.
+            let done = work(&mut writer).await?;
+            match keep {
+                true => tx.commit().await?,
+                false => tx.rollback().await?,
+            }
+            Ok(done)
+        };
+        result.await.map_err(|e| match e {
+            write::WriteError::Fenced => CatalogError::Fenced,
+            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            write::WriteError::Sql(e) => self.failed(e),
+        })
+    }
+
+    /// Wakes the others, unless they have just been woken.
+    async fn hint(&self) {
+        {
+            let mut hinted = self.hinted.lock().expect("no panic while locked");
+            if hinted.is_some_and(|at| at.elapsed() < HINTS) {
+                return;
+            }
+            *hinted = Some(Instant::now());
+        }
+        let sent = sqlx::query("SELECT pg_notify($1, '')")
+            .bind(CHANNEL)
+            .execute(&self.pool)
+            .await;
+        if let Err(error) = sent {
+            tracing::debug!(%error, "no hint sent; the others ask by themselves");
+        }
+    }
+}
+
+async fn listen(pool: &PgPool) -> Result<PgListener, sqlx::Error> {
+    let mut listener = PgListener::connect_with(pool).await?;
+    listener.listen(CHANNEL).await?;
+    Ok(listener)
+}
+
+async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
+    let known = migrations::latest(&migrations::POSTGRES);
+    // Several coordinators may start at once: the migrator takes an advisory lock.
+    migrations::POSTGRES
+        .run(pool)
+        .await
+        .map_err(|error| match error {
+            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
+                CatalogError::Newer {
+                    place: place.to_owned(),
+                    found,
+                    known,
+                }
+            }
+            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
+                errors::classify(place, e)
+            }
+            other => CatalogError::Unusable {
+                place: place.to_owned(),
+                what: format!("its schema is not this program's ({other})"),
+            },
+        })
+}
+
+#[async_trait]
+impl Catalog for PostgresCatalog {
+    async fn load(&self) -> Result<Snapshot, CatalogError> {
+        let former = self.instance.lock().expect("no panic while locked").take();
+        let instance = InstanceId::from_uuid(Uuid::now_v7());
+        let snapshot = async {
+            let mut connection = self.pool.acquire().await?;
+            let mut tx = connection.begin().await?;
+            instance::found(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
+            let ranges = instance::take_lost(&mut tx, instance).await?;
+            let snapshot = Snapshot {
+                instance,
+                jobs: job_query::active_jobs(&mut tx).await?,
+                owned: Owned {
+                    exceptions: query::exceptions(&mut tx, &ranges).await?,
+                    ranges,
+                },
+                workers: query::workers(&mut tx).await?,
+            };
+            tx.commit().await?;
+            Ok(snapshot)
+        };
+        let snapshot = snapshot.await.map_err(|e| self.failed(e))?;
+        *self.instance.lock().expect("no panic while locked") = Some(instance);
+        Ok(snapshot)
+    }
+
+    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+        let instance = self.instance()?;
+        let news = async {
+            let mut connection = self.pool.acquire().await?;
+            let mut tx = connection.begin().await?;
+            if !instance::renew(&mut tx, instance, workers, INSTANCE_SECONDS).await? {
+                return Ok(None);
+            }
+            let taken = instance::take_lost(&mut tx, instance).await?;
+            let (instances, workers) = instance::count_instances(&mut tx).await?;
+            let news = News {
+                active: job_query::active(&mut tx).await?,
+                busy: instance::busy(&mut tx, instance).await?,
+                free: job_query::free(&mut tx).await?,
+                taken: Owned {
+                    exceptions: query::exceptions(&mut tx, &taken).await?,
+                    ranges: taken,
+                },
+                leased: Some(instance::leased(&mut tx, instance).await?),
+                instances,
+                workers,
+            };
+            tx.commit().await?;
+            Ok(Some(news))
+        };
+        news.await
+            .map_err(|e| self.failed(e))?
+            .ok_or(CatalogError::Fenced)
+    }
+
+    async fn changed(&self) {
+        let mut hints = self.hints.lock().await;
+        loop {
+            if let Some(listener) = hints.as_mut() {
+                match listener.recv().await {
+                    Ok(_) => return,
+                    Err(error) => tracing::debug!(%error, "no more hints; trying again"),
+                }
+                *hints = None;
+            }
+            tokio::time::sleep(Duration::from_secs(2)).await;
+            *hints = listen(&self.pool).await.ok();
+        }
+    }
+
+    async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError> {
+        self.write(async |writer| write::claim(writer, wants).await)
+            .await
+    }
+
+    async fn adopt(&self, worker: WorkerId) -> Result<Owned, CatalogError> {
+        self.write(async |writer| {
+            let ranges = instance::adopt(writer, worker).await?;
+            Ok(Owned {
+                exceptions: query::exceptions(writer.c, &ranges).await?,
+                ranges,
+            })
+        })
+        .await
+    }
+
+    async fn commit(&self, changes: &Changes) -> Result<Settled, CatalogError> {
+        if changes.is_empty() {
+            return Ok(Settled::default());
+        }
+        let settled = self
+            .write(async |writer| write::changes(writer, changes).await)
+            .await?;
+        let pending = |r: &Range| matches!(r.state, RangeState::Pending { .. });
+        if settled != Settled::default() || changes.free.values().any(pending) {
+            self.hint().await;
+        }
+        Ok(settled)
+    }
+
+    async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
+        picofarm_catalog::verdict(
+            self.transaction(false, async |writer| {
+                write::write_rows(writer, changes).await
+            })
+            .await,
+        )
+    }
+
+    async fn record(&self, submission: &Submission<'_>) -> Result<Outcome, CatalogError> {
+        // Before the transaction: a large spec takes a while.
+        let spec = serde_json::to_string(&*submission.job.spec).expect("a spec is plain data");
+        let outcome = self
+            .write(async |writer| jobs::record(writer, submission, &spec).await)
+            .await?;
+        self.hint().await;
+        Ok(outcome)
+    }
+
+    async fn recorded(&self, set: &ResultSet, count: u64) -> Result<Vec<Recorded>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::recorded(&mut c, set, count)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn mark_checked(
+        &self,
+        set: &ResultSet,
+        outputs: &[Recorded],
+    ) -> Result<(), CatalogError> {
+        // Short transactions: others wait for them.
+        for some in outputs.chunks(1_000) {
+            self.write(async |writer| {
+                for output in some {
+                    query::mark_checked(writer.c, set, output).await?;
+                }
+                Ok(())
+            })
+            .await?;
+        }
+        Ok(())
+    }
+
+    async fn drop_output(&self, gone: &Gone) -> Result<bool, CatalogError> {
+        self.write(async |writer| Ok(query::drop_output(writer.c, gone).await?))
+            .await
+    }
+
+    async fn state(&self, job: JobId) -> Result<Option<JobState>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::state(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn cancel(&self, job: JobId, why: &str, now_ms: i64) -> Result<bool, CatalogError> {
+        let cancelled = self
+            .write(async |writer| jobs::cancel(writer, job, why, now_ms).await)
+            .await?;
+        self.hint().await;
+        Ok(cancelled)
+    }
+
+    async fn pause(
+        &self,
+        job: JobId,
+        paused: bool,
+        who: &str,
+        now_ms: i64,
+    ) -> Result<bool, CatalogError> {
+        let changed = self
+            .write(async |writer| jobs::pause(writer, job, paused, who, now_ms).await)
+            .await?;
+        self.hint().await;
+        Ok(changed)
+    }
+
+    async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
+        self.write(async |writer| {
+            *writer.keys = write::Keys::default();
+            Ok(listing_query::forget(writer.c, before_ms).await?)
+        })
+        .await
+    }
+
+    async fn jobs_of(&self, user: &str) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::jobs_of(&mut c, user)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn retry(&self, job: JobId, now_ms: i64) -> Result<u64, CatalogError> {
+        let retried = self
+            .write(async |writer| jobs::retry(writer, job, now_ms).await)
+            .await?;
+        self.hint().await;
+        Ok(retried)
+    }
+
+    async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::record(&mut c, id)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn active_tasks(&self) -> Result<TaskCounts, CatalogError> {
+        let mut c = self.reader().await?;
+        listing_query::active_tasks(&mut c)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn page(&self, query: &JobQuery) -> Result<Page, CatalogError> {
+        let mut c = self.reader().await?;
+        listing_query::page(&mut c, query)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn job_with(&self, spec_hash: &str) -> Result<Option<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::job_with(&mut c, spec_hash)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn recent(&self, most: u32, sight: &Sight) -> Result<Vec<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::recent(&mut c, most, sight)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn jobs_at(&self, store: &str, dataset: &str) -> Result<Vec<Job>, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::jobs_at(&mut c, store, dataset)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn output_runs(&self, set: &ResultSet, count: u64) -> Result<Vec<Run>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::output_runs(&mut c, set, count)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn manifests(
+        &self,
+        tasks: &[(StageRef, u64)],
+    ) -> Result<Vec<Option<[u8; 32]>>, CatalogError> {
+        if tasks.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut c = self.reader().await?;
+        write::manifests(&mut c, tasks)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn timing(&self, set: &ResultSet) -> Result<Timing, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::timing(&mut c, set)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn holdups(&self, job: JobId, now_ms: i64) -> Result<Holdups, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::holdups(&mut c, job, now_ms)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn task(&self, stage: StageRef, task: u64) -> Result<TaskRecord, CatalogError> {
+        let mut c = self.reader().await?;
+        query::task(&mut c, stage, task)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn events(&self, query: &EventQuery) -> Result<Vec<Event>, CatalogError> {
+        let mut c = self.reader().await?;
+        query::events(&mut c, query)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn close(&self) {
+        let instance = self.instance.lock().expect("no panic while locked").take();
+        if let Some(instance) = instance {
+            // What is not given back now, others find when the instance is lost.
+            if let Ok(mut c) = self.pool.acquire().await
+                && let Err(error) = instance::leave(&mut c, instance).await
+            {
+                tracing::debug!(%error, "the instance was not given up in order");
+            }
+        }
+        // The pool waits for every connection, the listener's too.
+        if let Ok(mut hints) = self.hints.try_lock() {
+            hints.take();
+        }
+        self.pool.close().await;
+    }
+}

@@ -1,0 +1,39 @@
+//! Owners of jobs and the audit log, in Postgres. The log is written without a coordinator's life: a line that a fenced
+//! coordinator writes is true as well.
+
+use async_trait::async_trait;
+use picofarm_proto::{ids::JobId, model::AuditEntry};
+
+use super::{PostgresCatalog, rights_query};
+use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, Owner, Rights};
+
+#[async_trait]
+impl Rights for PostgresCatalog {
+    async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::owner(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn audit(&self, lines: &[NewAudit]) -> Result<(), CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::audit(&mut c, lines)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn audited(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::audited(&mut c, query)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn forget_audit(&self, before_ms: i64) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::forget_audit(&mut c, before_ms)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+}

@@ -1,0 +1,420 @@
+//! The queries about jobs and stages, for one database: `job_queries!(SqliteConnection, SqliteRow)` makes a module
+//! `job_query` beside `query` (see [`crate::sql`]).
+
+macro_rules! job_queries {
+    ($connection:ty, $row:ty) => {
+        pub(crate) mod job_query {
+            use std::{collections::BTreeMap, sync::Arc};
+
+            use picofarm_proto::{
+                ids::{JobId, StageRef},
+                model::{EventKind, JobSpec, JobState, StageState, TaskCounts},
+            };
+            use sqlx::Row;
+
+            use super::query::{exception, marks, stage_of, uint};
+            use picofarm_catalog::{Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight};
+            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}};
+
+            type Connection = $connection;
+            type DbRow = $row;
+            type Result<T> = std::result::Result<T, sqlx::Error>;
+
+            fn job(row: &DbRow) -> Result<Job> {
+                let spec: JobSpec =
+                    serde_json::from_str(row.try_get("spec")?).map_err(|e| bad("spec", e))?;
+                Ok(Job {
+                    id: JobId::from_uuid(row.try_get("id")?),
+                    spec_hash: row.try_get("spec_hash")?,
+                    spec: Arc::new(spec),
+                    state: sql::job_state(row.try_get("state")?)?,
+                    submitted_ms: row.try_get("submitted_ms")?,
+                    ended_ms: row.try_get("ended_ms")?,
+                    paused: row.try_get("paused")?,
+                    user: row.try_get("username")?,
+                })
+            }
+
+            pub(crate) async fn active_jobs(c: &mut Connection) -> Result<Vec<Job>> {
+                let rows = sqlx::query("SELECT * FROM job WHERE state = 0 ORDER BY key")
+                    .fetch_all(c)
+                    .await?;
+                rows.iter().map(job).collect()
+            }
+
+            /// The active jobs, and whether they are held.
+            pub(crate) async fn active(c: &mut Connection) -> Result<BTreeMap<JobId, bool>> {
+                let rows = sqlx::query("SELECT id, paused FROM job WHERE state = 0")
+                    .fetch_all(c)
+                    .await?;
+                rows.iter()
+                    .map(|row| Ok((JobId::from_uuid(row.try_get("id")?), row.try_get("paused")?)))
+                    .collect()
+            }
+
+            /// Pending tasks of open stages of active jobs that are nobody's.
+            pub(crate) async fn free(c: &mut Connection) -> Result<BTreeMap<StageRef, u64>> {
+                let rows = sqlx::query(
+                    "SELECT job.id AS job_id, stage.ordinal, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+                     JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+                     WHERE task_range.state = 0 AND owner IS NULL AND stage.state = 1 AND job.state = 0 \
+                     GROUP BY job.id, stage.ordinal",
+                )
+                .fetch_all(c)
+                .await?;
+                rows.iter()
+                    .map(|row| Ok((stage_of(row)?, uint(row, "tasks")?)))
+                    .collect()
+            }
+
+            pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
+                let row = sqlx::query(
+                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds \
+                     FROM output WHERE NOT adopted AND result_set = \
+                     (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3)",
+                )
+                .bind(&set.store)
+                .bind(&set.dataset)
+                .bind(&set.stage_key.0[..])
+                .fetch_one(c)
+                .await?;
+                timing_of(&row)
+            }
+
+            fn timing_of(row: &DbRow) -> Result<Timing> {
+                Ok(Timing {
+                    tasks: uint(row, "timed")?,
+                    seconds: row.try_get("seconds")?,
+                })
+            }
+
+            /// A job with its counts.
+            pub(crate) async fn record(c: &mut Connection, id: JobId) -> Result<Option<JobRecord>> {
+                let row = sqlx::query("SELECT * FROM job WHERE id = $1")
+                    .bind(id.uuid())
+                    .fetch_optional(&mut *c)
+                    .await?;
+                let Some(row) = row else {
+                    return Ok(None);
+                };
+                let key: i64 = row.try_get("key")?;
+                let stages = match row.try_get::<Option<i64>, _>("tasks")? {
+                    Some(_) => final_stages(c, key).await?,
+                    None => {
+                        let nodes = nodes(c, key).await?;
+                        nodes.into_iter().map(|(stage, _)| stage).collect()
+                    }
+                };
+                Ok(Some(JobRecord {
+                    job: job(&row)?,
+                    stages,
+                    timing: timing_of(&row)?,
+                }))
+            }
+
+            /// The stages of a job that has ended, whose counts are final.
+            async fn final_stages(c: &mut Connection, key: i64) -> Result<Vec<StageCounts>> {
+                let rows = sqlx::query("SELECT * FROM stage WHERE job = $1 ORDER BY ordinal")
+                    .bind(key)
+                    .fetch_all(c)
+                    .await?;
+                let stage = |row: &DbRow| {
+                    let (total, done, dead) = (uint(row, "tasks")?, uint(row, "done")?, uint(row, "dead")?);
+                    let counts = TaskCounts {
+                        total,
+                        done,
+                        reused: uint(row, "reused")?,
+                        leased: 0,
+                        pending: total.saturating_sub(done + dead),
+                        dead,
+                    };
+                    Ok(StageCounts {
+                        state: sql::stage_state(row.try_get("state")?)?,
+                        counts,
+                    })
+                };
+                rows.iter().map(stage).collect()
+            }
+
+            /// The stages of a job with their tasks counted, in order.
+            async fn nodes(c: &mut Connection, key: i64) -> Result<Vec<(StageCounts, Node)>> {
+                let mut counts: BTreeMap<i64, TaskCounts> = BTreeMap::new();
+                let rows = sqlx::query(
+                    "SELECT task_range.stage, task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+                     JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage.job = $1 AND task_range.state <> 1 GROUP BY task_range.stage, task_range.state",
+                )
+                .bind(key)
+                .fetch_all(&mut *c)
+                .await?;
+                for row in &rows {
+                    let n = uint(row, "tasks")?;
+                    let counts = counts.entry(row.try_get("stage")?).or_default();
+                    match row.try_get::<i64, _>("state")? {
+                        sql::PENDING => counts.pending += n,
+                        sql::DONE => counts.done += n,
+                        sql::DONE_REUSED => {
+                            counts.done += n;
+                            counts.reused += n;
+                        }
+                        sql::DEAD => counts.dead += n,
+                        other => return Err(bad("state", other)),
+                    }
+                }
+                let rows = sqlx::query(
+                    "SELECT task_range.stage, marks FROM task_range JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage.job = $1 AND task_range.state = 1",
+                )
+                .bind(key)
+                .fetch_all(&mut *c)
+                .await?;
+                for row in &rows {
+                    let counts = counts.entry(row.try_get("stage")?).or_default();
+                    for mark in marks(row)? {
+                        match mark {
+                            Mark::Todo => counts.leased += 1,
+                            Mark::Done => counts.done += 1,
+                            Mark::Reused => {
+                                counts.done += 1;
+                                counts.reused += 1;
+                            }
+                            Mark::Left => {}
+                        }
+                    }
+                }
+                let rows = sqlx::query("SELECT * FROM stage WHERE job = $1 ORDER BY ordinal")
+                    .bind(key)
+                    .fetch_all(c)
+                    .await?;
+                rows.iter()
+                    .map(|row| {
+                        let mut counts = counts
+                            .get(&row.try_get::<i64, _>("key")?)
+                            .copied()
+                            .unwrap_or_default();
+                        counts.total = counts.done + counts.leased + counts.pending + counts.dead;
+                        let state = sql::stage_state(row.try_get("state")?)?;
+                        let node = Node {
+                            needs: sql::needs(row.try_get("needs")?)?,
+                            tolerate_dead: row.try_get("tolerate_dead")?,
+                            counts,
+                        };
+                        Ok((StageCounts { state, counts }, node))
+                    })
+                    .collect()
+            }
+
+            /// Opens the stages of an active job that may begin, and ends the job if it is over; with the lines for its
+            /// history. The caller holds the job's row, so that of two instances that finish their last tasks at once the
+            /// second sees what the first wrote.
+            pub(crate) async fn settle(
+                c: &mut Connection,
+                key: i64,
+                id: JobId,
+                at_ms: i64,
+            ) -> Result<(Settled, Vec<NewEvent>)> {
+                let mut settled = Settled::default();
+                let mut events = Vec::new();
+                let stages = nodes(c, key).await?;
+                let (before, nodes): (Vec<_>, Vec<_>) = stages.into_iter().unzip();
+                let (states, end) = graph::states(&nodes);
+                for (ordinal, (before, state)) in before.iter().zip(&states).enumerate() {
+                    if before.state == *state {
+                        continue;
+                    }
+                    sqlx::query("UPDATE stage SET state = $1 WHERE job = $2 AND ordinal = $3")
+                        .bind(sql::stage_state_code(*state))
+                        .bind(key)
+                        .bind(int(ordinal as u64))
+                        .execute(&mut *c)
+                        .await?;
+                    if *state == StageState::Open {
+                        let stage = ordinal as u32;
+                        settled.opened.push(StageRef { job: id, stage });
+                        if !nodes[ordinal].needs.is_empty() {
+                            let event = NewEvent::of(id, at_ms, EventKind::Opened, String::new());
+                            events.push(NewEvent { stage: Some(stage), ..event });
+                        }
+                    }
+                }
+                let Some(state) = end else {
+                    return Ok((settled, events));
+                };
+                let mut counts = TaskCounts::default();
+                for (ordinal, node) in nodes.iter().enumerate() {
+                    counts += node.counts;
+                    sqlx::query("UPDATE stage SET done = $1, reused = $2, dead = $3 WHERE job = $4 AND ordinal = $5")
+                        .bind(int(node.counts.done))
+                        .bind(int(node.counts.reused))
+                        .bind(int(node.counts.dead))
+                        .bind(key)
+                        .bind(int(ordinal as u64))
+                        .execute(&mut *c)
+                        .await?;
+                }
+                sqlx::query(
+                    "UPDATE job SET state = $2, ended_ms = $3, tasks = $4, done = $5, reused = $6, dead = $7, \
+                     (timed, seconds) = (SELECT count(*), coalesce(sum(seconds), 0.0) FROM output \
+                       WHERE NOT adopted AND result_set IN (SELECT result_set FROM stage WHERE job = $1)) WHERE key = $1",
+                )
+                .bind(key)
+                .bind(sql::job_state_code(state))
+                .bind(at_ms)
+                .bind(int(counts.total))
+                .bind(int(counts.done))
+                .bind(int(counts.reused))
+                .bind(int(counts.dead))
+                .execute(&mut *c)
+                .await?;
+                events.push(NewEvent::ended(id, at_ms, &counts));
+                settled.ends.push(JobEnd {
+                    job: id,
+                    state,
+                    at_ms,
+                });
+                Ok((settled, events))
+            }
+
+            /// Whether anything of a stage is pending or leased.
+            pub(crate) async fn is_open(c: &mut Connection, stage: i64) -> Result<bool> {
+                let open = sqlx::query("SELECT 1 FROM task_range WHERE stage = $1 AND state IN (0, 1) LIMIT 1")
+                    .bind(stage)
+                    .fetch_optional(c)
+                    .await?;
+                Ok(open.is_some())
+            }
+
+            /// Stops an active job; `false` where it is not active.
+            pub(crate) async fn cancel(c: &mut Connection, key: i64, now_ms: i64) -> Result<bool> {
+                let cancelled =
+                    sqlx::query("UPDATE job SET state = $1, ended_ms = $2 WHERE key = $3 AND state = 0")
+                        .bind(sql::job_state_code(JobState::Cancelled))
+                        .bind(now_ms)
+                        .bind(key)
+                        .execute(c)
+                        .await?;
+                Ok(cancelled.rows_affected() > 0)
+            }
+
+            /// Holds an active job or lets it go on; `false` where that changes nothing.
+            pub(crate) async fn pause(c: &mut Connection, key: i64, paused: bool) -> Result<bool> {
+                let changed = sqlx::query("UPDATE job SET paused = $1 WHERE key = $2 AND state = 0 AND paused <> $1")
+                    .bind(paused)
+                    .bind(key)
+                    .execute(c)
+                    .await?;
+                Ok(changed.rows_affected() > 0)
+            }
+
+            /// Where a job stands.
+            pub(crate) async fn state(c: &mut Connection, id: JobId) -> Result<Option<JobState>> {
+                let state: Option<i64> = sqlx::query_scalar("SELECT state FROM job WHERE id = $1")
+                    .bind(id.uuid())
+                    .fetch_optional(c)
+                    .await?;
+                state.map(sql::job_state).transpose()
+            }
+
+            /// Marks a done job whose results are gone, so that another with its spec may be recorded.
+            pub(crate) async fn supersede(c: &mut Connection, id: JobId) -> Result<()> {
+                sqlx::query("UPDATE job SET superseded = $1 WHERE id = $2 AND state = 1")
+                    .bind(true)
+                    .bind(id.uuid())
+                    .execute(c)
+                    .await?;
+                Ok(())
+            }
+
+            /// Active jobs of a user.
+            pub(crate) async fn jobs_of(c: &mut Connection, user: &str) -> Result<u64> {
+                let row = sqlx::query("SELECT count(*) AS jobs FROM job WHERE username = $1 AND state = 0")
+                    .bind(user)
+                    .fetch_one(c)
+                    .await?;
+                uint(&row, "jobs")
+            }
+
+            pub(crate) async fn job_with(c: &mut Connection, spec_hash: &str) -> Result<Option<Job>> {
+                let row = sqlx::query("SELECT * FROM job WHERE spec_hash = $1 ORDER BY key DESC LIMIT 1")
+                    .bind(spec_hash)
+                    .fetch_optional(c)
+                    .await?;
+                row.as_ref().map(job).transpose()
+            }
+
+            /// Size of the specs of the latest jobs together, at most: they are in memory at once.
+            const RECENT_BYTES: i64 = 64 << 20;
+
+            /// The latest jobs, whatever became of them, the last first.
+            pub(crate) async fn recent(c: &mut Connection, most: u32, sight: &Sight) -> Result<Vec<Job>> {
+                let [all, user, projects] = crate::seen::columns(sight);
+                let text = concat!(
+                    "SELECT * FROM job WHERE key IN (SELECT key FROM (SELECT key, \
+                     sum(octet_length(spec)) OVER (ORDER BY key DESC) AS total FROM (SELECT key, spec FROM job WHERE ",
+                    seen!("$2", "$3", "$4"),
+                    " ORDER BY key DESC LIMIT $1) AS latest) AS sized WHERE total <= $5) ORDER BY key DESC"
+                );
+                let rows = sqlx::query(text)
+                    .bind(i64::from(most))
+                    .bind(all)
+                    .bind(user)
+                    .bind(projects)
+                    .bind(RECENT_BYTES)
+                    .fetch_all(c)
+                    .await?;
+                rows.iter().map(job).collect()
+            }
+
+            /// Jobs with a stage in a data set that is active or has written something.
+            pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
+                let rows = sqlx::query(
+                    "SELECT * FROM job WHERE key IN (SELECT stage.job FROM stage \
+                       JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2 \
+                       AND (stage.done > 0 OR EXISTS (SELECT 1 FROM job AS live WHERE live.key = stage.job AND live.state = 0) \
+                         OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
+                           AND task_range.state IN (2, 3)))) \
+                     ORDER BY key DESC",
+                )
+                .bind(store)
+                .bind(dataset)
+                .fetch_all(c)
+                .await?;
+                rows.iter().map(job).collect()
+            }
+
+            pub(crate) async fn holdups(c: &mut Connection, job: JobId, now_ms: i64) -> Result<Holdups> {
+                let row = sqlx::query(
+                    "SELECT \
+                     CAST(coalesce(sum(CASE WHEN not_before_ms <= $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS ready, \
+                     CAST(coalesce(sum(CASE WHEN not_before_ms > $2 THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS waiting, \
+                     min(CASE WHEN not_before_ms > $2 THEN not_before_ms END) AS next_ms \
+                     FROM task_range JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+                     WHERE job.id = $1 AND task_range.state = 0 AND stage.state = 1",
+                )
+                .bind(job.uuid())
+                .bind(now_ms)
+                .fetch_one(&mut *c)
+                .await?;
+                let failed = sqlx::query(
+                    "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
+                     JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
+                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes DESC, task LIMIT 5",
+                )
+                .bind(job.uuid())
+                .fetch_all(c)
+                .await?;
+                Ok(Holdups {
+                    ready: uint(&row, "ready")?,
+                    waiting: uint(&row, "waiting")?,
+                    next_ms: row.try_get("next_ms")?,
+                    failed: failed
+                        .iter()
+                        .map(|row| exception(row, stage_of(row)?))
+                        .collect::<Result<_>>()?,
+                })
+            }
+        }
+    };
+}
+
+pub(crate) use job_queries;

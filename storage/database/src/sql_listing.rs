@@ -1,0 +1,283 @@
+//! The queries that deal with many jobs, for one database: pages of a list, and forgetting. They never read a spec.
+//! `listing_queries!(Sqlite, SqliteConnection, SqliteRow, "")` makes a module `listing_query` beside `job_query`; the last
+//! locks the rows that a query returns, where the database knows such a thing.
+
+macro_rules! listing_queries {
+    ($database:ty, $connection:ty, $row:ty, $lock:literal) => {
+        pub(crate) mod listing_query {
+            use std::collections::BTreeMap;
+
+            use picofarm_proto::{
+                ids::JobId,
+                model::{JobState, JobSummary, TaskCounts},
+            };
+            use sqlx::{QueryBuilder, Row};
+
+            use super::query::{marks, uint};
+            use picofarm_catalog::{Forgotten, JobQuery, Page, Mark};
+            use crate::{seen::seen, sql::{self, bad}};
+
+            type Connection = $connection;
+            type DbRow = $row;
+            type Result<T> = std::result::Result<T, sqlx::Error>;
+
+            pub(crate) async fn page(c: &mut Connection, query: &JobQuery) -> Result<Page> {
+                let [all, user, projects] = crate::seen::columns(&query.sight);
+                let ids = query.find.as_deref().and_then(crate::listing::ids);
+                let most = i64::from(query.limit.max(1));
+                let mut rows = sqlx::query(concat!(
+                    "SELECT key, id, name, username, project, state, paused, submitted_ms, ended_ms, tasks, done, reused, \
+                     dead FROM job WHERE key < $1 AND (CAST($2 AS BIGINT) IS NULL OR state = $2) \
+                     AND (CAST($3 AS TEXT) IS NULL OR username = $3) \
+                     AND (CAST($4 AS TEXT) IS NULL OR name = $4 OR (id >= $5 AND id <= $6)) AND ",
+                    seen!("$7", "$8", "$9"),
+                    " ORDER BY key DESC LIMIT $10"
+                ))
+                .bind(query.before.unwrap_or(i64::MAX))
+                .bind(query.state.map(sql::job_state_code))
+                .bind(&query.user)
+                .bind(&query.find)
+                .bind(ids.map(|(first, _)| first))
+                .bind(ids.map(|(_, last)| last))
+                .bind(all)
+                .bind(user)
+                .bind(projects)
+                // One more, to see whether there are more.
+                .bind(most + 1)
+                .fetch_all(&mut *c)
+                .await?;
+                let more = rows.len() as i64 > most;
+                rows.truncate(usize::try_from(most).unwrap_or(usize::MAX));
+                let mut keys = Vec::with_capacity(rows.len());
+                let mut open = Vec::new();
+                for row in &rows {
+                    let key: i64 = row.try_get("key")?;
+                    keys.push(key);
+                    if row.try_get::<Option<i64>, _>("tasks")?.is_none() {
+                        open.push(key);
+                    }
+                }
+                let mut counts = counts(c, &open).await?;
+                let jobs = rows.iter().zip(&keys).map(|(row, key)| {
+                    let tasks = match row.try_get::<Option<i64>, _>("tasks")? {
+                        Some(_) => ended(row)?,
+                        None => counts.remove(key).unwrap_or_default(),
+                    };
+                    summary(row, tasks)
+                });
+                Ok(Page {
+                    jobs: jobs.collect::<Result<_>>()?,
+                    next: keys.last().copied().filter(|_| more),
+                })
+            }
+
+            /// The counts of a job that has ended, which are kept with it.
+            fn ended(row: &DbRow) -> Result<TaskCounts> {
+                let (total, done, dead) = (uint(row, "tasks")?, uint(row, "done")?, uint(row, "dead")?);
+                Ok(TaskCounts {
+                    total,
+                    done,
+                    reused: uint(row, "reused")?,
+                    leased: 0,
+                    pending: total.saturating_sub(done + dead),
+                    dead,
+                })
+            }
+
+            fn summary(row: &DbRow, tasks: TaskCounts) -> Result<JobSummary> {
+                let state = sql::job_state(row.try_get("state")?)?;
+                Ok(JobSummary {
+                    id: JobId::from_uuid(row.try_get("id")?),
+                    name: row.try_get("name")?,
+                    user: row.try_get("username")?,
+                    project: row.try_get("project")?,
+                    state,
+                    paused: row.try_get("paused")? && state == JobState::Active,
+                    tasks,
+                    submitted_at_ms: row.try_get("submitted_ms")?,
+                    ended_at_ms: row.try_get("ended_ms")?,
+                })
+            }
+
+            /// Tasks of these jobs by state, counted from their ranges.
+            async fn counts(c: &mut Connection, jobs: &[i64]) -> Result<BTreeMap<i64, TaskCounts>> {
+                if jobs.is_empty() {
+                    return Ok(BTreeMap::new());
+                }
+                let whole = of_jobs(
+                    "SELECT stage.job, task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM stage \
+                     JOIN task_range ON task_range.stage = stage.key WHERE task_range.state <> 1 AND stage.job IN (",
+                    jobs,
+                    ") GROUP BY stage.job, task_range.state",
+                );
+                let leased = of_jobs(
+                    "SELECT stage.job, marks FROM stage JOIN task_range ON task_range.stage = stage.key \
+                     WHERE task_range.state = 1 AND stage.job IN (",
+                    jobs,
+                    ")",
+                );
+                counted(c, whole, leased).await
+            }
+
+            /// Tasks of all active jobs by state.
+            pub(crate) async fn active_tasks(c: &mut Connection) -> Result<TaskCounts> {
+                // They count as those of one job.
+                let whole = QueryBuilder::new(
+                    "SELECT CAST(0 AS BIGINT) AS job, task_range.state, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM job \
+                     JOIN stage ON stage.job = job.key JOIN task_range ON task_range.stage = stage.key \
+                     WHERE job.state = 0 AND task_range.state <> 1 GROUP BY task_range.state",
+                );
+                let leased = QueryBuilder::new(
+                    "SELECT CAST(0 AS BIGINT) AS job, marks FROM job \
+                     JOIN stage ON stage.job = job.key JOIN task_range ON task_range.stage = stage.key \
+                     WHERE job.state = 0 AND task_range.state = 1",
+                );
+                let counts = counted(c, whole, leased).await?;
+                Ok(counts.into_values().next().unwrap_or_default())
+            }
+
+            /// The counts that two queries give: of ranges by job and state, and of the leased ones by their marks.
+            async fn counted(
+                c: &mut Connection,
+                mut whole: QueryBuilder<$database>,
+                mut leased: QueryBuilder<$database>,
+            ) -> Result<BTreeMap<i64, TaskCounts>> {
+                let mut counts: BTreeMap<i64, TaskCounts> = BTreeMap::new();
+                for row in &whole.build().fetch_all(&mut *c).await? {
+                    let n = uint(row, "tasks")?;
+                    let counts = counts.entry(row.try_get("job")?).or_default();
+                    match row.try_get::<i64, _>("state")? {
+                        sql::PENDING => counts.pending += n,
+                        sql::DONE => counts.done += n,
+                        sql::DONE_REUSED => {
+                            counts.done += n;
+                            counts.reused += n;
+                        }
+                        sql::DEAD => counts.dead += n,
+                        other => return Err(bad("state", other)),
+                    }
+                }
+                for row in &leased.build().fetch_all(c).await? {
+                    let counts = counts.entry(row.try_get("job")?).or_default();
+                    for mark in marks(row)? {
+                        match mark {
+                            Mark::Todo => counts.leased += 1,
+                            Mark::Done => counts.done += 1,
+                            Mark::Reused => {
+                                counts.done += 1;
+                                counts.reused += 1;
+                            }
+                            Mark::Left => {}
+                        }
+                    }
+                }
+                for counts in counts.values_mut() {
+                    counts.total = counts.done + counts.leased + counts.pending + counts.dead;
+                }
+                Ok(counts)
+            }
+
+            /// A statement about a list of keys.
+            fn of_jobs(before: &str, keys: &[i64], after: &str) -> QueryBuilder<$database> {
+                let mut text = QueryBuilder::new(before);
+                let mut list = text.separated(", ");
+                for key in keys {
+                    list.push_bind(*key);
+                }
+                text.push(after);
+                text
+            }
+
+            /// Removes some of what is to be forgotten: jobs that ended before this time with their history, and then outputs
+            /// of result sets that no job is left of. Few rows at a time, since others wait.
+            pub(crate) async fn forget(c: &mut Connection, before_ms: i64) -> Result<Forgotten> {
+                let keys: Vec<i64> = sqlx::query_scalar(
+                    "SELECT key FROM job WHERE state <> 0 AND ended_ms < $1 ORDER BY ended_ms LIMIT $2",
+                )
+                .bind(before_ms)
+                .bind(crate::listing::JOBS)
+                .fetch_all(&mut *c)
+                .await?;
+                if keys.is_empty() {
+                    return forget_outputs(c).await;
+                }
+                let mut left = crate::listing::ROWS;
+                // A job goes last: where its rows are too many, the rest follows next time.
+                for (before, after) in [
+                    (
+                        "DELETE FROM event WHERE sequence IN (SELECT sequence FROM event WHERE job IN (",
+                        ") LIMIT ",
+                    ),
+                    (
+                        "DELETE FROM exception WHERE (stage, task) IN (SELECT stage, task FROM exception \
+                         WHERE stage IN (SELECT key FROM stage WHERE job IN (",
+                        ")) LIMIT ",
+                    ),
+                    (
+                        "DELETE FROM task_range WHERE id IN (SELECT id FROM task_range \
+                         WHERE stage IN (SELECT key FROM stage WHERE job IN (",
+                        ")) LIMIT ",
+                    ),
+                ] {
+                    let mut text = of_jobs(before, &keys, after);
+                    text.push_bind(left);
+                    text.push(")");
+                    let gone = text.build().execute(&mut *c).await?.rows_affected();
+                    left -= i64::try_from(gone).unwrap_or(left);
+                    if left <= 0 {
+                        return Ok(Forgotten { jobs: 0, more: true });
+                    }
+                }
+                for before in ["DELETE FROM stage WHERE job IN (", "DELETE FROM job WHERE key IN ("] {
+                    of_jobs(before, &keys, ")").build().execute(&mut *c).await?;
+                }
+                Ok(Forgotten {
+                    jobs: u32::try_from(keys.len()).unwrap_or(u32::MAX),
+                    more: true,
+                })
+            }
+
+            async fn forget_outputs(c: &mut Connection) -> Result<Forgotten> {
+                let sets: Vec<i64> = sqlx::query_scalar(concat!(
+                    "SELECT key FROM result_set WHERE NOT EXISTS \
+                     (SELECT 1 FROM stage WHERE stage.result_set = result_set.key) LIMIT $1",
+                    $lock
+                ))
+                .bind(crate::listing::JOBS)
+                .fetch_all(&mut *c)
+                .await?;
+                if sets.is_empty() {
+                    return Ok(Forgotten::default());
+                }
+                // A job that was being recorded when the rows were looked for may have one of them; now that they are locked,
+                // no other can.
+                let used: Vec<i64> = of_jobs("SELECT DISTINCT result_set FROM stage WHERE result_set IN (", &sets, ")")
+                    .build_query_scalar()
+                    .fetch_all(&mut *c)
+                    .await?;
+                let sets: Vec<i64> = sets.into_iter().filter(|set| !used.contains(set)).collect();
+                if sets.is_empty() {
+                    return Ok(Forgotten { jobs: 0, more: true });
+                }
+                let mut text = of_jobs(
+                    "DELETE FROM output WHERE (result_set, task) IN (SELECT result_set, task FROM output \
+                     WHERE result_set IN (",
+                    &sets,
+                    ") LIMIT ",
+                );
+                text.push_bind(crate::listing::ROWS);
+                text.push(")");
+                let gone = text.build().execute(&mut *c).await?.rows_affected();
+                if gone < crate::listing::ROWS as u64 {
+                    of_jobs("DELETE FROM result_set WHERE key IN (", &sets, ")")
+                        .build()
+                        .execute(c)
+                        .await?;
+                }
+                Ok(Forgotten { jobs: 0, more: true })
+            }
+        }
+    };
+}
+
+pub(crate) use listing_queries;

@@ -1,0 +1,34 @@
+//! Owners of jobs and the audit log, in SQLite.
+
+use async_trait::async_trait;
+use picofarm_proto::{ids::JobId, model::AuditEntry};
+
+use super::{SqliteCatalog, rights_query};
+use picofarm_catalog::{AuditQuery, CatalogError, NewAudit, Owner, Rights};
+
+#[async_trait]
+impl Rights for SqliteCatalog {
+    async fn owner(&self, job: JobId) -> Result<Option<Owner>, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::owner(&mut c, job)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn audit(&self, lines: &[NewAudit]) -> Result<(), CatalogError> {
+        self.write(async |c, _| Ok(rights_query::audit(c, lines).await?))
+            .await
+    }
+
+    async fn audited(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, CatalogError> {
+        let mut c = self.reader().await?;
+        rights_query::audited(&mut c, query)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn forget_audit(&self, before_ms: i64) -> Result<u64, CatalogError> {
+        self.write(async |c, _| Ok(rights_query::forget_audit(c, before_ms).await?))
+            .await
+    }
+}

@@ -1,0 +1,22 @@
+//! The whole worker.
+
+use std::sync::Arc;
+
+use picofarm_session::{AgentConfig, AgentError, StorePrefixes, Summary, opener, run_with};
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+
+use crate::TaskExecutor;
+
+/// Runs a worker for every kind of task, until `shutdown` or a refusal.
+///
+/// # Errors
+/// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
+/// coordinator is no error: the worker tries again for ever.
+pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Summary, AgentError> {
+    config.check()?;
+    let files = opener(&StorePrefixes::new(&config.store_prefixes)?);
+    let executor = TaskExecutor::new(&config.asset_dirs, Handle::current(), files)
+        .with_memory(config.memory_mib);
+    run_with(config, Arc::new(executor), shutdown).await
+}

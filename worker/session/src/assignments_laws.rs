@@ -1,0 +1,241 @@
+//! Laws of the [`Assignments`] under any order of grants, renewals, losses, disconnects and results.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::{Duration, Instant},
+};
+
+use picofarm_proto::{
+    ids::{Epoch, JobId, LeaseRef, RangeId},
+    key::StageKey,
+    model::{
+        Lease, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, StageSpec,
+        TaskAt, TaskSpec,
+    },
+};
+use proptest::prelude::*;
+use uuid::Uuid;
+
+use crate::executor::{Output, TaskError};
+use crate::{
+    assignments::Assignments,
+    message::{Outgoing, Report},
+};
+
+const TTL: Duration = Duration::from_millis(900);
+
+#[derive(Debug, Clone)]
+enum Step {
+    Grant {
+        tasks: u64,
+        skip: Vec<u64>,
+    },
+    Begin,
+    End(u8),
+    Wait(u64),
+    /// The machine is suspended: the monotonic clock stands still.
+    Suspend(u64),
+    Heartbeat,
+    /// Answer the oldest heartbeat; the bits choose which leases live on.
+    Renew(u8),
+    Revoke(usize),
+    Send,
+    Acknowledge,
+    Disconnect,
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        (1u64..5, prop::collection::vec(0u64..5, 0..3))
+            .prop_map(|(tasks, skip)| Step::Grant { tasks, skip }),
+        Just(Step::Begin),
+        Just(Step::Begin),
+        (0u8..5).prop_map(Step::End),
+        (0u64..400).prop_map(Step::Wait),
+        (0u64..1_500).prop_map(Step::Suspend),
+        Just(Step::Heartbeat),
+        any::<u8>().prop_map(Step::Renew),
+        (0usize..4).prop_map(Step::Revoke),
+        Just(Step::Send),
+        Just(Step::Acknowledge),
+        Just(Step::Disconnect),
+    ]
+}
+
+fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
+    Lease {
+        lease: LeaseRef {
+            range: RangeId::from_uuid(Uuid::from_u128(1)),
+            epoch: Epoch(epoch),
+        },
+        job: JobId::from_uuid(Uuid::from_u128(2)),
+        lo: 0,
+        hi: tasks,
+        skip,
+        ttl_ms: TTL.as_millis() as u32,
+        ordinal: 0,
+        key: StageKey([0; 32]),
+        traceparent: String::new(),
+        stage: StageSpec::new(TaskSpec::Render(RenderTask {
+            parts: 1,
+            scenes: SceneSource {
+                kind: SceneKind::Primitive,
+                count: 5,
+                seed: 0,
+                fov_deg: 90.0,
+                spots: 1,
+            },
+            render: RenderSettings::default(),
+            output: OutputSettings {
+                store: "/s".into(),
+                dataset: "d".into(),
+                profile: "lossless".into(),
+            },
+        })),
+    }
+}
+
+fn result(kind: u8) -> Result<Output, TaskError> {
+    match kind {
+        0 => Err(TaskError::User("u".into())),
+        1 => Err(TaskError::Stopped),
+        _ => Ok(Output {
+            manifest_sha256: String::new(),
+            bytes: 1,
+            adopted: false,
+        }),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn no_task_starts_twice_skipped_fenced_or_lost_and_every_finished_one_is_told_until_acknowledged(
+        steps in prop::collection::vec(step(), 1..60),
+    ) {
+        let mut assignments = Assignments::new();
+        let mut now = Instant::now();
+        // Of suspends, which `now` does not count.
+        let mut slept = Duration::ZERO;
+        let mut epoch = 0;
+        let mut renewed: BTreeMap<LeaseRef, Instant> = BTreeMap::new();
+        let mut skipped: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut started: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut finished: BTreeSet<(LeaseRef, u64)> = BTreeSet::new();
+        let mut wire: Vec<Report> = Vec::new();
+        let mut beats: Vec<(Instant, Vec<LeaseRef>)> = Vec::new();
+
+        for step in steps {
+            match step {
+                Step::Grant { tasks, skip } => {
+                    epoch += 1;
+                    let lease = lease(epoch, tasks, skip);
+                    skipped.extend(lease.skip.iter().map(|i| (lease.lease, *i)));
+                    renewed.insert(lease.lease, now + slept);
+                    prop_assert!(assignments.granted(now, lease.clone()));
+                    if assignments.held().contains(&lease.lease) {
+                        prop_assert!(!assignments.granted(now, lease), "a repeated grant is no news");
+                    }
+                }
+                Step::Begin => {
+                    let free = assignments.in_hand().is_none();
+                    if let Some(task) = assignments.begin(now) {
+                        prop_assert!(free, "one at a time");
+                        let lease = assignments.in_hand().unwrap().lease;
+                        prop_assert!(started.insert((lease, task.index)), "twice");
+                        prop_assert!(!skipped.contains(&(lease, task.index)), "skipped");
+                        let life = renewed.get(&lease).expect("not lost");
+                        prop_assert!(now + slept - *life < TTL * 2 / 3, "fenced");
+                    }
+                }
+                Step::End(kind) => {
+                    if assignments.in_hand().is_some() {
+                        let hand = assignments.ended(now, &result(kind));
+                        if kind > 1 {
+                            finished.insert((hand.lease, hand.task.index));
+                        }
+                    }
+                }
+                Step::Wait(ms) => now += Duration::from_millis(ms),
+                Step::Suspend(ms) => {
+                    let long = Duration::from_millis(ms);
+                    slept += long;
+                    assignments.suspended(long);
+                }
+                Step::Heartbeat => {
+                    let Outgoing::Heartbeat { leases, progress } = assignments.heartbeat(now, 0.5, TaskAt::default()) else {
+                        unreachable!()
+                    };
+                    prop_assert!(progress.iter().all(|p| leases.contains(&p.lease)));
+                    beats.push((now + slept, leases));
+                }
+                Step::Renew(bits) => {
+                    if beats.is_empty() {
+                        continue;
+                    }
+                    let (sent, named) = beats.remove(0);
+                    let (kept, gone): (Vec<_>, Vec<_>) =
+                        named.into_iter().partition(|l| bits >> (l.epoch.0 % 8) & 1 == 1);
+                    assignments.renewed(now, &kept, TTL);
+                    for lease in kept {
+                        // A lease lost earlier does not come back.
+                        renewed.entry(lease).and_modify(|at| *at = (*at).max(sent));
+                    }
+                    for lease in gone {
+                        renewed.remove(&lease);
+                    }
+                }
+                Step::Revoke(k) => {
+                    if let Some(lease) = assignments.held().get(k).copied() {
+                        let life = renewed.remove(&lease).expect("held leases are not lost");
+                        let mine = assignments.in_hand().is_some_and(|t| t.lease == lease);
+                        prop_assert_eq!(assignments.revoked(now, lease), mine && now + slept - life < TTL);
+                    }
+                }
+                Step::Send => {
+                    for message in assignments.outgoing(now) {
+                        match message {
+                            Outgoing::Report(report) => wire.push(report),
+                            Outgoing::Credit(n) => prop_assert_eq!(n, 1),
+                            Outgoing::Heartbeat { .. } | Outgoing::Log(_) => unreachable!(),
+                        }
+                    }
+                }
+                Step::Acknowledge => {
+                    if wire.is_empty() {
+                        continue;
+                    }
+                    let report = wire.remove(0);
+                    let index = match &report {
+                        Report::Done(d) => d.index,
+                        Report::Failed(f) => f.index,
+                        Report::Release { .. } => 0,
+                    };
+                    let answered = assignments.acknowledged(report.lease(), index);
+                    prop_assert_eq!(answered.as_ref(), Some(&report));
+                    if let Report::Done(done) = report {
+                        prop_assert!(finished.remove(&(done.lease, done.index)));
+                    }
+                }
+                Step::Disconnect => {
+                    assignments.disconnected();
+                    wire.clear();
+                    beats.clear();
+                }
+            }
+            prop_assert_eq!(assignments.unacknowledged_outputs(), finished.len());
+        }
+        // Whatever was never acknowledged goes out once more after a reconnect.
+        assignments.disconnected();
+        let told: BTreeSet<_> = assignments
+            .outgoing(now)
+            .into_iter()
+            .filter_map(|m| match m {
+                Outgoing::Report(Report::Done(d)) => Some((d.lease, d.index)),
+                _ => None,
+            })
+            .collect();
+        prop_assert_eq!(told, finished);
+    }
+}

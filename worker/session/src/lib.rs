@@ -1,0 +1,29 @@
+//! The session of a worker with the coordinator: the connection, the leases it holds, the reports that are not yet
+//! acknowledged, and the thread on which tasks run. It knows the wire; what tasks do is behind [`Executor`], and no kind of
+//! task is known here.
+
+mod access;
+mod agent;
+mod allow;
+mod assignments;
+#[cfg(test)]
+mod assignments_laws;
+mod backoff;
+mod config;
+mod executor;
+mod log;
+mod machine;
+mod message;
+mod outbox;
+mod runner;
+mod session;
+mod suspend;
+
+pub use access::{Access, AccessError, Bearer, Target, Trouble, lost_connection};
+pub use agent::run_with;
+pub use allow::{StorePrefixes, opener};
+pub use backoff::{Backoff, random};
+pub use config::{AgentConfig, AgentError, Summary};
+pub use executor::{Control, Executor, Output, Task, TaskError};
+pub use log::task_logs;
+pub use machine::{Memory, MemoryLimit, cores, memory_mib};
