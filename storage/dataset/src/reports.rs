@@ -9,9 +9,9 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
-use crate::objects;
-use crate::publish::check_size;
+use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
+use crate::scenes::publish::check_size;
+use crate::store::objects;
 
 /// The folder of reports in a store; no data set has this name.
 pub const REPORTS: &str = "reports";
@@ -42,7 +42,7 @@ pub struct ReportManifest {
     pub models: Vec<ReportedModel>,
     /// Its objects; keys below the report's folder. Filled in.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::manifest::seal`] says of the rest.
+    /// What [`crate::layout::manifest::seal`] says of the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

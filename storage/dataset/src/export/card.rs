@@ -6,8 +6,8 @@ use std::fmt::Write as _;
 use serde_json::{Value, json};
 
 use super::{ExportFormat, plain::about};
-use crate::manifest::{Manifest, sha256_hex};
-use crate::spec::DatasetSpec;
+use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::layout::spec::DatasetSpec;
 
 /// A line of `scenes.csv`.
 #[derive(Debug, Clone, PartialEq)]

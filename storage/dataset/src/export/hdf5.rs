@@ -4,7 +4,7 @@ use hdf5_pure::{AttrValue, DatasetBuilder, FileBuilder};
 
 use super::plain::{Plain, PlainScene, Values};
 use crate::error::DatasetError;
-use crate::spec::DatasetSpec;
+use crate::layout::spec::DatasetSpec;
 
 /// gzip: beyond it, files shrink by a few per cent and take twice the time.
 const LEVEL: u32 = 4;

@@ -14,11 +14,11 @@ use object_store::ObjectStore;
 use object_store::path::Path;
 use sha2::{Digest, Sha256};
 
-use crate::dataset::Dataset;
 use crate::error::DatasetError;
-use crate::layout::Quantity;
-use crate::manifest::Manifest;
-use crate::objects;
+use crate::layout::arrays::Quantity;
+use crate::layout::manifest::Manifest;
+use crate::scenes::dataset::Dataset;
+use crate::store::objects;
 
 pub(crate) use sb3d::{ASIDE, Aside};
 

@@ -6,14 +6,14 @@ use futures::{StreamExt, TryStreamExt, stream};
 use serde_json::{Map, Value, json};
 
 use super::Out;
-use crate::codec::ChunkCodec;
-use crate::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
+use crate::coding::codec::ChunkCodec;
+use crate::coding::shard;
 use crate::error::DatasetError;
-use crate::layout::{Element, Layout, index_codecs};
-use crate::manifest::{Manifest, sha256_hex};
-use crate::objects;
-use crate::shard;
-use crate::spec::DatasetSpec;
+use crate::layout::arrays::{Element, Layout, index_codecs};
+use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::layout::spec::DatasetSpec;
+use crate::scenes::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
+use crate::store::objects;
 
 /// Version of the packed layout.
 const EXPORT_VERSION: u32 = 1;

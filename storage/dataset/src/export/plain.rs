@@ -1,9 +1,9 @@
 //! A scene as plain arrays: decoded, with the names, shapes, units and descriptions that files for other tools carry.
 
-use crate::dataset::Dataset;
 use crate::error::DatasetError;
-use crate::layout::Quantity;
-use crate::manifest::Manifest;
+use crate::layout::arrays::Quantity;
+use crate::layout::manifest::Manifest;
+use crate::scenes::dataset::Dataset;
 
 /// Values of an array.
 #[derive(Debug, Clone, PartialEq)]

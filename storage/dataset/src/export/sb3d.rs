@@ -16,12 +16,12 @@ use half::f16;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use crate::import::npy;
-use crate::layout::Quantity;
-use crate::record::{Intrinsics, Spot};
-use crate::spec::{DatasetSpec, Gate};
+use crate::layout::arrays::Quantity;
+use crate::layout::record::{Intrinsics, Spot};
+use crate::layout::spec::{DatasetSpec, Gate};
+use crate::scenes::dataset::Dataset;
 
 /// Name of the file with what the layout has no place for.
 pub(crate) const ASIDE: &str = "picofarm.json";

@@ -8,7 +8,7 @@ use serde_json::json;
 use super::plain::{Plain, PlainScene, Values};
 use crate::error::DatasetError;
 use crate::import::npy;
-use crate::spec::DatasetSpec;
+use crate::layout::spec::DatasetSpec;
 
 /// Deflate: a sample is read as a whole, and written once.
 const LEVEL: i64 = 4;

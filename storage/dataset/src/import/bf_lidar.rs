@@ -16,8 +16,8 @@ use super::mat::Mat;
 use super::platonerf::along;
 use super::scene::{ImportedScene, Shape};
 use super::{Captures, ImportError, ImportOptions, Item};
-use crate::record::Intrinsics;
-use crate::spec::{Gate, Subsets};
+use crate::layout::record::Intrinsics;
+use crate::layout::spec::{Gate, Subsets};
 
 const LIGHT_M_S: f64 = 299_792_458.0;
 const BIN_S: f64 = 8e-12;

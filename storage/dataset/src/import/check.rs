@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::ImportError;
 use super::masks::{self, Masks};
 use super::scene::{Shape, direction};
-use crate::record::{Intrinsics, Spot};
+use crate::layout::record::{Intrinsics, Spot};
 
 /// Pixels in the sample, at most about.
 const SAMPLE: usize = 2048;

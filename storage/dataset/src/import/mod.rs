@@ -31,7 +31,7 @@ pub use scene::ImportedScene;
 use files::Files;
 use scene::Shape;
 
-use crate::spec::{DatasetSpec, Profile};
+use crate::layout::spec::{DatasetSpec, Profile};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
 pub const IMPORT_VERSION: &str = "import-3";

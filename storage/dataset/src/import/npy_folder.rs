@@ -11,8 +11,8 @@ use super::files::Files;
 use super::npy::{self, Array};
 use super::scene::{ImportedScene, Shape, clean};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity};
-use crate::record::Intrinsics;
-use crate::spec::{Gate, Subsets};
+use crate::layout::record::Intrinsics;
+use crate::layout::spec::{Gate, Subsets};
 
 const SCENE: &str = "scene.json";
 const LIGHT_M_S: f64 = 299_792_458.0;

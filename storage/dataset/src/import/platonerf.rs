@@ -17,8 +17,8 @@ use super::check::norm;
 use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
 use super::{Captures, ImportError, ImportOptions, Item, npy};
-use crate::record::Intrinsics;
-use crate::spec::{Gate, Subsets};
+use crate::layout::record::Intrinsics;
+use crate::layout::spec::{Gate, Subsets};
 
 const TRANSFORMS: &str = "transforms_train.json";
 /// The brightest pixel may be so far from where the laser points at.

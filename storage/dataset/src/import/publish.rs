@@ -4,11 +4,11 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{IMPORT_VERSION, ImportError, ImportedScene, Source, SourceFile};
-use crate::dataset::Dataset;
-use crate::encode::EncodedScene;
 use crate::error::DatasetError;
-use crate::manifest::{ENCODER_VERSION, Manifest};
-use crate::record::Provenance;
+use crate::layout::manifest::{ENCODER_VERSION, Manifest};
+use crate::layout::record::Provenance;
+use crate::scenes::dataset::Dataset;
+use crate::scenes::encode::EncodedScene;
 
 impl Source {
     /// Codes an imported scene as scene `at` of the data set; publish it with [`Dataset::publish_encoded`]. Blocks;

@@ -15,8 +15,8 @@ use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity, image, npy};
 use crate::export::{ASIDE, Aside};
-use crate::layout::Quantity;
-use crate::spec::{Gate, Subsets};
+use crate::layout::arrays::Quantity;
+use crate::layout::spec::{Gate, Subsets};
 
 const DEPTH: &str = "depth.exr";
 const SPECULAR: &str = "specular_mask.png";

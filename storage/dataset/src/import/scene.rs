@@ -6,10 +6,10 @@ use serde_json::Value;
 
 use super::check::{distance, norm};
 use super::{ImportError, SourceFile};
-use crate::layout::Quantity;
-use crate::record::{Intrinsics, SceneRecord, Spot, SubsetRecord};
-use crate::spec::{Gate, Subsets};
-use crate::squareroot::photon_scale;
+use crate::coding::squareroot::photon_scale;
+use crate::layout::arrays::Quantity;
+use crate::layout::record::{Intrinsics, SceneRecord, Spot, SubsetRecord};
+use crate::layout::spec::{Gate, Subsets};
 
 /// Photons in the median pixel's brightest bin: the convention for the stored scale.
 const PEAK_PHOTONS: f32 = 400.0;

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 
 use super::{Models, check_name};
 use crate::error::DatasetError;
-use crate::objects;
+use crate::store::objects;
 
 /// First bytes of a checkpoint; its SHA-256 (32 bytes) and its content follow.
 const MAGIC: &[u8; 8] = b"pfckpt1\n";

@@ -13,10 +13,10 @@ use object_store::ObjectMeta;
 use object_store::path::Path;
 
 use super::{Models, key_below, object_folder};
-use crate::collect::Orphan;
 use crate::error::DatasetError;
-use crate::objects;
+use crate::repair::collect::Orphan;
 use crate::store::leftovers;
+use crate::store::objects;
 
 impl Models {
     /// Finds what nobody needs and was last written at `limit` or earlier, `grace` before now: checkpoints of trainings

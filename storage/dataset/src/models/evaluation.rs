@@ -6,8 +6,8 @@ use serde_json::Value;
 
 use super::{Models, SplitUsed, check_name};
 use crate::error::DatasetError;
-use crate::manifest::{seal, unseal};
-use crate::objects;
+use crate::layout::manifest::{seal, unseal};
+use crate::store::objects;
 
 /// A model's figures on scenes. A pure function of model, scenes and code.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -37,7 +37,7 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Its bytes as they lie in the store: with their checksum, as [`crate::manifest::seal`] has it.
+    /// Its bytes as they lie in the store: with their checksum, as [`crate::layout::manifest::seal`] has it.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut sorted = self.clone();
         sorted.metrics.sort_all_objects();

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
+use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
 /// Version of manifests of models.
 const FORMAT: u32 = 1;
@@ -32,7 +32,7 @@ pub struct ModelManifest {
     pub metrics: Value,
     /// Its objects; keys below the model's folder.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::manifest::seal`] says of the rest.
+    /// What [`crate::layout::manifest::seal`] says of the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

@@ -24,8 +24,8 @@ use object_store::path::Path;
 use object_store::{Error, ObjectStore, ObjectStoreExt};
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{ObjectEntry, sha256_hex};
+use crate::store::objects;
 
 pub use checkpoint::Checkpoint;
 pub use evaluation::Evaluation;

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{MANIFEST, MODELS, ModelManifest, Models, check_name, speed};
 use crate::error::DatasetError;
-use crate::objects;
 use crate::predictions::{ModelUsed, PredictionManifest, Predictions, TimesUsed};
 use crate::reports::REPORTS;
+use crate::store::objects;
 
 /// The object that says what is being removed.
 pub(super) const REMOVING: &str = "removing.json";
@@ -142,7 +142,7 @@ impl Models {
         };
         let manifest_path = self.path(name, MANIFEST);
         if let Some(bytes) = objects::get(&*self.store, &manifest_path).await? {
-            let hash = crate::manifest::sha256_hex(&bytes);
+            let hash = crate::layout::manifest::sha256_hex(&bytes);
             if hash == note.manifest_sha256 {
                 self.remove_one(&manifest_path, &mut removed).await?;
             }
@@ -189,7 +189,7 @@ impl Models {
                 // Nobody can say what it names: all that lies there goes.
                 let bytes = objects::require(&*self.store, &self.path(name, MANIFEST)).await?;
                 Ok(Note {
-                    manifest_sha256: crate::manifest::sha256_hex(&bytes),
+                    manifest_sha256: crate::layout::manifest::sha256_hex(&bytes),
                     training_key: String::new(),
                     objects: keys,
                 })

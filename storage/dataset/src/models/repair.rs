@@ -5,8 +5,8 @@ use bytes::Bytes;
 
 use super::{MANIFEST, ModelManifest, Models};
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{ObjectEntry, sha256_hex};
+use crate::store::objects;
 use crate::verify::{Fault, Problem};
 
 /// What was done to a model.

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{Models, check_name};
 use crate::error::DatasetError;
-use crate::manifest::{read_unsealed, seal, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{read_unsealed, seal, sha256_hex};
+use crate::store::objects;
 
 pub(super) const FILE: &str = "speed.json";
 

@@ -12,8 +12,8 @@ use serde_json::Value;
 
 use super::{Models, check_name};
 use crate::error::DatasetError;
-use crate::manifest::{read_unsealed, seal, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{read_unsealed, seal, sha256_hex};
+use crate::store::objects;
 
 /// Folder of sweeps below a name.
 const FOLDER: &str = "sweeps";

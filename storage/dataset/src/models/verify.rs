@@ -7,8 +7,8 @@ use super::{
     checkpoint, key_below, object_folder, remove::REMOVING,
 };
 use crate::error::DatasetError;
-use crate::manifest::sha256_hex;
-use crate::objects;
+use crate::layout::manifest::sha256_hex;
+use crate::store::objects;
 use crate::verify::{Fault, Problem};
 
 /// What a check of a model found.

@@ -3,8 +3,8 @@
 use serde_json::{Value, json};
 
 use super::PredictionSpec;
-use crate::codec::ChunkCodec;
-use crate::layout::{Element, image_codecs};
+use crate::coding::codec::ChunkCodec;
+use crate::layout::arrays::{Element, image_codecs};
 
 /// An array. One object holds a scene.
 #[derive(Debug)]

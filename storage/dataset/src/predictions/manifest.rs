@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
-use crate::manifest::{ObjectEntry, read_sealed, sha256_hex};
+use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
 
 /// Version of groups of predictions and of their manifests.
 pub(super) const FORMAT: u32 = 1;
@@ -31,7 +31,7 @@ pub struct PredictionManifest {
     pub two_bounce_times: Option<TimesUsed>,
     /// Its objects; filled in.
     pub objects: Vec<ObjectEntry>,
-    /// What [`crate::manifest::seal`] says of the rest.
+    /// What [`crate::layout::manifest::seal`] says of the rest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub checksum: Option<String>,
 }

@@ -18,13 +18,13 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use crate::dataset::{METADATA, pretty};
 use crate::error::DatasetError;
-use crate::group::create_metadata;
-use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
-use crate::objects;
-use crate::publish::{CONCURRENCY, put_again, put_all};
-use crate::read::scenes_in;
+use crate::layout::group::create_metadata;
+use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::scenes::dataset::{METADATA, pretty};
+use crate::scenes::publish::{CONCURRENCY, put_again, put_all};
+use crate::scenes::read::scenes_in;
+use crate::store::objects;
 use array::{Plate, plates};
 use manifest::FORMAT;
 

@@ -4,8 +4,8 @@ use bytes::Bytes;
 
 use super::{EncodedPredictions, PredictionManifest, Predictions};
 use crate::error::DatasetError;
-use crate::manifest::{Manifest, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::store::objects;
 
 impl Predictions {
     /// Puts back what is missing or changed of a scene's predictions, made again: the only path on which an object of theirs

@@ -4,10 +4,10 @@ use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
 use super::{Plate, PredictionManifest, Predictions};
-use crate::dataset::METADATA;
 use crate::error::DatasetError;
-use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
-use crate::objects;
+use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::scenes::dataset::METADATA;
+use crate::store::objects;
 use crate::verify::{Fault, Problem, Verification, VerifyMode, Watch, metadata_fault};
 
 /// Scenes checked at a time.

@@ -5,6 +5,7 @@ mod bandwidth;
 mod clouds;
 mod failure;
 mod local;
+pub(crate) mod objects;
 mod place;
 mod probe;
 mod writable;

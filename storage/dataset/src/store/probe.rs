@@ -8,7 +8,7 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 use crate::error::DatasetError;
-use crate::objects;
+use crate::store::objects;
 
 /// Longest that a store is waited for, where nobody waits for the answer.
 pub const PROBE_WITHIN: Duration = Duration::from_secs(30);

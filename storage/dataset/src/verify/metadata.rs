@@ -3,12 +3,15 @@
 use serde_json::Value;
 
 use super::{Fault, Problem, Verification};
-use crate::dataset::{Dataset, METADATA};
 use crate::error::DatasetError;
-use crate::listing::Listing;
-use crate::objects;
-use crate::snapshot::Snapshot;
-use crate::{recipe, snapshot, splits};
+use crate::repair::listing::Listing;
+use crate::scenes::dataset::{Dataset, METADATA};
+use crate::scenes::snapshot::Snapshot;
+use crate::store::objects;
+use crate::{
+    repair::recipe,
+    scenes::{snapshot, splits},
+};
 
 impl Dataset {
     /// Metadata must be those that the specification asks for.
@@ -33,7 +36,7 @@ impl Dataset {
 
     /// Keys and contents of the metadata that the specification asks for, the root's first.
     pub(crate) fn metadata(&self) -> Vec<(String, Value)> {
-        let root = crate::dataset::root_metadata(&self.spec, self.format);
+        let root = crate::scenes::dataset::root_metadata(&self.spec, self.format);
         let arrays = self.arrays.iter().map(|array| {
             let key = format!("{}/{METADATA}", array.layout.quantity.name());
             (key, array.layout.metadata(self.spec.scenes))

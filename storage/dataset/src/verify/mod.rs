@@ -13,12 +13,12 @@ use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 
-use crate::dataset::Dataset;
 use crate::error::DatasetError;
-use crate::listing::Listing;
-use crate::manifest::{Manifest, ObjectEntry, sha256_hex};
-use crate::objects;
-use crate::snapshot::Snapshot;
+use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::repair::listing::Listing;
+use crate::scenes::dataset::Dataset;
+use crate::scenes::snapshot::Snapshot;
+use crate::store::objects;
 
 pub(crate) use metadata::metadata_fault;
 pub use report::{Fault, Problem, Verification, VerifyMode};

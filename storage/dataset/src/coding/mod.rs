@@ -1,0 +1,11 @@
+//! How numbers become bytes: codec profiles, Zarr codec chains, shards and tiles.
+
+pub(crate) mod codec;
+pub(crate) mod counts;
+pub(crate) mod profile;
+pub(crate) mod rounding;
+pub(crate) mod shard;
+pub(crate) mod squareroot;
+pub(crate) mod tiles;
+pub(crate) mod transient;
+pub(crate) mod values;

@@ -1,0 +1,77 @@
+//! Zarr's sharding format: inner chunks one after another, then an index of (offset, size) pairs.
+//!
+//! zarrs' own sharding codec writes inner chunks in the order in which threads finish them and wants the whole
+//! shard in one buffer of codes. Here the order is row-major and each inner chunk is coded straight from the
+//! floats, so the bytes depend on nothing but the values; zarrs and zarr-python read the result.
+
+use std::ops::Range;
+
+use bytes::Bytes;
+
+use crate::coding::codec::ChunkCodec;
+use crate::error::DatasetError;
+
+/// (offset, size) of an inner chunk; `None` = all fill value.
+pub(crate) type IndexEntry = Option<Range<u64>>;
+
+/// Bytes of an index of `chunks` entries, with its crc32c.
+pub(crate) fn index_len(chunks: usize) -> usize {
+    chunks * 16 + 4
+}
+
+/// Puts coded inner chunks, in row-major order, and the index together.
+pub(crate) fn assemble(chunks: &[Vec<u8>]) -> Result<Vec<u8>, DatasetError> {
+    put_together(chunks.iter().map(|chunk| Some(&chunk[..])))
+}
+
+/// The same where some chunks are all fill value.
+pub(crate) fn assemble_some(chunks: &[Option<Bytes>]) -> Result<Vec<u8>, DatasetError> {
+    put_together(chunks.iter().map(|chunk| chunk.as_deref()))
+}
+
+fn put_together<'a>(
+    chunks: impl ExactSizeIterator<Item = Option<&'a [u8]>> + Clone,
+) -> Result<Vec<u8>, DatasetError> {
+    let payload: usize = chunks.clone().flatten().map(<[u8]>::len).sum();
+    let count = chunks.len();
+    let mut shard = Vec::with_capacity(payload + index_len(count));
+    let mut index: Vec<u64> = Vec::with_capacity(count * 2);
+    for chunk in chunks {
+        match chunk {
+            Some(chunk) => {
+                index.extend([shard.len() as u64, chunk.len() as u64]);
+                shard.extend_from_slice(chunk);
+            }
+            None => index.extend([u64::MAX; 2]),
+        }
+    }
+    shard.extend(ChunkCodec::index(count).encode(bytemuck::cast_slice(&index))?);
+    Ok(shard)
+}
+
+/// Reads the index from the last [`index_len`] bytes of a shard of `shard_len` bytes.
+pub(crate) fn parse_index(
+    tail: &[u8],
+    chunks: usize,
+    shard_len: u64,
+) -> Result<Vec<IndexEntry>, DatasetError> {
+    let decoded = ChunkCodec::index(chunks).decode(tail)?;
+    let limit = shard_len.saturating_sub(index_len(chunks) as u64);
+    decoded
+        .chunks_exact(16)
+        .map(|pair| {
+            let offset = u64::from_ne_bytes(pair[..8].try_into().expect("a pair has 16 bytes"));
+            let size = u64::from_ne_bytes(pair[8..].try_into().expect("a pair has 16 bytes"));
+            if offset == u64::MAX && size == u64::MAX {
+                return Ok(None);
+            }
+            match offset.checked_add(size) {
+                Some(end) if end <= limit => Ok(Some(offset..end)),
+                _ => Err(DatasetError::codec(
+                    "cannot read a shard's index",
+                    format!("an inner chunk at {offset} of {size} bytes lies outside the shard of {shard_len} bytes"),
+                )),
+            }
+        })
+        .collect()
+}

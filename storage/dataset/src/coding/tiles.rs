@@ -1,0 +1,235 @@
+//! The inner chunks of a transient: which pixels and bins each holds, and the order of values inside.
+
+use std::ops::Range;
+
+use crate::layout::arrays::Layout;
+use crate::layout::spec::DatasetSpec;
+
+/// Columns that are reordered at a time: their targets stay in the first cache.
+const BLOCK: usize = 32;
+
+/// The inner chunks of a transient: plane by plane, then by rows, columns and bins.
+pub(crate) struct Tiles {
+    /// Images, one below the other: row r of plane p counts as row p·rows + r.
+    planes: usize,
+    /// Size of one in pixels (rows, columns).
+    image: [usize; 2],
+    /// Tile size: rows, columns, bins.
+    side: [usize; 3],
+    /// Number of tiles down, across, and along the bins.
+    grid: [usize; 3],
+    bins: usize,
+    bins_first: bool,
+}
+
+/// One row of a tile's pixels inside the image.
+pub(crate) struct Run {
+    /// First pixel, counted through all planes.
+    pub pixel: usize,
+    /// The same within the tile.
+    pub tile: usize,
+    /// Image row (counted through all planes), first column and number of columns.
+    pub row: usize,
+    pub column: usize,
+    pub columns: usize,
+}
+
+/// A part of a transient. Rows are counted through all planes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Part {
+    pub rows: Range<usize>,
+    pub columns: Range<usize>,
+    pub bins: Range<usize>,
+}
+
+impl Part {
+    /// Values in it.
+    pub fn len(&self) -> usize {
+        self.rows.len() * self.row_len()
+    }
+
+    /// Values in a row of it.
+    pub fn row_len(&self) -> usize {
+        self.columns.len() * self.bins.len()
+    }
+}
+
+impl Tiles {
+    pub fn new(spec: &DatasetSpec, layout: &Layout) -> Self {
+        let inner = layout.inner.as_ref().expect("transients are sharded");
+        let image = [spec.height as usize, spec.width as usize];
+        let bins = spec.gate.bins as usize;
+        let [.., down, across, along] = inner[..] else {
+            unreachable!("transients have rows, columns and bins");
+        };
+        let side = [down, across, along].map(|n| n as usize);
+        Self {
+            planes: layout.planes(),
+            image,
+            side,
+            grid: [
+                image[0].div_ceil(side[0]),
+                image[1].div_ceil(side[1]),
+                bins.div_ceil(side[2]),
+            ],
+            bins,
+            bins_first: layout.bins_first,
+        }
+    }
+
+    pub fn count(&self) -> usize {
+        self.planes * self.grid.iter().product::<usize>()
+    }
+
+    /// All of the transient.
+    pub fn whole(&self) -> Part {
+        Part {
+            rows: 0..self.planes * self.image[0],
+            columns: 0..self.image[1],
+            bins: 0..self.bins,
+        }
+    }
+
+    pub fn tile_len(&self) -> usize {
+        self.side.iter().product()
+    }
+
+    /// Bins of a histogram of the tile, those beyond the last one included.
+    pub fn slab_len(&self) -> usize {
+        self.side[2]
+    }
+
+    /// Whether the tile has values of the part.
+    pub fn touches(&self, tile: usize, part: &Part) -> bool {
+        let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
+        let left = self.left_of(tile);
+        overlap(&self.rows_of(tile), &part.rows)
+            && overlap(&(left..left + self.side[1]), &part.columns)
+            && overlap(&self.bins_of(tile), &part.bins)
+    }
+
+    /// Which row of tiles a tile is in, counted through all planes.
+    pub fn row_of(&self, tile: usize) -> usize {
+        tile / (self.grid[1] * self.grid[2])
+    }
+
+    /// The image rows of a tile, cut at the image's edge.
+    pub fn rows_of(&self, tile: usize) -> Range<usize> {
+        let (plane, band) = (
+            self.row_of(tile) / self.grid[0],
+            self.row_of(tile) % self.grid[0],
+        );
+        let top = plane * self.image[0] + band * self.side[0];
+        top..(top + self.side[0]).min((plane + 1) * self.image[0])
+    }
+
+    /// The bins of a tile, cut at the last one.
+    pub fn bins_of(&self, tile: usize) -> Range<usize> {
+        let first = tile % self.grid[2] * self.side[2];
+        first..(first + self.side[2]).min(self.bins)
+    }
+
+    fn left_of(&self, tile: usize) -> usize {
+        tile / self.grid[2] % self.grid[1] * self.side[1]
+    }
+
+    pub fn runs(&self, tile: usize) -> impl Iterator<Item = Run> + '_ {
+        let left = self.left_of(tile);
+        let columns = self.side[1].min(self.image[1] - left);
+        self.rows_of(tile).enumerate().map(move |(r, row)| Run {
+            pixel: row * self.image[1] + left,
+            tile: r * self.side[1],
+            row,
+            column: left,
+            columns,
+        })
+    }
+
+    /// A tile's values, histogram by histogram, in the order in which they are stored.
+    pub fn to_stored<T: bytemuck::Pod>(&self, values: Vec<T>) -> Vec<T> {
+        if !self.bins_first {
+            return values;
+        }
+        let mut stored = vec![T::zeroed(); values.len()];
+        let pixels = values.len() / self.side[2];
+        let matrix = Matrix {
+            values: &values,
+            stride: self.side[2],
+        };
+        matrix.transpose(0..pixels, 0..self.side[2], &mut stored, pixels);
+        stored
+    }
+
+    /// Some bins of some columns of a run, histogram by histogram, out of a tile as it is stored.
+    /// `columns` are the image's, `bins` the transient's.
+    pub fn of_run<T: bytemuck::Pod>(
+        &self,
+        stored: &[T],
+        run: &Run,
+        columns: Range<usize>,
+        bins: Range<usize>,
+        target: &mut Vec<T>,
+    ) {
+        target.clear();
+        let first = run.tile + columns.start - run.column;
+        let pixels = first..first + columns.len();
+        let slab = bins.start % self.side[2];
+        let slab = slab..slab + bins.len();
+        if self.bins_first {
+            target.resize(columns.len() * bins.len(), T::zeroed());
+            let matrix = Matrix {
+                values: stored,
+                stride: self.side[0] * self.side[1],
+            };
+            matrix.transpose(slab, pixels, target, bins.len());
+            return;
+        }
+        for pixel in pixels {
+            let h = &stored[pixel * self.side[2]..][..self.side[2]];
+            target.extend_from_slice(&h[slab.clone()]);
+        }
+    }
+}
+
+/// Rows of `stride` values.
+struct Matrix<'a, T> {
+    values: &'a [T],
+    stride: usize,
+}
+
+impl<T: Copy> Matrix<'_, T> {
+    /// Writes the given columns as rows of `stride` values, of which it fills the first ones with the given rows.
+    fn transpose(&self, rows: Range<usize>, columns: Range<usize>, to: &mut [T], stride: usize) {
+        // What is read lies side by side; what is written is the part that stays in the cache.
+        for c0 in columns.clone().step_by(BLOCK) {
+            let c1 = (c0 + BLOCK).min(columns.end);
+            let to = &mut to[(c0 - columns.start) * stride..];
+            for r in rows.clone() {
+                let source = &self.values[r * self.stride..][c0..c1];
+                let places = to[r - rows.start..].iter_mut().step_by(stride);
+                places.zip(source).for_each(|(to, from)| *to = *from);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_transposed_part_of_a_matrix_has_rows_for_columns() {
+        let values: Vec<u16> = (0..70 * 90).collect();
+        let matrix = Matrix {
+            values: &values,
+            stride: 90,
+        };
+        let mut to = vec![0; 50 * 64];
+        matrix.transpose(3..67, 20..70, &mut to, 64);
+        for (c, row) in to.chunks_exact(64).enumerate() {
+            for (r, value) in row.iter().enumerate() {
+                assert_eq!(usize::from(*value), (r + 3) * 90 + c + 20);
+            }
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! Single histogram images coded as data sets code them, without a store around them: for measurements.
+
+use bytes::Bytes;
+
+use crate::coding::codec::ChunkCodec;
+use crate::coding::squareroot::EncodeError;
+use crate::error::DatasetError;
+use crate::layout::arrays::Quantity;
+use crate::layout::manifest::FORMAT_VERSION;
+use crate::layout::spec::DatasetSpec;
+use crate::scenes::dataset::ArrayCodec;
+use crate::scenes::encode::encode_transient;
+use crate::scenes::window::Decoding;
+
+/// Codes the transients of data sets with these properties.
+#[derive(Debug)]
+pub struct TransientCodec {
+    spec: DatasetSpec,
+    array: ArrayCodec,
+}
+
+/// A coded transient.
+#[derive(Debug, Clone)]
+pub struct CodedImage {
+    /// The shard: what is the scene's object in a data set.
+    pub shard: Bytes,
+    /// What stands in the manifest.
+    pub error: EncodeError,
+    /// Saturated bins: (flat index in `[row][column][bin]`, exact value).
+    pub overflow: Vec<(u64, f32)>,
+    /// Photons per unit of h.
+    pub scale: f32,
+}
+
+impl TransientCodec {
+    /// Of the newest format.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] names the property that is out of range.
+    pub fn new(spec: &DatasetSpec) -> Result<Self, DatasetError> {
+        spec.check()?;
+        let layout = Quantity::Transient.layout(spec, FORMAT_VERSION);
+        let codec = ChunkCodec::new(&layout);
+        Ok(Self {
+            spec: *spec,
+            array: ArrayCodec { layout, codec },
+        })
+    }
+
+    /// Codes h, `[row][column][bin]`, on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the size is another, or a value is negative or not finite.
+    pub fn encode(&self, h: &[f32], scale: f32) -> Result<CodedImage, DatasetError> {
+        self.check(h.len())?;
+        let coded = encode_transient(&self.spec, &self.array, &[h], scale)?;
+        Ok(CodedImage {
+            error: coded.error.finish(coded.overflow.len()),
+            shard: coded.shard.into(),
+            overflow: coded.overflow,
+            scale,
+        })
+    }
+
+    /// Decodes into `target`, on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::Codec`] where the bytes are damaged; [`DatasetError::Invalid`] where the target has another size.
+    pub fn decode(&self, coded: &CodedImage, target: &mut [f32]) -> Result<(), DatasetError> {
+        self.check(target.len())?;
+        let decoding = Decoding {
+            spec: &self.spec,
+            array: &self.array,
+            scale: coded.scale,
+            overflow: &coded.overflow,
+        };
+        match decoding.shard(&coded.shard, target)?.0 {
+            true => Ok(()),
+            false => Err(DatasetError::codec(
+                "cannot decode a transient",
+                "a saturated bin has no exact value",
+            )),
+        }
+    }
+
+    fn check(&self, len: usize) -> Result<(), DatasetError> {
+        let expected = self.spec.transient_len();
+        if len == expected {
+            return Ok(());
+        }
+        let what = format!("expected {expected} values, found {len}");
+        Err(DatasetError::invalid("transient", what))
+    }
+}

@@ -1,0 +1,254 @@
+//! Values of h to what a tile stores and back, by profile.
+
+use std::borrow::Cow;
+use std::ops::Range;
+
+use crate::coding::counts;
+use crate::coding::rounding::Rounding;
+use crate::coding::squareroot::{ErrorSums, SATURATED, SquareRoot};
+use crate::coding::tiles::{Part, Run, Tiles};
+use crate::error::DatasetError;
+use crate::layout::spec::Profile;
+
+/// The values of a transient: its planes one after the other.
+pub(crate) struct Source<'a> {
+    pub name: &'a str,
+    pub planes: &'a [&'a [f32]],
+    /// Pixels of a plane, bins of a pixel.
+    pub pixels: usize,
+    pub bins: usize,
+    pub scale: f32,
+}
+
+impl Source<'_> {
+    fn at(&self, pixel: usize, bins: &Range<usize>) -> &[f32] {
+        let plane = self.planes[pixel / self.pixels];
+        &plane[pixel % self.pixels * self.bins..][bins.clone()]
+    }
+}
+
+/// A tile's values in stored order, and what was lost.
+pub(crate) struct CodedValues {
+    pub bytes: Vec<u8>,
+    pub error: ErrorSums,
+    /// Saturated bins: (flat index, exact value), in no order.
+    pub overflow: Vec<(u64, f32)>,
+}
+
+/// Codes a tile.
+///
+/// # Errors
+/// [`DatasetError::Invalid`] names a value that the profile cannot hold.
+pub(crate) fn code(
+    profile: Profile,
+    tiles: &Tiles,
+    tile: usize,
+    source: &Source<'_>,
+) -> Result<CodedValues, DatasetError> {
+    let mut error = ErrorSums::default();
+    let mut overflow = Vec::new();
+    let valid = |h: &[f32], at: usize| match h.iter().all(|h| (0.0..=f32::MAX).contains(h)) {
+        true => Ok(()),
+        false => Err(invalid_value(source.name, h, at)),
+    };
+    let bytes = match profile {
+        Profile::SqrtU16 { delta } => {
+            let code = SquareRoot::new(delta, source.scale);
+            let q = each(tiles, tile, source, |h, q: &mut [u16], at| {
+                let facts = code.encode_run(h, q, &mut error);
+                if facts.invalid {
+                    return Err(invalid_value(source.name, h, at));
+                }
+                if facts.saturated {
+                    overflow.extend(saturated(h, q, at));
+                }
+                Ok(())
+            })?;
+            bytemuck::cast_slice(&tiles.to_stored(q)).to_vec()
+        }
+        Profile::CountsU16 => {
+            let q = each(tiles, tile, source, |h, q: &mut [u16], at| {
+                match counts::encode_run(source.scale, h, q, &mut error) {
+                    Ok(false) => {}
+                    Ok(true) => overflow.extend(saturated(h, q, at)),
+                    Err(bad) => return Err(invalid_count(source, h[bad], at + bad)),
+                }
+                Ok(())
+            })?;
+            bytemuck::cast_slice(&tiles.to_stored(q)).to_vec()
+        }
+        Profile::PlainF32 { round } => {
+            let rounding = (round > 0.0).then(|| Rounding::new(round, source.scale));
+            let values = each(tiles, tile, source, |h, to: &mut [f32], at| {
+                valid(h, at)?;
+                match rounding {
+                    Some(rounding) => rounding.run(h, to, &mut error),
+                    None => {
+                        to.copy_from_slice(h);
+                        error.add_exact(h.len());
+                    }
+                }
+                Ok(())
+            })?;
+            bytemuck::cast_slice(&tiles.to_stored(values)).to_vec()
+        }
+    };
+    Ok(CodedValues {
+        bytes,
+        error,
+        overflow,
+    })
+}
+
+/// A tile's values, histogram by histogram: `code` is given each histogram's bins, where they go, and the flat index of
+/// the first.
+fn each<T: bytemuck::Pod>(
+    tiles: &Tiles,
+    tile: usize,
+    source: &Source<'_>,
+    mut code: impl FnMut(&[f32], &mut [T], usize) -> Result<(), DatasetError>,
+) -> Result<Vec<T>, DatasetError> {
+    let mut values = vec![T::zeroed(); tiles.tile_len()];
+    let bins = tiles.bins_of(tile);
+    for run in tiles.runs(tile) {
+        for k in 0..run.columns {
+            let (pixel, to) = (run.pixel + k, (run.tile + k) * tiles.slab_len());
+            let to = &mut values[to..to + bins.len()];
+            code(
+                source.at(pixel, &bins),
+                to,
+                pixel * source.bins + bins.start,
+            )?;
+        }
+    }
+    Ok(values)
+}
+
+fn saturated<'a>(
+    h: &'a [f32],
+    q: &'a [u16],
+    at: usize,
+) -> impl Iterator<Item = (u64, f32)> + use<'a> {
+    let all = h.iter().zip(q).enumerate();
+    all.filter(|(_, (_, q))| **q == SATURATED)
+        .map(move |(i, (h, _))| ((at + i) as u64, *h))
+}
+
+fn invalid_value(name: &str, h: &[f32], start: usize) -> DatasetError {
+    let at = h
+        .iter()
+        .position(|h| !(0.0..=f32::MAX).contains(h))
+        .unwrap_or(0);
+    DatasetError::invalid(
+        format!("record.{name}[{}]", start + at),
+        format!("expected a finite value of at least 0, found {}", h[at]),
+    )
+}
+
+fn invalid_count(source: &Source<'_>, h: f32, at: usize) -> DatasetError {
+    if !(0.0..=f32::MAX).contains(&h) {
+        return invalid_value(source.name, &[h], at);
+    }
+    DatasetError::invalid(
+        format!("record.{}[{at}]", source.name),
+        format!(
+            "expected a whole number of photons, found {}; counts-u16 holds counts, other values need sqrt-u16 or lossless",
+            h * source.scale
+        ),
+    )
+}
+
+/// Decodes what a tile stores into a part's values; saturated bins become +∞.
+pub(crate) struct Decoder<'a> {
+    profile: Profile,
+    scale: f32,
+    tiles: &'a Tiles,
+    codes: Vec<u16>,
+    floats: Vec<f32>,
+}
+
+impl<'a> Decoder<'a> {
+    pub fn new(profile: Profile, scale: f32, tiles: &'a Tiles) -> Self {
+        Self {
+            profile,
+            scale,
+            tiles,
+            codes: Vec::new(),
+            floats: Vec::new(),
+        }
+    }
+
+    /// Decodes the values of `tile`, whose stored bytes are `raw`, that lie in `part`, into `target`, the part's values.
+    /// Says whether one of them is saturated.
+    pub fn decode(&mut self, tile: usize, raw: &[u8], part: &Part, target: &mut [f32]) -> bool {
+        match self.profile {
+            Profile::SqrtU16 { delta } => {
+                let code = SquareRoot::new(delta, self.scale);
+                let mut codes = std::mem::take(&mut self.codes);
+                let saturated = self.runs(tile, &values(raw), &mut codes, part, target, |q, h| {
+                    code.decode_run(q, h)
+                });
+                self.codes = codes;
+                saturated
+            }
+            Profile::CountsU16 => {
+                let scale = self.scale;
+                let mut codes = std::mem::take(&mut self.codes);
+                let saturated = self.runs(tile, &values(raw), &mut codes, part, target, |q, h| {
+                    counts::decode_run(scale, q, h)
+                });
+                self.codes = codes;
+                saturated
+            }
+            Profile::PlainF32 { .. } => {
+                let mut floats = std::mem::take(&mut self.floats);
+                self.runs(tile, &values(raw), &mut floats, part, target, |from, h| {
+                    h.copy_from_slice(from);
+                    false
+                });
+                self.floats = floats;
+                false
+            }
+        }
+    }
+
+    fn runs<T: bytemuck::Pod>(
+        &self,
+        tile: usize,
+        stored: &[T],
+        scratch: &mut Vec<T>,
+        part: &Part,
+        target: &mut [f32],
+        decode: impl Fn(&[T], &mut [f32]) -> bool,
+    ) -> bool {
+        let bins = self.tiles.bins_of(tile);
+        let bins = bins.start.max(part.bins.start)..bins.end.min(part.bins.end);
+        let mut saturated = false;
+        for run in self.tiles.runs(tile).filter(|r| part.rows.contains(&r.row)) {
+            let columns = columns(&run, part);
+            self.tiles
+                .of_run(stored, &run, columns.clone(), bins.clone(), scratch);
+            let top = (run.row - part.rows.start) * part.row_len();
+            let histograms = scratch.chunks_exact(bins.len());
+            for (column, from) in columns.zip(histograms) {
+                let at = top + (column - part.columns.start) * part.bins.len() + bins.start
+                    - part.bins.start;
+                saturated |= decode(from, &mut target[at..at + bins.len()]);
+            }
+        }
+        saturated
+    }
+}
+
+/// The columns of a run that lie in the part.
+fn columns(run: &Run, part: &Part) -> Range<usize> {
+    run.column.max(part.columns.start)..(run.column + run.columns).min(part.columns.end)
+}
+
+/// Bytes as values, copied only where they are not aligned.
+fn values<T: bytemuck::Pod>(bytes: &[u8]) -> Cow<'_, [T]> {
+    match bytemuck::try_cast_slice(bytes) {
+        Ok(values) => Cow::Borrowed(values),
+        Err(_) => Cow::Owned(bytemuck::pod_collect_to_vec(bytes)),
+    }
+}

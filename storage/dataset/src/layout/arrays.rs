@@ -1,0 +1,407 @@
+//! The arrays of a data set: names, shapes, types, codecs and the Zarr v3 metadata that describes them.
+
+use serde_json::{Value, json};
+
+use crate::coding::profile::Coding;
+use crate::layout::spec::DatasetSpec;
+
+/// Side of the transient's inner chunks in pixels (smaller where the image is smaller).
+pub const INNER_SIDE: u64 = 32;
+
+/// The quantities of a scene, one Zarr array each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Quantity {
+    /// h(p, b): `[row][column][bin]`, u16 codes or f32.
+    Transient,
+    /// Σ_b h(p, b), f32 `[row][column]`, from the transient before coding.
+    Intensity,
+    /// z-depth in metres, f32 `[row][column]`.
+    Depth,
+    /// Distance along the ray in metres, f32 `[row][column]`.
+    Range,
+    /// Unit normals in the camera frame, i16 `[row][column][3]`, to be divided by 32767.
+    Normal,
+    /// Instance id, u32 `[row][column]`, 0 = nothing.
+    Instance,
+    /// Semantic label, u16 `[row][column]`, 0 = nothing.
+    Label,
+    /// 1 = mirror, u8 `[row][column]`.
+    Specular,
+    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
+    Visibility,
+    /// sRGB-encoded colour, u8 `[row][column][3]`.
+    Rgb,
+    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN = no spot.
+    Spots,
+    /// fx, fy, cx, cy in pixels, f32.
+    Intrinsics,
+    /// Camera-to-world matrix, f32 `[4][4]`, points as columns.
+    Camera,
+    /// Laser origin in the camera frame in metres, f32 `[3]`.
+    Laser,
+    /// Photons per unit of h, f32; NaN where the scene is missing.
+    Scale,
+    /// h of the 4 of the 100 spots of [`Self::spots_of_100`] alone, coded as the transient, with the same scale.
+    Transient4,
+    /// h of the 25 of the 100 spots of [`Self::spots_of_100`] alone, likewise.
+    Transient25,
+    /// h of each spot alone: `[spot][row][column][bin]`, likewise.
+    TransientSpots,
+}
+
+/// Rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9 of the 10×10 grid.
+const SPOTS_25: [u32; 25] = {
+    let mut spots = [0; 25];
+    let mut i = 0;
+    while i < 25 {
+        spots[i] = (i / 5 * 20 + i % 5 * 2 + 1) as u32;
+        i += 1;
+    }
+    spots
+};
+const SPOTS_4: [u32; 4] = [22, 27, 72, 77];
+
+/// Element type of an array (public only for the sealed trait behind [`crate::Stored`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Element {
+    F32,
+    U8,
+    U16,
+    I16,
+    U32,
+}
+
+impl Element {
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "float32",
+            Self::U8 => "uint8",
+            Self::U16 => "uint16",
+            Self::I16 => "int16",
+            Self::U32 => "uint32",
+        }
+    }
+
+    pub fn size(self) -> u64 {
+        match self {
+            Self::U8 => 1,
+            Self::U16 | Self::I16 => 2,
+            Self::F32 | Self::U32 => 4,
+        }
+    }
+}
+
+/// One array.
+#[derive(Debug, Clone)]
+pub(crate) struct Layout {
+    pub quantity: Quantity,
+    pub element: Element,
+    /// Shape of one scene, without the scene axis.
+    pub shape: Vec<u64>,
+    /// Shape of one object, without the scene axis: `shape`, rounded up to whole inner chunks.
+    pub object_shape: Vec<u64>,
+    /// Shape of the shard's inner chunks, without the scene axis.
+    pub inner: Option<Vec<u64>>,
+    /// Whether the values of an inner chunk are stored bin by bin.
+    pub bins_first: bool,
+    dimensions: &'static [&'static str],
+    /// The filter of blosc.
+    shuffle: &'static str,
+    fill_nan: bool,
+    attributes: Value,
+}
+
+impl Quantity {
+    /// All quantities there are, in the order of their objects in a manifest; see [`DatasetSpec::quantities`].
+    pub const ALL: [Self; 18] = [
+        Self::Transient,
+        Self::Intensity,
+        Self::Depth,
+        Self::Range,
+        Self::Normal,
+        Self::Instance,
+        Self::Label,
+        Self::Specular,
+        Self::Visibility,
+        Self::Rgb,
+        Self::Spots,
+        Self::Intrinsics,
+        Self::Camera,
+        Self::Laser,
+        Self::Scale,
+        Self::Transient4,
+        Self::Transient25,
+        Self::TransientSpots,
+    ];
+
+    /// Whether it is a transient, coded with the data set's profile.
+    pub fn is_transient(self) -> bool {
+        matches!(
+            self,
+            Self::Transient | Self::Transient4 | Self::Transient25 | Self::TransientSpots
+        )
+    }
+
+    /// Which of the 100 spots of a 10×10 grid (row by row) make up this transient; empty for other quantities.
+    pub fn spots_of_100(self) -> &'static [u32] {
+        match self {
+            Self::Transient4 => &SPOTS_4,
+            Self::Transient25 => &SPOTS_25,
+            _ => &[],
+        }
+    }
+
+    /// Name of the Zarr array.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Transient => "transient",
+            Self::Intensity => "intensity",
+            Self::Depth => "depth",
+            Self::Range => "range",
+            Self::Normal => "normal",
+            Self::Instance => "instance",
+            Self::Label => "label",
+            Self::Specular => "specular",
+            Self::Visibility => "visibility",
+            Self::Rgb => "rgb",
+            Self::Spots => "spots",
+            Self::Intrinsics => "intrinsics",
+            Self::Camera => "camera",
+            Self::Laser => "laser",
+            Self::Scale => "scale",
+            Self::Transient4 => "transient_4",
+            Self::Transient25 => "transient_25",
+            Self::TransientSpots => "transient_spots",
+        }
+    }
+
+    /// Its array in a data set of the given format.
+    pub(crate) fn layout(self, spec: &DatasetSpec, format: u32) -> Layout {
+        use Element::{F32, I16, U8, U16, U32};
+        let (h, w) = (u64::from(spec.height), u64::from(spec.width));
+        let (n, b) = (u64::from(spec.spots), u64::from(spec.gate.bins));
+        let coding = self.is_transient().then(|| Coding::of(self, spec, format));
+        let coded = || {
+            let coding = coding.as_ref().expect("made for every transient");
+            (coding.element, coding.attributes.clone())
+        };
+        const IMAGE: &[&str] = &["scene", "row", "column"];
+        let (element, shape, dimensions, attributes): (_, _, &'static [&'static str], _) =
+            match self {
+                Self::Transient | Self::Transient4 | Self::Transient25 => {
+                    let dims = &["scene", "row", "column", "bin"];
+                    let (element, attributes) = coded();
+                    (element, vec![h, w, b], dims, attributes)
+                }
+                Self::TransientSpots => {
+                    let dims = &["scene", "spot", "row", "column", "bin"];
+                    let (element, attributes) = coded();
+                    (element, vec![n, h, w, b], dims, attributes)
+                }
+                Self::Intensity => {
+                    let a = json!({"long_name": "sum of the transient over all bins, before coding", "units": "1/(m2 sr)"});
+                    (F32, vec![h, w], IMAGE, a)
+                }
+                Self::Depth => {
+                    let a = json!({"long_name": "z-depth; 0 where the ray leaves the scene", "units": "m"});
+                    (F32, vec![h, w], IMAGE, a)
+                }
+                Self::Range => {
+                    let a = json!({"long_name": "distance along the ray; 0 where it leaves the scene", "units": "m"});
+                    (F32, vec![h, w], IMAGE, a)
+                }
+                Self::Normal => {
+                    // CF's scale_factor: xarray decodes it by itself.
+                    let a = json!({"long_name": "unit normal, camera frame (x right, y down, z forward)", "scale_factor": 1.0 / 32767.0});
+                    (I16, vec![h, w, 3], &["scene", "row", "column", "axis"], a)
+                }
+                Self::Instance => {
+                    let a = json!({"long_name": "object index + 1; 0 = nothing"});
+                    (U32, vec![h, w], IMAGE, a)
+                }
+                Self::Label => {
+                    let a = json!({
+                        "long_name": "semantic label index + 1; 0 = nothing",
+                        "names": "manifests/<scene>.json, provenance.plan.labels",
+                    });
+                    (U16, vec![h, w], IMAGE, a)
+                }
+                Self::Specular => {
+                    let a = json!({"long_name": "1 = the first surface is a mirror"});
+                    (U8, vec![h, w], IMAGE, a)
+                }
+                Self::Visibility => {
+                    let a = json!({"long_name": "visibility of each spot, eight spots a byte", "polarity": "1 = lit", "bit_order": "little", "spots": n});
+                    let dims = &["scene", "spot_byte", "row", "column"];
+                    (U8, vec![n.div_ceil(8), h, w], dims, a)
+                }
+                Self::Rgb => {
+                    let a = json!({"long_name": "colour image, red green blue, sRGB-encoded"});
+                    (U8, vec![h, w, 3], &["scene", "row", "column", "channel"], a)
+                }
+                Self::Spots => {
+                    let a = json!({
+                        "long_name": "illumination spots in the camera frame; NaN = the beam meets nothing",
+                        "components": ["x", "y", "z", "nx", "ny", "nz", "path_from_laser"],
+                        "units": "m",
+                    });
+                    (F32, vec![n, 7], &["scene", "spot", "spot_component"], a)
+                }
+                Self::Intrinsics => {
+                    let a = json!({"long_name": "pinhole intrinsics", "components": ["fx", "fy", "cx", "cy"], "units": "pixels", "pixel_centre": "(u + 0.5, v + 0.5)"});
+                    (F32, vec![4], &["scene", "intrinsic"], a)
+                }
+                Self::Camera => {
+                    let a = json!({"long_name": "camera-to-world matrix, x_world = M x_camera", "units": "m"});
+                    (F32, vec![4, 4], &["scene", "pose_row", "pose_column"], a)
+                }
+                Self::Laser => {
+                    let a = json!({"long_name": "laser origin, camera frame", "units": "m"});
+                    (F32, vec![3], &["scene", "axis"], a)
+                }
+                Self::Scale => {
+                    let a = json!({"long_name": "photons per unit of h; NaN = no such scene yet"});
+                    (F32, vec![], &["scene"], a)
+                }
+            };
+        let inner = coding.as_ref().map(|coding| {
+            let inner = [1, h.min(INNER_SIDE), w.min(INNER_SIDE), coding.inner_bins];
+            inner[4 - shape.len()..].to_vec()
+        });
+        let object_shape = match &inner {
+            Some(inner) => shape
+                .iter()
+                .zip(inner)
+                .map(|(s, i)| s.div_ceil(*i) * i)
+                .collect(),
+            None => shape.clone(),
+        };
+        let fill_nan = matches!(
+            self,
+            Self::Spots | Self::Intrinsics | Self::Camera | Self::Laser | Self::Scale
+        );
+        Layout {
+            quantity: self,
+            element,
+            shape,
+            object_shape,
+            inner,
+            bins_first: coding.as_ref().is_some_and(|c| c.bins_first),
+            shuffle: match &coding {
+                Some(coding) => coding.shuffle(),
+                None if element.size() == 1 => "noshuffle",
+                None => "shuffle",
+            },
+            dimensions,
+            fill_nan,
+            attributes,
+        }
+    }
+}
+
+impl Layout {
+    /// Images in an object: one for each spot of `transient_spots`, otherwise one.
+    pub fn planes(&self) -> usize {
+        match self.quantity {
+            Quantity::TransientSpots => self.shape[0] as usize,
+            _ => 1,
+        }
+    }
+
+    /// Key of the scene's object, relative to the data set.
+    pub fn key(&self, scene: u64) -> String {
+        format!(
+            "{}/c/{scene}{}",
+            self.quantity.name(),
+            "/0".repeat(self.shape.len())
+        )
+    }
+
+    /// The codecs of an object, or of an inner chunk where there is a shard, in the array's order of axes.
+    pub fn chunk_codecs(&self) -> Value {
+        let mut codecs = self.stored_codecs();
+        if let (true, Some(inner)) = (self.bins_first, &self.inner) {
+            // The bins' axis, the last one, comes before the rows'.
+            let axes = inner.len() + 1;
+            let order: Vec<usize> = (0..axes - 3)
+                .chain([axes - 1, axes - 3, axes - 2])
+                .collect();
+            let transpose = json!({"name": "transpose", "configuration": {"order": order}});
+            let codecs = codecs.as_array_mut().expect("a list of codecs");
+            codecs.insert(0, transpose);
+        }
+        codecs
+    }
+
+    /// The same for values that are in stored order already.
+    pub fn stored_codecs(&self) -> Value {
+        let mut codecs = image_codecs(self.element, self.shuffle);
+        let few = matches!(
+            self.quantity,
+            Quantity::Spots
+                | Quantity::Intrinsics
+                | Quantity::Camera
+                | Quantity::Laser
+                | Quantity::Scale
+        );
+        if few {
+            let codecs = codecs.as_array_mut().expect("a list of codecs");
+            codecs.remove(1);
+        }
+        codecs
+    }
+
+    pub fn fill_value(&self) -> Value {
+        match self.element {
+            Element::F32 if self.fill_nan => json!("NaN"),
+            Element::F32 => json!(0.0),
+            _ => json!(0),
+        }
+    }
+
+    /// The array's `zarr.json`.
+    pub fn metadata(&self, scenes: u64) -> Value {
+        let with_scene = |first: u64, rest: &[u64]| -> Vec<u64> {
+            std::iter::once(first).chain(rest.iter().copied()).collect()
+        };
+        let codecs = match &self.inner {
+            None => self.chunk_codecs(),
+            Some(inner) => json!([{"name": "sharding_indexed", "configuration": {
+                "chunk_shape": with_scene(1, inner),
+                "codecs": self.chunk_codecs(),
+                "index_codecs": index_codecs(),
+                "index_location": "end",
+            }}]),
+        };
+        json!({
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": with_scene(scenes, &self.shape),
+            "data_type": self.element.name(),
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": with_scene(1, &self.object_shape)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": self.fill_value(),
+            "codecs": codecs,
+            "attributes": self.attributes,
+            "dimension_names": self.dimensions,
+        })
+    }
+}
+
+/// The codecs of images: values as bytes, compressed, with a checksum.
+pub(crate) fn image_codecs(element: Element, shuffle: &str) -> Value {
+    let typesize = element.size();
+    let bytes = match typesize {
+        1 => json!({"name": "bytes"}),
+        _ => json!({"name": "bytes", "configuration": {"endian": "little"}}),
+    };
+    let blosc = json!({"name": "blosc", "configuration": {
+        "cname": "zstd", "clevel": 3, "shuffle": shuffle, "typesize": typesize, "blocksize": 0,
+    }});
+    json!([bytes, blosc, {"name": "crc32c"}])
+}
+
+/// The codecs of a shard's index.
+pub(crate) fn index_codecs() -> Value {
+    json!([{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}])
+}

@@ -1,0 +1,7 @@
+//! What a data set consists of: its spec, its arrays and their metadata, scenes as records, and manifests.
+
+pub(crate) mod arrays;
+pub(crate) mod group;
+pub(crate) mod manifest;
+pub(crate) mod record;
+pub(crate) mod spec;

@@ -1,0 +1,163 @@
+//! Reading render groups back. Only what `write_render_group` wrote is read; every chunk must be there and whole.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use serde_json::{Map, Value};
+
+use crate::coding::codec::ChunkCodec;
+use crate::error::DatasetError;
+use crate::render_group::write::{chunk_path, codecs, grid, key_encoding, runs, unravel};
+use crate::scenes::dataset::METADATA;
+use crate::scenes::read::Stored;
+
+/// Chunks decoded at a time: bounds the memory beside the array's own.
+const BATCH: u64 = 16;
+/// Most values of a chunk; more would be damaged metadata.
+const MAX_CHUNK: u64 = 1 << 28;
+
+/// A render group in a local folder.
+#[derive(Debug, Clone)]
+pub struct RenderGroup {
+    dir: PathBuf,
+    attributes: Map<String, Value>,
+}
+
+impl RenderGroup {
+    /// Opens the group in `dir`; changes nothing.
+    ///
+    /// # Errors
+    /// [`DatasetError::Io`] where there is none, [`DatasetError::Invalid`] where its metadata cannot be read.
+    pub fn open(dir: &Path) -> Result<Self, DatasetError> {
+        let path = dir.join(METADATA);
+        let mut root = metadata(&path)?;
+        let attributes = match root.get_mut("attributes").map(Value::take) {
+            Some(Value::Object(attributes)) if root["node_type"] == "group" => attributes,
+            _ => {
+                return Err(foreign(
+                    &path,
+                    "a group with attributes",
+                    &root["node_type"],
+                ));
+            }
+        };
+        Ok(Self {
+            dir: dir.to_path_buf(),
+            attributes,
+        })
+    }
+
+    /// The group's attributes.
+    pub fn attributes(&self) -> &Map<String, Value> {
+        &self.attributes
+    }
+
+    /// Whether it has an array of this name.
+    pub fn has(&self, name: &str) -> bool {
+        self.dir.join(name).join(METADATA).is_file()
+    }
+
+    /// Shape and values (row-major) of an array.
+    ///
+    /// # Errors
+    /// [`DatasetError::Io`] where it or one of its chunks is missing, [`DatasetError::Invalid`] where it has another type
+    /// or was not written by `write_render_group`, [`DatasetError::Codec`] where a chunk is damaged.
+    pub fn read<T: Stored + Send + Sync>(
+        &self,
+        name: &str,
+    ) -> Result<(Vec<u64>, Vec<T>), DatasetError> {
+        let folder = self.dir.join(name);
+        let path = folder.join(METADATA);
+        let metadata = metadata(&path)?;
+        for (field, expected) in [
+            ("data_type", T::ELEMENT.name().into()),
+            ("codecs", codecs(T::ELEMENT)),
+            ("chunk_key_encoding", key_encoding()),
+        ] {
+            if metadata[field] != expected {
+                return Err(foreign(
+                    &path,
+                    &format!("{field} = {expected}"),
+                    &metadata[field],
+                ));
+            }
+        }
+        let shape = sizes(&path, &metadata["shape"])?;
+        let chunk = sizes(
+            &path,
+            &metadata["chunk_grid"]["configuration"]["chunk_shape"],
+        )?;
+        if chunk.len() != shape.len()
+            || chunk.iter().zip(&shape).any(|(c, s)| c > s)
+            || chunk.iter().product::<u64>() > MAX_CHUNK
+        {
+            return Err(foreign(
+                &path,
+                &format!("chunks within the shape {shape:?}"),
+                &metadata["chunk_grid"],
+            ));
+        }
+        let grid = grid(&shape, &chunk);
+        let chunks: u64 = grid.iter().product();
+        // Found before room is made for what the shape promises.
+        for at in (0..chunks).map(|at| unravel(at, &grid)) {
+            let path = chunk_path(&folder, &at);
+            fs::metadata(&path).map_err(|e| DatasetError::io("read", &path, e))?;
+        }
+        let codec = ChunkCodec::plain(&codecs(T::ELEMENT), &chunk, T::ELEMENT);
+        let mut values = vec![T::zeroed(); shape.iter().product::<u64>() as usize];
+        for first in (0..chunks).step_by(BATCH as usize) {
+            let batch = (first..chunks.min(first + BATCH))
+                .into_par_iter()
+                .map(|at| {
+                    let path = chunk_path(&folder, &unravel(at, &grid));
+                    let bytes = fs::read(&path).map_err(|e| DatasetError::io("read", &path, e))?;
+                    codec
+                        .decode(&bytes)
+                        .map_err(|e| DatasetError::codec(path.display().to_string(), e))
+                })
+                .collect::<Result<Vec<_>, _>>()?;
+            for (at, bytes) in (first..).zip(batch) {
+                let size = size_of::<T>();
+                for run in runs(&shape, &chunk, &unravel(at, &grid)) {
+                    let target = &mut values[run.array..][..run.len];
+                    let source = &bytes[run.chunk * size..][..run.len * size];
+                    bytemuck::cast_slice_mut(target).copy_from_slice(source);
+                }
+            }
+        }
+        Ok((shape, values))
+    }
+}
+
+fn metadata(path: &Path) -> Result<Value, DatasetError> {
+    let bytes = fs::read(path).map_err(|e| DatasetError::io("read", path, e))?;
+    serde_json::from_slice(&bytes).map_err(|e| {
+        DatasetError::invalid(
+            path.display().to_string(),
+            format!("expected the JSON of a Zarr v3 node: {e}"),
+        )
+    })
+}
+
+/// Positive sizes whose product can be addressed.
+fn sizes(path: &Path, value: &Value) -> Result<Vec<u64>, DatasetError> {
+    let sizes: Option<Vec<u64>> = value
+        .as_array()
+        .map(|sizes| sizes.iter().filter_map(Value::as_u64).collect());
+    sizes
+        .filter(|s| s.len() == value.as_array().map_or(0, Vec::len) && !s.contains(&0))
+        .filter(|s| {
+            let product = s.iter().try_fold(1u64, |n, s| n.checked_mul(*s));
+            product.is_some_and(|n| n <= 1 << 40)
+        })
+        .ok_or_else(|| foreign(path, "positive sizes", value))
+}
+
+fn foreign(path: &Path, expected: &str, found: &Value) -> DatasetError {
+    DatasetError::invalid(
+        path.display().to_string(),
+        format!("expected {expected} as `picofarm scene render` writes it, found {found}"),
+    )
+}

@@ -1,0 +1,273 @@
+//! Small Zarr v3 groups of plain arrays in a local folder, for single renders and comparisons; see `render_read` for
+//! the way back.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use serde_json::{Map, Value, json};
+
+use crate::coding::codec::ChunkCodec;
+use crate::error::DatasetError;
+use crate::layout::arrays::Element;
+use crate::scenes::dataset::{METADATA, pretty};
+use crate::scenes::read::Stored;
+
+/// Values of the largest chunk.
+const CHUNK_VALUES: u64 = 1 << 20;
+
+/// An array of a render group.
+#[derive(Debug, Clone, Copy)]
+pub struct RenderArray<'a, T = f32> {
+    /// Name: letters, digits, `_` and `-`.
+    pub name: &'a str,
+    /// Shape.
+    pub shape: &'a [u64],
+    /// A name for each dimension; dimensions of equal name must have equal length, as xarray demands.
+    pub dimension_names: &'a [&'a str],
+    /// Values in row-major order; any bits are kept.
+    pub data: &'a [T],
+}
+
+/// Writes a Zarr v3 group of plain arrays with `attributes` to the new folder `dir`. All or nothing: the group is
+/// written beside `dir` and renamed into place.
+///
+/// # Errors
+/// [`DatasetError::Invalid`] for unfit arrays and where `dir` exists and is not empty (nothing is overwritten);
+/// [`DatasetError::Io`].
+pub fn write_render_group<T: Stored + Send + Sync>(
+    dir: &Path,
+    arrays: &[RenderArray<'_, T>],
+    attributes: &Map<String, Value>,
+) -> Result<(), DatasetError> {
+    check(arrays)?;
+    let dir = std::path::absolute(dir).map_err(|e| DatasetError::io("resolve", dir, e))?;
+    refuse_occupied(&dir)?;
+    let (Some(parent), Some(name)) = (dir.parent(), dir.file_name()) else {
+        return Err(DatasetError::invalid(
+            "dir",
+            format!("expected a new folder, found {}", dir.display()),
+        ));
+    };
+    fs::create_dir_all(parent).map_err(|e| DatasetError::io("create", parent, e))?;
+    let partial = parent.join(format!(
+        ".{}.partial-{}",
+        name.display(),
+        uuid::Uuid::new_v4()
+    ));
+    let written = write_into(&partial, arrays, attributes).and_then(|()| {
+        // Replaces an empty folder; fails on one that was filled meanwhile.
+        fs::rename(&partial, &dir).map_err(|e| DatasetError::io("create", &dir, e))
+    });
+    if written.is_err() {
+        // The first error is the one to tell; what cannot be removed shows in the folder.
+        let _ = fs::remove_dir_all(&partial);
+    }
+    written
+}
+
+fn check<T>(arrays: &[RenderArray<'_, T>]) -> Result<(), DatasetError> {
+    for (i, array) in arrays.iter().enumerate() {
+        let invalid = |what: String| {
+            Err(DatasetError::invalid(
+                format!("arrays[{i}] ({})", array.name),
+                what,
+            ))
+        };
+        let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+        if array.name.is_empty() || !array.name.chars().all(plain) {
+            return invalid("expected a name of letters, digits, _ and -".into());
+        }
+        if arrays[..i].iter().any(|other| other.name == array.name) {
+            return invalid("expected a name of its own, found it twice".into());
+        }
+        if array.dimension_names.len() != array.shape.len() {
+            return invalid(format!(
+                "expected {} dimension names, found {}",
+                array.shape.len(),
+                array.dimension_names.len()
+            ));
+        }
+        let values: u64 = array.shape.iter().product();
+        if values == 0 || values != array.data.len() as u64 {
+            return invalid(format!(
+                "expected {values} values (and at least one) for the shape {:?}, found {}",
+                array.shape,
+                array.data.len()
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn refuse_occupied(dir: &Path) -> Result<(), DatasetError> {
+    let occupied = |what: &str| {
+        let hint = "choose another folder or remove it first";
+        Err(DatasetError::invalid(
+            "dir",
+            format!(
+                "{} {what}, and nothing is overwritten: {hint}",
+                dir.display()
+            ),
+        ))
+    };
+    match fs::read_dir(dir) {
+        Ok(mut entries) => match entries.next() {
+            Some(_) => occupied("is not empty"),
+            None => Ok(()),
+        },
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotADirectory => occupied("is a file"),
+        Err(e) => Err(DatasetError::io("list", dir, e)),
+    }
+}
+
+fn write_into<T: Stored + Send + Sync>(
+    dir: &Path,
+    arrays: &[RenderArray<'_, T>],
+    attributes: &Map<String, Value>,
+) -> Result<(), DatasetError> {
+    let mut consolidated = Map::new();
+    for array in arrays {
+        let chunk = chunk_shape(array.shape);
+        let codecs = codecs(T::ELEMENT);
+        let metadata = json!({
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": array.shape,
+            "data_type": T::ELEMENT.name(),
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
+            "chunk_key_encoding": key_encoding(),
+            "fill_value": if T::ELEMENT == Element::F32 { json!(0.0) } else { json!(0) },
+            "codecs": codecs,
+            "attributes": {},
+            "dimension_names": array.dimension_names,
+        });
+        let folder = dir.join(array.name);
+        write(&folder.join(METADATA), &pretty(&metadata))?;
+        let codec = ChunkCodec::plain(&codecs, &chunk, T::ELEMENT);
+        let grid = grid(array.shape, &chunk);
+        (0..grid.iter().product::<u64>())
+            .into_par_iter()
+            .try_for_each(|at| {
+                let at = unravel(at, &grid);
+                let values = gather(array, &chunk, &at);
+                let bytes = codec.encode(bytemuck::cast_slice(&values))?;
+                write(&chunk_path(&folder, &at), &bytes)
+            })?;
+        consolidated.insert(array.name.to_string(), metadata);
+    }
+    let root = json!({
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": attributes,
+        "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": consolidated},
+    });
+    write(&dir.join(METADATA), &pretty(&root))
+}
+
+/// How the chunks of a render group's arrays are coded.
+pub(crate) fn codecs(element: Element) -> Value {
+    json!([
+        {"name": "bytes", "configuration": {"endian": "little"}},
+        {"name": "blosc", "configuration": {
+            "cname": "zstd", "clevel": 3, "shuffle": "shuffle", "typesize": element.size(), "blocksize": 0,
+        }},
+        {"name": "crc32c"},
+    ])
+}
+
+/// How their chunks are named.
+pub(crate) fn key_encoding() -> Value {
+    json!({"name": "default", "configuration": {"separator": "/"}})
+}
+
+/// Number of chunks along each dimension.
+pub(crate) fn grid(shape: &[u64], chunk: &[u64]) -> Vec<u64> {
+    let sizes = shape.iter().zip(chunk);
+    sizes.map(|(s, c)| s.div_ceil(*c)).collect()
+}
+
+pub(crate) fn chunk_path(folder: &Path, at: &[u64]) -> PathBuf {
+    let mut path = folder.join("c");
+    path.extend(at.iter().map(u64::to_string));
+    path
+}
+
+fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), DatasetError> {
+    if let Some(parent) = path.parent() {
+        fs::create_dir_all(parent).map_err(|e| DatasetError::io("create", parent, e))?;
+    }
+    fs::write(path, bytes).map_err(|e| DatasetError::io("write", path, e))
+}
+
+/// The whole shape, its longest dimension but the last halved until a chunk is small enough.
+fn chunk_shape(shape: &[u64]) -> Vec<u64> {
+    let mut chunk = shape.to_vec();
+    while chunk.iter().product::<u64>() > CHUNK_VALUES {
+        let splittable = chunk.len().saturating_sub(1).max(1);
+        let Some(longest) = chunk[..splittable].iter_mut().max_by_key(|c| **c) else {
+            break;
+        };
+        if *longest == 1 {
+            break;
+        }
+        *longest = longest.div_ceil(2);
+    }
+    chunk
+}
+
+pub(crate) fn unravel(mut index: u64, shape: &[u64]) -> Vec<u64> {
+    let mut at = vec![0; shape.len()];
+    for (at, n) in at.iter_mut().zip(shape).rev() {
+        *at = index % n;
+        index /= n;
+    }
+    at
+}
+
+/// The values of a chunk, 0 outside the array.
+fn gather<T: Stored>(array: &RenderArray<'_, T>, chunk: &[u64], at: &[u64]) -> Vec<T> {
+    let mut values = vec![T::zeroed(); chunk.iter().product::<u64>() as usize];
+    for run in runs(array.shape, chunk, at) {
+        values[run.chunk..][..run.len].copy_from_slice(&array.data[run.array..][..run.len]);
+    }
+    values
+}
+
+/// Contiguous values that a chunk and its array share.
+pub(crate) struct Run {
+    /// Where they start in the chunk.
+    pub chunk: usize,
+    /// Where they start in the array.
+    pub array: usize,
+    pub len: usize,
+}
+
+/// The runs of chunk `at`, those outside the array left out.
+pub(crate) fn runs<'a>(
+    shape: &'a [u64],
+    chunk: &'a [u64],
+    at: &'a [u64],
+) -> impl Iterator<Item = Run> + 'a {
+    let last = chunk.last().copied().unwrap_or(1);
+    let length = shape.last().copied().unwrap_or(1);
+    let start = at.last().copied().unwrap_or(0) * last;
+    let len = last.min(length - start) as usize;
+    let outer = &chunk[..chunk.len().saturating_sub(1)];
+    (0..outer.iter().product::<u64>()).filter_map(move |row| {
+        let mut array = 0;
+        for (d, within) in unravel(row, outer).iter().enumerate() {
+            let index = at[d] * chunk[d] + within;
+            if index >= shape[d] {
+                return None;
+            }
+            array = array * shape[d] + index;
+        }
+        Some(Run {
+            chunk: (row * last) as usize,
+            array: (array * length + start) as usize,
+            len,
+        })
+    })
+}

@@ -1,0 +1,8 @@
+//! What keeps a store whole: finding orphaned and lost objects, and making them again.
+
+pub(crate) mod collect;
+pub(crate) mod held;
+pub(crate) mod listing;
+pub(crate) mod recipe;
+pub(crate) mod restore;
+pub(crate) mod root;

@@ -1,0 +1,133 @@
+//! Recipes beside a data set: how its scenes are made again, `recipes/<key>.json` or, where scenes are made of files of
+//! their own, `recipes/<key>/<scene>.json`. Create-only, never changed; the first to write one wins. What they say is
+//! proved by what comes out: the same task key, the same bytes.
+
+use futures::TryStreamExt;
+use object_store::ObjectStore;
+use serde_json::Value;
+
+use crate::error::DatasetError;
+use crate::layout::manifest::{seal, unseal};
+use crate::scenes::dataset::{Dataset, pretty};
+use crate::store::objects;
+
+/// Version of recipes.
+const FORMAT: u64 = 1;
+
+/// A stored recipe.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recipe {
+    /// The key that it is stored under.
+    pub key: String,
+    /// The only scene that it is for.
+    pub scene: Option<u64>,
+    /// What it says.
+    pub content: Value,
+    /// Where it lies, for messages.
+    pub place: String,
+}
+
+impl Dataset {
+    /// Stores a recipe create-only; `false` where there is one already.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn create_recipe(
+        &self,
+        key: &str,
+        scene: Option<u64>,
+        content: &Value,
+    ) -> Result<bool, DatasetError> {
+        let path = self.path(&recipe_key(key, scene));
+        // Of one for all scenes this is the usual case, and a look costs less than a write.
+        if objects::size(&*self.store, &path).await?.is_some() {
+            return Ok(false);
+        }
+        let sealed = seal(&pretty(
+            &serde_json::json!({"format": FORMAT, "recipe": content}),
+        ));
+        objects::create(&*self.store, &path, sealed.into()).await
+    }
+
+    /// The recipe of `scene` under `key`: its own, or that of all.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn recipe(&self, key: &str, scene: u64) -> Result<Option<Recipe>, DatasetError> {
+        for scene in [Some(scene), None] {
+            let path = self.path(&recipe_key(key, scene));
+            let Some(bytes) = objects::get(&*self.store, &path).await? else {
+                continue;
+            };
+            let place = self.shown(&path);
+            let content = parse(&bytes).map_err(|what| DatasetError::Damaged {
+                object: place.clone(),
+                what,
+            })?;
+            return Ok(Some(Recipe {
+                key: key.to_owned(),
+                scene,
+                content,
+                place,
+            }));
+        }
+        Ok(None)
+    }
+
+    /// The keys under which there are recipes, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn recipe_keys(&self) -> Result<Vec<String>, DatasetError> {
+        let folder = self.path("recipes");
+        let failed = |e| DatasetError::store("list", self.shown(&folder), e);
+        let mut keys = std::collections::BTreeSet::new();
+        let mut listed = self.store.list(Some(&folder));
+        while let Some(object) = listed.try_next().await.map_err(failed)? {
+            let name = self.relative(&object.location);
+            if is_recipe(&name) {
+                let key = name.split('/').nth(1).unwrap_or_default();
+                keys.insert(key.trim_end_matches(".json").to_owned());
+            }
+        }
+        Ok(keys.into_iter().collect())
+    }
+}
+
+fn recipe_key(key: &str, scene: Option<u64>) -> String {
+    match scene {
+        None => format!("recipes/{key}.json"),
+        Some(scene) => format!("recipes/{key}/{scene}.json"),
+    }
+}
+
+/// What a stored recipe says.
+pub(crate) fn parse(bytes: &[u8]) -> Result<Value, String> {
+    let sealed: Value = serde_json::from_slice(bytes).map_err(|e| format!("not JSON: {e}"))?;
+    let checksum = sealed["checksum"].as_str().ok_or("it has no checksum")?;
+    unseal(bytes, checksum)?;
+    match sealed["format"].as_u64() {
+        Some(FORMAT) if sealed["recipe"].is_object() => Ok(sealed["recipe"].clone()),
+        Some(FORMAT) => Err("it holds no recipe".into()),
+        Some(n) => Err(format!(
+            "written in format {n}, this program knows {FORMAT}"
+        )),
+        None => Err("it has no format".into()),
+    }
+}
+
+/// Whether a key relative to the data set is that of a recipe.
+pub(crate) fn is_recipe(key: &str) -> bool {
+    let hex = |text: &str| text.len() == 64 && text.bytes().all(|b| b.is_ascii_hexdigit());
+    let parts: Vec<&str> = key.split('/').collect();
+    match parts[..] {
+        ["recipes", file] => file.strip_suffix(".json").is_some_and(hex),
+        ["recipes", key, file] => {
+            let scene = file
+                .strip_suffix(".json")
+                .and_then(|s| s.parse::<u64>().ok());
+            hex(key) && scene.is_some_and(|scene| file == format!("{scene}.json"))
+        }
+        _ => false,
+    }
+}

@@ -1,0 +1,141 @@
+//! A data set whose root `zarr.json` is broken or lost: found again from a recipe and the arrays' own metadata.
+
+use std::sync::Arc;
+
+use object_store::ObjectStore;
+use object_store::path::Path;
+use serde_json::Value;
+
+use crate::error::DatasetError;
+use crate::layout::manifest::FORMAT_VERSION;
+use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets};
+use crate::repair::recipe::Recipe;
+use crate::scenes::dataset::{Dataset, METADATA, pretty, root_metadata};
+use crate::store::objects;
+
+/// What lies beside the root.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Remains {
+    /// The recipes.
+    pub recipes: Vec<Recipe>,
+    /// A scene with a readable manifest, and the key of the task that made it.
+    pub scene: Option<(u64, String)>,
+}
+
+/// Looks at a data set that cannot be opened.
+///
+/// # Errors
+/// [`DatasetError::Store`], [`DatasetError::Damaged`].
+pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remains, DatasetError> {
+    let anything = DatasetSpec {
+        scenes: u64::MAX,
+        height: 1,
+        width: 1,
+        spots: 1,
+        subsets: Subsets::NONE,
+        per_spot: false,
+        gate: Gate {
+            start_m: 0.0,
+            bin_width_m: 1.0,
+            bins: 1,
+        },
+        profile: Profile::LOSSLESS,
+    };
+    let blind = Dataset::assume(store, prefix, anything, FORMAT_VERSION);
+    let mut found = Remains::default();
+    for scene in blind.scenes_present().await? {
+        match blind.manifest(scene).await {
+            Ok(manifest) => {
+                found.scene = Some((scene, manifest.provenance.task_key));
+                break;
+            }
+            Err(DatasetError::Damaged { .. }) => {}
+            Err(error) => return Err(error),
+        }
+    }
+    let scene = found.scene.as_ref().map_or(0, |(scene, _)| *scene);
+    for key in blind.recipe_keys().await? {
+        found.recipes.extend(blind.recipe(&key, scene).await?);
+    }
+    Ok(found)
+}
+
+impl Dataset {
+    /// Whether the root's metadata agree with themselves: the properties that they state lead to all that they say.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`] where it is missing by now; [`DatasetError::Store`].
+    pub async fn root_agrees(&self) -> Result<bool, DatasetError> {
+        let bytes = objects::require(&*self.store, &self.path(METADATA)).await?;
+        let stored: Option<Value> = serde_json::from_slice(&bytes).ok();
+        Ok(stored == Some(root_metadata(&self.spec, self.format)))
+    }
+}
+
+/// Writes the root's metadata of a data set with these properties; the number of scenes is that of the arrays. Every
+/// array's metadata that can be read must be those of `spec`, and at least one must.
+///
+/// # Errors
+/// [`DatasetError::Damaged`] where the arrays do not prove that it is this data set; nothing is written then.
+/// [`DatasetError::Store`].
+pub async fn restore_root(
+    store: Arc<dyn ObjectStore>,
+    prefix: Path,
+    spec: &DatasetSpec,
+) -> Result<Dataset, DatasetError> {
+    let mut spec = *spec;
+    let format = format_of(&store, &prefix, spec).await?;
+    let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
+    let mut agreed = None;
+    for array in assumed.arrays.iter() {
+        let path = assumed.metadata_path(&array.layout);
+        let Some(bytes) = objects::get(&*store, &path).await? else {
+            continue;
+        };
+        let Ok(stored) = serde_json::from_slice::<Value>(&bytes) else {
+            continue;
+        };
+        let scenes = stored["shape"][0].as_u64().unwrap_or(0);
+        if stored == array.layout.metadata(scenes) && agreed.is_none_or(|n| n == scenes) {
+            agreed = Some(scenes);
+            continue;
+        }
+        return Err(DatasetError::Damaged {
+            object: assumed.shown(&path),
+            what: "is not what the recipe of the data set gives, while the root is broken too: nothing was written".into(),
+        });
+    }
+    let root = assumed.path(METADATA);
+    let Some(scenes) = agreed.filter(|n| *n > 0) else {
+        return Err(DatasetError::Damaged {
+            object: assumed.shown(&root),
+            what: "is broken, and so are the metadata of every array: nothing says how many scenes there are".into(),
+        });
+    };
+    spec.scenes = scenes;
+    spec.check()?;
+    objects::overwrite(&*store, &root, pretty(&root_metadata(&spec, format))).await?;
+    Dataset::open(store, prefix).await
+}
+
+/// The format in which the arrays were laid out: that of the first transient whose metadata are those of one, else the
+/// newest. Formats differ in nothing but transients.
+async fn format_of(
+    store: &Arc<dyn ObjectStore>,
+    prefix: &Path,
+    spec: DatasetSpec,
+) -> Result<u32, DatasetError> {
+    for format in (1..=FORMAT_VERSION).rev() {
+        let assumed = Dataset::assume(store.clone(), prefix.clone(), spec, format);
+        let transients = assumed.arrays.iter().map(|array| &array.layout);
+        for layout in transients.filter(|layout| layout.quantity.is_transient()) {
+            let bytes = objects::get(&**store, &assumed.metadata_path(layout)).await?;
+            let stored: Option<Value> = bytes.and_then(|b| serde_json::from_slice(&b).ok());
+            let Some(stored) = stored else { continue };
+            if stored == layout.metadata(stored["shape"][0].as_u64().unwrap_or(0)) {
+                return Ok(format);
+            }
+        }
+    }
+    Ok(FORMAT_VERSION)
+}

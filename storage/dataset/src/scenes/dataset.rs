@@ -1,0 +1,263 @@
+//! Creating, opening and growing a data set.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use object_store::ObjectStore;
+use object_store::path::Path;
+use serde_json::{Map, Value, json};
+
+use crate::coding::codec::ChunkCodec;
+use crate::coding::profile::decode_lines;
+use crate::error::DatasetError;
+use crate::layout::arrays::{Layout, Quantity};
+use crate::layout::group::create_metadata;
+use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
+use crate::layout::spec::DatasetSpec;
+use crate::predictions::is_predictions;
+use crate::store::objects;
+
+/// An open data set: one Zarr v3 group in an object store. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    pub(crate) store: Arc<dyn ObjectStore>,
+    pub(crate) prefix: Path,
+    pub(crate) spec: DatasetSpec,
+    /// The layout's version, [`FORMAT_VERSION`] at the time of creation.
+    pub(crate) format: u32,
+    pub(crate) arrays: Arc<[ArrayCodec]>,
+}
+
+/// An array and the codec of its chunks.
+#[derive(Debug)]
+pub(crate) struct ArrayCodec {
+    pub layout: Layout,
+    pub codec: ChunkCodec,
+}
+
+/// Name of the metadata objects.
+pub(crate) const METADATA: &str = "zarr.json";
+
+impl Dataset {
+    /// Creates the data set at `prefix`, or opens it if it is there.
+    ///
+    /// The metadata are written create-only, the root last: a data set exists once its root `zarr.json` does.
+    /// Where the stored number of scenes is smaller than `spec.scenes`, the data set grows: the first number of
+    /// every array's shape is replaced, the root's last. Where it is larger, the stored number stands. Let one
+    /// process at a time grow a data set: metadata are replaced without comparison (published scenes are never
+    /// touched, so the worst case is a number of scenes too small, which growing again repairs).
+    ///
+    /// # Errors
+    /// [`DatasetError::SpecMismatch`] names the first differing field and both values; [`DatasetError::Invalid`];
+    /// [`DatasetError::Store`].
+    pub async fn create_or_open(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+        spec: &DatasetSpec,
+    ) -> Result<Self, DatasetError> {
+        spec.check()?;
+        let root = objects::path_of(&prefix, METADATA);
+        let (stored, format) = match objects::get(&*store, &root).await? {
+            Some(bytes) => parse_root(&bytes, &objects::shown(&*store, &root))?,
+            None => {
+                let new = Self::assume(store.clone(), prefix.clone(), *spec, FORMAT_VERSION);
+                for array in new.arrays.iter() {
+                    new.create_array_metadata(&array.layout).await?;
+                }
+                if objects::create(&*store, &root, pretty(&root_metadata(spec, FORMAT_VERSION)))
+                    .await?
+                {
+                    return Ok(new);
+                }
+                // Another process was faster.
+                parse_root(
+                    &objects::require(&*store, &root).await?,
+                    &objects::shown(&*store, &root),
+                )?
+            }
+        };
+        if let Some((field, stored, asked)) = stored.difference(spec) {
+            return Err(DatasetError::SpecMismatch {
+                prefix: objects::shown(&*store, &prefix),
+                field: field.into(),
+                stored,
+                asked,
+            });
+        }
+        if spec.scenes <= stored.scenes {
+            return Ok(Self::assume(store, prefix, stored, format));
+        }
+        let grown = Self::assume(store, prefix, *spec, format);
+        for array in grown.arrays.iter() {
+            let path = grown.metadata_path(&array.layout);
+            let bytes = pretty(&array.layout.metadata(spec.scenes));
+            objects::overwrite(&*grown.store, &path, bytes).await?;
+        }
+        objects::overwrite(&*grown.store, &root, pretty(&root_metadata(spec, format))).await?;
+        Ok(grown)
+    }
+
+    /// Opens the data set at `prefix`.
+    ///
+    /// # Errors
+    /// [`DatasetError::NoDataset`], [`DatasetError::Damaged`] where the root is not a data set of ours,
+    /// [`DatasetError::Store`].
+    pub async fn open(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Self, DatasetError> {
+        let root = objects::path_of(&prefix, METADATA);
+        let Some(bytes) = objects::get(&*store, &root).await? else {
+            return Err(DatasetError::NoDataset {
+                prefix: objects::shown(&*store, &prefix),
+            });
+        };
+        let (spec, format) = parse_root(&bytes, &objects::shown(&*store, &root))?;
+        Ok(Self::assume(store, prefix, spec, format))
+    }
+
+    /// The data set's properties as stored.
+    pub fn spec(&self) -> &DatasetSpec {
+        &self.spec
+    }
+
+    /// Where it lies in its store.
+    pub fn prefix(&self) -> &Path {
+        &self.prefix
+    }
+
+    /// The same for a message.
+    pub fn place(&self) -> String {
+        self.shown(&self.prefix)
+    }
+
+    pub(crate) fn assume(
+        store: Arc<dyn ObjectStore>,
+        prefix: Path,
+        spec: DatasetSpec,
+        format: u32,
+    ) -> Self {
+        let array = |quantity: Quantity| {
+            let layout = quantity.layout(&spec, format);
+            let codec = ChunkCodec::new(&layout);
+            ArrayCodec { layout, codec }
+        };
+        Self {
+            store,
+            prefix,
+            spec,
+            format,
+            arrays: spec.quantities().into_iter().map(array).collect(),
+        }
+    }
+
+    /// An array that every data set has.
+    pub(crate) fn array(&self, quantity: Quantity) -> &ArrayCodec {
+        self.array_of(quantity)
+            .expect("only transients of subsets may be missing")
+    }
+
+    /// The array of any quantity.
+    pub(crate) fn array_of(&self, quantity: Quantity) -> Result<&ArrayCodec, DatasetError> {
+        let found = self.arrays.iter().find(|a| a.layout.quantity == quantity);
+        found.ok_or_else(|| {
+            let what = format!("the data set has no array {}", quantity.name());
+            DatasetError::invalid("quantity", what)
+        })
+    }
+
+    pub(crate) fn path(&self, key: &str) -> Path {
+        objects::path_of(&self.prefix, key)
+    }
+
+    /// A path for a message.
+    pub(crate) fn shown(&self, path: &Path) -> String {
+        objects::shown(&*self.store, path)
+    }
+
+    pub(crate) fn metadata_path(&self, layout: &Layout) -> Path {
+        self.path(&format!("{}/{METADATA}", layout.quantity.name()))
+    }
+
+    pub(crate) fn check_scene(&self, scene: u64) -> Result<(), DatasetError> {
+        if scene < self.spec.scenes {
+            return Ok(());
+        }
+        Err(DatasetError::SceneOutOfRange {
+            scene,
+            scenes: self.spec.scenes,
+        })
+    }
+
+    /// Writes an array's metadata while there is no root.
+    async fn create_array_metadata(&self, layout: &Layout) -> Result<(), DatasetError> {
+        let path = self.metadata_path(layout);
+        create_metadata(&*self.store, &path, self.spec.scenes, |n| {
+            layout.metadata(n)
+        })
+        .await
+    }
+}
+
+pub(crate) fn pretty(value: &Value) -> Bytes {
+    let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
+    text.push(b'\n');
+    text.into()
+}
+
+/// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.
+pub(crate) fn root_metadata(spec: &DatasetSpec, format: u32) -> Value {
+    let arrays: Map<String, Value> = spec
+        .quantities()
+        .into_iter()
+        .map(|q| {
+            let layout = q.layout(spec, format);
+            (q.name().to_string(), layout.metadata(spec.scenes))
+        })
+        .collect();
+    json!({
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": {
+            "picofarm": {"format": format, "encoder": encoder_of(format), "spec": spec},
+            "gate": spec.gate,
+            "bin": "bin b holds optical path lengths [start_m + b*bin_width_m, start_m + (b+1)*bin_width_m)",
+            "speed_of_light_m_s": 299_792_458,
+            "units": "lengths in metres, times as optical path in metres, images [row][column]",
+            "visibility_polarity": "1 = lit",
+            "decode": decode_lines(spec),
+        },
+        "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": arrays},
+    })
+}
+
+/// The data set's properties and format.
+fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetError> {
+    let damaged = |what: String| DatasetError::Damaged {
+        object: object.to_string(),
+        what,
+    };
+    let root: Value = serde_json::from_slice(bytes)
+        .map_err(|e| damaged(format!("not JSON ({e}), so no Zarr group")))?;
+    if is_predictions(&root) {
+        let what = "holds what models predict of the scenes of a data set, and is no data set itself; its manifests name the one \
+                    that it is about";
+        return Err(DatasetError::invalid(object, what));
+    }
+    let ours = &root["attributes"]["picofarm"];
+    let Some(format) = ours["format"].as_u64() else {
+        return Err(damaged(
+            "a Zarr group, but not a picofarm data set (attributes.picofarm.format is missing)"
+                .into(),
+        ));
+    };
+    let format = match u32::try_from(format) {
+        Ok(format @ 1..=FORMAT_VERSION) => format,
+        _ => {
+            return Err(damaged(format!(
+                "written in format {format}, this program knows formats 1 to {FORMAT_VERSION}: use a newer one"
+            )));
+        }
+    };
+    let spec: DatasetSpec = serde_json::from_value(ours["spec"].clone())
+        .map_err(|e| damaged(format!("attributes.picofarm.spec: {e}")))?;
+    spec.check()?;
+    Ok((spec, format))
+}

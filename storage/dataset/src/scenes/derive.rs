@@ -1,0 +1,145 @@
+//! Scenes made of other scenes: another histogram, the same ground truth.
+
+use std::collections::BTreeMap;
+
+use crate::error::DatasetError;
+use crate::layout::arrays::Quantity;
+use crate::layout::manifest::sha256_hex;
+use crate::layout::record::Provenance;
+use crate::layout::spec::DatasetSpec;
+use crate::scenes::dataset::Dataset;
+use crate::scenes::encode::{Content, EncodedScene, assemble, intensity};
+use crate::store::objects;
+
+/// Everything of a published scene that is neither a histogram nor made from one: depth, range, normals, instances,
+/// labels, specular, visibility, RGB, spots, intrinsics, pose and laser, as stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneTruth {
+    spec: DatasetSpec,
+    /// Native-endian values.
+    arrays: BTreeMap<Quantity, Vec<u8>>,
+}
+
+impl Dataset {
+    /// The ground truth of a published scene, each object checked against its manifest.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Codec`], [`DatasetError::Store`].
+    pub async fn read_truth(&self, scene: u64) -> Result<SceneTruth, DatasetError> {
+        let manifest = self.manifest(scene).await?;
+        let mut arrays = BTreeMap::new();
+        for array in self.arrays.iter().filter(|a| is_truth(a.layout.quantity)) {
+            let key = array.layout.key(scene);
+            let path = self.path(&key);
+            let bytes = objects::require(&*self.store, &path).await?;
+            if manifest.object(&key).map(|o| &o.sha256) != Some(&sha256_hex(&bytes)) {
+                return Err(DatasetError::Damaged {
+                    object: self.shown(&path),
+                    what: "its SHA-256 is not the manifest's".into(),
+                });
+            }
+            arrays.insert(array.layout.quantity, array.codec.decode(&bytes)?);
+        }
+        Ok(SceneTruth {
+            spec: self.spec,
+            arrays,
+        })
+    }
+
+    /// Codes a scene with the given histogram (`[row][column][bin]` of this data set's gate) and photon scale, and
+    /// the ground truth of another data set's scene. Blocks its thread while coding on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where this data set has another image size, other spots or further transients, or a
+    /// value is unusable; [`DatasetError::SceneOutOfRange`].
+    pub fn encode_derived(
+        &self,
+        scene: u64,
+        truth: &SceneTruth,
+        transient: &[f32],
+        scale: f32,
+        provenance: &Provenance,
+    ) -> Result<EncodedScene, DatasetError> {
+        self.check_scene(scene)?;
+        let spec = &self.spec;
+        let (ours, theirs) = (
+            [spec.height, spec.width, spec.spots],
+            [truth.spec.height, truth.spec.width, truth.spec.spots],
+        );
+        if ours != theirs {
+            let what = format!(
+                "expected {ours:?} rows, columns and spots as in the data set, found {theirs:?}"
+            );
+            return Err(DatasetError::invalid("truth", what));
+        }
+        if spec
+            .quantities()
+            .iter()
+            .filter(|q| q.is_transient())
+            .count()
+            != 1
+        {
+            let what = "a derived data set has one histogram a scene; found subsets of spots too";
+            return Err(DatasetError::invalid("spec.subsets", what));
+        }
+        if transient.len() != spec.transient_len() {
+            let (expected, found) = (spec.transient_len(), transient.len());
+            let what = format!("expected {expected} values, found {found}");
+            return Err(DatasetError::invalid("transient", what));
+        }
+        if !(scale.is_normal() && scale > 0.0) {
+            let what = format!("expected a positive finite number, found {scale}");
+            return Err(DatasetError::invalid("scale", what));
+        }
+        let content = Content {
+            transient,
+            subsets: &[],
+            scale,
+        };
+        assemble(self, scene, &content, provenance, |quantity| {
+            Ok(match quantity {
+                Quantity::Intensity => intensity(transient, spec.gate.bins),
+                Quantity::Scale => scale.to_ne_bytes().to_vec(),
+                truth_of => truth.arrays[&truth_of].clone(),
+            })
+        })
+    }
+}
+
+impl SceneTruth {
+    /// The truth with only the given spots, in the given order.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there is no such spot, or none is chosen.
+    pub fn of_spots(mut self, chosen: &[u32]) -> Result<Self, DatasetError> {
+        let spots = self.spec.spots;
+        if chosen.is_empty() || chosen.iter().any(|s| *s >= spots) {
+            let what = format!(
+                "expected some of the spots 0 to {}, found {chosen:?}",
+                spots - 1
+            );
+            return Err(DatasetError::invalid("spots", what));
+        }
+        let pixels = self.spec.pixels();
+        let packed = &self.arrays[&Quantity::Visibility];
+        let mut visibility = vec![0u8; chosen.len().div_ceil(8) * pixels];
+        for (to, from) in chosen.iter().map(|s| *s as usize).enumerate() {
+            let source = &packed[from / 8 * pixels..][..pixels];
+            let target = &mut visibility[to / 8 * pixels..][..pixels];
+            for (target, source) in target.iter_mut().zip(source) {
+                *target |= (source >> (from % 8) & 1) << (to % 8);
+            }
+        }
+        let rows: Vec<&[u8]> = self.arrays[&Quantity::Spots].chunks_exact(7 * 4).collect();
+        let rows = chosen.iter().map(|s| rows[*s as usize]);
+        let rows = rows.collect::<Vec<_>>().concat();
+        self.arrays.insert(Quantity::Visibility, visibility);
+        self.arrays.insert(Quantity::Spots, rows);
+        self.spec.spots = chosen.len() as u32;
+        Ok(self)
+    }
+}
+
+fn is_truth(quantity: Quantity) -> bool {
+    !quantity.is_transient() && !matches!(quantity, Quantity::Intensity | Quantity::Scale)
+}

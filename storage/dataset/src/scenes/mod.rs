@@ -1,0 +1,12 @@
+//! Data sets and their scenes: created, published, read, listed by splits and snapshots.
+
+pub(crate) mod dataset;
+pub(crate) mod derive;
+pub(crate) mod encode;
+pub(crate) mod parts;
+pub(crate) mod publish;
+pub(crate) mod read;
+pub(crate) mod snapshot;
+pub(crate) mod splits;
+pub(crate) mod summary;
+pub(crate) mod window;

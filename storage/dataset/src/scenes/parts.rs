@@ -1,0 +1,151 @@
+//! Parts of scenes that several workers render together, on their way to who joins them: `parts/<scene>/<task key>/<part>-of-<ranges>.zst`
+//! in the data set. Nobody else needs them; they are deleted when the scene is published, and
+//! [`Dataset::collect`] deletes what a killed job left.
+
+use bytes::Bytes;
+use object_store::path::Path;
+use object_store::{Error, ObjectStoreExt};
+
+use crate::error::DatasetError;
+use crate::scenes::dataset::Dataset;
+use crate::store::objects;
+
+/// The folder of the parts.
+const FOLDER: &str = "parts";
+/// zstd level: a part is read once.
+const LEVEL: i32 = 1;
+
+/// Names a part of a scene.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PartName {
+    /// The scene.
+    pub scene: u64,
+    /// Key of the task that joins it, hexadecimal.
+    pub task_key: String,
+    /// Which part, and of how many.
+    pub part: (u32, u32),
+}
+
+impl PartName {
+    pub(crate) fn key(&self) -> String {
+        let (index, of) = self.part;
+        format!(
+            "{FOLDER}/{}/{}/{index}-of-{of}.zst",
+            self.scene, self.task_key
+        )
+    }
+}
+
+/// The scene that an object belongs to, if it is a part of one.
+pub(crate) fn part_scene(key: &str) -> Option<u64> {
+    let rest = key.strip_prefix(FOLDER)?.strip_prefix('/')?;
+    let (scene, name) = rest.split_once('/')?;
+    (name.ends_with(".zst") && name.matches('/').count() == 1).then(|| scene.parse().ok())?
+}
+
+impl Dataset {
+    /// Puts a part, over a damaged one if need be.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn put_part(&self, name: &PartName, bytes: &[u8]) -> Result<(), DatasetError> {
+        let path = self.path(&name.key());
+        // With a checksum, so that whoever reads it knows that it is whole.
+        let packed = zstd::bulk::Compressor::new(LEVEL).and_then(|mut packer| {
+            packer.include_checksum(true)?;
+            packer.compress(bytes)
+        });
+        let packed = packed.map_err(|e| DatasetError::codec("part of a scene", e))?;
+        objects::overwrite(&*self.store, &path, packed.into()).await
+    }
+
+    /// A part; `None` where there is none, or a damaged one.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn part(&self, name: &PartName) -> Result<Option<Bytes>, DatasetError> {
+        let path = self.path(&name.key());
+        let Some(packed) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        match unpack(&packed, self.most_of_a_part()) {
+            Ok(bytes) => Ok(Some(bytes.into())),
+            Err(error) => {
+                tracing::warn!(object = %path, %error, "a part of a scene is damaged; it is rendered again");
+                Ok(None)
+            }
+        }
+    }
+
+    /// Bytes that a part of a scene has at most: sums, squares and draws of every histogram there is, in 64 bits.
+    fn most_of_a_part(&self) -> u64 {
+        const HISTOGRAMS: u64 = 8;
+        let spec = self.spec();
+        let each = if spec.per_spot {
+            u64::from(spec.spots)
+        } else {
+            0
+        };
+        let histograms = 1 + spec.subsets.sizes().len() as u64 + each;
+        let values = spec.transient_len() as u64;
+        values * histograms * HISTOGRAMS * 8 + (64 << 20)
+    }
+
+    /// Deletes a part, if it is there.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn delete_part(&self, name: &PartName) -> Result<(), DatasetError> {
+        let path: Path = self.path(&name.key());
+        match self.store.delete(&path).await {
+            Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
+            Err(e) => Err(DatasetError::store("delete", self.shown(&path), e)),
+        }
+    }
+}
+
+/// Unpacks a part that says how large it is, and is no larger than `most`.
+fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
+    let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
+    let size = zstd::zstd_safe::get_frame_content_size(packed);
+    let size = size
+        .ok()
+        .flatten()
+        .ok_or_else(|| invalid("does not say how large it is"))?;
+    picofarm_files::read_entry(zstd::Decoder::new(packed)?, size, most)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_that_announces_too_much_or_another_size_is_not_unpacked() {
+        let bomb = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
+        assert!(bomb.len() < 1 << 16);
+        let said = unpack(&bomb, 1 << 20).unwrap_err().to_string();
+        assert!(said.contains("announces 67108864 bytes"), "{said}");
+        assert_eq!(unpack(&bomb, 64 << 20).unwrap().len(), 64 << 20);
+        // Without a size in its header.
+        let streamed = zstd::encode_all(&vec![0; 1 << 20][..], 1).unwrap();
+        assert!(unpack(&streamed, 2 << 20).is_err());
+    }
+
+    #[test]
+    fn only_names_of_parts_are_taken_for_parts() {
+        let name = PartName {
+            scene: 7,
+            task_key: "ab".into(),
+            part: (2, 4),
+        };
+        assert_eq!(part_scene(&name.key()), Some(7));
+        for other in [
+            "parts/7/ab",
+            "parts/x/ab/2-of-4.zst",
+            "transient/c/7/0/0/0",
+            "parts/7/2-of-4.zst",
+        ] {
+            assert_eq!(part_scene(other), None, "{other}");
+        }
+    }
+}

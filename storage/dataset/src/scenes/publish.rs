@@ -1,0 +1,165 @@
+//! Publishing scenes: create-only objects, then the manifest, which is the durable record of completion.
+
+use bytes::Bytes;
+use futures::{StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
+use object_store::path::Path;
+
+use crate::error::DatasetError;
+use crate::layout::manifest::Manifest;
+use crate::layout::record::{Provenance, SceneRecord};
+use crate::scenes::dataset::Dataset;
+use crate::scenes::encode::{EncodedScene, encode_scene};
+use crate::store::objects;
+
+/// Requests in flight for one scene.
+pub(crate) const CONCURRENCY: usize = 8;
+
+impl Dataset {
+    /// Codes a scene on rayon's threads. Pure and blocking: from async code, call it through `spawn_blocking` and
+    /// hand the result to [`Self::publish_encoded`].
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] names the field and index of an unusable value; [`DatasetError::SceneOutOfRange`].
+    pub fn encode(
+        &self,
+        scene: u64,
+        record: &SceneRecord<'_>,
+        provenance: &Provenance,
+    ) -> Result<EncodedScene, DatasetError> {
+        self.check_scene(scene)?;
+        encode_scene(self, scene, record, provenance)
+    }
+
+    /// Publishes a coded scene. Objects first, the manifest last, all create-only; an object that exists with equal
+    /// bytes counts as written, so that a scene half-written by a killed worker is completed and publishing twice
+    /// succeeds. When it returns, each object was there at a time when the manifest already protected it from
+    /// [`Self::collect`].
+    ///
+    /// # Errors
+    /// [`DatasetError::Conflict`] where an object exists with other bytes (nothing stored is changed);
+    /// [`DatasetError::Store`].
+    pub async fn publish_encoded(&self, scene: EncodedScene) -> Result<Manifest, DatasetError> {
+        let EncodedScene { manifest, bytes } = scene;
+        let paths = manifest.objects.iter().map(|object| self.path(&object.key));
+        let objects: Vec<(Path, Bytes)> = paths.zip(bytes).collect();
+        put_all(&*self.store, &objects).await?;
+        let path = self.path(&Manifest::key(manifest.scene));
+        let put_manifest =
+            objects::create_or_match(&*self.store, &path, manifest.to_bytes().into());
+        let manifest = match put_manifest.await {
+            Ok(()) => manifest,
+            Err(conflict @ DatasetError::Conflict { .. }) => {
+                match self.older_form(&path, &manifest).await? {
+                    Some(stored) => stored,
+                    None => return Err(conflict),
+                }
+            }
+            Err(error) => return Err(error),
+        };
+        put_again(&*self.store, &objects).await?;
+        Ok(manifest)
+    }
+
+    /// The stored manifest, where it says the same in the form it had before manifests had a checksum.
+    async fn older_form(
+        &self,
+        path: &Path,
+        ours: &Manifest,
+    ) -> Result<Option<Manifest>, DatasetError> {
+        let stored = objects::require(&*self.store, path).await?;
+        let parsed = Manifest::parse(&stored, ours.scene, &self.shown(path));
+        Ok(parsed.ok().filter(|stored| stored.same_as(ours)))
+    }
+
+    /// Codes and publishes a scene; blocks its thread while coding.
+    ///
+    /// # Errors
+    /// Those of [`Self::encode`] and [`Self::publish_encoded`].
+    pub async fn publish(
+        &self,
+        scene: u64,
+        record: &SceneRecord<'_>,
+        provenance: &Provenance,
+    ) -> Result<Manifest, DatasetError> {
+        let encoded = self.encode(scene, record, provenance)?;
+        self.publish_encoded(encoded).await
+    }
+
+    /// The manifest of a scene published before, by whomever, after checking that each of its objects exists with
+    /// the stated size; `None` where the scene is not published. Lets a worker adopt work finished before a crash.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`] where the manifest is there but an object is missing (publishing again restores it)
+    /// or has another size; [`DatasetError::Store`].
+    pub async fn published(&self, scene: u64) -> Result<Option<Manifest>, DatasetError> {
+        self.check_scene(scene)?;
+        let path = self.path(&Manifest::key(scene));
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            return Ok(None);
+        };
+        let manifest = Manifest::parse(&bytes, scene, &self.shown(&path))?;
+        let objects = manifest.objects.iter();
+        let checks: Vec<_> = objects
+            .map(|object| check_size(&*self.store, self.path(&object.key), object.size))
+            .collect();
+        all(checks).await?;
+        Ok(Some(manifest))
+    }
+}
+
+/// Puts objects create-only, some at a time; those that exist must have equal bytes.
+pub(crate) async fn put_all(
+    store: &dyn ObjectStore,
+    objects: &[(Path, Bytes)],
+) -> Result<(), DatasetError> {
+    let put = |(path, bytes): &(Path, Bytes)| {
+        let (path, bytes) = (path.clone(), bytes.clone());
+        async move { objects::create_or_match(store, &path, bytes).await }
+    };
+    all(objects.iter().map(put).collect()).await
+}
+
+/// The same for those that are gone when the manifest stands. A collector may have taken an object before there was a
+/// manifest to protect it: what a killed worker had left and was found equal, or what this process wrote before it stood
+/// still for long.
+pub(crate) async fn put_again(
+    store: &dyn ObjectStore,
+    objects: &[(Path, Bytes)],
+) -> Result<(), DatasetError> {
+    let again = |(path, bytes): &(Path, Bytes)| {
+        let (path, bytes) = (path.clone(), bytes.clone());
+        async move {
+            match objects::size(store, &path).await? {
+                Some(_) => Ok(()),
+                None => objects::create_or_match(store, &path, bytes).await,
+            }
+        }
+    };
+    all(objects.iter().map(again).collect()).await
+}
+
+/// Waits for all, some at a time; the first error ends it.
+async fn all(
+    requests: Vec<impl Future<Output = Result<(), DatasetError>>>,
+) -> Result<(), DatasetError> {
+    let mut results = stream::iter(requests).buffer_unordered(CONCURRENCY);
+    while results.try_next().await?.is_some() {}
+    Ok(())
+}
+
+pub(crate) async fn check_size(
+    store: &dyn ObjectStore,
+    path: Path,
+    expected: u64,
+) -> Result<(), DatasetError> {
+    let what = match objects::size(store, &path).await? {
+        Some(size) if size == expected => return Ok(()),
+        Some(size) => format!("expected {expected} bytes, found {size}"),
+        None => "the object is missing".into(),
+    };
+    Err(DatasetError::Damaged {
+        object: objects::shown(store, &path),
+        what,
+    })
+}

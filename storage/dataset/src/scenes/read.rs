@@ -1,0 +1,331 @@
+//! Reading published scenes back.
+
+use std::ops::Range;
+
+use futures::{Stream, StreamExt, TryStreamExt, stream};
+use object_store::ObjectStore;
+use object_store::path::Path;
+
+use crate::coding::tiles::Part;
+use crate::error::DatasetError;
+use crate::layout::arrays::{Element, Quantity};
+use crate::layout::manifest::Manifest;
+use crate::layout::record::{Intrinsics, Spot};
+use crate::scenes::dataset::Dataset;
+use crate::store::objects;
+
+/// A type in which an array may be stored.
+pub trait Stored: bytemuck::Pod + sealed::Stored {}
+
+mod sealed {
+    pub trait Stored {
+        const ELEMENT: crate::layout::arrays::Element;
+    }
+}
+
+macro_rules! stored {
+    ($($type:ty => $element:ident),*) => {$(
+        impl sealed::Stored for $type {
+            const ELEMENT: Element = Element::$element;
+        }
+        impl Stored for $type {}
+    )*};
+}
+stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
+
+/// The scenes that have a manifest in a folder, ascending.
+pub(crate) async fn scenes_in(
+    store: &dyn ObjectStore,
+    folder: &Path,
+) -> Result<Vec<u64>, DatasetError> {
+    let mut scenes: Vec<u64> = store
+        .list(Some(folder))
+        .try_filter_map(|object| async move {
+            let name = object
+                .location
+                .filename()
+                .and_then(|n| n.strip_suffix(".json"));
+            Ok(name.and_then(|n| n.parse::<u64>().ok()))
+        })
+        .try_collect()
+        .await
+        .map_err(|e| DatasetError::store("list", objects::shown(store, folder), e))?;
+    scenes.sort_unstable();
+    Ok(scenes)
+}
+
+impl Dataset {
+    /// The manifest of a published scene (its objects are not looked at; see [`Self::published`]).
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn manifest(&self, scene: u64) -> Result<Manifest, DatasetError> {
+        self.check_scene(scene)?;
+        let path = self.path(&Manifest::key(scene));
+        match objects::get(&*self.store, &path).await? {
+            Some(bytes) => Manifest::parse(&bytes, scene, &self.shown(&path)),
+            None => Err(DatasetError::NotPublished {
+                scene,
+                object: self.shown(&path),
+            }),
+        }
+    }
+
+    /// Indices of the published scenes, ascending.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn scenes_present(&self) -> Result<Vec<u64>, DatasetError> {
+        let mut scenes = scenes_in(&*self.store, &self.path("manifests")).await?;
+        scenes.retain(|scene| *scene < self.spec.scenes);
+        Ok(scenes)
+    }
+
+    /// h of a scene, decoded, with the exact values of saturated bins: `[row][column][bin]`. Blocks its thread
+    /// while decoding on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn read_transient(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        self.read_histogram(scene, Quantity::Transient).await
+    }
+
+    /// h of a scene from any of the data set's transients: `[row][column][bin]`, for `TransientSpots`
+    /// `[spot][row][column][bin]`. Blocks its thread while decoding on rayon's threads.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the data set has no such transient; those of [`Self::read_transient`].
+    pub async fn read_histogram(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let mut target = Vec::new();
+        self.read_histogram_into(scene, quantity, &mut target)
+            .await?;
+        Ok(target)
+    }
+
+    /// The same into `target`, which becomes as long as needed and is overwritten: whoever reads scene after scene is
+    /// spared a fresh 167 MB for each.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_histogram`]; what `target` holds then is worth nothing.
+    pub async fn read_histogram_into(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+        target: &mut Vec<f32>,
+    ) -> Result<(), DatasetError> {
+        let array = self.array_of(quantity)?;
+        if !quantity.is_transient() {
+            let what = format!("{} is no transient; use read", quantity.name());
+            return Err(DatasetError::invalid("quantity", what));
+        }
+        let manifest = self.manifest(scene).await?;
+        let path = self.path(&array.layout.key(scene));
+        let bytes = objects::require(&*self.store, &path).await?;
+        let len = array.layout.planes() * self.spec.transient_len();
+        if target.len() != len {
+            // Fresh pages come zeroed from the system; growing would touch them twice.
+            *target = vec![0.0; len];
+        }
+        self.decode_shard_into(&manifest, array, &bytes, target)
+            .map_err(|e| e.in_object(|| self.shown(&path)))
+    }
+
+    /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
+    /// training loops; a scene that cannot be read gives its error and the next one follows.
+    ///
+    /// # Panics
+    /// Outside of a tokio runtime.
+    pub fn read_transients(
+        &self,
+        scenes: Vec<u64>,
+        ahead: usize,
+    ) -> impl Stream<Item = (u64, Result<Vec<f32>, DatasetError>)> + use<> {
+        let dataset = self.clone();
+        stream::iter(scenes)
+            .map(move |scene| {
+                let dataset = dataset.clone();
+                async move { (scene, dataset.read_apart(scene).await) }
+            })
+            .buffered(ahead.max(1))
+    }
+
+    /// A scene's transient, decoded on a thread of its own.
+    async fn read_apart(self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let manifest = self.manifest(scene).await?;
+        let path = self.path(&self.array(Quantity::Transient).layout.key(scene));
+        let bytes = objects::require(&*self.store, &path).await?;
+        let decoded = tokio::task::spawn_blocking(move || {
+            self.decode_shard(&manifest, self.array(Quantity::Transient), &bytes)
+                .map_err(|e| e.in_object(|| self.shown(&path)))
+        });
+        let broken = |e| DatasetError::codec("cannot decode a scene", e);
+        decoded.await.map_err(broken)?
+    }
+
+    /// A window of h: `[row][column][bin]` for the given rows and columns. Fetches and decodes only the inner
+    /// chunks it touches.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the window is empty or leaves the image; those of [`Self::read_transient`].
+    pub async fn read_transient_crop(
+        &self,
+        scene: u64,
+        rows: Range<u32>,
+        columns: Range<u32>,
+    ) -> Result<Vec<f32>, DatasetError> {
+        self.read_transient_part(scene, rows, columns, 0..self.spec.gate.bins)
+            .await
+    }
+
+    /// The same of the given bins alone. Fetches and decodes only the inner chunks that it touches, of 32×32 pixels and
+    /// 128 bins (of all bins in data sets of format 1).
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where a range is empty or leaves the transient; those of [`Self::read_transient`].
+    pub async fn read_transient_part(
+        &self,
+        scene: u64,
+        rows: Range<u32>,
+        columns: Range<u32>,
+        bins: Range<u32>,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let limits = [
+            ("rows", &rows, self.spec.height),
+            ("columns", &columns, self.spec.width),
+            ("bins", &bins, self.spec.gate.bins),
+        ];
+        for (field, range, limit) in limits {
+            if range.is_empty() || range.end > limit {
+                let what = format!(
+                    "expected a range within 0..{limit} that is not empty, found {range:?}"
+                );
+                return Err(DatasetError::invalid(field, what));
+            }
+        }
+        let of = |range: Range<u32>| range.start as usize..range.end as usize;
+        let part = Part {
+            rows: of(rows),
+            columns: of(columns),
+            bins: of(bins),
+        };
+        let manifest = self.manifest(scene).await?;
+        self.read_part(&manifest, self.array(Quantity::Transient), part)
+            .await
+    }
+
+    /// h of one spot alone, from `transient_spots`: `[row][column][bin]`. Fetches and decodes nothing of the other spots.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where the data set has no such transient or no such spot; those of
+    /// [`Self::read_transient`].
+    pub async fn read_spot(&self, scene: u64, spot: u32) -> Result<Vec<f32>, DatasetError> {
+        let array = self.array_of(Quantity::TransientSpots)?;
+        if spot >= self.spec.spots {
+            let what = format!(
+                "the data set has {} spots, counted from 0; found {spot}",
+                self.spec.spots
+            );
+            return Err(DatasetError::invalid("spot", what));
+        }
+        let (height, width) = (self.spec.height as usize, self.spec.width as usize);
+        let top = spot as usize * height;
+        let manifest = self.manifest(scene).await?;
+        let part = Part {
+            rows: top..top + height,
+            columns: 0..width,
+            bins: 0..self.spec.gate.bins as usize,
+        };
+        self.read_part(&manifest, array, part).await
+    }
+
+    /// The stored values of a quantity that is no transient, in the shape [`Quantity`] states.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where `T` is not the stored type or a transient is asked for;
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn read<T: Stored>(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+    ) -> Result<Vec<T>, DatasetError> {
+        let array = self.array_of(quantity)?;
+        if quantity.is_transient() {
+            return Err(DatasetError::invalid(
+                "quantity",
+                "transients are read by read_transient and read_histogram",
+            ));
+        }
+        if array.layout.element != T::ELEMENT {
+            let what = format!(
+                "{} is stored as {}, not {}",
+                quantity.name(),
+                array.layout.element.name(),
+                T::ELEMENT.name()
+            );
+            return Err(DatasetError::invalid("quantity", what));
+        }
+        let path = self.path(&array.layout.key(scene));
+        let Some(bytes) = objects::get(&*self.store, &path).await? else {
+            // Tells a scene that is not there from one that lost an object.
+            self.manifest(scene).await?;
+            return Err(DatasetError::Damaged {
+                object: self.shown(&path),
+                what: "the object is missing".into(),
+            });
+        };
+        let values = array.codec.decode(&bytes);
+        let values = values.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        Ok(bytemuck::pod_collect_to_vec(&values))
+    }
+
+    /// Unit normals, camera frame: `[row][column][3]`.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_normal(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let codes = self.read::<i16>(scene, Quantity::Normal).await?;
+        Ok(codes.into_iter().map(|n| f32::from(n) / 32767.0).collect())
+    }
+
+    /// Visibility, 1 = lit: `[spot][row][column]`.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_visibility(&self, scene: u64) -> Result<Vec<u8>, DatasetError> {
+        let packed = self.read::<u8>(scene, Quantity::Visibility).await?;
+        let pixels = self.spec.pixels();
+        let spot = |s: usize| {
+            packed[s / 8 * pixels..][..pixels]
+                .iter()
+                .map(move |b| b >> (s % 8) & 1)
+        };
+        Ok((0..self.spec.spots as usize).flat_map(spot).collect())
+    }
+
+    /// The spots in the camera frame; `None` where a beam meets nothing.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_spots(&self, scene: u64) -> Result<Vec<Option<Spot>>, DatasetError> {
+        let rows = self.read::<f32>(scene, Quantity::Spots).await?;
+        Ok(rows.chunks_exact(7).map(Spot::from_row).collect())
+    }
+
+    /// Intrinsics.
+    ///
+    /// # Errors
+    /// See [`Self::read`].
+    pub async fn read_intrinsics(&self, scene: u64) -> Result<Intrinsics, DatasetError> {
+        let v = self.read::<f32>(scene, Quantity::Intrinsics).await?;
+        Ok(Intrinsics {
+            fx: v[0],
+            fy: v[1],
+            cx: v[2],
+            cy: v[3],
+        })
+    }
+}

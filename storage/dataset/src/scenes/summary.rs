@@ -1,0 +1,73 @@
+//! A data set in numbers.
+
+use futures::future::BoxFuture;
+use futures::{FutureExt, StreamExt, TryStreamExt, stream};
+
+use crate::error::DatasetError;
+use crate::layout::manifest::Manifest;
+use crate::layout::spec::DatasetSpec;
+use crate::scenes::dataset::Dataset;
+
+/// Requests in flight.
+const CONCURRENCY: usize = 16;
+
+/// A data set in numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Summary {
+    /// Its properties; `spec.scenes` is the number of scenes there is room for.
+    pub spec: DatasetSpec,
+    /// Published scenes.
+    pub scenes: u64,
+    /// Bytes of their objects.
+    pub bytes: u64,
+    /// Largest coding error of any bin of any scene, in σ.
+    pub max_sigma: f64,
+    /// Smallest and largest root-mean-square coding error of a scene, in σ; `None` while nothing is published.
+    pub rms_sigma: Option<(f64, f64)>,
+    /// Saturated bins kept in overflow lists.
+    pub overflow: u64,
+    /// Median over the scenes of the Monte Carlo error that the renderer states (`error.median_relative` in the
+    /// provenance's plan: median over pixels of standard error / h); `None` where no scene states one.
+    pub noise: Option<f64>,
+}
+
+impl Dataset {
+    /// Sums the data set up from its manifests.
+    ///
+    /// # Errors
+    /// [`DatasetError::Damaged`] names an unusable manifest; [`DatasetError::Store`].
+    pub async fn info(&self) -> Result<Summary, DatasetError> {
+        let scenes = self.scenes_present().await?;
+        let mut summary = Summary {
+            spec: self.spec,
+            scenes: scenes.len() as u64,
+            bytes: 0,
+            max_sigma: 0.0,
+            rms_sigma: None,
+            overflow: 0,
+            noise: None,
+        };
+        let mut noise = Vec::new();
+        let read = |scene: u64| -> BoxFuture<'_, Result<Manifest, DatasetError>> {
+            self.manifest(scene).boxed()
+        };
+        let mut manifests =
+            stream::iter(scenes.into_iter().map(read)).buffer_unordered(CONCURRENCY);
+        while let Some(manifest) = manifests.try_next().await? {
+            summary.bytes += manifest.total_bytes();
+            summary.overflow += manifest.overflow.len() as u64;
+            summary.max_sigma = summary.max_sigma.max(manifest.error.max_sigma);
+            for subset in manifest.subsets.values() {
+                summary.overflow += subset.overflow.len() as u64;
+                summary.max_sigma = summary.max_sigma.max(subset.error.max_sigma);
+            }
+            noise.extend(manifest.provenance.plan["error"]["median_relative"].as_f64());
+            let rms = manifest.error.rms_sigma;
+            let (low, high) = summary.rms_sigma.unwrap_or((rms, rms));
+            summary.rms_sigma = Some((low.min(rms), high.max(rms)));
+        }
+        noise.sort_by(f64::total_cmp);
+        summary.noise = noise.get(noise.len() / 2).copied();
+        Ok(summary)
+    }
+}

@@ -1,0 +1,225 @@
+//! Parts of a transient: fetching the inner chunks that hold them, and nothing else, and decoding these.
+
+use std::ops::Range;
+
+use bytes::Bytes;
+use object_store::ObjectStoreExt;
+use rayon::prelude::*;
+
+use crate::coding::shard;
+use crate::coding::tiles::{Part, Tiles};
+use crate::coding::values::Decoder;
+use crate::error::DatasetError;
+use crate::layout::manifest::Manifest;
+use crate::layout::spec::DatasetSpec;
+use crate::scenes::dataset::{ArrayCodec, Dataset};
+
+/// Inner chunks so close to each other are fetched by one request, with the bytes between them.
+const GAP: u64 = 16 * 1024;
+
+impl Dataset {
+    /// A part of an array.
+    pub(crate) async fn read_part(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        part: Part,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let tiles = Tiles::new(&self.spec, &array.layout);
+        let wanted: Vec<usize> = (0..tiles.count())
+            .filter(|tile| tiles.touches(*tile, &part))
+            .collect();
+        let chunks = self.fetch_tiles(manifest, array, &tiles, &wanted).await?;
+        let mut target = vec![0f32; part.len()];
+        let decoding = self.decoding(manifest, array);
+        let complete = decoding.part(&tiles, chunks, &part, &mut target);
+        let path = self.path(&array.layout.key(manifest.scene));
+        let complete = complete.map_err(|e| e.in_object(|| self.shown(&path)))?;
+        self.complete(manifest, complete)?;
+        Ok(target)
+    }
+
+    /// The coded bytes of the wanted tiles; `None` = all fill value.
+    async fn fetch_tiles(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        tiles: &Tiles,
+        wanted: &[usize],
+    ) -> Result<Vec<(usize, Option<Bytes>)>, DatasetError> {
+        let key = array.layout.key(manifest.scene);
+        let path = self.path(&key);
+        let damaged = |what: String| DatasetError::Damaged {
+            object: self.shown(&path),
+            what,
+        };
+        let entry = manifest
+            .object(&key)
+            .ok_or_else(|| damaged("the manifest does not list it".into()))?;
+        let tail = shard::index_len(tiles.count()) as u64;
+        let Some(start) = entry.size.checked_sub(tail) else {
+            return Err(damaged(format!(
+                "{} bytes are too few for a shard",
+                entry.size
+            )));
+        };
+        let fetch_error = |e| match e {
+            object_store::Error::NotFound { .. } => damaged("the object is missing".into()),
+            e => DatasetError::store("read", self.shown(&path), e),
+        };
+        let index = self.store.get_range(&path, start..entry.size);
+        let index = index.await.map_err(fetch_error)?;
+        let index = shard::parse_index(&index, tiles.count(), entry.size)?;
+        let ranges: Vec<(usize, Range<u64>)> = wanted
+            .iter()
+            .filter_map(|tile| index[*tile].clone().map(|range| (*tile, range)))
+            .collect();
+        let only: Vec<Range<u64>> = ranges.iter().map(|(_, r)| r.clone()).collect();
+        // The store's own way would fetch up to a megabyte between two chunks.
+        let fetch = |range| self.store.get_range(&path, range);
+        let parts = object_store::coalesce_ranges(&only, fetch, GAP);
+        let parts = parts.await.map_err(fetch_error)?;
+        let mut found = ranges.iter().map(|(tile, _)| *tile).zip(parts).peekable();
+        Ok(wanted
+            .iter()
+            .map(|tile| {
+                (
+                    *tile,
+                    found.next_if(|(t, _)| t == tile).map(|(_, bytes)| bytes),
+                )
+            })
+            .collect())
+    }
+
+    /// h of a whole scene from the bytes of its shard.
+    pub(crate) fn decode_shard(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+    ) -> Result<Vec<f32>, DatasetError> {
+        let len = array.layout.planes() * self.spec.transient_len();
+        let mut target = vec![0f32; len];
+        self.decode_shard_into(manifest, array, bytes, &mut target)?;
+        Ok(target)
+    }
+
+    /// The same into a target of that size, which is overwritten.
+    pub(crate) fn decode_shard_into(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+        target: &mut [f32],
+    ) -> Result<(), DatasetError> {
+        let decoding = self.decoding(manifest, array);
+        let whole = decoding.shard(bytes, target)?;
+        self.complete(manifest, whole)
+    }
+
+    fn decoding<'a>(&'a self, manifest: &'a Manifest, array: &'a ArrayCodec) -> Decoding<'a> {
+        Decoding {
+            spec: &self.spec,
+            array,
+            scale: manifest.scale,
+            overflow: manifest.overflow_of(array.layout.quantity),
+        }
+    }
+
+    fn complete(&self, manifest: &Manifest, complete: Complete) -> Result<(), DatasetError> {
+        if complete.0 {
+            return Ok(());
+        }
+        Err(DatasetError::Damaged {
+            object: self.shown(&self.path(&Manifest::key(manifest.scene))),
+            what: "a saturated bin has no exact value in the overflow list".into(),
+        })
+    }
+}
+
+/// Whether each saturated bin had its exact value.
+#[must_use]
+pub(crate) struct Complete(pub bool);
+
+/// What it takes to decode a transient.
+pub(crate) struct Decoding<'a> {
+    pub spec: &'a DatasetSpec,
+    pub array: &'a ArrayCodec,
+    pub scale: f32,
+    pub overflow: &'a [(u64, f32)],
+}
+
+impl Decoding<'_> {
+    /// A whole transient from the bytes of its shard, into a target of its size, which is overwritten.
+    pub fn shard(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
+        let tiles = Tiles::new(self.spec, &self.array.layout);
+        let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
+            let what = format!("{} bytes are too few", bytes.len());
+            return Err(DatasetError::codec("cannot read a shard's index", what));
+        };
+        let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
+        if index.iter().any(Option::is_none) {
+            target.fill(0.0);
+        }
+        let chunks = index
+            .into_iter()
+            .map(|entry| entry.map(|r| bytes.slice(r.start as usize..r.end as usize)))
+            .enumerate()
+            .collect();
+        self.part(&tiles, chunks, &tiles.whole(), target)
+    }
+
+    /// Decodes tiles into a part's values and applies the overflow list. Bands of tiles are decoded at once, each
+    /// straight into its rows. A tile without bytes is all fill value, which the target holds already.
+    fn part(
+        &self,
+        tiles: &Tiles,
+        chunks: Vec<(usize, Option<Bytes>)>,
+        part: &Part,
+        target: &mut [f32],
+    ) -> Result<Complete, DatasetError> {
+        let mut bands = Vec::new();
+        let mut rest = &mut *target;
+        let mut top = part.rows.start;
+        for chunks in chunks.chunk_by(|a, b| tiles.row_of(a.0) == tiles.row_of(b.0)) {
+            let end = tiles.rows_of(chunks[0].0).end.min(part.rows.end);
+            let len = (end - top) * part.row_len();
+            let (values, below) = std::mem::take(&mut rest).split_at_mut(len);
+            let rows = Part {
+                rows: top..end,
+                ..part.clone()
+            };
+            bands.push((chunks, rows, values));
+            rest = below;
+            top = end;
+        }
+        let saturated = bands
+            .into_par_iter()
+            .map(|(chunks, rows, values)| {
+                let mut decoder = Decoder::new(self.spec.profile, self.scale, tiles);
+                let mut saturated = false;
+                for (tile, bytes) in chunks {
+                    let Some(bytes) = bytes else { continue };
+                    let raw = self.array.codec.decode(bytes)?;
+                    saturated |= decoder.decode(*tile, &raw, &rows, values);
+                }
+                Ok(saturated)
+            })
+            .collect::<Result<Vec<bool>, DatasetError>>()?;
+        let bins = self.spec.gate.bins as usize;
+        let width = self.spec.width as usize;
+        for (index, value) in self.overflow {
+            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
+            let (row, column) = (pixel / width, pixel % width);
+            if part.rows.contains(&row)
+                && part.columns.contains(&column)
+                && part.bins.contains(&bin)
+            {
+                let at = (row - part.rows.start) * part.columns.len() + column - part.columns.start;
+                target[at * part.bins.len() + bin - part.bins.start] = *value;
+            }
+        }
+        let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
+        Ok(Complete(complete))
+    }
+}

@@ -1,0 +1,169 @@
+//! Single objects: create-only puts, gets and sizes, with errors that name the object.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use object_store::path::Path;
+use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+
+use crate::error::DatasetError;
+use crate::layout::manifest::sha256_hex;
+use crate::store::no_bucket;
+
+/// Create-only puts of an object that is refused as existing and yet is not there.
+const ATTEMPTS: usize = 4;
+/// Between them.
+const PAUSE: Duration = Duration::from_millis(250);
+
+/// Full path of a key relative to `prefix`.
+pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
+    key.split('/')
+        .fold(prefix.clone(), |path, part| path.join(part))
+}
+
+/// A path as a person would look for it: with the leading `/` for local stores, whose keys are paths from the root.
+pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
+    // The store's root is told only by how it displays itself.
+    let named = |kind: &str| {
+        let name = store.to_string();
+        let (_, rest) = name.split_once(kind)?;
+        Some(rest.trim_end_matches(')').to_string())
+    };
+    if let Some(root) = named("LocalFileSystem(file://") {
+        format!("{}/{path}", root.trim_end_matches('/'))
+    } else if let Some(bucket) = named("AmazonS3(") {
+        format!("s3://{bucket}/{path}")
+    } else if let Some(bucket) = named("GoogleCloudStorage(") {
+        format!("gs://{bucket}/{path}")
+    } else if let Some(container) = named("MicrosoftAzure { account: ") {
+        let container = container.split_once("container: ").map_or("", |c| c.1);
+        format!("az://{}/{path}", container.trim_end_matches(" }"))
+    } else {
+        path.to_string()
+    }
+}
+
+/// The folder that a path of a local store stands for; `None` for other stores.
+pub(crate) fn folder(store: &dyn ObjectStore, path: &Path) -> Option<std::path::PathBuf> {
+    let local = store.to_string().starts_with("LocalFileSystem(file://");
+    local.then(|| shown(store, path).into())
+}
+
+/// Puts create-only. `false`: it exists already.
+pub(crate) async fn create(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<bool, DatasetError> {
+    let options = PutOptions::from(PutMode::Create);
+    match store.put_opts(path, bytes.into(), options).await {
+        Ok(_) => Ok(true),
+        Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => Ok(false),
+        Err(e) => Err(DatasetError::store("write", shown(store, path), e)),
+    }
+}
+
+/// Puts create-only; an object that exists must have equal bytes.
+pub(crate) async fn create_or_match(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), DatasetError> {
+    let mut found = None;
+    for _ in 0..ATTEMPTS {
+        if create(store, path, bytes.clone()).await? {
+            return Ok(());
+        }
+        // Never trust the server's own checksum: read it back.
+        found = get(store, path).await?;
+        if found.is_some() {
+            break;
+        }
+        // Refused because of another request in flight (S3's 409), or collected since.
+        tokio::time::sleep(PAUSE).await;
+    }
+    let Some(stored) = found else {
+        return Err(DatasetError::Store {
+            action: "write",
+            object: shown(store, path),
+            hint: None,
+            account: format!("refused {ATTEMPTS} times as existing, but it does not exist"),
+        });
+    };
+    if stored == bytes {
+        return Ok(());
+    }
+    let (stored, ours) = (sha256_hex(&stored), sha256_hex(&bytes));
+    tracing::error!(object = %path, %stored, %ours, "conflict: an object exists with other bytes");
+    Err(DatasetError::Conflict {
+        object: shown(store, path),
+        stored,
+        ours,
+    })
+}
+
+/// Puts files create-only, in their order: where the last one names the others, whoever sees it finds them. Files that
+/// exist must have equal bytes. For what is no data set.
+///
+/// # Errors
+/// [`DatasetError::Conflict`] for other bytes, [`DatasetError::Store`].
+pub async fn publish_files(
+    store: &dyn ObjectStore,
+    prefix: &Path,
+    files: &[(String, Bytes)],
+) -> Result<(), DatasetError> {
+    for (name, bytes) in files {
+        create_or_match(store, &path_of(prefix, name), bytes.clone()).await?;
+    }
+    Ok(())
+}
+
+/// Puts in any case (for metadata that grows).
+pub(crate) async fn overwrite(
+    store: &dyn ObjectStore,
+    path: &Path,
+    bytes: Bytes,
+) -> Result<(), DatasetError> {
+    let put = store.put_opts(path, bytes.into(), PutOptions::default());
+    put.await
+        .map(drop)
+        .map_err(|e| DatasetError::store("replace", shown(store, path), e))
+}
+
+/// The bytes; `None` where there is no such object.
+pub(crate) async fn get(
+    store: &dyn ObjectStore,
+    path: &Path,
+) -> Result<Option<Bytes>, DatasetError> {
+    let result = match store.get(path).await {
+        Ok(result) => result.bytes().await,
+        Err(e) => Err(e),
+    };
+    match result {
+        Ok(bytes) => Ok(Some(bytes)),
+        Err(e @ Error::NotFound { .. }) if !no_bucket(&e) => Ok(None),
+        Err(e) => Err(DatasetError::store("read", shown(store, path), e)),
+    }
+}
+
+/// The bytes of an object that must be there.
+pub(crate) async fn require(store: &dyn ObjectStore, path: &Path) -> Result<Bytes, DatasetError> {
+    get(store, path)
+        .await?
+        .ok_or_else(|| DatasetError::Damaged {
+            object: shown(store, path),
+            what: "the object is missing".into(),
+        })
+}
+
+/// The size; `None` where there is no such object.
+pub(crate) async fn size(
+    store: &dyn ObjectStore,
+    path: &Path,
+) -> Result<Option<u64>, DatasetError> {
+    match store.head(path).await {
+        Ok(meta) => Ok(Some(meta.size)),
+        Err(e @ Error::NotFound { .. }) if !no_bucket(&e) => Ok(None),
+        Err(e) => Err(DatasetError::store("look up", shown(store, path), e)),
+    }
+}
