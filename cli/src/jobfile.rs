@@ -18,8 +18,8 @@ fn read(path: &Path, asset_dir: &Path) -> Result<JobSpec> {
 }
 
 fn checked(spec: JobSpec, path: &Path) -> Result<JobSpec> {
-    let checked = spec.check().and_then(|()| spec.check_places());
-    checked.map_err(|e| CliError::input(format!("{}: {e}", path.display())))?;
+    spec.check_submitted()
+        .map_err(|e| CliError::input(format!("{}: {e}", path.display())))?;
     Ok(spec)
 }
 

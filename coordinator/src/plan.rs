@@ -181,15 +181,6 @@ fn differences(told: &mut Vec<String>, path: String, was: Option<&Value>, is: Op
     told.push(format!("{path} is {} and was {}", text(is), text(was)));
 }
 
-/// Checks what a client must have resolved before it submits.
-///
-/// # Errors
-/// [`SpecError`] naming the field.
-pub fn check_resolved(spec: &JobSpec) -> Result<(), SpecError> {
-    let mut stages = spec.stages.iter();
-    stages.try_for_each(|stage| stage.check_resolved().map_err(|e| spec.at(stage, e)))
-}
-
 #[cfg(test)]
 mod tests {
     use picofarm_proto::model::{PromoteSettings, PromoteTask, SourceSettings, TaskSpec};

@@ -20,7 +20,6 @@ use crate::{
     VERSION,
     actor::{Command, Submitted},
     auth::{Caller, Quotas},
-    plan,
     submission::Draft,
 };
 
@@ -137,9 +136,7 @@ fn broken(error: CatalogError) -> Status {
 
 fn draft(wire: wire::JobSpec, bytes: usize, quotas: &Quotas, by: &Caller) -> Result<Draft, Status> {
     let spec = JobSpec::try_from(wire).map_err(invalid)?;
-    spec.check().map_err(|e| invalid(e.into()))?;
-    plan::check_resolved(&spec).map_err(|e| invalid(e.into()))?;
-    spec.check_places().map_err(|e| invalid(e.into()))?;
+    spec.check_submitted().map_err(|e| invalid(e.into()))?;
     by.may_submit(&spec, quotas.max_priority)
         .map_err(|e| invalid(e.into()))?;
     let most = quotas.tasks_per_job;

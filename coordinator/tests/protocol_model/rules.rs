@@ -5,10 +5,10 @@
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rules {
     /// A write transaction first locks its instance's row; an instance whose row has run out or is gone writes nothing and
-    /// comes back as a new instance. Enforced by `storage/catalog/src/postgres/instance.rs` (`fence`), which every writing
+    /// comes back as a new instance. Enforced by `storage/database/src/postgres/instance.rs` (`fence`), which every writing
     /// transaction calls first.
     pub instance_is_fenced: bool,
-    /// A range is written only by the instance that owns it. Enforced by `storage/catalog/src/postgres/write.rs`
+    /// A range is written only by the instance that owns it. Enforced by `storage/database/src/postgres/write.rs`
     /// (`replace_known`): one range of another owner fails the whole transaction.
     pub writes_check_owner: bool,
     /// An instance becomes the owner of a lease that a worker names in its hello only if the range still has that epoch,
@@ -22,15 +22,15 @@ pub struct Rules {
     /// Enforced by `coordinator/src/core/leases.rs` (`held_to_do`), called by `core/commit.rs`.
     pub commit_checks_lease: bool,
     /// A worker reports a task only after its objects and then its manifest are stored. Enforced by
-    /// `worker/agent/src/execute/kinds/render.rs` over `storage/dataset/src/publish.rs`.
+    /// `worker/agent/src/execute/kinds/render.rs` over `storage/dataset/src/scenes/publish.rs`.
     pub store_precedes_report: bool,
     /// A worker that finds a manifest takes the task as finished only if the objects exist; else it renders again.
-    /// Enforced by `storage/dataset/src/publish.rs` (`published`).
+    /// Enforced by `storage/dataset/src/scenes/publish.rs` (`published`).
     pub reuse_checks_objects: bool,
     /// The collector takes a range that nobody owns and that is not leased, before it looks for a manifest, and keeps
     /// others off it until its last delete is answered. Not so in the product: `dataset collect` leaves alone what is
     /// younger than a day, looks again after it deleted, and publishers look again after their manifest
-    /// (`storage/dataset/src/collect.rs`).
+    /// (`storage/dataset/src/repair/collect.rs`).
     pub collector_holds_range: bool,
     /// The collector's hold does not run out like an instance's lease: it ends when the collector gives the range back or
     /// its process is dead (its database session has ended). A delete in an object store cannot be fenced, so nobody

@@ -356,6 +356,18 @@ impl JobSpec {
         Ok(())
     }
 
+    /// Checks all that a coordinator holds a submitted job to: fields within their limits, everything pinned that a client
+    /// must pin, and places that mean the same to everyone. Called once on either side.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check_submitted(&self) -> Result<(), SpecError> {
+        self.check()?;
+        let mut stages = self.stages.iter();
+        stages.try_for_each(|stage| stage.check_resolved().map_err(|e| self.at(stage, e)))?;
+        self.check_places()
+    }
+
     /// Checks where a submitted job reads and writes: absolute paths or URLs, none of which climbs. (Job files may name
     /// relative ones; submission resolves them.)
     ///
