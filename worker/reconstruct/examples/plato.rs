@@ -76,7 +76,58 @@ fn main() {
         flipped: num("flip", 0.0) as f32,
         seed: 0,
     };
-    let measured = from_truth(&scene, &rendered, &how).unwrap();
+    let measured = if arg("source", "truth") == "truth" {
+        from_truth(&scene, &rendered, &how).unwrap()
+    } else {
+        let t = Instant::now();
+        let c = picofarm_reconstruct::source::CaptureSettings {
+            gate: Gate {
+                start_m: 1.0,
+                bin_width_m: 0.0384,
+                bins: 391,
+            },
+            samples: num("samples", 8.0) as u32,
+            seed: 0,
+        };
+        let m = picofarm_reconstruct::source::captures_of(&scene, &c, &|_, _| true).unwrap();
+        println!(
+            "captures {:.1}s left out {:?}",
+            t.elapsed().as_secs_f32(),
+            m.left_out
+        );
+        let tr = from_truth(&scene, &rendered, &how).unwrap();
+        let n = m.pixels();
+        for (k, s) in m.spots.iter().enumerate() {
+            let (mut a, mut b, mut c, mut e, mut u) = (0, 0, 0, 0.0, 0);
+            for p in 0..n {
+                let q = k * n + p;
+                if m.used[q] == 0 || tr.used[q] == 0 {
+                    u += 1;
+                    continue;
+                }
+                match (m.lit[q], tr.lit[q]) {
+                    (1, 0) => a += 1,
+                    (0, 1) => b += 1,
+                    (1, 1) => {
+                        c += 1;
+                        if (m.tau[q] - tr.tau[q]).abs() > 0.06 {
+                            e += 1.0
+                        }
+                    }
+                    _ => {}
+                }
+            }
+            println!(
+                "  spot {k} off {:.4} m: false lit {:.4} false shadow {:.4} of them wrong times {:.4} unused {:.3}",
+                (s.point - rendered.spots[s.beam].unwrap().point).length(),
+                a as f32 / n as f32,
+                b as f32 / n as f32,
+                e / c as f32,
+                u as f32 / n as f32
+            );
+        }
+        m
+    };
     for n in arg("nodes", "192").split(',') {
         let settings = Settings {
             nodes: n.parse().unwrap(),

@@ -70,7 +70,6 @@ pub(crate) fn trainable(
     field: &mut Field,
     states: &[State],
     empty: &[f32],
-    closed: bool,
 ) -> (Vec<u32>, Vec<Kind>) {
     let mut near: Vec<bool> = states.iter().map(|&s| s == State::Unseen).collect();
     let strides = field.strides();
@@ -84,11 +83,6 @@ pub(crate) fn trainable(
     let (mut nodes, mut kinds) = (Vec::new(), Vec::new());
     for i in (0..states.len()).filter(|&i| near[i]) {
         let kind = match states[i] {
-            State::Unseen if empty[i] < 0.0 && !closed => {
-                // Nothing closes the room: what no light path crosses lies behind walls.
-                field.logit[i] = 4.0;
-                continue;
-            }
             State::Unseen => {
                 field.logit[i] = match empty[i] {
                     e if e > SURELY => -5.0,

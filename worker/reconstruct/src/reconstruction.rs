@@ -189,7 +189,7 @@ impl Reconstruction {
         let mut these = (Vec::new(), Vec::new());
         match (&carved, settings.shadows) {
             (Some(c), Shadows::Optimise) => {
-                these = trainable(&mut field, &states, &c.empty, !walls.is_empty());
+                these = trainable(&mut field, &states, &c.empty);
             }
             _ => without_optimisation(&mut field, &states, carved.as_ref().map(|c| &*c.empty)),
         }
@@ -223,17 +223,17 @@ impl Reconstruction {
         let of = (&self.measured, &self.depth);
         let mut optimiser =
             Optimiser::new(of, &self.field, self.trainable.clone(), steps, progress)?;
+        // What rays are cast at is decided by the start, so the start stays as it was until the end.
+        let mut field = self.field.clone();
         if let Some(saved) = self.saved.take() {
             let (nodes, moments) = optimiser.state();
             for (&i, u) in nodes.iter().zip(&saved.logits) {
-                self.field.logit[i as usize] = *u;
+                field.logit[i as usize] = *u;
             }
             moments.first = saved.first;
             moments.second = saved.second;
             (optimiser.done, optimiser.loss) = (saved.done, saved.loss);
         }
-        // What rays are cast at is decided by the start, so the start stays as it was until the end.
-        let mut field = self.field.clone();
         let ended = optimiser.run(&mut field, progress);
         let (done, loss) = (optimiser.done, optimiser.loss);
         let (nodes, moments) = optimiser.state();

@@ -86,6 +86,13 @@ impl World {
         self.room[hit.triangle]
     }
 
+    /// The box round all surfaces.
+    pub fn bounds(&self) -> (Vec3, Vec3) {
+        let none = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
+        let corners = self.triangles.iter().flatten();
+        corners.fold(none, |(lo, hi), p| (lo.min(*p), hi.max(*p)))
+    }
+
     /// Whether a place lies inside a solid or behind a wall: of the rays along the six axes that meet a facet, at least half
     /// meet its back; or none meets any. Facets must face outwards of solids and into rooms.
     pub fn buried(&self, stack: &mut Stack, x: Vec3) -> bool {

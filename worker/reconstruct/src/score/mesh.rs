@@ -126,7 +126,8 @@ pub fn mesh_score(
     })
 }
 
-/// Matter farther than 5 cm from any surface, inside the room and outside of solids.
+/// Matter farther than 5 cm from any surface, within the box round the scene's surfaces and outside of solids. (Planes of the
+/// room go on beyond an open side; that is no floating matter.)
 ///
 /// # Errors
 /// [`ReconstructError::Invalid`] where the scene has no surface inside the grid.
@@ -137,9 +138,11 @@ pub fn floaters(field: &Field, world: &World, seed: u64) -> Result<Floaters, Rec
         return Err(ReconstructError::invalid("scene", what));
     }
     let tree = tree(&truth)?;
+    let (lo, hi) = world.bounds();
+    let within = |x: Vec3| (0..3).all(|k| x[k] >= lo[k] && x[k] <= hi[k]);
     let threshold = -libm::logf(1.0 - OPAQUE) / field.spacing;
     let dense: Vec<usize> = (0..field.logit.len())
-        .filter(|&i| field.density(i) > threshold)
+        .filter(|&i| field.density(i) > threshold && within(field.at(i)))
         .collect();
     let count: usize = dense
         .par_chunks(1024)
