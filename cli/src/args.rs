@@ -7,6 +7,7 @@ mod job;
 mod model;
 mod network;
 mod ranges;
+mod reconstruct;
 mod render;
 mod secrets;
 mod sweep;
@@ -24,6 +25,7 @@ pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, Dataset
 pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
+pub use reconstruct::{Reconstruct, SpotsFrom, ViewsArg};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use secrets::without_secrets;
 pub use sweep::{Sweep, WhichSweep};
@@ -166,6 +168,8 @@ pub enum Command {
     /// Make, inspect and render single scenes
     #[command(subcommand)]
     Scene(Scene),
+    /// Reconstruct one scene in 3D from two-bounce times and shadows, without a farm: mesh, density and errors
+    Reconstruct(Reconstruct),
     /// Say who may use a coordinator
     #[command(subcommand)]
     Token(Token),
@@ -398,15 +402,18 @@ pub enum Scene {
         /// Where to write it
         #[arg(long, default_value = "scene.glb", value_name = "FILE")]
         out: PathBuf,
-        /// Laser spots: 1, 4, 16, 25 or 100
-        #[arg(long, default_value_t = 25, value_parser = ranges::spots)]
-        spots: u32,
+        /// Laser spots: 1, 4, 16, 25 or 100 [default: 25; 16 in plato rooms, which have no more]
+        #[arg(long, value_parser = ranges::spots)]
+        spots: Option<u32>,
         /// Image width and height in pixels
         #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
         resolution: u32,
         /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
         #[arg(long, default_value = "auto")]
         assets: String,
+        /// What stands in a plato room
+        #[arg(long, value_enum, default_value_t = PlatoArg::Chair)]
+        object: PlatoArg,
     },
     /// Say what a scene file holds
     Show {
@@ -456,6 +463,17 @@ pub enum FormatArg {
 pub enum GeneratorArg {
     Furnished,
     Primitive,
+    /// The room that reconstructions are measured in, after PlatoNeRF's
+    Plato,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+pub enum PlatoArg {
+    Chair,
+    Armchair,
+    /// A box that a board hides from the camera
+    HiddenBox,
+    Empty,
 }
 
 #[derive(Subcommand)]

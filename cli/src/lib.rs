@@ -27,6 +27,7 @@ mod pace;
 mod paths;
 pub mod picture;
 mod reach;
+mod reconstruct;
 mod render;
 pub mod roles;
 mod scene;
@@ -156,6 +157,7 @@ async fn run(
         #[cfg(not(feature = "networks"))]
         Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
         Command::Scene(command) => scene::run(command, settings, output).await,
+        Command::Reconstruct(args) => reconstruct::run(args, output).await,
         Command::Token(command) => token::run(command, output),
         Command::Audit(args) => audit::run(&args, settings, output).await,
         Command::Assets(command) => assets::run(command, settings, output).await,

@@ -7,12 +7,13 @@ use picofarm_scene::{
     AssetLibrary, LaserGrid, Scene, export,
     furnished::{self, FurnishedSettings},
     import::{self, ImportOptions},
+    plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
 };
 use serde_json::json;
 
 use crate::{
-    args::{FormatArg, GeneratorArg, Scene as Command, SceneExport},
+    args::{FormatArg, GeneratorArg, PlatoArg, Scene as Command, SceneExport},
     error::{CliError, Result, io},
     output::Output,
     render, sense,
@@ -28,8 +29,9 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
             spots,
             resolution,
             assets: name,
+            object,
         } => {
-            let scene = generate(kind, seed, spots, resolution, &name, settings)?;
+            let scene = generate(kind, seed, spots, resolution, object, &name, settings)?;
             export::write_glb(&scene, &out)?;
             output.result(
                 &json!({"file": out, "name": scene.name, "objects": scene.objects.len(), "triangles": scene.triangle_count()}),
@@ -110,18 +112,20 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
 fn generate(
     kind: GeneratorArg,
     seed: u64,
-    spots: u32,
+    spots: Option<u32>,
     resolution: u32,
+    object: PlatoArg,
     assets: &str,
     settings: &Settings,
 ) -> Result<Scene> {
+    let grid = spots.unwrap_or(25);
     match kind {
         GeneratorArg::Furnished => {
             let library = AssetLibrary::named(assets, std::slice::from_ref(&settings.assets))?;
             let settings = FurnishedSettings {
                 assets: library.name().to_owned(),
                 specular_at_least: 1,
-                spots,
+                spots: grid,
                 width: resolution,
                 height: resolution,
                 ..Default::default()
@@ -130,12 +134,26 @@ fn generate(
         }
         GeneratorArg::Primitive => {
             let settings = PrimitiveSettings {
-                spots,
+                spots: grid,
                 width: resolution,
                 height: resolution,
                 ..Default::default()
             };
             Ok(primitive::generate(seed, &settings)?)
+        }
+        GeneratorArg::Plato => {
+            let object = match object {
+                PlatoArg::Chair => PlatoObject::Chair,
+                PlatoArg::Armchair => PlatoObject::Armchair,
+                PlatoArg::HiddenBox => PlatoObject::HiddenBox,
+                PlatoArg::Empty => PlatoObject::Empty,
+            };
+            let spots = spots.unwrap_or(16) as usize;
+            Ok(plato::generate(&PlatoSettings {
+                object,
+                spots,
+                resolution,
+            })?)
         }
     }
 }

@@ -16,6 +16,7 @@ mod layout;
 mod material;
 mod mesh;
 mod model;
+pub mod plato;
 pub mod primitive;
 mod rng;
 mod shape;

@@ -285,6 +285,14 @@ impl AssetLibrary {
         self.assets.is_empty()
     }
 
+    /// The first model of a category of our own furniture, in its own frame.
+    pub(crate) fn first(&self, label: &str) -> Mesh {
+        let asset = self.by_label.get(label).and_then(|of| of.first());
+        let model = asset.and_then(|&k| self.assets[k].model());
+        let model = model.expect("our own furniture has models of the categories that we ask for");
+        (*model.mesh).clone()
+    }
+
     /// A random asset of a category that `fits` by its (width, height, depth) and elevation, with its
     /// model; `None` if the category has none or a few draws do not fit.
     pub(crate) fn draw(

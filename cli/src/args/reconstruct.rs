@@ -1,0 +1,61 @@
+//! The arguments of `reconstruct`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::render::{GateArgs, SceneRoot};
+
+#[derive(Args)]
+pub struct Reconstruct {
+    /// A .glb, .gltf, .xml (Mitsuba) or .json scene
+    pub file: PathBuf,
+    #[command(flatten)]
+    pub root: SceneRoot,
+    /// Folder for mesh.ply, density.zarr and metrics.json (must not exist, or be empty)
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Where times and shadows come from
+    #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
+    pub spots_from: SpotsFrom,
+    /// Image width and height in pixels of the measurements
+    #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub resolution: u32,
+    /// Nodes of the density grid along its longest side
+    #[arg(long, default_value_t = 192, value_name = "N", conflicts_with = "fine", value_parser = clap::value_parser!(u32).range(16..=512))]
+    pub nodes: u32,
+    /// A grid of 256 nodes: smaller errors at twice the time
+    #[arg(long)]
+    pub fine: bool,
+    /// Leave out what closes the room by planes where the camera does not look
+    #[arg(long)]
+    pub no_planes: bool,
+    /// Novel views to measure errors in: a circle in the middle of the scene, or PlatoNeRF's 139 in its room
+    #[arg(long, value_enum, default_value_t = ViewsArg::Around)]
+    pub views: ViewsArg,
+    /// Camera paths per pixel of the captures, for three bounces and more
+    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_048_576))]
+    pub samples: u32,
+    /// Seed of all random numbers
+    #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
+    pub seed: u64,
+    /// Threads [default: all cores]
+    #[arg(long, value_parser = super::ranges::threads)]
+    pub threads: Option<usize>,
+    #[command(flatten)]
+    pub gate: GateArgs,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SpotsFrom {
+    /// One rendered capture a spot, all bounces; matched filter and thresholds as PlatoNeRF has them
+    Captures,
+    /// Depth and visibility of the scene itself, exactly
+    Truth,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ViewsArg {
+    Around,
+    Plato,
+}

@@ -1,0 +1,247 @@
+//! `picofarm reconstruct`: one scene file in 3D, without a farm.
+
+mod watch;
+mod written;
+
+use std::time::Instant;
+
+use picofarm_reconstruct::{
+    Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Surface, World,
+    render::Renderer,
+    score::{self, MeshScore},
+    source::{self, CaptureSettings, Disturbed},
+    surface,
+};
+use picofarm_scene::{
+    Scene,
+    import::{self, ImportOptions},
+    plato,
+};
+use picofarm_transient::{Gate, RenderError};
+use serde_json::{Value, json};
+
+use self::{watch::Watch, written::write};
+use crate::{
+    args::{Reconstruct, SpotsFrom, ViewsArg},
+    error::{CliError, Code, Result},
+    output::{Output, duration},
+    render::free_folder,
+    roles, signals,
+};
+
+/// Pixels a side of a novel view.
+const VIEW_SIDE: u32 = 128;
+/// Novel views on the circle, before those are left out that stand in something.
+const AROUND: usize = 24;
+
+/// What was made, and how long each part took.
+struct Made {
+    reconstructed: Reconstructed,
+    mesh: Surface,
+    metrics: Value,
+    seconds: [f64; 3],
+}
+
+/// `reconstruct`.
+///
+/// # Errors
+/// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
+pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
+    free_folder(&args.out)?;
+    let options = ImportOptions::default();
+    let mut scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
+    let i = &mut scene.camera.intrinsics;
+    *i = i.resized(args.resolution, args.resolution);
+    if scene.laser.beams.is_empty() {
+        let what = format!("{}: the scene has no laser beam", args.file.display());
+        return Err(CliError::input(what).hint(
+            "picofarm scene export --spots 16 gives it beams; see docs/rendering.md for laser_directions",
+        ));
+    }
+    let threads = args.threads.unwrap_or_else(roles::cores).max(1);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| {
+            CliError::new(
+                Code::Resource,
+                format!("cannot start {threads} threads: {e}"),
+            )
+        })?;
+    let watch = Watch::new(output, signals::stop_on_signal()?);
+    let (args, watch, made) = tokio::task::spawn_blocking(move || {
+        let made = pool.install(|| make(&args, &scene, threads, &watch));
+        (args, watch, made)
+    })
+    .await
+    .map_err(|e| CliError::new(Code::Failed, format!("the reconstruction broke: {e}")))?;
+    watch.finish();
+    let made = made?;
+    write(&args.out, &made.reconstructed, &made.mesh, &made.metrics)?;
+    let [measuring, fitting, scoring] = made.seconds;
+    let mut shown = made.metrics.clone();
+    shown["out"] = json!(args.out);
+    shown["threads"] = json!(threads);
+    shown["seconds"] =
+        json!({"measurements": measuring, "reconstruction": fitting, "metrics": scoring});
+    output.result(&shown, || told(&args, &made));
+    Ok(())
+}
+
+fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Made> {
+    let start = Instant::now();
+    let measured = measure(args, scene, threads, watch)?;
+    let lap = |since: Instant| since.elapsed().as_secs_f64();
+    let measuring = lap(start);
+    let settings = Settings {
+        nodes: if args.fine {
+            Settings::FINE_NODES
+        } else {
+            args.nodes
+        },
+        planes: !args.no_planes,
+        seed: args.seed,
+        ..Settings::default()
+    };
+    let start = Instant::now();
+    let mut reconstruction = Reconstruction::begin(measured, settings, watch).map_err(refused)?;
+    if !reconstruction.run(watch).map_err(refused)? {
+        return Err(signals::interrupted("nothing was written"));
+    }
+    let reconstructed = reconstruction.finish();
+    let fitting = lap(start);
+    let start = Instant::now();
+    watch.step("errors", 0.0);
+    let mesh = surface(&reconstructed.field);
+    let metrics = metrics(args, scene, &settings, &reconstructed, &mesh)?;
+    Ok(Made {
+        reconstructed,
+        mesh,
+        metrics,
+        seconds: [measuring, fitting, lap(start)],
+    })
+}
+
+fn measure(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Measured> {
+    if args.spots_from == SpotsFrom::Truth {
+        watch.step("ground truth", 0.0);
+        let rendered = source::truth_of(scene, watch).map_err(refused)?;
+        return source::from_truth(scene, &rendered, &Disturbed::default()).map_err(refused);
+    }
+    let settings = CaptureSettings {
+        gate: Gate {
+            start_m: args.gate.gate_start_m,
+            bin_width_m: args.gate.bin_width_m,
+            bins: args.gate.bins,
+        },
+        samples: args.samples,
+        seed: args.seed,
+    };
+    let i = &scene.camera.intrinsics;
+    picofarm_agent::check_memory(&settings.render_settings(), (i.width, i.height), threads)
+        .map_err(|e| CliError::new(Code::Resource, e))?;
+    let captures = scene.laser.beams.len();
+    let progress = |capture: usize, done: f32| {
+        let share = (capture as f32 + done) / captures as f32;
+        watch.step(&format!("capture {} of {captures}", capture + 1), share)
+    };
+    source::captures_of(scene, &settings, &progress).map_err(refused)
+}
+
+fn refused(e: ReconstructError) -> CliError {
+    match e {
+        ReconstructError::Stopped | ReconstructError::Render(RenderError::Stopped) => {
+            signals::interrupted("nothing was written")
+        }
+        ReconstructError::Render(RenderError::Memory { .. }) => CliError::new(Code::Resource, e),
+        e => CliError::input(e),
+    }
+}
+
+/// What metrics.json holds: the same bytes for the same scene and arguments, so no times.
+fn metrics(
+    args: &Reconstruct,
+    scene: &Scene,
+    settings: &Settings,
+    made: &Reconstructed,
+    mesh: &Surface,
+) -> Result<Value> {
+    let world = World::new(scene);
+    let camera = &made.measured.camera;
+    let views = match args.views {
+        ViewsArg::Plato => plato::views(VIEW_SIDE),
+        ViewsArg::Around => {
+            score::around(&made.measured, &made.depth.range, &world, AROUND, VIEW_SIDE)
+        }
+    };
+    let novel = score::score_views(&Renderer::new(&made.field), camera, &world, &views);
+    let of_mesh: Option<MeshScore> = match mesh.triangles.is_empty() {
+        true => None,
+        false => Some(score::mesh_score(mesh, &world, &made.field, args.seed).map_err(refused)?),
+    };
+    let floaters = score::floaters(&made.field, &world, args.seed).map_err(refused)?;
+    let left_out: Vec<Value> = made
+        .measured
+        .left_out
+        .iter()
+        .map(|l| json!({"beam": l.beam, "why": l.why}))
+        .collect();
+    let evidence =
+        |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
+    use picofarm_reconstruct::Evidence;
+    Ok(json!({
+        "scene": scene.name,
+        "provenance": scene.provenance,
+        "spots_from": match args.spots_from { SpotsFrom::Captures => "captures", SpotsFrom::Truth => "truth" },
+        "resolution": args.resolution,
+        "settings": settings,
+        "spots": made.measured.spots.len(),
+        "left_out": left_out,
+        "planes": made.planes.iter().map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset})).collect::<Vec<_>>(),
+        "iterations": made.iterations,
+        "loss": made.loss,
+        "views": match args.views { ViewsArg::Around => "around", ViewsArg::Plato => "plato" },
+        "depth": "distance along the ray at which half the light is stopped; where none is, to the grid's end",
+        "novel_views": novel,
+        "mesh": of_mesh,
+        "vertices": mesh.positions.len(),
+        "triangles": mesh.triangles.len(),
+        "floaters": floaters,
+        "evidence": {
+            "none": evidence(Evidence::None), "plane": evidence(Evidence::Plane),
+            "paths": evidence(Evidence::Paths), "seen": evidence(Evidence::Seen),
+        },
+        "notes": made.notes,
+    }))
+}
+
+fn told(args: &Reconstruct, made: &Made) -> String {
+    let m = &made.metrics["novel_views"];
+    let l1 = |of: &str| m[of]["l1_m"].as_f64().unwrap_or(0.0);
+    let mut text = format!(
+        "{}: novel views: L1 {:.4} m over {} views (visible {:.4}, occluded {:.4}, outside the view {:.4}), PSNR {:.1} dB\n",
+        args.out.display(),
+        l1("all"),
+        m["views"],
+        l1("visible"),
+        l1("occluded"),
+        l1("outside"),
+        m["psnr_db"].as_f64().unwrap_or(0.0),
+    );
+    if let Some(chamfer) = made.metrics["mesh"]["chamfer_m"].as_f64() {
+        let f = made.metrics["mesh"]["f_score"].as_f64().unwrap_or(0.0);
+        let floating = made.metrics["floaters"]["volume_m3"]
+            .as_f64()
+            .unwrap_or(0.0);
+        text += &format!(
+            "  mesh: {} triangles, Chamfer {chamfer:.4} m, F-score {f:.3} at 5 cm; floating matter {floating:.4} m3\n",
+            made.mesh.triangles.len()
+        );
+    }
+    let [measuring, fitting, scoring] = made.seconds.map(duration);
+    text += &format!("  measurements {measuring}, reconstruction {fitting}, errors {scoring}\n");
+    for note in &made.reconstructed.notes {
+        text += &format!("  note: {note}\n");
+    }
+    text
+}

@@ -1,0 +1,83 @@
+//! Progress of a reconstruction: which part, its loss, and how long the rest of the part takes.
+
+use std::{sync::Mutex, time::Instant};
+
+use picofarm_reconstruct::Phase;
+use tokio_util::sync::CancellationToken;
+
+use crate::output::{Meter, Output, duration};
+
+/// Seconds for which a part is watched before its end is forecast.
+const WATCHED_S: f64 = 1.0;
+
+/// Shows progress; a cancelled token stops the work.
+pub struct Watch {
+    shown: Mutex<Shown>,
+    stop: CancellationToken,
+}
+
+struct Shown {
+    meter: Meter,
+    part: String,
+    began: Instant,
+}
+
+impl Watch {
+    pub fn new(output: Output, stop: CancellationToken) -> Self {
+        let shown = Shown {
+            meter: Meter::new(output),
+            part: String::new(),
+            began: Instant::now(),
+        };
+        Self {
+            shown: Mutex::new(shown),
+            stop,
+        }
+    }
+
+    /// Shows how far a part is; returns whether to go on.
+    pub fn step(&self, part: &str, done: f32) -> bool {
+        self.show(part, done, None)
+    }
+
+    pub fn finish(self) {
+        if let Ok(shown) = self.shown.into_inner() {
+            shown.meter.finish();
+        }
+    }
+
+    fn show(&self, part: &str, done: f32, loss: Option<f64>) -> bool {
+        // Whoever finds it taken has nothing newer to tell.
+        if let Ok(mut shown) = self.shown.try_lock() {
+            // Captures are one part, whatever their number.
+            let head = |text: &str| text.split(' ').next().unwrap_or("").to_owned();
+            if head(&shown.part) != head(part) {
+                shown.began = Instant::now();
+            }
+            part.clone_into(&mut shown.part);
+            let elapsed = shown.began.elapsed().as_secs_f64();
+            let mut text = part.to_owned();
+            if let Some(loss) = loss {
+                text += &format!(", loss {loss:.4}");
+            }
+            let done = f64::from(done);
+            if elapsed > WATCHED_S && done > 0.01 && done < 1.0 {
+                text += &format!(", about {} left", duration(elapsed * (1.0 - done) / done));
+            }
+            shown.meter.at(done, text);
+        }
+        !self.stop.is_cancelled()
+    }
+}
+
+impl picofarm_transient::Progress for Watch {
+    fn at(&self, done: f32) -> bool {
+        self.show("ground truth", done, None)
+    }
+}
+
+impl picofarm_reconstruct::Progress for Watch {
+    fn at(&self, phase: Phase, done: f32, loss: Option<f64>) -> bool {
+        self.show(phase.name(), done, loss)
+    }
+}

@@ -1,0 +1,96 @@
+//! A reconstruction's state as bytes, for going on later or elsewhere. Only the optimisation is kept: what comes before is
+//! made again in a few seconds, to the same bits.
+
+use crate::{
+    Measured, Progress, ReconstructError, Reconstruction, Settings, reconstruction::Saved,
+};
+
+/// First bytes of a checkpoint: its form and version.
+const MAGIC: &[u8; 8] = b"pfrecon1";
+
+impl Reconstruction {
+    /// The state as bytes: little-endian, a few MB.
+    pub fn checkpoint(&self) -> Vec<u8> {
+        let mut out = MAGIC.to_vec();
+        out.extend(self.fingerprint().to_le_bytes());
+        let Some(saved) = self.saved() else {
+            return out;
+        };
+        out.extend(saved.done.to_le_bytes());
+        out.extend(saved.loss.to_le_bytes());
+        for values in [&saved.logits, &saved.first, &saved.second] {
+            out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+        }
+        out
+    }
+
+    /// Goes on from a checkpoint of the same measurements and settings.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] for bytes that are no checkpoint of these; otherwise as [`Reconstruction::begin`].
+    pub fn resume(
+        measured: Measured,
+        settings: Settings,
+        checkpoint: &[u8],
+        progress: &dyn Progress,
+    ) -> Result<Self, ReconstructError> {
+        let bad = |what: &str| ReconstructError::invalid("checkpoint", what);
+        let mut begun = Self::begin(measured, settings, progress)?;
+        let rest = checkpoint.strip_prefix(MAGIC);
+        let rest = rest.ok_or_else(|| bad("is none, or of another version; begin anew"))?;
+        let (print, rest) = rest
+            .split_first_chunk()
+            .ok_or_else(|| bad("is cut off; begin anew"))?;
+        if u64::from_le_bytes(*print) != begun.fingerprint() {
+            return Err(bad(
+                "is of other measurements or settings; give those it was made with",
+            ));
+        }
+        if rest.is_empty() {
+            return Ok(begun);
+        }
+        let nodes = begun.trainable_nodes().len();
+        if rest.len() != 12 + 12 * nodes {
+            return Err(bad("is cut off; begin anew"));
+        }
+        let (done, rest) = rest
+            .split_first_chunk()
+            .ok_or_else(|| bad("is cut off; begin anew"))?;
+        let (loss, rest) = rest
+            .split_first_chunk()
+            .ok_or_else(|| bad("is cut off; begin anew"))?;
+        let (words, _) = rest.as_chunks::<4>();
+        let values = |part: usize| -> Vec<f32> {
+            let part = &words[part * nodes..(part + 1) * nodes];
+            part.iter().map(|w| f32::from_le_bytes(*w)).collect()
+        };
+        begun.set_saved(Saved {
+            done: u32::from_le_bytes(*done),
+            loss: f64::from_le_bytes(*loss),
+            logits: values(0),
+            first: values(1),
+            second: values(2),
+        });
+        Ok(begun)
+    }
+
+    /// FNV-1a over what the optimisation starts from.
+    fn fingerprint(&self) -> u64 {
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        let mut take = |x: u32| {
+            for byte in x.to_le_bytes() {
+                hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+            }
+        };
+        let settings = self.settings();
+        take(settings.iterations);
+        take(settings.batch);
+        take(settings.seed as u32);
+        take((settings.seed >> 32) as u32);
+        for &i in self.trainable_nodes() {
+            take(i);
+            take(self.start_field().logit[i as usize].to_bits());
+        }
+        hash
+    }
+}

@@ -1,0 +1,173 @@
+//! Depth in closed form: a two-bounce time puts the surface point on an ellipsoid with the spot and the camera as foci,
+//! which a pixel's ray meets once (Henley et al. 2022, bounce-flash lidar). Several spots are joined by weighted least
+//! squares; neighbouring pixels by a plane in inverse depth.
+
+mod smooth;
+
+use picofarm_scene::Vec3;
+use rayon::prelude::*;
+
+use crate::{Measured, MeasuredSpot};
+
+pub use smooth::smooth;
+
+/// Rounds of refining the spots' distances.
+const ROUNDS: usize = 4;
+/// Newton steps of the least squares of a pixel.
+const STEPS: usize = 4;
+/// Least sensitivity of a time to depth: below it (surface point and camera on opposite sides of the spot) a time says
+/// nothing about depth.
+const LEAST_SENSITIVITY: f32 = 0.1;
+/// Residuals are trusted to at least this, metres, where times are exact.
+const FINEST: f32 = 1e-3;
+
+/// What every pixel sees.
+#[derive(Debug, Clone)]
+pub struct Depth {
+    /// Distance along the ray, metres; NaN where no time is known. `[row][column]`.
+    pub range: Vec<f32>,
+    /// Its standard error from the residuals of the spots' times, metres; NaN likewise.
+    pub error: Vec<f32>,
+    /// Unit normal in world axes, facing the camera; zero where unknown.
+    pub normal: Vec<Vec3>,
+}
+
+/// Depth of every pixel. The distances of spots that lie straight along their beams are refined on the way, since each is
+/// known to half a bin only.
+pub fn closed_form(measured: &mut Measured) -> Depth {
+    let mut range = medians(measured);
+    for _ in 0..ROUNDS {
+        range = fit(measured, &range).0;
+        refine_spots(measured, &range);
+    }
+    let (range, error) = fit(measured, &range);
+    Depth {
+        normal: vec![Vec3::ZERO; range.len()],
+        range,
+        error,
+    }
+}
+
+/// A spot relative to the camera, which is one focus.
+fn seen(measured: &Measured, spot: &MeasuredSpot) -> Vec3 {
+    spot.point - measured.camera.origin
+}
+
+/// Distance along the unit ray `r` at which |x| + |x − l| = s; not positive where there is none.
+pub(crate) fn on_ellipsoid(s: f32, l: Vec3, r: Vec3) -> f32 {
+    (s * s - l.dot(l)) / (2.0 * (s - r.dot(l)))
+}
+
+/// How much a time grows with depth: 1 + cos of the angle between the ray and the way from spot to point. In [0, 2].
+fn sensitivity(to_point: Vec3, r: Vec3) -> f32 {
+    1.0 + to_point.dot(r) / to_point.length().max(1e-3)
+}
+
+/// Of each pixel the weighted median over its lit spots.
+fn medians(measured: &Measured) -> Vec<f32> {
+    let pixels = measured.pixels();
+    let foci: Vec<Vec3> = measured.spots.iter().map(|s| seen(measured, s)).collect();
+    let of = |p: usize| {
+        let r = measured.ray(p);
+        let mut found: Vec<(f32, f32)> = Vec::with_capacity(foci.len());
+        for (i, &l) in foci.iter().enumerate() {
+            let q = i * pixels + p;
+            if measured.lit[q] == 0 || measured.used[q] == 0 {
+                continue;
+            }
+            let d = on_ellipsoid(measured.tau[q] - measured.spots[i].path_m, l, r);
+            let s = sensitivity(r * d - l, r);
+            if d.is_finite() && d > 0.0 && s > LEAST_SENSITIVITY {
+                found.push((d, s * s));
+            }
+        }
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let half = 0.5 * found.iter().map(|f| f.1).sum::<f32>();
+        let mut sum = 0.0;
+        let past = |f: &&(f32, f32)| {
+            sum += f.1;
+            sum >= half
+        };
+        found.iter().find(past).map_or(f32::NAN, |f| f.0)
+    };
+    (0..pixels).into_par_iter().map(of).collect()
+}
+
+/// Weighted least squares of each pixel over its lit spots from a first guess: depth and its standard error. Residuals
+/// within half a bin count little (a time is somewhere in its bin), far ones hardly.
+fn fit(measured: &Measured, guess: &[f32]) -> (Vec<f32>, Vec<f32>) {
+    let pixels = measured.pixels();
+    let dead = (0.5 * measured.bin_width_m).max(FINEST);
+    let foci: Vec<Vec3> = measured.spots.iter().map(|s| seen(measured, s)).collect();
+    let of = |p: usize| -> (f32, f32) {
+        let (r, mut x) = (measured.ray(p), guess[p]);
+        if !x.is_finite() {
+            return (f32::NAN, f32::NAN);
+        }
+        let mut error = dead;
+        for _ in 0..STEPS {
+            let (mut a, mut b, mut square) = (1e-9f32, 0.0f32, 0.0f32);
+            for (i, &l) in foci.iter().enumerate() {
+                let q = i * pixels + p;
+                if measured.lit[q] == 0 || measured.used[q] == 0 {
+                    continue;
+                }
+                let way = r * x - l;
+                let g = sensitivity(way, r);
+                let miss = x + way.length() + measured.spots[i].path_m - measured.tau[q];
+                let far = miss.abs();
+                let weight = match far {
+                    _ if far > 3.0 * dead => 0.3 * dead / far,
+                    _ if far > dead => 1.0,
+                    _ => 0.25,
+                };
+                a += weight * g * g;
+                b += weight * g * miss;
+                square += weight * miss * miss;
+            }
+            x -= (b / a).clamp(-0.5, 0.5);
+            error = libm::sqrtf((square + 0.25 * dead * dead) / a);
+        }
+        match x > 0.0 {
+            true => (x, error),
+            false => (f32::NAN, f32::NAN),
+        }
+    };
+    (0..pixels).into_par_iter().map(of).unzip()
+}
+
+/// Moves each straight spot along its beam to where the depths of all pixels say that it is.
+fn refine_spots(measured: &mut Measured, range: &[f32]) {
+    let pixels = measured.pixels();
+    let this = &*measured;
+    let limit = this.bin_width_m.max(10.0 * FINEST);
+    let step = |(i, spot): (usize, &MeasuredSpot)| -> f32 {
+        if spot.folded {
+            return 0.0;
+        }
+        let l = seen(this, spot);
+        let (mut a, mut b) = (1e-9f64, 0.0f64);
+        for (p, &depth) in range.iter().enumerate() {
+            let q = i * pixels + p;
+            if this.lit[q] == 0 || this.used[q] == 0 || !depth.is_finite() {
+                continue;
+            }
+            let way = this.ray(p) * depth - l;
+            let length = way.length();
+            let g = 1.0 - way.dot(spot.direction) / length;
+            let miss = depth + length + spot.path_m - this.tau[q];
+            // Pixels near the spot are sensitive to its place sideways, and outliers to anything.
+            if length < 0.2 || miss.abs() > limit {
+                continue;
+            }
+            a += f64::from(g * g);
+            b += f64::from(g * miss);
+        }
+        -((b / a) as f32).clamp(-limit, limit)
+    };
+    let steps: Vec<f32> = this.spots.par_iter().enumerate().map(step).collect();
+    for (spot, step) in measured.spots.iter_mut().zip(steps) {
+        spot.path_m += step;
+        spot.point = spot.point + spot.direction * step;
+    }
+}

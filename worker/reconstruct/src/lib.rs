@@ -1,0 +1,38 @@
+//! Reconstruction of one scene from light that bounced twice: a density field of a room, fitted to two-bounce times and
+//! shadow masks, in seconds on a CPU.
+//!
+//! The problem is PlatoNeRF's (Klinghoffer et al., CVPR 2024); the method is not a network but a grid whose start comes in
+//! closed form and from carving. `docs/reconstruction.md` explains it and has the figures. This crate knows nothing of jobs
+//! or stores; files are the caller's.
+
+mod carve;
+mod checkpoint;
+mod closed_form;
+mod error;
+pub mod field;
+mod measured;
+mod mesh;
+mod optimise;
+mod paths;
+mod planes;
+mod progress;
+mod rays;
+mod reconstruction;
+pub mod render;
+mod rng;
+pub mod score;
+pub mod source;
+mod start;
+mod world;
+
+pub use closed_form::Depth;
+pub use error::ReconstructError;
+pub use measured::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE};
+pub use mesh::{Surface, surface};
+pub use optimise::cast_ray;
+pub use planes::Plane;
+pub use progress::{Phase, Progress, Unwatched};
+pub use reconstruction::{
+    Evidence, MOST_NODES, Reconstructed, Reconstruction, Settings, Shadows, reconstruct,
+};
+pub use world::{Hit, World};

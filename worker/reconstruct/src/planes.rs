@@ -1,0 +1,197 @@
+//! Planes of the room: large planes behind which hardly anything is seen. They close the room where the camera does not
+//! look, and steady the depth of what lies on them.
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    Depth, Measured,
+    rng::{Rng, Stream},
+};
+
+/// Most planes.
+const MOST: usize = 8;
+/// Candidates tried for each.
+const TRIES: usize = 300;
+/// Every so many pixels counts.
+const STRIDE: usize = 7;
+/// Points within this are on a plane, metres; more where times are noisy.
+const CLOSE_M: f32 = 0.02;
+/// Least cosine between a point's normal and the plane's.
+const ALIKE: f32 = 0.9;
+/// Least share of the pixels on a plane.
+const LEAST_SHARE: f32 = 1.0 / 40.0;
+/// Largest share of the points that may lie behind a plane.
+const MOST_BEHIND: f32 = 0.02;
+/// Points are behind beyond so many times the tolerance.
+const BEHIND: f32 = 3.0;
+
+/// The half space n·x ≤ c of the room.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plane {
+    /// Unit normal, out of the room.
+    pub normal: Vec3,
+    /// Offset, metres.
+    pub offset: f32,
+}
+
+impl Plane {
+    /// Distance into the room, metres; negative behind the plane.
+    #[inline]
+    pub fn inside(&self, x: Vec3) -> f32 {
+        self.offset - self.normal.dot(x)
+    }
+}
+
+/// A pixel's point and its normal out of the room.
+type Point = (Vec3, Vec3);
+
+/// Planes by random sample consensus (Fischler and Bolles 1981) over the pixels' points and normals, the largest first,
+/// each refined by least squares. One with more than 2 % of the points behind it (a table's top, a wardrobe's front) is no
+/// wall and rejected.
+pub fn planes(measured: &Measured, depth: &Depth, seed: u64) -> Vec<Plane> {
+    let mut errors: Vec<f32> = depth
+        .error
+        .iter()
+        .copied()
+        .filter(|e| e.is_finite())
+        .collect();
+    errors.sort_by(f32::total_cmp);
+    let typical = errors.get(errors.len() / 2).copied().unwrap_or(0.0);
+    let close = CLOSE_M.max(2.0 * typical).min(3.0 * CLOSE_M);
+    let points: Vec<Point> = (0..depth.range.len())
+        .step_by(STRIDE)
+        .filter(|&p| depth.range[p].is_finite() && depth.normal[p] != Vec3::ZERO)
+        .map(|p| {
+            let x = measured.camera.origin + measured.ray(p) * depth.range[p];
+            (x, -depth.normal[p])
+        })
+        .collect();
+    let least = (depth.range.len() as f32 * LEAST_SHARE / STRIDE as f32) as usize;
+    let mut free = vec![true; points.len()];
+    let mut found = Vec::new();
+    let mut rng = Rng::new(seed, Stream::Planes, 0);
+    let on = |plane: &Plane, (x, n): &Point| {
+        plane.inside(*x).abs() < close && plane.normal.dot(*n) > ALIKE
+    };
+    for _ in 0..2 * MOST {
+        let mut best: Option<(usize, Plane)> = None;
+        for _ in 0..TRIES {
+            let at = rng.below(points.len());
+            if !free.get(at).copied().unwrap_or(false) {
+                continue;
+            }
+            let (x, normal) = points[at];
+            let plane = Plane {
+                normal,
+                offset: normal.dot(x),
+            };
+            let count = points
+                .iter()
+                .zip(&free)
+                .filter(|(q, f)| **f && on(&plane, q))
+                .count();
+            if best.is_none_or(|(most, _)| count > most) {
+                best = Some((count, plane));
+            }
+        }
+        let Some((count, mut plane)) = best.filter(|(count, _)| *count >= least.max(8)) else {
+            break;
+        };
+        for _ in 0..3 {
+            let members = points
+                .iter()
+                .zip(&free)
+                .filter(|(q, f)| **f && on(&plane, q));
+            plane = least_squares(members.map(|(q, _)| q.0), plane);
+        }
+        for (f, q) in free.iter_mut().zip(&points) {
+            *f &= !(plane.inside(q.0).abs() < 2.0 * close && plane.normal.dot(q.1) > ALIKE);
+        }
+        let behind = points
+            .iter()
+            .filter(|q| plane.inside(q.0) < -BEHIND * close)
+            .count();
+        if behind as f32 <= MOST_BEHIND * points.len() as f32 && count > 0 {
+            found.push(plane);
+            if found.len() == MOST {
+                break;
+            }
+        }
+    }
+    found
+}
+
+/// The plane through points with the least sum of squared distances, facing as `plane` does.
+fn least_squares(points: impl Iterator<Item = Vec3>, plane: Plane) -> Plane {
+    let (mut n, mut mean, mut square) = (0.0f64, [0f64; 3], [[0f64; 3]; 3]);
+    for x in points {
+        let x = [x.x, x.y, x.z].map(f64::from);
+        n += 1.0;
+        for a in 0..3 {
+            mean[a] += x[a];
+            for b in 0..3 {
+                square[a][b] += x[a] * x[b];
+            }
+        }
+    }
+    if n < 3.0 {
+        return plane;
+    }
+    let m = mean.map(|v| v / n);
+    let cov: [[f64; 3]; 3] =
+        std::array::from_fn(|a| std::array::from_fn(|b| square[a][b] / n - m[a] * m[b]));
+    let normal = smallest_axis(cov, plane.normal);
+    let offset = (0..3).map(|a| f64::from(normal[a]) * m[a]).sum::<f64>() as f32;
+    Plane { normal, offset }
+}
+
+/// The unit eigenvector of the smallest eigenvalue of a covariance, on the side of `near`, by inverse iteration.
+fn smallest_axis(mut cov: [[f64; 3]; 3], near: Vec3) -> Vec3 {
+    let trace = cov[0][0] + cov[1][1] + cov[2][2];
+    for (a, row) in cov.iter_mut().enumerate() {
+        row[a] += 1e-9 * trace + 1e-15;
+    }
+    let [a, b, c] = cov;
+    let cross = |u: [f64; 3], v: [f64; 3]| {
+        [
+            u[1] * v[2] - u[2] * v[1],
+            u[2] * v[0] - u[0] * v[2],
+            u[0] * v[1] - u[1] * v[0],
+        ]
+    };
+    // Rows of the adjugate: the inverse but for a factor.
+    let adjugate = [cross(b, c), cross(c, a), cross(a, b)];
+    let mut n = [near.x, near.y, near.z].map(f64::from);
+    for _ in 0..30 {
+        let next: [f64; 3] = std::array::from_fn(|k| (0..3).map(|j| adjugate[j][k] * n[j]).sum());
+        let length = next.iter().map(|v| v * v).sum::<f64>().sqrt();
+        if length <= 0.0 || !length.is_finite() {
+            return near;
+        }
+        n = next.map(|v| v / length);
+    }
+    let n = Vec3::new(n[0] as f32, n[1] as f32, n[2] as f32);
+    if n.dot(near) < 0.0 { -n } else { n }
+}
+
+/// Moves the depth of pixels that lie on a plane, by place and normal, onto it, and takes its normal.
+pub fn settle(measured: &Measured, depth: &mut Depth, planes: &[Plane]) {
+    for p in 0..depth.range.len() {
+        let (range, normal) = (depth.range[p], depth.normal[p]);
+        if !range.is_finite() || normal == Vec3::ZERO {
+            continue;
+        }
+        let ray = measured.ray(p);
+        let x = measured.camera.origin + ray * range;
+        let reach = CLOSE_M.max(3.0 * depth.error[p]).min(4.0 * CLOSE_M);
+        let near =
+            |plane: &&Plane| plane.inside(x).abs() < reach && -plane.normal.dot(normal) > ALIKE;
+        if let Some(plane) = planes.iter().find(near) {
+            let slope = plane.normal.dot(ray);
+            if slope > 0.05 {
+                depth.range[p] = range + plane.inside(x) / slope;
+                depth.normal[p] = -plane.normal;
+            }
+        }
+    }
+}

@@ -1,0 +1,338 @@
+//! A reconstruction from beginning to end: closed form → planes → start → carving → optimisation, which can stop and go
+//! on.
+
+use picofarm_scene::Vec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    Depth, Measured, ReconstructError,
+    carve::carve,
+    closed_form::{closed_form, smooth},
+    field::{EMPTY, Field, SOLID},
+    optimise::{Optimiser, Steps, trainable},
+    paths::Paths,
+    planes::{Plane, planes, settle},
+    progress::{Phase, Progress, begin},
+    start::{State, bounds, start},
+};
+
+/// Most nodes along the longest side of the grid.
+pub const MOST_NODES: u32 = 512;
+
+/// How far light paths are believed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Shadows {
+    /// Not at all: what the camera does not see is empty.
+    Ignore,
+    /// Carving alone.
+    Carve,
+    /// Carving, then optimisation.
+    Optimise,
+}
+
+/// Settings of a reconstruction.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// Nodes along the longest side of the grid, 16 to [`MOST_NODES`]. 192 by default; 256 is fine.
+    pub nodes: u32,
+    /// Close the room by planes where the camera does not look.
+    pub planes: bool,
+    /// What becomes of the shadow masks.
+    pub shadows: Shadows,
+    /// Iterations of the optimisation.
+    pub iterations: u32,
+    /// Rays of an iteration.
+    pub batch: u32,
+    /// Seed of all random numbers.
+    pub seed: u64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            nodes: 192,
+            planes: true,
+            shadows: Shadows::Optimise,
+            iterations: 100,
+            batch: 16_384,
+            seed: 0,
+        }
+    }
+}
+
+impl Settings {
+    /// The grid for quality rather than speed.
+    pub const FINE_NODES: u32 = 256;
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] naming the setting.
+    pub fn check(&self) -> Result<(), ReconstructError> {
+        let within = |field: &str, value: u32, least: u32, most: u32| {
+            let what = format!("is {value}, choose {least} to {most}");
+            match (least..=most).contains(&value) {
+                true => Ok(()),
+                false => Err(ReconstructError::invalid(field, what)),
+            }
+        };
+        within("nodes", self.nodes, 16, MOST_NODES)?;
+        within("iterations", self.iterations, 1, 100_000)?;
+        within("batch", self.batch, 1, 1 << 22)
+    }
+}
+
+/// What is known of a node of the result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Evidence {
+    /// No ray tells of it: its density is a guess.
+    None = 0,
+    /// A plane of the room puts it at or behind a wall.
+    Plane = 1,
+    /// Light paths go through it.
+    Paths = 2,
+    /// The camera sees it, or through it.
+    Seen = 3,
+}
+
+/// A finished reconstruction.
+#[derive(Debug, Clone)]
+pub struct Reconstructed {
+    /// The density field.
+    pub field: Field,
+    /// What is known of each node, in the field's order.
+    pub evidence: Vec<Evidence>,
+    /// Depth of every pixel, from closed form and planes.
+    pub depth: Depth,
+    /// The room's planes.
+    pub planes: Vec<Plane>,
+    /// Measurements with refined spots.
+    pub measured: Measured,
+    /// Loss per ray of the last iteration, where there was one.
+    pub loss: Option<f64>,
+    /// Iterations done.
+    pub iterations: u32,
+    /// What somebody should know before trusting it.
+    pub notes: Vec<String>,
+}
+
+/// A reconstruction that is under way.
+pub struct Reconstruction {
+    settings: Settings,
+    measured: Measured,
+    depth: Depth,
+    planes: Vec<Plane>,
+    field: Field,
+    evidence: Vec<Evidence>,
+    trainable: Trainable,
+    saved: Option<Saved>,
+    notes: Vec<String>,
+}
+
+type Trainable = (Vec<u32>, Vec<crate::optimise::Kind>);
+
+/// How far the optimisation is.
+#[derive(Debug, Clone)]
+pub(crate) struct Saved {
+    pub done: u32,
+    pub loss: f64,
+    pub logits: Vec<f32>,
+    pub first: Vec<f32>,
+    pub second: Vec<f32>,
+}
+
+impl Reconstruction {
+    /// Everything before the optimisation: a few seconds.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] for settings or measurements that cannot be used; [`ReconstructError::Stopped`].
+    pub fn begin(
+        mut measured: Measured,
+        settings: Settings,
+        progress: &dyn Progress,
+    ) -> Result<Self, ReconstructError> {
+        settings.check()?;
+        let mut notes = measured.check()?;
+        begin(progress, Phase::Depth)?;
+        let raw = closed_form(&mut measured);
+        if !raw.range.iter().any(|r| r.is_finite()) {
+            let what = "no time gives a depth: all are shorter than the way by the spot; check the gate and the laser's place";
+            return Err(ReconstructError::invalid("tau", what));
+        }
+        let mut depth = smooth(&measured, &raw);
+        begin(progress, Phase::Planes)?;
+        let walls = match settings.planes {
+            true => planes(&measured, &depth, settings.seed),
+            false => Vec::new(),
+        };
+        settle(&measured, &mut depth, &walls);
+        if settings.planes && walls.is_empty() {
+            notes.push(
+                "no plane of a room was found: what lies outside the view stays empty".into(),
+            );
+        }
+        begin(progress, Phase::Start)?;
+        let (lo, hi) = bounds(&measured, &depth, settings.nodes as usize);
+        let mut field = Field::over(lo, hi, settings.nodes as usize);
+        let states = start(&mut field, &measured, &depth, &walls);
+        begin(progress, Phase::Carve)?;
+        let paths = Paths::new(&measured, &depth);
+        let carved = match settings.shadows {
+            Shadows::Ignore => None,
+            _ => Some(carve(&field, &states, &paths, progress)?),
+        };
+        let evidence = evidence(&field, &states, carved.as_ref().map(|c| &*c.empty), &walls);
+        let mut these = (Vec::new(), Vec::new());
+        match (&carved, settings.shadows) {
+            (Some(c), Shadows::Optimise) => {
+                these = trainable(&mut field, &states, &c.empty);
+            }
+            _ => without_optimisation(&mut field, &states, carved.as_ref().map(|c| &*c.empty)),
+        }
+        Ok(Self {
+            settings,
+            measured,
+            depth,
+            planes: walls,
+            field,
+            evidence,
+            trainable: these,
+            saved: None,
+            notes,
+        })
+    }
+
+    /// Optimises until it is done (`true`) or `progress` stops it (`false`); call it again to go on. The bits of the result
+    /// depend neither on stops nor on the number of threads.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Stopped`] where it was stopped before the first iteration.
+    pub fn run(&mut self, progress: &dyn Progress) -> Result<bool, ReconstructError> {
+        if self.settings.shadows != Shadows::Optimise || self.trainable.0.is_empty() {
+            return Ok(true);
+        }
+        let steps = Steps {
+            iterations: self.settings.iterations,
+            batch: self.settings.batch,
+            seed: self.settings.seed,
+        };
+        let of = (&self.measured, &self.depth);
+        let mut optimiser =
+            Optimiser::new(of, &self.field, self.trainable.clone(), steps, progress)?;
+        // What rays are cast at is decided by the start, so the start stays as it was until the end.
+        let mut field = self.field.clone();
+        if let Some(saved) = self.saved.take() {
+            let (nodes, moments) = optimiser.state();
+            for (&i, u) in nodes.iter().zip(&saved.logits) {
+                field.logit[i as usize] = *u;
+            }
+            moments.first = saved.first;
+            moments.second = saved.second;
+            (optimiser.done, optimiser.loss) = (saved.done, saved.loss);
+        }
+        let ended = optimiser.run(&mut field, progress);
+        let (done, loss) = (optimiser.done, optimiser.loss);
+        let (nodes, moments) = optimiser.state();
+        self.saved = Some(Saved {
+            done,
+            loss,
+            logits: nodes.iter().map(|&i| field.logit[i as usize]).collect(),
+            first: std::mem::take(&mut moments.first),
+            second: std::mem::take(&mut moments.second),
+        });
+        Ok(ended)
+    }
+
+    /// The result so far.
+    pub fn finish(self) -> Reconstructed {
+        let mut field = self.field;
+        let (mut loss, mut iterations) = (None, 0);
+        if let Some(saved) = self.saved {
+            for (&i, u) in self.trainable.0.iter().zip(&saved.logits) {
+                field.logit[i as usize] = *u;
+            }
+            (loss, iterations) = (saved.loss.is_finite().then_some(saved.loss), saved.done);
+        }
+        Reconstructed {
+            field,
+            evidence: self.evidence,
+            depth: self.depth,
+            planes: self.planes,
+            measured: self.measured,
+            loss,
+            iterations,
+            notes: self.notes,
+        }
+    }
+
+    /// Its settings.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    pub(crate) fn saved(&self) -> Option<&Saved> {
+        self.saved.as_ref()
+    }
+
+    pub(crate) fn trainable_nodes(&self) -> &[u32] {
+        &self.trainable.0
+    }
+
+    pub(crate) fn start_field(&self) -> &Field {
+        &self.field
+    }
+
+    pub(crate) fn set_saved(&mut self, saved: Saved) {
+        self.saved = Some(saved);
+    }
+}
+
+/// A whole reconstruction in one go. Runs on the caller's rayon pool; the same bits for any number of threads.
+///
+/// # Errors
+/// As [`Reconstruction::begin`]; [`ReconstructError::Stopped`] where it was stopped.
+pub fn reconstruct(
+    measured: Measured,
+    settings: Settings,
+    progress: &dyn Progress,
+) -> Result<Reconstructed, ReconstructError> {
+    let mut reconstruction = Reconstruction::begin(measured, settings, progress)?;
+    match reconstruction.run(progress)? {
+        true => Ok(reconstruction.finish()),
+        false => Err(ReconstructError::Stopped),
+    }
+}
+
+/// Unseen nodes by carving alone, or all empty.
+fn without_optimisation(field: &mut Field, states: &[State], empty: Option<&[f32]>) {
+    for (i, u) in field.logit.iter_mut().enumerate() {
+        if states[i] == State::Unseen {
+            *u = match empty.map(|e| e[i]) {
+                None => EMPTY,
+                Some(e) if e < 0.0 || e > 0.9 => EMPTY,
+                Some(e) => ((0.35 - e) * 12.0).clamp(EMPTY, SOLID),
+            };
+        }
+    }
+}
+
+fn evidence(
+    field: &Field,
+    states: &[State],
+    empty: Option<&[f32]>,
+    planes: &[Plane],
+) -> Vec<Evidence> {
+    let near = |x: Vec3| planes.iter().any(|p| p.inside(x) < 1.5 * field.spacing);
+    let of = |i: usize| match states[i] {
+        State::Free | State::Band => Evidence::Seen,
+        State::Wall => Evidence::Plane,
+        State::Unseen if empty.is_some_and(|e| e[i] >= 0.0) => Evidence::Paths,
+        State::Outside if near(field.at(i)) => Evidence::Plane,
+        State::Unseen | State::Outside => Evidence::None,
+    };
+    (0..states.len()).into_par_iter().map(of).collect()
+}

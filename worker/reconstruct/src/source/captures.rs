@@ -1,0 +1,191 @@
+//! Measurements from K separate single-spot histograms, as PlatoNeRF makes them (its `src/run_platonerf.py` and
+//! `utils/load_tof.py`; numbers in the code are the steps of its preprocessing).
+//!
+//! What differs: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin late), and pixels near a spot
+//! take no part (PlatoNeRF zeroes their histograms, which then count as shadow).
+
+use picofarm_scene::{Beam, Camera, Laser, Vec3};
+use picofarm_transient::Gate;
+use rayon::prelude::*;
+
+use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
+
+/// A pixel is lit where the matched filter's response reaches this (PlatoNeRF's threshold in all four of its scenes).
+pub const LIT_THRESHOLD: f32 = 0.15;
+/// Largest angle between a beam's spot and the brightest pixel, radians: beyond it the beam met a mirror.
+const ASTRAY: f32 = 0.04;
+/// Bins of the pulse template below this share of it are left out.
+const TEMPLATE_FLOOR: f32 = 1e-3;
+
+/// Takes captures one by one, so that the histograms of one spot are in memory at a time.
+#[derive(Debug)]
+pub struct Captures {
+    gate: Gate,
+    threshold: f32,
+    laser: Laser,
+    measured: Measured,
+}
+
+impl Captures {
+    /// Begins with the camera, the laser and its beams' directions, and the gate of the histograms.
+    pub fn new(camera: Camera, laser: Laser, gate: Gate, threshold: f32) -> Self {
+        let measured = Measured {
+            camera,
+            laser: laser.origin,
+            spots: Vec::new(),
+            tau: Vec::new(),
+            lit: Vec::new(),
+            used: Vec::new(),
+            bin_width_m: gate.bin_width_m as f32,
+            mirror: Vec::new(),
+            left_out: Vec::new(),
+        };
+        Self {
+            gate,
+            threshold,
+            laser,
+            measured,
+        }
+    }
+
+    /// Pixels of which it is known that they see a mirror (1), `[row][column]`; they take no part.
+    pub fn mirrors(&mut self, mirror: Vec<u8>) {
+        self.measured.mirror = mirror;
+    }
+
+    /// Takes the capture of beam `beam`: histograms `[row][column][bin]`.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] for a histogram of another size, a value that is no number, or a beam that is not there.
+    pub fn add(&mut self, beam: usize, histogram: &[f32]) -> Result<(), ReconstructError> {
+        let (pixels, bins) = (self.measured.pixels(), self.gate.bins as usize);
+        let field = || format!("captures[{beam}]");
+        let Some(&Beam { direction, .. }) = self.laser.beams.get(beam) else {
+            let what = format!(
+                "there is no such beam, the laser has {}",
+                self.laser.beams.len()
+            );
+            return Err(ReconstructError::invalid(field(), what));
+        };
+        if histogram.len() != pixels * bins {
+            let what = format!(
+                "has {} values, expected {pixels} pixels x {bins} bins",
+                histogram.len()
+            );
+            return Err(ReconstructError::invalid(field(), what));
+        }
+        if let Some(at) = histogram.iter().position(|v| !v.is_finite()) {
+            let what = format!("pixel {} bin {} is not finite", at / bins, at % bins);
+            return Err(ReconstructError::invalid(field(), what));
+        }
+        match self.spot(direction, beam, histogram) {
+            Ok((spot, template)) => self.pixels_of(spot, &template, histogram),
+            Err(why) => self.measured.left_out.push(LeftOut { beam, why }),
+        }
+        Ok(())
+    }
+
+    /// What was measured.
+    pub fn finish(self) -> Measured {
+        self.measured
+    }
+
+    fn middle(&self, bin: usize) -> f32 {
+        (self.gate.start_m + (bin as f64 + 0.5) * self.gate.bin_width_m) as f32
+    }
+
+    /// Step 2 and 4: the spot from the brightest pixel's one-bounce peak, and the pulse from that pixel; or why there is none.
+    fn spot(
+        &self,
+        direction: Vec3,
+        beam: usize,
+        histogram: &[f32],
+    ) -> Result<(MeasuredSpot, Vec<f32>), String> {
+        let bins = self.gate.bins as usize;
+        let peaks: Vec<(usize, f32)> = histogram.par_chunks(bins).map(peak).collect();
+        let best = (0..peaks.len()).reduce(|a, b| if peaks[b].1 > peaks[a].1 { b } else { a });
+        let Some(pixel) = best.filter(|&p| peaks[p].1 > 0.0) else {
+            let end = self.gate.start_m + bins as f64 * self.gate.bin_width_m;
+            return Err(format!(
+                "its capture holds no light between {} m and {end:.2} m; widen the gate",
+                self.gate.start_m
+            ));
+        };
+        // The path laser → L → camera; L = laser + d · direction.
+        let path = self.middle(peaks[pixel].0);
+        let base = self.measured.camera.origin - self.laser.origin;
+        let d = (path * path - base.dot(base)) / (2.0 * (path - base.dot(direction)));
+        let point = self.laser.origin + direction * d;
+        let seen = (point - self.measured.camera.origin).normalized();
+        let astray = self.measured.ray(pixel).cross(seen).length();
+        if !(d.is_finite() && d > 0.0) || astray > ASTRAY {
+            return Err(
+                "the brightest pixel does not lie where its beam points: the beam meets a mirror, or the camera does not see its spot".into(),
+            );
+        }
+        let pulse = &histogram[pixel * bins..(pixel + 1) * bins];
+        let sum: f32 = pulse.iter().sum();
+        let template = pulse.iter().map(|v| v / sum).collect();
+        let spot = MeasuredSpot {
+            beam,
+            direction,
+            point,
+            path_m: d,
+            folded: false,
+        };
+        Ok((spot, template))
+    }
+
+    /// Steps 3 and 5 to 7 for every pixel.
+    fn pixels_of(&mut self, spot: MeasuredSpot, template: &[f32], histogram: &[f32]) {
+        let bins = self.gate.bins as usize;
+        let taps: Vec<(usize, f32)> = template
+            .iter()
+            .copied()
+            .enumerate()
+            .filter(|&(_, v)| v >= TEMPLATE_FLOOR)
+            .collect();
+        let (first, last) = (
+            taps.first().map_or(0, |t| t.0),
+            taps.last().map_or(0, |t| t.0),
+        );
+        let to_spot = (spot.point - self.measured.camera.origin).normalized();
+        let this = &*self;
+        let pixel = |(p, h): (usize, &[f32])| -> (f32, u8, u8) {
+            let near = this.measured.ray(p).cross(to_spot).length() < NEAR_SPOT_SINE;
+            let mirror = this.measured.mirror.get(p).is_some_and(|&m| m != 0);
+            let sum: f32 = h.iter().sum();
+            if near || mirror || sum <= 0.0 {
+                // A histogram without any light says nothing: not even light of three bounces came.
+                return (0.0, 0, 0);
+            }
+            let (bin, _) = peak(h);
+            let mut response = 0.0f32;
+            for lag in -(last as i64)..(bins - first) as i64 {
+                let at = |t: usize| usize::try_from(t as i64 + lag).ok().and_then(|b| h.get(b));
+                let c: f32 = taps
+                    .iter()
+                    .map(|&(t, v)| v * at(t).copied().unwrap_or(0.0))
+                    .sum();
+                response = response.max(c);
+            }
+            let tau = this.middle(bin);
+            let lit = response / sum >= this.threshold && tau > spot.path_m;
+            (if lit { tau } else { 0.0 }, u8::from(lit), 1)
+        };
+        let found: Vec<(f32, u8, u8)> = histogram.par_chunks(bins).enumerate().map(pixel).collect();
+        for (tau, lit, used) in found {
+            self.measured.tau.push(tau);
+            self.measured.lit.push(lit);
+            self.measured.used.push(used);
+        }
+        self.measured.spots.push(spot);
+    }
+}
+
+/// The first highest bin and its value.
+fn peak(h: &[f32]) -> (usize, f32) {
+    let better =
+        |best: (usize, f32), (b, &v): (usize, &f32)| if v > best.1 { (b, v) } else { best };
+    h.iter().enumerate().fold((0, 0.0), better)
+}
