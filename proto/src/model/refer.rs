@@ -68,7 +68,10 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
             .task
             .trains()
             .is_some_and(|(place, model)| *place == store && read(model));
-        divides || evaluates || trains
+        let beside = task
+            .reads_beside()
+            .is_some_and(|folder| s.task.writes() == Some((&store, folder)));
+        divides || evaluates || trains || beside
     });
     let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
     for name in wanted {

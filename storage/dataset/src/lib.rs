@@ -11,6 +11,7 @@ pub mod import;
 mod layout;
 mod models;
 mod predictions;
+mod reconstructions;
 mod render_group;
 mod repair;
 mod reports;
@@ -37,8 +38,9 @@ pub use predictions::{
     EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,
     SceneUsed, TimesUsed,
 };
+pub use reconstructions::{ReconstructionManifest, Reconstructions};
 pub use render_group::read::RenderGroup;
-pub use render_group::write::{RenderArray, write_render_group};
+pub use render_group::write::{RenderArray, encode_render_group, write_render_group};
 pub use repair::collect::{Collection, MIN_GRACE, Orphan};
 pub use repair::held::{Held, Holdings};
 pub use repair::recipe::Recipe;

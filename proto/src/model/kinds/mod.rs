@@ -12,6 +12,7 @@ pub mod import;
 pub mod infer;
 mod part;
 mod promote;
+pub mod reconstruct;
 pub mod render;
 pub mod report;
 pub mod reprocess;
@@ -39,6 +40,7 @@ pub use import::ImportTask;
 pub use infer::InferTask;
 pub use part::PartTask;
 pub use promote::{PromoteSettings, PromoteTask};
+pub use reconstruct::{ReconstructSettings, ReconstructTask};
 pub use render::RenderTask;
 use render::SceneSource;
 pub use report::ReportTask;
@@ -122,6 +124,8 @@ kinds! {
     Infer(InferTask),
     /// What models came to, as a page: one task.
     Report(ReportTask),
+    /// Scenes become rooms in 3D: one task each.
+    Reconstruct(ReconstructTask),
     /// Scenes of a data set are read and compared with their manifests: one task each.
     Verify(VerifyTask),
     /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
@@ -209,6 +213,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
 
     /// The data set that is read, and the number of its scenes; to be filled in.
     fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        None
+    }
+
+    /// What is read beside it: a folder of the same store, into which a stage may put something of each scene.
+    fn reads_beside(&self) -> Option<&String> {
         None
     }
 

@@ -1,10 +1,12 @@
 //! Putting back what is missing or changed of a scene's predictions, from the same predicted again.
 
 use bytes::Bytes;
+use object_store::path::Path;
 
 use super::{EncodedPredictions, PredictionManifest, Predictions};
 use crate::error::DatasetError;
 use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::repair::put_back::put_back;
 use crate::store::objects;
 
 impl Predictions {
@@ -36,38 +38,9 @@ impl Predictions {
                 ours: ours.sha256(),
             });
         }
-        let (mut broken, mut equal) = (Vec::new(), 0);
-        for (object, bytes) in ours.objects.iter().zip(&encoded.bytes) {
-            let path = self.path(&object.key);
-            match objects::get(&*self.store, &path).await? {
-                Some(there) if there == *bytes => equal += 1,
-                there => broken.push((path, bytes.clone(), there.is_some())),
-            }
-        }
-        if !readable && (equal == 0 || broken.iter().any(|(_, _, there)| *there)) {
-            return Err(DatasetError::Damaged {
-                object: shown,
-                what: "it cannot be read, and the objects that are left are not all equal to what is predicted now, so that \
-                       nothing proves what was there; nothing was written. Delete the scene's manifest and objects to have \
-                       it predicted anew"
-                    .into(),
-            });
-        }
-        let manifest = (manifest_path, Bytes::from(ours.to_bytes()), true);
-        broken.extend((!readable).then_some(manifest));
-        let mut written = Vec::new();
-        for (path, bytes, _) in broken {
-            objects::overwrite(&*self.store, &path, bytes.clone()).await?;
-            if objects::get(&*self.store, &path).await?.as_ref() != Some(&bytes) {
-                return Err(DatasetError::Damaged {
-                    object: self.shown(&path),
-                    what:
-                        "it was written again, but does not read back as written; check the store"
-                            .into(),
-                });
-            }
-            written.push(self.shown(&path));
-        }
-        Ok(written)
+        let paths = ours.objects.iter().map(|o| self.path(&o.key));
+        let objects: Vec<(Path, Bytes)> = paths.zip(encoded.bytes.iter().cloned()).collect();
+        let manifest = (manifest_path, Bytes::from(ours.to_bytes()));
+        put_back(&*self.store, manifest, readable, &objects).await
     }
 }

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use crate::coding::codec::ChunkCodec;
 use crate::error::DatasetError;
-use crate::render_group::write::{chunk_path, codecs, grid, key_encoding, runs, unravel};
+use crate::render_group::write::{chunk_key, codecs, grid, key_encoding, runs, unravel};
 use crate::scenes::dataset::METADATA;
 use crate::scenes::read::Stored;
 
@@ -102,7 +102,7 @@ impl RenderGroup {
         let chunks: u64 = grid.iter().product();
         // Found before room is made for what the shape promises.
         for at in (0..chunks).map(|at| unravel(at, &grid)) {
-            let path = chunk_path(&folder, &at);
+            let path = folder.join(chunk_key(&at));
             fs::metadata(&path).map_err(|e| DatasetError::io("read", &path, e))?;
         }
         let codec = ChunkCodec::plain(&codecs(T::ELEMENT), &chunk, T::ELEMENT);
@@ -111,7 +111,7 @@ impl RenderGroup {
             let batch = (first..chunks.min(first + BATCH))
                 .into_par_iter()
                 .map(|at| {
-                    let path = chunk_path(&folder, &unravel(at, &grid));
+                    let path = folder.join(chunk_key(&unravel(at, &grid)));
                     let bytes = fs::read(&path).map_err(|e| DatasetError::io("read", &path, e))?;
                     codec
                         .decode(&bytes)

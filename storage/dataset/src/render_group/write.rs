@@ -1,9 +1,12 @@
 //! Small Zarr v3 groups of plain arrays in a local folder, for single renders and comparisons; see `render_read` for
 //! the way back.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
+use bytes::Bytes;
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 
@@ -127,6 +130,35 @@ fn write_into<T: Stored + Send + Sync>(
     arrays: &[RenderArray<'_, T>],
     attributes: &Map<String, Value>,
 ) -> Result<(), DatasetError> {
+    encode(arrays, attributes, &|key, bytes| {
+        write(&dir.join(key), &bytes)
+    })
+}
+
+/// The objects of the group that [`write_render_group`] writes, by their keys below its folder, ascending.
+///
+/// # Errors
+/// [`DatasetError::Invalid`] for unfit arrays.
+pub fn encode_render_group<T: Stored + Send + Sync>(
+    arrays: &[RenderArray<'_, T>],
+    attributes: &Map<String, Value>,
+) -> Result<BTreeMap<String, Bytes>, DatasetError> {
+    check(arrays)?;
+    let objects = Mutex::new(BTreeMap::new());
+    encode(arrays, attributes, &|key, bytes| {
+        let mut objects = objects.lock().expect("no panic while locked");
+        objects.insert(key, bytes);
+        Ok(())
+    })?;
+    Ok(objects.into_inner().expect("no panic while locked"))
+}
+
+/// Hands the objects of a group over one by one, from any thread; the root's metadata comes last.
+fn encode<T: Stored + Send + Sync>(
+    arrays: &[RenderArray<'_, T>],
+    attributes: &Map<String, Value>,
+    put: &(dyn Fn(String, Bytes) -> Result<(), DatasetError> + Sync),
+) -> Result<(), DatasetError> {
     let mut consolidated = Map::new();
     for array in arrays {
         let chunk = chunk_shape(array.shape);
@@ -143,8 +175,7 @@ fn write_into<T: Stored + Send + Sync>(
             "attributes": {},
             "dimension_names": array.dimension_names,
         });
-        let folder = dir.join(array.name);
-        write(&folder.join(METADATA), &pretty(&metadata))?;
+        put(format!("{}/{METADATA}", array.name), pretty(&metadata))?;
         let codec = ChunkCodec::plain(&codecs, &chunk, T::ELEMENT);
         let grid = grid(array.shape, &chunk);
         (0..grid.iter().product::<u64>())
@@ -153,7 +184,7 @@ fn write_into<T: Stored + Send + Sync>(
                 let at = unravel(at, &grid);
                 let values = gather(array, &chunk, &at);
                 let bytes = codec.encode(bytemuck::cast_slice(&values))?;
-                write(&chunk_path(&folder, &at), &bytes)
+                put(format!("{}/{}", array.name, chunk_key(&at)), bytes.into())
             })?;
         consolidated.insert(array.name.to_string(), metadata);
     }
@@ -163,7 +194,7 @@ fn write_into<T: Stored + Send + Sync>(
         "attributes": attributes,
         "consolidated_metadata": {"kind": "inline", "must_understand": false, "metadata": consolidated},
     });
-    write(&dir.join(METADATA), &pretty(&root))
+    put(METADATA.to_owned(), pretty(&root))
 }
 
 /// How the chunks of a render group's arrays are coded.
@@ -188,10 +219,13 @@ pub(crate) fn grid(shape: &[u64], chunk: &[u64]) -> Vec<u64> {
     sizes.map(|(s, c)| s.div_ceil(*c)).collect()
 }
 
-pub(crate) fn chunk_path(folder: &Path, at: &[u64]) -> PathBuf {
-    let mut path = folder.join("c");
-    path.extend(at.iter().map(u64::to_string));
-    path
+/// The name of a chunk below its array's folder.
+pub(crate) fn chunk_key(at: &[u64]) -> String {
+    let mut key = "c".to_owned();
+    for index in at {
+        key += &format!("/{index}");
+    }
+    key
 }
 
 fn write(path: &PathBuf, bytes: &[u8]) -> Result<(), DatasetError> {

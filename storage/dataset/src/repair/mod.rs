@@ -3,6 +3,7 @@
 pub(crate) mod collect;
 pub(crate) mod held;
 pub(crate) mod listing;
+pub(crate) mod put_back;
 pub(crate) mod recipe;
 pub(crate) mod restore;
 pub(crate) mod root;

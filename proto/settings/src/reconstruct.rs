@@ -1,0 +1,72 @@
+//! How a scene is reconstructed.
+
+use serde::{Deserialize, Serialize};
+
+/// Most nodes along the longest side of the grid.
+pub const MOST_NODES: u32 = 512;
+
+/// How far light paths are believed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Shadows {
+    /// Not at all: what the camera does not see is empty.
+    Ignore,
+    /// Carving alone.
+    Carve,
+    /// Carving, then optimisation.
+    #[default]
+    Optimise,
+}
+
+/// Settings of a reconstruction on a grid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Reconstruction {
+    /// Nodes along the longest side of the grid, 16 to [`MOST_NODES`]. 192 by default; 256 is fine.
+    pub nodes: u32,
+    /// Close the room by planes where the camera does not look.
+    pub planes: bool,
+    /// What becomes of the shadow masks.
+    pub shadows: Shadows,
+    /// Iterations of the optimisation.
+    pub iterations: u32,
+    /// Rays of an iteration.
+    pub batch: u32,
+    /// Seed of all random numbers.
+    pub seed: u64,
+}
+
+impl Default for Reconstruction {
+    fn default() -> Self {
+        Self {
+            nodes: 192,
+            planes: true,
+            shadows: Shadows::Optimise,
+            iterations: 100,
+            batch: 16_384,
+            seed: 0,
+        }
+    }
+}
+
+impl Reconstruction {
+    /// The grid for quality rather than speed.
+    pub const FINE_NODES: u32 = 256;
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// The setting, and what is wrong with it.
+    pub fn check(&self) -> Result<(), (&'static str, String)> {
+        for (field, value, least, most) in [
+            ("nodes", self.nodes, 16, MOST_NODES),
+            ("iterations", self.iterations, 1, 100_000),
+            ("batch", self.batch, 1, 1 << 22),
+        ] {
+            if !(least..=most).contains(&value) {
+                return Err((field, format!("is {value}, choose {least} to {most}")));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,210 @@
+//! Reconstruction: each scene of a data set becomes a room in 3D, from light that bounced twice. One task a scene.
+
+use picofarm_settings::Reconstruction;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{Declared, Fields, Results, TaskKind};
+use crate::model::{
+    job::{
+        OutputSettings, SourceSettings, SpecError, check_count, check_source, default_profile,
+    },
+    memory::{BASE, Known},
+};
+
+/// Bytes of a node of the grid while it is fitted: measured at 128, 192 and 256 nodes.
+const NODE: f64 = 40.0;
+/// Bytes of a pixel for each spot: its time, its mask, and the light path that they make.
+const PATH: f64 = 30.0;
+/// Most novel views of a scene.
+const MOST_VIEWS: u32 = 1_000;
+
+/// A density field, a mesh and their errors for each scene of a data set: one task a scene.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReconstructTask {
+    /// The data set whose scenes are reconstructed.
+    pub source: SourceSettings,
+    /// The number of scenes that the source has room for.
+    pub count: u64,
+    /// From what, and how.
+    pub reconstruct: ReconstructSettings,
+    /// Where reconstructions go: a folder of their own, beside data sets. They have no histograms, so no profile either.
+    pub output: OutputSettings,
+}
+
+/// From what a scene is reconstructed, and how.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReconstructSettings {
+    /// Where two-bounce times and shadow masks come from.
+    pub from: Measurements,
+    /// With `from = "predictions"`: the folder in the source's store that an infer stage wrote, with depth and masks.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub predictions: String,
+    /// Only these spots, ascending; empty = all.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub spots: Vec<u32>,
+    /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
+    pub views: u32,
+    /// The grid.
+    pub grid: Reconstruction,
+    /// Version of the reconstruction, part of every task key; filled in at submission where left out.
+    pub version: String,
+}
+
+/// Where two-bounce times and shadow masks come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Measurements {
+    /// The ground truth's depth and visibility.
+    #[default]
+    Truth,
+    /// What networks predict of one histogram (Shoot-Bounce-3D, appendices C and E).
+    Predictions,
+    /// A histogram of each spot alone (`per_spot = true` in the render stage), through PlatoNeRF's matched filter.
+    Captures,
+}
+
+impl Declared for ReconstructTask {
+    const NAME: &'static str = "reconstruct";
+    const FIELDS: &'static [&'static str] = &["source", "count", "reconstruct", "output"];
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            source: fields.required("source")?,
+            count: fields.or_default("count")?,
+            reconstruct: fields.or_default("reconstruct")?,
+            output: fields.required("output")?,
+        })
+    }
+}
+
+impl TaskKind for ReconstructTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        ("reconstruct.version", &self.reconstruct.version)
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        Some(&mut self.reconstruct.version)
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        check_source(&self.source)?;
+        check_count("count", self.count)?;
+        self.reconstruct.check()?;
+        let to = &self.output;
+        let folder = |name: &String| (&self.source.store, name) == (&to.store, &to.dataset);
+        if folder(&self.source.dataset) || folder(&self.reconstruct.predictions) {
+            let what = format!(
+                "{:?} is read by this stage; choose another folder for the reconstructions",
+                to.dataset
+            );
+            return Err(SpecError::new("output.dataset", what));
+        }
+        if to.profile != default_profile() {
+            let what = format!(
+                "{:?} is how histograms are coded, and reconstructions have none; remove it",
+                to.profile
+            );
+            return Err(SpecError::new("output.profile", what));
+        }
+        to.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "reconstruct",
+            "source": self.source.shaping(),
+            "settings": self.reconstruct,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        Results::scenes(&self.output)
+    }
+
+    fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
+        let source = known.source.as_ref()?;
+        let side = f64::from(self.reconstruct.grid.nodes);
+        let spots = match self.reconstruct.spots.len() {
+            0 => source.spots,
+            chosen => chosen as u32,
+        };
+        let paths = PATH * source.pixels() * f64::from(spots);
+        let histogram = match self.reconstruct.from {
+            Measurements::Captures => 2.0 * source.histogram(),
+            _ => 0.0,
+        };
+        Some(BASE + source.truth() + paths + histogram + NODE * side * side * side)
+    }
+
+    fn tasks(&self) -> u64 {
+        self.count
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        Some(&self.source)
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        Some((&mut self.source, &mut self.count))
+    }
+
+    fn reads_beside(&self) -> Option<&String> {
+        let folder = &self.reconstruct.predictions;
+        (!folder.is_empty()).then_some(folder)
+    }
+
+    fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {
+        vec![("output.store", &mut self.output.store)]
+    }
+
+    fn writes(&self) -> Option<(&String, &String)> {
+        Some((&self.output.store, &self.output.dataset))
+    }
+
+    fn makes(&self) -> Option<(&String, &String)> {
+        None
+    }
+}
+
+impl ReconstructSettings {
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail =
+            |field: &str, what: String| Err(SpecError::new(format!("reconstruct.{field}"), what));
+        match (self.from, &*self.predictions) {
+            (Measurements::Predictions, "") => {
+                return fail(
+                    "predictions",
+                    "is empty; name the folder that an infer stage wrote, as in predictions = \"seen\"".into(),
+                );
+            }
+            (Measurements::Truth | Measurements::Captures, named) if !named.is_empty() => {
+                return fail(
+                    "predictions",
+                    format!("is {named:?}, which only from = \"predictions\" reads; remove it, or say so"),
+                );
+            }
+            _ => {}
+        }
+        if !self.spots.is_sorted_by(|a, b| a < b) {
+            return fail(
+                "spots",
+                format!("{:?} must name each once, ascending", self.spots),
+            );
+        }
+        if self.views > MOST_VIEWS {
+            return fail(
+                "views",
+                format!("is {}, at most {MOST_VIEWS} are compared", self.views),
+            );
+        }
+        self.grid
+            .check()
+            .or_else(|(field, what)| fail(&format!("grid.{field}"), what))
+    }
+}
