@@ -1,234 +1,288 @@
-//! Measures reconstructions of PlatoNeRF's room: L1 of 139 novel views against CPU-seconds.
-use std::time::Instant;
+//! The figures of docs/reconstruction.md: L1 of novel views against CPU-seconds.
+//!
+//! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
+//! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
+//! histograms, minutes), `rooms` (unseen primitive and furnished rooms), `quick` (every seventh view).
+
+use std::error::Error;
 
 use picofarm_reconstruct::{
-    Reconstruction, Settings, Shadows, World,
+    Measured, Reconstructed, Settings, Shadows, Unwatched, World, reconstruct,
     render::Renderer,
-    score::score_views,
-    source::{Disturbed, from_truth},
+    score::{ViewScore, around, floaters, mesh_score, score_views},
+    source::{CaptureSettings, Disturbed, captures_of, from_truth, truth_of},
+    surface,
 };
-use picofarm_scene::plato::{self, PlatoObject, PlatoSettings};
-use picofarm_transient::{Budget, Gate, Strategy};
+use picofarm_scene::{
+    AssetLibrary, Scene,
+    furnished::{self, FurnishedSettings},
+    plato::{self, PlatoObject, PlatoSettings},
+    primitive::{self, PrimitiveSettings},
+};
+use picofarm_transient::{Gate, Progress};
+use rustix::time::{ClockId, clock_gettime};
 
-struct Quiet;
-impl picofarm_transient::Progress for Quiet {
+/// Width of a bin of 128 ps, metres.
+const BIN_M: f32 = 0.0384;
+/// Pixels a side of a novel view.
+const SIDE: u32 = 128;
+/// Unseen rooms of each kind.
+const ROOMS: u64 = 8;
+
+struct Unstopped;
+
+impl Progress for Unstopped {
     fn at(&self, _: f32) -> bool {
         true
     }
 }
-fn cpu() -> f64 {
-    let s = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let f: Vec<&str> = s
-        .rsplit(')')
-        .next()
-        .unwrap_or("")
-        .split_whitespace()
-        .collect();
-    (f[11].parse::<f64>().unwrap() + f[12].parse::<f64>().unwrap()) / 100.0
+
+/// One line of the table.
+#[derive(Clone, Copy)]
+struct Row {
+    name: &'static str,
+    room: PlatoSettings,
+    how: Disturbed,
+    settings: Settings,
+    captures: bool,
 }
-fn main() {
-    let arg = |k: &str, d: &str| {
-        std::env::args()
-            .find_map(|a| a.strip_prefix(&format!("{k}=")).map(str::to_owned))
-            .unwrap_or(d.into())
-    };
-    let num = |k: &str, d: f64| arg(k, &d.to_string()).parse::<f64>().unwrap();
-    let object = PlatoObject::ALL
-        .iter()
-        .find(|o| o.0 == arg("object", "chair"))
-        .unwrap()
-        .1;
-    let px = num("px", 512.0) as u32;
-    let scene = plato::generate(&PlatoSettings {
-        object,
-        spots: num("spots", 16.0) as usize,
-        resolution: px,
-    })
-    .unwrap();
-    let t = Instant::now();
-    let settings = picofarm_transient::Settings {
-        gate: Gate {
-            start_m: 0.0,
-            bin_width_m: 100.0,
-            bins: 1,
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let asked = |word: &str| words.iter().any(|w| w == word);
+    let every = if asked("quick") { 7 } else { 1 };
+    println!(
+        "room and variant | L1 m | visible | occluded | outside | within view | Chamfer m | floaters m3 | CPU s"
+    );
+    if asked("rooms") {
+        for furnished in [false, true] {
+            for captures in [false, true] {
+                rooms(furnished, captures)?;
+            }
+        }
+        return Ok(());
+    }
+    for row in rows(asked("captures")) {
+        measure(&row, every)?;
+    }
+    Ok(())
+}
+
+fn rows(captures: bool) -> Vec<Row> {
+    let base = Row {
+        name: "chair, 192 nodes",
+        room: PlatoSettings::default(),
+        how: Disturbed {
+            bin_width_m: BIN_M,
+            ..Disturbed::default()
         },
-        budget: Budget::Samples(1),
-        max_bounces: Some(1),
-        one_bounce: false,
-        seed: 0,
-        split: false,
-        groups: vec![],
-        strategy: Strategy::default(),
+        settings: Settings::default(),
+        captures: false,
     };
-    let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
-    println!("truth {:.1}s", t.elapsed().as_secs_f32());
-    let world = World::new(&scene);
-    let every = num("every", 7.0) as usize;
-    let views: Vec<_> = plato::views(128)
+    let room = |name, room| Row { name, room, ..base };
+    let with = |name, settings| Row {
+        name,
+        settings,
+        ..base
+    };
+    let how = |name, how| Row { name, how, ..base };
+    let (r, s, d) = (base.room, base.settings, base.how);
+    if captures {
+        let pixels = |name, resolution| Row {
+            captures: true,
+            ..room(name, PlatoSettings { resolution, ..r })
+        };
+        return vec![
+            pixels("chair, captures of 128 pixels", 128),
+            pixels("chair, captures of 256 pixels", 256),
+            pixels("chair, captures of 512 pixels", 512),
+        ];
+    }
+    let object = |name, object| room(name, PlatoSettings { object, ..r });
+    let spots = |name, spots| room(name, PlatoSettings { spots, ..r });
+    let dark = |row: Row, name| Row {
+        name,
+        settings: Settings {
+            shadows: Shadows::Ignore,
+            ..s
+        },
+        ..row
+    };
+    vec![
+        with("chair, 96 nodes", Settings { nodes: 96, ..s }),
+        with("chair, 128 nodes", Settings { nodes: 128, ..s }),
+        base,
+        with("chair, 256 nodes", Settings { nodes: 256, ..s }),
+        with(
+            "chair, 30 iterations",
+            Settings {
+                iterations: 30,
+                ..s
+            },
+        ),
+        with(
+            "chair, 300 iterations",
+            Settings {
+                iterations: 300,
+                ..s
+            },
+        ),
+        with("chair, without planes", Settings { planes: false, ..s }),
+        with(
+            "chair, carving only",
+            Settings {
+                shadows: Shadows::Carve,
+                ..s
+            },
+        ),
+        dark(base, "chair, without shadows"),
+        object("armchair", PlatoObject::Armchair),
+        object("hidden box", PlatoObject::HiddenBox),
+        dark(
+            object("", PlatoObject::HiddenBox),
+            "hidden box, without shadows",
+        ),
+        spots("chair, 1 spot", 1),
+        spots("chair, 2 spots", 2),
+        spots("chair, 4 spots", 4),
+        spots("chair, 8 spots", 8),
+        room(
+            "chair, 256 pixels",
+            PlatoSettings {
+                resolution: 256,
+                ..r
+            },
+        ),
+        room(
+            "chair, 128 pixels",
+            PlatoSettings {
+                resolution: 128,
+                ..r
+            },
+        ),
+        how(
+            "chair, exact times",
+            Disturbed {
+                bin_width_m: 0.0,
+                ..d
+            },
+        ),
+        how(
+            "chair, times with noise of 5 cm",
+            Disturbed { noise_m: 0.05, ..d },
+        ),
+        how(
+            "chair, smooth depth error of 2 cm",
+            Disturbed {
+                smooth_m: 0.02,
+                ..d
+            },
+        ),
+        how(
+            "chair, smooth depth error of 5 cm",
+            Disturbed {
+                smooth_m: 0.05,
+                ..d
+            },
+        ),
+        how(
+            "chair, 2 % wrong mask pixels",
+            Disturbed { flipped: 0.02, ..d },
+        ),
+        how(
+            "chair, 10 % wrong mask pixels",
+            Disturbed { flipped: 0.1, ..d },
+        ),
+    ]
+}
+
+fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
+    let scene = plato::generate(&row.room)?;
+    let measured = measured(&scene, &row.how, row.captures)?;
+    let (made, seconds) = timed(measured, row.settings)?;
+    let views: Vec<_> = plato::views(SIDE)
         .into_iter()
         .skip(every / 2)
         .step_by(every)
         .collect();
-    let how = Disturbed {
-        bin_width_m: num("bin", 0.0384) as f32,
-        noise_m: num("noise", 0.0) as f32,
-        smooth_m: num("smooth", 0.0) as f32,
-        flipped: num("flip", 0.0) as f32,
+    let world = World::new(&scene);
+    let score = score_views(&Renderer::new(&made.field), &scene.camera, &world, &views);
+    let mesh = mesh_score(&surface(&made.field), &world, &made.field, 0)?;
+    let floating = floaters(&made.field, &world, 0)?;
+    told(
+        row.name,
+        &score,
+        (mesh.chamfer_m, floating.volume_m3),
+        seconds,
+    );
+    Ok(())
+}
+
+fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, Box<dyn Error>> {
+    if !captures {
+        return Ok(from_truth(scene, &truth_of(scene, &Unstopped)?, how)?);
+    }
+    let settings = CaptureSettings {
+        gate: Gate {
+            start_m: 0.0,
+            bin_width_m: f64::from(BIN_M),
+            bins: 391,
+        },
+        samples: 8,
         seed: 0,
     };
-    let measured = if arg("source", "truth") == "truth" {
-        from_truth(&scene, &rendered, &how).unwrap()
-    } else {
-        let t = Instant::now();
-        let c = picofarm_reconstruct::source::CaptureSettings {
-            gate: Gate {
-                start_m: 1.0,
-                bin_width_m: 0.0384,
-                bins: 391,
-            },
-            samples: num("samples", 8.0) as u32,
-            seed: 0,
-        };
-        let m = picofarm_reconstruct::source::captures_of(&scene, &c, &|_, _| true).unwrap();
-        println!(
-            "captures {:.1}s left out {:?}",
-            t.elapsed().as_secs_f32(),
-            m.left_out
-        );
-        let tr = from_truth(&scene, &rendered, &how).unwrap();
-        let n = m.pixels();
-        for (k, s) in m.spots.iter().enumerate() {
-            let (mut a, mut b, mut c, mut e, mut u) = (0, 0, 0, 0.0, 0);
-            for p in 0..n {
-                let q = k * n + p;
-                if m.used[q] == 0 || tr.used[q] == 0 {
-                    u += 1;
-                    continue;
-                }
-                match (m.lit[q], tr.lit[q]) {
-                    (1, 0) => a += 1,
-                    (0, 1) => b += 1,
-                    (1, 1) => {
-                        c += 1;
-                        if (m.tau[q] - tr.tau[q]).abs() > 0.06 {
-                            e += 1.0
-                        }
-                    }
-                    _ => {}
-                }
-            }
-            println!(
-                "  spot {k} off {:.4} m: false lit {:.4} false shadow {:.4} of them wrong times {:.4} unused {:.3}",
-                (s.point - rendered.spots[s.beam].unwrap().point).length(),
-                a as f32 / n as f32,
-                b as f32 / n as f32,
-                e / c as f32,
-                u as f32 / n as f32
-            );
-        }
-        m
+    Ok(captures_of(scene, &settings, &|_, _| true)?)
+}
+
+/// A reconstruction and the CPU-seconds it took.
+fn timed(measured: Measured, settings: Settings) -> Result<(Reconstructed, f64), Box<dyn Error>> {
+    let cpu = || {
+        let t = clock_gettime(ClockId::ProcessCPUTime);
+        t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
     };
-    for n in arg("nodes", "192").split(',') {
-        let settings = Settings {
-            nodes: n.parse().unwrap(),
-            planes: arg("planes", "1") == "1",
-            shadows: match &*arg("shadows", "opt") {
-                "no" => Shadows::Ignore,
-                "carve" => Shadows::Carve,
-                _ => Shadows::Optimise,
-            },
-            iterations: num("iters", 100.0) as u32,
-            batch: num("batch", 16384.0) as u32,
-            seed: 0,
+    let start = cpu();
+    let made = reconstruct(measured, settings, &Unwatched)?;
+    Ok((made, cpu() - start))
+}
+
+fn told(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), seconds: f64) {
+    let [all, visible, occluded, outside, within] =
+        [s.all, s.visible, s.occluded, s.outside, s.within_view].map(|split| split.l1_m);
+    println!(
+        "{name} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | {within:.4} | {chamfer:.4} | {floating:.4} | {seconds:.1}"
+    );
+}
+
+/// Means over unseen rooms of 256 pixels and 25 spots.
+fn rooms(furnished: bool, captures: bool) -> Result<(), Box<dyn Error>> {
+    let library = AssetLibrary::parametric();
+    let (mut sums, mut seconds, mut count) = ([0.0f64; 4], 0.0, 0.0f64);
+    for seed in 1000..1000 + ROOMS {
+        let scene = match furnished {
+            true => furnished::generate(seed, &FurnishedSettings::default(), &library)?,
+            false => primitive::generate(seed, &PrimitiveSettings::default())?,
         };
-        struct P(Instant);
-        impl picofarm_reconstruct::Progress for P {
-            fn at(&self, p: picofarm_reconstruct::Phase, d: f32, l: Option<f64>) -> bool {
-                if d == 0.0
-                    || p == picofarm_reconstruct::Phase::Optimise && (d * 100.0) as u32 % 25 == 0
-                {
-                    eprintln!(
-                        "  {:6.2} {} {d:.2} {l:?}",
-                        self.0.elapsed().as_secs_f32(),
-                        p.name()
-                    )
-                }
-                true
-            }
+        let (made, took) = timed(
+            measured(&scene, &Disturbed::default(), captures)?,
+            Settings::default(),
+        )?;
+        let world = World::new(&scene);
+        let views = around(&made.measured, &made.depth.range, &world, 24, SIDE);
+        let s = score_views(&Renderer::new(&made.field), &scene.camera, &world, &views);
+        if s.all.pixels == 0 {
+            continue;
         }
-        let (c, t) = (cpu(), Instant::now());
-        let p = P(t);
-        let mut r = Reconstruction::begin(measured.clone(), settings, &p).unwrap();
-        r.run(&p).unwrap();
-        let out = r.finish();
-        let (c, t) = (cpu() - c, t.elapsed().as_secs_f32());
-        let dm: Vec<f32> = {
-            let mut e: Vec<f32> = out
-                .depth
-                .range
-                .iter()
-                .zip(&rendered.truth.range)
-                .filter(|(a, _)| a.is_finite())
-                .map(|(a, b)| (a - b).abs() * 1e3)
-                .collect();
-            e.sort_by(f32::total_cmp);
-            vec![
-                e.iter().sum::<f32>() / e.len() as f32,
-                e[e.len() / 2],
-                e[e.len() * 99 / 100],
-            ]
-        };
-        println!(
-            "  planes {} grid {:?} depth mean/median/p99 {dm:?} mm none {}",
-            out.planes.len(),
-            out.field.nodes,
-            out.depth.range.iter().filter(|r| !r.is_finite()).count()
-        );
-        let tt = Instant::now();
-        let s = score_views(
-            &Renderer::new(&out.field),
-            &out.measured.camera,
-            &world,
-            &views,
-        );
-        println!(
-            "n {n}: L1 all {:.4} within {:.4} visible {:.4} occluded {:.4} (objects {:.4}) outside {:.4} | rmse {:.3} psnr {:.1} | cpu {c:.1} wall {t:.1} score {:.1}s | share {:.2} {:.2} {:.2} open filled {:.2}",
-            s.all.l1_m,
-            s.within_view.l1_m,
-            s.visible.l1_m,
-            s.occluded.l1_m,
-            s.occluded_objects.l1_m,
-            s.outside.l1_m,
-            s.all.rmse_m,
-            s.psnr_db,
-            tt.elapsed().as_secs_f32(),
-            s.visible.pixels as f64 / s.all.pixels as f64,
-            s.occluded.pixels as f64 / s.all.pixels as f64,
-            s.outside.pixels as f64 / s.all.pixels as f64,
-            s.open_filled
-        );
-        if arg("mesh", "0") == "1" {
-            let tt = Instant::now();
-            let m = picofarm_reconstruct::surface(&out.field);
-            println!(
-                "  mesh {} vertices {:.2}s",
-                m.positions.len(),
-                tt.elapsed().as_secs_f32()
-            );
-            println!(
-                "  {:?}",
-                picofarm_reconstruct::score::mesh_score(&m, &world, &out.field, 0)
-            );
-            println!(
-                "  {:?} {:.2}s",
-                picofarm_reconstruct::score::floaters(&out.field, &world, 0),
-                tt.elapsed().as_secs_f32()
-            );
-            if let Some(f) =
-                std::env::args().find_map(|a| a.strip_prefix("ply=").map(str::to_owned))
-            {
-                std::fs::write(f, m.ply()).unwrap();
-            }
-        }
+        let split = [s.all, s.visible, s.occluded, s.outside].map(|split| split.l1_m);
+        sums.iter_mut().zip(split).for_each(|(sum, x)| *sum += x);
+        (seconds, count) = (seconds + took, count + 1.0);
+        println!("  seed {seed}: {:.4} ({} views)", s.all.l1_m, s.views);
     }
+    let kind = if furnished { "furnished" } else { "primitive" };
+    let source = if captures { "captures" } else { "truth" };
+    let [all, visible, occluded, outside] = sums.map(|sum| sum / count.max(1.0));
+    println!(
+        "{count} {kind} rooms, {source} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | | | | {:.1}",
+        seconds / count.max(1.0)
+    );
+    Ok(())
 }

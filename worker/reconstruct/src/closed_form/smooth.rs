@@ -7,8 +7,11 @@ use rayon::prelude::*;
 use super::Depth;
 use crate::Measured;
 
-/// Pixels on each side of the one in the middle.
+/// Pixels on each side of the one in the middle, at a focal length of 256 pixels or more; in coarser images fewer, so that the
+/// fit does not span edges.
 const REACH: i64 = 3;
+/// Focal length in pixels for each pixel of reach.
+const FOCAL: f32 = 128.0;
 /// Relative difference in inverse depth up to which a neighbour counts as on the same surface: this, and as much again
 /// for each pixel of distance.
 const SLOPE: f32 = 0.012;
@@ -23,6 +26,7 @@ pub fn smooth(measured: &Measured, depth: &Depth) -> Depth {
     let (width, height) = (i64::from(i.width), i64::from(i.height));
     // Coarse images see larger steps from pixel to pixel.
     let slope = SLOPE * (512.0 * 0.5 / i.fx.min(i.fy)).max(1.0);
+    let reach = ((i.fx.min(i.fy) / FOCAL).round() as i64).clamp(1, REACH);
     let rays: Vec<(Vec3, f32)> = (0..measured.pixels())
         .map(|p| {
             let r = measured.ray(p);
@@ -42,8 +46,8 @@ pub fn smooth(measured: &Measured, depth: &Depth) -> Depth {
         }
         let (u, v) = (p as i64 % width, p as i64 / width);
         let (mut m, mut count) = ([[0f64; 4]; 3], 0.0);
-        for dv in -REACH..=REACH {
-            for du in -REACH..=REACH {
+        for dv in -reach..=reach {
+            for du in -reach..=reach {
                 let (a, b) = (u + du, v + dv);
                 if a < 0 || b < 0 || a >= width || b >= height {
                     continue;
