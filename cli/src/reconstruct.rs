@@ -6,9 +6,7 @@ mod written;
 use std::time::Instant;
 
 use picofarm_reconstruct::{
-    Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Surface, World,
-    render::Renderer,
-    score::{self, MeshScore},
+    Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Surface, World, score,
     source::{self, CaptureSettings, Disturbed},
     surface,
 };
@@ -167,52 +165,27 @@ fn metrics(
     mesh: &Surface,
 ) -> Result<Value> {
     let world = World::new(scene);
-    let camera = &made.measured.camera;
     let views = match args.views {
         ViewsArg::Plato => plato::views(VIEW_SIDE),
         ViewsArg::Around => {
             score::around(&made.measured, &made.depth.range, &world, AROUND, VIEW_SIDE)
         }
     };
-    let novel = score::score_views(&Renderer::new(&made.field), camera, &world, &views);
-    let of_mesh: Option<MeshScore> = match mesh.triangles.is_empty() {
-        true => None,
-        false => Some(score::mesh_score(mesh, &world, &made.field, args.seed).map_err(refused)?),
-    };
-    let floaters = score::floaters(&made.field, &world, args.seed).map_err(refused)?;
-    let left_out: Vec<Value> = made
-        .measured
-        .left_out
-        .iter()
-        .map(|l| json!({"beam": l.beam, "why": l.why}))
-        .collect();
-    let evidence =
-        |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
-    use picofarm_reconstruct::Evidence;
-    Ok(json!({
+    let mut all = picofarm_agent::reconstruct::facts(made, mesh);
+    all.extend(
+        picofarm_agent::reconstruct::errors(made, mesh, &world, &views, args.seed)
+            .map_err(refused)?,
+    );
+    let asked = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
         "spots_from": match args.spots_from { SpotsFrom::Captures => "captures", SpotsFrom::Truth => "truth" },
         "resolution": args.resolution,
         "settings": settings,
-        "spots": made.measured.spots.len(),
-        "left_out": left_out,
-        "planes": made.planes.iter().map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset})).collect::<Vec<_>>(),
-        "iterations": made.iterations,
-        "loss": made.loss,
         "views": match args.views { ViewsArg::Around => "around", ViewsArg::Plato => "plato" },
-        "depth": "distance along the ray at which half the light is stopped; where none is, to the grid's end",
-        "novel_views": novel,
-        "mesh": of_mesh,
-        "vertices": mesh.positions.len(),
-        "triangles": mesh.triangles.len(),
-        "floaters": floaters,
-        "evidence": {
-            "none": evidence(Evidence::None), "plane": evidence(Evidence::Plane),
-            "paths": evidence(Evidence::Paths), "seen": evidence(Evidence::Seen),
-        },
-        "notes": made.notes,
-    }))
+    });
+    all.extend(asked.as_object().cloned().unwrap_or_default());
+    Ok(Value::Object(all))
 }
 
 fn told(args: &Reconstruct, made: &Made) -> String {

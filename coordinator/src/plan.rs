@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    model::{JobPlan, JobSpec, SpecError, StagePlan, StageSpec, memory::peak_bytes},
+    model::{JobPlan, JobSpec, StagePlan, StageSpec, memory::peak_bytes},
 };
 use serde_json::Value;
 

@@ -2,9 +2,8 @@
 
 use std::{fs, path::Path};
 
-use picofarm_dataset::{RenderArray, write_render_group};
-use picofarm_reconstruct::{Reconstructed, Surface, field::surface_logit};
-use serde_json::{Value, json};
+use picofarm_reconstruct::{Reconstructed, Surface};
+use serde_json::Value;
 
 use crate::error::{CliError, Code, Result, io};
 
@@ -43,39 +42,16 @@ fn into(dir: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) -> Re
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))
     };
     fs::create_dir_all(dir).map_err(|e| io(dir.display(), &e))?;
-    density(&dir.join("density.zarr"), made)?;
+    let objects =
+        picofarm_agent::reconstruct::density(made).map_err(|e| CliError::new(Code::Resource, e))?;
+    for (key, bytes) in &objects {
+        let path = dir.join("density.zarr").join(key);
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder).map_err(|e| io(folder.display(), &e))?;
+        }
+        fs::write(&path, bytes).map_err(|e| io(path.display(), &e))?;
+    }
     save("mesh.ply", &mesh.ply())?;
     let text = serde_json::to_string_pretty(metrics).expect("metrics are plain data");
     save("metrics.json", (text + "\n").as_bytes())
-}
-
-fn density(path: &Path, made: &Reconstructed) -> Result<()> {
-    let field = &made.field;
-    let [nx, ny, nz] = field.nodes.map(|n| n as u64);
-    let density: Vec<f32> = (0..field.logit.len()).map(|i| field.density(i)).collect();
-    let evidence: Vec<f32> = made.evidence.iter().map(|e| f32::from(*e as u8)).collect();
-    let shape = [nz, ny, nx];
-    let array = |name, data| RenderArray {
-        name,
-        shape: &shape,
-        dimension_names: &["z", "y", "x"],
-        data,
-    };
-    let attributes = json!({
-        "origin_m": <[f32; 3]>::from(field.origin),
-        "spacing_m": field.spacing,
-        "axes": "x, y, z of the scene, metres; node (k, j, i) lies at origin + spacing * (i, j, k)",
-        "density": "1/m at the nodes: 4/spacing * sigmoid(logit); between nodes the logit is trilinear, logit = ln(s/(1 - s)) with s = density * spacing/4",
-        "surface_density_per_m": picofarm_reconstruct::field::PEAK / field.spacing
-            * picofarm_reconstruct::field::sigmoid(surface_logit()),
-        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.ply is this level",
-        "evidence": "what tells of a node: 0 nothing (its density is a guess), 1 a plane of the room, 2 light paths, 3 the camera",
-    });
-    let attributes = attributes.as_object().expect("written as an object");
-    write_render_group(
-        path,
-        &[array("density", &density), array("evidence", &evidence)],
-        attributes,
-    )
-    .map_err(|e| CliError::new(Code::Resource, e))
 }

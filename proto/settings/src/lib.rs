@@ -9,6 +9,6 @@ pub mod sensor;
 
 pub use gate::Gate;
 pub use network::{Architecture, Precision, Schedule, ShadowVariant, Target};
-pub use reconstruct::{MOST_NODES, Reconstruction, Shadows};
+pub use reconstruct::{GridSettings, MOST_NODES, Shadows};
 pub use render::{Budget, Choice, Strategy};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};

@@ -21,7 +21,7 @@ pub enum Shadows {
 /// Settings of a reconstruction on a grid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Reconstruction {
+pub struct GridSettings {
     /// Nodes along the longest side of the grid, 16 to [`MOST_NODES`]. 192 by default; 256 is fine.
     pub nodes: u32,
     /// Close the room by planes where the camera does not look.
@@ -36,7 +36,7 @@ pub struct Reconstruction {
     pub seed: u64,
 }
 
-impl Default for Reconstruction {
+impl Default for GridSettings {
     fn default() -> Self {
         Self {
             nodes: 192,
@@ -49,7 +49,7 @@ impl Default for Reconstruction {
     }
 }
 
-impl Reconstruction {
+impl GridSettings {
     /// The grid for quality rather than speed.
     pub const FINE_NODES: u32 = 256;
 

@@ -11,7 +11,7 @@ mod run;
 pub use execute::{
     Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version, resolve,
 };
-pub use execute::{export, repair, reprocess, split};
+pub use execute::{export, reconstruct, repair, reprocess, split};
 #[cfg(feature = "networks")]
 pub use execute::{infer_version, model_version, report};
 pub use picofarm_session::{

@@ -30,9 +30,11 @@ pub use error::ReconstructError;
 pub use measured::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE};
 pub use mesh::{Surface, surface};
 pub use optimise::cast_ray;
+pub use picofarm_settings::{GridSettings as Settings, MOST_NODES, Shadows};
 pub use planes::Plane;
 pub use progress::{Phase, Progress, Unwatched};
-pub use reconstruction::{
-    Evidence, MOST_NODES, Reconstructed, Reconstruction, Settings, Shadows, reconstruct,
-};
+pub use reconstruction::{Evidence, Reconstructed, Reconstruction, reconstruct};
 pub use world::{Hit, World};
+
+/// Version of the reconstruction: part of every task key. Change it whenever any bit of a result may change.
+pub const VERSION: &str = "reconstruct-1";

@@ -2,8 +2,8 @@
 //! on.
 
 use picofarm_scene::Vec3;
+use picofarm_settings::{GridSettings as Settings, Shadows};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use crate::{
     Depth, Measured, ReconstructError,
@@ -16,74 +16,6 @@ use crate::{
     progress::{Phase, Progress, begin},
     start::{State, bounds, start},
 };
-
-/// Most nodes along the longest side of the grid.
-pub const MOST_NODES: u32 = 512;
-
-/// How far light paths are believed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Shadows {
-    /// Not at all: what the camera does not see is empty.
-    Ignore,
-    /// Carving alone.
-    Carve,
-    /// Carving, then optimisation.
-    Optimise,
-}
-
-/// Settings of a reconstruction.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Settings {
-    /// Nodes along the longest side of the grid, 16 to [`MOST_NODES`]. 192 by default; 256 is fine.
-    pub nodes: u32,
-    /// Close the room by planes where the camera does not look.
-    pub planes: bool,
-    /// What becomes of the shadow masks.
-    pub shadows: Shadows,
-    /// Iterations of the optimisation.
-    pub iterations: u32,
-    /// Rays of an iteration.
-    pub batch: u32,
-    /// Seed of all random numbers.
-    pub seed: u64,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            nodes: 192,
-            planes: true,
-            shadows: Shadows::Optimise,
-            iterations: 100,
-            batch: 16_384,
-            seed: 0,
-        }
-    }
-}
-
-impl Settings {
-    /// The grid for quality rather than speed.
-    pub const FINE_NODES: u32 = 256;
-
-    /// Checks the ranges.
-    ///
-    /// # Errors
-    /// [`ReconstructError::Invalid`] naming the setting.
-    pub fn check(&self) -> Result<(), ReconstructError> {
-        let within = |field: &str, value: u32, least: u32, most: u32| {
-            let what = format!("is {value}, choose {least} to {most}");
-            match (least..=most).contains(&value) {
-                true => Ok(()),
-                false => Err(ReconstructError::invalid(field, what)),
-            }
-        };
-        within("nodes", self.nodes, 16, MOST_NODES)?;
-        within("iterations", self.iterations, 1, 100_000)?;
-        within("batch", self.batch, 1, 1 << 22)
-    }
-}
 
 /// What is known of a node of the result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -155,7 +87,9 @@ impl Reconstruction {
         settings: Settings,
         progress: &dyn Progress,
     ) -> Result<Self, ReconstructError> {
-        settings.check()?;
+        settings
+            .check()
+            .map_err(|(field, what)| ReconstructError::invalid(field, what))?;
         let mut notes = measured.check()?;
         begin(progress, Phase::Depth)?;
         let raw = closed_form(&mut measured);

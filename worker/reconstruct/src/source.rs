@@ -1,9 +1,11 @@
 //! Where measurements come from.
 
 mod captures;
+mod given;
 mod rendered;
 mod truth;
 
 pub use captures::{Captures, LIT_THRESHOLD};
+pub use given::{Given, given};
 pub use rendered::{CaptureProgress, CaptureSettings, captures_of, truth_of};
 pub use truth::{Disturbed, from_truth, surface_normals};

@@ -1,14 +1,12 @@
 //! Reconstruction: each scene of a data set becomes a room in 3D, from light that bounced twice. One task a scene.
 
-use picofarm_settings::Reconstruction;
+use picofarm_settings::GridSettings;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{Declared, Fields, Results, TaskKind};
 use crate::model::{
-    job::{
-        OutputSettings, SourceSettings, SpecError, check_count, check_source, default_profile,
-    },
+    job::{OutputSettings, SourceSettings, SpecError, check_count, check_source, default_profile},
     memory::{BASE, Known},
 };
 
@@ -47,7 +45,7 @@ pub struct ReconstructSettings {
     /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
     pub views: u32,
     /// The grid.
-    pub grid: Reconstruction,
+    pub grid: GridSettings,
     /// Version of the reconstruction, part of every task key; filled in at submission where left out.
     pub version: String,
 }
@@ -186,7 +184,9 @@ impl ReconstructSettings {
             (Measurements::Truth | Measurements::Captures, named) if !named.is_empty() => {
                 return fail(
                     "predictions",
-                    format!("is {named:?}, which only from = \"predictions\" reads; remove it, or say so"),
+                    format!(
+                        "is {named:?}, which only from = \"predictions\" reads; remove it, or say so"
+                    ),
                 );
             }
             _ => {}

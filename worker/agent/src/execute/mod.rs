@@ -8,6 +8,7 @@ mod kinds;
 mod memory;
 mod output;
 mod recipe;
+mod remade;
 pub mod repair;
 mod scenes;
 mod submission;
@@ -18,7 +19,9 @@ mod truth;
 pub use picofarm_session::{Control, Executor, Output, Task, TaskError};
 
 use kinds::{Context, RunTask, STORE_PATIENCE, part, render};
-pub use kinds::{TaskExecutor, export, render::renderer_version, reprocess, resolve, split};
+pub use kinds::{
+    TaskExecutor, export, reconstruct, render::renderer_version, reprocess, resolve, split,
+};
 #[cfg(feature = "networks")]
 use kinds::{evaluate, train};
 #[cfg(feature = "networks")]

@@ -134,7 +134,7 @@ impl Stores {
     }
 
     /// A place to read from.
-    fn source(&self, location: &str) -> Result<Place, TaskError> {
+    pub(super) fn source(&self, location: &str) -> Result<Place, TaskError> {
         let known = || self.sources.lock().expect("no panic while locked");
         if let Some(place) = known().get(location) {
             return Ok(place.clone());

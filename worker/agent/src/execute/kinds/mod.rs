@@ -11,6 +11,7 @@ pub(super) mod infer;
 pub(super) mod part;
 #[cfg(feature = "networks")]
 mod promote;
+pub mod reconstruct;
 pub(super) mod render;
 #[cfg(feature = "networks")]
 pub mod report;
@@ -28,7 +29,7 @@ use picofarm_files::Opener;
 use picofarm_proto::model::{
     EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask, PromoteTask,
     RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
-    kinds::{Declared, VerifyTask},
+    kinds::{Declared, ReconstructTask, VerifyTask},
 };
 use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
@@ -116,6 +117,7 @@ kinds! {
     Promote(PromoteTask),
     Infer(InferTask),
     Report(ReportTask),
+    Reconstruct(ReconstructTask),
     Verify(VerifyTask),
     Part(PartTask),
 }

@@ -1,0 +1,578 @@
+//! Reconstruction: a scene of a data set as a density field, a mesh and their errors. Adopt, or measure, fit and publish.
+//!
+//! A task takes seconds, so it keeps no checkpoint: one that is stopped begins again, and comes to the same bytes.
+
+use std::collections::BTreeMap;
+
+use bytes::Bytes;
+use picofarm_dataset::{
+    Dataset, DatasetError, Manifest, Predictions, Quantity, ReconstructionManifest,
+    Reconstructions, RenderArray, SceneUsed, encode_render_group,
+};
+use picofarm_proto::{
+    key::TaskKey,
+    model::{
+        TaskSpec,
+        kinds::{
+            ReconstructTask,
+            reconstruct::{Measurements, ReconstructSettings},
+        },
+    },
+};
+use picofarm_reconstruct::{
+    Evidence, Measured, Phase, Progress, ReconstructError, Reconstructed, Reconstruction, Surface,
+    VERSION, World,
+    field::{PEAK, sigmoid, surface_logit},
+    render::Renderer,
+    score,
+    source::{Captures, Given, LIT_THRESHOLD, given},
+    surface,
+};
+use picofarm_scene::{Beam, Camera, Intrinsics, Laser, Vec3};
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+use tracing::{info, warn};
+
+use crate::execute::{
+    Context, Control, Output, RunTask, Task, TaskError,
+    output::{Stores, manifest_sha256, of_dataset},
+    remade,
+    reprocess::source_manifest,
+};
+
+/// Pixels a side of a novel view.
+const VIEW_SIDE: u32 = 128;
+/// Progress once everything is measured, and once the field is fitted.
+const MEASURED: f32 = 0.2;
+const FITTED: f32 = 0.85;
+
+impl RunTask for ReconstructTask {
+    fn code_version() -> String {
+        VERSION.to_owned()
+    }
+
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let (stores, place, index) = (&context.stores, &self.source, task.index);
+        let dataset = stores.open_source(&place.store, &place.dataset, control)?;
+        stores.fits(TaskSpec::Reconstruct(self.clone()), Some(dataset.spec()))?;
+        let found = source_manifest(stores, &dataset, index, control)?;
+        let work = Work(self);
+        let predictions = work.predictions(stores, index, control)?;
+        let manifest = work.manifest(index, &found, predictions.as_ref().map(|(_, used)| used));
+        let (store, prefix) = stores.probed(&self.output.store, control)?;
+        let folder = Reconstructions::create_or_open(store, prefix.join(&*self.output.dataset));
+        let folder = stores.wait(control, folder)?;
+        if !task.spec.force
+            && let Some(there) = finished(stores, &folder, &manifest, control)?
+        {
+            return Ok(output(&there, true));
+        }
+        let predictions = predictions.map(|(predictions, _)| predictions);
+        let measured = work.measured(stores, &dataset, &found, predictions.as_ref(), control)?;
+        let files = work.files(context, index, measured, control)?;
+        let made = stores.patiently(control, async || {
+            folder.restore(manifest.clone(), files.clone()).await
+        })?;
+        control.at(1.0);
+        Ok(output(&made, false))
+    }
+}
+
+fn output(manifest: &ReconstructionManifest, adopted: bool) -> Output {
+    Output {
+        manifest_sha256: manifest.sha256(),
+        bytes: manifest.total_bytes(),
+        adopted,
+    }
+}
+
+/// What is there if this very task has published it.
+fn finished(
+    stores: &Stores,
+    folder: &Reconstructions,
+    ours: &ReconstructionManifest,
+    control: &Control,
+) -> Result<Option<ReconstructionManifest>, TaskError> {
+    let looked = async {
+        match folder.finished(ours.scene, &ours.task_key).await {
+            Err(error @ DatasetError::Damaged { .. }) => {
+                warn!(%error, "a reconstruction is damaged; it is made again and put back");
+                Ok(None)
+            }
+            other => other,
+        }
+    };
+    stores.wait(control, looked)
+}
+
+/// A task, and what belongs to it.
+struct Work<'a>(&'a ReconstructTask);
+
+impl Work<'_> {
+    fn manifest(
+        &self,
+        scene: u64,
+        found: &Manifest,
+        predictions: Option<&SceneUsed>,
+    ) -> ReconstructionManifest {
+        let source = SceneUsed {
+            dataset: self.0.source.dataset.clone(),
+            task_key: found.provenance.task_key.clone(),
+            manifest_sha256: manifest_sha256(found),
+        };
+        let settings = ReconstructSettings {
+            version: String::new(),
+            ..self.0.reconstruct.clone()
+        };
+        let settings = json!(settings);
+        let named = json!([
+            VERSION,
+            source.manifest_sha256,
+            predictions.map(|p| &p.manifest_sha256),
+            settings
+        ]);
+        let key = TaskKey(Sha256::digest(named.to_string()).into());
+        ReconstructionManifest {
+            scene,
+            task_key: key.to_string(),
+            code: VERSION.to_owned(),
+            source,
+            predictions: predictions.cloned(),
+            settings,
+            ..ReconstructionManifest::default()
+        }
+    }
+
+    /// The predictions that are read, and which they are.
+    fn predictions(
+        &self,
+        stores: &Stores,
+        index: u64,
+        control: &Control,
+    ) -> Result<Option<(Predictions, SceneUsed)>, TaskError> {
+        let folder = &self.0.reconstruct.predictions;
+        if folder.is_empty() {
+            return Ok(None);
+        }
+        let at = |e: TaskError| match e {
+            TaskError::User(what) => TaskError::User(format!("reconstruct.predictions: {what}")),
+            other => other,
+        };
+        let (store, prefix) = stores.source(&self.0.source.store)?;
+        let opened = Predictions::open(store, prefix.join(&**folder));
+        let predictions = stores.wait(control, opened).map_err(at)?;
+        let spec = predictions.spec();
+        if !spec.depth || spec.spots.is_empty() {
+            return Err(TaskError::User(format!(
+                "reconstruct.predictions: {} holds {}; depth and masks are needed: give its infer stage a \"tof\" and a \
+                 \"shadow\" model",
+                predictions.place(),
+                match (spec.depth, spec.spots.is_empty()) {
+                    (true, _) => "no masks of spots",
+                    (_, false) => "no depth",
+                    _ => "neither depth nor masks",
+                }
+            )));
+        }
+        let manifest = stores
+            .wait(control, predictions.manifest(index))
+            .map_err(at)?;
+        let used = SceneUsed {
+            dataset: folder.clone(),
+            task_key: manifest.task_key.clone(),
+            manifest_sha256: manifest.sha256(),
+        };
+        Ok(Some((predictions, used)))
+    }
+
+    /// Times and masks of the scene, in the axes of the scene.
+    fn measured(
+        &self,
+        stores: &Stores,
+        dataset: &Dataset,
+        found: &Manifest,
+        predictions: Option<&Predictions>,
+        control: &Control,
+    ) -> Result<Measured, TaskError> {
+        let (scene, from) = (found.scene, self.0.reconstruct.from);
+        let needed: &[&str] = match from {
+            Measurements::Truth => &["depth", "visibility", "spots.path"],
+            Measurements::Predictions => &["spots.path"],
+            Measurements::Captures => &[],
+        };
+        let missing = found.missing();
+        if let Some(missing) = missing.iter().find(|m| needed.contains(&m.as_str())) {
+            return Err(TaskError::User(format!(
+                "source: scene {scene} of {} was imported without {missing:?}, which from = {:?} needs; import it with it, \
+                 or choose other measurements",
+                dataset.place(),
+                json!(from).as_str().unwrap_or_default(),
+            )));
+        }
+        control.say("reads the scene".into(), &[]);
+        let spec = dataset.spec();
+        let read = async {
+            futures::try_join!(
+                dataset.read_spots(scene),
+                dataset.read_intrinsics(scene),
+                dataset.read::<f32>(scene, Quantity::Camera),
+                dataset.read::<f32>(scene, Quantity::Laser),
+                dataset.read::<f32>(scene, Quantity::Depth),
+                dataset.read::<u8>(scene, Quantity::Specular),
+            )
+        };
+        let (spots, intrinsics, pose, laser, mut depth, mut mirror) = stores.wait(control, read)?;
+        let frame = Frame(&pose);
+        let camera = frame.camera(Intrinsics {
+            fx: intrinsics.fx,
+            fy: intrinsics.fy,
+            cx: intrinsics.cx,
+            cy: intrinsics.cy,
+            width: spec.width,
+            height: spec.height,
+        });
+        let laser = frame.point([laser[0], laser[1], laser[2]]);
+        let spots: Vec<Option<(Vec3, f32)>> = spots
+            .iter()
+            .map(|spot| spot.map(|s| (frame.point(s.position), s.path_m)))
+            .collect();
+        let beams = self.beams(spec.spots, predictions)?;
+        if from == Measurements::Captures {
+            return captures(
+                stores,
+                dataset,
+                scene,
+                (camera, laser, &spots, &beams),
+                control,
+            );
+        }
+        let pixels = spec.pixels();
+        let all: Vec<u8> = match predictions {
+            None => stores.wait(control, dataset.read_visibility(scene))?,
+            Some(predictions) => {
+                let predicted = stores.wait(control, predictions.read(scene))?;
+                if predicted.depth_m.len() != pixels {
+                    return Err(TaskError::User(format!(
+                        "reconstruct.predictions: {} has images of another size than {}",
+                        predictions.place(),
+                        dataset.place()
+                    )));
+                }
+                depth = predicted.depth_m;
+                // Where no network looks for mirrors, the truth is not asked instead.
+                mirror = match predicted.specular.is_empty() {
+                    true => vec![0; pixels],
+                    false => predicted
+                        .specular
+                        .iter()
+                        .map(|p| u8::from(*p >= 128))
+                        .collect(),
+                };
+                let mut all = vec![0; spots.len() * pixels];
+                for (number, mask) in predictions
+                    .spec()
+                    .spots
+                    .iter()
+                    .zip(predicted.lit.chunks_exact(pixels))
+                {
+                    let to = &mut all[*number as usize * pixels..][..pixels];
+                    for (to, p) in to.iter_mut().zip(mask) {
+                        *to = u8::from(*p >= 128);
+                    }
+                }
+                all
+            }
+        };
+        let lit: Vec<u8> = beams
+            .iter()
+            .flat_map(|b| &all[*b as usize * pixels..][..pixels])
+            .copied()
+            .collect();
+        let range: Vec<f32> = (0..pixels).map(|p| depth[p] * slant(&camera, p)).collect();
+        given(&Given {
+            camera,
+            laser,
+            spots: &spots,
+            beams: &beams,
+            range_m: &range,
+            lit: &lit,
+            mirror: &mirror,
+        })
+        .map_err(of_reconstruction)
+    }
+
+    /// The beams that are used.
+    fn beams(&self, spots: u32, predictions: Option<&Predictions>) -> Result<Vec<u32>, TaskError> {
+        let there: Vec<u32> = match predictions {
+            Some(predictions) => predictions.spec().spots.clone(),
+            None => (0..spots).collect(),
+        };
+        let wanted = &self.0.reconstruct.spots;
+        if let Some(none) = wanted.iter().find(|s| !there.contains(s)) {
+            return Err(TaskError::User(format!(
+                "reconstruct.spots: there is nothing of spot {none}; there is of {}",
+                there
+                    .iter()
+                    .map(u32::to_string)
+                    .collect::<Vec<_>>()
+                    .join(", ")
+            )));
+        }
+        Ok(match wanted.is_empty() {
+            true => there,
+            false => wanted.clone(),
+        })
+    }
+
+    /// Fits the field and gives the scene's files by their names.
+    fn files(
+        &self,
+        context: &Context,
+        index: u64,
+        measured: Measured,
+        control: &Control,
+    ) -> Result<BTreeMap<String, Bytes>, TaskError> {
+        let grid = self.0.reconstruct.grid;
+        let watch = Watch(control);
+        let mut fitting =
+            Reconstruction::begin(measured, grid, &watch).map_err(of_reconstruction)?;
+        if !fitting.run(&watch).map_err(of_reconstruction)? {
+            return Err(TaskError::Stopped);
+        }
+        let made = fitting.finish();
+        for note in &made.notes {
+            info!(note, "reconstruction");
+        }
+        let mesh = surface(&made.field);
+        proceed(control, FITTED)?;
+        let mut metrics = facts(&made, &mesh);
+        if self.0.reconstruct.views > 0 {
+            control.say("compares with the scene".into(), &[]);
+            let scene =
+                remade::scene(context, &self.0.source, index, control).map_err(|e| match e {
+                    TaskError::User(what) => TaskError::User(format!("reconstruct.views: {what}")),
+                    other => other,
+                })?;
+            let world = World::new(&scene);
+            let views = score::around(
+                &made.measured,
+                &made.depth.range,
+                &world,
+                self.0.reconstruct.views as usize,
+                VIEW_SIDE,
+            );
+            proceed(control, 0.9)?;
+            let errors =
+                errors(&made, &mesh, &world, &views, grid.seed).map_err(of_reconstruction)?;
+            metrics.extend(errors);
+        }
+        let mut files: BTreeMap<String, Bytes> = density(&made)
+            .map_err(of_dataset)?
+            .into_iter()
+            .map(|(key, bytes)| (format!("density.zarr/{key}"), bytes))
+            .collect();
+        files.insert("mesh.ply".into(), mesh.ply().into());
+        let text = serde_json::to_string_pretty(&metrics).expect("metrics are plain data");
+        files.insert("metrics.json".into(), (text + "\n").into());
+        Ok(files)
+    }
+}
+
+fn captures(
+    stores: &Stores,
+    dataset: &Dataset,
+    scene: u64,
+    (camera, origin, spots, beams): (Camera, Vec3, &[Option<(Vec3, f32)>], &[u32]),
+    control: &Control,
+) -> Result<Measured, TaskError> {
+    if !dataset.spec().per_spot {
+        return Err(TaskError::User(format!(
+            "source: {} has no histogram of each spot alone, which from = \"captures\" reads; render it with per_spot = true",
+            dataset.place()
+        )));
+    }
+    // A beam that a mirror folds has no direction here: it points at its spot, where the filter looks for it.
+    let towards = |spot: &Option<(Vec3, f32)>| {
+        let away = spot.map_or(camera.forward, |(point, _)| point - origin);
+        Beam {
+            direction: away.normalized(),
+            spot: None,
+        }
+    };
+    let laser = Laser {
+        origin,
+        beams: spots.iter().map(towards).collect(),
+    };
+    let mut all = Captures::new(camera, laser, dataset.spec().gate, LIT_THRESHOLD);
+    for (done, beam) in beams.iter().enumerate() {
+        control.say(format!("capture {} of {}", done + 1, beams.len()), &[]);
+        proceed(control, MEASURED * done as f32 / beams.len() as f32)?;
+        let histogram = stores.wait(control, dataset.read_spot(scene, *beam))?;
+        all.add(*beam as usize, &histogram)
+            .map_err(of_reconstruction)?;
+    }
+    Ok(all.finish())
+}
+
+/// A camera-to-world matrix, row by row.
+struct Frame<'a>(&'a [f32]);
+
+impl Frame<'_> {
+    fn axis(&self, column: usize) -> Vec3 {
+        Vec3::new(self.0[column], self.0[4 + column], self.0[8 + column])
+    }
+
+    fn point(&self, p: [f32; 3]) -> Vec3 {
+        self.axis(3) + self.axis(0) * p[0] + self.axis(1) * p[1] + self.axis(2) * p[2]
+    }
+
+    fn camera(&self, intrinsics: Intrinsics) -> Camera {
+        Camera {
+            intrinsics,
+            origin: self.axis(3),
+            right: self.axis(0),
+            down: self.axis(1),
+            forward: self.axis(2),
+        }
+    }
+}
+
+/// Distance along a pixel's ray for each metre of z-depth.
+fn slant(camera: &Camera, pixel: usize) -> f32 {
+    let i = &camera.intrinsics;
+    let (u, v) = (
+        (pixel % i.width as usize) as f32 + 0.5,
+        (pixel / i.width as usize) as f32 + 0.5,
+    );
+    let (x, y) = ((u - i.cx) / i.fx, (v - i.cy) / i.fy);
+    (x * x + y * y + 1.0).sqrt()
+}
+
+/// What is known of a reconstruction without its true scene: the same bytes for the same measurements, so no times.
+pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Value> {
+    let left_out = made.measured.left_out.iter();
+    let left_out: Vec<Value> = left_out
+        .map(|l| json!({"beam": l.beam, "why": l.why}))
+        .collect();
+    let planes = made.planes.iter();
+    let planes: Vec<Value> = planes
+        .map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset}))
+        .collect();
+    let share =
+        |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
+    let facts = json!({
+        "spots": made.measured.spots.len(),
+        "left_out": left_out,
+        "planes": planes,
+        "iterations": made.iterations,
+        "loss": made.loss,
+        "vertices": mesh.positions.len(),
+        "triangles": mesh.triangles.len(),
+        "evidence": {
+            "none": share(Evidence::None), "plane": share(Evidence::Plane),
+            "paths": share(Evidence::Paths), "seen": share(Evidence::Seen),
+        },
+        "notes": made.notes,
+    });
+    match facts {
+        Value::Object(facts) => facts,
+        _ => unreachable!("written as an object"),
+    }
+}
+
+/// How far a reconstruction is from its true scene: novel views, mesh, floating matter.
+///
+/// # Errors
+/// [`ReconstructError::Invalid`] where the scene has no surface in the grid.
+pub fn errors(
+    made: &Reconstructed,
+    mesh: &Surface,
+    world: &World,
+    views: &[Camera],
+    seed: u64,
+) -> Result<serde_json::Map<String, Value>, ReconstructError> {
+    let camera = &made.measured.camera;
+    let novel = score::score_views(&Renderer::new(&made.field), camera, world, views);
+    let of_mesh = match mesh.triangles.is_empty() {
+        true => None,
+        false => Some(score::mesh_score(mesh, world, &made.field, seed)?),
+    };
+    let floaters = score::floaters(&made.field, world, seed)?;
+    let errors = json!({
+        "depth": "distance along the ray at which half the light is stopped; where none is, to the grid's end",
+        "novel_views": novel,
+        "mesh": of_mesh,
+        "floaters": floaters,
+    });
+    match errors {
+        Value::Object(errors) => Ok(errors),
+        _ => unreachable!("written as an object"),
+    }
+}
+
+/// The density field as the objects of a Zarr group.
+///
+/// # Errors
+/// None that a field can give rise to.
+pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetError> {
+    let field = &made.field;
+    let [nx, ny, nz] = field.nodes.map(|n| n as u64);
+    let density: Vec<f32> = (0..field.logit.len()).map(|i| field.density(i)).collect();
+    let evidence: Vec<f32> = made.evidence.iter().map(|e| f32::from(*e as u8)).collect();
+    let shape = [nz, ny, nx];
+    let array = |name, data| RenderArray {
+        name,
+        shape: &shape,
+        dimension_names: &["z", "y", "x"],
+        data,
+    };
+    let attributes = json!({
+        "origin_m": <[f32; 3]>::from(field.origin),
+        "spacing_m": field.spacing,
+        "axes": "x, y, z of the scene, metres; node (k, j, i) lies at origin + spacing * (i, j, k)",
+        "density": "1/m at the nodes: 4/spacing * sigmoid(logit); between nodes the logit is trilinear, logit = ln(s/(1 - s)) with s = density * spacing/4",
+        "surface_density_per_m": PEAK / field.spacing * sigmoid(surface_logit()),
+        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.ply is this level",
+        "evidence": "what tells of a node: 0 nothing (its density is a guess), 1 a plane of the room, 2 light paths, 3 the camera",
+    });
+    let attributes = attributes.as_object().expect("written as an object");
+    encode_render_group(
+        &[array("density", &density), array("evidence", &evidence)],
+        attributes,
+    )
+}
+
+/// Between a task's control and a reconstruction.
+struct Watch<'a>(&'a Control);
+
+impl Progress for Watch<'_> {
+    fn at(&self, phase: Phase, done: f32, loss: Option<f64>) -> bool {
+        // How long each takes of the whole, roughly.
+        let (start, share) = match phase {
+            Phase::Depth => (0.0, 0.1),
+            Phase::Planes => (0.1, 0.05),
+            Phase::Start => (0.15, 0.1),
+            Phase::Carve => (0.25, 0.15),
+            Phase::Rays => (0.4, 0.05),
+            Phase::Optimise => (0.45, 0.55),
+        };
+        let figures: Vec<(&str, f64)> = loss.map(|loss| ("loss", loss)).into_iter().collect();
+        self.0.say(phase.name().to_owned(), &figures);
+        self.0
+            .at(MEASURED + (FITTED - MEASURED) * (start + share * done))
+    }
+}
+
+fn proceed(control: &Control, fraction: f32) -> Result<(), TaskError> {
+    match control.at(fraction) {
+        true => Ok(()),
+        false => Err(TaskError::Stopped),
+    }
+}
+
+fn of_reconstruction(error: ReconstructError) -> TaskError {
+    match error {
+        ReconstructError::Stopped => TaskError::Stopped,
+        error => TaskError::User(format!("reconstruct: {error}")),
+    }
+}

@@ -1,0 +1,63 @@
+//! Scenes made again by the recipe beside their data set, to compare with what was found of them.
+
+use picofarm_proto::{
+    key::task_key,
+    model::{SourceSettings, TaskSpec},
+};
+use picofarm_scene::Scene;
+
+use super::{Context, Control, TaskError, recipe, reprocess::source_manifest, scenes};
+
+/// Data sets that are reprocessed from one another, at most.
+const DEEPEST: usize = 8;
+
+/// The scene that a data set's scene was rendered of, also by way of the data sets that it was reprocessed from.
+///
+/// # Errors
+/// [`TaskError::User`] where no recipe leads to it; those of making a scene.
+pub(super) fn scene(
+    context: &Context,
+    source: &SourceSettings,
+    index: u64,
+    control: &Control,
+) -> Result<Scene, TaskError> {
+    let stores = &context.stores;
+    let mut place = source.clone();
+    for _ in 0..DEEPEST {
+        let dataset = stores.open_source(&place.store, &place.dataset, control)?;
+        let manifest = source_manifest(stores, &dataset, index, control)?;
+        let mut from = None;
+        for key in stores.wait(control, dataset.recipe_keys())? {
+            let Some(stored) = stores.wait(control, dataset.recipe(&key, index))? else {
+                continue;
+            };
+            match recipe::read(&stored, &place.store, &place.dataset)? {
+                (stage, TaskSpec::Render(task))
+                    if task_key(&stage, index).to_string() == manifest.provenance.task_key =>
+                {
+                    let side = task.render.resolution;
+                    return scenes::scene(&task.scenes, side, index, context.scenes());
+                }
+                (_, TaskSpec::Reprocess(task))
+                    if manifest.provenance.plan["kind"] == "reprocess" =>
+                {
+                    from = Some(task.source);
+                }
+                _ => {}
+            }
+        }
+        match from {
+            Some(earlier) => place = earlier,
+            None => {
+                return Err(TaskError::User(format!(
+                    "{} does not say how scene {index} is made, so that nothing can be compared with it; set views = 0",
+                    dataset.place()
+                )));
+            }
+        }
+    }
+    Err(TaskError::User(format!(
+        "{}/{}: data sets are reprocessed from one another {DEEPEST} times over; set views = 0",
+        source.store, source.dataset
+    )))
+}
