@@ -393,7 +393,7 @@ pub enum Dataset {
 pub enum Scene {
     /// Generate a scene from a seed and write it as .glb
     Generate {
-        /// Kind of scene
+        /// Kind of scene; plato is the room that reconstructions are measured in
         #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
         kind: GeneratorArg,
         /// Seed
@@ -463,7 +463,6 @@ pub enum FormatArg {
 pub enum GeneratorArg {
     Furnished,
     Primitive,
-    /// The room that reconstructions are measured in, after PlatoNeRF's
     Plato,
 }
 
@@ -471,7 +470,6 @@ pub enum GeneratorArg {
 pub enum PlatoArg {
     Chair,
     Armchair,
-    /// A box that a board hides from the camera
     HiddenBox,
     Empty,
 }

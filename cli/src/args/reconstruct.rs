@@ -15,7 +15,7 @@ pub struct Reconstruct {
     /// Folder for mesh.ply, density.zarr and metrics.json (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where times and shadows come from
+    /// Where times and shadows come from: one rendered histogram a spot, all bounces; or depth and visibility of the scene itself
     #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
     pub spots_from: SpotsFrom,
     /// Image width and height in pixels of the measurements
@@ -48,9 +48,7 @@ pub struct Reconstruct {
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum SpotsFrom {
-    /// One rendered capture a spot, all bounces; matched filter and thresholds as PlatoNeRF has them
     Captures,
-    /// Depth and visibility of the scene itself, exactly
     Truth,
 }
 

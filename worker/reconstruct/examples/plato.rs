@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
 //! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
-//! histograms, minutes), `rooms` (unseen primitive and furnished rooms), `quick` (every seventh view).
+//! histograms, minutes), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view).
 
 use std::error::Error;
 
@@ -56,9 +56,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     );
     if asked("rooms") {
         for furnished in [false, true] {
-            for captures in [false, true] {
-                rooms(furnished, captures)?;
-            }
+            rooms(furnished, asked("captures"))?;
         }
         return Ok(());
     }

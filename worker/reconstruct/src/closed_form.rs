@@ -168,6 +168,6 @@ fn refine_spots(measured: &mut Measured, range: &[f32]) {
     let steps: Vec<f32> = this.spots.par_iter().enumerate().map(step).collect();
     for (spot, step) in measured.spots.iter_mut().zip(steps) {
         spot.path_m += step;
-        spot.point = spot.point + spot.direction * step;
+        spot.point += spot.direction * step;
     }
 }

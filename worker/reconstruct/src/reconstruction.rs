@@ -247,7 +247,7 @@ fn without_optimisation(field: &mut Field, states: &[State], empty: Option<&[f32
         if states[i] == State::Unseen {
             *u = match empty.map(|e| e[i]) {
                 None => EMPTY,
-                Some(e) if e < 0.0 || e > 0.9 => EMPTY,
+                Some(e) if !(0.0..=0.9).contains(&e) => EMPTY,
                 Some(e) => ((0.35 - e) * 12.0).clamp(EMPTY, SOLID),
             };
         }
