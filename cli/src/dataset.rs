@@ -4,6 +4,7 @@ pub mod export;
 pub mod gc;
 pub mod import;
 mod predictions;
+mod reconstructions;
 pub mod repair;
 pub mod reprocess;
 pub mod show;
@@ -31,6 +32,9 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Info { dataset } => {
             if let Some(there) = predictions::find(&dataset).await? {
                 return predictions::info(&dataset, &there, output).await;
+            }
+            if let Some(there) = reconstructions::find(&dataset).await? {
+                return reconstructions::info(&dataset, &there, output).await;
             }
             let info = open(&dataset).await?.info().await.map_err(failed)?;
             output.result(&info_json(&dataset, &info), || describe(&dataset, &info));

@@ -171,8 +171,11 @@ mod tests {
                 let spec = read_uncounted(&path, Some(scale), dir.path()).unwrap();
                 let spec = checked(spec, &path).unwrap();
                 let kinds: Vec<&str> = spec.stages.iter().map(|s| s.task.kind()).collect();
-                assert!(kinds.contains(&"evaluate"), "{path:?}");
-                assert_eq!(kinds.last(), Some(&"report"), "{path:?}");
+                // The errors of a reconstruction lie beside it; `dataset info` has their means.
+                if !kinds.contains(&"reconstruct") {
+                    assert!(kinds.contains(&"evaluate"), "{path:?}");
+                    assert_eq!(kinds.last(), Some(&"report"), "{path:?}");
+                }
             }
             files += 1;
         }

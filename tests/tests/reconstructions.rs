@@ -1,0 +1,180 @@
+//! Reconstructions as a job: planned, leased, killed and resumed as renders are, from truth, from single-spot captures and from
+//! what networks predict.
+
+use std::{fs, path::Path, thread::sleep, time::Duration};
+
+use picofarm_tests::{Farm, Signal, rng::Rng, store};
+use serde_json::Value;
+
+const SCENES: u64 = 64;
+
+fn job(store: &Path, scenes: u64) -> String {
+    format!(
+        r#"
+name = "rooms in 3D"
+[limits]
+max_crashes = 1000
+[[stage]]
+name = "rooms"
+scenes = {{ kind = "primitive", count = {scenes}, seed = 8, spots = 4 }}
+render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768, per_spot = true }}
+output = {{ store = {store:?}, dataset = "rooms" }}
+[[stage]]
+name = "from-captures"
+kind = "reconstruct"
+source = "rooms"
+reconstruct = {{ from = "captures", views = 2, grid = {{ nodes = 40, iterations = 10 }} }}
+output = {{ store = {store:?}, dataset = "captures-3d" }}
+"#
+    )
+}
+
+fn submit(farm: &Farm, text: &str) -> String {
+    let file = farm.store().with_file_name("job.toml");
+    fs::write(&file, text).unwrap();
+    let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    answer["job"].as_str().unwrap().to_owned()
+}
+
+/// The objects that a job leaves that nobody disturbs.
+fn undisturbed() -> std::collections::BTreeMap<String, String> {
+    let farm = Farm::start("rooms-calm");
+    let id = submit(&farm, &job(&farm.store(), SCENES));
+    let _worker = farm.worker("calm");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    store::hashes(&farm.store().join("captures-3d"))
+}
+
+#[test]
+fn each_room_of_a_job_is_reconstructed_once_with_equal_bytes_however_often_workers_are_killed() {
+    let farm = Farm::with_lease("rooms-struck", 2.0);
+    let id = submit(&farm, &job(&farm.store(), SCENES));
+    let mut rng = Rng::new(3);
+    let mut workers = vec![farm.worker("worker-0"), farm.worker("worker-1")];
+    let mut started = 2;
+    let mut kills = 0;
+    while farm.status(&id)["state"] == "active" && kills < 20 {
+        sleep(Duration::from_millis(150 + rng.number() % 600));
+        let at = (rng.number() % 2) as usize;
+        let struck = workers.swap_remove(at);
+        struck.kill();
+        kills += 1;
+        workers.push(farm.worker(&format!("worker-{started}")));
+        started += 1;
+    }
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    assert!(kills >= 5, "{kills} kills before it was over");
+    let status = farm.status(&id);
+    assert_eq!(status["tasks"]["done"], 2 * SCENES, "{status}");
+    let alarms = farm.events_of(&id, "alarm");
+    assert!(alarms.is_empty(), "{alarms:?}");
+    let found = store::hashes(&farm.store().join("captures-3d"));
+    assert_eq!(found, undisturbed(), "after {kills} kills");
+}
+
+fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
+    let path = farm.store().join(format!("{folder}/scenes/{scene}/metrics.json"));
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+#[test]
+fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
+    let farm = Farm::start("rooms-predicted");
+    let store = farm.store();
+    let network = "net = { width = 4, levels = 3 }\noptimise = { epochs = 20, batch = 4 }\ninput = { bins = 40 }";
+    let text = format!(
+        r#"
+name = "rooms in 3D"
+[[stage]]
+name = "rooms"
+scenes = {{ kind = "primitive", count = 12, seed = 8, spots = 4 }}
+render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
+output = {{ store = {store:?}, dataset = "rooms" }}
+[[stage]]
+kind = "split"
+source = "rooms"
+split = {{ counts = [8, 2, 2] }}
+[[stage]]
+name = "tof"
+kind = "train"
+source = "rooms"
+[stage.train]
+target = "tof"
+model = "tof"
+{network}
+[[stage]]
+name = "shadow"
+kind = "train"
+source = "rooms"
+[stage.train]
+target = "shadow"
+model = "shadow"
+{network}
+[[stage]]
+name = "seen"
+kind = "infer"
+source = "rooms"
+infer = {{ models = ["tof", "shadow"] }}
+output = {{ store = {store:?}, dataset = "seen" }}
+[[stage]]
+name = "from-truth"
+kind = "reconstruct"
+source = "rooms"
+reconstruct = {{ views = 4, grid = {{ nodes = 64 }} }}
+output = {{ store = {store:?}, dataset = "truth-3d" }}
+[[stage]]
+name = "from-predictions"
+kind = "reconstruct"
+source = "rooms"
+reconstruct = {{ from = "predictions", predictions = "seen", views = 4, grid = {{ nodes = 64 }} }}
+output = {{ store = {store:?}, dataset = "seen-3d" }}
+"#
+    );
+    let id = submit(&farm, &text);
+    let mut worker = farm.worker("worker");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    for scene in 0..12 {
+        for folder in ["truth-3d", "seen-3d"] {
+            let found = metrics(&farm, folder, scene);
+            let l1 = found["novel_views"]["all"]["l1_m"].as_f64().unwrap();
+            let most = if folder == "truth-3d" { 0.5 } else { 3.0 };
+            assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
+            assert_eq!(found["spots"], 4, "{found}");
+            let mesh = farm.store().join(format!("{folder}/scenes/{scene}/mesh.ply"));
+            assert!(fs::read(mesh).unwrap().starts_with(b"ply\n"));
+        }
+    }
+    // A damaged result is found, and put back by the same job again.
+    let mesh = farm.store().join("truth-3d/scenes/3/mesh.ply");
+    let whole = fs::read(&mesh).unwrap();
+    fs::write(&mesh, &whole[..whole.len() / 2]).unwrap();
+    let again = submit(&farm, &text);
+    assert_eq!(farm.until_ended(&again)["state"], "done");
+    assert_eq!(fs::read(&mesh).unwrap(), whole);
+    // No histogram of each spot alone; no masks among the predictions.
+    let wrong = text
+        .split("[[stage]]\nname = \"from-truth\"")
+        .next()
+        .unwrap()
+        .to_owned()
+        + &format!(
+            r#"
+[[stage]]
+name = "from-captures"
+kind = "reconstruct"
+source = "rooms"
+reconstruct = {{ from = "captures" }}
+output = {{ store = {store:?}, dataset = "captures-3d" }}
+"#
+        );
+    let id = submit(&farm, &wrong);
+    assert_eq!(farm.until_ended(&id)["state"], "failed");
+    let events = farm.events(&id);
+    let said = |words: &str| {
+        events
+            .iter()
+            .any(|e| e["message"].as_str().is_some_and(|m| m.contains(words)))
+    };
+    assert!(said("per_spot = true"), "{events:?}");
+    worker.signal(Signal::Terminate);
+}
