@@ -80,6 +80,34 @@ impl<'a> Paths<'a> {
         self.points.len()
     }
 
+    /// What light loses on the way from a spot to a pixel's surface by geometry: cos · cos / r², 1/m², for matt surfaces. `None`
+    /// where depth or a normal is unknown, or the path tells nothing.
+    pub fn geometry(&self, spot: usize, pixel: usize) -> Option<f32> {
+        let (here, there) = (self.normals[pixel], self.spot_normals[spot]);
+        let way = self.measured.spots[spot].point - self.points[pixel];
+        let square = way.dot(way);
+        let direction = way / libm::sqrtf(square);
+        let (a, b) = (here.dot(direction), -there.dot(direction));
+        let known = a.min(b) >= GRAZING && square.is_finite();
+        known.then(|| a * b / square)
+    }
+
+    /// Whether the path meets a surface, whose normal is known, at so small an angle that it tells nothing.
+    #[inline]
+    pub fn grazes(&self, spot: usize, pixel: usize) -> bool {
+        let (here, there) = (self.normals[pixel], self.spot_normals[spot]);
+        let way = self.measured.spots[spot].point - self.points[pixel];
+        let direction = way / way.length();
+        let grazes = |n: Vec3, w: Vec3| n != Vec3::ZERO && n.dot(w) < GRAZING;
+        grazes(here, direction) || grazes(there, -direction)
+    }
+
+    /// Path of light laser → spot → what a pixel sees → camera, metres; NaN where depth is unknown.
+    pub fn length(&self, spot: usize, pixel: usize) -> f32 {
+        let (x, spot) = (self.points[pixel], &self.measured.spots[spot]);
+        spot.path_m + (x - spot.point).length() + (x - self.measured.camera.origin).length()
+    }
+
     /// The path from what a pixel sees to a spot; `None` where it tells nothing.
     #[inline]
     pub fn get(&self, spot: usize, pixel: usize) -> Option<LightPath> {
@@ -97,9 +125,7 @@ impl<'a> Paths<'a> {
         if span.0 >= span.1 {
             return None;
         }
-        let (here, there) = (self.normals[pixel], self.spot_normals[spot]);
-        let grazes = |n: Vec3, w: Vec3| n != Vec3::ZERO && n.dot(w) < GRAZING;
-        if grazes(here, direction) || grazes(there, -direction) {
+        if self.grazes(spot, pixel) {
             return None;
         }
         Some(LightPath {

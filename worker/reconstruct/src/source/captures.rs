@@ -2,12 +2,14 @@
 //! `utils/load_tof.py`; numbers in the code are the steps of its preprocessing).
 //!
 //! What differs: a time is the **middle** of its bin (PlatoNeRF takes the end, half a bin late), and pixels near a spot
-//! take no part (PlatoNeRF zeroes their histograms, which then count as shadow).
+//! take no part (PlatoNeRF zeroes their histograms, which then count as shadow). [`Captures::finish`] goes on from there
+//! and compares each pixel's two-bounce light with what a lit pixel would return; [`Captures::finish_plain`] does not.
 
 use picofarm_scene::{Beam, Camera, Laser, Vec3};
 use picofarm_transient::Gate;
 use rayon::prelude::*;
 
+use super::expected::{Return, expected};
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
 
 /// A pixel is lit where the matched filter's response reaches this (PlatoNeRF's threshold in all four of its scenes).
@@ -24,6 +26,8 @@ pub struct Captures {
     threshold: f32,
     laser: Laser,
     measured: Measured,
+    /// The strongest return of every pixel and spot, `[spot][row][column]`.
+    returns: Vec<Return>,
 }
 
 impl Captures {
@@ -45,6 +49,7 @@ impl Captures {
             threshold,
             laser,
             measured,
+            returns: Vec::new(),
         }
     }
 
@@ -85,8 +90,13 @@ impl Captures {
         Ok(())
     }
 
-    /// What was measured.
+    /// What was measured: masks by the light that a lit pixel is expected to return.
     pub fn finish(self) -> Measured {
+        expected(self.measured, &self.returns)
+    }
+
+    /// The same with PlatoNeRF's masks: lit where the matched filter's response reaches the threshold.
+    pub fn finish_plain(self) -> Measured {
         self.measured
     }
 
@@ -151,13 +161,13 @@ impl Captures {
         );
         let to_spot = (spot.point - self.measured.camera.origin).normalized();
         let this = &*self;
-        let pixel = |(p, h): (usize, &[f32])| -> (f32, u8, u8) {
+        let pixel = |(p, h): (usize, &[f32])| -> (f32, u8, u8, Return) {
             let near = this.measured.ray(p).cross(to_spot).length() < NEAR_SPOT_SINE;
             let mirror = this.measured.mirror.get(p).is_some_and(|&m| m != 0);
             let sum: f32 = h.iter().sum();
             if near || mirror || sum <= 0.0 {
                 // A histogram without any light says nothing: not even light of three bounces came.
-                return (0.0, 0, 0);
+                return (0.0, 0, 0, Return::default());
             }
             let (bin, _) = peak(h);
             let mut response = 0.0f32;
@@ -171,13 +181,20 @@ impl Captures {
             }
             let tau = this.middle(bin);
             let lit = response / sum >= this.threshold && tau > spot.path_m;
-            (if lit { tau } else { 0.0 }, u8::from(lit), 1)
+            let near = h[bin.saturating_sub(1)..(bin + 2).min(bins)].iter().sum();
+            let strongest = Return {
+                path_m: tau,
+                energy: near,
+                share: near / sum,
+            };
+            (if lit { tau } else { 0.0 }, u8::from(lit), 1, strongest)
         };
-        let found: Vec<(f32, u8, u8)> = histogram.par_chunks(bins).enumerate().map(pixel).collect();
-        for (tau, lit, used) in found {
+        let found: Vec<_> = histogram.par_chunks(bins).enumerate().map(pixel).collect();
+        for (tau, lit, used, strongest) in found {
             self.measured.tau.push(tau);
             self.measured.lit.push(lit);
             self.measured.used.push(used);
+            self.returns.push(strongest);
         }
         self.measured.spots.push(spot);
     }
