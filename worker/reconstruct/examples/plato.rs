@@ -2,12 +2,15 @@
 //!
 //! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
 //! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
-//! histograms, minutes), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view).
+//! histograms, minutes), `peers` (other methods), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view).
 
 use std::error::Error;
 
 use picofarm_reconstruct::{
-    Measured, Reconstructed, Settings, Shadows, Unwatched, World, reconstruct,
+    Measured, ReconstructError, Settings, Shadows, Unwatched, World,
+    baseline::{Behind, bounce_flash, depth_alone},
+    field::Field,
+    reconstruct,
     render::Renderer,
     score::{ViewScore, around, floaters, mesh_score, score_views},
     source::{CaptureSettings, Disturbed, captures_of, from_truth, truth_of},
@@ -45,6 +48,17 @@ struct Row {
     how: Disturbed,
     settings: Settings,
     captures: bool,
+    /// How the field is made.
+    method: Method,
+}
+
+/// A way from measurements to a field.
+#[derive(Clone, Copy)]
+enum Method {
+    /// This crate's.
+    Grid,
+    BounceFlash,
+    DepthAlone(Behind),
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -60,7 +74,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         return Ok(());
     }
-    for row in rows(asked("captures")) {
+    let rows = match asked("peers") {
+        true => peers(asked("captures")),
+        false => rows(asked("captures")),
+    };
+    for row in rows {
         measure(&row, every)?;
     }
     Ok(())
@@ -76,6 +94,7 @@ fn rows(captures: bool) -> Vec<Row> {
         },
         settings: Settings::default(),
         captures: false,
+        method: Method::Grid,
     };
     let room = |name, room| Row { name, room, ..base };
     let with = |name, settings| Row {
@@ -194,19 +213,55 @@ fn rows(captures: bool) -> Vec<Row> {
     ]
 }
 
+/// Each method on two rooms; from captures, at 256 pixels.
+fn peers(captures: bool) -> Vec<Row> {
+    let rooms = [
+        ("chair", PlatoObject::Chair),
+        ("hidden box", PlatoObject::HiddenBox),
+    ];
+    let methods = [
+        ("bounce-flash lidar", Method::BounceFlash),
+        ("depth, behind it solid", Method::DepthAlone(Behind::Solid)),
+        ("depth, behind it empty", Method::DepthAlone(Behind::Empty)),
+        ("grid", Method::Grid),
+    ];
+    let mut rows = Vec::new();
+    for (room, object) in rooms {
+        for (name, method) in methods {
+            let all = PlatoSettings::default();
+            rows.push(Row {
+                name: format!("{room}, {name}").leak(),
+                room: PlatoSettings {
+                    object,
+                    resolution: if captures { 256 } else { all.resolution },
+                    ..all
+                },
+                how: Disturbed {
+                    bin_width_m: BIN_M,
+                    ..Disturbed::default()
+                },
+                settings: Settings::default(),
+                captures,
+                method,
+            });
+        }
+    }
+    rows
+}
+
 fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
     let scene = plato::generate(&row.room)?;
     let measured = measured(&scene, &row.how, row.captures)?;
-    let (made, seconds) = timed(measured, row.settings)?;
+    let (field, seconds) = timed(|| row.field(measured))?;
     let views: Vec<_> = plato::views(SIDE)
         .into_iter()
         .skip(every / 2)
         .step_by(every)
         .collect();
     let world = World::new(&scene);
-    let score = score_views(&Renderer::new(&made.field), &scene.camera, &world, &views);
-    let mesh = mesh_score(&surface(&made.field), &world, &made.field, 0)?;
-    let floating = floaters(&made.field, &world, 0)?;
+    let score = score_views(&Renderer::new(&field), &scene.camera, &world, &views);
+    let mesh = mesh_score(&surface(&field), &world, &field, 0)?;
+    let floating = floaters(&field, &world, 0)?;
     told(
         row.name,
         &score,
@@ -232,14 +287,26 @@ fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, 
     Ok(captures_of(scene, &settings, &|_, _| true)?)
 }
 
-/// A reconstruction and the CPU-seconds it took.
-fn timed(measured: Measured, settings: Settings) -> Result<(Reconstructed, f64), Box<dyn Error>> {
+impl Row {
+    fn field(&self, measured: Measured) -> Result<Field, ReconstructError> {
+        match self.method {
+            Method::Grid => Ok(reconstruct(measured, self.settings, &Unwatched)?.field),
+            Method::BounceFlash => bounce_flash(&measured, self.settings.nodes),
+            Method::DepthAlone(behind) => depth_alone(&measured, &self.settings, behind),
+        }
+    }
+}
+
+/// What is made, and the CPU-seconds it took.
+fn timed<T>(
+    make: impl FnOnce() -> Result<T, ReconstructError>,
+) -> Result<(T, f64), Box<dyn Error>> {
     let cpu = || {
         let t = clock_gettime(ClockId::ProcessCPUTime);
         t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
     };
     let start = cpu();
-    let made = reconstruct(measured, settings, &Unwatched)?;
+    let made = make()?;
     Ok((made, cpu() - start))
 }
 
@@ -260,10 +327,8 @@ fn rooms(furnished: bool, captures: bool) -> Result<(), Box<dyn Error>> {
             true => furnished::generate(seed, &FurnishedSettings::default(), &library)?,
             false => primitive::generate(seed, &PrimitiveSettings::default())?,
         };
-        let (made, took) = timed(
-            measured(&scene, &Disturbed::default(), captures)?,
-            Settings::default(),
-        )?;
+        let measured = measured(&scene, &Disturbed::default(), captures)?;
+        let (made, took) = timed(|| reconstruct(measured, Settings::default(), &Unwatched))?;
         let world = World::new(&scene);
         let views = around(&made.measured, &made.depth.range, &world, 24, SIDE);
         let s = score_views(&Renderer::new(&made.field), &scene.camera, &world, &views);

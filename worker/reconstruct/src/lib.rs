@@ -5,6 +5,7 @@
 //! closed form and from carving. `docs/reconstruction.md` explains it and has the figures. This crate knows nothing of jobs
 //! or stores; files are the caller's.
 
+pub mod baseline;
 mod carve;
 mod checkpoint;
 mod closed_form;
