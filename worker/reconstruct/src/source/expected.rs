@@ -99,6 +99,10 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
         }
     };
     let decided: Vec<(u8, u8)> = (0..k * pixels).into_par_iter().map(decide).collect();
+    if !decided.contains(&(1, 1)) {
+        // Too coarse an image for normals, or no times that agree: the threshold is all there is.
+        return measured;
+    }
     for (q, (lit, used)) in decided.into_iter().enumerate() {
         measured.tau[q] = if lit != 0 { returns[q].path_m } else { 0.0 };
         measured.lit[q] = lit;
