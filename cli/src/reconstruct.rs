@@ -1,5 +1,6 @@
 //! `picofarm reconstruct`: one scene file in 3D, without a farm.
 
+mod pictures;
 mod watch;
 mod written;
 
@@ -11,7 +12,7 @@ use picofarm_reconstruct::{
     surface,
 };
 use picofarm_scene::{
-    Scene,
+    Camera, Scene,
     import::{self, ImportOptions},
     plato,
 };
@@ -23,6 +24,7 @@ use crate::{
     args::{Reconstruct, SpotsFrom, ViewsArg},
     error::{CliError, Code, Result},
     output::{Output, duration},
+    picture::canvas::Canvas,
     render::free_folder,
     roles, signals,
 };
@@ -37,6 +39,8 @@ struct Made {
     reconstructed: Reconstructed,
     mesh: Surface,
     metrics: Value,
+    views: Canvas,
+    orbit: Vec<u8>,
     seconds: [f64; 3],
 }
 
@@ -75,7 +79,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     .map_err(|e| CliError::new(Code::Failed, format!("the reconstruction broke: {e}")))?;
     watch.finish();
     let made = made?;
-    write(&args.out, &made.reconstructed, &made.mesh, &made.metrics)?;
+    write(&args.out, &made)?;
     let [measuring, fitting, scoring] = made.seconds;
     let mut shown = made.metrics.clone();
     shown["out"] = json!(args.out);
@@ -111,12 +115,33 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     let start = Instant::now();
     watch.step("errors", 0.0);
     let mesh = surface(&reconstructed.field);
-    let metrics = metrics(args, scene, &settings, &reconstructed, &mesh)?;
+    let world = World::new(scene);
+    let views = match args.views {
+        ViewsArg::Plato => plato::views(VIEW_SIDE),
+        ViewsArg::Around => score::around(
+            &reconstructed.measured,
+            &reconstructed.depth.range,
+            &world,
+            AROUND,
+            VIEW_SIDE,
+        ),
+    };
+    let metrics = metrics(
+        args,
+        scene,
+        &settings,
+        (&reconstructed, &mesh),
+        (&world, &views),
+    )?;
+    let scoring = lap(start);
+    watch.step("pictures", 0.0);
     Ok(Made {
+        views: pictures::views(&reconstructed, &world, &views),
+        orbit: pictures::orbit(&reconstructed, &views, &args.out)?,
         reconstructed,
         mesh,
         metrics,
-        seconds: [measuring, fitting, lap(start)],
+        seconds: [measuring, fitting, scoring],
     })
 }
 
@@ -161,19 +186,12 @@ fn metrics(
     args: &Reconstruct,
     scene: &Scene,
     settings: &Settings,
-    made: &Reconstructed,
-    mesh: &Surface,
+    (made, mesh): (&Reconstructed, &Surface),
+    (world, views): (&World, &[Camera]),
 ) -> Result<Value> {
-    let world = World::new(scene);
-    let views = match args.views {
-        ViewsArg::Plato => plato::views(VIEW_SIDE),
-        ViewsArg::Around => {
-            score::around(&made.measured, &made.depth.range, &world, AROUND, VIEW_SIDE)
-        }
-    };
     let mut all = picofarm_agent::reconstruct::facts(made, mesh);
     all.extend(
-        picofarm_agent::reconstruct::errors(made, mesh, &world, &views, args.seed)
+        picofarm_agent::reconstruct::errors(made, mesh, world, views, args.seed)
             .map_err(refused)?,
     );
     let asked = json!({

@@ -67,6 +67,14 @@ fn job(store: &Path, side: u32, samples: u32) -> String {
                 out("seen")
             ),
         ),
+        stage(
+            "reconstruct",
+            &format!(
+                "kind = \"reconstruct\"\nsource = \"render\"\n\
+                 reconstruct = {{ from = \"captures\", grid = {{ nodes = 192, iterations = 3 }} }}\n{}",
+                out("rooms-3d")
+            ),
+        ),
         stage("report", "kind = \"report\"\nreport = { name = \"all\", models = [\"tof\"] }"),
     ]
     .concat()

@@ -44,7 +44,24 @@ fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
         .map(|e| e.unwrap().file_name().into_string().unwrap())
         .collect();
     names.sort();
-    assert_eq!(names, ["density.zarr", "mesh.ply", "metrics.json"]);
+    let files = [
+        "density.zarr",
+        "mesh.ply",
+        "metrics.json",
+        "orbit.gif",
+        "views.png",
+    ];
+    assert_eq!(names, files);
+    assert!(
+        std::fs::read(dir.join("orbit.gif"))
+            .unwrap()
+            .starts_with(b"GIF89a")
+    );
+    assert!(
+        std::fs::read(dir.join("views.png"))
+            .unwrap()
+            .starts_with(b"\x89PNG")
+    );
     let left: Vec<_> = std::fs::read_dir(scratch.path())
         .unwrap()
         .map(|e| e.unwrap().file_name().into_string().unwrap())

@@ -73,7 +73,9 @@ fn each_room_of_a_job_is_reconstructed_once_with_equal_bytes_however_often_worke
 }
 
 fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
-    let path = farm.store().join(format!("{folder}/scenes/{scene}/metrics.json"));
+    let path = farm
+        .store()
+        .join(format!("{folder}/scenes/{scene}/metrics.json"));
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
@@ -140,7 +142,9 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
             let most = if folder == "truth-3d" { 0.5 } else { 3.0 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
             assert_eq!(found["spots"], 4, "{found}");
-            let mesh = farm.store().join(format!("{folder}/scenes/{scene}/mesh.ply"));
+            let mesh = farm
+                .store()
+                .join(format!("{folder}/scenes/{scene}/mesh.ply"));
             assert!(fs::read(mesh).unwrap().starts_with(b"ply\n"));
         }
     }

@@ -2,16 +2,14 @@
 
 use std::{fs, path::Path};
 
-use picofarm_reconstruct::{Reconstructed, Surface};
-use serde_json::Value;
-
+use super::Made;
 use crate::error::{CliError, Code, Result, io};
 
 /// Writes mesh, density and metrics to `out`, which does not exist or is empty.
 ///
 /// # Errors
 /// The folder cannot be written.
-pub fn write(out: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) -> Result<()> {
+pub fn write(out: &Path, made: &Made) -> Result<()> {
     let out = std::path::absolute(out).map_err(|e| io(format!("--out {}", out.display()), &e))?;
     let (Some(parent), Some(name)) = (out.parent(), out.file_name()) else {
         return Err(CliError::input(format!(
@@ -26,7 +24,7 @@ pub fn write(out: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) 
         name.display(),
         uuid::Uuid::new_v4()
     ));
-    let written = into(&partial, made, mesh, metrics)
+    let written = into(&partial, made)
         // Replaces an empty folder; fails on one that was filled meanwhile.
         .and_then(|()| fs::rename(&partial, &out).map_err(told));
     if written.is_err() {
@@ -36,14 +34,14 @@ pub fn write(out: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) 
     written
 }
 
-fn into(dir: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) -> Result<()> {
+fn into(dir: &Path, made: &Made) -> Result<()> {
     let save = |name: &str, bytes: &[u8]| {
         let path = dir.join(name);
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))
     };
     fs::create_dir_all(dir).map_err(|e| io(dir.display(), &e))?;
-    let objects =
-        picofarm_agent::reconstruct::density(made).map_err(|e| CliError::new(Code::Resource, e))?;
+    let objects = picofarm_agent::reconstruct::density(&made.reconstructed)
+        .map_err(|e| CliError::new(Code::Resource, e))?;
     for (key, bytes) in &objects {
         let path = dir.join("density.zarr").join(key);
         if let Some(folder) = path.parent() {
@@ -51,7 +49,9 @@ fn into(dir: &Path, made: &Reconstructed, mesh: &Surface, metrics: &Value) -> Re
         }
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))?;
     }
-    save("mesh.ply", &mesh.ply())?;
-    let text = serde_json::to_string_pretty(metrics).expect("metrics are plain data");
+    save("mesh.ply", &made.mesh.ply())?;
+    made.views.save(&dir.join("views.png"))?;
+    save("orbit.gif", &made.orbit)?;
+    let text = serde_json::to_string_pretty(&made.metrics).expect("metrics are plain data");
     save("metrics.json", (text + "\n").as_bytes())
 }

@@ -245,7 +245,7 @@ impl Sensor {
             return Err(SensorError::new(
                 "sensor.rebin",
                 format!(
-                    "expected 1 to {MAX_REBIN} bins summed to one, found {}; 1 leaves them as they are",
+                    "{} lies outside 1..={MAX_REBIN} bins summed to one; 1 leaves them as they are",
                     self.rebin
                 ),
             ));
@@ -255,7 +255,7 @@ impl Sensor {
         {
             return Err(SensorError::new(
                 "sensor.dead_time.pulses",
-                format!("expected 1 to {MAX_PULSES} pulses, found {pulses}"),
+                format!("{pulses} lies outside 1..={MAX_PULSES} pulses"),
             ));
         }
         Ok(())
@@ -268,7 +268,7 @@ fn within(field: &str, value: f64, low: f64, high: f64, unit: &str) -> Result<()
     }
     Err(SensorError::new(
         field,
-        format!("expected {low} to {high} {unit}, found {value}"),
+        format!("{value} lies outside {low}..={high} {unit}"),
     ))
 }
 

@@ -20,7 +20,7 @@ fn unusable_settings_and_histograms_are_named() {
     for (text, start) in [
         (
             r#"{"pulse":{"kind":"analytic","fwhm_ps":-1}}"#,
-            "sensor.pulse.fwhm_ps: expected",
+            "sensor.pulse.fwhm_ps: -1 lies outside",
         ),
         (
             r#"{"pulse":{"kind":"sampled","bin_width_ps":8,"values":[1,-2]}}"#,
@@ -36,9 +36,9 @@ fn unusable_settings_and_histograms_are_named() {
         ),
         (
             r#"{"scale":{"kind":"peak_range","low":5,"high":4}}"#,
-            "sensor.scale.high: expected 5 to",
+            "sensor.scale.high: 4 lies outside 5..=",
         ),
-        (r#"{"rebin":0}"#, "sensor.rebin: expected at least 1"),
+        (r#"{"rebin":0}"#, "sensor.rebin: 0 lies outside 1..="),
         (r#"{"dark_per_bin":-0.1}"#, "sensor.dark_per_bin"),
         (
             r#"{"dead_time":{"kind":"first_photon","pulses":0}}"#,
