@@ -23,7 +23,7 @@ output = {{ store = {store:?}, dataset = "rooms" }}
 name = "from-captures"
 kind = "reconstruct"
 source = "rooms"
-reconstruct = {{ from = "captures", views = 2, grid = {{ nodes = 40, iterations = 10 }} }}
+reconstruct = {{ from = "captures", grid = {{ nodes = 40, iterations = 10 }} }}
 output = {{ store = {store:?}, dataset = "captures-3d" }}
 "#
     )
