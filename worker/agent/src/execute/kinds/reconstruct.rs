@@ -378,11 +378,14 @@ impl Work<'_> {
     }
 }
 
+/// Place of each spot, and its path from the laser; `None` where a beam meets nothing.
+type Spots = [Option<(Vec3, f32)>];
+
 fn captures(
     stores: &Stores,
     dataset: &Dataset,
     scene: u64,
-    (camera, origin, spots, beams): (Camera, Vec3, &[Option<(Vec3, f32)>], &[u32]),
+    (camera, origin, spots, beams): (Camera, Vec3, &Spots, &[u32]),
     control: &Control,
 ) -> Result<Measured, TaskError> {
     if !dataset.spec().per_spot {
