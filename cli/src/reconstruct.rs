@@ -6,6 +6,11 @@ mod written;
 
 use std::time::Instant;
 
+use picofarm_agent::Memory;
+use picofarm_proto::model::{
+    kinds::reconstruct::grid_bytes,
+    memory::{Shape, gib},
+};
 use picofarm_reconstruct::{
     Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Surface, World, score,
     source::{self, CaptureSettings, Disturbed},
@@ -86,21 +91,47 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     shown["threads"] = json!(threads);
     shown["seconds"] =
         json!({"measurements": measuring, "reconstruction": fitting, "metrics": scoring});
-    output.result(&shown, || told(&args, &made));
+    output.result(&shown, || summary(&args, &made));
     Ok(())
 }
 
+/// Refuses a grid that does not fit into memory, before anything is rendered for it.
+fn check_memory(args: &Reconstruct, scene: &Scene, nodes: u32) -> Result<()> {
+    let i = &scene.camera.intrinsics;
+    let shape = Shape {
+        height: i.height,
+        width: i.width,
+        bins: args.gate.bins,
+        spots: scene.laser.beams.len() as u32,
+    };
+    let needed = grid_bytes(nodes, &shape);
+    match Memory::here() {
+        Some(there) if needed > there.for_tasks_mib() << 20 => Err(CliError::new(
+            Code::Resource,
+            format!(
+                "--nodes {nodes}, --resolution {}: the reconstruction takes about {} of memory, but there is {there}; choose \
+                 fewer nodes or pixels",
+                args.resolution,
+                gib(needed)
+            ),
+        )),
+        _ => Ok(()),
+    }
+}
+
 fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Made> {
+    let nodes = if args.fine {
+        Settings::FINE_NODES
+    } else {
+        args.nodes
+    };
+    check_memory(args, scene, nodes)?;
     let start = Instant::now();
     let measured = measure(args, scene, threads, watch)?;
     let lap = |since: Instant| since.elapsed().as_secs_f64();
     let measuring = lap(start);
     let settings = Settings {
-        nodes: if args.fine {
-            Settings::FINE_NODES
-        } else {
-            args.nodes
-        },
+        nodes,
         planes: !args.no_planes,
         seed: args.seed,
         ..Settings::default()
@@ -137,7 +168,7 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     watch.step("pictures", 0.0);
     Ok(Made {
         views: pictures::views(&reconstructed, &world, &views),
-        orbit: pictures::orbit(&reconstructed, &views, &args.out)?,
+        orbit: pictures::orbit(&reconstructed, &views)?,
         reconstructed,
         mesh,
         metrics,
@@ -206,7 +237,7 @@ fn metrics(
     Ok(Value::Object(all))
 }
 
-fn told(args: &Reconstruct, made: &Made) -> String {
+fn summary(args: &Reconstruct, made: &Made) -> String {
     let m = &made.metrics["novel_views"];
     let l1 = |of: &str| m[of]["l1_m"].as_f64().unwrap_or(0.0);
     let mut text = format!(

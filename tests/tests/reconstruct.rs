@@ -37,7 +37,7 @@ fn metrics(dir: &Path) -> Value {
 #[test]
 fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
     let (scratch, cli) = room("reconstruct", "chair", "16");
-    let told = cli.json(&[&TRUTH[..], &["made", "--views", "plato"]].concat());
+    let said = cli.json(&[&TRUTH[..], &["made", "--views", "plato"]].concat());
     let dir = scratch.join("made");
     let mut names: Vec<_> = std::fs::read_dir(&dir)
         .unwrap()
@@ -78,10 +78,10 @@ fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
         "settings",
         "notes",
     ] {
-        assert_eq!(kept[name], told[name], "{name}");
+        assert_eq!(kept[name], said[name], "{name}");
     }
     assert!(kept["seconds"].is_null(), "the file has no times: {kept}");
-    assert!(told["seconds"]["reconstruction"].as_f64().unwrap() > 0.0);
+    assert!(said["seconds"]["reconstruction"].as_f64().unwrap() > 0.0);
     assert_eq!(kept["novel_views"]["views"], 139);
     assert_eq!(kept["spots"], 16);
     let l1 = kept["novel_views"]["all"]["l1_m"].as_f64().unwrap();
@@ -162,7 +162,7 @@ fn what_cannot_be_used_is_refused_by_name_and_nothing_is_written() {
     let (scratch, cli) = room("reconstruct-refused", "empty", "1");
     let to =
         |more: &[&str]| cli.run(&[&["reconstruct", "room.glb", "--out", "made"], more].concat());
-    for (more, code, told) in [
+    for (more, code, said) in [
         (&["--resolution", "0"][..], 2, "--resolution"),
         (&["--nodes", "8"], 2, "--nodes"),
         (&["--fine", "--nodes", "64"], 2, "--fine"),
@@ -188,7 +188,7 @@ fn what_cannot_be_used_is_refused_by_name_and_nothing_is_written() {
         ),
     ] {
         let ended = to(more).code(code);
-        assert!(ended.stderr.contains(told), "{more:?}: {}", ended.stderr);
+        assert!(ended.stderr.contains(said), "{more:?}: {}", ended.stderr);
         assert!(!scratch.join("made").exists(), "{more:?}");
     }
     let missing = cli

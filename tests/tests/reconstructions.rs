@@ -42,6 +42,17 @@ fn undisturbed() -> std::collections::BTreeMap<String, String> {
     let id = submit(&farm, &job(&farm.store(), SCENES));
     let _worker = farm.worker("calm");
     assert_eq!(farm.until_ended(&id)["state"], "done");
+    let folded = (0..SCENES).filter(|scene| {
+        let found = metrics(&farm, "captures-3d", *scene);
+        let left_out = found["left_out"].as_array().unwrap().iter();
+        left_out
+            .filter_map(|l| l["why"].as_str())
+            .any(|why| why.contains("a mirror folds the beam"))
+    });
+    assert!(
+        folded.count() > 0,
+        "no beam of {SCENES} rooms meets a mirror"
+    );
     store::hashes(&farm.store().join("captures-3d"))
 }
 
@@ -89,13 +100,13 @@ fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
 name = "rooms in 3D"
 [[stage]]
 name = "rooms"
-scenes = {{ kind = "primitive", count = 12, seed = 8, spots = 4 }}
+scenes = {{ kind = "primitive", count = 6, seed = 8, spots = 4 }}
 render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
 output = {{ store = {store:?}, dataset = "rooms" }}
 [[stage]]
 kind = "split"
 source = "rooms"
-split = {{ counts = [8, 2, 2] }}
+split = {{ counts = [4, 1, 1] }}
 [[stage]]
 name = "tof"
 kind = "train"
@@ -113,7 +124,7 @@ target = "shadow"
 model = "shadow"
 {network}
 [[stage]]
-name = "seen"
+name = "networks"
 kind = "infer"
 source = "rooms"
 infer = {{ models = ["tof", "shadow"] }}
@@ -122,24 +133,25 @@ output = {{ store = {store:?}, dataset = "seen" }}
 name = "from-truth"
 kind = "reconstruct"
 source = "rooms"
-reconstruct = {{ views = 4, grid = {{ nodes = 64 }} }}
+reconstruct = {{ views = 2, grid = {{ nodes = 48, iterations = 30 }} }}
 output = {{ store = {store:?}, dataset = "truth-3d" }}
 [[stage]]
 name = "from-predictions"
 kind = "reconstruct"
 source = "rooms"
-reconstruct = {{ from = "predictions", predictions = "seen", views = 4, grid = {{ nodes = 64 }} }}
+reconstruct = {{ from = "predictions", predictions = "networks", views = 2, grid = {{ nodes = 48, iterations = 30 }} }}
 output = {{ store = {store:?}, dataset = "seen-3d" }}
 "#
     );
     let id = submit(&farm, &text);
     let mut worker = farm.worker("worker");
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    for scene in 0..12 {
+    for scene in 0..6 {
         for folder in ["truth-3d", "seen-3d"] {
             let found = metrics(&farm, folder, scene);
             let l1 = found["novel_views"]["all"]["l1_m"].as_f64().unwrap();
-            let most = if folder == "truth-3d" { 0.5 } else { 3.0 };
+            // Networks of twenty epochs are poor ones; what they predict of another room would be worse still.
+            let most = if folder == "truth-3d" { 0.25 } else { 1.2 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
             assert_eq!(found["spots"], 4, "{found}");
             let mesh = farm
@@ -149,19 +161,47 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         }
     }
     // A damaged result is found, and put back by the same job again.
-    let mesh = farm.store().join("truth-3d/scenes/3/mesh.ply");
+    let folder = farm.store().join("truth-3d");
+    let verified = farm.json(&["dataset", "verify", folder.to_str().unwrap()]);
+    assert_eq!(verified["scenes"], 6, "{verified}");
+    assert_eq!(verified["problems"], serde_json::json!([]), "{verified}");
+    let mesh = folder.join("scenes/3/mesh.ply");
     let whole = fs::read(&mesh).unwrap();
     fs::write(&mesh, &whole[..whole.len() / 2]).unwrap();
+    let damaged = farm
+        .run(&["dataset", "verify", folder.to_str().unwrap()])
+        .code(6);
+    assert!(
+        damaged.stderr.contains("scenes/3/mesh.ply"),
+        "{}",
+        damaged.stderr
+    );
+    let no_data_set = farm.run(&["dataset", "export", folder.to_str().unwrap(), "--out", "x"]);
+    assert!(
+        no_data_set.stderr.contains("holds reconstructions"),
+        "{}",
+        no_data_set.stderr
+    );
     let again = submit(&farm, &text);
     assert_eq!(farm.until_ended(&again)["state"], "done");
     assert_eq!(fs::read(&mesh).unwrap(), whole);
-    // No histogram of each spot alone; no masks among the predictions.
-    let wrong = text
+    // No histogram of each spot alone; predictions of other rooms.
+    let before = text
         .split("[[stage]]\nname = \"from-truth\"")
         .next()
-        .unwrap()
-        .to_owned()
-        + &format!(
+        .unwrap();
+    let fails = |stages: &str, words: &[&str]| {
+        let id = submit(&farm, &format!("{before}{stages}"));
+        assert_eq!(farm.until_ended(&id)["state"], "failed");
+        let events = farm.events(&id);
+        let said = |m: &str| words.iter().all(|w| m.contains(w));
+        let found = events
+            .iter()
+            .any(|e| e["message"].as_str().is_some_and(said));
+        assert!(found, "{words:?}: {events:?}");
+    };
+    fails(
+        &format!(
             r#"
 [[stage]]
 name = "from-captures"
@@ -170,15 +210,26 @@ source = "rooms"
 reconstruct = {{ from = "captures" }}
 output = {{ store = {store:?}, dataset = "captures-3d" }}
 "#
-        );
-    let id = submit(&farm, &wrong);
-    assert_eq!(farm.until_ended(&id)["state"], "failed");
-    let events = farm.events(&id);
-    let said = |words: &str| {
-        events
-            .iter()
-            .any(|e| e["message"].as_str().is_some_and(|m| m.contains(words)))
-    };
-    assert!(said("per_spot = true"), "{events:?}");
+        ),
+        &["per_spot = true"],
+    );
+    fails(
+        &format!(
+            r#"
+[[stage]]
+name = "others"
+scenes = {{ kind = "primitive", count = 6, seed = 9, spots = 4 }}
+render = {{ resolution = 32, samples = 2, bins = 200, bin_width_m = 0.0768 }}
+output = {{ store = {store:?}, dataset = "others" }}
+[[stage]]
+name = "mixed"
+kind = "reconstruct"
+source = "others"
+reconstruct = {{ from = "predictions", predictions = "seen" }}
+output = {{ store = {store:?}, dataset = "mixed-3d" }}
+"#
+        ),
+        &["reconstruct.predictions", "\"rooms\"", "\"others\""],
+    );
     worker.signal(Signal::Terminate);
 }

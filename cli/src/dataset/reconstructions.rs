@@ -1,11 +1,18 @@
-//! `dataset info` of reconstructions: the means of their errors.
+//! `dataset info` of reconstructions: the means of their errors; and whether they are whole.
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{DatasetError, Reconstructions, open_store};
+use picofarm_dataset::{DatasetError, Problem, Reconstructions, open_store};
 use serde_json::{Map, Value, json};
 
-use super::failed;
-use crate::{error::Result, output::Output};
+use super::{
+    failed,
+    verify::{Late, broken_by, mode, problems_json_by},
+};
+use crate::{
+    args::DatasetVerify,
+    error::{CliError, Code, Result},
+    output::{Output, bytes},
+};
 
 /// Requests in flight.
 const CONCURRENCY: usize = 16;
@@ -49,8 +56,14 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
         .map_err(failed)?;
     let all: Vec<Value> = all
         .iter()
-        .filter_map(|bytes| serde_json::from_slice(bytes).ok())
-        .collect();
+        .map(|bytes| serde_json::from_slice(bytes))
+        .collect::<std::result::Result<_, _>>()
+        .map_err(|e| {
+            CliError::new(
+                Code::Failed,
+                format!("{place}: metrics.json of a scene: {e}"),
+            )
+        })?;
     let mut means = Map::new();
     for (name, way) in FIGURES {
         // A class without pixels has no error.
@@ -80,4 +93,51 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
         text
     });
     Ok(())
+}
+
+/// `dataset verify`.
+///
+/// # Errors
+/// Exit code 6 naming what is broken.
+pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Output) -> Result<()> {
+    if args.snapshot.is_some() || args.complete {
+        return Err(CliError::input(format!(
+            "{}: reconstructions have no snapshots and no number of scenes; leave --snapshot and --complete away",
+            args.dataset
+        )));
+    }
+    let late = Late::new("scenes checked", output);
+    let watch = |done, of| late.at(done, of);
+    let report = there.verify(mode(args.fast), &watch).await;
+    late.finish();
+    let report = report.map_err(failed)?;
+    let facts = json!({
+        "reconstructions": args.dataset, "fast": args.fast, "scenes": report.scenes, "objects": report.objects,
+        "bytes": report.bytes, "problems": problems_json_by(&report.problems, hint),
+    });
+    if output.json || report.is_sound() {
+        output.result(&facts, || {
+            format!(
+                "{} scenes, {} objects, {}: whole{}",
+                report.scenes,
+                report.objects,
+                bytes(report.bytes),
+                if args.fast {
+                    " by manifests and sizes"
+                } else {
+                    ""
+                }
+            )
+        });
+    }
+    match report.is_sound() {
+        true => Ok(()),
+        false => Err(broken_by(&args.dataset, &report.problems, hint)),
+    }
+}
+
+/// How it is repaired.
+fn hint(_: &Problem) -> &'static str {
+    "submit its job again with `picofarm job submit FILE --from-stage STAGE`, with its reconstruct stage: what is damaged is \
+     made again, proved equal, and put back"
 }

@@ -9,7 +9,7 @@ use picofarm_dataset::{Dataset, Problem, Snapshot, Verification, VerifyMode, Ver
 use picofarm_proto::show;
 use serde_json::{Value, json};
 
-use super::{failed, open, predictions};
+use super::{failed, open, predictions, reconstructions};
 use crate::{
     args::DatasetVerify,
     error::{CliError, Code, Result},
@@ -22,6 +22,9 @@ const SHOWN: usize = 20;
 pub async fn run(args: &DatasetVerify, output: Output) -> Result<()> {
     if let Some(there) = predictions::find(&args.dataset).await? {
         return predictions::verify(args, &there, output).await;
+    }
+    if let Some(there) = reconstructions::find(&args.dataset).await? {
+        return reconstructions::verify(args, &there, output).await;
     }
     let dataset = open(&args.dataset).await?;
     let snapshot = match &args.snapshot {

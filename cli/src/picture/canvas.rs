@@ -77,18 +77,25 @@ impl Canvas {
         }
     }
 
-    /// Writes a PNG, whole or not at all.
-    pub fn save(&self, path: &std::path::Path) -> Result<()> {
+    /// The picture as a PNG.
+    ///
+    /// # Errors
+    /// It cannot be coded.
+    pub fn png(&self) -> std::result::Result<Vec<u8>, image::ImageError> {
         use image::ImageEncoder;
         let mut bytes = Vec::new();
-        image::codecs::png::PngEncoder::new(&mut bytes)
-            .write_image(
-                self.pixels.as_flattened(),
-                self.width as u32,
-                self.height as u32,
-                image::ExtendedColorType::Rgb8,
-            )
-            .map_err(|e| super::cannot_write(path, e))?;
+        image::codecs::png::PngEncoder::new(&mut bytes).write_image(
+            self.pixels.as_flattened(),
+            self.width as u32,
+            self.height as u32,
+            image::ExtendedColorType::Rgb8,
+        )?;
+        Ok(bytes)
+    }
+
+    /// Writes a PNG, whole or not at all.
+    pub fn save(&self, path: &std::path::Path) -> Result<()> {
+        let bytes = self.png().map_err(|e| super::cannot_write(path, e))?;
         super::write_atomically(path, &bytes)
     }
 }

@@ -5,9 +5,8 @@ use picofarm_scene::{Camera, Vec3};
 use rayon::prelude::*;
 
 use crate::{
-    error::Result,
+    error::{CliError, Code, Result},
     picture::{
-        cannot_write,
         canvas::{Canvas, TEXT},
         colour::{inferno, viridis},
     },
@@ -77,9 +76,9 @@ pub fn views(made: &Reconstructed, world: &World, cameras: &[Camera]) -> Canvas 
 ///
 /// # Errors
 /// The animation cannot be coded.
-pub fn orbit(made: &Reconstructed, cameras: &[Camera], path: &std::path::Path) -> Result<Vec<u8>> {
+pub fn orbit(made: &Reconstructed, cameras: &[Camera]) -> Result<Vec<u8>> {
     let palette: Vec<u8> = (0..=255u8).flat_map(|i| [i; 3]).collect();
-    let failed = |e: gif::EncodingError| cannot_write(path, e);
+    let failed = |e: gif::EncodingError| CliError::new(Code::Failed, format!("orbit.gif: {e}"));
     let mut bytes = Vec::new();
     let side = CELL as u16;
     {

@@ -17,8 +17,8 @@ pub fn write(out: &Path, made: &Made) -> Result<()> {
             out.display()
         )));
     };
-    let told = |e: std::io::Error| io(format!("--out {}", out.display()), &e);
-    fs::create_dir_all(parent).map_err(told)?;
+    let failed = |e: std::io::Error| io(format!("--out {}", out.display()), &e);
+    fs::create_dir_all(parent).map_err(failed)?;
     let partial = parent.join(format!(
         ".{}.partial-{}",
         name.display(),
@@ -26,7 +26,7 @@ pub fn write(out: &Path, made: &Made) -> Result<()> {
     ));
     let written = into(&partial, made)
         // Replaces an empty folder; fails on one that was filled meanwhile.
-        .and_then(|()| fs::rename(&partial, &out).map_err(told));
+        .and_then(|()| fs::rename(&partial, &out).map_err(failed));
     if written.is_err() {
         // The first error is the one to tell; what cannot be removed shows in the folder.
         let _ = fs::remove_dir_all(&partial);
@@ -50,7 +50,9 @@ fn into(dir: &Path, made: &Made) -> Result<()> {
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))?;
     }
     save("mesh.ply", &made.mesh.ply())?;
-    made.views.save(&dir.join("views.png"))?;
+    let views = made.views.png();
+    let views = views.map_err(|e| CliError::new(Code::Failed, format!("views.png: {e}")))?;
+    save("views.png", &views)?;
     save("orbit.gif", &made.orbit)?;
     let text = serde_json::to_string_pretty(&made.metrics).expect("metrics are plain data");
     save("metrics.json", (text + "\n").as_bytes())

@@ -29,6 +29,17 @@ pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), Sp
     let Some(store) = stage.task.shelf().cloned() else {
         return Ok(());
     };
+    if let Some(folder) = stage.task.reads_beside_mut() {
+        // A folder that a stage writes means itself, so that a job may be read again.
+        let written = |s: &&StageSpec| s.task.writes().is_some_and(|(_, to)| to == folder);
+        let named = before.iter().find(|s| s.name == *folder);
+        if !before.iter().any(|s| written(&s))
+            && let Some((place, to)) = named.and_then(|s| s.task.writes())
+            && *place == store
+        {
+            *folder = to.clone();
+        }
+    }
     let source = stage.task.reads().cloned();
     let at = |field: &str| format!("stage.{}.{field}", stage.name);
     match stage.task.models_mut() {

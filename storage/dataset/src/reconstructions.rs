@@ -22,6 +22,8 @@ use crate::scenes::dataset::{METADATA, pretty};
 use crate::scenes::publish::{CONCURRENCY, put_again, put_all};
 use crate::scenes::read::scenes_in;
 use crate::store::objects;
+use crate::verify::object::{intact, looked_at};
+use crate::verify::{Fault, Problem, Verification, VerifyMode, Watch};
 
 /// Version of these folders and of their manifests.
 const FORMAT: u32 = 1;
@@ -284,15 +286,48 @@ impl Reconstructions {
     }
 
     async fn intact(&self, object: &ObjectEntry) -> Result<Bytes, DatasetError> {
-        let path = self.path(&object.key);
-        let bytes = objects::require(&*self.store, &path).await?;
-        match sha256_hex(&bytes) == object.sha256 {
-            true => Ok(bytes),
-            false => Err(DatasetError::Damaged {
-                object: self.shown(&path),
-                what: "its SHA-256 is not the manifest's".into(),
-            }),
+        intact(&*self.store, &self.path(&object.key), object).await
+    }
+
+    /// Checks what is published. `watch` hears how many scenes are checked of how many.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn verify(
+        &self,
+        mode: VerifyMode,
+        watch: Watch<'_>,
+    ) -> Result<Verification, DatasetError> {
+        let mut report = Verification::default();
+        let present = self.scenes_present().await?;
+        for scene in &present {
+            let problem = |object: String, fault| Problem {
+                object,
+                scene: Some(*scene),
+                fault,
+            };
+            report.scenes += 1;
+            let manifest = match self.manifest(*scene).await {
+                Ok(manifest) => manifest,
+                Err(DatasetError::Damaged { object, what }) => {
+                    report
+                        .problems
+                        .push(problem(object, Fault::BadManifest(what)));
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
+            for entry in &manifest.objects {
+                let path = self.path(&entry.key);
+                report.objects += 1;
+                report.bytes += entry.size;
+                if let Err(fault) = looked_at(&*self.store, &path, entry, mode).await? {
+                    report.problems.push(problem(self.shown(&path), fault));
+                }
+            }
+            watch(report.scenes, present.len() as u64);
         }
+        Ok(report)
     }
 
     fn path(&self, key: &str) -> Path {
@@ -302,6 +337,11 @@ impl Reconstructions {
     fn shown(&self, path: &Path) -> String {
         objects::shown(&*self.store, path)
     }
+}
+
+/// Whether a group's root is that of reconstructions.
+pub(crate) fn is_reconstructions(root: &Value) -> bool {
+    root["attributes"]["picofarm"]["reconstructions"].is_u64()
 }
 
 fn key(scene: u64, name: &str) -> String {

@@ -262,7 +262,7 @@ fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
     let score = score_views(&Renderer::new(&field), &scene.camera, &world, &views);
     let mesh = mesh_score(&surface(&field), &world, &field, 0)?;
     let floating = floaters(&field, &world, 0)?;
-    told(
+    show(
         row.name,
         &score,
         (mesh.chamfer_m, floating.volume_m3),
@@ -310,7 +310,7 @@ fn timed<T>(
     Ok((made, cpu() - start))
 }
 
-fn told(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), seconds: f64) {
+fn show(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), seconds: f64) {
     let [all, visible, occluded, outside, within] =
         [s.all, s.visible, s.occluded, s.outside, s.within_view].map(|split| split.l1_m);
     println!(

@@ -80,7 +80,7 @@ impl Measured {
             return Err(ReconstructError::invalid("camera", what));
         }
         if k == 0 {
-            let why: Vec<String> = self.left_out.iter().map(told).collect();
+            let why: Vec<String> = self.left_out.iter().map(reason).collect();
             let what = format!(
                 "there is no usable spot, expected at least one; {}",
                 if why.is_empty() {
@@ -127,7 +127,7 @@ impl Measured {
             let what = "no pixel is lit by any spot: there are no times to find depth from; check gate, threshold and spots";
             return Err(ReconstructError::invalid("lit", what));
         }
-        let mut notes: Vec<String> = self.left_out.iter().map(told).collect();
+        let mut notes: Vec<String> = self.left_out.iter().map(reason).collect();
         if shadow == 0 {
             notes.push(
                 "no pixel is in shadow: nothing can be found of what the camera does not see"
@@ -141,6 +141,6 @@ impl Measured {
     }
 }
 
-fn told(left: &LeftOut) -> String {
+fn reason(left: &LeftOut) -> String {
     format!("beam {} is left out: {}", left.beam, left.why)
 }

@@ -77,10 +77,10 @@ fn arrays_of_another_size_and_impossible_times_are_refused() {
             .find(|&q| wrong.lit[q] != 0 && wrong.used[q] != 0)
             .unwrap();
         wrong.tau[at] = time;
-        let told = refused(wrong, small());
+        let said = refused(wrong, small());
         assert!(
-            told.starts_with("tau[0][") && told.contains("mark the pixel as unused"),
-            "{told}"
+            said.starts_with("tau[0][") && said.contains("mark the pixel as unused"),
+            "{said}"
         );
     }
 }
@@ -145,8 +145,8 @@ fn a_spot_on_a_mirror_is_left_out_and_named() {
         seed: 0,
     };
     let found = picofarm_reconstruct::source::captures_of(&scene, &settings, &|_, _| true).unwrap();
-    let told = found.check();
-    assert!(!found.left_out.is_empty(), "{told:?}");
+    let said = found.check();
+    assert!(!found.left_out.is_empty(), "{said:?}");
     assert!(
         found.left_out.iter().all(|l| l.why.contains("mirror")),
         "{:?}",
@@ -163,14 +163,14 @@ fn captures_of_another_size_or_without_light_are_told() {
         bins: 100,
     };
     let mut captures = Captures::new(scene.camera, scene.laser.clone(), gate, LIT_THRESHOLD);
-    let told = |e: ReconstructError| e.to_string();
+    let said = |e: ReconstructError| e.to_string();
     assert!(
-        told(captures.add(0, &[0.0; 7]).unwrap_err()).contains("expected 64 pixels x 100 bins")
+        said(captures.add(0, &[0.0; 7]).unwrap_err()).contains("expected 64 pixels x 100 bins")
     );
-    assert!(told(captures.add(5, &[0.0; 6400]).unwrap_err()).contains("no such beam"));
+    assert!(said(captures.add(5, &[0.0; 6400]).unwrap_err()).contains("no such beam"));
     let mut broken = [0.0; 6400];
     broken[123] = f32::NAN;
-    assert!(told(captures.add(0, &broken).unwrap_err()).contains("pixel 1 bin 23 is not finite"));
+    assert!(said(captures.add(0, &broken).unwrap_err()).contains("pixel 1 bin 23 is not finite"));
     captures.add(0, &[0.0; 6400]).unwrap();
     let measured = captures.finish();
     assert!(

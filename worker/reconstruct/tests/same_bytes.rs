@@ -73,7 +73,7 @@ fn a_checkpoint_of_something_else_is_refused() {
     let begun = Reconstruction::begin(input.clone(), small(), &Unwatched).unwrap();
     let kept = begun.checkpoint();
     let other = picofarm_reconstruct::Settings { seed: 9, ..small() };
-    let told = |settings, bytes: &[u8]| match Reconstruction::resume(
+    let said = |settings, bytes: &[u8]| match Reconstruction::resume(
         input.clone(),
         settings,
         bytes,
@@ -83,12 +83,12 @@ fn a_checkpoint_of_something_else_is_refused() {
         Err(e) => panic!("{e}"),
         Ok(_) => panic!("it was taken"),
     };
-    assert!(told(other, &kept).contains("other measurements or settings"));
-    assert!(told(small(), b"nonsense").contains("is none"));
-    assert!(told(small(), &kept[..10]).contains("cut off"));
+    assert!(said(other, &kept).contains("other measurements or settings"));
+    assert!(said(small(), b"nonsense").contains("is none"));
+    assert!(said(small(), &kept[..10]).contains("cut off"));
     let mut longer = kept.clone();
     longer.push(0);
-    assert!(told(small(), &longer).contains("cut off"));
+    assert!(said(small(), &longer).contains("cut off"));
 }
 
 #[test]

@@ -221,6 +221,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         None
     }
 
+    /// The same, for the name of a stage to be replaced by its folder.
+    fn reads_beside_mut(&mut self) -> Option<&mut String> {
+        None
+    }
+
     /// Where scenes come from that are made or read as files.
     fn scenes(&self) -> Option<&SceneSource> {
         None

@@ -7,13 +7,13 @@ use serde_json::{Value, json};
 use super::{Declared, Fields, Results, TaskKind};
 use crate::model::{
     job::{OutputSettings, SourceSettings, SpecError, check_count, check_source, default_profile},
-    memory::{BASE, Known},
+    memory::{BASE, Known, Shape},
 };
 
-/// Bytes of a node of the grid while it is fitted: measured at 128, 192 and 256 nodes.
-const NODE: f64 = 40.0;
-/// Bytes of a pixel for each spot: its time, its mask, and the light path that they make.
-const PATH: f64 = 30.0;
+/// Bytes of a node of the grid while it is fitted: 19 to 25 were measured at 256 to 128 nodes.
+const NODE: f64 = 28.0;
+/// Bytes of a pixel for each spot: its time, its mask, its strongest return, and all of them twice while masks are compared.
+const PATH: f64 = 40.0;
 /// Most novel views of a scene.
 const MOST_VIEWS: u32 = 1_000;
 
@@ -36,7 +36,7 @@ pub struct ReconstructTask {
 pub struct ReconstructSettings {
     /// Where two-bounce times and shadow masks come from.
     pub from: Measurements,
-    /// With `from = "predictions"`: the folder in the source's store that an infer stage wrote, with depth and masks.
+    /// With `from = "predictions"`: an infer stage, or the folder in the source's store that one wrote, with depth and masks.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub predictions: String,
     /// Only these spots, ascending; empty = all.
@@ -61,6 +61,12 @@ pub enum Measurements {
     Predictions,
     /// A histogram of each spot alone (`per_spot = true` in the render stage), through PlatoNeRF's matched filter.
     Captures,
+}
+
+/// Bytes that a grid of `nodes` nodes along its longest side takes at most while it is fitted to images of this shape.
+pub fn grid_bytes(nodes: u32, shape: &Shape) -> u64 {
+    let paths = PATH * shape.pixels() * f64::from(shape.spots);
+    (NODE * f64::from(nodes).powi(3) + paths) as u64
 }
 
 impl Declared for ReconstructTask {
@@ -123,17 +129,17 @@ impl TaskKind for ReconstructTask {
 
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
-        let side = f64::from(self.reconstruct.grid.nodes);
         let spots = match self.reconstruct.spots.len() {
             0 => source.spots,
             chosen => chosen as u32,
         };
-        let paths = PATH * source.pixels() * f64::from(spots);
+        let used = Shape { spots, ..*source };
         let histogram = match self.reconstruct.from {
             Measurements::Captures => 2.0 * source.histogram(),
             _ => 0.0,
         };
-        Some(BASE + source.truth() + paths + histogram + NODE * side * side * side)
+        let grid = grid_bytes(self.reconstruct.grid.nodes, &used) as f64;
+        Some(BASE + source.truth() + histogram + grid)
     }
 
     fn tasks(&self) -> u64 {
@@ -150,6 +156,11 @@ impl TaskKind for ReconstructTask {
 
     fn reads_beside(&self) -> Option<&String> {
         let folder = &self.reconstruct.predictions;
+        (!folder.is_empty()).then_some(folder)
+    }
+
+    fn reads_beside_mut(&mut self) -> Option<&mut String> {
+        let folder = &mut self.reconstruct.predictions;
         (!folder.is_empty()).then_some(folder)
     }
 
@@ -178,7 +189,7 @@ impl ReconstructSettings {
             (Measurements::Predictions, "") => {
                 return fail(
                     "predictions",
-                    "is empty; name the folder that an infer stage wrote, as in predictions = \"seen\"".into(),
+                    "is empty; name an infer stage, or the folder that one wrote, as in predictions = \"seen\"".into(),
                 );
             }
             (Measurements::Truth | Measurements::Captures, named) if !named.is_empty() => {

@@ -181,7 +181,7 @@ fn bytes(estimate: f64) -> u64 {
 /// | reprocess | 2.6·H; from single spots 4.6·H |
 /// | split | nothing that grows with pixels |
 /// | promote | twice the weights |
-/// | reconstruct | 40 bytes a node of the grid, 30 a pixel and spot; from single spots 2·H |
+/// | reconstruct | 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H |
 /// | export | 3.5·H |
 /// | train, evaluate, infer, report | see [`Network`]; and two scenes |
 pub fn peak_bytes(task: &TaskSpec, known: &Known, threads: u32) -> Option<u64> {

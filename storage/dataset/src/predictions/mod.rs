@@ -25,6 +25,7 @@ use crate::scenes::dataset::{METADATA, pretty};
 use crate::scenes::publish::{CONCURRENCY, put_again, put_all};
 use crate::scenes::read::scenes_in;
 use crate::store::objects;
+use crate::verify::object::intact;
 use array::{Plate, plates};
 use manifest::FORMAT;
 
@@ -238,14 +239,7 @@ impl Predictions {
 
     async fn check_hash(&self, object: &ObjectEntry) -> Result<(), DatasetError> {
         let path = self.path(&object.key);
-        let bytes = objects::require(&*self.store, &path).await?;
-        match sha256_hex(&bytes) == object.sha256 {
-            true => Ok(()),
-            false => Err(DatasetError::Damaged {
-                object: self.shown(&path),
-                what: "its SHA-256 is not the manifest's".into(),
-            }),
-        }
+        intact(&*self.store, &path, object).await.map(|_| ())
     }
 
     /// Codes what is predicted of the scene that `manifest` names; its format, objects and checksum are filled in.

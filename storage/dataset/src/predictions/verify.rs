@@ -5,9 +5,10 @@ use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
 use super::{Plate, PredictionManifest, Predictions};
 use crate::error::DatasetError;
-use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
+use crate::layout::manifest::{Manifest, ObjectEntry};
 use crate::scenes::dataset::METADATA;
 use crate::store::objects;
+use crate::verify::object::looked_at;
 use crate::verify::{Fault, Problem, Verification, VerifyMode, Watch, metadata_fault};
 
 /// Scenes checked at a time.
@@ -114,26 +115,11 @@ impl Predictions {
         mode: VerifyMode,
     ) -> Result<Option<Fault>, DatasetError> {
         let path = self.path(&entry.key);
-        let Some(size) = objects::size(&*self.store, &path).await? else {
-            return Ok(Some(Fault::Missing));
+        let bytes = match looked_at(&*self.store, &path, entry, mode).await? {
+            Err(fault) => return Ok(Some(fault)),
+            Ok(None) => return Ok(None),
+            Ok(Some(bytes)) => bytes,
         };
-        if size != entry.size {
-            return Ok(Some(Fault::WrongSize {
-                expected: entry.size,
-                found: size,
-            }));
-        }
-        if mode == VerifyMode::Fast {
-            return Ok(None);
-        }
-        let bytes = objects::require(&*self.store, &path).await?;
-        let found = sha256_hex(&bytes);
-        if found != entry.sha256 {
-            return Ok(Some(Fault::WrongHash {
-                expected: entry.sha256.clone(),
-                found,
-            }));
-        }
         let decoded = plate.codec.decode(&bytes);
         Ok(decoded.err().map(|e| Fault::Undecodable(e.to_string())))
     }

@@ -15,6 +15,7 @@ use crate::layout::group::create_metadata;
 use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
 use crate::layout::spec::DatasetSpec;
 use crate::predictions::is_predictions;
+use crate::reconstructions::is_reconstructions;
 use crate::store::objects;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
@@ -239,6 +240,11 @@ fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetE
     if is_predictions(&root) {
         let what = "holds what models predict of the scenes of a data set, and is no data set itself; its manifests name the one \
                     that it is about";
+        return Err(DatasetError::invalid(object, what));
+    }
+    if is_reconstructions(&root) {
+        let what = "holds reconstructions of the scenes of a data set, and is no data set itself; `dataset info` and `dataset \
+                    verify` read it";
         return Err(DatasetError::invalid(object, what));
     }
     let ours = &root["attributes"]["picofarm"];

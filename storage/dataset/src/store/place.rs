@@ -127,11 +127,11 @@ mod tests {
     #[test]
     fn a_url_is_a_service_a_bucket_and_a_prefix() {
         for (url, service, bucket, prefix) in [
-            ("s3://farm", Service::S3, "farm", ""),
-            ("s3://farm/", Service::S3, "farm", ""),
+            ("s3://farm", Service::S3, "lab", ""),
+            ("s3://lab/", Service::S3, "lab", ""),
             ("s3://my.farm-1/a/b c/", Service::S3, "my.farm-1", "a/b c"),
             ("gs://farm_2/sets", Service::Gcs, "farm_2", "sets"),
-            ("az://farm/sets/deep", Service::Azure, "farm", "sets/deep"),
+            ("az://lab/sets/deep", Service::Azure, "lab", "sets/deep"),
         ] {
             let place = Place::parse(url).unwrap().unwrap();
             assert_eq!(
@@ -146,7 +146,7 @@ mod tests {
             "s3:///x",
             "s3://Farm/x",
             "s3://ab/x",
-            "s3://farm/../x",
+            "s3://lab/../x",
             "gs://",
             "gs://Farm/x",
             "az://my.farm/x",
@@ -165,7 +165,7 @@ mod tests {
         ] {
             for url in [
                 format!("{scheme}://keyid:{SECRET}@farm/x"),
-                format!("{scheme}://farm/x?keyid={SECRET}"),
+                format!("{scheme}://lab/x?keyid={SECRET}"),
                 format!("{scheme}://farm?keyid={SECRET}"),
                 format!("{scheme}://farm#keyid={SECRET}"),
             ] {

@@ -4,6 +4,7 @@
 //! objects as are decoded at once.
 
 mod metadata;
+pub(crate) mod object;
 mod report;
 
 use std::sync::Arc;

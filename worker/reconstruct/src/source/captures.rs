@@ -90,6 +90,12 @@ impl Captures {
         Ok(())
     }
 
+    /// Leaves a beam out, and says why.
+    pub fn leave_out(&mut self, beam: usize, why: &str) {
+        let why = why.to_owned();
+        self.measured.left_out.push(LeftOut { beam, why });
+    }
+
     /// What was measured: masks by the light that a lit pixel is expected to return.
     pub fn finish(self) -> Measured {
         expected(self.measured, &self.returns)

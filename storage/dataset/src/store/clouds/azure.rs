@@ -69,7 +69,7 @@ mod tests {
     const ACCOUNT: (&str, &str) = ("AZURE_STORAGE_ACCOUNT_NAME", "lidar");
 
     fn connected(variables: &[(&str, &str)]) -> Result<MicrosoftAzure, DatasetError> {
-        let place = Place::parse("az://farm/sets").unwrap().unwrap();
+        let place = Place::parse("az://lab/sets").unwrap().unwrap();
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
         connect(&place, &Settings::of(&place, variables))
     }

@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     fn connected(variables: &[(&str, &str)]) -> Result<GoogleCloudStorage, DatasetError> {
-        let place = Place::parse("gs://farm/sets").unwrap().unwrap();
+        let place = Place::parse("gs://lab/sets").unwrap().unwrap();
         let variables = variables.iter().map(|(n, v)| ((*n).into(), (*v).into()));
         connect(&place, &Settings::of(&place, variables))
     }

@@ -83,7 +83,7 @@ mod tests {
     const SECRET: &str = "Very/Secret+Key";
 
     fn place() -> Place {
-        Place::parse("s3://farm/sets").unwrap().unwrap()
+        Place::parse("s3://lab/sets").unwrap().unwrap()
     }
 
     fn connected(variables: &[(&str, &str)]) -> Result<AmazonS3, DatasetError> {

@@ -2,12 +2,15 @@
 //!
 //! A task takes seconds, so it keeps no checkpoint: one that is stopped begins again, and comes to the same bytes.
 
+mod captured;
+mod written;
+
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
 use picofarm_dataset::{
     Dataset, DatasetError, Manifest, Predictions, Quantity, ReconstructionManifest,
-    Reconstructions, RenderArray, SceneUsed, encode_render_group,
+    Reconstructions, SceneUsed,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -20,16 +23,12 @@ use picofarm_proto::{
     },
 };
 use picofarm_reconstruct::{
-    Evidence, Measured, Phase, Progress, ReconstructError, Reconstructed, Reconstruction, Surface,
-    VERSION, World,
-    field::{PEAK, sigmoid, surface_logit},
-    render::Renderer,
-    score,
-    source::{Captures, Given, LIT_THRESHOLD, given},
+    Measured, Phase, Progress, ReconstructError, Reconstruction, VERSION, World, score,
+    source::{Given, given},
     surface,
 };
-use picofarm_scene::{Beam, Camera, Intrinsics, Laser, Vec3};
-use serde_json::{Value, json};
+use picofarm_scene::{Intrinsics, Vec3};
+use serde_json::json;
 use sha2::{Digest, Sha256};
 use tracing::{info, warn};
 
@@ -39,6 +38,9 @@ use crate::execute::{
     remade,
     reprocess::source_manifest,
 };
+
+use captured::{Frame, captures, slant};
+pub use written::{density, errors, facts};
 
 /// Pixels a side of a novel view.
 const VIEW_SIDE: u32 = 128;
@@ -57,7 +59,7 @@ impl RunTask for ReconstructTask {
         stores.fits(TaskSpec::Reconstruct(self.clone()), Some(dataset.spec()))?;
         let found = source_manifest(stores, &dataset, index, control)?;
         let work = Work(self);
-        let predictions = work.predictions(stores, index, control)?;
+        let predictions = work.predictions(stores, &found, control)?;
         let manifest = work.manifest(index, &found, predictions.as_ref().map(|(_, used)| used));
         let (store, prefix) = stores.probed(&self.output.store, control)?;
         let folder = Reconstructions::create_or_open(store, prefix.join(&*self.output.dataset));
@@ -147,9 +149,10 @@ impl Work<'_> {
     fn predictions(
         &self,
         stores: &Stores,
-        index: u64,
+        found: &Manifest,
         control: &Control,
     ) -> Result<Option<(Predictions, SceneUsed)>, TaskError> {
+        let index = found.scene;
         let folder = &self.0.reconstruct.predictions;
         if folder.is_empty() {
             return Ok(None);
@@ -177,6 +180,15 @@ impl Work<'_> {
         let manifest = stores
             .wait(control, predictions.manifest(index))
             .map_err(at)?;
+        if manifest.source.manifest_sha256 != manifest_sha256(found) {
+            return Err(TaskError::User(format!(
+                "reconstruct.predictions: {} holds what networks predict of scene {index} of {:?}, which is not the scene of \
+                 this stage's source, {:?}; name the data set that the infer stage has read",
+                predictions.place(),
+                manifest.source.dataset,
+                self.0.source.dataset,
+            )));
+        }
         let used = SceneUsed {
             dataset: folder.clone(),
             task_key: manifest.task_key.clone(),
@@ -198,7 +210,7 @@ impl Work<'_> {
         let needed: &[&str] = match from {
             Measurements::Truth => &["depth", "visibility", "spots.path"],
             Measurements::Predictions => &["spots.path"],
-            Measurements::Captures => &[],
+            Measurements::Captures => &["spots.path"],
         };
         let missing = found.missing();
         if let Some(missing) = missing.iter().find(|m| needed.contains(&m.as_str())) {
@@ -376,173 +388,6 @@ impl Work<'_> {
         files.insert("metrics.json".into(), (text + "\n").into());
         Ok(files)
     }
-}
-
-/// Place of each spot, and its path from the laser; `None` where a beam meets nothing.
-type Spots = [Option<(Vec3, f32)>];
-
-fn captures(
-    stores: &Stores,
-    dataset: &Dataset,
-    scene: u64,
-    (camera, origin, spots, beams): (Camera, Vec3, &Spots, &[u32]),
-    control: &Control,
-) -> Result<Measured, TaskError> {
-    if !dataset.spec().per_spot {
-        return Err(TaskError::User(format!(
-            "source: {} has no histogram of each spot alone, which from = \"captures\" reads; render it with per_spot = true",
-            dataset.place()
-        )));
-    }
-    // A beam that a mirror folds has no direction here: it points at its spot, where the filter looks for it.
-    let towards = |spot: &Option<(Vec3, f32)>| {
-        let away = spot.map_or(camera.forward, |(point, _)| point - origin);
-        Beam {
-            direction: away.normalized(),
-            spot: None,
-        }
-    };
-    let laser = Laser {
-        origin,
-        beams: spots.iter().map(towards).collect(),
-    };
-    let mut all = Captures::new(camera, laser, dataset.spec().gate, LIT_THRESHOLD);
-    for (done, beam) in beams.iter().enumerate() {
-        control.say(format!("capture {} of {}", done + 1, beams.len()), &[]);
-        proceed(control, MEASURED * done as f32 / beams.len() as f32)?;
-        let histogram = stores.wait(control, dataset.read_spot(scene, *beam))?;
-        all.add(*beam as usize, &histogram)
-            .map_err(of_reconstruction)?;
-    }
-    Ok(all.finish())
-}
-
-/// A camera-to-world matrix, row by row.
-struct Frame<'a>(&'a [f32]);
-
-impl Frame<'_> {
-    fn axis(&self, column: usize) -> Vec3 {
-        Vec3::new(self.0[column], self.0[4 + column], self.0[8 + column])
-    }
-
-    fn point(&self, p: [f32; 3]) -> Vec3 {
-        self.axis(3) + self.axis(0) * p[0] + self.axis(1) * p[1] + self.axis(2) * p[2]
-    }
-
-    fn camera(&self, intrinsics: Intrinsics) -> Camera {
-        Camera {
-            intrinsics,
-            origin: self.axis(3),
-            right: self.axis(0),
-            down: self.axis(1),
-            forward: self.axis(2),
-        }
-    }
-}
-
-/// Distance along a pixel's ray for each metre of z-depth.
-fn slant(camera: &Camera, pixel: usize) -> f32 {
-    let i = &camera.intrinsics;
-    let (u, v) = (
-        (pixel % i.width as usize) as f32 + 0.5,
-        (pixel / i.width as usize) as f32 + 0.5,
-    );
-    let (x, y) = ((u - i.cx) / i.fx, (v - i.cy) / i.fy);
-    (x * x + y * y + 1.0).sqrt()
-}
-
-/// What is known of a reconstruction without its true scene: the same bytes for the same measurements, so no times.
-pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Value> {
-    let left_out = made.measured.left_out.iter();
-    let left_out: Vec<Value> = left_out
-        .map(|l| json!({"beam": l.beam, "why": l.why}))
-        .collect();
-    let planes = made.planes.iter();
-    let planes: Vec<Value> = planes
-        .map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset}))
-        .collect();
-    let share =
-        |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
-    let facts = json!({
-        "spots": made.measured.spots.len(),
-        "left_out": left_out,
-        "planes": planes,
-        "iterations": made.iterations,
-        "loss": made.loss,
-        "vertices": mesh.positions.len(),
-        "triangles": mesh.triangles.len(),
-        "evidence": {
-            "none": share(Evidence::None), "plane": share(Evidence::Plane),
-            "paths": share(Evidence::Paths), "seen": share(Evidence::Seen),
-        },
-        "notes": made.notes,
-    });
-    match facts {
-        Value::Object(facts) => facts,
-        _ => unreachable!("written as an object"),
-    }
-}
-
-/// How far a reconstruction is from its true scene: novel views, mesh, floating matter.
-///
-/// # Errors
-/// [`ReconstructError::Invalid`] where the scene has no surface in the grid.
-pub fn errors(
-    made: &Reconstructed,
-    mesh: &Surface,
-    world: &World,
-    views: &[Camera],
-    seed: u64,
-) -> Result<serde_json::Map<String, Value>, ReconstructError> {
-    let camera = &made.measured.camera;
-    let novel = score::score_views(&Renderer::new(&made.field), camera, world, views);
-    let of_mesh = match mesh.triangles.is_empty() {
-        true => None,
-        false => Some(score::mesh_score(mesh, world, &made.field, seed)?),
-    };
-    let floaters = score::floaters(&made.field, world, seed)?;
-    let errors = json!({
-        "depth": "distance along the ray at which half the light is stopped; where none is, to the grid's end",
-        "novel_views": novel,
-        "mesh": of_mesh,
-        "floaters": floaters,
-    });
-    match errors {
-        Value::Object(errors) => Ok(errors),
-        _ => unreachable!("written as an object"),
-    }
-}
-
-/// The density field as the objects of a Zarr group.
-///
-/// # Errors
-/// None that a field can give rise to.
-pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetError> {
-    let field = &made.field;
-    let [nx, ny, nz] = field.nodes.map(|n| n as u64);
-    let density: Vec<f32> = (0..field.logit.len()).map(|i| field.density(i)).collect();
-    let evidence: Vec<f32> = made.evidence.iter().map(|e| f32::from(*e as u8)).collect();
-    let shape = [nz, ny, nx];
-    let array = |name, data| RenderArray {
-        name,
-        shape: &shape,
-        dimension_names: &["z", "y", "x"],
-        data,
-    };
-    let attributes = json!({
-        "origin_m": <[f32; 3]>::from(field.origin),
-        "spacing_m": field.spacing,
-        "axes": "x, y, z of the scene, metres; node (k, j, i) lies at origin + spacing * (i, j, k)",
-        "density": "1/m at the nodes: 4/spacing * sigmoid(logit); between nodes the logit is trilinear, logit = ln(s/(1 - s)) with s = density * spacing/4",
-        "surface_density_per_m": PEAK / field.spacing * sigmoid(surface_logit()),
-        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.ply is this level",
-        "evidence": "what tells of a node: 0 nothing (its density is a guess), 1 a plane of the room, 2 light paths, 3 the camera",
-    });
-    let attributes = attributes.as_object().expect("written as an object");
-    encode_render_group(
-        &[array("density", &density), array("evidence", &evidence)],
-        attributes,
-    )
 }
 
 /// Between a task's control and a reconstruction.

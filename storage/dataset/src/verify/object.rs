@@ -1,0 +1,62 @@
+//! Whether an object is what a manifest says of it.
+
+use bytes::Bytes;
+use object_store::ObjectStore;
+use object_store::path::Path;
+
+use super::{Fault, VerifyMode};
+use crate::error::DatasetError;
+use crate::layout::manifest::{ObjectEntry, sha256_hex};
+use crate::store::objects;
+
+/// What is wrong with an object, or its bytes where they were read: not with [`VerifyMode::Fast`].
+///
+/// # Errors
+/// [`DatasetError::Store`].
+pub(crate) async fn looked_at(
+    store: &dyn ObjectStore,
+    path: &Path,
+    entry: &ObjectEntry,
+    mode: VerifyMode,
+) -> Result<Result<Option<Bytes>, Fault>, DatasetError> {
+    let Some(size) = objects::size(store, path).await? else {
+        return Ok(Err(Fault::Missing));
+    };
+    if size != entry.size {
+        return Ok(Err(Fault::WrongSize {
+            expected: entry.size,
+            found: size,
+        }));
+    }
+    if mode == VerifyMode::Fast {
+        return Ok(Ok(None));
+    }
+    let bytes = objects::require(store, path).await?;
+    let found = sha256_hex(&bytes);
+    Ok(match found == entry.sha256 {
+        true => Ok(Some(bytes)),
+        false => Err(Fault::WrongHash {
+            expected: entry.sha256.clone(),
+            found,
+        }),
+    })
+}
+
+/// The bytes of an object that a manifest names.
+///
+/// # Errors
+/// [`DatasetError::Damaged`] where it is missing or another; [`DatasetError::Store`].
+pub(crate) async fn intact(
+    store: &dyn ObjectStore,
+    path: &Path,
+    entry: &ObjectEntry,
+) -> Result<Bytes, DatasetError> {
+    let bytes = objects::require(store, path).await?;
+    match sha256_hex(&bytes) == entry.sha256 {
+        true => Ok(bytes),
+        false => Err(DatasetError::Damaged {
+            object: objects::shown(store, path),
+            what: "its SHA-256 is not the manifest's".into(),
+        }),
+    }
+}
