@@ -1,6 +1,7 @@
 //! A picture to draw on: scaled images and small captions.
 
 use font8x8::UnicodeFonts;
+use picofarm_scene::export::rgb_png;
 
 use crate::error::Result;
 
@@ -78,24 +79,13 @@ impl Canvas {
     }
 
     /// The picture as a PNG.
-    ///
-    /// # Errors
-    /// It cannot be coded.
-    pub fn png(&self) -> std::result::Result<Vec<u8>, image::ImageError> {
-        use image::ImageEncoder;
-        let mut bytes = Vec::new();
-        image::codecs::png::PngEncoder::new(&mut bytes).write_image(
-            self.pixels.as_flattened(),
-            self.width as u32,
-            self.height as u32,
-            image::ExtendedColorType::Rgb8,
-        )?;
-        Ok(bytes)
+    pub fn png(&self) -> Vec<u8> {
+        let pixels = self.pixels.as_flattened();
+        rgb_png(self.width as u32, self.height as u32, pixels)
     }
 
     /// Writes a PNG, whole or not at all.
     pub fn save(&self, path: &std::path::Path) -> Result<()> {
-        let bytes = self.png().map_err(|e| super::cannot_write(path, e))?;
-        super::write_atomically(path, &bytes)
+        super::write_atomically(path, &self.png())
     }
 }

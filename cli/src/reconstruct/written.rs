@@ -50,9 +50,7 @@ fn into(dir: &Path, made: &Made) -> Result<()> {
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))?;
     }
     save("mesh.ply", &made.mesh.ply())?;
-    let views = made.views.png();
-    let views = views.map_err(|e| CliError::new(Code::Failed, format!("views.png: {e}")))?;
-    save("views.png", &views)?;
+    save("views.png", &made.views.png())?;
     save("orbit.gif", &made.orbit)?;
     let text = serde_json::to_string_pretty(&made.metrics).expect("metrics are plain data");
     save("metrics.json", (text + "\n").as_bytes())

@@ -5,6 +5,7 @@ mod binary;
 mod document;
 pub(crate) mod mitsuba;
 mod ply;
+mod rgb_png;
 mod textures;
 
 use std::{
@@ -15,8 +16,8 @@ use std::{
 
 use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
-use image::ImageEncoder;
 pub use mitsuba::write_mitsuba;
+pub use rgb_png::rgb_png;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;
@@ -130,14 +131,6 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SceneError> {
 
 /// A texture as 8-bit RGB PNG.
 fn png(texture: &Texture) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    image::codecs::png::PngEncoder::new(&mut bytes)
-        .write_image(
-            texture.texels().as_flattened(),
-            texture.width(),
-            texture.height(),
-            image::ExtendedColorType::Rgb8,
-        )
-        .expect("memory takes every image whose size fits its texels");
-    bytes
+    let texels = texture.texels().as_flattened();
+    rgb_png(texture.width(), texture.height(), texels)
 }

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use base64::{Engine, engine::general_purpose::STANDARD};
 use gltf::{
     Accessor, Document,
     accessor::{DataType, Dimensions},
@@ -33,14 +34,17 @@ impl Buffers {
                 return read_file(files, &file)
                     .and_then(|data| checked(path, &at, data, buffer.length()));
             }
-            let data =
-                gltf::buffer::Data::from_source_and_blob(source, None, &mut blob).map_err(|e| {
-                    format_error(
-                        path,
-                        format!("{at}: cannot be read ({e}); export the file again"),
-                    )
-                })?;
-            checked(path, &at, data.0, buffer.length())
+            let data = match source {
+                Source::Uri(uri) => data_uri(uri),
+                Source::Bin => blob
+                    .take()
+                    .ok_or_else(|| "the file has no binary chunk".into()),
+            };
+            let data = data.map_err(|why| {
+                let what = format!("{at}: cannot be read ({why}); export the file again");
+                format_error(path, what)
+            })?;
+            checked(path, &at, data, buffer.length())
         };
         document
             .buffers()
@@ -140,6 +144,15 @@ pub(super) fn buffer_file(path: &Path, uri: &str) -> Result<Option<PathBuf>, Sce
     }
     let named = Opener::named(base, &percent_decoded(uri));
     named.map(Some).map_err(of_file)
+}
+
+/// The bytes of a data URI.
+pub(super) fn data_uri(uri: &str) -> Result<Vec<u8>, String> {
+    let coded = uri
+        .strip_prefix("data:")
+        .and_then(|rest| rest.split_once(";base64,"));
+    let (_, text) = coded.ok_or("it is no data URI in base64")?;
+    STANDARD.decode(text).map_err(|e| e.to_string())
 }
 
 /// File names in glTF are URIs: `%20` stands for a space.

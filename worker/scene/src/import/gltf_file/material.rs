@@ -8,7 +8,10 @@ use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
 use crate::{
     Bsdf, Distribution, Material, SceneError, Texture, Wrap,
     extras::{MaterialExtras, metallic_roughness},
-    import::{buffers::buffer_file, format_error, image, read_file},
+    import::{
+        buffers::{buffer_file, data_uri},
+        format_error, image, read_file,
+    },
 };
 
 use super::{Walk, keyed};
@@ -284,10 +287,8 @@ impl Walk<'_> {
             }
             (None, Source::View { view, .. }) => buffers.view(&view).map_err(fail)?,
             (None, Source::Uri { uri, .. }) => {
-                let source = gltf::buffer::Source::Uri(uri);
-                held = gltf::buffer::Data::from_source_and_blob(source, None, &mut None)
-                    .map_err(|e| fail(format!("data URI cannot be read ({e})")))?
-                    .0;
+                held = data_uri(uri)
+                    .map_err(|why| fail(format!("data URI cannot be read ({why})")))?;
                 &held
             }
         };
