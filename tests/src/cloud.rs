@@ -1,15 +1,19 @@
-//! A stand-in for Google's and Azure's object stores on a loopback port: puts (also create-only), gets and deletes of whole
-//! objects, as far as the probe of a store goes. It checks no signature, only who asks.
+//! A stand-in for Google's and Azure's object stores on a loopback port: puts (also create-only), gets of objects and of
+//! ranges, deletes, and lists in pages, as far as data sets need them. It checks no signature, only who asks.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeMap, BTreeSet, HashMap},
     fmt::Write as _,
     io::{BufRead, BufReader, Write},
     net::{TcpListener, TcpStream},
     sync::{Arc, Mutex},
 };
 
-type Objects = Arc<Mutex<HashMap<String, Vec<u8>>>>;
+/// By bucket and key, as in `/bucket/key`.
+type Objects = Arc<Mutex<BTreeMap<String, Vec<u8>>>>;
+
+/// Most objects and folders in one answer to a list; the services' own is 1,000 or 5,000.
+const PAGE: usize = 100;
 
 /// A running stand-in; it ends with the test's process.
 pub struct Cloud {
@@ -119,6 +123,7 @@ impl Request {
             return error(403, "AccessDenied");
         }
         let (key, query) = self.target.split_once('?').unwrap_or((&self.target, ""));
+        let key = &decoded(key);
         let mut objects = objects.lock().expect("no thread panics");
         match &*self.method {
             "POST" if query.contains("comp=batch") => {
@@ -131,7 +136,7 @@ impl Request {
                     .enumerate()
                 {
                     let key = line.split(' ').nth(1).unwrap_or_default();
-                    objects.remove(key);
+                    objects.remove(&decoded(key));
                     write!(
                         answer,
                         "--x\r\nContent-Type: application/http\r\nContent-ID: {i}\r\n\r\nHTTP/1.1 202 Accepted\r\n\
@@ -151,9 +156,22 @@ impl Request {
                 objects.insert(key.to_owned(), self.body.clone());
                 (201, String::new(), Vec::new())
             }
-            "GET" | "HEAD" => match objects.get(key) {
-                Some(body) => (200, String::new(), body.clone()),
-                None => error(404, "NoSuchKey"),
+            "GET" if query.contains("list-type=2") || query.contains("comp=list") => {
+                let azure = query.contains("comp=list");
+                let body = List::new(query).page(key.trim_end_matches('/'), &objects, azure);
+                (200, String::new(), body.into_bytes())
+            }
+            "GET" | "HEAD" => match (objects.get(key), header("range").or(header("x-ms-range"))) {
+                (None, _) => error(404, "NoSuchKey"),
+                (Some(body), None) => (200, String::new(), body.clone()),
+                (Some(body), Some(range)) => match part(range, body.len()) {
+                    None => error(416, "InvalidRange"),
+                    Some(part) => {
+                        let (first, last, of) = (part.start, part.end - 1, body.len());
+                        let headers = format!("Content-Range: bytes {first}-{last}/{of}\r\n");
+                        (206, headers, body[part].to_vec())
+                    }
+                },
             },
             "DELETE" => match objects.remove(key) {
                 Some(_) => (204, String::new(), Vec::new()),
@@ -162,4 +180,125 @@ impl Request {
             _ => error(400, "NotHere"),
         }
     }
+}
+
+/// The bytes that `bytes=a-b`, `bytes=a-` or `bytes=-n` means; `None` where there are none.
+fn part(range: &str, length: usize) -> Option<std::ops::Range<usize>> {
+    let (from, to) = range.strip_prefix("bytes=")?.split_once('-')?;
+    let (start, end) = match (from.parse::<usize>(), to.parse::<usize>()) {
+        (Ok(from), Ok(to)) => (from, length.min(to + 1)),
+        (Ok(from), Err(_)) => (from, length),
+        (Err(_), Ok(last)) => (length.saturating_sub(last), length),
+        _ => return None,
+    };
+    (start < end).then_some(start..end)
+}
+
+/// What a list asks for.
+struct List {
+    prefix: String,
+    /// Keys are cut at the first slash after the prefix.
+    folders: bool,
+    /// The last that the page before this one had.
+    after: String,
+}
+
+impl List {
+    fn new(query: &str) -> Self {
+        let values: HashMap<&str, String> = query
+            .split('&')
+            .filter_map(|pair| pair.split_once('='))
+            .map(|(name, value)| (name, decoded(&value.replace('+', " "))))
+            .collect();
+        let value = |name: &str| values.get(name).cloned().unwrap_or_default();
+        Self {
+            prefix: value("prefix"),
+            folders: !value("delimiter").is_empty(),
+            after: value("continuation-token") + &value("marker"),
+        }
+    }
+
+    fn page(&self, bucket: &str, objects: &BTreeMap<String, Vec<u8>>, azure: bool) -> String {
+        let mut names = BTreeSet::new();
+        for key in objects.keys() {
+            let Some(key) = key.strip_prefix(&format!("{bucket}/")) else {
+                continue;
+            };
+            let Some(rest) = key.strip_prefix(&*self.prefix) else {
+                continue;
+            };
+            match rest.find('/').filter(|_| self.folders) {
+                Some(slash) => names.insert(format!("{}{}", self.prefix, &rest[..=slash])),
+                None => names.insert(key.to_owned()),
+            };
+        }
+        let mut rest = names.into_iter().filter(|name| *name > self.after);
+        let page: Vec<String> = rest.by_ref().take(PAGE).collect();
+        let more = rest.next().is_some();
+        let (mut files, mut folders) = (String::new(), String::new());
+        for name in &page {
+            let shown = escaped(name);
+            if name.ends_with('/') {
+                let tag = if azure {
+                    "BlobPrefix"
+                } else {
+                    "CommonPrefixes"
+                };
+                let inner = if azure { "Name" } else { "Prefix" };
+                folders += &format!("<{tag}><{inner}>{shown}</{inner}></{tag}>");
+                continue;
+            }
+            let size = objects[&format!("{bucket}/{name}")].len();
+            files += &match azure {
+                true => format!(
+                    "<Blob><Name>{shown}</Name><Properties><Last-Modified>Thu, 01 Jan 2026 00:00:00 GMT</Last-Modified>\
+                     <Etag>e</Etag><Content-Length>{size}</Content-Length><Content-Type>x</Content-Type></Properties></Blob>"
+                ),
+                false => format!(
+                    "<Contents><Key>{shown}</Key><Size>{size}</Size><LastModified>2026-01-01T00:00:00.000Z</LastModified>\
+                     <ETag>e</ETag></Contents>"
+                ),
+            };
+        }
+        let last = page.last().filter(|_| more).map(|name| escaped(name));
+        match azure {
+            true => format!(
+                "<EnumerationResults><Blobs>{files}{folders}</Blobs><NextMarker>{}</NextMarker></EnumerationResults>",
+                last.unwrap_or_default()
+            ),
+            false => {
+                let token =
+                    last.map(|l| format!("<NextContinuationToken>{l}</NextContinuationToken>"));
+                let token = token.unwrap_or_default();
+                format!("<ListBucketResult>{files}{folders}{token}</ListBucketResult>")
+            }
+        }
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+}
+
+/// A URL's text: `%20` stands for a space.
+fn decoded(text: &str) -> String {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((first, after)) = rest.split_first() {
+        let code = after.get(..2).and_then(|hex| std::str::from_utf8(hex).ok());
+        let code = code.and_then(|hex| u8::from_str_radix(hex, 16).ok());
+        match code.filter(|_| *first == b'%') {
+            Some(code) => {
+                bytes.push(code);
+                rest = &after[2..];
+            }
+            None => {
+                bytes.push(*first);
+                rest = after;
+            }
+        }
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
 }
