@@ -127,9 +127,9 @@ mod tests {
     #[test]
     fn a_url_is_a_service_a_bucket_and_a_prefix() {
         for (url, service, bucket, prefix) in [
-            ("s3://farm", Service::S3, "lab", ""),
+            ("s3://lab", Service::S3, "lab", ""),
             ("s3://lab/", Service::S3, "lab", ""),
-            ("s3://my.farm-1/a/b c/", Service::S3, "my.farm-1", "a/b c"),
+            ("s3://my.lab-1/a/b c/", Service::S3, "my.lab-1", "a/b c"),
             ("gs://farm_2/sets", Service::Gcs, "farm_2", "sets"),
             ("az://lab/sets/deep", Service::Azure, "lab", "sets/deep"),
         ] {
@@ -149,7 +149,7 @@ mod tests {
             "s3://lab/../x",
             "gs://",
             "gs://Farm/x",
-            "az://my.farm/x",
+            "az://my.lab/x",
         ] {
             let text = Place::parse(url).unwrap_err().to_string();
             assert!(text.contains(url) && text.contains("prefix"), "{text}");
@@ -164,10 +164,10 @@ mod tests {
             ("az", "AZURE_STORAGE_ACCOUNT_KEY"),
         ] {
             for url in [
-                format!("{scheme}://keyid:{SECRET}@farm/x"),
+                format!("{scheme}://keyid:{SECRET}@lab/x"),
                 format!("{scheme}://lab/x?keyid={SECRET}"),
-                format!("{scheme}://farm?keyid={SECRET}"),
-                format!("{scheme}://farm#keyid={SECRET}"),
+                format!("{scheme}://lab?keyid={SECRET}"),
+                format!("{scheme}://lab#keyid={SECRET}"),
             ] {
                 let text = Place::parse(&url).unwrap_err().to_string();
                 assert!(text.contains(variable), "{text}");

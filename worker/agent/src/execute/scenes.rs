@@ -178,3 +178,6 @@ pub(super) fn of_scene(error: SceneError) -> TaskError {
         _ => TaskError::User(error.to_string()),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -79,7 +79,7 @@ mod tests {
         let error = |variables: &[(&str, &str)]| {
             let text = connected(variables).unwrap_err().to_string();
             assert!(
-                text.starts_with("az://farm: ") && !text.contains("s3cr3t"),
+                text.starts_with("az://lab: ") && !text.contains("s3cr3t"),
                 "{text}"
             );
             text
@@ -107,7 +107,7 @@ mod tests {
             &[],
         ] {
             let store = connected(&[kind, &[ACCOUNT]].concat()).unwrap();
-            assert!(store.to_string().contains("container: farm"), "{store}");
+            assert!(store.to_string().contains("container: lab"), "{store}");
         }
     }
 }

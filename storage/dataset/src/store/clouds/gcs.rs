@@ -83,7 +83,7 @@ mod tests {
         let error = |variables: &[(&str, &str)]| {
             let text = connected(variables).unwrap_err().to_string();
             assert!(
-                text.starts_with("gs://farm: ") && !text.contains("s3cr3t"),
+                text.starts_with("gs://lab: ") && !text.contains("s3cr3t"),
                 "{text}"
             );
             text
@@ -114,7 +114,7 @@ mod tests {
             &[("AWS_ACCESS_KEY_ID", "of another service")],
         ] {
             let store = connected(variables).unwrap();
-            assert_eq!(store.to_string(), "GoogleCloudStorage(farm)");
+            assert_eq!(store.to_string(), "GoogleCloudStorage(lab)");
         }
     }
 }

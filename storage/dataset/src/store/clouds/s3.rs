@@ -116,7 +116,7 @@ mod tests {
         assert!(user.contains("without user"), "{user}");
         let url = with_keys("AWS_ENDPOINT", "host:8333");
         assert!(
-            url.starts_with("s3://farm: AWS_ENDPOINT: expected the server's URL"),
+            url.starts_with("s3://lab: AWS_ENDPOINT: expected the server's URL"),
             "{url}"
         );
         let timeout = error(&[endpoint, id, key, ("AWS_TIMEOUT", "soon")]);
@@ -142,7 +142,7 @@ mod tests {
         for kind in kinds {
             let all = [kind, &[endpoint, ("AWS_ALLOW_HTTP", "true")]].concat();
             let store = connected(&all).unwrap();
-            assert_eq!(store.to_string(), "AmazonS3(farm)");
+            assert_eq!(store.to_string(), "AmazonS3(lab)");
         }
         assert!(
             connected(&[]).is_ok(),
