@@ -42,17 +42,6 @@ fn undisturbed() -> std::collections::BTreeMap<String, String> {
     let id = submit(&farm, &job(&farm.store(), SCENES));
     let _worker = farm.worker("calm");
     assert_eq!(farm.until_ended(&id)["state"], "done");
-    let folded = (0..SCENES).filter(|scene| {
-        let found = metrics(&farm, "captures-3d", *scene);
-        let left_out = found["left_out"].as_array().unwrap().iter();
-        left_out
-            .filter_map(|l| l["why"].as_str())
-            .any(|why| why.contains("a mirror folds the beam"))
-    });
-    assert!(
-        folded.count() > 0,
-        "no beam of {SCENES} rooms meets a mirror"
-    );
     store::hashes(&farm.store().join("captures-3d"))
 }
 
@@ -94,7 +83,7 @@ fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
 fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
     let farm = Farm::start("rooms-predicted");
     let store = farm.store();
-    let network = "net = { width = 4, levels = 3 }\noptimise = { epochs = 20, batch = 4 }\ninput = { bins = 40 }";
+    let network = "net = { width = 4, levels = 3 }\noptimise = { epochs = 80, batch = 4 }\ninput = { bins = 40 }";
     let text = format!(
         r#"
 name = "rooms in 3D"
@@ -150,7 +139,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         for folder in ["truth-3d", "seen-3d"] {
             let found = metrics(&farm, folder, scene);
             let l1 = found["novel_views"]["all"]["l1_m"].as_f64().unwrap();
-            // Networks of twenty epochs are poor ones; what they predict of another room would be worse still.
+            // Networks of four rooms are poor ones.
             let most = if folder == "truth-3d" { 0.25 } else { 1.2 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
             assert_eq!(found["spots"], 4, "{found}");

@@ -20,6 +20,10 @@ use picofarm_proto::{
         memory::{Known, Shape, peak_bytes},
     },
 };
+use picofarm_scene::{
+    Material, export,
+    plato::{self, PlatoObject, PlatoSettings},
+};
 use serde_json::{Value, json};
 use tokio::runtime::{Handle, Runtime};
 use uuid::Uuid;
@@ -347,4 +351,47 @@ fn damaged_histograms_are_the_tasks_own_failure_and_name_the_object() {
         tried.insert(kind);
     }
     assert!(tried.len() >= 5, "{tried:?}");
+}
+
+/// PlatoNeRF's room, some of whose walls are mirrors, with three beams.
+fn room_of_mirrors() -> Vec<u8> {
+    let settings = PlatoSettings {
+        object: PlatoObject::Empty,
+        spots: 3,
+        resolution: 24,
+    };
+    let mut scene = plato::generate(&settings).unwrap();
+    for wall in &mut scene.objects[3..5] {
+        let mut mesh = (*wall.mesh).clone();
+        mesh.materials[0] = Material::mirror("mirror", 0.01);
+        wall.mesh = mesh.into();
+    }
+    export::glb_bytes(&scene).unwrap()
+}
+
+#[test]
+fn a_beam_that_a_mirror_folds_is_left_out_of_captures_and_named() {
+    let place = Place::new();
+    fs::write(place.dir.path().join("room.glb"), room_of_mirrors()).unwrap();
+    let store = place.store();
+    let job = json!({"name": "mirrors", "stage": [
+        {"name": "rooms", "scenes": {"kind": "files", "files": ["room.glb"], "spots": 3},
+         "render": {"resolution": 24, "samples": 2, "bins": 391, "bin_width_m": 0.0384, "per_spot": true},
+         "output": {"store": store, "dataset": "rooms"}},
+        {"kind": "reconstruct", "source": "rooms",
+         "reconstruct": {"from": "captures", "views": 0, "grid": {"nodes": 32, "iterations": 3}},
+         "output": {"store": store, "dataset": "rooms-3d"}},
+    ]});
+    for stage in place.stages(job) {
+        place.run_all(&stage, 2);
+    }
+    let metrics = place.dir.path().join("rooms-3d/scenes/0/metrics.json");
+    let metrics: Value = serde_json::from_slice(&fs::read(metrics).unwrap()).unwrap();
+    let left_out = metrics["left_out"].as_array().unwrap();
+    assert!((1..3).contains(&left_out.len()), "{metrics}");
+    assert_eq!(metrics["spots"], 3 - left_out.len(), "{metrics}");
+    for left in left_out {
+        let why = left["why"].as_str().unwrap();
+        assert!(why.contains("a mirror folds the beam"), "{why}");
+    }
 }
