@@ -28,9 +28,7 @@ use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{
-    file::substitute,
-    job::{MAX_STAGES, SpecError},
-    train::check_model,
+    limits::MAX_STAGES, spec_error::SpecError, substitute::substitute, train::check_model,
 };
 
 /// `[stage.sweep]`.

@@ -7,8 +7,8 @@ use picofarm_settings::{Budget, Choice, Strategy};
 use serde::Deserialize;
 
 use super::{
-    job::SpecError,
     kinds::render::{RenderSettings, SceneFile, SceneKind, SceneSource},
+    spec_error::SpecError,
 };
 use crate::show;
 

@@ -10,8 +10,10 @@ use super::{
 };
 use crate::{
     model::{
-        job::{SourceSettings, SpecError, check_count, check_source},
+        limits::check_count,
         memory::{BASE, Known},
+        places::{SourceSettings, check_source},
+        spec_error::SpecError,
     },
     show,
     split::SIDES,

@@ -10,8 +10,8 @@ use super::{
 };
 use crate::{
     model::{
-        job::{SpecError, within},
         memory::{BASE, Known},
+        spec_error::{SpecError, within},
     },
     show,
 };

@@ -5,8 +5,10 @@ use serde_json::{Map, Value, json};
 
 use super::{Declared, Fields, Results, TaskKind, TaskSpec};
 use crate::model::{
-    job::{MAX_TASKS, OutputSettings, SpecError},
+    limits::MAX_TASKS,
     memory::{BASE, Known},
+    places::OutputSettings,
+    spec_error::SpecError,
 };
 
 /// Importing scenes into a data set: one task a scene.

@@ -11,11 +11,11 @@ use super::{
     train::{check_model, check_spots},
 };
 use crate::model::{
-    job::{
-        OutputSettings, SourceSettings, SpecError, StageSpec, check_count, check_source,
-        default_profile,
-    },
+    limits::check_count,
     memory::{BASE, Known, Network},
+    places::{OutputSettings, SourceSettings, check_source, default_profile},
+    spec_error::SpecError,
+    stage::StageSpec,
 };
 
 /// Most models in one inference: one of each kind.

@@ -26,8 +26,10 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::{
-    job::{OutputSettings, SourceSettings, SpecError, StageSpec},
     memory::{Known, Network, Shape},
+    places::{OutputSettings, SourceSettings},
+    spec_error::SpecError,
+    stage::StageSpec,
     sweep::Trial,
 };
 use crate::{key::StageKey, show};

@@ -9,8 +9,8 @@ use super::{
 use crate::{
     key::StageKey,
     model::{
-        job::SpecError,
         memory::{BASE, Known, LIGHT_PATHS, Rendering},
+        spec_error::SpecError,
     },
 };
 

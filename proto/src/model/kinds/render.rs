@@ -8,8 +8,10 @@ use super::{Declared, Fields, Results, TaskKind, TaskSpec};
 use crate::{
     key::StageKey,
     model::{
-        job::{OutputSettings, SpecError, check_count, within},
+        limits::check_count,
         memory::{Known, LIGHT_PATHS, Rendering, Shape},
+        places::OutputSettings,
+        spec_error::{SpecError, within},
         text::{RenderSettingsText, SceneSourceText, check_share},
     },
 };

@@ -8,8 +8,9 @@ use super::{
     train::check_model,
 };
 use crate::model::{
-    job::{REPORTS, SpecError, within},
     memory::{BASE, Known},
+    places::REPORTS,
+    spec_error::{SpecError, within},
 };
 
 /// Most scenes of each model that a report shows.

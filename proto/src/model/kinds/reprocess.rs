@@ -9,8 +9,10 @@ use super::{Declared, Fields, Results, TaskKind};
 use crate::{
     key::reprocess_stage_key,
     model::{
-        job::{OutputSettings, SourceSettings, SpecError, check_count, check_source},
+        limits::check_count,
         memory::{BASE, Known, Shape},
+        places::{OutputSettings, SourceSettings, check_source},
+        spec_error::SpecError,
     },
     show,
 };

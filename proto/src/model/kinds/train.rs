@@ -7,8 +7,10 @@ use serde_json::{Value, json};
 
 use super::{Declared, Fields, Manifest, ModelNames, Results, TaskKind, reprocess::Histogram};
 use crate::model::{
-    job::{MODELS, SourceSettings, SpecError, check_count, check_source},
+    limits::check_count,
     memory::{BASE, Known, Network, Shape},
+    places::{MODELS, SourceSettings, check_source},
+    spec_error::SpecError,
     sweep::Trial,
 };
 

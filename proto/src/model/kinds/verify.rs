@@ -5,8 +5,10 @@ use serde_json::{Value, json};
 
 use super::{Declared, Fields, Manifest, Results, TaskKind};
 use crate::model::{
-    job::{SourceSettings, SpecError, check_count, check_source},
+    limits::check_count,
     memory::{BASE, Known},
+    places::{SourceSettings, check_source},
+    spec_error::SpecError,
 };
 
 /// Verifying a data set: one task a scene. It is over when the scene is sound, and fails when it is not.

@@ -5,8 +5,8 @@ use super::{
     TrainSettings,
 };
 use crate::model::{
-    job::{SpecError, within},
     kinds::reprocess::Histogram,
+    spec_error::{SpecError, within},
 };
 
 impl TrainSettings {
