@@ -18,9 +18,9 @@ mod spec_error;
 pub mod stage;
 pub mod status;
 mod substitute;
-pub mod sweep;
-mod text;
+mod sweep;
 mod texts;
+pub mod trial;
 
 pub use audit::{Act, AuditEntry, Outcome};
 // What jobs share with data sets, the renderer and the networks.
@@ -34,9 +34,10 @@ pub use kinds::{
     generate::GenerateSettings,
     import::ImportSettings,
     infer::{self, InferSettings},
-    render::{self, RenderSettings, SceneFile, SceneKind, SceneSource},
+    render::{self, RenderSettings, parse_share},
     report::{self, ReportSettings},
     reprocess::{self, Histogram, ReprocessSettings},
+    scenes::{SceneFile, SceneKind, SceneSource},
     train::{self, TrainSettings},
 };
 pub use lease::{
@@ -53,5 +54,4 @@ pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,
 };
-pub use sweep::{Halving, Trial};
-pub use text::parse_share;
+pub use trial::{Halving, Trial};

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::{
-    kinds::{Fields, TaskSpec},
+    kinds::{Fields, TaskKind, TaskSpec},
     limits::Resources,
     places::place,
     spec_error::SpecError,
@@ -184,7 +184,8 @@ impl StageSpec {
                 return Err(SpecError::new("needs", what));
             }
         }
-        self.task.check_among(before)
+        let before: Vec<&dyn TaskKind> = before.iter().map(|s| &*s.task).collect();
+        self.task.check_among(&before)
     }
 
     /// Checks where it reads and writes: absolute paths or URLs, none of which climbs.

@@ -4,9 +4,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, ModelNames, Results, TaskKind,
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::{check_model, check_split},
     reprocess::Histogram,
-    train::{check_model, check_split, check_spots, is_zero},
+    train::{check_spots, is_zero},
 };
 use crate::{
     model::{

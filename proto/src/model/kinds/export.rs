@@ -3,7 +3,10 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Manifest, Results, TaskKind};
+use super::{
+    fields::Fields,
+    kind::{Declared, Manifest, Results, TaskKind},
+};
 use crate::model::{
     limits::check_count,
     memory::{BASE, Known},

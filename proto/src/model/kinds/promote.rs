@@ -3,7 +3,11 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Manifest, ModelNames, Results, TaskKind, train::check_model};
+use super::{
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::check_model,
+};
 use crate::model::{
     limits::{MAX_STAGES, check_count},
     memory::{BASE, Known, Network},

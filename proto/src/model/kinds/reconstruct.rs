@@ -4,7 +4,10 @@ use picofarm_settings::GridSettings;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Results, TaskKind};
+use super::{
+    fields::Fields,
+    kind::{Declared, Results, TaskKind},
+};
 use crate::model::{
     limits::check_count,
     memory::{BASE, Known, Shape},

@@ -4,8 +4,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, ModelNames, Results, TaskKind, evaluate::MAX_MODELS,
-    train::check_model,
+    evaluate::MAX_MODELS,
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::check_model,
 };
 use crate::model::{
     memory::{BASE, Known},
