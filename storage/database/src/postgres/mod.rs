@@ -9,7 +9,9 @@ mod errors;
 mod instance;
 mod jobs;
 mod rights;
+mod rows;
 mod write;
+mod writer;
 
 use std::{
     sync::Mutex,
@@ -66,7 +68,7 @@ pub struct PostgresCatalog {
     pool: PgPool,
     /// The present life.
     instance: Mutex<Option<InstanceId>>,
-    keys: tokio::sync::Mutex<write::Keys>,
+    keys: tokio::sync::Mutex<writer::Keys>,
     hints: tokio::sync::Mutex<Option<PgListener>>,
     hinted: Mutex<Option<Instant>>,
 }
@@ -137,7 +139,7 @@ impl PostgresCatalog {
     /// Runs `work` in one transaction, on behalf of an instance that is alive.
     async fn write<T>(
         &self,
-        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         self.transaction(true, work).await
     }
@@ -146,7 +148,7 @@ impl PostgresCatalog {
     async fn transaction<T>(
         &self,
         keep: bool,
-        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         let instance = self.instance()?;
         let mut keys = self.keys.lock().await;
@@ -154,7 +156,7 @@ impl PostgresCatalog {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
             instance::fence(&mut tx, instance).await?;
-            let mut writer = write::Writer {
+            let mut writer = writer::Writer {
                 c: &mut tx,
                 instance: instance.uuid(),
                 keys: &mut keys,
@@ -168,9 +170,9 @@ impl PostgresCatalog {
             Ok(done)
         };
         result.await.map_err(|e| match e {
-            write::WriteError::Fenced => CatalogError::Fenced,
-            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
-            write::WriteError::Sql(e) => self.failed(e),
+            writer::WriteError::Fenced => CatalogError::Fenced,
+            writer::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            writer::WriteError::Sql(e) => self.failed(e),
         })
     }
 
@@ -328,7 +330,7 @@ impl Catalog for PostgresCatalog {
     async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
         picofarm_catalog::verdict(
             self.transaction(false, async |writer| {
-                write::write_rows(writer, changes).await
+                rows::write_rows(writer, changes).await
             })
             .await,
         )
@@ -405,7 +407,7 @@ impl Catalog for PostgresCatalog {
 
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
         self.write(async |writer| {
-            *writer.keys = write::Keys::default();
+            *writer.keys = writer::Keys::default();
             Ok(listing_query::forget(writer.c, before_ms).await?)
         })
         .await
@@ -483,7 +485,7 @@ impl Catalog for PostgresCatalog {
             return Ok(Vec::new());
         }
         let mut c = self.reader().await?;
-        write::manifests(&mut c, tasks)
+        rows::manifests(&mut c, tasks)
             .await
             .map_err(|e| self.failed(e))
     }
