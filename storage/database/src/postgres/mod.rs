@@ -6,17 +6,16 @@
 //! and asks once a second anyway.
 
 mod errors;
+mod hints;
 mod instance;
 mod jobs;
+mod migrate;
 mod rights;
 mod rows;
 mod write;
 mod writer;
 
-use std::{
-    sync::Mutex,
-    time::{Duration, Instant},
-};
+use std::{sync::Mutex, time::Duration};
 
 use async_trait::async_trait;
 use picofarm_proto::{
@@ -25,18 +24,18 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, PgPool,
-    migrate::MigrateError,
     pool::PoolConnection,
-    postgres::{PgConnectOptions, PgListener, PgPoolOptions, PgRow},
+    postgres::{PgConnectOptions, PgPoolOptions, PgRow},
 };
 use uuid::Uuid;
 
-use crate::migrations;
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
     Sight, Snapshot, Submission, TaskRecord, Timing, Want,
 };
+
+use hints::Hints;
 
 crate::sql::queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_listing::listing_queries!(
@@ -54,10 +53,6 @@ const CONNECTIONS: u32 = 10;
 const PATIENCE: Duration = Duration::from_secs(10);
 /// An instance that has not beaten for so long is lost.
 const INSTANCE_SECONDS: f64 = 5.0;
-/// At most one hint to the others in this time.
-const HINTS: Duration = Duration::from_millis(100);
-/// The channel of the hints.
-const CHANNEL: &str = "picofarm";
 
 /// A catalog in a Postgres database.
 pub struct PostgresCatalog {
@@ -69,8 +64,7 @@ pub struct PostgresCatalog {
     /// The present life.
     instance: Mutex<Option<InstanceId>>,
     keys: tokio::sync::Mutex<writer::Keys>,
-    hints: tokio::sync::Mutex<Option<PgListener>>,
-    hinted: Mutex<Option<Instant>>,
+    hints: Hints,
 }
 
 impl PostgresCatalog {
@@ -102,15 +96,14 @@ impl PostgresCatalog {
             Ok(pool) => pool,
             Err(error) => return Err(errors::unconnected(&place, &options, error).await),
         };
-        migrate(&place, &pool).await?;
-        let listener = listen(&pool).await.map_err(failed)?;
+        migrate::migrate(&place, &pool).await?;
+        let hints = Hints::new(pool.clone()).await.map_err(failed)?;
         Ok(Self {
             name: name.to_owned(),
             pool,
             instance: Mutex::new(None),
             keys: tokio::sync::Mutex::default(),
-            hints: tokio::sync::Mutex::new(Some(listener)),
-            hinted: Mutex::new(None),
+            hints,
             place,
         })
     }
@@ -175,54 +168,6 @@ impl PostgresCatalog {
             writer::WriteError::Sql(e) => self.failed(e),
         })
     }
-
-    /// Wakes the others, unless they have just been woken.
-    async fn hint(&self) {
-        {
-            let mut hinted = self.hinted.lock().expect("no panic while locked");
-            if hinted.is_some_and(|at| at.elapsed() < HINTS) {
-                return;
-            }
-            *hinted = Some(Instant::now());
-        }
-        let sent = sqlx::query("SELECT pg_notify($1, '')")
-            .bind(CHANNEL)
-            .execute(&self.pool)
-            .await;
-        if let Err(error) = sent {
-            tracing::debug!(%error, "no hint sent; the others ask by themselves");
-        }
-    }
-}
-
-async fn listen(pool: &PgPool) -> Result<PgListener, sqlx::Error> {
-    let mut listener = PgListener::connect_with(pool).await?;
-    listener.listen(CHANNEL).await?;
-    Ok(listener)
-}
-
-async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
-    let known = migrations::latest(&migrations::POSTGRES);
-    // Several coordinators may start at once: the migrator takes an advisory lock.
-    migrations::POSTGRES
-        .run(pool)
-        .await
-        .map_err(|error| match error {
-            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
-                CatalogError::Newer {
-                    place: place.to_owned(),
-                    found,
-                    known,
-                }
-            }
-            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
-                errors::classify(place, e)
-            }
-            other => CatalogError::Unusable {
-                place: place.to_owned(),
-                what: format!("its schema is not this program's ({other})"),
-            },
-        })
 }
 
 #[async_trait]
@@ -283,18 +228,7 @@ impl Catalog for PostgresCatalog {
     }
 
     async fn changed(&self) {
-        let mut hints = self.hints.lock().await;
-        loop {
-            if let Some(listener) = hints.as_mut() {
-                match listener.recv().await {
-                    Ok(_) => return,
-                    Err(error) => tracing::debug!(%error, "no more hints; trying again"),
-                }
-                *hints = None;
-            }
-            tokio::time::sleep(Duration::from_secs(2)).await;
-            *hints = listen(&self.pool).await.ok();
-        }
+        self.hints.heard().await;
     }
 
     async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError> {
@@ -322,7 +256,7 @@ impl Catalog for PostgresCatalog {
             .await?;
         let pending = |r: &Range| matches!(r.state, RangeState::Pending { .. });
         if settled != Settled::default() || changes.free.values().any(pending) {
-            self.hint().await;
+            self.hints.give().await;
         }
         Ok(settled)
     }
@@ -342,7 +276,7 @@ impl Catalog for PostgresCatalog {
         let outcome = self
             .write(async |writer| jobs::record(writer, submission, &spec).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(outcome)
     }
 
@@ -387,7 +321,7 @@ impl Catalog for PostgresCatalog {
         let cancelled = self
             .write(async |writer| jobs::cancel(writer, job, why, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(cancelled)
     }
 
@@ -401,7 +335,7 @@ impl Catalog for PostgresCatalog {
         let changed = self
             .write(async |writer| jobs::pause(writer, job, paused, who, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(changed)
     }
 
@@ -424,7 +358,7 @@ impl Catalog for PostgresCatalog {
         let retried = self
             .write(async |writer| jobs::retry(writer, job, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(retried)
     }
 
@@ -529,9 +463,7 @@ impl Catalog for PostgresCatalog {
             }
         }
         // The pool waits for every connection, the listener's too.
-        if let Ok(mut hints) = self.hints.try_lock() {
-            hints.take();
-        }
+        self.hints.end();
         self.pool.close().await;
     }
 }
