@@ -5,8 +5,8 @@ use picofarm_proto::{model::AuditEntry, show};
 use crate::{
     args::Audit,
     client::Client,
+    describe::clock,
     error::{CliError, Result},
-    jobs::clock,
     output::{Output, table},
     settings::Settings,
 };

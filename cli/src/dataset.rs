@@ -3,7 +3,9 @@
 pub mod export;
 pub mod gc;
 pub mod import;
+mod late;
 mod predictions;
+mod problems;
 mod reconstructions;
 pub mod repair;
 pub mod reprocess;

@@ -5,8 +5,8 @@ use picofarm_proto::show;
 use crate::{
     args,
     client::{Client, Explained, Workers},
+    describe::{clock, counts, describe_event, state},
     error::Result,
-    jobs::{self, clock, describe_event},
     output::{Output, bytes, duration, table},
     settings::Settings,
 };
@@ -18,8 +18,8 @@ pub fn describe(explained: &Explained) -> String {
         "job {} \"{}\": {}\n  {}\n",
         status.id,
         show::line(&status.name),
-        jobs::state(status),
-        jobs::counts(status)
+        state(status),
+        counts(status)
     );
     for reason in &explained.reasons {
         text += &format!("  - {}\n", show::line(&reason.words));

@@ -1,7 +1,7 @@
 //! `picofarm job …`.
 
 mod dark;
-mod describe;
+mod finish;
 mod submit;
 
 use std::{
@@ -12,25 +12,26 @@ use std::{
 use clap::ValueEnum;
 use picofarm_proto::{
     ids::JobId,
-    model::{Event, JobSpec, JobStatus},
+    model::{Event, JobSpec},
     show,
 };
 use serde_json::json;
 
+use finish::finish;
+
 use crate::{
     args::{Job, JobKind},
     client::{Client, Listing, Page},
+    describe::{describe, describe_event, describe_plan},
     error::{CliError, Code, Result, io},
     explain,
-    follow::{Show, follow, verdict},
+    follow::{Show, follow},
     jobfile, listing,
     output::Output,
     reach,
     settings::Settings,
     tail,
 };
-
-pub use describe::{clock, counts, describe, describe_event, describe_plan, state};
 
 pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()> {
     if let Job::Init { file, kind } = &command {
@@ -301,13 +302,4 @@ async fn history(client: &mut Client, page: Page) -> Result<Vec<Event>> {
         events.drain(..surplus);
     }
     Ok(events)
-}
-
-/// How a job ended that was followed.
-async fn finish(client: &mut Client, status: &JobStatus, output: Output) -> Result<()> {
-    output.result(status, || describe(status));
-    if let Some(warning) = dark::warning(client, status).await {
-        output.warn(warning);
-    }
-    verdict(status)
 }

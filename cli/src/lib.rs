@@ -12,6 +12,7 @@ pub mod choices;
 pub mod client;
 pub mod dataset;
 mod demo;
+mod describe;
 mod doctor;
 pub mod error;
 mod explain;

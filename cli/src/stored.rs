@@ -122,17 +122,17 @@ impl Question {
             Manifest::Part {
                 dataset,
                 joined_by,
-                task,
+                division,
             } => {
                 let Some(stage) = joined_by else {
                     return Err("its joining stage has no key".into());
                 };
                 let name = |(index, _): &(u64, [u8; 32])| {
-                    let (scene, part) = task.split(*index);
+                    let (scene, part) = division.split(*index);
                     PartName {
                         scene,
                         task_key: task_key(&stage, scene).to_string(),
-                        part: (part, task.whole.parts),
+                        part: (part, division.parts),
                     }
                 };
                 Self::Parts(dataset.to_owned(), results.iter().map(name).collect())

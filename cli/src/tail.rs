@@ -13,8 +13,8 @@ use picofarm_proto::{ids::JobId, model::Event};
 
 use crate::{
     client::{Client, Page},
+    describe::describe_event,
     error::{CliError, Code, Result},
-    jobs::describe_event,
     output::Output,
     settings::Settings,
     signals,

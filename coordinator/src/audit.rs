@@ -19,7 +19,7 @@ use picofarm_proto::{
 use tokio::sync::{mpsc, oneshot};
 use tonic::{Code, Status};
 
-use crate::{auth::ANYONE, clock::Clock};
+use crate::{auth::caller::ANYONE, clock::Clock};
 
 /// The name in lines about what nobody called for. No caller can have it.
 pub(crate) const COORDINATOR: &str = "(coordinator)";

@@ -1,92 +1,24 @@
 //! Names of results. A stage key hashes everything that shapes the outputs of a job's tasks; a task key
 //! adds the task's index. Equal key, equal bytes: resume, reuse and reprocessing all rest on this.
 
-use std::{collections::BTreeMap, fmt};
+use std::collections::BTreeMap;
 
 use sha2::{Digest, Sha256};
 
 use crate::{
-    model::{Histogram, JobSpec, ReportSettings, ReprocessSettings, StageSpec, TrainSettings},
+    model::{Histogram, JobSpec, ReportSettings, StageSpec, TrainSettings},
     split::SplitSettings,
 };
+use hash::canonical;
 
-/// Hash of the canonical description of a stage's tasks, without their number, name or budgets.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct StageKey(pub [u8; 32]);
+pub(crate) mod hash;
 
-/// Names one task's result.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct TaskKey(pub [u8; 32]);
-
-macro_rules! hex_text {
-    ($name:ident) => {
-        impl fmt::Display for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str(&hex::encode(self.0))
-            }
-        }
-        impl fmt::Debug for $name {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                write!(f, concat!(stringify!($name), "({})"), self)
-            }
-        }
-        impl $name {
-            /// Parses 64 hexadecimal digits.
-            pub fn parse(text: &str) -> Option<Self> {
-                let mut bytes = [0; 32];
-                hex::decode_to_slice(text, &mut bytes).ok()?;
-                Some(Self(bytes))
-            }
-        }
-    };
-}
-hex_text!(StageKey);
-hex_text!(TaskKey);
-
-impl StageKey {
-    /// Of a description of all that shapes the results of a stage's tasks but their number.
-    pub fn of(description: serde_json::Value) -> Self {
-        Self(Sha256::digest(canonical(description).as_bytes()).into())
-    }
-}
+pub use hash::{StageKey, TaskKey, derived_key, task_key};
 
 /// The key of a stage: everything that shapes the results of its tasks but their number. A data set that is read counts
 /// by its place.
 pub fn stage_key(stage: &StageSpec) -> StageKey {
     StageKey::of(stage.task.shaping())
-}
-
-/// The key of task `index` of a stage.
-pub fn task_key(stage: &StageKey, index: u64) -> TaskKey {
-    let mut hash = Sha256::new();
-    hash.update(stage.0);
-    hash.update(index.to_le_bytes());
-    TaskKey(hash.finalize().into())
-}
-
-/// The stage key of a reprocess stage: everything but the places of source and target, which follow from the keys of
-/// the source's scenes ([`derived_key`]).
-pub fn reprocess_stage_key(settings: &ReprocessSettings, profile: &str) -> StageKey {
-    let description = serde_json::json!({
-        "task": "reprocess",
-        "histogram": settings.histogram,
-        "spots": settings.spots,
-        "sensor": serde_json::to_value(&settings.sensor).expect("settings are plain data"),
-        "drop_left_over": settings.drop_left_over,
-        "seed": settings.seed,
-        "version": settings.version,
-        "profile": profile,
-    });
-    StageKey::of(description)
-}
-
-/// The key of a task that makes one scene of another: the stage, and the key of the task that made the source.
-pub fn derived_key(stage: &StageKey, source: &TaskKey) -> TaskKey {
-    let mut hash = Sha256::new();
-    hash.update(b"derived");
-    hash.update(stage.0);
-    hash.update(source.0);
-    TaskKey(hash.finalize().into())
 }
 
 /// The key of the one task of a split stage over the first `scenes` scenes of what `source` makes.
@@ -188,11 +120,4 @@ pub fn scene_seed(seed: u64, index: u64) -> u64 {
 pub fn spec_hash(spec: &JobSpec) -> String {
     let description = serde_json::to_value(spec).expect("a spec is plain data");
     hex::encode(Sha256::digest(canonical(description).as_bytes()))
-}
-
-/// JSON with the members of each object sorted. Whether serde_json sorts them by itself depends on its feature
-/// `preserve_order`, which any crate of a build may switch on.
-fn canonical(mut description: serde_json::Value) -> String {
-    description.sort_all_objects();
-    description.to_string()
 }

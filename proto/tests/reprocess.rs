@@ -1,7 +1,7 @@
 //! Reprocess settings: what a key depends on, and what is refused.
 
 use picofarm_proto::{
-    key::{TaskKey, derived_key, reprocess_stage_key},
+    key::{TaskKey, derived_key},
     model::ReprocessSettings,
 };
 
@@ -36,16 +36,16 @@ fn everything_that_shapes_a_result_is_part_of_its_key_and_nothing_else_is() {
         "[sensor]\nscale = { kind = \"peak\", photons = 100.0 }",
         "[sensor]\ndead_time = { kind = \"first_photon\", pulses = 7 }",
     ];
-    let keys = settings.map(|text| reprocess_stage_key(&good(text), "sqrt-u16"));
+    let keys = settings.map(|text| good(text).stage_key("sqrt-u16"));
     for (i, key) in keys.iter().enumerate() {
         assert!(!keys[..i].contains(key), "{:?}", settings[i]);
     }
-    assert_ne!(reprocess_stage_key(&good(""), "plain-f32"), keys[0]);
+    assert_ne!(good("").stage_key("plain-f32"), keys[0]);
     // Written out or left to the default, here or there, in this order or that: the same.
     let written = good("[sensor]\nrebin = 1\npulse = { kind = \"analytic\", fwhm_ps = 128.0 }");
-    assert_eq!(reprocess_stage_key(&written, "sqrt-u16"), keys[0]);
+    assert_eq!(written.stage_key("sqrt-u16"), keys[0]);
     let reversed = good("histogram = \"transient_spots\"\nspots = [5, 0]");
-    assert_eq!(reprocess_stage_key(&reversed, "sqrt-u16"), keys[2]);
+    assert_eq!(reversed.stage_key("sqrt-u16"), keys[2]);
     let tasks = [1, 2].map(|k| derived_key(&keys[0], &TaskKey([k; 32])));
     assert_ne!(tasks[0], tasks[1]);
     // This key names results that lie in stores: it may never change.

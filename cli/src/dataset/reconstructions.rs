@@ -6,7 +6,8 @@ use serde_json::{Map, Value, json};
 
 use super::{
     failed,
-    verify::{Late, broken_by, mode, problems_json_by},
+    late::Late,
+    problems::{broken_by, mode, problems_json_by},
 };
 use crate::{
     args::DatasetVerify,

@@ -13,8 +13,10 @@ use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
 use super::{
-    failed, open, store_and_folder, task_failed,
-    verify::{How, look, problems_json},
+    failed, open,
+    problems::{mode, problems_json},
+    store_and_folder, task_failed,
+    verify::{How, look},
 };
 use crate::{
     args::DatasetRepair,
@@ -110,7 +112,7 @@ pub async fn run(args: DatasetRepair, settings: &Settings, output: Output) -> Re
         dataset,
         snapshot,
         dry: args.dry_run,
-        mode: super::verify::mode(args.fast),
+        mode: mode(args.fast),
         stop,
         runtime: Handle::current(),
     };

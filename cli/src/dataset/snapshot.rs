@@ -6,8 +6,10 @@ use picofarm_dataset::{Dataset, Snapshot};
 use serde_json::json;
 
 use super::{
-    failed, open,
-    verify::{How, Late, look, tell},
+    failed,
+    late::Late,
+    open,
+    verify::{How, look, tell},
 };
 use crate::{
     args::Snapshot as Command,

@@ -3,9 +3,10 @@
 use picofarm_proto::model::{JobPlan, JobState, JobStatus};
 use serde_json::json;
 
-use super::{counts, describe_plan, finish};
+use super::finish::finish;
 use crate::{
     client::{Client, Submitted},
+    describe::{counts, describe_plan, state},
     error::Result,
     follow::{Show, follow, verdict},
     output::Output,
@@ -62,7 +63,7 @@ pub async fn answer(
         &json!({"job": job, "existed": existed, "plan": plan}),
         || match &there {
             Some(status) => {
-                let state = super::state(status);
+                let state = state(status);
                 format!("job {job} was there already: {state}; {}\n", counts(status))
             }
             None if existed => format!("job {job} was there already\n"),

@@ -3,9 +3,12 @@
 use std::{fmt, str::FromStr};
 
 use picofarm_catalog::{Owner, Sight};
-use picofarm_proto::model::{JobSpec, SpecError};
+use picofarm_proto::{
+    ids::JobId,
+    model::{JobSpec, SpecError},
+};
 
-use super::{Caller, Role};
+use super::{caller::Caller, roles::Role};
 
 /// What callers see of jobs that are not theirs. Administrators see everything.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -135,6 +138,18 @@ impl Caller {
             .flat_map(|entry| entry.member.iter().chain(&entry.maintainer))
             .map(String::as_str)
     }
+}
+
+/// Why a caller may not change a job that it sees.
+pub(crate) fn not_yours(job: &JobId, owner: &Owner) -> String {
+    let maintainers = match owner.project.as_str() {
+        "" => String::new(),
+        project => format!(", a maintainer of project {project:?}"),
+    };
+    format!(
+        "job {job} is {:?}'s: only its owner{maintainers} or an administrator may change it",
+        owner.user
+    )
 }
 
 #[cfg(test)]

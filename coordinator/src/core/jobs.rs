@@ -15,7 +15,11 @@ use picofarm_proto::{
 use uuid::Uuid;
 
 use super::{Core, Say};
-use crate::{auth::Caller, plan, rpc::not_yours, submission::Draft};
+use crate::{
+    auth::{Caller, not_yours},
+    plan,
+    submission::Draft,
+};
 
 /// A job ready to be recorded.
 #[derive(Debug, Clone, PartialEq)]

@@ -30,7 +30,6 @@ use crate::{
 pub(crate) use farm::FarmService;
 pub(crate) use jobs::JobsService;
 use rights::no_such_job;
-pub(crate) use rights::not_yours;
 
 /// What the services share.
 #[derive(Clone)]

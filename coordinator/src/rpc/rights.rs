@@ -7,7 +7,7 @@ use tonic::Status;
 use super::Link;
 use crate::{
     actor::{Command, Reply},
-    auth::Caller,
+    auth::{Caller, not_yours},
 };
 
 impl Link {
@@ -74,16 +74,4 @@ pub(super) fn no_such_job(job: JobId) -> Status {
     Status::not_found(format!(
         "there is no job {job}; list the jobs to see their ids"
     ))
-}
-
-/// Why a caller may not change a job that it sees.
-pub(crate) fn not_yours(job: &JobId, owner: &Owner) -> String {
-    let maintainers = match owner.project.as_str() {
-        "" => String::new(),
-        project => format!(", a maintainer of project {project:?}"),
-    };
-    format!(
-        "job {job} is {:?}'s: only its owner{maintainers} or an administrator may change it",
-        owner.user
-    )
 }

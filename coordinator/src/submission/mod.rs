@@ -24,11 +24,10 @@ use uuid::Uuid;
 
 use crate::{
     actor::{Command, Refusal, Submitted},
-    auth::{Caller, Visibility},
+    auth::{Caller, Visibility, not_yours},
     clock::Clock,
     core::{Learnt, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
     lanes::Lanes,
-    rpc::not_yours,
     stored::{Found, Stored},
 };
 use check::Findings;

@@ -4,13 +4,6 @@
 //! the field's name: whoever sent it can send another. A *free text* (an error message, a log line, a reason) is made
 //! printable and cut: refusing it would lose an honest worker's report.
 
-use std::io;
-
-use serde::Serialize;
-use serde_json::ser::CharEscape;
-
-use super::job::{JobSpec, SpecError};
-
 /// Bytes of a name: of a job, stage, data set, split, model, report, worker, user. A store's place and two names with a few
 /// letters between are one index entry of the catalog, and Postgres takes at most 2,704 bytes there.
 pub const NAME_BYTES: usize = 200;
@@ -50,14 +43,16 @@ pub fn name(text: &str, most: usize) -> Result<(), String> {
     length(text.len(), most)
 }
 
-fn control(c: char) -> String {
+/// That a text holds a control character.
+pub(super) fn control(c: char) -> String {
     format!(
         "holds the control character U+{:04X}; remove it",
         u32::from(c)
     )
 }
 
-fn length(bytes: usize, most: usize) -> Result<(), String> {
+/// Checks the length of a text.
+pub(super) fn length(bytes: usize, most: usize) -> Result<(), String> {
     match bytes > most {
         true => Err(format!("is {bytes} bytes long; at most {most} are allowed")),
         false => Ok(()),
@@ -101,231 +96,11 @@ pub fn seconds(value: f64) -> Result<f64, String> {
     }
 }
 
-/// Checks the length of every text of a job, and that none has control characters.
-///
-/// # Errors
-/// [`SpecError`] that names the first that cannot be used.
-pub(super) fn texts(spec: &JobSpec) -> Result<(), SpecError> {
-    let mut walk = Walk::default();
-    let mut writer = serde_json::Serializer::with_formatter(io::sink(), &mut walk);
-    if spec.serialize(&mut writer).is_ok() {
-        return Ok(());
-    }
-    let what = walk
-        .wrong
-        .unwrap_or_else(|| "cannot be written as JSON".into());
-    let mut path = walk.path.into_iter().map(|step| match step {
-        Step::Key(key) => cut(&key, NAME_BYTES),
-        Step::Item(at) => at.to_string(),
-    });
-    let mut field: Vec<String> = path.by_ref().collect();
-    let at = field.get(1).and_then(|at| at.parse::<usize>().ok());
-    if field.first().is_some_and(|first| first == "stage")
-        && let Some(stage) = at.and_then(|at| spec.stages.get(at))
-    {
-        field.drain(..2);
-        if spec.stages.len() > 1 {
-            field.insert(0, format!("stage.{}", cut(&stage.name, NAME_BYTES)));
-        }
-    }
-    Err(SpecError::new(field.join("."), what))
-}
-
-/// A step from a value to one within it.
-#[derive(Debug)]
-enum Step {
-    Key(String),
-    Item(usize),
-}
-
-/// Looks at every text while a job is written as JSON into nothing: so nothing is copied, and no field is forgotten.
-#[derive(Debug, Default)]
-struct Walk {
-    path: Vec<Step>,
-    in_key: bool,
-    /// Bytes of the text in hand.
-    bytes: usize,
-    wrong: Option<String>,
-}
-
-impl Walk {
-    fn refuse(&mut self, what: String) -> io::Result<()> {
-        self.wrong = Some(what);
-        Err(io::Error::other("a text that cannot be used"))
-    }
-
-    /// How long the text in hand may be.
-    fn most(&self) -> usize {
-        let named = self.path.iter().rev().find_map(|step| match step {
-            Step::Key(key) => Some(&**key),
-            Step::Item(_) => None,
-        });
-        match named {
-            Some(
-                "name" | "dataset" | "model" | "models" | "among" | "split" | "needs" | "nonce"
-                | "sweep" | "id",
-            ) => NAME_BYTES,
-            Some("store" | "dest" | "folder") => PLACE_BYTES,
-            _ => TEXT_BYTES,
-        }
-    }
-
-    fn text(&mut self, text: &str) -> io::Result<()> {
-        self.bytes += text.len();
-        if let Some(c) = text.chars().find(|c| steers(*c)) {
-            return self.refuse(control(c));
-        }
-        if self.in_key
-            && let Some(Step::Key(key)) = self.path.last_mut()
-        {
-            key.push_str(text);
-        }
-        Ok(())
-    }
-}
-
-impl serde_json::ser::Formatter for &mut Walk {
-    fn begin_array<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        self.path.push(Step::Item(0));
-        Ok(())
-    }
-
-    fn begin_array_value<W: ?Sized + io::Write>(
-        &mut self,
-        _: &mut W,
-        first: bool,
-    ) -> io::Result<()> {
-        if let Some(Step::Item(at)) = self.path.last_mut() {
-            *at += usize::from(!first);
-        }
-        Ok(())
-    }
-
-    fn end_array<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        self.path.pop();
-        Ok(())
-    }
-
-    fn begin_object_key<W: ?Sized + io::Write>(&mut self, _: &mut W, _: bool) -> io::Result<()> {
-        self.path.push(Step::Key(String::new()));
-        self.in_key = true;
-        Ok(())
-    }
-
-    fn end_object_key<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        self.in_key = false;
-        Ok(())
-    }
-
-    fn end_object_value<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        self.path.pop();
-        Ok(())
-    }
-
-    fn begin_string<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        self.bytes = 0;
-        Ok(())
-    }
-
-    fn end_string<W: ?Sized + io::Write>(&mut self, _: &mut W) -> io::Result<()> {
-        match length(self.bytes, self.most()) {
-            Ok(()) => Ok(()),
-            Err(what) => self.refuse(what),
-        }
-    }
-
-    fn write_string_fragment<W: ?Sized + io::Write>(
-        &mut self,
-        _: &mut W,
-        fragment: &str,
-    ) -> io::Result<()> {
-        self.text(fragment)
-    }
-
-    fn write_char_escape<W: ?Sized + io::Write>(
-        &mut self,
-        _: &mut W,
-        escape: CharEscape,
-    ) -> io::Result<()> {
-        self.text(match escape {
-            CharEscape::Quote => "\"",
-            CharEscape::ReverseSolidus => "\\",
-            CharEscape::Solidus => "/",
-            CharEscape::Backspace => "\u{8}",
-            CharEscape::FormFeed => "\u{c}",
-            CharEscape::LineFeed => "\n",
-            CharEscape::CarriageReturn => "\r",
-            CharEscape::Tab => "\t",
-            CharEscape::AsciiControl(byte) => {
-                return self.refuse(control(char::from(byte)));
-            }
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
     use super::*;
-
-    fn spec() -> serde_json::Value {
-        serde_json::json!({"name": "n", "scenes": {"kind": "primitive", "count": 3},
-            "render": {"renderer": "r1"}, "resources": {"labels": ["a", "b"]},
-            "output": {"store": "file:///s", "dataset": "d"}})
-    }
-
-    fn refused(at: &str, value: &str) -> String {
-        let mut job = spec();
-        *job.pointer_mut(at).unwrap() = value.into();
-        let spec: JobSpec = serde_json::from_value(job).unwrap();
-        spec.check().unwrap_err().to_string()
-    }
-
-    #[test]
-    fn a_text_of_a_job_with_a_control_character_is_refused_by_its_field() {
-        for steering in ["\0", "\u{1b}[2J", "\n", "\u{7f}", "\u{202e}"] {
-            let text = format!("x{steering}y");
-            for (at, field) in [
-                ("/name", "name: holds"),
-                ("/output/store", "output.store: holds"),
-                ("/output/dataset", "output.dataset: holds"),
-                ("/render/renderer", "render.renderer: holds"),
-                ("/resources/labels/1", "resources.labels.1: holds"),
-            ] {
-                let why = refused(at, &text);
-                assert!(why.starts_with(field), "{at}: {why}");
-                assert!(!why.chars().any(steers), "{why:?}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_text_of_a_job_that_is_too_long_is_refused_with_the_length_allowed() {
-        for (at, most) in [
-            ("/name", NAME_BYTES),
-            ("/output/dataset", NAME_BYTES),
-            ("/output/store", PLACE_BYTES),
-            ("/render/renderer", TEXT_BYTES),
-        ] {
-            let why = refused(at, &"x".repeat(most + 1));
-            assert!(why.contains(&format!("at most {most}")), "{at}: {why}");
-            assert!(why.len() < 200, "the text itself is not repeated: {why}");
-        }
-    }
-
-    #[test]
-    fn in_a_job_of_several_stages_the_error_names_the_stage() {
-        let mut job = serde_json::json!({"name": "n", "stage": [spec(), spec()]});
-        for stage in job["stage"].as_array_mut().unwrap() {
-            stage.as_object_mut().unwrap().remove("name");
-        }
-        job["stage"][1]["name"] = "second".into();
-        job["stage"][1]["output"]["dataset"] = "a\0".into();
-        let spec: JobSpec = serde_json::from_value(job).unwrap();
-        let why = spec.check().unwrap_err();
-        assert_eq!(why.field, "stage.second.output.dataset");
-    }
 
     proptest! {
         #[test]

@@ -7,21 +7,25 @@ pub mod file;
 pub mod job;
 pub mod kinds;
 pub mod lease;
+pub mod limits;
 pub mod log;
+mod matrix;
 pub mod memory;
+pub mod places;
 mod refer;
 mod scale;
+mod spec_error;
+pub mod stage;
 pub mod status;
-pub mod sweep;
-mod text;
+mod substitute;
+mod sweep;
+mod texts;
+pub mod trial;
 
 pub use audit::{Act, AuditEntry, Outcome};
 // What jobs share with data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
-pub use job::{
-    JobSpec, Limits, OutputSettings, Resources, SourceSettings, SpecError, StageSpec, check_label,
-    check_project,
-};
+pub use job::JobSpec;
 pub use kinds::{
     EvaluateTask, ExportSettings, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteSettings, PromoteTask, RenderTask, ReportTask, ReprocessTask, SplitTask, TaskKind,
@@ -30,20 +34,24 @@ pub use kinds::{
     generate::GenerateSettings,
     import::ImportSettings,
     infer::{self, InferSettings},
-    render::{self, RenderSettings, SceneFile, SceneKind, SceneSource},
+    render::{self, RenderSettings, parse_share},
     report::{self, ReportSettings},
     reprocess::{self, Histogram, ReprocessSettings},
+    scenes::{SceneFile, SceneKind, SceneSource},
     train::{self, TrainSettings},
 };
 pub use lease::{
     Abilities, Failure, FailureKind, Finished, Lease, TaskAt, TaskProgress, WorkerHello,
 };
+pub use limits::{Limits, Resources, check_label, check_project};
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
 pub use picofarm_settings::{Budget, Choice, Sensor, Strategy};
+pub use places::{OutputSettings, SourceSettings};
 pub use scale::scaled;
+pub use spec_error::SpecError;
+pub use stage::StageSpec;
 pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,
 };
-pub use sweep::{Halving, Trial};
-pub use text::parse_share;
+pub use trial::{Halving, Trial};

@@ -1,20 +1,72 @@
-//! What stages refer to in those before them: models, which the name of a stage that trains them may stand for, splits, and
+//! What stages refer to in those before them: data sets, models, which the name of a stage that trains them may stand for, splits, and
 //! evaluations.
 //!
 //! A name is first that of a model that some stage before trains, then that of a stage: so a job that was read once, and
 //! names models only, means the same when it is read again.
 
-use super::{
-    job::{SpecError, StageSpec},
-    kinds::ModelNames,
-};
+use super::{kinds::ModelNames, places::SourceSettings, spec_error::SpecError, stage::StageSpec};
+
+/// Fills in what follows from other stages: places, needs and numbers of scenes.
+///
+/// # Errors
+/// A source that no stage before makes.
+pub(super) fn resolve(stages: &mut [StageSpec]) -> Result<(), SpecError> {
+    for i in 0..stages.len() {
+        let (before, rest) = stages.split_at_mut(i);
+        let stage = &mut rest[0];
+        let mut needs = Vec::with_capacity(stage.needs.len());
+        for need in stage.needs.drain(..) {
+            let instance = format!("{need}[");
+            let all = before.iter().map(|s| &s.name);
+            let mut all = all.filter(|n| n.starts_with(&instance)).peekable();
+            if before.iter().any(|s| s.name == need) || all.peek().is_none() {
+                needs.push(need);
+            } else {
+                needs.extend(all.cloned());
+            }
+        }
+        stage.needs = needs;
+        let Some((source, count)) = stage.task.reads_mut() else {
+            link(stage, before)?;
+            continue;
+        };
+        if source.store.is_empty() && !source.dataset.is_empty() {
+            let named = before.iter().find(|s| s.name == source.dataset);
+            let Some((store, dataset)) = named.and_then(|s| s.task.makes()) else {
+                return Err(SpecError::new(
+                    format!("stage.{}.source", stage.name),
+                    format!(
+                        "{:?} is no stage before this one that makes a data set; for one that exists, write \
+                             {{ store = \"…\", dataset = \"…\" }}",
+                        source.dataset
+                    ),
+                ));
+            };
+            *source = SourceSettings {
+                store: store.clone(),
+                dataset: dataset.clone(),
+            };
+        }
+        let place = (&source.store, &source.dataset);
+        if let Some(maker) = before.iter().find(|s| s.task.writes() == Some(place)) {
+            if *count == 0 {
+                *count = maker.tasks();
+            }
+            if !stage.needs.contains(&maker.name) {
+                stage.needs.push(maker.name.clone());
+            }
+        }
+        link(stage, before)?;
+    }
+    Ok(())
+}
 
 /// Puts the names of models in place of those of stages, and lets `stage` need those `before` whose models, split or
 /// evaluations it reads.
 ///
 /// # Errors
 /// A name that stands for several models where one is wanted, or for a stage that trains none.
-pub(super) fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
+fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
     if stage.task.shelf().is_some_and(String::is_empty) {
         let models = stage
             .task

@@ -4,8 +4,8 @@
 use serde_json::Value;
 
 use super::{
-    file::{plain, substitute},
-    job::SpecError,
+    spec_error::SpecError,
+    substitute::{plain, substitute},
 };
 
 /// A job file's content at a scale: without its scales, values in place.

@@ -4,7 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use picofarm_proto::ids::{RangeId, StageRef, WorkerId};
 
-use crate::record::{Exception, NewEvent, Output, Range, Worker};
+use crate::{
+    event::NewEvent,
+    instance::Worker,
+    range::Range,
+    task::{Exception, Output},
+};
 
 /// What one commit writes. For each range, exception and worker only the last word counts.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -15,11 +15,15 @@
 
 mod changes;
 mod error;
+mod event;
+mod instance;
+mod job;
 mod listing;
-mod record;
+mod range;
 mod refused;
 mod rights;
 mod submission;
+mod task;
 
 use std::{fmt, sync::Arc};
 
@@ -31,15 +35,15 @@ use picofarm_proto::{
 
 pub use changes::Changes;
 pub use error::CatalogError;
+pub use event::{EventQuery, NewEvent};
+pub use instance::{Claim, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
+pub use job::{Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timing};
 pub use listing::{Forgotten, JobQuery, Page};
-pub use record::{
-    Claim, EventQuery, Exception, Holdups, Job, JobEnd, JobRecord, LeaseState, Mark, NewEvent,
-    News, Output, Owned, Range, RangeState, ResultSet, Run, Settled, Snapshot, StageCounts,
-    StageRecord, TaskRecord, Timing, Want, Worker,
-};
+pub use range::{LeaseState, Mark, Range, RangeState, Run};
 pub use refused::{Culprit, Row, culprits, verdict};
 pub use rights::{AuditQuery, NewAudit, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
+pub use task::{Exception, Output, TaskRecord};
 
 /// A catalog that can be opened: where it lies. Its text never shows a password.
 #[async_trait]

@@ -2,7 +2,9 @@
 
 use std::io;
 
-use crate::store::{Failure, Service, io_hint};
+use crate::store::account::Failure;
+use crate::store::failure::io_hint;
+use crate::store::service::Service;
 
 /// An operation on a data set that failed.
 #[derive(Debug, thiserror::Error)]

@@ -23,10 +23,11 @@ pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use coding::transient::{CodedImage, TransientCodec};
 pub use error::DatasetError;
 pub use export::{ExportFormat, Exported, Exporter};
-pub use layout::arrays::{INNER_SIDE, Quantity};
+pub use layout::arrays::INNER_SIDE;
 pub use layout::manifest::{
     ENCODER_VERSION, FORMAT_VERSION, Manifest, ObjectEntry, SubsetCoding, sha256_hex,
 };
+pub use layout::quantity::Quantity;
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use models::{

@@ -15,15 +15,15 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::error::DatasetError;
+use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::{Manifest, ObjectEntry, read_sealed, sha256_hex};
+use crate::layout::published::scenes_in;
 use crate::predictions::SceneUsed;
 use crate::repair::put_back::put_back;
-use crate::scenes::dataset::{METADATA, pretty};
-use crate::scenes::publish::{CONCURRENCY, put_again, put_all};
-use crate::scenes::read::scenes_in;
+use crate::store::many::{CONCURRENCY, put_again, put_all};
 use crate::store::objects;
 use crate::verify::object::{intact, looked_at};
-use crate::verify::{Fault, Problem, Verification, VerifyMode, Watch};
+use crate::verify::report::{Fault, Problem, Verification, VerifyMode, Watch};
 
 /// Version of these folders and of their manifests.
 const FORMAT: u32 = 1;
@@ -337,11 +337,6 @@ impl Reconstructions {
     fn shown(&self, path: &Path) -> String {
         objects::shown(&*self.store, path)
     }
-}
-
-/// Whether a group's root is that of reconstructions.
-pub(crate) fn is_reconstructions(root: &Value) -> bool {
-    root["attributes"]["picofarm"]["reconstructions"].is_u64()
 }
 
 fn key(scene: u64, name: &str) -> String {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, read_sealed, sha256_hex};
-use crate::scenes::publish::check_size;
+use crate::store::many::check_size;
 use crate::store::objects;
 
 /// The folder of reports in a store; no data set has this name.

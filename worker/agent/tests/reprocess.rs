@@ -9,7 +9,7 @@ use picofarm_agent::{
 };
 use picofarm_dataset::*;
 use picofarm_proto::{
-    key::{TaskKey, derived_key, reprocess_stage_key},
+    key::{TaskKey, derived_key},
     model::{Histogram, OutputSettings, ReprocessSettings, ReprocessTask, Sensor, SourceSettings},
 };
 use picofarm_settings::{DeadTime, Jitter, Pulse, Scale};
@@ -409,7 +409,7 @@ async fn the_target_is_usable_alone_and_knows_where_it_comes_from() {
     let manifest = place.open("target", None).await.manifest(2).await.unwrap();
     let provenance = &manifest.provenance;
     let source_key = TaskKey([3; 32]);
-    let stage = reprocess_stage_key(&place.settings, &place.target.profile);
+    let stage = place.settings.stage_key(&place.target.profile);
     assert_eq!(
         provenance.task_key,
         derived_key(&stage, &source_key).to_string()

@@ -12,7 +12,7 @@
 //!
 //! Light paths cover that class and nothing else: z is drawn into the image where the camera sees it, and
 //! is a light vertex ([`crate::light_vertices`]) for every other point. [`crate::walk`] leaves out just these:
-//! [`crate::walk::Vertex::open`] carries condition 3 along a camera path. What is left to chance are
+//! [`crate::vertex::Vertex::open`] carries condition 3 along a camera path. What is left to chance are
 //! caustics seen by way of a near-mirror.
 //!
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
@@ -21,13 +21,13 @@
 use picofarm_scene::Vec3;
 
 use crate::{
-    api::Stop,
+    api::{Gate, Stop},
     bvh::Stack,
     emitter::Emitters,
     film::Film,
-    light_vertices::LightVertex,
+    light_vertices::{LightVertex, LightVertices},
+    mirror_images::Mirrors,
     rng::{Rng, Stream},
-    walk::Walk,
     world::{Hit, World, lift},
 };
 
@@ -40,6 +40,17 @@ const SURE: u32 = 3;
 /// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
 const PROBE: u32 = 4096;
 const PAYS: f64 = 1e-3;
+
+/// What light paths are traced in.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Surroundings<'a> {
+    pub world: &'a World,
+    pub emitters: &'a Emitters,
+    pub mirrors: &'a Mirrors,
+    pub gate: &'a Gate,
+    /// Longest path in bounces.
+    pub max_bounces: u32,
+}
 
 /// Near-mirrors as targets of light paths.
 #[derive(Debug)]
@@ -208,25 +219,25 @@ impl Caustics {
     /// ends on one. The sum over the batch is an estimate.
     pub fn trace(
         &self,
-        walk: &Walk,
+        within: &Surroundings<'_>,
         (l, count): (u32, u32),
         rng: &mut Rng,
         stack: &mut Stack,
     ) -> Option<LightVertex> {
-        let world = walk.world;
+        let world = within.world;
         let Start {
             spot,
             mut hit,
             back: mut wo,
             mut flux,
             mut path_m,
-        } = self.start(walk, (l, self.shares(count)), rng, stack)?;
-        let images = walk.emitters.columns.strength[spot] > 0.0;
-        let aimed_at = images && walk.mirrors.of(hit.triangle).is_some();
+        } = self.start(within, (l, self.shares(count)), rng, stack)?;
+        let images = within.emitters.columns.strength[spot] > 0.0;
+        let aimed_at = images && within.mirrors.of(hit.triangle).is_some();
         let mut events = 1;
         loop {
             // The spot, the events, and z.
-            if events + 2 > walk.max_bounces || path_m >= walk.gate.end_m() {
+            if events + 2 > within.max_bounces || path_m >= within.gate.end_m() {
                 return None;
             }
             let (w, mut weight, _) = hit.surface.sample(hit.n, wo, rng)?;
@@ -239,7 +250,7 @@ impl Caustics {
             }
             flux *= weight;
             let mut next = world.closest(stack, lift(hit.p, hit.n), w)?;
-            walk.choose_lobe(rng, &mut next);
+            next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
             (hit, wo) = (next, -w);
             if hit.surface.is_black() || flux == 0.0 {
@@ -261,15 +272,32 @@ impl Caustics {
         }
     }
 
+    /// Draws light vertices beyond near-mirrors anew, from `count` light paths.
+    pub fn fill(
+        &self,
+        vertices: &mut LightVertices,
+        within: &Surroundings<'_>,
+        count: u32,
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) {
+        vertices.clear();
+        for l in 0..count {
+            if let Some(z) = self.trace(within, (l, count), rng, stack) {
+                vertices.push(z);
+            }
+        }
+    }
+
     /// The leg from a spot to a near-mirror.
     fn start(
         &self,
-        walk: &Walk,
+        within: &Surroundings<'_>,
         (l, shares): (u32, Shares),
         rng: &mut Rng,
         stack: &mut Stack,
     ) -> Option<Start> {
-        let (world, emitters) = (walk.world, walk.emitters);
+        let (world, emitters) = (within.world, within.emitters);
         let spots = emitters.list.len();
         let (spot, mut hit) = if l < shares.aimed {
             let at = (f64::from(l) + f64::from(rng.uniform())) / f64::from(shares.aimed);
@@ -295,7 +323,7 @@ impl Caustics {
             (spot, world.closest(stack, emitters.lifted[spot], w)?)
         };
         let k = self.place[hit.triangle as usize];
-        walk.choose_lobe(rng, &mut hit);
+        hit.choose_lobe(rng);
         if k == NONE || !hit.surface.specular || hit.surface.is_black() {
             return None;
         }
@@ -319,19 +347,23 @@ impl Caustics {
     }
 
     /// True where the spots send a share of their power by near-mirrors that makes light paths pay.
-    pub fn pay(&self, walk: &Walk, seed: u64) -> bool {
-        let mut stack = walk.world.bvh.stack();
+    pub fn pay(&self, within: &Surroundings<'_>, seed: u64) -> bool {
+        let mut stack = within.world.bvh.stack();
         let mut rng = Rng::new(seed, Stream::Caustic, 0, u64::MAX);
-        let found = (0..PROBE).filter_map(|l| self.trace(walk, (l, PROBE), &mut rng, &mut stack));
+        let found = (0..PROBE).filter_map(|l| self.trace(within, (l, PROBE), &mut rng, &mut stack));
         let flux: f64 = found.map(|z| f64::from(z.flux)).sum();
-        flux > PAYS * walk.emitters.list.len() as f64
+        flux > PAYS * within.emitters.list.len() as f64
     }
 }
 
 /// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
 /// distance d and angle θ gives I/(d² cos³θ) over the pixel's area on the film at unit distance.
-pub(crate) fn splat(walk: &Walk, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<Splat> {
-    let world = walk.world;
+pub(crate) fn splat(
+    world: &World,
+    film: &Film,
+    z: &LightVertex,
+    stack: &mut Stack,
+) -> Option<Splat> {
     let i = &world.camera.intrinsics;
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);

@@ -16,7 +16,7 @@ pub(crate) use self::patches::Patches;
 use crate::{
     api::Gate,
     rng::Rng,
-    walk::Vertex,
+    vertex::Vertex,
     world::{Hit, World},
 };
 

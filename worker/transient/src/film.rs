@@ -1,9 +1,6 @@
 //! The gate as an array of slots, and what pixels collect in it.
 
-use crate::{
-    api::{Gate, Overflow},
-    walk::Sink,
-};
+use crate::api::{Gate, Overflow};
 
 /// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
 /// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
@@ -57,21 +54,6 @@ impl Film {
                 pixel[usize::from(c) * self.slots + slot] += value;
             }
         }
-    }
-}
-
-/// A walk's contributions to one pixel.
-pub(crate) struct PixelSink<'a> {
-    pub film: &'a Film,
-    pub pixel: &'a mut [f32],
-    pub factor: f32,
-}
-
-impl Sink for PixelSink<'_> {
-    #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32) {
-        let slot = self.film.slot(path_m);
-        self.film.add(self.pixel, slot, self.factor * value, spot);
     }
 }
 

@@ -17,8 +17,10 @@ mod plan;
 mod render;
 mod rng;
 pub mod sensor;
+mod sink;
 mod truth;
 mod two_bounce;
+mod vertex;
 mod walk;
 mod world;
 

@@ -10,11 +10,9 @@ use picofarm_scene::Vec3;
 use crate::{
     bsdf::Surface,
     bvh::Stack,
-    caustic::Caustics,
     emitter::{Columns, Emitters},
     rng::Rng,
-    walk::Walk,
-    world::{Hit, lift},
+    world::{Hit, World, lift},
 };
 
 /// One light vertex.
@@ -47,8 +45,13 @@ pub(crate) struct LightVertices {
 impl LightVertices {
     /// Draws `count` vertices anew, spread evenly over the spots. Vertices on mirrors are left out: a
     /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them).
-    pub fn fill(&mut self, walk: &Walk, count: u32, rng: &mut Rng, stack: &mut Stack) {
-        let (world, emitters) = (walk.world, walk.emitters);
+    pub fn fill(
+        &mut self,
+        (world, emitters): (&World, &Emitters),
+        count: u32,
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) {
         self.clear();
         let spots = emitters.list.len();
         if spots == 0 {
@@ -67,7 +70,7 @@ impl LightVertices {
             let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
                 continue;
             };
-            walk.choose_lobe(rng, &mut hit);
+            hit.choose_lobe(rng);
             if weight == 0.0 || hit.surface.specular || hit.surface.is_black() {
                 continue;
             }
@@ -86,29 +89,15 @@ impl LightVertices {
         }
     }
 
-    /// Draws vertices anew beyond near-mirrors, from `count` light paths.
-    pub fn fill_beyond(
-        &mut self,
-        (walk, caustics): (&Walk, &Caustics),
-        count: u32,
-        rng: &mut Rng,
-        stack: &mut Stack,
-    ) {
-        self.clear();
-        for l in 0..count {
-            if let Some(z) = caustics.trace(walk, (l, count), rng, stack) {
-                self.push(z);
-            }
-        }
-    }
-
-    fn clear(&mut self) {
+    /// Forgets all.
+    pub fn clear(&mut self) {
         self.list.clear();
         self.glossy.clear();
         self.columns.clear();
     }
 
-    fn push(&mut self, y: LightVertex) {
+    /// Adds one.
+    pub fn push(&mut self, y: LightVertex) {
         let lambert = if y.hit.surface.diffuse() {
             y.hit.surface.lambertian()
         } else {

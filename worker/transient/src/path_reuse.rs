@@ -21,9 +21,11 @@ use picofarm_scene::Vec3;
 use crate::{
     ellipsoid::Shells,
     emitter::Columns,
-    film::{Film, PixelSink},
+    film::Film,
     rng::{Rng, Stream},
-    walk::{Scratch, Sink, Vertex, Walk},
+    sink::{PixelSink, Sink},
+    vertex::Vertex,
+    walk::{Scratch, Walk},
     world::Hit,
 };
 
@@ -184,7 +186,7 @@ impl Sharing {
             let Scratch {
                 vertices, stack, ..
             } = scratch;
-            vertices.fill(walk, few, &mut rng, stack);
+            vertices.fill((walk.world, walk.emitters), few, &mut rng, stack);
         }
         self.beyond_mirrors((walk, film, effort), &mut rng, scratch, pixels);
         let camera = (count * effort.camera).round().max(1.0) as u32;

@@ -5,6 +5,7 @@ mod forecast;
 mod image;
 mod part;
 mod ready;
+mod region;
 mod splat;
 mod tile;
 mod warn;

@@ -9,13 +9,15 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Gate,
     bvh::Stack,
-    caustic::Caustics,
+    caustic::{Caustics, Surroundings},
     ellipsoid::{Patches, Window},
     emitter::Emitters,
     light_vertices::LightVertices,
     mirror_images::Mirrors,
     rng::Rng,
-    world::{Hit, World, lift},
+    sink::Sink,
+    vertex::Vertex,
+    world::{World, lift},
 };
 
 /// What paths are traced in.
@@ -39,37 +41,6 @@ pub(crate) struct Walk<'a> {
     pub patches: Option<&'a Patches>,
 }
 
-/// A vertex of a path from the camera.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Vertex {
-    pub hit: Hit,
-    /// Unit direction back along the path.
-    pub wo: Vec3,
-    /// Product of scattering and sampling weights up to here.
-    pub beta: f32,
-    /// Optical path from where the walk is counted, metres.
-    pub length_m: f64,
-    /// Bounces up to and with this vertex.
-    pub bounce: u32,
-    /// The vertex before it is a near-mirror's.
-    pub after_mirror: bool,
-    /// [`Vertex::open`] of the vertex before it.
-    pub open_before: bool,
-}
-
-impl Vertex {
-    /// True where light paths ([`crate::caustic`]) reach the last vertex up to here that is not a
-    /// near-mirror's: it is what the camera sees directly, or such a vertex comes before it too.
-    #[inline]
-    pub fn open(&self) -> bool {
-        if self.hit.surface.specular {
-            self.open_before
-        } else {
-            !self.after_mirror
-        }
-    }
-}
-
 /// How a vertex was reached, for MIS.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Step {
@@ -90,11 +61,6 @@ pub(crate) enum Lights {
     Glossy,
     /// Those beyond near-mirrors.
     Beyond,
-}
-
-/// Takes what a walk finds: optical path in metres, value, spot, bounces of the whole path.
-pub(crate) trait Sink {
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32);
 }
 
 /// Buffers of one thread's walks.
@@ -141,6 +107,18 @@ const AIMS: f32 = 0.25;
 const SURVIVAL: f32 = 1.5;
 
 impl Walk<'_> {
+    /// What light paths are traced in.
+    #[inline]
+    pub fn surroundings(&self) -> Surroundings<'_> {
+        Surroundings {
+            world: self.world,
+            emitters: self.emitters,
+            mirrors: self.mirrors,
+            gate: self.gate,
+            max_bounces: self.max_bounces,
+        }
+    }
+
     /// True where a path with one more vertex and a spot can still count.
     #[inline]
     pub fn goes_on(&self, v: &Vertex) -> bool {
@@ -187,15 +165,6 @@ impl Walk<'_> {
         self.window.is_none_or(|w| w.holds(path))
     }
 
-    /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
-    /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
-    #[inline]
-    pub fn choose_lobe(&self, rng: &mut Rng, hit: &mut Hit) {
-        if hit.surface.is_mixed() {
-            hit.surface = hit.surface.lobe(rng.uniform());
-        }
-    }
-
     /// Walks on from a vertex: everything beyond it except its own connection to the spots.
     pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
         let mut vertex = from;
@@ -234,7 +203,7 @@ impl Walk<'_> {
             weight /= survive;
         }
         let (step, mut next) = self.follow(v, (w, weight, pdf), aims, stack)?;
-        self.choose_lobe(rng, &mut next.hit);
+        next.hit.choose_lobe(rng);
         Some((step, next))
     }
 

@@ -10,6 +10,7 @@ use crate::{
     api::{RenderError, Stop},
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
+    rng::Rng,
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -60,6 +61,17 @@ pub(crate) struct Hit {
     pub triangle: u32,
     /// Scattering; black where the ray came from behind a one-sided surface.
     pub surface: Surface,
+}
+
+impl Hit {
+    /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
+    /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
+    #[inline]
+    pub fn choose_lobe(&mut self, rng: &mut Rng) {
+        if self.surface.is_mixed() {
+            self.surface = self.surface.lobe(rng.uniform());
+        }
+    }
 }
 
 impl World {

@@ -4,14 +4,18 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, ModelNames, Results, TaskKind,
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::{check_model, check_split},
     reprocess::Histogram,
-    train::{check_model, check_split, check_spots, is_zero},
+    train::{check_spots, is_zero},
 };
 use crate::{
     model::{
-        job::{SourceSettings, SpecError, check_count, check_source},
+        limits::check_count,
         memory::{BASE, Known},
+        places::{SourceSettings, check_source},
+        spec_error::SpecError,
     },
     show,
     split::SIDES,

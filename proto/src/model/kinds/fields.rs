@@ -3,7 +3,7 @@
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
-use crate::{model::job::SpecError, show};
+use crate::{model::spec_error::SpecError, show};
 
 /// Fields that every stage may have.
 const COMMON: [&str; 6] = [

@@ -5,13 +5,15 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, Results, TaskKind,
-    render::{RenderSettings, SceneKind, SceneSource},
+    fields::Fields,
+    kind::{Declared, Manifest, Results, TaskKind},
+    render::RenderSettings,
+    scenes::{SceneKind, SceneSource},
 };
 use crate::{
     model::{
-        job::{SpecError, within},
         memory::{BASE, Known},
+        spec_error::{SpecError, within},
     },
     show,
 };

@@ -3,10 +3,15 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use super::{Declared, Fields, Results, TaskKind, TaskSpec};
+use super::{
+    fields::Fields,
+    kind::{Declared, Results, TaskKind},
+};
 use crate::model::{
-    job::{MAX_TASKS, OutputSettings, SpecError},
+    limits::MAX_TASKS,
     memory::{BASE, Known},
+    places::OutputSettings,
+    spec_error::SpecError,
 };
 
 /// Importing scenes into a data set: one task a scene.
@@ -67,6 +72,24 @@ impl Declared for ImportTask {
             output: fields.required("output")?,
         })
     }
+
+    fn only(&self, lo: u64, hi: u64) -> Option<Self> {
+        let import = &self.import;
+        let at = |i: u64| usize::try_from(i.saturating_sub(import.first)).unwrap_or(usize::MAX);
+        let own = import.scenes.get(at(lo)..at(hi).min(import.scenes.len()));
+        Some(Self {
+            import: ImportSettings {
+                folder: import.folder.clone(),
+                format: import.format.clone(),
+                options: import.options.clone(),
+                scenes: own.unwrap_or_default().to_vec(),
+                first: lo.max(import.first),
+                count: import.count,
+                version: import.version.clone(),
+            },
+            output: self.output.clone(),
+        })
+    }
 }
 
 impl TaskKind for ImportTask {
@@ -123,24 +146,6 @@ impl TaskKind for ImportTask {
 
     fn tasks(&self) -> u64 {
         self.import.count
-    }
-
-    fn only(&self, lo: u64, hi: u64) -> Option<TaskSpec> {
-        let import = &self.import;
-        let at = |i: u64| usize::try_from(i.saturating_sub(import.first)).unwrap_or(usize::MAX);
-        let own = import.scenes.get(at(lo)..at(hi).min(import.scenes.len()));
-        Some(TaskSpec::Import(Self {
-            import: ImportSettings {
-                folder: import.folder.clone(),
-                format: import.format.clone(),
-                options: import.options.clone(),
-                scenes: own.unwrap_or_default().to_vec(),
-                first: lo.max(import.first),
-                count: import.count,
-                version: import.version.clone(),
-            },
-            output: self.output.clone(),
-        }))
     }
 
     fn inputs(&self, _task: Option<u64>) -> Vec<(String, &str)> {

@@ -6,16 +6,17 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, ModelNames, Results, TaskKind,
+    fields::Fields,
+    kind::{Declared, ModelNames, Results, TaskKind},
+    names::check_model,
     reprocess::Histogram,
-    train::{check_model, check_spots},
+    train::check_spots,
 };
 use crate::model::{
-    job::{
-        OutputSettings, SourceSettings, SpecError, StageSpec, check_count, check_source,
-        default_profile,
-    },
+    limits::check_count,
     memory::{BASE, Known, Network},
+    places::{OutputSettings, SourceSettings, check_source, default_profile},
+    spec_error::SpecError,
 };
 
 /// Most models in one inference: one of each kind.
@@ -97,12 +98,12 @@ impl TaskKind for InferTask {
     }
 
     /// No two models, as far as stages before it train them, predict the same.
-    fn check_among(&self, before: &[StageSpec]) -> Result<(), SpecError> {
+    fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
         let mut kinds = BTreeMap::new();
         for model in &self.infer.models {
             let place = Some((&self.source.store, model));
-            let trained = before.iter().find(|s| s.task.trains() == place);
-            let Some(kind) = trained.and_then(|s| s.task.predicts()) else {
+            let trained = before.iter().find(|task| task.trains() == place);
+            let Some(kind) = trained.and_then(|task| task.predicts()) else {
                 continue;
             };
             if let Some(other) = kinds.insert(kind, model) {

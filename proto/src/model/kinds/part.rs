@@ -4,18 +4,21 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, RenderTask, Results, TaskKind, TaskSpec, render::SceneSource,
+    division::Division,
+    fields::Fields,
+    kind::{Declared, Manifest, Results, TaskKind},
+    render::RenderTask,
+    scenes::SceneSource,
 };
 use crate::{
-    key::StageKey,
+    key::hash::StageKey,
     model::{
-        job::SpecError,
-        memory::{BASE, Known, LIGHT_PATHS, Rendering},
+        memory::{BASE, Known, LIGHT_PATHS},
+        spec_error::SpecError,
     },
 };
 
-/// Rendering parts of scenes, which the stage that needs it joins: one task a part. Task `i` is part
-/// `i % tasks_per_scene` of scene `i / tasks_per_scene`.
+/// Rendering parts of scenes, which the stage that needs it joins: one task a part.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PartTask {
     /// The rendering.
@@ -26,15 +29,11 @@ pub struct PartTask {
 }
 
 impl PartTask {
-    /// Tasks of each scene: the ranges of tiles, and the light paths that cross them.
-    pub fn tasks_per_scene(&self) -> u64 {
-        u64::from(self.whole.parts) + 1
-    }
-
-    /// The scene and the part that task `index` is.
-    pub fn split(&self, index: u64) -> (u64, u32) {
-        let part = index % self.tasks_per_scene();
-        (index / self.tasks_per_scene(), part as u32)
+    /// How its tasks go over scenes.
+    pub fn division(&self) -> Division {
+        Division {
+            parts: self.whole.parts,
+        }
     }
 }
 
@@ -48,6 +47,14 @@ impl Declared for PartTask {
         Ok(Self {
             joined_by: fields.or_default("joined_by")?,
             whole: RenderTask::read(fields)?,
+        })
+    }
+
+    fn only(&self, lo: u64, hi: u64) -> Option<Self> {
+        let each = self.division().tasks_per_scene();
+        Some(Self {
+            whole: self.whole.some(lo / each, hi.div_ceil(each)),
+            joined_by: self.joined_by.clone(),
         })
     }
 }
@@ -93,13 +100,13 @@ impl TaskKind for PartTask {
             manifest: Manifest::Part {
                 dataset: &whole.dataset,
                 joined_by: StageKey::parse(&self.joined_by),
-                task: self,
+                division: self.division(),
             },
         }
     }
 
     fn memory(&self, _known: &Known, threads: u32) -> Option<f64> {
-        let rendering = Rendering::of(&self.whole, threads);
+        let rendering = self.whole.rendering(threads);
         let share = 1.0 / f64::from(self.whole.parts.max(1));
         // Cut out of the image, and written.
         let tiles = 3.0 * share * rendering.images() + rendering.tiles();
@@ -108,15 +115,7 @@ impl TaskKind for PartTask {
     }
 
     fn tasks(&self) -> u64 {
-        self.whole.scenes.count * self.tasks_per_scene()
-    }
-
-    fn only(&self, lo: u64, hi: u64) -> Option<TaskSpec> {
-        let each = self.tasks_per_scene();
-        Some(TaskSpec::Part(Self {
-            whole: self.whole.some(lo / each, hi.div_ceil(each)),
-            joined_by: self.joined_by.clone(),
-        }))
+        self.whole.scenes.count * self.division().tasks_per_scene()
     }
 
     fn scenes(&self) -> Option<&SceneSource> {
@@ -124,7 +123,8 @@ impl TaskKind for PartTask {
     }
 
     fn inputs(&self, task: Option<u64>) -> Vec<(String, &str)> {
-        self.whole.inputs(task.map(|task| self.split(task).0))
+        self.whole
+            .inputs(task.map(|task| self.division().split(task).0))
     }
 
     fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {

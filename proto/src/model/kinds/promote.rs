@@ -3,10 +3,16 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Manifest, ModelNames, Results, TaskKind, train::check_model};
+use super::{
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::check_model,
+};
 use crate::model::{
-    job::{MAX_STAGES, MODELS, SourceSettings, SpecError, check_count, check_source},
+    limits::{MAX_STAGES, check_count},
     memory::{BASE, Known, Network},
+    places::{MODELS, SourceSettings, check_source},
+    spec_error::SpecError,
 };
 
 /// Giving the best of several models a name: one task.

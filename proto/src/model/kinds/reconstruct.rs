@@ -4,10 +4,15 @@ use picofarm_settings::GridSettings;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Results, TaskKind};
+use super::{
+    fields::Fields,
+    kind::{Declared, Results, TaskKind},
+};
 use crate::model::{
-    job::{OutputSettings, SourceSettings, SpecError, check_count, check_source, default_profile},
+    limits::check_count,
     memory::{BASE, Known, Shape},
+    places::{OutputSettings, SourceSettings, check_source, default_profile},
+    spec_error::SpecError,
 };
 
 /// Bytes of a node of the grid while it is fitted: 19 to 25 were measured at 256 to 128 nodes.

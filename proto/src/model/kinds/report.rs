@@ -4,12 +4,15 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{
-    Declared, Fields, Manifest, ModelNames, Results, TaskKind, evaluate::MAX_MODELS,
-    train::check_model,
+    evaluate::MAX_MODELS,
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    names::check_model,
 };
 use crate::model::{
-    job::{REPORTS, SpecError, within},
     memory::{BASE, Known},
+    places::REPORTS,
+    spec_error::{SpecError, within},
 };
 
 /// Most scenes of each model that a report shows.

@@ -5,12 +5,17 @@ use picofarm_settings::{Sensor, SensorError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Results, TaskKind};
+use super::{
+    fields::Fields,
+    kind::{Declared, Results, TaskKind},
+};
 use crate::{
-    key::reprocess_stage_key,
+    key::hash::StageKey,
     model::{
-        job::{OutputSettings, SourceSettings, SpecError, check_count, check_source},
+        limits::check_count,
         memory::{BASE, Known, Shape},
+        places::{OutputSettings, SourceSettings, check_source},
+        spec_error::SpecError,
     },
     show,
 };
@@ -70,7 +75,7 @@ impl TaskKind for ReprocessTask {
         json!({
             "stage": "reprocess",
             "source": self.source.shaping(),
-            "settings": reprocess_stage_key(&self.reprocess, &self.output.profile).to_string(),
+            "settings": self.reprocess.stage_key(&self.output.profile).to_string(),
         })
     }
 
@@ -188,6 +193,22 @@ impl Histogram {
 }
 
 impl ReprocessSettings {
+    /// The stage key of a reprocess stage: everything but the places of source and target, which follow from the keys of
+    /// the source's scenes ([`crate::key::derived_key`]).
+    pub fn stage_key(&self, profile: &str) -> StageKey {
+        let description = json!({
+            "task": "reprocess",
+            "histogram": self.histogram,
+            "spots": self.spots,
+            "sensor": serde_json::to_value(&self.sensor).expect("settings are plain data"),
+            "drop_left_over": self.drop_left_over,
+            "seed": self.seed,
+            "version": self.version,
+            "profile": profile,
+        });
+        StageKey::of(description)
+    }
+
     /// The codec profile that loses nothing that matters: whole counts are kept exactly, rates to a fraction of the
     /// photon noise.
     pub fn natural_profile(&self) -> &'static str {

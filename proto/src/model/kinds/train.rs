@@ -5,17 +5,23 @@ pub use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Ta
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Manifest, ModelNames, Results, TaskKind, reprocess::Histogram};
+use super::{
+    fields::Fields,
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    reprocess::Histogram,
+};
 use crate::model::{
-    job::{MODELS, SourceSettings, SpecError, check_count, check_source},
+    limits::check_count,
     memory::{BASE, Known, Network, Shape},
-    sweep::Trial,
+    places::{MODELS, SourceSettings, check_source},
+    spec_error::SpecError,
+    trial::Trial,
 };
 
 mod check;
 
-pub use check::check_model;
-pub(super) use check::{check_split, check_spots};
+pub use super::names::check_model;
+pub(super) use check::check_spots;
 
 /// Training a network: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -296,7 +302,7 @@ impl TaskKind for TrainTask {
 
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
-        let ours = Network::of(&self.train, source);
+        let ours = self.train.network(source);
         let others = known.networks.iter().map(|n| n.ask(source));
         let images = self.train.optimise.batch / self.train.optimise.accumulate.max(1);
         let learns = ours.learn(source, images.max(1));
@@ -328,7 +334,7 @@ impl TaskKind for TrainTask {
     }
 
     fn network(&self, source: &Shape) -> Option<Network> {
-        Some(Network::of(&self.train, source))
+        Some(self.train.network(source))
     }
 
     fn models(&self) -> Vec<(&'static str, &String)> {
@@ -341,6 +347,36 @@ impl TaskKind for TrainTask {
 }
 
 impl TrainSettings {
+    /// The shape of the network that learns from such scenes.
+    pub(in crate::model) fn network(&self, source: &Shape) -> Network {
+        let bins = match self.input.bins {
+            0 => source.bins,
+            bins => bins,
+        };
+        let seen = match self.input.intensity_only {
+            true => 1.0,
+            false => f64::from(bins),
+        };
+        let (dense, one_hot) = match (self.target, self.shadow.variant) {
+            (Target::Shadow, ShadowVariant::Concat) => (seen, f64::from(bins)),
+            (Target::Shadow, ShadowVariant::Index) => (seen + f64::from(source.spots), 0.0),
+            _ => (seen, 0.0),
+        };
+        let net = &self.net;
+        Network {
+            scene: *source,
+            inputs: dense + one_hot,
+            dense,
+            width: f64::from(net.width),
+            levels: net.levels,
+            time: match net.architecture {
+                Architecture::Unet2d => 1.0,
+                Architecture::Unet25d => f64::from(net.time_features.max(1)),
+            },
+            stem: f64::from(net.stem),
+        }
+    }
+
     /// What of them decides the bytes of the model: all but its name, how often it is saved on the way, and whether it is
     /// one of a sweep.
     pub fn shaping(&self) -> serde_json::Value {

@@ -3,10 +3,15 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{Declared, Fields, Manifest, Results, TaskKind};
+use super::{
+    fields::Fields,
+    kind::{Declared, Manifest, Results, TaskKind},
+};
 use crate::model::{
-    job::{SourceSettings, SpecError, check_count, check_source},
+    limits::check_count,
     memory::{BASE, Known},
+    places::{SourceSettings, check_source},
+    spec_error::SpecError,
 };
 
 /// Verifying a data set: one task a scene. It is over when the scene is sound, and fails when it is not.

@@ -1,7 +1,6 @@
 //! What networks take: weights, what passes keep, and what the optimiser keeps.
 
-use super::{BIN, Shape};
-use crate::model::train::{Architecture, ShadowVariant, Target, TrainSettings};
+use super::shape::{BIN, Shape};
 
 /// Copies of the weights in a training: their values, the optimiser's two moments, gradients, and a checkpoint of the
 /// first three on its way to the store.
@@ -33,36 +32,6 @@ pub struct Network {
 }
 
 impl Network {
-    /// Of a training on scenes of a shape.
-    pub fn of(settings: &TrainSettings, source: &Shape) -> Self {
-        let bins = match settings.input.bins {
-            0 => source.bins,
-            bins => bins,
-        };
-        let seen = match settings.input.intensity_only {
-            true => 1.0,
-            false => f64::from(bins),
-        };
-        let (dense, one_hot) = match (settings.target, settings.shadow.variant) {
-            (Target::Shadow, ShadowVariant::Concat) => (seen, f64::from(bins)),
-            (Target::Shadow, ShadowVariant::Index) => (seen + f64::from(source.spots), 0.0),
-            _ => (seen, 0.0),
-        };
-        let net = &settings.net;
-        Self {
-            scene: *source,
-            inputs: dense + one_hot,
-            dense,
-            width: f64::from(net.width),
-            levels: net.levels,
-            time: match net.architecture {
-                Architecture::Unet2d => 1.0,
-                Architecture::Unet25d => f64::from(net.time_features.max(1)),
-            },
-            stem: f64::from(net.stem),
-        }
-    }
-
     /// Inputs, middle and outputs of each level's encoder, from the finest.
     fn encoders(&self) -> impl Iterator<Item = [f64; 3]> {
         let first = match (self.time > 1.0, self.stem > 0.0) {

@@ -1,6 +1,7 @@
 //! That estimates follow the settings, and are known where they can be.
 
-use super::*;
+use super::{Shape, peak_bytes};
+use crate::model::JobSpec;
 
 fn job(stages: &str) -> JobSpec {
     serde_json::from_str(&format!(r#"{{"name": "m", "stage": [{stages}]}}"#)).unwrap()
@@ -54,7 +55,7 @@ fn stages_that_read_what_the_job_makes_are_known_and_others_are_not() {
     let source = own.known(1).source.unwrap();
     assert_eq!((source.width, source.bins, source.spots), (256, 637, 100));
     assert!(of(&own, 1).unwrap() > 300_000_000);
-    let made = super::made(&own.stages, (&"/s".into(), &"e".into())).unwrap();
+    let made = super::job::made(&own.stages, (&"/s".into(), &"e".into())).unwrap();
     assert_eq!(made.bins, 91);
     let other = job(&reads(r#"{"store": "/s", "dataset": "other"}"#));
     assert_eq!(of(&other, 0), None);
@@ -70,7 +71,7 @@ fn the_released_network_takes_what_is_known_of_it() {
         bins: 637,
         spots: 25,
     };
-    let net = Network::of(&settings, &source);
+    let net = settings.network(&source);
     // 356,404,556 parameters.
     let share = net.weights() / (4.0 * 356_404_556.0);
     assert!((0.98..1.02).contains(&share), "{share}");

@@ -6,7 +6,7 @@ use picofarm_proto::ids::{InstanceId, JobId, RangeId, WorkerId};
 use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
-use super::write::{RANGE, Result, Sql, WriteError, Writer, ranges};
+use super::writer::{RANGE, Result, Sql, WriteError, Writer, ranges};
 use picofarm_catalog::Range;
 
 /// Holds the instance's row until the transaction ends, so that nobody can find it lost meanwhile. A row whose time is over

@@ -11,7 +11,8 @@ use sqlx::PgConnection;
 
 use super::{
     job_query, query,
-    write::{RANGE, Result, WriteError, Writer, give, insert_events, insert_ranges, ranges},
+    rows::{give, insert_events, insert_ranges},
+    writer::{RANGE, Result, WriteError, Writer, ranges},
 };
 use crate::sql::{self, int};
 use picofarm_catalog::{NewEvent, Outcome, RangeState, Settled, StageRecord, Submission};

@@ -6,15 +6,16 @@
 //! and asks once a second anyway.
 
 mod errors;
+mod hints;
 mod instance;
 mod jobs;
+mod migrate;
 mod rights;
+mod rows;
 mod write;
+mod writer;
 
-use std::{
-    sync::Mutex,
-    time::{Duration, Instant},
-};
+use std::{sync::Mutex, time::Duration};
 
 use async_trait::async_trait;
 use picofarm_proto::{
@@ -23,18 +24,18 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, PgPool,
-    migrate::MigrateError,
     pool::PoolConnection,
-    postgres::{PgConnectOptions, PgListener, PgPoolOptions, PgRow},
+    postgres::{PgConnectOptions, PgPoolOptions, PgRow},
 };
 use uuid::Uuid;
 
-use crate::migrations;
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
     Sight, Snapshot, Submission, TaskRecord, Timing, Want,
 };
+
+use hints::Hints;
 
 crate::sql::queries!(sqlx::PgConnection, super::PgRow);
 crate::sql_listing::listing_queries!(
@@ -52,10 +53,6 @@ const CONNECTIONS: u32 = 10;
 const PATIENCE: Duration = Duration::from_secs(10);
 /// An instance that has not beaten for so long is lost.
 const INSTANCE_SECONDS: f64 = 5.0;
-/// At most one hint to the others in this time.
-const HINTS: Duration = Duration::from_millis(100);
-/// The channel of the hints.
-const CHANNEL: &str = "picofarm";
 
 /// A catalog in a Postgres database.
 pub struct PostgresCatalog {
@@ -66,9 +63,8 @@ pub struct PostgresCatalog {
     pool: PgPool,
     /// The present life.
     instance: Mutex<Option<InstanceId>>,
-    keys: tokio::sync::Mutex<write::Keys>,
-    hints: tokio::sync::Mutex<Option<PgListener>>,
-    hinted: Mutex<Option<Instant>>,
+    keys: tokio::sync::Mutex<writer::Keys>,
+    hints: Hints,
 }
 
 impl PostgresCatalog {
@@ -100,15 +96,14 @@ impl PostgresCatalog {
             Ok(pool) => pool,
             Err(error) => return Err(errors::unconnected(&place, &options, error).await),
         };
-        migrate(&place, &pool).await?;
-        let listener = listen(&pool).await.map_err(failed)?;
+        migrate::migrate(&place, &pool).await?;
+        let hints = Hints::new(pool.clone()).await.map_err(failed)?;
         Ok(Self {
             name: name.to_owned(),
             pool,
             instance: Mutex::new(None),
             keys: tokio::sync::Mutex::default(),
-            hints: tokio::sync::Mutex::new(Some(listener)),
-            hinted: Mutex::new(None),
+            hints,
             place,
         })
     }
@@ -137,7 +132,7 @@ impl PostgresCatalog {
     /// Runs `work` in one transaction, on behalf of an instance that is alive.
     async fn write<T>(
         &self,
-        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         self.transaction(true, work).await
     }
@@ -146,7 +141,7 @@ impl PostgresCatalog {
     async fn transaction<T>(
         &self,
         keep: bool,
-        work: impl AsyncFnOnce(&mut write::Writer<'_>) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(&mut writer::Writer<'_>) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         let instance = self.instance()?;
         let mut keys = self.keys.lock().await;
@@ -154,7 +149,7 @@ impl PostgresCatalog {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
             instance::fence(&mut tx, instance).await?;
-            let mut writer = write::Writer {
+            let mut writer = writer::Writer {
                 c: &mut tx,
                 instance: instance.uuid(),
                 keys: &mut keys,
@@ -168,59 +163,11 @@ impl PostgresCatalog {
             Ok(done)
         };
         result.await.map_err(|e| match e {
-            write::WriteError::Fenced => CatalogError::Fenced,
-            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
-            write::WriteError::Sql(e) => self.failed(e),
+            writer::WriteError::Fenced => CatalogError::Fenced,
+            writer::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            writer::WriteError::Sql(e) => self.failed(e),
         })
     }
-
-    /// Wakes the others, unless they have just been woken.
-    async fn hint(&self) {
-        {
-            let mut hinted = self.hinted.lock().expect("no panic while locked");
-            if hinted.is_some_and(|at| at.elapsed() < HINTS) {
-                return;
-            }
-            *hinted = Some(Instant::now());
-        }
-        let sent = sqlx::query("SELECT pg_notify($1, '')")
-            .bind(CHANNEL)
-            .execute(&self.pool)
-            .await;
-        if let Err(error) = sent {
-            tracing::debug!(%error, "no hint sent; the others ask by themselves");
-        }
-    }
-}
-
-async fn listen(pool: &PgPool) -> Result<PgListener, sqlx::Error> {
-    let mut listener = PgListener::connect_with(pool).await?;
-    listener.listen(CHANNEL).await?;
-    Ok(listener)
-}
-
-async fn migrate(place: &str, pool: &PgPool) -> Result<(), CatalogError> {
-    let known = migrations::latest(&migrations::POSTGRES);
-    // Several coordinators may start at once: the migrator takes an advisory lock.
-    migrations::POSTGRES
-        .run(pool)
-        .await
-        .map_err(|error| match error {
-            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
-                CatalogError::Newer {
-                    place: place.to_owned(),
-                    found,
-                    known,
-                }
-            }
-            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
-                errors::classify(place, e)
-            }
-            other => CatalogError::Unusable {
-                place: place.to_owned(),
-                what: format!("its schema is not this program's ({other})"),
-            },
-        })
 }
 
 #[async_trait]
@@ -281,18 +228,7 @@ impl Catalog for PostgresCatalog {
     }
 
     async fn changed(&self) {
-        let mut hints = self.hints.lock().await;
-        loop {
-            if let Some(listener) = hints.as_mut() {
-                match listener.recv().await {
-                    Ok(_) => return,
-                    Err(error) => tracing::debug!(%error, "no more hints; trying again"),
-                }
-                *hints = None;
-            }
-            tokio::time::sleep(Duration::from_secs(2)).await;
-            *hints = listen(&self.pool).await.ok();
-        }
+        self.hints.heard().await;
     }
 
     async fn claim(&self, wants: &[Want]) -> Result<Vec<Claim>, CatalogError> {
@@ -320,7 +256,7 @@ impl Catalog for PostgresCatalog {
             .await?;
         let pending = |r: &Range| matches!(r.state, RangeState::Pending { .. });
         if settled != Settled::default() || changes.free.values().any(pending) {
-            self.hint().await;
+            self.hints.give().await;
         }
         Ok(settled)
     }
@@ -328,7 +264,7 @@ impl Catalog for PostgresCatalog {
     async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
         picofarm_catalog::verdict(
             self.transaction(false, async |writer| {
-                write::write_rows(writer, changes).await
+                rows::write_rows(writer, changes).await
             })
             .await,
         )
@@ -340,7 +276,7 @@ impl Catalog for PostgresCatalog {
         let outcome = self
             .write(async |writer| jobs::record(writer, submission, &spec).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(outcome)
     }
 
@@ -385,7 +321,7 @@ impl Catalog for PostgresCatalog {
         let cancelled = self
             .write(async |writer| jobs::cancel(writer, job, why, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(cancelled)
     }
 
@@ -399,13 +335,13 @@ impl Catalog for PostgresCatalog {
         let changed = self
             .write(async |writer| jobs::pause(writer, job, paused, who, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(changed)
     }
 
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
         self.write(async |writer| {
-            *writer.keys = write::Keys::default();
+            *writer.keys = writer::Keys::default();
             Ok(listing_query::forget(writer.c, before_ms).await?)
         })
         .await
@@ -422,7 +358,7 @@ impl Catalog for PostgresCatalog {
         let retried = self
             .write(async |writer| jobs::retry(writer, job, now_ms).await)
             .await?;
-        self.hint().await;
+        self.hints.give().await;
         Ok(retried)
     }
 
@@ -483,7 +419,7 @@ impl Catalog for PostgresCatalog {
             return Ok(Vec::new());
         }
         let mut c = self.reader().await?;
-        write::manifests(&mut c, tasks)
+        rows::manifests(&mut c, tasks)
             .await
             .map_err(|e| self.failed(e))
     }
@@ -527,9 +463,7 @@ impl Catalog for PostgresCatalog {
             }
         }
         // The pool waits for every connection, the listener's too.
-        if let Ok(mut hints) = self.hints.try_lock() {
-            hints.take();
-        }
+        self.hints.end();
         self.pool.close().await;
     }
 }

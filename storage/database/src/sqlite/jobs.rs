@@ -10,7 +10,8 @@ use sqlx::SqliteConnection;
 
 use super::{
     job_query, query,
-    write::{Keys, Result, WriteError, give, insert_events, insert_ranges},
+    rows::{give, insert_events, insert_ranges},
+    writer::{Keys, Result, WriteError},
 };
 use crate::sql::{self, int};
 use picofarm_catalog::{NewEvent, Outcome, RangeState, Settled, StageRecord, Submission};

@@ -6,7 +6,9 @@ mod errors;
 mod files;
 mod jobs;
 mod rights;
+mod rows;
 mod write;
+mod writer;
 
 use std::{
     collections::BTreeMap,
@@ -49,7 +51,7 @@ const READERS: u32 = 8;
 pub struct SqliteCatalog {
     path: PathBuf,
     /// `None` once closed.
-    writer: Mutex<Option<write::Writer>>,
+    writer: Mutex<Option<writer::Writer>>,
     readers: SqlitePool,
     /// A reader opens the file anew, and shall not open another.
     files: files::Files,
@@ -98,7 +100,7 @@ impl SqliteCatalog {
         };
         Ok(Self {
             path: path.to_owned(),
-            writer: Mutex::new(Some(write::Writer::new(connection, options, files()?))),
+            writer: Mutex::new(Some(writer::Writer::new(connection, options, files()?))),
             readers,
             files: files()?,
             _lock: lock,
@@ -117,21 +119,24 @@ impl SqliteCatalog {
         self.readers.acquire().await.map_err(|e| self.failed(e))
     }
 
-    fn refused(&self, error: write::WriteError) -> CatalogError {
+    fn refused(&self, error: writer::WriteError) -> CatalogError {
         match error {
-            write::WriteError::Conflict(what) => CatalogError::Conflict(what),
-            write::WriteError::Lost(what) => CatalogError::Lost {
+            writer::WriteError::Conflict(what) => CatalogError::Conflict(what),
+            writer::WriteError::Lost(what) => CatalogError::Lost {
                 path: self.path.clone(),
                 what,
             },
-            write::WriteError::Sql(e) => self.failed(e),
+            writer::WriteError::Sql(e) => self.failed(e),
         }
     }
 
     /// Runs `work` in one transaction.
     async fn write<T>(
         &self,
-        work: impl AsyncFnOnce(&mut SqliteConnection, &mut write::Keys) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(
+            &mut SqliteConnection,
+            &mut writer::Keys,
+        ) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         self.transaction(true, work).await
     }
@@ -140,7 +145,10 @@ impl SqliteCatalog {
     async fn transaction<T>(
         &self,
         keep: bool,
-        work: impl AsyncFnOnce(&mut SqliteConnection, &mut write::Keys) -> Result<T, write::WriteError>,
+        work: impl AsyncFnOnce(
+            &mut SqliteConnection,
+            &mut writer::Keys,
+        ) -> Result<T, writer::WriteError>,
     ) -> Result<T, CatalogError> {
         let mut writer = self.writer.lock().await;
         let writer = writer.as_mut().ok_or(CatalogError::Closed)?;
@@ -244,7 +252,7 @@ impl Catalog for SqliteCatalog {
     async fn trial(&self, changes: &Changes) -> Result<Option<String>, CatalogError> {
         picofarm_catalog::verdict(
             self.transaction(false, async |c, keys| {
-                write::write_rows(c, keys, changes).await
+                rows::write_rows(c, keys, changes).await
             })
             .await,
         )
@@ -313,7 +321,7 @@ impl Catalog for SqliteCatalog {
     async fn forget(&self, before_ms: i64) -> Result<Forgotten, CatalogError> {
         self.write(async |c, keys| {
             // The database may use keys again that are free.
-            *keys = write::Keys::default();
+            *keys = writer::Keys::default();
             Ok(listing_query::forget(c, before_ms).await?)
         })
         .await
@@ -385,7 +393,7 @@ impl Catalog for SqliteCatalog {
         tasks: &[(StageRef, u64)],
     ) -> Result<Vec<Option<[u8; 32]>>, CatalogError> {
         let mut c = self.reader().await?;
-        write::manifests(&mut c, tasks)
+        rows::manifests(&mut c, tasks)
             .await
             .map_err(|e| self.failed(e))
     }

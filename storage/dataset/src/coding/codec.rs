@@ -9,7 +9,8 @@ use zarrs::array::codec::api::{ArrayToBytesCodecTraits, CodecOptions};
 use zarrs::array::{ArrayBytes, DataType, FillValue, data_type};
 
 use crate::error::DatasetError;
-use crate::layout::arrays::{Element, Layout, index_codecs};
+use crate::layout::arrays::{Layout, index_codecs};
+use crate::layout::quantity::Element;
 
 /// The codecs of one kind of chunk. Deterministic: one thread a chunk, no state.
 #[derive(Debug, Clone)]

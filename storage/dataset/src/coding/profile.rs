@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use crate::coding::squareroot::SATURATED;
-use crate::layout::arrays::{Element, Quantity};
+use crate::layout::quantity::{Element, Quantity};
 use crate::layout::spec::{DatasetSpec, Profile, decimal};
 
 /// Formats from this one on store the values of an inner chunk bin by bin: neighbouring pixels see the same light, and

@@ -15,8 +15,8 @@ use object_store::path::Path;
 use sha2::{Digest, Sha256};
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
 use crate::layout::manifest::Manifest;
+use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 

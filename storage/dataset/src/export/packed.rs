@@ -9,10 +9,12 @@ use super::Out;
 use crate::coding::codec::ChunkCodec;
 use crate::coding::shard;
 use crate::error::DatasetError;
-use crate::layout::arrays::{Element, Layout, index_codecs};
+use crate::layout::arrays::{Layout, index_codecs};
+use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::layout::quantity::Element;
 use crate::layout::spec::DatasetSpec;
-use crate::scenes::dataset::{ArrayCodec, Dataset, METADATA, pretty, root_metadata};
+use crate::scenes::dataset::{ArrayCodec, Dataset, root_metadata};
 use crate::store::objects;
 
 /// Version of the packed layout.

@@ -1,8 +1,8 @@
 //! A scene as plain arrays: decoded, with the names, shapes, units and descriptions that files for other tools carry.
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
 use crate::layout::manifest::Manifest;
+use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
 
 /// Values of an array.

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
 use crate::import::npy;
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 use crate::layout::record::{Intrinsics, Spot};
 use crate::layout::spec::{DatasetSpec, Gate};
 use crate::scenes::dataset::Dataset;

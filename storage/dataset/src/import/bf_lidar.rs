@@ -428,13 +428,13 @@ impl Scan {
             .unwrap_or(0);
         let (pixel, bin) = (at / bins, at % bins);
         let d = super::scene::direction(self.intrinsics, pixel / self.width, pixel % self.width);
-        let d = d.map(|x| x / super::check::norm(d));
+        let d = d.map(|x| x / super::vector::norm(d));
         let path = shape.gate.start_m + (bin as f64 + 0.5) * shape.gate.bin_width_m;
         // Light's way turned round: from the detector along the pixel's ray, then to the laser.
         let from = laser.map(|x| -x);
         let relative = along(from, d, path);
         let position = [0, 1, 2].map(|k| relative[k] + laser[k]);
-        let baseline = super::check::norm(laser);
+        let baseline = super::vector::norm(laser);
         if path <= baseline || position[2] <= 0.0 {
             return Err(ImportError::refused(
                 file,
@@ -446,7 +446,7 @@ impl Scan {
                 "give another --t0-s or --laser-m",
             ));
         }
-        let check = json!({"one_bounce_path_m": path, "spot_range_m": super::check::norm(position), "counts": h[at]});
+        let check = json!({"one_bounce_path_m": path, "spot_range_m": super::vector::norm(position), "counts": h[at]});
         Ok((position.map(|x| x as f32), check))
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::error::DatasetError;
-use crate::store::io_hint;
+use crate::store::failure::io_hint;
 
 /// An import that was refused or failed.
 #[derive(Debug, thiserror::Error)]

@@ -2,73 +2,13 @@
 //! says shadow. Masks of the wrong polarity, order of spots, or order of rows and columns mix both.
 
 use super::ImportError;
-use super::check::{
-    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Profile, Reading, Which, flipped, profile,
+use super::mask_order::Masks;
+use super::profile::{
+    BETTER, Blame, CONTRAST, Geometry, MIN_PAIRS, Profile, Reading, Which, profile,
 };
 
 /// Share of the lit pixels' light by which another order must separate lit from shadow to be believed.
 const CLEAR: f64 = 0.25;
-
-/// The order in which the masks' entries are taken.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) enum Masks {
-    /// As they stand.
-    #[default]
-    AsTheyStand,
-    /// Rows for columns.
-    Transposed,
-    /// Columns, rows or both from their other end.
-    Turned([bool; 2]),
-    /// The last spot first.
-    LastSpotFirst,
-    /// The spots of a square grid, rows for columns.
-    SpotsTransposed,
-}
-
-impl Masks {
-    /// Where the entry of a spot and a pixel (row, column) stands in masks of (spots, rows, columns).
-    pub fn place(
-        self,
-        spot: usize,
-        (row, column): (usize, usize),
-        (spots, h, w): (usize, usize, usize),
-    ) -> usize {
-        let (spot, row, column) = match self {
-            Self::AsTheyStand => (spot, row, column),
-            // Only where both sides are equal.
-            Self::Transposed => (spot, column, row),
-            Self::Turned([x, y]) => (spot, flipped(row, h, y), flipped(column, w, x)),
-            Self::LastSpotFirst => (spots - 1 - spot, row, column),
-            Self::SpotsTransposed => {
-                let side = spots.isqrt();
-                (spot % side * side + spot / side, row, column)
-            }
-        };
-        (spot * h + row) * w + column
-    }
-
-    /// The other orders that masks of this shape could have.
-    fn others(spots: usize, h: usize, w: usize) -> Vec<(Self, &'static str)> {
-        let mut all = vec![
-            (Self::Turned([true, false]), "columns from right to left"),
-            (Self::Turned([false, true]), "rows from bottom to top"),
-            (
-                Self::Turned([true, true]),
-                "rows and columns from their other ends",
-            ),
-        ];
-        if h == w {
-            all.push((Self::Transposed, "rows and columns exchanged"));
-        }
-        if spots > 1 {
-            all.push((Self::LastSpotFirst, "the last spot first"));
-        }
-        if spots > 1 && spots.isqrt().pow(2) == spots {
-            all.push((Self::SpotsTransposed, "the spots' grid by columns"));
-        }
-        all
-    }
-}
 
 /// Masks the wrong way round light up where no light arrives.
 pub(super) fn polarity(
@@ -151,25 +91,5 @@ pub(super) fn order(
             ),
             "put the masks in order, or import them as they are with --unchecked",
         )),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_order_is_a_permutation() {
-        for (spots, h, w) in [(4, 3, 3), (9, 2, 5), (1, 1, 1)] {
-            for (masks, words) in Masks::others(spots, h, w) {
-                let mut seen = vec![false; spots * h * w];
-                for spot in 0..spots {
-                    for at in 0..h * w {
-                        seen[masks.place(spot, (at / w, at % w), (spots, h, w))] = true;
-                    }
-                }
-                assert!(seen.into_iter().all(|s| s), "{words}");
-            }
-        }
     }
 }

@@ -9,15 +9,18 @@ mod check;
 mod error;
 mod files;
 mod image;
+mod mask_order;
 mod masks;
 mod mat;
 pub(crate) mod npy;
 mod npy_folder;
 mod options;
 mod platonerf;
+mod profile;
 mod publish;
 mod sb3d;
 mod scene;
+mod vector;
 
 use std::path::{Path, PathBuf};
 

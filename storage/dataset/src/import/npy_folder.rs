@@ -6,9 +6,10 @@ use serde::Deserialize;
 
 use picofarm_files::Opener;
 
-use super::check::{Blame, Geometry, check};
+use super::check::check;
 use super::files::Files;
 use super::npy::{self, Array};
+use super::profile::{Blame, Geometry};
 use super::scene::{ImportedScene, Shape, clean};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity};
 use crate::layout::record::Intrinsics;

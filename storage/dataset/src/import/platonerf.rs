@@ -13,9 +13,9 @@ use serde_json::{Value, json};
 
 use picofarm_files::Opener;
 
-use super::check::norm;
 use super::files::Files;
 use super::scene::{ImportedScene, Shape, clean, of_fov};
+use super::vector::norm;
 use super::{Captures, ImportError, ImportOptions, Item, npy};
 use crate::layout::record::Intrinsics;
 use crate::layout::spec::{Gate, Subsets};

@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 
 use picofarm_files::Opener;
 
-use super::check::{Blame, Geometry, check};
+use super::check::check;
 use super::files::Files;
+use super::profile::{Blame, Geometry};
 use super::scene::{ImportedScene, Shape, clean, of_fov};
 use super::{DepthKind, ImportError, ImportOptions, Item, Polarity, image, npy};
 use crate::export::{ASIDE, Aside};
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 use crate::layout::spec::{Gate, Subsets};
 
 const DEPTH: &str = "depth.exr";

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::check::{distance, norm};
+use super::vector::{distance, norm};
 use super::{ImportError, SourceFile};
 use crate::coding::squareroot::photon_scale;
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 use crate::layout::record::{Intrinsics, SceneRecord, Spot, SubsetRecord};
 use crate::layout::spec::{Gate, Subsets};
 

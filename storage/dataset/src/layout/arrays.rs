@@ -3,93 +3,11 @@
 use serde_json::{Value, json};
 
 use crate::coding::profile::Coding;
+use crate::layout::quantity::{Element, Quantity};
 use crate::layout::spec::DatasetSpec;
 
 /// Side of the transient's inner chunks in pixels (smaller where the image is smaller).
 pub const INNER_SIDE: u64 = 32;
-
-/// The quantities of a scene, one Zarr array each.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Quantity {
-    /// h(p, b): `[row][column][bin]`, u16 codes or f32.
-    Transient,
-    /// Σ_b h(p, b), f32 `[row][column]`, from the transient before coding.
-    Intensity,
-    /// z-depth in metres, f32 `[row][column]`.
-    Depth,
-    /// Distance along the ray in metres, f32 `[row][column]`.
-    Range,
-    /// Unit normals in the camera frame, i16 `[row][column][3]`, to be divided by 32767.
-    Normal,
-    /// Instance id, u32 `[row][column]`, 0 = nothing.
-    Instance,
-    /// Semantic label, u16 `[row][column]`, 0 = nothing.
-    Label,
-    /// 1 = mirror, u8 `[row][column]`.
-    Specular,
-    /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
-    Visibility,
-    /// sRGB-encoded colour, u8 `[row][column][3]`.
-    Rgb,
-    /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN = no spot.
-    Spots,
-    /// fx, fy, cx, cy in pixels, f32.
-    Intrinsics,
-    /// Camera-to-world matrix, f32 `[4][4]`, points as columns.
-    Camera,
-    /// Laser origin in the camera frame in metres, f32 `[3]`.
-    Laser,
-    /// Photons per unit of h, f32; NaN where the scene is missing.
-    Scale,
-    /// h of the 4 of the 100 spots of [`Self::spots_of_100`] alone, coded as the transient, with the same scale.
-    Transient4,
-    /// h of the 25 of the 100 spots of [`Self::spots_of_100`] alone, likewise.
-    Transient25,
-    /// h of each spot alone: `[spot][row][column][bin]`, likewise.
-    TransientSpots,
-}
-
-/// Rows 0, 2, 4, 6, 8 and columns 1, 3, 5, 7, 9 of the 10×10 grid.
-const SPOTS_25: [u32; 25] = {
-    let mut spots = [0; 25];
-    let mut i = 0;
-    while i < 25 {
-        spots[i] = (i / 5 * 20 + i % 5 * 2 + 1) as u32;
-        i += 1;
-    }
-    spots
-};
-const SPOTS_4: [u32; 4] = [22, 27, 72, 77];
-
-/// Element type of an array (public only for the sealed trait behind [`crate::Stored`]).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Element {
-    F32,
-    U8,
-    U16,
-    I16,
-    U32,
-}
-
-impl Element {
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "float32",
-            Self::U8 => "uint8",
-            Self::U16 => "uint16",
-            Self::I16 => "int16",
-            Self::U32 => "uint32",
-        }
-    }
-
-    pub fn size(self) -> u64 {
-        match self {
-            Self::U8 => 1,
-            Self::U16 | Self::I16 => 2,
-            Self::F32 | Self::U32 => 4,
-        }
-    }
-}
 
 /// One array.
 #[derive(Debug, Clone)]
@@ -112,69 +30,6 @@ pub(crate) struct Layout {
 }
 
 impl Quantity {
-    /// All quantities there are, in the order of their objects in a manifest; see [`DatasetSpec::quantities`].
-    pub const ALL: [Self; 18] = [
-        Self::Transient,
-        Self::Intensity,
-        Self::Depth,
-        Self::Range,
-        Self::Normal,
-        Self::Instance,
-        Self::Label,
-        Self::Specular,
-        Self::Visibility,
-        Self::Rgb,
-        Self::Spots,
-        Self::Intrinsics,
-        Self::Camera,
-        Self::Laser,
-        Self::Scale,
-        Self::Transient4,
-        Self::Transient25,
-        Self::TransientSpots,
-    ];
-
-    /// Whether it is a transient, coded with the data set's profile.
-    pub fn is_transient(self) -> bool {
-        matches!(
-            self,
-            Self::Transient | Self::Transient4 | Self::Transient25 | Self::TransientSpots
-        )
-    }
-
-    /// Which of the 100 spots of a 10×10 grid (row by row) make up this transient; empty for other quantities.
-    pub fn spots_of_100(self) -> &'static [u32] {
-        match self {
-            Self::Transient4 => &SPOTS_4,
-            Self::Transient25 => &SPOTS_25,
-            _ => &[],
-        }
-    }
-
-    /// Name of the Zarr array.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Transient => "transient",
-            Self::Intensity => "intensity",
-            Self::Depth => "depth",
-            Self::Range => "range",
-            Self::Normal => "normal",
-            Self::Instance => "instance",
-            Self::Label => "label",
-            Self::Specular => "specular",
-            Self::Visibility => "visibility",
-            Self::Rgb => "rgb",
-            Self::Spots => "spots",
-            Self::Intrinsics => "intrinsics",
-            Self::Camera => "camera",
-            Self::Laser => "laser",
-            Self::Scale => "scale",
-            Self::Transient4 => "transient_4",
-            Self::Transient25 => "transient_25",
-            Self::TransientSpots => "transient_spots",
-        }
-    }
-
     /// Its array in a data set of the given format.
     pub(crate) fn layout(self, spec: &DatasetSpec, format: u32) -> Layout {
         use Element::{F32, I16, U8, U16, U32};

@@ -1,12 +1,33 @@
-//! Metadata of groups whose arrays have a leading scene axis: created array by array, the root last, and grown.
+//! Metadata of groups whose arrays have a leading scene axis: created array by array, the root last, and grown. And what
+//! a root says that its group is.
 
+use bytes::Bytes;
 use object_store::ObjectStore;
 use object_store::path::Path;
 use serde_json::{Value, json};
 
 use crate::error::DatasetError;
-use crate::scenes::dataset::pretty;
 use crate::store::objects;
+
+/// Name of the metadata objects.
+pub(crate) const METADATA: &str = "zarr.json";
+
+/// Metadata as they are stored.
+pub(crate) fn pretty(value: &Value) -> Bytes {
+    let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
+    text.push(b'\n');
+    text.into()
+}
+
+/// Whether a group's root is that of predictions.
+pub(crate) fn is_predictions(root: &Value) -> bool {
+    root["attributes"]["picofarm"]["predictions"].is_u64()
+}
+
+/// Whether a group's root is that of reconstructions.
+pub(crate) fn is_reconstructions(root: &Value) -> bool {
+    root["attributes"]["picofarm"]["reconstructions"].is_u64()
+}
 
 /// Writes an array's metadata while its group has no root; `metadata` says what they are for a number of scenes. What an
 /// interrupted creation left is adopted if it differs at most in that number.

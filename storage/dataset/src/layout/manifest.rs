@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 
 use crate::coding::squareroot::EncodeError;
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 use crate::layout::record::Provenance;
 use crate::layout::spec::Profile;
 

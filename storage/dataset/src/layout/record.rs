@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
 
 /// Pinhole intrinsics in pixels; pixel (u, v) has its centre at (u + 0.5, v + 0.5).

@@ -4,7 +4,7 @@ pub use picofarm_settings::Gate;
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
+use crate::layout::quantity::Quantity;
 
 /// How transients are coded.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -7,7 +7,7 @@ use super::{MANIFEST, ModelManifest, Models};
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects;
-use crate::verify::{Fault, Problem};
+use crate::verify::report::{Fault, Problem};
 
 /// What was done to a model.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -9,7 +9,7 @@ use super::{
 use crate::error::DatasetError;
 use crate::layout::manifest::sha256_hex;
 use crate::store::objects;
-use crate::verify::{Fault, Problem};
+use crate::verify::report::{Fault, Problem};
 
 /// What a check of a model found.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -4,7 +4,8 @@ use serde_json::{Value, json};
 
 use super::PredictionSpec;
 use crate::coding::codec::ChunkCodec;
-use crate::layout::arrays::{Element, image_codecs};
+use crate::layout::arrays::image_codecs;
+use crate::layout::quantity::Element;
 
 /// An array. One object holds a scene.
 #[derive(Debug)]

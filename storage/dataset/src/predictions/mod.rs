@@ -19,11 +19,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
 use crate::error::DatasetError;
-use crate::layout::group::create_metadata;
+use crate::layout::group::{METADATA, create_metadata, is_predictions, pretty};
 use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
-use crate::scenes::dataset::{METADATA, pretty};
-use crate::scenes::publish::{CONCURRENCY, put_again, put_all};
-use crate::scenes::read::scenes_in;
+use crate::layout::published::scenes_in;
+use crate::store::many::{CONCURRENCY, put_again, put_all};
 use crate::store::objects;
 use crate::verify::object::intact;
 use array::{Plate, plates};
@@ -379,11 +378,6 @@ fn difference(
     ]
     .into_iter()
     .find(|(_, stored, asked)| stored != asked)
-}
-
-/// Whether a group's root is that of predictions.
-pub(crate) fn is_predictions(root: &Value) -> bool {
-    root["attributes"]["picofarm"]["predictions"].is_u64()
 }
 
 fn parse_root(bytes: &[u8], object: &str) -> Result<PredictionSpec, DatasetError> {

@@ -5,11 +5,12 @@ use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 
 use super::{Plate, PredictionManifest, Predictions};
 use crate::error::DatasetError;
+use crate::layout::group::METADATA;
 use crate::layout::manifest::{Manifest, ObjectEntry};
-use crate::scenes::dataset::METADATA;
 use crate::store::objects;
+use crate::verify::metadata_fault;
 use crate::verify::object::looked_at;
-use crate::verify::{Fault, Problem, Verification, VerifyMode, Watch, metadata_fault};
+use crate::verify::report::{Fault, Problem, Verification, VerifyMode, Watch};
 
 /// Scenes checked at a time.
 const SCENES: usize = 4;

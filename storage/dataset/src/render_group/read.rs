@@ -8,8 +8,8 @@ use serde_json::{Map, Value};
 
 use crate::coding::codec::ChunkCodec;
 use crate::error::DatasetError;
+use crate::layout::group::METADATA;
 use crate::render_group::write::{chunk_key, codecs, grid, key_encoding, runs, unravel};
-use crate::scenes::dataset::METADATA;
 use crate::scenes::read::Stored;
 
 /// Chunks decoded at a time: bounds the memory beside the array's own.

@@ -12,8 +12,8 @@ use serde_json::{Map, Value, json};
 
 use crate::coding::codec::ChunkCodec;
 use crate::error::DatasetError;
-use crate::layout::arrays::Element;
-use crate::scenes::dataset::{METADATA, pretty};
+use crate::layout::group::{METADATA, pretty};
+use crate::layout::quantity::Element;
 use crate::scenes::read::Stored;
 
 /// Values of the largest chunk.

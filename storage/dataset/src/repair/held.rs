@@ -15,7 +15,7 @@ use crate::models::{MODELS, Models};
 use crate::reports::REPORTS;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::PartName;
-use crate::scenes::publish::CONCURRENCY;
+use crate::store::many::CONCURRENCY;
 use crate::store::objects;
 
 /// Larger objects are no manifests, bytes: whoever made them shall not fill this process's memory.

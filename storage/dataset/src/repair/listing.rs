@@ -4,9 +4,10 @@ use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 
 use crate::error::DatasetError;
-use crate::scenes::dataset::{Dataset, METADATA};
+use crate::layout::group::METADATA;
+use crate::layout::published::manifest_scene;
+use crate::scenes::dataset::Dataset;
 use crate::scenes::parts::part_scene;
-use crate::verify::manifest_scene;
 use crate::{
     repair::recipe,
     scenes::{snapshot, splits},

@@ -7,8 +7,9 @@ use object_store::ObjectStore;
 use serde_json::Value;
 
 use crate::error::DatasetError;
+use crate::layout::group::pretty;
 use crate::layout::manifest::{seal, unseal};
-use crate::scenes::dataset::{Dataset, pretty};
+use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 
 /// Version of recipes.

@@ -7,9 +7,10 @@
 use futures::{StreamExt, TryStreamExt, stream};
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
+use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::{Manifest, sha256_hex};
-use crate::scenes::dataset::{Dataset, METADATA, pretty};
+use crate::layout::quantity::Quantity;
+use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 use crate::store::objects;
 

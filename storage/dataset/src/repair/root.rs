@@ -7,10 +7,11 @@ use object_store::path::Path;
 use serde_json::Value;
 
 use crate::error::DatasetError;
+use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::FORMAT_VERSION;
 use crate::layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 use crate::repair::recipe::Recipe;
-use crate::scenes::dataset::{Dataset, METADATA, pretty, root_metadata};
+use crate::scenes::dataset::{Dataset, root_metadata};
 use crate::store::objects;
 
 /// What lies beside the root.

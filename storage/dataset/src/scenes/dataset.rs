@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use bytes::Bytes;
 use object_store::ObjectStore;
 use object_store::path::Path;
 use serde_json::{Map, Value, json};
@@ -10,12 +9,11 @@ use serde_json::{Map, Value, json};
 use crate::coding::codec::ChunkCodec;
 use crate::coding::profile::decode_lines;
 use crate::error::DatasetError;
-use crate::layout::arrays::{Layout, Quantity};
-use crate::layout::group::create_metadata;
+use crate::layout::arrays::Layout;
+use crate::layout::group::{METADATA, create_metadata, is_predictions, is_reconstructions, pretty};
 use crate::layout::manifest::{FORMAT_VERSION, encoder_of};
+use crate::layout::quantity::Quantity;
 use crate::layout::spec::DatasetSpec;
-use crate::predictions::is_predictions;
-use crate::reconstructions::is_reconstructions;
 use crate::store::objects;
 
 /// An open data set: one Zarr v3 group in an object store. Cheap to clone.
@@ -35,9 +33,6 @@ pub(crate) struct ArrayCodec {
     pub layout: Layout,
     pub codec: ChunkCodec,
 }
-
-/// Name of the metadata objects.
-pub(crate) const METADATA: &str = "zarr.json";
 
 impl Dataset {
     /// Creates the data set at `prefix`, or opens it if it is there.
@@ -168,6 +163,13 @@ impl Dataset {
         objects::path_of(&self.prefix, key)
     }
 
+    /// The key of a path below the prefix, relative to it.
+    pub(crate) fn relative(&self, path: &Path) -> String {
+        let parts = path.parts().skip(self.prefix.parts().count());
+        let parts: Vec<String> = parts.map(|part| part.as_ref().to_string()).collect();
+        parts.join("/")
+    }
+
     /// A path for a message.
     pub(crate) fn shown(&self, path: &Path) -> String {
         objects::shown(&*self.store, path)
@@ -195,12 +197,6 @@ impl Dataset {
         })
         .await
     }
-}
-
-pub(crate) fn pretty(value: &Value) -> Bytes {
-    let mut text = serde_json::to_vec_pretty(value).expect("a JSON value can be written");
-    text.push(b'\n');
-    text.into()
 }
 
 /// The root's `zarr.json`: attributes and, consolidated, the metadata of all arrays.

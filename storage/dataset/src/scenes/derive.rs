@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use crate::error::DatasetError;
-use crate::layout::arrays::Quantity;
 use crate::layout::manifest::sha256_hex;
+use crate::layout::quantity::Quantity;
 use crate::layout::record::Provenance;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;

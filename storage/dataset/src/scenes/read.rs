@@ -2,14 +2,13 @@
 
 use std::ops::Range;
 
-use futures::{Stream, StreamExt, TryStreamExt, stream};
-use object_store::ObjectStore;
-use object_store::path::Path;
+use futures::{Stream, StreamExt, stream};
 
 use crate::coding::tiles::Part;
 use crate::error::DatasetError;
-use crate::layout::arrays::{Element, Quantity};
 use crate::layout::manifest::Manifest;
+use crate::layout::published::scenes_in;
+use crate::layout::quantity::{Element, Quantity};
 use crate::layout::record::{Intrinsics, Spot};
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
@@ -19,7 +18,7 @@ pub trait Stored: bytemuck::Pod + sealed::Stored {}
 
 mod sealed {
     pub trait Stored {
-        const ELEMENT: crate::layout::arrays::Element;
+        const ELEMENT: crate::layout::quantity::Element;
     }
 }
 
@@ -32,27 +31,6 @@ macro_rules! stored {
     )*};
 }
 stored!(f32 => F32, u8 => U8, u16 => U16, i16 => I16, u32 => U32);
-
-/// The scenes that have a manifest in a folder, ascending.
-pub(crate) async fn scenes_in(
-    store: &dyn ObjectStore,
-    folder: &Path,
-) -> Result<Vec<u64>, DatasetError> {
-    let mut scenes: Vec<u64> = store
-        .list(Some(folder))
-        .try_filter_map(|object| async move {
-            let name = object
-                .location
-                .filename()
-                .and_then(|n| n.strip_suffix(".json"));
-            Ok(name.and_then(|n| n.parse::<u64>().ok()))
-        })
-        .try_collect()
-        .await
-        .map_err(|e| DatasetError::store("list", objects::shown(store, folder), e))?;
-    scenes.sort_unstable();
-    Ok(scenes)
-}
 
 impl Dataset {
     /// The manifest of a published scene (its objects are not looked at; see [`Self::published`]).

@@ -16,7 +16,7 @@ use crate::layout::manifest::Manifest;
 use crate::layout::spec::DatasetSpec;
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
-use crate::verify::Watch;
+use crate::verify::report::Watch;
 
 /// Version of snapshots.
 const FORMAT: u32 = 1;

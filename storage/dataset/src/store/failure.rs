@@ -4,22 +4,17 @@ use std::io;
 
 use object_store::Error;
 
-use super::place::Service;
-
-/// An error of a store in words.
-pub(crate) struct Failure {
-    /// What happened.
-    pub account: String,
-    /// How to repair it, where known.
-    pub hint: Option<&'static str>,
-}
+use super::account::Failure;
+use super::service::Service;
 
 impl Failure {
     /// The account of an error of any store; of an object store's with its service.
     pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
         #[cfg(feature = "clouds")]
-        if let Some(failure) = super::clouds::failure(&chain, service.unwrap_or(Service::S3)) {
+        if let Some(failure) =
+            super::clouds::failure::failure(&chain, service.unwrap_or(Service::S3))
+        {
             return failure;
         }
         #[cfg(not(feature = "clouds"))]
@@ -35,7 +30,7 @@ impl Failure {
 /// Whether an error says that the whole bucket, not only the object, is missing.
 pub(crate) fn no_bucket(error: &Error) -> bool {
     #[cfg(feature = "clouds")]
-    return super::clouds::no_bucket(&chain(error));
+    return super::clouds::failure::no_bucket(&chain(error));
     #[cfg(not(feature = "clouds"))]
     {
         let _ = error;

@@ -1,13 +1,16 @@
 //! Stores from a path or URL, the check that a store is safe for several writers, and what killed writers leave.
 
+pub(crate) mod account;
 mod bandwidth;
 #[cfg(feature = "clouds")]
 mod clouds;
-mod failure;
+pub(crate) mod failure;
 mod local;
+pub(crate) mod many;
 pub(crate) mod objects;
 mod place;
 mod probe;
+pub(crate) mod service;
 mod writable;
 
 use std::sync::Arc;
@@ -19,9 +22,7 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 
 pub use bandwidth::{Bandwidth, limit_bandwidth};
-pub(crate) use failure::{Failure, io_hint, no_bucket};
 pub(crate) use local::{leftovers, probe_leftovers};
-pub(crate) use place::Service;
 pub(crate) use probe::PROBE;
 pub use probe::{PROBE_WITHIN, probe};
 pub use writable::{Writable, check_writable, local_ground};

@@ -8,7 +8,7 @@ use object_store::{Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 
 use crate::error::DatasetError;
 use crate::layout::manifest::sha256_hex;
-use crate::store::no_bucket;
+use crate::store::failure::no_bucket;
 
 /// Create-only puts of an object that is refused as existing and yet is not there.
 const ATTEMPTS: usize = 4;

@@ -2,51 +2,8 @@
 
 use object_store::path::Path;
 
+use super::service::Service;
 use crate::error::DatasetError;
-
-/// Whose protocol an object store speaks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Service {
-    /// Amazon's, and servers that speak it.
-    S3,
-    /// Google Cloud Storage.
-    Gcs,
-    /// Azure Blob Storage.
-    Azure,
-}
-
-impl Service {
-    const ALL: [Self; 3] = [Self::S3, Self::Gcs, Self::Azure];
-
-    /// Of a URL, and what stands behind its scheme.
-    pub(crate) fn of(url: &str) -> Option<(Self, &str)> {
-        let (scheme, rest) = url.split_once("://")?;
-        let service = Self::ALL.into_iter().find(|s| s.scheme() == scheme)?;
-        Some((service, rest))
-    }
-
-    /// Of its URLs.
-    pub(crate) fn scheme(self) -> &'static str {
-        match self {
-            Self::S3 => "s3",
-            Self::Gcs => "gs",
-            Self::Azure => "az",
-        }
-    }
-
-    /// Where keys and addresses belong, which are no part of a URL.
-    fn secrets(self) -> &'static str {
-        match self {
-            Self::S3 => "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_ENDPOINT_URL",
-            Self::Gcs => {
-                "GOOGLE_APPLICATION_CREDENTIALS or GOOGLE_SERVICE_ACCOUNT, and GOOGLE_BASE_URL"
-            }
-            Self::Azure => {
-                "AZURE_STORAGE_ACCOUNT_NAME, AZURE_STORAGE_ACCOUNT_KEY and AZURE_STORAGE_ENDPOINT"
-            }
-        }
-    }
-}
 
 /// A bucket and the prefix in it.
 #[derive(Debug, PartialEq)]

@@ -4,8 +4,9 @@ use serde_json::Value;
 
 use super::{Fault, Problem, Verification};
 use crate::error::DatasetError;
+use crate::layout::group::METADATA;
 use crate::repair::listing::Listing;
-use crate::scenes::dataset::{Dataset, METADATA};
+use crate::scenes::dataset::Dataset;
 use crate::scenes::snapshot::Snapshot;
 use crate::store::objects;
 use crate::{

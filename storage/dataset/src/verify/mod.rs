@@ -5,14 +5,13 @@
 
 mod metadata;
 pub(crate) mod object;
-mod report;
+pub(crate) mod report;
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::{FutureExt, StreamExt, TryStreamExt, stream};
-use object_store::path::Path;
 
 use crate::error::DatasetError;
 use crate::layout::manifest::{Manifest, ObjectEntry, sha256_hex};
@@ -22,7 +21,7 @@ use crate::scenes::snapshot::Snapshot;
 use crate::store::objects;
 
 pub(crate) use metadata::metadata_fault;
-pub use report::{Fault, Problem, Verification, VerifyMode};
+pub use report::{Fault, Problem, Verification, VerifyMode, Watch};
 
 /// Manifests read at a time.
 const MANIFESTS: usize = 32;
@@ -30,9 +29,6 @@ const MANIFESTS: usize = 32;
 const OBJECTS: usize = 4;
 /// Scenes checked in full at a time, at most: each holds a histogram, decoded.
 const SCENES: usize = 4;
-
-/// Told how many scenes are checked, of how many.
-pub type Watch<'a> = &'a (dyn Fn(u64, u64) + Sync);
 
 /// What to check.
 #[derive(Clone, Copy)]
@@ -135,13 +131,6 @@ impl Dataset {
         }
         report.problems.sort_by(|a, b| a.object.cmp(&b.object));
         Ok(report)
-    }
-
-    /// The key of a path below the prefix, relative to it.
-    pub(crate) fn relative(&self, path: &Path) -> String {
-        let parts = path.parts().skip(self.prefix.parts().count());
-        let parts: Vec<String> = parts.map(|part| part.as_ref().to_string()).collect();
-        parts.join("/")
     }
 
     fn missing_manifests(&self, scenes: &[u64], report: &mut Verification) {
@@ -373,13 +362,4 @@ impl Verification {
         self.bytes += checked.bytes;
         self.problems.extend(checked.problems);
     }
-}
-
-pub(crate) fn manifest_scene(key: &str) -> Option<u64> {
-    let scene = key
-        .strip_prefix("manifests/")?
-        .strip_suffix(".json")?
-        .parse()
-        .ok()?;
-    (Manifest::key(scene) == key).then_some(scene)
 }

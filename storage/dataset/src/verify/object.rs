@@ -4,7 +4,7 @@ use bytes::Bytes;
 use object_store::ObjectStore;
 use object_store::path::Path;
 
-use super::{Fault, VerifyMode};
+use super::report::{Fault, VerifyMode};
 use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects;

@@ -2,6 +2,9 @@
 
 use std::fmt;
 
+/// Told how many scenes are checked, of how many.
+pub type Watch<'a> = &'a (dyn Fn(u64, u64) + Sync);
+
 /// How thoroughly to check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VerifyMode {

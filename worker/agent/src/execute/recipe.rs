@@ -4,7 +4,7 @@
 
 use picofarm_dataset::{Dataset, Recipe};
 use picofarm_proto::{
-    key::{StageKey, reprocess_stage_key},
+    key::StageKey,
     model::{OutputSettings, ReprocessTask, SceneKind, StageSpec, TaskSpec},
 };
 use serde_json::json;
@@ -43,7 +43,7 @@ pub(super) fn note_reprocess(
     task: &ReprocessTask,
     control: &Control,
 ) -> Result<(), TaskError> {
-    let key = reprocess_stage_key(&task.reprocess, &task.output.profile);
+    let key = task.reprocess.stage_key(&task.output.profile);
     let mut task = task.clone();
     if task.source.store == task.output.store {
         task.source.store = HERE.to_owned();
@@ -93,7 +93,7 @@ pub(super) fn read(
             if task.source.store == HERE {
                 task.source.store = store.to_owned();
             }
-            reprocess_stage_key(&task.reprocess, &task.output.profile)
+            task.reprocess.stage_key(&task.output.profile)
         }
         other => return Err(unusable(format!("a {} makes no scenes", other.kind()))),
     };

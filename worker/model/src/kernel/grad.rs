@@ -7,7 +7,8 @@
 
 use rayon::prelude::*;
 
-use super::conv::{ConvShape, image_band};
+use super::conv::image_band;
+use super::conv_shape::ConvShape;
 use super::plane::{Band, Grid};
 use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, Positions, outer};

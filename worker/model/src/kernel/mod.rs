@@ -10,6 +10,7 @@
 
 mod adam;
 mod conv;
+mod conv_shape;
 mod grad;
 mod norm;
 mod onehot;
@@ -21,7 +22,7 @@ mod winograd;
 mod winograd_grad;
 
 pub use adam::AdamW;
-pub use conv::ConvShape;
+pub use conv_shape::ConvShape;
 pub use norm::{BatchNorm, NormShape};
 pub use onehot::OneHotShape;
 pub use pool::PlaneShape;

@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use super::conv::ConvShape;
+use super::conv_shape::ConvShape;
 use super::plane::{Grid, split};
 use super::simd::{Kernels, LANES, Lanes, Op};
 

@@ -8,7 +8,7 @@
 
 use rayon::prelude::*;
 
-use super::conv::{BLOCK, ConvShape};
+use super::conv_shape::{BLOCK, ConvShape};
 use super::plane::{Band, Grid, Unit, split};
 use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, shifted};

@@ -7,7 +7,7 @@
 
 use rayon::prelude::*;
 
-use super::conv::ConvShape;
+use super::conv_shape::ConvShape;
 use super::scratch::Scratch;
 use super::simd::{Kernels, LANES, Lanes, Op, Positions, outer};
 

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     learner::Learner,
-    run::{Line, Position},
+    position::{Line, Position},
 };
 use crate::{
     ModelError,

@@ -9,7 +9,7 @@ use std::{
     thread,
 };
 
-use super::{Plan, order, run::Position};
+use super::{Plan, order, position::Position};
 use crate::{
     ModelError,
     input::{Batch, Visit, example},

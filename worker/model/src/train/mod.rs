@@ -5,6 +5,7 @@ mod learner;
 mod load;
 mod loss;
 mod order;
+mod position;
 mod run;
 mod schedule;
 
@@ -14,7 +15,8 @@ pub use checkpoint::left_by;
 pub use learner::{Gradients, Learner, predict};
 pub use load::{Guide, Loading};
 pub use picofarm_settings::Schedule;
-pub use run::{Control, Ended, Event, Line, Position, Sources, Trained, Training};
+pub use position::{Line, Position};
+pub use run::{Control, Ended, Event, Sources, Trained, Training};
 pub use schedule::Pace;
 
 use crate::{ModelError, input::Question, net::NetSpec};

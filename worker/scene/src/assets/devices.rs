@@ -2,7 +2,7 @@
 
 use crate::{Affine, Mesh, Vec3, rng::Rng, shape::Shape};
 
-use super::parametric::{board, bright, linen, plastic};
+use super::materials::{board, bright, linen, plastic};
 
 pub(super) fn tv(rng: &mut Rng) -> Mesh {
     let mut shape = Shape::new("tv");

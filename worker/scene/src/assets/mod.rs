@@ -5,6 +5,7 @@ mod category;
 mod devices;
 mod folder;
 mod install;
+mod materials;
 mod obj;
 mod parametric;
 mod small;

@@ -4,7 +4,7 @@ use std::f32::consts::TAU;
 
 use crate::{Affine, Mesh, Vec3, rng::Rng, shape::Shape};
 
-use super::parametric::{board, bright, ceramic, cloth, leaf, linen, plastic, wood};
+use super::materials::{board, bright, ceramic, cloth, leaf, linen, plastic, wood};
 
 pub(super) fn table_lamp(rng: &mut Rng) -> Mesh {
     let mut shape = Shape::new("lamp");

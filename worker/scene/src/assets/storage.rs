@@ -3,7 +3,7 @@
 use crate::{Mesh, rng::Rng, shape::Shape};
 
 use super::{
-    parametric::{board, bright, ceramic, paint, plastic, wood},
+    materials::{board, bright, ceramic, paint, plastic, wood},
     upholstery::legs,
 };
 

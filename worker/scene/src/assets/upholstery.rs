@@ -2,7 +2,7 @@
 
 use crate::{Affine, Mesh, Vec3, rng::Rng, shape::Shape};
 
-use super::parametric::{board, cloth, linen, plastic, wood};
+use super::materials::{board, cloth, linen, plastic, wood};
 
 /// Turn about x by `angle` (positive leans the top back, towards −z), then move.
 fn leaning(angle: f32, at: Vec3) -> Affine {

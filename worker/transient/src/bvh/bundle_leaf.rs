@@ -2,9 +2,9 @@
 
 use super::{
     Bvh, Pack,
-    bundle::{MOST, Rays},
     lanes::Lanes,
     last_fill, packs,
+    rays::{MOST, Rays},
 };
 
 impl Rays {

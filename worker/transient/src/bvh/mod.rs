@@ -11,6 +11,7 @@ mod bundle_leaf;
 mod lanes;
 mod plan;
 mod pyramid;
+mod rays;
 mod simd;
 mod traverse;
 

@@ -6,7 +6,7 @@
 //! errs by less than 9 units of 2⁻²³ in relation to each coordinate of the point where the ray meets the
 //! box; the margins here are about twice that, and the test itself adds less than 4 units.
 
-use super::{Node, bundle::Rays, lanes::Lanes};
+use super::{Node, lanes::Lanes, rays::Rays};
 
 /// Relative margin: 17 units of 2⁻²³.
 const MARGIN: f32 = 2e-6;

@@ -6,7 +6,9 @@ use super::{ArrivalSink, Effort, Sharing};
 use crate::{
     film::Film,
     rng::Rng,
-    walk::{Scratch, Sink, Vertex, Walk},
+    sink::Sink,
+    vertex::Vertex,
+    walk::{Scratch, Walk},
     world::lift,
 };
 

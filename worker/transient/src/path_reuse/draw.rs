@@ -8,9 +8,11 @@ use super::{BEYOND, Effort, GLOSSY, Shared, Sharing};
 use crate::{
     bsdf::{Surface, frame},
     ellipsoid::Patches,
-    film::{Film, PixelSink},
+    film::Film,
     rng::Rng,
-    walk::{ALL, Lights, Scratch, Vertex, Walk},
+    sink::PixelSink,
+    vertex::Vertex,
+    walk::{ALL, Lights, Scratch, Walk},
     world::lift,
 };
 
@@ -33,7 +35,7 @@ impl Sharing {
             stack,
             ..
         } = scratch;
-        vertices.fill_beyond((walk, caustics), count, rng, stack);
+        caustics.fill(vertices, &walk.surroundings(), count, rng, stack);
         for (v, k) in &self.gathers {
             let mut sink = PixelSink {
                 film,
@@ -78,7 +80,7 @@ impl Sharing {
             else {
                 continue;
             };
-            walk.choose_lobe(rng, &mut next.hit);
+            next.hit.choose_lobe(rng);
             if next.hit.surface.is_black() {
                 continue;
             }
@@ -116,7 +118,7 @@ impl Sharing {
                 .closest(&mut scratch.stack, lift(e.p, e.n), w)
                 .filter(|_| weight > 0.0);
             let Some(mut hit) = hit else { continue };
-            walk.choose_lobe(rng, &mut hit);
+            hit.choose_lobe(rng);
             if !hit.surface.is_black() && hit.surface.diffuse() {
                 self.shared.push(Shared {
                     hit,
@@ -144,7 +146,7 @@ impl Sharing {
             let Some(mut hit) = self.shells.draw(place, at, rng) else {
                 continue;
             };
-            walk.choose_lobe(rng, &mut hit);
+            hit.choose_lobe(rng);
             if hit.surface.diffuse() {
                 self.shared.push(Shared {
                     hit,
@@ -235,7 +237,7 @@ pub(super) fn gather_point(
         open_before: false,
     };
     loop {
-        walk.choose_lobe(rng, &mut vertex.hit);
+        vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
             walk.connect(rng, &vertex, None, ALL, scratch, sink);
         }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::tile::Region;
+use super::region::Region;
 use crate::api::ErrorEstimate;
 
 /// Bins on either side over which the variance of the 3+ part and of the two-bounce part is pooled.

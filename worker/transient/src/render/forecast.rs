@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::{
     FIRST_PASSES, GOAL, MAX_PASSES,
     error::{Stat, median_after, passes_for, relative_median},
-    tile::{Bench, Done, Frame, Order, Region},
+    region::Region,
+    tile::{Bench, Done, Frame, Order},
 };
 use crate::{
     api::{Budget, Plan},

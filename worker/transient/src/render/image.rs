@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     error::Stat,
-    tile::{Bench, Done, Frame, Order, Region},
+    region::Region,
+    tile::{Bench, Done, Frame, Order},
 };
 use crate::api::{Progress, RenderError};
 

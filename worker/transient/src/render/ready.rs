@@ -83,8 +83,10 @@ pub(super) fn prepare<R>(
     };
     let caustics = match strategy.caustics {
         Some(false) => None,
-        wanted => Caustics::find(&world, &emitters, stop)
-            .filter(|c| walk.max_bounces >= 3 && (wanted.is_some() || c.pay(&walk, settings.seed))),
+        wanted => Caustics::find(&world, &emitters, stop).filter(|c| {
+            walk.max_bounces >= 3
+                && (wanted.is_some() || c.pay(&walk.surroundings(), settings.seed))
+        }),
     };
     stop.check()?;
     walk.caustics = caustics.as_ref();

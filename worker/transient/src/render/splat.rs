@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::{
     error::{MULTI_REACH, Stat, estimate, pool},
     image::{Image, Watch, zeros},
-    tile::{Frame, Region},
+    region::Region,
+    tile::Frame,
 };
 use crate::{
     api::{ErrorEstimate, RenderError, Stop},
@@ -67,7 +68,7 @@ impl Splats {
         wave: u32,
         watch: &Watch,
     ) -> Result<u64, RenderError> {
-        let walk = &frame.walk;
+        let within = frame.walk.surroundings();
         let pixels = f64::from(frame.width) * f64::from(frame.height);
         let count = (pixels * PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
         let mut rays = 0;
@@ -76,7 +77,7 @@ impl Splats {
             let found: Vec<(Vec<Splat>, u64)> = (0..count.div_ceil(CHUNK))
                 .into_par_iter()
                 .map_init(
-                    || walk.world.bvh.stack(),
+                    || within.world.bvh.stack(),
                     |stack, chunk| {
                         if !watch.go_on() {
                             return (vec![], 0);
@@ -85,8 +86,8 @@ impl Splats {
                         let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
                         let paths = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
                         let splats = paths.filter_map(|l| {
-                            let z = caustics.trace(walk, (l, count), &mut rng, stack)?;
-                            splat(walk, frame.film, &z, stack)
+                            let z = caustics.trace(&within, (l, count), &mut rng, stack)?;
+                            splat(within.world, frame.film, &z, stack)
                         });
                         (splats.collect(), stack.rays - before)
                     },

@@ -1,7 +1,10 @@
 //! One tile of the image, from first pass to finished histograms. A tile is what one thread works on: its
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
-use super::error::{MULTI_REACH, TWO_REACH, pool, shut_out};
+use super::{
+    error::{MULTI_REACH, TWO_REACH, pool, shut_out},
+    region::Region,
+};
 use crate::{
     api::Overflow,
     film::{Blocks, Film},
@@ -23,21 +26,6 @@ pub(super) struct Frame<'a> {
     pub height: u32,
     /// The parts are wanted.
     pub split: bool,
-}
-
-/// A rectangle of pixels.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Region {
-    pub row: u32,
-    pub col: u32,
-    pub rows: u32,
-    pub cols: u32,
-}
-
-impl Region {
-    pub fn pixels(&self) -> usize {
-        self.rows as usize * self.cols as usize
-    }
 }
 
 /// Passes to do: the first one's number, and how many.

@@ -2,10 +2,12 @@
 
 use std::f32::consts::PI;
 
-use super::{ALL, Lights, Scratch, Sink, Step, Vertex, Walk};
+use super::{ALL, Lights, Scratch, Step, Walk};
 use crate::{
     light_vertices,
     rng::Rng,
+    sink::Sink,
+    vertex::Vertex,
     world::{Hit, lift},
 };
 

@@ -2,8 +2,8 @@
 
 use object_store::client::{HttpError, HttpErrorKind};
 
-use super::super::failure::Failure;
-use crate::store::Service;
+use crate::store::account::Failure;
+use crate::store::service::Service;
 
 /// An error of an object store in words, from it and its causes; `None` for an error of another kind.
 pub(in crate::store) fn failure(
@@ -216,12 +216,12 @@ mod tests {
             store: "S3",
             source: words.into(),
         };
-        let failure = crate::store::Failure::of(&error, Some(Service::S3));
+        let failure = Failure::of(&error, Some(Service::S3));
         assert_eq!(
             failure.account,
             "http://127.0.0.1:9 answered 400 InvalidToken: The token is malformed."
         );
         assert!(failure.hint.unwrap().contains("AWS_SESSION_TOKEN"));
-        assert!(!crate::store::no_bucket(&error));
+        assert!(!crate::store::failure::no_bucket(&error));
     }
 }

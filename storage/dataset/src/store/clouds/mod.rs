@@ -2,7 +2,7 @@
 
 mod azure;
 mod client;
-mod failure;
+pub(super) mod failure;
 mod gcs;
 mod limited;
 mod s3;
@@ -12,10 +12,9 @@ use std::sync::Arc;
 use object_store::ObjectStore;
 use object_store::limit::LimitStore;
 
-use super::place::{self, Place, Service};
+use super::place::{self, Place};
+use super::service::Service;
 use crate::error::DatasetError;
-
-pub(super) use failure::{failure, no_bucket};
 
 use client::{CONCURRENCY, Settings};
 use limited::Limited;

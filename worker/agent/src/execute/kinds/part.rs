@@ -33,7 +33,7 @@ impl RunTask for PartTask {
             );
             return Err(TaskError::User(what));
         };
-        let (scene, index) = spec.split(task.index);
+        let (scene, index) = spec.division().split(task.index);
         let key = task_key(&stage, scene);
         let dataset = stores.open(&spec.whole, control)?;
         let done = |bytes, adopted| {

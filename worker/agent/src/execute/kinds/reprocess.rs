@@ -9,7 +9,7 @@ use picofarm_dataset::{
     Provenance, Quantity, Subsets,
 };
 use picofarm_proto::{
-    key::{TaskKey, derived_key, reprocess_stage_key},
+    key::{TaskKey, derived_key},
     model::{
         Histogram, ReprocessSettings, ReprocessTask, SourceSettings, SpecError, TaskKind, TaskSpec,
     },
@@ -162,7 +162,7 @@ impl Made {
                 found.provenance.task_key
             ))
         })?;
-        let key = derived_key(&reprocess_stage_key(settings, profile), &source_key);
+        let key = derived_key(&settings.stage_key(profile), &source_key);
         Ok(Self {
             source,
             found,

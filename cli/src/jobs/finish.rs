@@ -1,0 +1,18 @@
+//! How a job ended that was followed.
+
+use picofarm_proto::model::JobStatus;
+
+use super::dark;
+use crate::{client::Client, describe::describe, error::Result, follow::verdict, output::Output};
+
+/// Tells how it ended.
+///
+/// # Errors
+/// It did not end well.
+pub async fn finish(client: &mut Client, status: &JobStatus, output: Output) -> Result<()> {
+    output.result(status, || describe(status));
+    if let Some(warning) = dark::warning(client, status).await {
+        output.warn(warning);
+    }
+    verdict(status)
+}

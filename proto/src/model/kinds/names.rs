@@ -1,0 +1,28 @@
+//! Names of models and splits.
+
+use crate::model::spec_error::SpecError;
+
+/// Checks the name of a model: it is a folder's.
+///
+/// # Errors
+/// [`SpecError`] naming the field.
+pub fn check_model(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if (1..=128).contains(&name.len()) && !name.starts_with('.') && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!(
+        "{name:?} must be up to 128 letters, digits, '-', '_' and '.', and not begin with '.'"
+    );
+    Err(SpecError::new(field, what))
+}
+
+/// Checks the name of a split.
+pub(super) fn check_split(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+    if (1..=64).contains(&name.len()) && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!("{name:?} must be up to 64 letters, digits, '-' and '_'");
+    Err(SpecError::new(field, what))
+}

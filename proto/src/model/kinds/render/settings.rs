@@ -1,0 +1,231 @@
+//! How scenes are rendered: the settings, how a job file says them, and the checks.
+
+use std::collections::BTreeMap;
+
+use picofarm_settings::{Budget, Choice, Gate, Strategy};
+use serde::{Deserialize, Serialize};
+
+use crate::model::spec_error::{SpecError, within};
+
+/// How scenes are rendered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "RenderSettingsText")]
+pub struct RenderSettings {
+    /// Image width and height in pixels.
+    pub resolution: u32,
+    /// ℓ_min, metres of optical path.
+    pub gate_start_m: f64,
+    /// Δ, metres.
+    pub bin_width_m: f64,
+    /// Number of bins.
+    pub bins: u32,
+    /// Multi-bounce work: `samples = N` (paths per pixel) or `error = 0.1` (target).
+    #[serde(flatten)]
+    pub budget: Budget,
+    /// Longest path in bounces; 0 = until the gate ends.
+    pub max_bounces: u32,
+    /// Version of the renderer, part of every task key; filled in at submission where left out.
+    pub renderer: String,
+    /// Subsets of the 10×10 grid of spots that get histograms of their own, from the same rays: 4 and 25, ascending.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub subsets: Vec<u32>,
+    /// Each spot gets a histogram of its own, from the same rays.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub per_spot: bool,
+    /// The renderer's ways of finding light that are chosen by hand; the others are left to the renderer.
+    #[serde(skip_serializing_if = "Strategy::is_default")]
+    pub strategy: Strategy,
+}
+
+impl Default for RenderSettings {
+    /// The measurement contract's default gate: [1.0, 25.45584) m in 637 bins of 0.0384 m, 256×256 px.
+    fn default() -> Self {
+        Self {
+            resolution: 256,
+            gate_start_m: 1.0,
+            bin_width_m: 0.0384,
+            bins: 637,
+            budget: Budget::Samples(32),
+            max_bounces: 0,
+            renderer: String::new(),
+            subsets: vec![],
+            per_spot: false,
+            strategy: Strategy::default(),
+        }
+    }
+}
+
+impl RenderSettings {
+    /// The recorded interval.
+    pub fn gate(&self) -> Gate {
+        Gate {
+            start_m: self.gate_start_m,
+            bin_width_m: self.bin_width_m,
+            bins: self.bins,
+        }
+    }
+}
+
+impl RenderSettings {
+    /// The subsets of the 10×10 grid of spots there are.
+    pub const SUBSETS: [u32; 2] = [4, 25];
+
+    /// Most pixels of an image's side.
+    pub const MAX_SIDE: u32 = 4096;
+
+    /// Checks every field against its limits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the first field that cannot be used.
+    pub fn check(&self) -> Result<(), SpecError> {
+        let fail = |field: &str, what: String| Err(SpecError::new(format!("render.{field}"), what));
+        within(
+            "render.resolution",
+            self.resolution,
+            (1, Self::MAX_SIDE),
+            "pixels a side",
+        )?;
+        // Light that has gone 10 km comes from no room.
+        let start = "metres of optical path (there and back); 1 ns of delay is 0.3 m";
+        within("render.gate_start_m", self.gate_start_m, (0.0, 1e4), start)?;
+        // From a hundredth of a picosecond to 33 ns: both ends are beyond any detector. Picoseconds taken for metres are not
+        // in it.
+        let width = "metres of optical path; 1 ps is 0.0002998 m, so 128 ps are 0.0384";
+        within("render.bin_width_m", self.bin_width_m, (1e-6, 10.0), width)?;
+        within("render.bins", self.bins, (1, 65_536), "bins")?;
+        if let Some(n) = self.subsets.iter().find(|n| !Self::SUBSETS.contains(n)) {
+            return fail(
+                "subsets",
+                format!(
+                    "{n} is no subset of the 10x10 grid of spots; there are {:?}",
+                    Self::SUBSETS
+                ),
+            );
+        }
+        if !self.subsets.is_sorted_by(|a, b| a < b) {
+            return fail(
+                "subsets",
+                format!("{:?} must name each once, ascending", self.subsets),
+            );
+        }
+        match self.budget {
+            Budget::Samples(n) => {
+                let unit = "paths a pixel; two at least, to estimate their error";
+                within("render.samples", n, (2, 1_048_576), unit)?;
+            }
+            Budget::Error(e) => {
+                check_share(e).map_err(|what| SpecError::new("render.error", what))?
+            }
+        }
+        match self.max_bounces {
+            1 => fail(
+                "max_bounces",
+                "1 keeps nothing but the spots; use 0 (all) or at least 2".into(),
+            ),
+            n => within("render.max_bounces", n, (0, 1_000_000), "bounces; 0 is all"),
+        }
+    }
+}
+
+/// `[render]` as it is written: every field known, every other one refused.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RenderSettingsText {
+    resolution: Option<u32>,
+    gate_start_m: Option<f64>,
+    bin_width_m: Option<f64>,
+    bins: Option<u32>,
+    samples: Option<u32>,
+    error: Option<Share>,
+    max_bounces: Option<u32>,
+    renderer: Option<String>,
+    #[serde(default)]
+    subsets: Vec<u32>,
+    #[serde(default)]
+    per_spot: bool,
+    #[serde(default)]
+    strategy: BTreeMap<String, Choice>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Share {
+    Number(f64),
+    Text(String),
+}
+
+/// Reads "10%" or "0.1" as 0.1.
+///
+/// # Errors
+/// A message that says what was expected.
+pub fn parse_share(text: &str) -> Result<f64, String> {
+    let (number, scale) = match text.trim().strip_suffix('%') {
+        Some(percent) => (percent, 0.01),
+        None => (text.trim(), 1.0),
+    };
+    let value = number.trim().parse::<f64>();
+    let value = value.map_err(|_| format!("{text:?} is not a share; write \"10%\" or 0.1"))?;
+    let share = value * scale;
+    check_share(share).map(|()| share)
+}
+
+/// Checks the error that a render is to reach: an error of the whole is no error, and nothing reaches one of nothing.
+///
+/// # Errors
+/// A message that says what was expected.
+fn check_share(share: f64) -> Result<(), String> {
+    if (1e-6..1.0).contains(&share) {
+        return Ok(());
+    }
+    let meant = match share {
+        1.0..=100.0 => format!("; did you mean \"{share}%\"?"),
+        _ => String::new(),
+    };
+    Err(format!(
+        "{share} is {} %, and lies outside 0.0001 %..100 %; write \"10%\" or 0.1{meant}",
+        share * 100.0
+    ))
+}
+
+impl TryFrom<RenderSettingsText> for RenderSettings {
+    type Error = SpecError;
+
+    fn try_from(text: RenderSettingsText) -> Result<Self, SpecError> {
+        let default = RenderSettings::default();
+        let budget = match (text.samples, text.error) {
+            (Some(_), Some(_)) => {
+                return Err(SpecError::new(
+                    "render.error",
+                    "samples and error exclude each other; keep one",
+                ));
+            }
+            (Some(n), None) => Budget::Samples(n),
+            (None, Some(Share::Number(e))) => Budget::Error(e),
+            (None, Some(Share::Text(e))) => {
+                Budget::Error(parse_share(&e).map_err(|m| SpecError::new("render.error", m))?)
+            }
+            (None, None) => default.budget,
+        };
+        let mut strategy = Strategy::default();
+        for (name, choice) in text.strategy {
+            strategy
+                .choose(&name, choice)
+                .map_err(|what| SpecError::new("render.strategy", what))?;
+        }
+        // The order in which somebody names them shall not make other results of them.
+        let mut subsets = text.subsets;
+        subsets.sort_unstable();
+        Ok(RenderSettings {
+            resolution: text.resolution.unwrap_or(default.resolution),
+            gate_start_m: text.gate_start_m.unwrap_or(default.gate_start_m),
+            bin_width_m: text.bin_width_m.unwrap_or(default.bin_width_m),
+            bins: text.bins.unwrap_or(default.bins),
+            budget,
+            max_bounces: text.max_bounces.unwrap_or(default.max_bounces),
+            renderer: text.renderer.unwrap_or_default(),
+            subsets,
+            per_spot: text.per_spot,
+            strategy,
+        })
+    }
+}

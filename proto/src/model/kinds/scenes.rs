@@ -1,0 +1,279 @@
+//! The scenes of a stage that renders or generates: where they come from, how a job file says it, and the checks.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::{
+    model::{
+        limits::check_count,
+        spec_error::{SpecError, within},
+    },
+    show,
+};
+
+/// Names of furniture that stand for whatever a machine has of it.
+const LIBRARIES: [&str; 5] = ["", "auto", "parametric", "sweethome3d", "gltf"];
+/// The kinds of scenes.
+const KINDS: [&str; 3] = ["furnished", "primitive", "files"];
+
+/// The scenes of a job: one task each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "SceneSourceText")]
+pub struct SceneSource {
+    /// Where scenes come from.
+    #[serde(flatten)]
+    pub kind: SceneKind,
+    /// Number of scenes; with `kind = "files"`, the number of files (may be left out).
+    pub count: u64,
+    /// Seed (default 0); scene i derives its own from (seed, i).
+    pub seed: u64,
+    /// Horizontal field of view in degrees (generated scenes; default 90).
+    pub fov_deg: f64,
+    /// Laser spots: 1, 4, 16, 25 (default) or 100 (generated scenes, and files without a laser).
+    pub spots: u32,
+}
+
+/// Where scenes come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum SceneKind {
+    /// Furnished rooms.
+    Furnished {
+        /// `parametric`, `sweethome3d`, `auto` (default: whichever is installed; resolved before
+        /// submission), or a resolved fingerprint.
+        assets: String,
+        /// At least this many mirrors a room (default 1).
+        min_specular: u32,
+    },
+    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale.
+    Primitive,
+    /// Scene files (.glb, .gltf, .json), one scene each.
+    Files {
+        /// The files; in a job file, plain paths.
+        files: Vec<SceneFile>,
+        /// Index of the first of them: 0 but in a lease, which brings only its own.
+        #[serde(skip_serializing_if = "is_zero")]
+        first: u64,
+        /// Folder that holds everything the scene files name (meshes, buffers, textures); without, each scene file's own.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        root: Option<String>,
+    },
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u64) -> bool {
+    *n == 0
+}
+
+impl SceneKind {
+    /// The file of scene `index`, where scenes are files and this one is listed.
+    pub fn file(&self, index: u64) -> Option<&SceneFile> {
+        match self {
+            Self::Files { files, first, .. } => {
+                files.get(usize::try_from(index.checked_sub(*first)?).ok()?)
+            }
+            _ => None,
+        }
+    }
+}
+
+/// A scene file, pinned by its content.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "SceneFileText")]
+pub struct SceneFile {
+    /// Path as the workers see it.
+    pub path: String,
+    /// SHA-256 of the content in hexadecimal; empty until submission fills it in.
+    pub sha256: String,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum SceneFileText {
+    Path(String),
+    Pinned { path: String, sha256: String },
+}
+
+impl From<SceneFileText> for SceneFile {
+    fn from(text: SceneFileText) -> Self {
+        match text {
+            SceneFileText::Path(path) => Self {
+                path,
+                sha256: String::new(),
+            },
+            SceneFileText::Pinned { path, sha256 } => Self { path, sha256 },
+        }
+    }
+}
+
+impl SceneSource {
+    /// What shapes the scenes, but for seed, field of view and spots, as keys know it.
+    pub(super) fn shaping(&self) -> Value {
+        match &self.kind {
+            SceneKind::Furnished {
+                assets,
+                min_specular,
+            } => json!({"kind": "furnished", "assets": assets, "min_specular": min_specular}),
+            SceneKind::Primitive => json!({"kind": "primitive"}),
+            SceneKind::Files { files, .. } => json!({
+                "kind": "files",
+                "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
+            }),
+        }
+    }
+
+    /// Checks what a client must have filled in before it submits.
+    ///
+    /// # Errors
+    /// [`SpecError`] naming the field.
+    pub(in crate::model) fn check_resolved(&self) -> Result<(), SpecError> {
+        match &self.kind {
+            SceneKind::Furnished { assets, .. } if LIBRARIES.contains(&&**assets) => {
+                Err(SpecError::new(
+                    "scenes.assets",
+                    format!(
+                        "{assets:?} is not a fingerprint; the client must resolve it (e.g. to \"parametric-1\") before it submits"
+                    ),
+                ))
+            }
+            SceneKind::Files { files, .. } => match files.iter().find(|f| f.sha256.len() != 64) {
+                Some(file) => Err(SpecError::new(
+                    "scenes.files",
+                    format!(
+                        "{:?} has no SHA-256; the client must hash each file before it submits",
+                        file.path
+                    ),
+                )),
+                None => Ok(()),
+            },
+            _ => Ok(()),
+        }
+    }
+
+    /// The numbers of laser spots there are: grids of up to 10×10.
+    pub const SPOTS: [u32; 5] = [1, 4, 16, 25, 100];
+
+    pub(super) fn check(&self) -> Result<(), SpecError> {
+        check_count("scenes.count", self.count)?;
+        if let SceneKind::Files { first: 1.., .. } = &self.kind {
+            return Err(SpecError::new(
+                "scenes.first",
+                "is only for leases; remove it",
+            ));
+        }
+        if let SceneKind::Files { files, .. } = &self.kind
+            && files.len() as u64 != self.count
+        {
+            return Err(SpecError::new(
+                "scenes.count",
+                format!(
+                    "{} differs from the {} files listed; leave count out",
+                    self.count,
+                    files.len()
+                ),
+            ));
+        }
+        // What the generators can furnish: beyond, walls or furniture leave the view.
+        let degrees = "degrees from left to right";
+        within("scenes.fov_deg", self.fov_deg, (20.0, 120.0), degrees)?;
+        Self::check_spots(self.spots).map_err(|what| SpecError::new("scenes.spots", what))?;
+        match &self.kind {
+            SceneKind::Furnished { min_specular, .. } => within(
+                "scenes.min_specular",
+                *min_specular,
+                (0, 16),
+                "mirrors a room at least; more find no wall",
+            ),
+            _ => Ok(()),
+        }
+    }
+
+    /// Checks a number of laser spots: they lie on a square grid.
+    ///
+    /// # Errors
+    /// What numbers there are.
+    pub fn check_spots(spots: u32) -> Result<(), String> {
+        match Self::SPOTS.contains(&spots) {
+            true => Ok(()),
+            false => Err(format!(
+                "{spots} is no number of spots; there are grids of 1, 4, 16, 25 and 100"
+            )),
+        }
+    }
+}
+
+/// `[scenes]` as it is written: every field known, every other one refused.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SceneSourceText {
+    kind: String,
+    assets: Option<String>,
+    min_specular: Option<u32>,
+    files: Option<Vec<SceneFile>>,
+    root: Option<String>,
+    /// Only in a lease.
+    #[serde(default)]
+    first: u64,
+    count: Option<u64>,
+    #[serde(default)]
+    seed: u64,
+    fov_deg: Option<f64>,
+    spots: Option<u32>,
+}
+
+impl TryFrom<SceneSourceText> for SceneSource {
+    type Error = SpecError;
+
+    fn try_from(text: SceneSourceText) -> Result<Self, SpecError> {
+        // First: of a kind that is unknown, fields cannot be said to belong to another.
+        if !KINDS.contains(&&*text.kind) {
+            return Err(SpecError::new(
+                "scenes.kind",
+                show::unknown(&text.kind, &KINDS),
+            ));
+        }
+        let only = |field: &str, kind: &str, given: bool| {
+            if given && text.kind != kind {
+                Err(SpecError::new(
+                    format!("scenes.{field}"),
+                    format!(
+                        "belongs to kind = \"{kind}\"; remove it from kind = {:?}",
+                        text.kind
+                    ),
+                ))
+            } else {
+                Ok(())
+            }
+        };
+        only("assets", "furnished", text.assets.is_some())?;
+        only("min_specular", "furnished", text.min_specular.is_some())?;
+        only("files", "files", text.files.is_some())?;
+        only("root", "files", text.root.is_some())?;
+        only("first", "files", text.first != 0)?;
+        let mut count = text.count;
+        let kind = match text.kind.as_str() {
+            "furnished" => SceneKind::Furnished {
+                assets: text.assets.unwrap_or_else(|| "auto".into()),
+                min_specular: text.min_specular.unwrap_or(1),
+            },
+            "primitive" => SceneKind::Primitive,
+            _ => {
+                let files = text.files.unwrap_or_default();
+                count = count.or(Some(files.len() as u64));
+                SceneKind::Files {
+                    files,
+                    first: text.first,
+                    root: text.root,
+                }
+            }
+        };
+        Ok(SceneSource {
+            kind,
+            count: count
+                .ok_or_else(|| SpecError::new("scenes.count", "is missing; say how many scenes"))?,
+            seed: text.seed,
+            fov_deg: text.fov_deg.unwrap_or(90.0),
+            spots: text.spots.unwrap_or(25),
+        })
+    }
+}

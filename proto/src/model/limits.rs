@@ -1,0 +1,165 @@
+//! How large a job may be, when it is given up, and what its workers must have.
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    bounds,
+    spec_error::{SpecError, within},
+};
+
+/// Most tasks in one job.
+pub const MAX_TASKS: u64 = 100_000_000;
+/// Most stages in one job.
+pub const MAX_STAGES: usize = 1_000;
+
+pub(super) fn check_count(field: &str, count: u64) -> Result<(), SpecError> {
+    within(field, count, (1, MAX_TASKS), "scenes")
+}
+
+/// When a task, or the job, is given up. Interruptions are free and have no limit.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Failures of the task itself before it is dead.
+    pub max_failures: u32,
+    /// Losses of the worker while it ran the task before it is dead.
+    pub max_crashes: u32,
+    /// Workers that may run the job at a time; 0 = as many as there are.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub max_workers: u32,
+    /// What is not done by then (RFC 3339, e.g. `2026-12-01T18:00:00Z`) is cancelled; empty = never.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub deadline: String,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u32) -> bool {
+    *n == 0
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            max_failures: 3,
+            max_crashes: 3,
+            max_workers: 0,
+            deadline: String::new(),
+        }
+    }
+}
+
+impl Limits {
+    /// The deadline as Unix time, milliseconds.
+    ///
+    /// # Errors
+    /// It is no time.
+    pub fn deadline_ms(&self) -> Result<Option<i64>, SpecError> {
+        if self.deadline.is_empty() {
+            return Ok(None);
+        }
+        let time = humantime::parse_rfc3339(&self.deadline);
+        let since = time.map(|t| t.duration_since(std::time::UNIX_EPOCH));
+        match since {
+            Ok(Ok(since)) => Ok(i64::try_from(since.as_millis()).ok()),
+            _ => Err(SpecError::new(
+                "limits.deadline",
+                format!(
+                    "{:?} is no time such as \"2026-12-01T18:00:00Z\"",
+                    self.deadline
+                ),
+            )),
+        }
+    }
+
+    pub(super) fn check(&self) -> Result<(), SpecError> {
+        // More attempts than these are an endless loop.
+        for (field, value) in [
+            ("limits.max_failures", self.max_failures),
+            ("limits.max_crashes", self.max_crashes),
+        ] {
+            let unit = "attempts of a task; 1 gives it up at the first";
+            within(field, value, (1, 1_000_000), unit)?;
+        }
+        let unit = "workers at a time; 0 is as many as there are";
+        within("limits.max_workers", self.max_workers, (0, 1_000_000), unit)?;
+        self.deadline_ms().map(|_| ())
+    }
+}
+
+/// What a worker must have to run a stage's tasks. A worker runs one task at a time with all that it has.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Resources {
+    /// CPU cores.
+    pub cores: u32,
+    /// Memory in GiB (2^30 bytes).
+    pub memory_gib: f64,
+    /// Graphics processors.
+    pub gpus: u32,
+    /// Labels, each of which the worker must have been given.
+    pub labels: Vec<String>,
+}
+
+impl Resources {
+    /// Whether nothing is asked for.
+    pub fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+
+    pub(super) fn check(&self) -> Result<(), SpecError> {
+        within(
+            "resources.cores",
+            self.cores,
+            (0, 65_536),
+            "cores of one worker",
+        )?;
+        let gib = "GiB of one worker; 1 GiB is 1.07 GB";
+        within("resources.memory_gib", self.memory_gib, (0.0, 1e6), gib)?;
+        within(
+            "resources.gpus",
+            self.gpus,
+            (0, 1024),
+            "graphics processors of one worker",
+        )?;
+        if self.labels.len() > bounds::LIST {
+            let what = format!(
+                "{} labels; at most {} are allowed",
+                self.labels.len(),
+                bounds::LIST
+            );
+            return Err(SpecError::new("resources.labels", what));
+        }
+        for label in &self.labels {
+            check_label(label).map_err(|what| SpecError::new("resources.labels", what))?;
+        }
+        Ok(())
+    }
+}
+
+/// Checks a label: it stands between commas and in messages.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_label(label: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.=".contains(c);
+    if label.is_empty() || label.len() > 64 || !label.chars().all(plain) {
+        return Err(format!(
+            "{label:?} must be up to 64 letters, digits, '-', '_', '.' and '='"
+        ));
+    }
+    Ok(())
+}
+
+/// Checks the name of a project: it stands between commas and in messages.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_project(name: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if name.is_empty() || name.len() > 64 || !name.chars().all(plain) {
+        return Err(format!(
+            "{name:?} is not the name of a project: expected up to 64 letters, digits, '-', '_' and '.'"
+        ));
+    }
+    Ok(())
+}

@@ -1,0 +1,65 @@
+//! The stages that one with `matrix = { … }` stands for: one of each combination of values.
+
+use serde_json::{Map, Value};
+
+use super::{
+    limits::MAX_STAGES,
+    spec_error::SpecError,
+    substitute::{plain, substitute},
+};
+
+/// The stages that a stage with a matrix stands for; one without stands for itself.
+pub(super) fn instances(mut stage: Value) -> Result<Vec<Value>, SpecError> {
+    let Some(matrix) = stage.as_object_mut().and_then(|s| s.remove("matrix")) else {
+        return Ok(vec![stage]);
+    };
+    let fail = |what: &str| Err(SpecError::new("stage.matrix", what));
+    let Value::Object(matrix) = matrix else {
+        return fail("must be a table of lists, e.g. { dark = [0.0, 0.1] }");
+    };
+    let mut parameters: Vec<(String, Value)> = matrix.into_iter().collect();
+    parameters.sort_by(|a, b| a.0.cmp(&b.0));
+    let mut choices: Vec<Vec<(String, Value)>> = vec![vec![]];
+    for (name, values) in parameters {
+        let Some(values) = values.as_array().filter(|v| !v.is_empty()) else {
+            return fail(&format!("{name} must be a list of at least one value"));
+        };
+        if choices.len() * values.len() > MAX_STAGES {
+            return fail(&format!("stands for more than {MAX_STAGES} stages"));
+        }
+        let with = |choice: &Vec<(String, Value)>, value: &Value| {
+            let mut choice = choice.clone();
+            choice.push((name.clone(), value.clone()));
+            choice
+        };
+        choices = choices
+            .iter()
+            .flat_map(|choice| values.iter().map(|value| with(choice, value)))
+            .collect();
+    }
+    let instance = |choice: Vec<(String, Value)>| {
+        let mut stage = stage.clone();
+        let values: Vec<String> = choice.iter().map(|(_, value)| plain(value)).collect();
+        if let Some(table) = stage.as_object_mut() {
+            name_instance(table, &values.join(","));
+        }
+        for (name, value) in &choice {
+            substitute(&mut stage, &format!("{{{name}}}"), value);
+        }
+        stage
+    };
+    Ok(choices.into_iter().map(instance).collect())
+}
+
+/// `name` becomes `name[values]`, unless it names its values itself.
+fn name_instance(stage: &mut Map<String, Value>, values: &str) {
+    let kind = stage
+        .get("kind")
+        .and_then(Value::as_str)
+        .unwrap_or("render");
+    let name = stage.get("name").and_then(Value::as_str).unwrap_or(kind);
+    if !name.contains('{') {
+        let name = format!("{name}[{values}]");
+        stage.insert("name".into(), Value::String(name));
+    }
+}

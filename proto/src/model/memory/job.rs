@@ -1,0 +1,71 @@
+//! What the tasks of a job's stages take, from the stages before them.
+
+use super::{known::Known, network::Network, shape::Shape};
+use crate::model::{JobSpec, StageSpec, TaskSpec};
+
+/// Bytes that a task takes at most, in a process of its own; `None` where that depends on a data set of which nothing is
+/// known here.
+///
+/// | kind | beside the program (70 MB) and the store (20 MB); H = 4·pixels·bins |
+/// | --- | --- |
+/// | render | H a histogram, truth (260 + spots a pixel), tiles of each thread; and what is more: .6 of the light paths' sums, or the coded result (.45·H) |
+/// | render of parts | the same, and all parts (as much as the image) |
+/// | part | the image's and truth's, of the range of tiles; the sums over light paths, and both once more as a message |
+/// | generate | nothing that grows with pixels: its scene is counted with the program |
+/// | import | 3.2·H |
+/// | reprocess | 2.6·H; from single spots 4.6·H |
+/// | split | nothing that grows with pixels |
+/// | promote | twice the weights |
+/// | reconstruct | 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H |
+/// | export | 3.5·H |
+/// | train, evaluate, infer, report | see [`Network`]; and two scenes |
+pub fn peak_bytes(task: &TaskSpec, known: &Known, threads: u32) -> Option<u64> {
+    let estimate = task.memory(known, threads)?;
+    // Casting saturates.
+    Some(estimate as u64)
+}
+
+impl JobSpec {
+    /// What is known of what the stage at a position reads: from the stages before it, which make it.
+    pub fn known(&self, stage: usize) -> Known {
+        let before = &self.stages[..stage.min(self.stages.len())];
+        let Some(spec) = self.stages.get(stage) else {
+            return Known::default();
+        };
+        Known {
+            source: spec
+                .task
+                .reads()
+                .and_then(|source| made(before, (&source.store, &source.dataset))),
+            networks: networks(before, spec),
+        }
+    }
+}
+
+/// The scenes that a stage puts into a place.
+pub(super) fn made(before: &[StageSpec], place: (&String, &String)) -> Option<Shape> {
+    let at = before.iter().rposition(|s| s.task.makes() == Some(place))?;
+    let source = before[at].task.reads();
+    let source = source.and_then(|source| made(&before[..at], (&source.store, &source.dataset)));
+    before[at].task.shape(source)
+}
+
+/// The networks that stages train of which another one reads the models.
+fn networks(before: &[StageSpec], spec: &StageSpec) -> Vec<Network> {
+    let Some(store) = spec.task.shelf() else {
+        return Vec::new();
+    };
+    let trained = |model: &String| {
+        let at = before
+            .iter()
+            .rposition(|s| s.task.trains() == Some((store, model)))?;
+        let source = before[at].task.reads()?;
+        let scenes = made(&before[..at], (&source.store, &source.dataset))?;
+        before[at].task.network(&scenes)
+    };
+    let models = spec.task.models();
+    models
+        .iter()
+        .filter_map(|(_, model)| trained(model))
+        .collect()
+}

@@ -1,0 +1,74 @@
+//! What a render keeps in memory.
+
+use super::shape::{BIN, PROGRAM, STORE, Shape};
+
+/// Share of a histogram's bytes that its coded form takes in memory while it is made, on average over scenes.
+const CODED: f64 = 0.45;
+/// Pixels from which an image has large tiles, channels from which it has small ones again, and pixels of both tiles.
+const LARGE: f64 = 65_536.0;
+const MANY: f64 = 5.0;
+const LARGE_TILE: f64 = 1024.0;
+const SMALL_TILE: f64 = 256.0;
+/// Sums that a thread keeps of each slot of its tile: of all channels, and of the first alone.
+const TILE_SUMS: (f64, f64) = (2.0, 6.0);
+/// Share of the sums over light paths that is counted: not every scene has mirrors that need them, and only the scene
+/// tells.
+pub(in crate::model) const LIGHT_PATHS: f64 = 0.6;
+
+/// What a render keeps, beside its scene.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rendering {
+    /// The image and its gate.
+    pub shape: Shape,
+    /// Histograms of a pixel: that of all spots, and those of groups of them.
+    pub histograms: u32,
+    /// The parts of the histogram are kept with their errors.
+    pub split: bool,
+    /// Light paths may be drawn into the image, where mirrors call for them.
+    pub light_paths: bool,
+    /// Threads that render.
+    pub threads: u32,
+}
+
+impl Rendering {
+    fn slots(&self) -> f64 {
+        BIN * (f64::from(self.shape.bins) + 2.0)
+    }
+
+    /// Histograms of the image, in bytes: 4·pixels·bins for each, and for the five parts of [`Rendering::split`].
+    pub(in crate::model) fn images(&self) -> f64 {
+        let parts = if self.split { 5.0 } else { 0.0 };
+        self.shape.histogram() * (f64::from(self.histograms) + parts)
+    }
+
+    /// What threads keep of the tiles that they work on.
+    pub(in crate::model) fn tiles(&self) -> f64 {
+        let (pixels, channels) = (self.shape.pixels(), f64::from(self.histograms));
+        let large = pixels >= LARGE && channels < MANY;
+        let tile = if large { LARGE_TILE } else { SMALL_TILE };
+        let sums = TILE_SUMS.0 * channels + TILE_SUMS.1;
+        tile.min(pixels) * self.slots() * sums * f64::from(self.threads.max(1))
+    }
+
+    /// Sums over light paths: of every channel, of squares, and with alternating signs for [`Rendering::split`].
+    pub(in crate::model) fn paths(&self) -> f64 {
+        let sums = f64::from(self.histograms) + if self.split { 2.0 } else { 1.0 };
+        match self.light_paths {
+            true => self.shape.pixels() * self.slots() * sums,
+            false => 0.0,
+        }
+    }
+
+    /// Bytes of the render alone: program, truth, images, tiles, and light paths as far as they are counted.
+    pub fn peak_bytes(&self) -> u64 {
+        let images = PROGRAM + self.shape.truth() + self.images();
+        // Casting saturates.
+        (images + self.tiles() + LIGHT_PATHS * self.paths()) as u64
+    }
+
+    /// The same, or what coding the result takes if that is more.
+    pub(in crate::model) fn coded(&self) -> f64 {
+        let after = PROGRAM + self.shape.truth() + self.images() * (1.0 + CODED);
+        (self.peak_bytes() as f64).max(after) + STORE
+    }
+}

@@ -1,0 +1,55 @@
+//! The size of scenes, and what every task takes.
+
+/// The program with its threads, what it has read of furniture, and a scene of some ten thousand triangles.
+pub(super) const PROGRAM: f64 = 70e6;
+/// What a store's requests and the coding of small arrays take beside the histograms.
+pub(super) const STORE: f64 = 20e6;
+/// Both: what every task takes.
+pub(in crate::model) const BASE: f64 = PROGRAM + STORE;
+/// Bytes of a histogram's bin in memory.
+pub(super) const BIN: f64 = 4.0;
+/// Bytes of a pixel for the ground truth, what its centre sees, and error sums.
+const TRUTH: f64 = 260.0;
+
+/// The size of scenes that a task reads or makes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shape {
+    /// Rows of pixels.
+    pub height: u32,
+    /// Columns of pixels.
+    pub width: u32,
+    /// Bins of a histogram.
+    pub bins: u32,
+    /// Laser spots.
+    pub spots: u32,
+}
+
+impl Shape {
+    pub(in crate::model) fn pixels(&self) -> f64 {
+        f64::from(self.height) * f64::from(self.width)
+    }
+
+    /// Bytes of one histogram of every pixel.
+    pub(in crate::model) fn histogram(&self) -> f64 {
+        BIN * self.pixels() * f64::from(self.bins)
+    }
+
+    /// Bytes of what is kept of each pixel beside histograms.
+    pub(in crate::model) fn truth(&self) -> f64 {
+        self.pixels() * (TRUTH + f64::from(self.spots))
+    }
+
+    /// Bytes of two scenes as networks meet them: the histogram as it is read, and as it is kept.
+    pub(in crate::model) fn two(&self) -> f64 {
+        self.truth() + 2.0 * self.histogram()
+    }
+}
+
+/// Bytes in words: "41.3 GiB".
+pub fn gib(bytes: u64) -> String {
+    let gib = bytes as f64 / (1u64 << 30) as f64;
+    match gib {
+        0.0..0.1 => format!("{:.0} MiB", gib * 1024.0),
+        _ => format!("{gib:.1} GiB"),
+    }
+}

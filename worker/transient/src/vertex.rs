@@ -1,0 +1,36 @@
+//! A vertex of a path from the camera.
+
+use picofarm_scene::Vec3;
+
+use crate::world::Hit;
+
+/// A vertex of a path from the camera.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Vertex {
+    pub hit: Hit,
+    /// Unit direction back along the path.
+    pub wo: Vec3,
+    /// Product of scattering and sampling weights up to here.
+    pub beta: f32,
+    /// Optical path from where the walk is counted, metres.
+    pub length_m: f64,
+    /// Bounces up to and with this vertex.
+    pub bounce: u32,
+    /// The vertex before it is a near-mirror's.
+    pub after_mirror: bool,
+    /// [`Vertex::open`] of the vertex before it.
+    pub open_before: bool,
+}
+
+impl Vertex {
+    /// True where light paths ([`crate::caustic`]) reach the last vertex up to here that is not a
+    /// near-mirror's: it is what the camera sees directly, or such a vertex comes before it too.
+    #[inline]
+    pub fn open(&self) -> bool {
+        if self.hit.surface.specular {
+            self.open_before
+        } else {
+            !self.after_mirror
+        }
+    }
+}
