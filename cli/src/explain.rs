@@ -77,9 +77,9 @@ pub async fn workers(
 ) -> Result<()> {
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     if let Some(args::Workers::Drain { worker }) = what {
-        let told = client.drain(&worker).await?;
-        output.result(&serde_json::json!({"worker": worker, "sent": told}), || {
-            format!("{told} asked to finish the task in hand and to end")
+        let said = client.drain(&worker).await?;
+        output.result(&serde_json::json!({"worker": worker, "sent": said}), || {
+            format!("{said} asked to finish the task in hand and to end")
         });
         return Ok(());
     }

@@ -201,7 +201,7 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
     }
     let mut text = table(&rows);
     for e in evaluations {
-        let told = format!(
+        let said = format!(
             "on {} {} scenes of {} ({}, {}): {}",
             e.scenes,
             e.side,
@@ -210,7 +210,7 @@ fn described(place: &str, manifest: &ModelManifest, evaluations: &[Evaluation]) 
             e.code,
             figures(&e.metrics)
         );
-        text += &format!("\n{}\n", show::line(&told));
+        text += &format!("\n{}\n", show::line(&said));
     }
     text
 }

@@ -46,14 +46,14 @@ fn status(sweep: &Sweep, output: Output) {
             }
             rows.push(row);
         }
-        format!("{}{}\n", table(&rows), sweep.told())
+        format!("{}{}\n", table(&rows), sweep.summary())
     });
 }
 
 fn best(which: &WhichSweep, sweep: &Sweep, output: Output) -> Result<()> {
     let Some(best) = sweep.best() else {
         let what = format!("no trial of {:?} has come to its end yet", sweep.name);
-        return Err(CliError::new(Code::Failed, what).hint(sweep.told()));
+        return Err(CliError::new(Code::Failed, what).hint(sweep.summary()));
     };
     output.result(best, || {
         let values = best.values.iter();
@@ -87,7 +87,7 @@ fn report(sweep: &Sweep, out: &Path, output: Output) -> Result<()> {
     output.result(&facts, || {
         format!(
             "{}\n{} and {}\n",
-            sweep.told(),
+            sweep.summary(),
             out.display(),
             beside.display()
         )
@@ -99,8 +99,8 @@ fn report(sweep: &Sweep, out: &Path, output: Output) -> Result<()> {
 async fn read(which: &WhichSweep) -> Result<Sweep> {
     let models = open(&which.store)?;
     let id = the_one(&models, which).await?;
-    let told = models.trials(&which.name, &id).await;
-    let (ended, rungs) = told.map_err(failed)?;
+    let found = models.trials(&which.name, &id).await;
+    let (ended, rungs) = found.map_err(failed)?;
     let kind = ended.first().map(|trial| trial.kind.clone());
     let mut all: BTreeMap<u64, Tried> = BTreeMap::new();
     // Rungs come in order: the last that a trial has told of counts.

@@ -151,10 +151,10 @@ fn shaping(stage: &StageSpec) -> Value {
 }
 
 /// Most differences that are told.
-const TOLD: usize = 8;
+const MOST_LINES: usize = 8;
 
-fn differences(told: &mut Vec<String>, path: String, was: Option<&Value>, is: Option<&Value>) {
-    if was == is || told.len() >= TOLD {
+fn differences(lines: &mut Vec<String>, path: String, was: Option<&Value>, is: Option<&Value>) {
+    if was == is || lines.len() >= MOST_LINES {
         return;
     }
     if let (Some(Value::Object(a)), Some(Value::Object(b))) = (was, is) {
@@ -162,23 +162,23 @@ fn differences(told: &mut Vec<String>, path: String, was: Option<&Value>, is: Op
         for name in names {
             let dot = if path.is_empty() { "" } else { "." };
             let path = format!("{path}{dot}{name}");
-            differences(told, path, a.get(name), b.get(name));
+            differences(lines, path, a.get(name), b.get(name));
         }
         return;
     }
     if let (Some(Value::Array(a)), Some(Value::Array(b))) = (was, is)
-        && a.len().max(b.len()) > TOLD
+        && a.len().max(b.len()) > MOST_LINES
     {
         let equal = a.iter().zip(b).filter(|(a, b)| a == b).count();
         let (changed, others) = (b.len() - equal, a.len());
-        told.push(format!(
+        lines.push(format!(
             "{changed} of {} {path} differ ({others} before)",
             b.len()
         ));
         return;
     }
     let text = |v: Option<&Value>| v.map_or("unset".into(), ToString::to_string);
-    told.push(format!("{path} is {} and was {}", text(is), text(was)));
+    lines.push(format!("{path} is {} and was {}", text(is), text(was)));
 }
 
 #[cfg(test)]

@@ -44,11 +44,11 @@ pub fn job(store: &Path, folder: &Path, number: u64) -> Job {
 /// # Panics
 /// When it does not.
 pub fn assert_told(events: &[Value]) {
-    let told = events.iter().any(|e| {
+    let said = events.iter().any(|e| {
         let message = e["message"].as_str().unwrap_or_default();
         message.contains("owned") && !message.contains(['\0', '\u{1b}', '\n'])
     });
-    assert!(told, "the history says which extension it was: {events:?}");
+    assert!(said, "the history says which extension it was: {events:?}");
 }
 
 /// Opens a session whose every text holds what Postgres refuses and a terminal obeys, and whose numbers cannot be.

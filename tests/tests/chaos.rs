@@ -247,7 +247,7 @@ fn with_objects_on_s3_too() {
 }
 
 /// How long something took, for people: `--nocapture` shows it. On a busy machine it means little.
-fn told(what: &str, since: Instant) {
+fn took(what: &str, since: Instant) {
     eprintln!("{what}: {:.2} s", since.elapsed().as_secs_f64());
 }
 
@@ -269,7 +269,7 @@ fn workers_of_a_killed_coordinator_go_on_under_the_other_and_no_task_restarts() 
     for worker in &mut workers {
         worker.until_says("reconnected");
     }
-    told("all workers at the other coordinator", killed);
+    took("all workers at the other coordinator", killed);
     done_once(&cluster, &id, 8);
     let started: usize = workers
         .iter()
@@ -294,7 +294,7 @@ fn the_lease_of_a_killed_worker_is_soon_anothers_although_it_had_long_to_live() 
     worker.kill();
     let killed = Instant::now();
     heir.until_says("task starts");
-    told("the task of a killed worker at another", killed);
+    took("the task of a killed worker at another", killed);
     // A lease lives for ten minutes here, longer than the patience of any test.
     done_once(&cluster, &id, 1);
     assert!(heir.stderr().contains("task done"), "{}", heir.stderr());

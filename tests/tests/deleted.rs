@@ -35,10 +35,10 @@ fn a_deleted_store_and_a_deleted_scene_are_made_again_by_the_same_job_file() {
     fs::remove_file(job.place().join("manifests/1.json")).unwrap();
     let plan = farm.json(&["job", "plan", &file]);
     assert_eq!((&plan["reuse"], &plan["run"]), (&2.into(), &1.into()));
-    let told = reasons(&plan);
+    let said = reasons(&plan);
     assert!(
-        told.contains("1 of 3 scenes recorded as done are gone from"),
-        "{told}"
+        said.contains("1 of 3 scenes recorded as done are gone from"),
+        "{said}"
     );
     let again = farm.json(&["job", "submit", &file]);
     assert_eq!(again["existed"], false, "{again}");

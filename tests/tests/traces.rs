@@ -62,13 +62,13 @@ fn heard(name: &str, of_coordinator: &[(&str, &str)]) -> Spans {
     let scratch = Scratch::new(name);
     let cli = Cli::new(scratch.path());
     // Named by the variable to the one, by the option to the other.
-    let mut told = cli.clone().with("OTEL_EXPORTER_OTLP_ENDPOINT", &collects);
+    let mut said = cli.clone().with("OTEL_EXPORTER_OTLP_ENDPOINT", &collects);
     for (name, value) in of_coordinator {
-        told = told.with(name, value);
+        said = said.with(name, value);
     }
     let listen = ["--listen", "127.0.0.1:0", "--json"];
     let args = ["coordinator", "--allow-insecure"];
-    let mut coordinator = told.start("coordinator", &[&args[..], &listen].concat());
+    let mut coordinator = said.start("coordinator", &[&args[..], &listen].concat());
     let line: serde_json::Value = serde_json::from_str(&coordinator.first_line()).unwrap();
     let cli = cli.with(
         "PICOFARM_COORDINATOR",

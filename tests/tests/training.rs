@@ -132,7 +132,7 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
         );
     }
     // Reports show how fast trainings were, too: of all else they tell the same.
-    let told = |farm: &Farm| {
+    let said = |farm: &Farm| {
         let report = fs::read(farm.store().join("reports/all/manifest.json")).unwrap();
         let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
         let models = report["models"].as_array().unwrap().iter().cloned();
@@ -146,7 +146,7 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
         });
         bare.collect::<Vec<_>>()
     };
-    assert_eq!(told(&farm), told(&calm));
+    assert_eq!(said(&farm), said(&calm));
     eprintln!("{kills} kills, {resumed} resumptions");
     predictions_can_be_looked_at(&calm);
     models_can_be_looked_after(&calm);

@@ -90,7 +90,7 @@ struct Done {
     read: u64,
     written: u64,
     /// Quantities reported as missing.
-    told: Vec<&'static str>,
+    named: Vec<&'static str>,
 }
 
 struct Work {
@@ -129,7 +129,7 @@ impl Work {
         let new: Vec<&str> = scene
             .missing
             .iter()
-            .filter(|m| !done.told.contains(m))
+            .filter(|m| !done.named.contains(m))
             .copied()
             .collect();
         if !new.is_empty() {
@@ -138,7 +138,7 @@ impl Work {
                 scene.name,
                 new.join(", ")
             ));
-            done.told.extend(scene.missing.iter());
+            done.named.extend(scene.missing.iter());
         }
         done.read += scene.files.iter().map(|f| f.bytes).sum::<u64>();
         let (source, pool, dataset) =

@@ -201,10 +201,10 @@ impl Work {
         if self.dry {
             return Ok(vec![self.repairer.explain(scene, &control)?]);
         }
-        let (stop, told) = (self.stop.clone(), control.clone());
+        let (stop, stopped) = (self.stop.clone(), control.clone());
         let watch = self.runtime.spawn(async move {
             stop.cancelled().await;
-            told.stop();
+            stopped.stop();
         });
         let witness = self
             .snapshot

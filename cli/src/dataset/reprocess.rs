@@ -152,10 +152,10 @@ impl Work {
     /// One scene, given up when a signal comes.
     fn one(&self, scene: u64) -> Result<picofarm_agent::Output, TaskError> {
         let control = Arc::new(Control::default());
-        let (stop, told) = (self.stop.clone(), control.clone());
+        let (stop, stopped) = (self.stop.clone(), control.clone());
         let watch = self.runtime.spawn(async move {
             stop.cancelled().await;
-            told.stop();
+            stopped.stop();
         });
         if self.stop.is_cancelled() {
             return Err(TaskError::Stopped);

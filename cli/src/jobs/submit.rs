@@ -18,13 +18,13 @@ pub async fn twin(client: &mut Client, plan: &JobPlan) -> String {
         return String::new();
     };
     match client.status(job).await {
-        Ok(status) => told(&status),
+        Ok(status) => line(&status),
         // It may be somebody else's, of which only its id is known.
         Err(_) => String::new(),
     }
 }
 
-fn told(s: &JobStatus) -> String {
+fn line(s: &JobStatus) -> String {
     let (id, counts) = (s.id, counts(s));
     match s.state {
         JobState::Active if s.paused => format!(

@@ -39,7 +39,7 @@ pub async fn verify(store: &str, names: &[String], output: Output) -> Result<()>
         checks.iter().filter(|(_, c)| !c.is_sound()).collect();
     if unsound.is_empty() {
         output.result(&facts, || {
-            checks.iter().map(|(name, c)| told(name, c)).collect()
+            checks.iter().map(|(name, c)| line(name, c)).collect()
         });
         return Ok(());
     }
@@ -86,7 +86,7 @@ fn problems(problems: &[Problem]) -> Vec<Value> {
     problems.iter().map(one).collect()
 }
 
-fn told(name: &str, check: &ModelCheck) -> String {
+fn line(name: &str, check: &ModelCheck) -> String {
     let state = match &check.manifest {
         Some(_) => format!("{} objects, {}: whole", check.objects, bytes(check.bytes)),
         None => "not finished".to_owned(),

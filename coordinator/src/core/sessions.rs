@@ -107,15 +107,15 @@ impl Core {
 
     /// Workers of this id or name are told to finish what is in hand and to end; returns how many there are.
     pub(crate) fn drain(&mut self, worker: &str) -> u32 {
-        let mut told = 0;
+        let mut count = 0;
         for (id, entry) in &mut self.workers {
             if entry.name == worker || id.to_string() == worker {
                 entry.drains = true;
                 self.say.push((entry.session, Say::Drain));
-                told += 1;
+                count += 1;
             }
         }
-        told
+        count
     }
 
     /// A session has ended. Leases that were not given back live on for a moment: the worker may come back. If its

@@ -688,10 +688,10 @@ fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
             sight: Sight::All,
         };
         let events = world.instances[0].catalog.events(&query).await;
-        let told = events.unwrap().into_iter().map(|e| e.message);
-        let told: Vec<String> = told.filter(|m| m.contains("w1")).collect();
+        let said = events.unwrap().into_iter().map(|e| e.message);
+        let said: Vec<String> = said.filter(|m| m.contains("w1")).collect();
         let what = format!("worker w1 fell silent while it ran task {}", silent.lo);
-        assert!(told.iter().any(|m| m.starts_with(&what)), "{told:?}");
+        assert!(said.iter().any(|m| m.starts_with(&what)), "{said:?}");
         // Once only: the next heartbeat must come in time.
         world.now += i64::from(SETTINGS.lease_ms) + 1;
         let core = &mut world.instances[0].core;

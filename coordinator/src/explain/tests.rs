@@ -300,18 +300,22 @@ fn each_run_of_a_task_but_the_first_has_its_cause() {
         event(EventKind::Dead, "c", "no light"),
         event(EventKind::Leased, "d", "tasks 4..5"),
     ];
-    let told = task(facts.clone());
-    assert_eq!(told.state, TaskState::Leased);
-    assert!(told.words.contains("leased to d for 5 s"), "{}", told.words);
+    let explained = task(facts.clone());
+    assert_eq!(explained.state, TaskState::Leased);
+    assert!(
+        explained.words.contains("leased to d for 5 s"),
+        "{}",
+        explained.words
+    );
     assert_eq!(
-        told.reruns,
+        explained.reruns,
         [
             "the lease ran out",
             "b gave it back: the worker is stopping",
             "it was given up on c: no light, and then tried again",
         ]
     );
-    assert_eq!((told.failures, told.crashes), (2, 1));
+    assert_eq!((explained.failures, explained.crashes), (2, 1));
     facts.running = Some(Runs {
         worker: "d".into(),
         fraction: 0.4,
@@ -359,20 +363,20 @@ fn a_task_that_waits_or_was_given_up_says_why() {
         not_before_ms: NOW + 8_000,
     });
     facts.record.exception = Some(failed(4, false));
-    let told = task(facts.clone());
-    assert_eq!(told.state, TaskState::Pending);
+    let explained = task(facts.clone());
+    assert_eq!(explained.state, TaskState::Pending);
     assert!(
-        told.words.contains("another 8 s") && told.words.contains("no light"),
+        explained.words.contains("another 8 s") && explained.words.contains("no light"),
         "{}",
-        told.words
+        explained.words
     );
     facts.record.range = Some(range(RangeState::Dead));
-    let told = task(facts.clone());
-    assert_eq!(told.state, TaskState::Dead);
+    let explained = task(facts.clone());
+    assert_eq!(explained.state, TaskState::Dead);
     assert!(
-        told.words.contains("2 of 3 failures") && told.words.contains("job retry"),
+        explained.words.contains("2 of 3 failures") && explained.words.contains("job retry"),
         "{}",
-        told.words
+        explained.words
     );
     facts.record.range = None;
     assert_eq!(task(facts).state, TaskState::Gone);

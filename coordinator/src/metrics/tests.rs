@@ -9,8 +9,8 @@ use super::*;
 #[test]
 fn names_and_help_texts_are_as_documented() {
     let page = Metrics::default().page(Some(Gauges::default()), Counts::default(), true);
-    let told: Vec<&str> = page.lines().filter(|line| line.starts_with('#')).collect();
-    insta::assert_snapshot!(told.join("\n"));
+    let lines: Vec<&str> = page.lines().filter(|line| line.starts_with('#')).collect();
+    insta::assert_snapshot!(lines.join("\n"));
 }
 
 #[test]

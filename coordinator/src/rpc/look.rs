@@ -80,7 +80,7 @@ pub(super) async fn explain(
         setback: setback(link, job).await?,
         now_ms,
     });
-    let told = match task {
+    let explained = match task {
         None => None,
         Some(index) => {
             let events = history(link, here, index).await?;
@@ -107,7 +107,7 @@ pub(super) async fn explain(
     Ok(wire::ExplainJobResponse {
         job: Some(status.into()),
         reasons: reasons.into_iter().map(Into::into).collect(),
-        task: told.map(Into::into),
+        task: explained.map(Into::into),
     })
 }
 

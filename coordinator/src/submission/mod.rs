@@ -331,11 +331,11 @@ impl Submissions {
             timings,
         };
         let learnt = (state == Some(JobState::Active)).then_some(learnt);
-        let (reply, told) = tokio::sync::oneshot::channel();
+        let (reply, answer) = tokio::sync::oneshot::channel();
         let command = Command::Learn(learnt.map(Box::new), reply);
         if self.commands.send(command).await.is_ok() {
             // An actor between two lives finds the job in the catalog.
-            let _ = told.await;
+            let _ = answer.await;
         }
         Ok(())
     }

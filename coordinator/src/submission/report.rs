@@ -16,14 +16,14 @@ pub(super) fn plan(
     let counts: Vec<_> = findings.iter().map(|f| f.counts.clone()).collect();
     let mut plan = plan::plan(&draft.spec, &draft.hash, &counts, existing_job, recent);
     let stages = plan.stages.iter_mut().zip(&draft.spec.stages);
-    for ((told, stage), (record, found)) in stages.zip(draft.stages().iter().zip(findings)) {
+    for ((planned, stage), (record, found)) in stages.zip(draft.stages().iter().zip(findings)) {
         let words = found.words(stage, &record.set);
         // Why the rest runs is said by these words alone, where all of it was recorded.
-        let explained = found.recorded >= told.total && !stage.force;
+        let explained = found.recorded >= planned.total && !stage.force;
         if explained && !words.is_empty() {
-            told.reasons.retain(|reason| !reason.contains(" run: "));
+            planned.reasons.retain(|reason| !reason.contains(" run: "));
         }
-        told.reasons.extend(words);
+        planned.reasons.extend(words);
     }
     plan
 }

@@ -256,12 +256,12 @@ async fn new_certificates_are_used_without_a_restart_and_bad_ones_are_not() {
         ..AuditQuery::default()
     };
     let lines = catalog.unwrap().audited(&query).await.unwrap();
-    let told: Vec<_> = lines
+    let said: Vec<_> = lines
         .iter()
         .rev()
         .map(|line| (line.act.name(), line.outcome.name()))
         .collect();
-    assert_eq!(told, [("certificates", "done"), ("certificates", "failed")]);
+    assert_eq!(said, [("certificates", "done"), ("certificates", "failed")]);
     assert!(
         lines[0].detail.contains("does not match"),
         "{}",

@@ -120,7 +120,7 @@ impl Farm {
         let catalog = catalog.unwrap_or_else(|| folder.path().join("state/catalog.db").into());
         let clock = Arc::new(AtomicI64::new(1_000_000));
         let slept = Arc::new(AtomicI64::new(0));
-        let (told, more) = (Arc::clone(&clock), Arc::clone(&slept));
+        let (time, more) = (Arc::clone(&clock), Arc::clone(&slept));
         let passed = Arc::clone(&slept);
         let shelf = Arc::new(Shelf::default());
         let config = CoordinatorConfig {
@@ -131,7 +131,7 @@ impl Farm {
                 most_ms: 8_000,
             },
             clock: Clock::with_stalls(
-                move || told.load(Ordering::SeqCst) + more.load(Ordering::SeqCst),
+                move || time.load(Ordering::SeqCst) + more.load(Ordering::SeqCst),
                 move || passed.load(Ordering::SeqCst),
             ),
             http: Some("127.0.0.1:0".parse().unwrap()),

@@ -61,9 +61,9 @@ async fn an_error_message_with_control_characters_is_recorded_printable_and_nobo
         let poison = format!("no mesh \0 \u{1b}[2J\n{}", "x".repeat(100_000));
         worker.say(failure(&lease, lease.lo, &poison)).await;
         assert!(worker.acknowledged().await.accepted);
-        let told = last_error(&mut farm, &job, 0).await;
-        assert!(told.starts_with("no mesh    [2J x"), "{told:?}");
-        assert!(told.len() <= 4096, "{}", told.len());
+        let said = last_error(&mut farm, &job, 0).await;
+        assert!(said.starts_with("no mesh    [2J x"), "{said:?}");
+        assert!(said.len() <= 4096, "{}", said.len());
         assert_eq!(farm.until_ended(&job).await.state, JobState::Failed);
         // The same session works on.
         let other = farm.submit(&strict("other", 3)).await.job_id;
@@ -97,8 +97,8 @@ async fn a_report_that_says_what_cannot_be_counts_as_its_tasks_failure_and_is_no
                 "{answer:?}"
             );
             assert_eq!(farm.until_ended(&job).await.state, JobState::Failed);
-            let told = last_error(&mut farm, &job, 0).await;
-            assert!(told.contains(field), "{told}");
+            let said = last_error(&mut farm, &job, 0).await;
+            assert!(said.contains(field), "{said}");
         }
         let job = farm.submit(&strict("good", 3)).await.job_id;
         assert_eq!(worker.work(&mut farm, &job).await.state, JobState::Done);
@@ -199,8 +199,8 @@ async fn what_the_database_refuses_costs_its_task_and_all_else_is_durable() {
             (2, "error message could not be recorded"),
             (5, "cannot be recorded"),
         ] {
-            let told = last_error(&mut farm, &mine, task).await;
-            assert!(told.contains(why), "{told}");
+            let said = last_error(&mut farm, &mine, task).await;
+            assert!(said.contains(why), "{said}");
         }
         // The other worker's session and lease are what they were.
         for index in held.lo..held.hi {

@@ -368,8 +368,8 @@ async fn a_drained_worker_hears_it_and_gets_nothing_more() {
     let drain = wire::DrainWorkerRequest {
         worker: worker.hello.name.clone(),
     };
-    let told = farm.jobs.drain_worker(drain).await.unwrap().into_inner();
-    assert_eq!(told.workers, 1);
+    let said = farm.jobs.drain_worker(drain).await.unwrap().into_inner();
+    assert_eq!(said.workers, 1);
     assert!(matches!(worker.hear().await.unwrap(), Heard::Drain(_)));
     worker.credit(1).await;
     assert!(worker.done(&lease, lease.lo).await.accepted);

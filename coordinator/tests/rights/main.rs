@@ -209,8 +209,8 @@ async fn lists_and_equal_jobs_show_nobody_what_they_may_not_see() {
                 assert_eq!(ids.contains(&job), standing.sees, "{who} {visibility}");
                 let events = jobs.list_events(wire::ListEventsRequest::default()).await;
                 let events = events.unwrap().into_inner().events;
-                let told = events.iter().any(|e| e.job_id == job);
-                assert_eq!(told, standing.sees, "{who} {visibility}");
+                let said = events.iter().any(|e| e.job_id == job);
+                assert_eq!(said, standing.sees, "{who} {visibility}");
                 if role == Role::View {
                     continue;
                 }

@@ -138,10 +138,10 @@ async fn readers_see_what_they_may(catalog: &dyn Catalog) {
                 sight: sight.clone(),
             };
             let events = catalog.events(&query).await.unwrap();
-            let mut told: Vec<_> = events.into_iter().map(|event| event.job).collect();
+            let mut said: Vec<_> = events.into_iter().map(|event| event.job).collect();
             // Each has its beginning and, without tasks, its end.
-            told.dedup();
-            assert_eq!(told, seen, "{sight:?}");
+            said.dedup();
+            assert_eq!(said, seen, "{sight:?}");
         }
     }
 }

@@ -118,9 +118,9 @@ proptest! {
             let record = ["/recipes/", "/snapshots/", "/splits/"].iter().any(|f| key.contains(f));
             let options = VerifyOptions { complete: true, ..VerifyOptions::new(VerifyMode::Full) };
             let report = opened.verify_with(&options).await.unwrap();
-            let mut told = report.problems.iter().filter(|p| p.object == *key);
+            let mut said = report.problems.iter().filter(|p| p.object == *key);
             if record && harm == 2 {
-                assert_eq!(told.next(), None);
+                assert_eq!(said.next(), None);
                 return;
             }
             // gzip has bits that mean nothing: those of its date.
@@ -129,7 +129,7 @@ proptest! {
                 assert_eq!(found, named(&dataset, "v1").await, "a bit that means something was not named");
                 return;
             }
-            let problem = told.next().unwrap_or_else(|| panic!("{key} in {report:?}"));
+            let problem = said.next().unwrap_or_else(|| panic!("{key} in {report:?}"));
             match problem.scene {
                 Some(scene) => {
                     let restored = opened.restore(encoded(&opened, scene), None).await.unwrap();

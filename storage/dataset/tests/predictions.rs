@@ -158,13 +158,13 @@ async fn a_check_names_what_is_broken_and_what_is_missing() {
     std::fs::write(folder.path().join("specular/zarr.json"), "{}").unwrap();
     std::fs::write(folder.path().join("manifests/2.json"), "{}").unwrap();
     let found = check(VerifyMode::Full, false).await;
-    let told: Vec<(Option<u64>, &str)> = found
+    let said: Vec<(Option<u64>, &str)> = found
         .problems
         .iter()
         .map(|p| (p.scene, p.fault.kind()))
         .collect();
     assert_eq!(
-        told,
+        said,
         [
             (Some(1), "missing"),
             (Some(0), "wrong_hash"),

@@ -228,7 +228,7 @@ proptest! {
         }
         // Whatever was never acknowledged goes out once more after a reconnect.
         assignments.disconnected();
-        let told: BTreeSet<_> = assignments
+        let said: BTreeSet<_> = assignments
             .outgoing(now)
             .into_iter()
             .filter_map(|m| match m {
@@ -236,6 +236,6 @@ proptest! {
                 _ => None,
             })
             .collect();
-        prop_assert_eq!(told, finished);
+        prop_assert_eq!(said, finished);
     }
 }

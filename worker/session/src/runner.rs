@@ -145,7 +145,7 @@ fn begin(means: &Arc<Means>, task: Task, control: Arc<Control>, span: Span) -> R
 /// Waits for a task's end; `None` where it was told to stop and has not noticed. One that saves what it has done may take
 /// its time, if anybody wants that.
 fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<Ended> {
-    let mut told: Option<Instant> = None;
+    let mut asked: Option<Instant> = None;
     loop {
         match running.recv_timeout(LOOK) {
             Ok(ended) => return Some(ended),
@@ -156,7 +156,7 @@ fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<End
             }
         }
         let over = control.stopped() && (!saves || control.unwanted());
-        if over && told.get_or_insert_with(Instant::now).elapsed() >= NOTICE {
+        if over && asked.get_or_insert_with(Instant::now).elapsed() >= NOTICE {
             return None;
         }
     }

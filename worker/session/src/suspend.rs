@@ -22,10 +22,10 @@ impl Suspends {
 
     /// How long the machine was suspended since this was last asked; `None` where it was not.
     pub(crate) fn new_one(&mut self) -> Option<Duration> {
-        self.told(suspended())
+        self.slept(suspended())
     }
 
-    fn told(&mut self, suspended: Duration) -> Option<Duration> {
+    fn slept(&mut self, suspended: Duration) -> Option<Duration> {
         let new = suspended.checked_sub(self.known)?;
         if new < NOTHING {
             return None;
@@ -56,11 +56,11 @@ mod tests {
     fn each_suspend_is_told_once_and_noise_never() {
         let s = Duration::from_secs;
         let mut suspends = Suspends { known: s(5) };
-        assert_eq!(suspends.told(s(5) + NOTHING / 2), None);
-        assert_eq!(suspends.told(s(5) - NOTHING / 2), None);
-        assert_eq!(suspends.told(s(65)), Some(s(60)));
-        assert_eq!(suspends.told(s(65)), None);
-        assert_eq!(suspends.told(s(66)), Some(s(1)));
+        assert_eq!(suspends.slept(s(5) + NOTHING / 2), None);
+        assert_eq!(suspends.slept(s(5) - NOTHING / 2), None);
+        assert_eq!(suspends.slept(s(65)), Some(s(60)));
+        assert_eq!(suspends.slept(s(65)), None);
+        assert_eq!(suspends.slept(s(66)), Some(s(1)));
         assert_eq!(Suspends::new().new_one(), None);
     }
 }

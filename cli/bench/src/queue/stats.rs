@@ -17,11 +17,11 @@ pub struct Stats {
     reconnects: AtomicU64,
     refused: AtomicU64,
     revoked: AtomicU64,
-    told: Mutex<Told>,
+    measured: Mutex<Measured>,
 }
 
 #[derive(Default)]
-struct Told {
+struct Measured {
     first: Option<Instant>,
     last: Option<Instant>,
     lease: Vec<f64>,
@@ -53,8 +53,8 @@ fn latency(mut seconds: Vec<f64>) -> Latency {
 }
 
 impl Stats {
-    fn told(&self) -> std::sync::MutexGuard<'_, Told> {
-        self.told.lock().expect("no panic while locked")
+    fn measured(&self) -> std::sync::MutexGuard<'_, Measured> {
+        self.measured.lock().expect("no panic while locked")
     }
 
     /// A worker was welcomed, for the first time or again.
@@ -66,20 +66,20 @@ impl Stats {
     }
 
     pub fn leased(&self, waited: Duration) {
-        let mut told = self.told();
-        told.first.get_or_insert_with(Instant::now);
-        told.lease.push(waited.as_secs_f64());
+        let mut measured = self.measured();
+        measured.first.get_or_insert_with(Instant::now);
+        measured.lease.push(waited.as_secs_f64());
     }
 
     pub fn beaten(&self, took: Duration) {
-        self.told().heartbeat.push(took.as_secs_f64());
+        self.measured().heartbeat.push(took.as_secs_f64());
     }
 
     pub fn acknowledged(&self, accepted: bool) {
         if !accepted {
             self.refused.fetch_add(1, Relaxed);
         }
-        self.told().last = Some(Instant::now());
+        self.measured().last = Some(Instant::now());
     }
 
     pub fn revoke(&self) {
@@ -87,7 +87,7 @@ impl Stats {
     }
 
     pub fn fail(&self, what: String) {
-        self.told().trouble.get_or_insert(what);
+        self.measured().trouble.get_or_insert(what);
     }
 
     pub fn connected(&self) -> u64 {
@@ -107,26 +107,26 @@ impl Stats {
     }
 
     pub fn trouble(&self) -> Option<String> {
-        self.told().trouble.clone()
+        self.measured().trouble.clone()
     }
 
     /// From the first lease to the last acknowledgement.
     pub fn span(&self) -> (Instant, Instant) {
-        let told = self.told();
+        let measured = self.measured();
         let now = Instant::now();
-        (told.first.unwrap_or(now), told.last.unwrap_or(now))
+        (measured.first.unwrap_or(now), measured.last.unwrap_or(now))
     }
 
     pub fn lease(&self) -> Latency {
-        latency(self.told().lease.clone())
+        latency(self.measured().lease.clone())
     }
 
     /// The heartbeats since the last time this was asked.
     pub fn heartbeats_since(&self) -> Latency {
-        latency(std::mem::take(&mut self.told().heartbeat))
+        latency(std::mem::take(&mut self.measured().heartbeat))
     }
 
     pub fn heartbeat(&self) -> Latency {
-        latency(self.told().heartbeat.clone())
+        latency(self.measured().heartbeat.clone())
     }
 }

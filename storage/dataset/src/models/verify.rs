@@ -138,11 +138,11 @@ impl Models {
             }
             Some(("sweeps", _)) => {
                 let bytes = objects::require(&*self.store, &object.location).await?;
-                let told = match key.contains("/trials/") {
+                let said = match key.contains("/trials/") {
                     true => serde_json::from_slice::<TrialRecord>(&bytes).map(drop),
                     false => serde_json::from_slice::<Rung>(&bytes).map(drop),
                 };
-                told.err()
+                said.err()
                     .and_then(|e| bad(&format!("is not what a trial says of itself: {e}")))
             }
             Some(_) if object_folder(key).is_some() => {

@@ -126,7 +126,7 @@ impl Sweep {
     }
 
     /// In a sentence: how many trials ended how, and which is the best.
-    pub fn told(&self) -> String {
+    pub fn summary(&self) -> String {
         let ends = ENDS.map(|end| (self.count(end), end.name()));
         let ends = ends.iter().filter(|(n, _)| *n > 0);
         let ends: Vec<String> = ends.map(|(n, name)| format!("{n} {name}")).collect();
@@ -164,7 +164,7 @@ impl Value {
 /// The page: it needs nothing beside it.
 pub fn html(sweep: &Sweep) -> String {
     let (title, date) = (Safe(&sweep.name), Safe(&sweep.date));
-    let told = sweep.told();
+    let summary = sweep.summary();
     let sections = [
         ("Trials", table(sweep)),
         ("Over epochs", curves(sweep)),
@@ -177,7 +177,7 @@ pub fn html(sweep: &Sweep) -> String {
          <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
          <title>Sweep {title}</title>\n<style>{STYLE}</style></head>\n<body>\
          <header><h1>Sweep {title}</h1><p class=\"note\">{date} · {}</p></header>\n<main>{}</main></body></html>\n",
-        Safe(told),
+        Safe(summary),
         sections.concat()
     )
 }
@@ -373,7 +373,7 @@ mod tests {
         let sweep = sweep();
         assert_eq!(sweep.best().map(|t| t.index), Some(2));
         assert_eq!(
-            sweep.told(),
+            sweep.summary(),
             "4 trials: 2 finished, 1 stopped, 1 diverged; best <m>.2 (MAE (m) 0.2500)"
         );
     }

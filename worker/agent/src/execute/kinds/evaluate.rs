@@ -121,7 +121,7 @@ impl EvaluationRun<'_> {
             }
         };
         let metrics = self.ask(which, &model, guide.as_ref(), (histogram, &spots), control)?;
-        info!("{name}: {}", told(&metrics));
+        info!("{name}: {}", summary(&metrics));
         let made = Evaluation {
             key: key.clone(),
             model: name.clone(),
@@ -202,7 +202,7 @@ impl EvaluationRun<'_> {
 }
 
 /// The figures of all scenes together, for people.
-fn told(metrics: &serde_json::Value) -> String {
+fn summary(metrics: &serde_json::Value) -> String {
     let all = metrics.as_object().into_iter().flatten();
     let numbers = all.filter(|(name, _)| *name != "examples");
     let numbers = numbers.filter_map(|(name, x)| Some(format!("{name} {:.4}", x.as_f64()?)));

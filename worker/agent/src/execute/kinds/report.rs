@@ -82,8 +82,8 @@ impl RunTask for ReportTask {
             let found = Subject::find(stores, &models, name, control);
             subjects.push(found.map_err(|e| at(&format!("report.models[{i}]"), e))?);
         }
-        let told: Vec<ReportedModel> = subjects.iter().map(Subject::told).collect();
-        let pins = told.iter().map(|model| {
+        let reported: Vec<ReportedModel> = subjects.iter().map(Subject::reported).collect();
+        let pins = reported.iter().map(|model| {
             let evaluation = model.evaluation.as_deref().unwrap_or_default();
             let speed = model.speed.as_deref().unwrap_or_default();
             format!("{} {evaluation} {speed}", model.manifest_sha256)
@@ -119,7 +119,7 @@ impl RunTask for ReportTask {
             name: settings.name.clone(),
             task_key: key,
             code: settings.version.clone(),
-            models: told,
+            models: reported,
             ..ReportManifest::default()
         };
         let objects = [
@@ -189,7 +189,7 @@ impl Subject {
         })
     }
 
-    fn told(&self) -> ReportedModel {
+    fn reported(&self) -> ReportedModel {
         ReportedModel {
             name: self.manifest.name.clone(),
             manifest_sha256: self.manifest.sha256(),

@@ -33,7 +33,7 @@ mod plan;
 mod results;
 mod trial;
 
-use along::{Saver, Teller, loading};
+use along::{Reporter, Saver, loading};
 pub(in crate::execute) use known::{CheckedModel, Known};
 pub(in crate::execute) use results::WEIGHTS;
 use results::{lines, metrics, output, pretty};
@@ -304,12 +304,12 @@ impl<'a> TrainingRun<'a> {
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
         let mut saved = Instant::now();
         let epochs = self.task.train.optimise.epochs;
-        let mut teller = Teller::new(control, epochs);
+        let mut teller = Reporter::new(control, epochs);
         // What the trial is told at its latest rung.
-        let mut told = Ok(true);
+        let mut answer = Ok(true);
         let mut ask = |line: &Line| {
-            told = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));
-            matches!(told, Ok(true))
+            answer = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));
+            matches!(answer, Ok(true))
         };
         // It may have been stopped right at a rung.
         let position = training.position();
@@ -350,7 +350,7 @@ impl<'a> TrainingRun<'a> {
                 }
                 Ok(Ok(training.finish()))
             }
-            Ok(Ended::Stopped) if matches!(told, Ok(false)) => {
+            Ok(Ended::Stopped) if matches!(answer, Ok(false)) => {
                 saver.last();
                 Ok(Err(left(&training, TrialEnd::Pruned)))
             }
@@ -358,7 +358,7 @@ impl<'a> TrainingRun<'a> {
                 saver.save(training.learner().steps(), training.checkpoint().into());
                 saver.last();
                 // Where the store was away at a rung, the trial goes on from there.
-                told.and(Err(TaskError::Stopped))
+                answer.and(Err(TaskError::Stopped))
             }
         }
     }

@@ -88,22 +88,22 @@ impl<'a> Saver<'a> {
 }
 
 /// Tells the task's control and its log how far the training is.
-pub(super) struct Teller<'a> {
+pub(super) struct Reporter<'a> {
     control: &'a Control,
     epochs: u32,
-    told: u64,
+    reported: u64,
     /// The latest figure of the validation scenes: MAE in metres, or one less IoU.
     validation: Option<(&'static str, f64)>,
     /// Training examples a second, and share of the time in which the network waited for data.
     pace: Option<(f64, f64)>,
 }
 
-impl<'a> Teller<'a> {
+impl<'a> Reporter<'a> {
     pub(super) fn new(control: &'a Control, epochs: u32) -> Self {
         Self {
             control,
             epochs,
-            told: 0,
+            reported: 0,
             validation: None,
             pace: None,
         }
@@ -149,9 +149,9 @@ impl<'a> Teller<'a> {
                     .map(|found| ("validation_loss", found.loss()));
                 // All of few epochs, every so many of many, and the last.
                 let between = u64::from(self.epochs.div_ceil(LINES));
-                if line.epoch >= self.told + between || line.epoch == u64::from(self.epochs) {
-                    self.told = line.epoch;
-                    info!("epoch {}/{}: {}", line.epoch, self.epochs, told(line));
+                if line.epoch >= self.reported + between || line.epoch == u64::from(self.epochs) {
+                    self.reported = line.epoch;
+                    info!("epoch {}/{}: {}", line.epoch, self.epochs, summary(line));
                 }
             }
         }
@@ -159,7 +159,7 @@ impl<'a> Teller<'a> {
 }
 
 /// An epoch for people.
-fn told(line: &Line) -> String {
+fn summary(line: &Line) -> String {
     let loss = format!("loss {:.4}", line.loss);
     match line.validation {
         None => loss,

@@ -103,8 +103,8 @@ impl<'a> Course<'a> {
             loss: found.loss(),
         };
         let (models, sweep, id) = (self.models(), &*trial.sweep, &*trial.id);
-        let told = async || models.put_rung(sweep, id, &ours).await;
-        self.stores.patiently(control, told)?;
+        let written = async || models.put_rung(sweep, id, &ours).await;
+        self.stores.patiently(control, written)?;
         let there = self
             .stores
             .wait(control, models.rung(sweep, id, line.epoch))?;
