@@ -18,7 +18,7 @@ mod spec_error;
 pub mod stage;
 pub mod status;
 mod substitute;
-mod sweep;
+pub mod sweep;
 mod texts;
 pub mod trial;
 

@@ -2,26 +2,30 @@
 //! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
 
 pub use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
     kind::{Declared, Manifest, ModelNames, Results, TaskKind},
-    reprocess::Histogram,
 };
 use crate::model::{
     limits::check_count,
     memory::{BASE, Known, Network, Shape},
     places::{MODELS, SourceSettings, check_source},
     spec_error::SpecError,
-    trial::Trial,
 };
 
 mod check;
+mod settings;
 
 pub use super::names::check_model;
 pub(super) use check::check_spots;
+pub(super) use settings::is_zero;
+pub use settings::{
+    InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, SpecularSettings,
+    TRUTH, TrainSettings,
+};
 
 /// Training a network: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -32,217 +36,6 @@ pub struct TrainTask {
     pub count: u64,
     /// What is learnt, and how.
     pub train: TrainSettings,
-}
-
-/// What is learnt, and how.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainSettings {
-    /// What the network predicts.
-    pub target: Target,
-    /// The name under which the model is kept in the store: letters, digits, `-`, `_` and `.`.
-    pub model: String,
-    /// The split of the data set whose training scenes are learnt from, and whose validation scenes tell when to stop.
-    #[serde(default = "default_split")]
-    pub split: String,
-    /// Only so many training scenes, the first by the split's order: the fewer are always among the more. 0 = all.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub scenes: u64,
-    /// Which of the data set's histograms.
-    #[serde(default)]
-    pub histogram: Histogram,
-    /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub spots: Vec<u32>,
-    /// What the network sees of a histogram.
-    #[serde(default)]
-    pub input: InputSettings,
-    /// The network.
-    #[serde(default)]
-    pub net: NetSettings,
-    /// How shadows are predicted; for `target = "shadow"` only.
-    #[serde(default, skip_serializing_if = "is_default")]
-    pub shadow: ShadowSettings,
-    /// What mirrors are predicted from; for `target = "specular"` only.
-    #[serde(default, skip_serializing_if = "is_default")]
-    pub specular: SpecularSettings,
-    /// Steps, rates and precision.
-    #[serde(default)]
-    pub optimise: OptimiseSettings,
-    /// Scenes are flipped at random, in both directions, together with their spots; not where a shadow network knows spots by
-    /// their number (`index`, `all`), since a flipped spot is at another one's place.
-    #[serde(default = "yes")]
-    pub augment: bool,
-    /// Seed of weights, order of scenes, spots and flips.
-    #[serde(default)]
-    pub seed: u64,
-    /// A trained model of the same network, or the stage that trains it, to start from; empty = random weights.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
-    pub from: String,
-    /// Minutes between checkpoints: as much is lost at most when a worker dies. Changes no result.
-    #[serde(default = "ten")]
-    pub checkpoint_minutes: f64,
-    /// What makes it a trial of a sweep; written by `[stage.sweep]`, not by hand.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub trial: Option<Trial>,
-    /// Version of networks and training, part of every task key; filled in at submission where left out.
-    #[serde(default)]
-    pub version: String,
-}
-
-/// What a network sees of a histogram.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct InputSettings {
-    /// How photons become numbers around 1.
-    pub normalise: Normalise,
-    /// For `normalise = "log"`: the largest bin of the data set, in its unit; 0 = that of the training scenes, which are
-    /// read once for it.
-    #[serde(skip_serializing_if = "is_zero_f64")]
-    pub max: f64,
-    /// Bins of the input: adjacent bins are summed to so many, those left over at the end dropped. 0 = all.
-    pub bins: u32,
-    /// The sum over bins alone: a picture instead of a histogram.
-    pub intensity_only: bool,
-}
-
-/// How photons become numbers around 1 (appendix B of the paper).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Normalise {
-    /// (h − min)/(max − min) of each pixel's histogram.
-    #[default]
-    Minmax,
-    /// (log10(h + 1e-8) + 8)/(log10 max + 8), with the largest bin of the data set.
-    Log,
-}
-
-/// The network.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct NetSettings {
-    /// Its kind.
-    pub architecture: Architecture,
-    /// Channels of the first level; each further one has twice as many.
-    pub width: u32,
-    /// Levels of the encoder; between two of them the image is halved.
-    pub levels: u32,
-    /// Channels of a projection before the first level, as in the paper's appendix (128); 0 = none, as in the released code.
-    pub stem: u32,
-    /// For `unet25d`: bins of time after the learnt projection of each stream; its levels halve them. 0 otherwise.
-    #[serde(skip_serializing_if = "is_zero_u32")]
-    pub time_features: u32,
-}
-
-/// How shadows are predicted (appendix A.1 of the paper).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ShadowSettings {
-    /// What the network is given of a spot.
-    pub variant: ShadowVariant,
-    /// Where the two-bounce times come from: `truth`, or a trained ToF model, or the stage that trains it.
-    pub tof: String,
-}
-
-/// What mirrors are predicted from.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SpecularSettings {
-    /// A trained ToF model, or the stage that trains it, whose frozen features a decoder learns from; empty = a network
-    /// of its own, from scratch.
-    pub on: String,
-}
-
-/// Steps, rates and precision.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct OptimiseSettings {
-    /// Times that each training scene is seen.
-    pub epochs: u32,
-    /// Scenes a step.
-    pub batch: u32,
-    /// Parts in which a batch is computed, to save memory; their gradients are added up. Must divide the batch.
-    pub accumulate: u32,
-    /// Largest learning rate (AdamW).
-    pub learning_rate: f64,
-    /// Weight decay (AdamW).
-    pub weight_decay: f64,
-    /// How the rate changes with the steps.
-    pub schedule: Schedule,
-    /// Numbers in which the network is computed.
-    pub precision: Precision,
-    /// Stop after so many validations (one an epoch) without improvement; 0 = never.
-    pub early_stop: u32,
-}
-
-impl Default for NetSettings {
-    fn default() -> Self {
-        Self {
-            architecture: Architecture::Unet2d,
-            width: 128,
-            levels: 6,
-            stem: 0,
-            time_features: 0,
-        }
-    }
-}
-
-impl Default for ShadowSettings {
-    fn default() -> Self {
-        Self {
-            variant: ShadowVariant::Concat,
-            tof: TRUTH.into(),
-        }
-    }
-}
-
-impl Default for OptimiseSettings {
-    fn default() -> Self {
-        Self {
-            epochs: 200,
-            batch: 32,
-            accumulate: 1,
-            learning_rate: 1e-2,
-            weight_decay: 1e-3,
-            schedule: Schedule::Onecycle,
-            precision: Precision::F32,
-            early_stop: 0,
-        }
-    }
-}
-
-/// [`ShadowSettings::tof`] where two-bounce times are the ground truth's.
-pub const TRUTH: &str = "truth";
-
-fn default_split() -> String {
-    "default".into()
-}
-
-fn yes() -> bool {
-    true
-}
-
-fn ten() -> f64 {
-    10.0
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-pub(super) fn is_zero(n: &u64) -> bool {
-    *n == 0
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_zero_u32(n: &u32) -> bool {
-    *n == 0
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_zero_f64(n: &f64) -> bool {
-    *n == 0.0
-}
-
-fn is_default<T: Default + PartialEq>(value: &T) -> bool {
-    *value == T::default()
 }
 
 impl Declared for TrainTask {
@@ -343,78 +136,5 @@ impl TaskKind for TrainTask {
 
     fn models_mut(&mut self) -> ModelNames<'_> {
         ModelNames::Single(self.train.models_mut())
-    }
-}
-
-impl TrainSettings {
-    /// The shape of the network that learns from such scenes.
-    pub(in crate::model) fn network(&self, source: &Shape) -> Network {
-        let bins = match self.input.bins {
-            0 => source.bins,
-            bins => bins,
-        };
-        let seen = match self.input.intensity_only {
-            true => 1.0,
-            false => f64::from(bins),
-        };
-        let (dense, one_hot) = match (self.target, self.shadow.variant) {
-            (Target::Shadow, ShadowVariant::Concat) => (seen, f64::from(bins)),
-            (Target::Shadow, ShadowVariant::Index) => (seen + f64::from(source.spots), 0.0),
-            _ => (seen, 0.0),
-        };
-        let net = &self.net;
-        Network {
-            scene: *source,
-            inputs: dense + one_hot,
-            dense,
-            width: f64::from(net.width),
-            levels: net.levels,
-            time: match net.architecture {
-                Architecture::Unet2d => 1.0,
-                Architecture::Unet25d => f64::from(net.time_features.max(1)),
-            },
-            stem: f64::from(net.stem),
-        }
-    }
-
-    /// What of them decides the bytes of the model: all but its name, how often it is saved on the way, and whether it is
-    /// one of a sweep.
-    pub fn shaping(&self) -> serde_json::Value {
-        let mut settings = serde_json::to_value(self).expect("settings are plain data");
-        let table = settings.as_object_mut().expect("settings are a table");
-        table.remove("model");
-        table.remove("checkpoint_minutes");
-        table.remove("trial");
-        settings
-    }
-
-    /// The models that it builds on: field and name.
-    pub fn models(&self) -> Vec<(&'static str, &String)> {
-        let mut models = Vec::new();
-        if self.shadow.tof != TRUTH {
-            models.push(("train.shadow.tof", &self.shadow.tof));
-        }
-        if !self.specular.on.is_empty() {
-            models.push(("train.specular.on", &self.specular.on));
-        }
-        if !self.from.is_empty() {
-            models.push(("train.from", &self.from));
-        }
-        models
-    }
-
-    /// The same, to be filled in.
-    pub(crate) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
-        let mut models = Vec::new();
-        if self.shadow.tof != TRUTH {
-            models.push(("train.shadow.tof", &mut self.shadow.tof));
-        }
-        if !self.specular.on.is_empty() {
-            models.push(("train.specular.on", &mut self.specular.on));
-        }
-        if !self.from.is_empty() {
-            models.push(("train.from", &mut self.from));
-        }
-        models
     }
 }

@@ -1,8 +1,9 @@
 //! What a training's settings may be.
 
-use super::{
-    Architecture, InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, Target,
-    TrainSettings,
+use picofarm_settings::{Architecture, Target};
+
+use super::settings::{
+    InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, TrainSettings,
 };
 use crate::model::{
     kinds::{
