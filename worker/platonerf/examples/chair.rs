@@ -1,15 +1,16 @@
-//! The figures of docs/reconstruction.md on the network: CPU-seconds of a step, and L1 of novel views against CPU-seconds.
+//! The figures of docs/reconstruction.md on the networks: CPU-seconds of a step, and L1 of novel views against CPU-seconds.
 //!
-//! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each stage at full size, and at the
-//! sizes of the curve. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS
-//! squares|cross_entropy` fits PlatoNeRF's room with a chair, from
-//! times and shadows of its truth at 512 pixels in bins of 128 ps, and says the errors at each quarter of the work.
+//! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each stage at full size, and at
+//! smaller ones. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits PlatoNeRF's room
+//! with a chair, from times and shadows of its truth at 512 pixels in bins of 128 ps, and says the errors at each quarter of
+//! the work. `-- grid` says those of the grid in the same views.
 
 use std::error::Error;
 
 use picofarm_platonerf::{Settings, ShadowLoss, Training};
 use picofarm_reconstruct::{
     Measured, Phase, Progress, Reconstructed, Reconstruction, Shadows, Unwatched, World,
+    reconstruct,
     render::{Distances, Renderer},
     score::score_views,
     source::{Disturbed, from_truth, truth_of},
@@ -56,6 +57,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let measured = from_truth(&scene, &truth_of(&scene, &Unstopped)?, &how)?;
     match words.as_slice() {
         ["step"] => steps(&measured),
+        ["grid"] => grid(&scene, &measured),
         ["curve", width, batch, coarse, fine, distance, shadow, how] => {
             let settings = Settings {
                 width: width.parse()?,
@@ -73,7 +75,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             curve(&scene, measured, settings)
         }
         _ => Err(
-            "expected: step, or curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy".into(),
+            "expected: step, grid, or curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy".into(),
         ),
     }
 }
@@ -132,8 +134,8 @@ fn curve(scene: &Scene, measured: Measured, settings: Settings) -> Result<(), Bo
         ..picofarm_reconstruct::Settings::default()
     };
     let start = Reconstruction::begin(measured.clone(), grid, &Unwatched)?.finish();
-    let world = World::new(scene);
-    let views: Vec<Camera> = plato::views(SIDE).into_iter().step_by(EVERY).collect();
+    let views = Views::new(scene);
+    let own = Views::measuring(scene);
     println!(
         "{settings:?}\nmethod | steps | loss | L1 m | visible | occluded | outside | within view | CPU s"
     );
@@ -149,18 +151,75 @@ fn curve(scene: &Scene, measured: Measured, settings: Settings) -> Result<(), Bo
             field,
             ..start.clone()
         };
-        let say = |name: &str, of: &dyn Distances| {
-            let s = score_views(of, &scene.camera, &world, &views);
-            let l1 = [s.all, s.visible, s.occluded, s.outside, s.within_view].map(|x| x.l1_m);
-            let [all, visible, occluded, outside, within] = l1;
-            let state = training.state();
-            println!(
-                "{name} | {} | {:.3} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | {within:.4} | {seconds:.1}",
-                state.step, state.loss
-            );
+        let after = format!("{} | {:.3}", training.state().step, training.state().loss);
+        own.say("networks, the measuring view", &after, &fitted, seconds);
+        views.say("networks", &after, &fitted, seconds);
+        views.say(
+            "networks on a grid",
+            &after,
+            &Renderer::new(&made.field),
+            seconds,
+        );
+    }
+    Ok(())
+}
+
+/// What a field is compared in.
+struct Views<'a> {
+    scene: &'a Scene,
+    world: World,
+    cameras: Vec<Camera>,
+}
+
+impl<'a> Views<'a> {
+    fn new(scene: &'a Scene) -> Self {
+        Self {
+            scene,
+            world: World::new(scene),
+            cameras: plato::views(SIDE).into_iter().step_by(EVERY).collect(),
+        }
+    }
+
+    fn measuring(scene: &'a Scene) -> Self {
+        let intrinsics = scene.camera.intrinsics.resized(SIDE, SIDE);
+        Self {
+            cameras: vec![Camera {
+                intrinsics,
+                ..scene.camera
+            }],
+            ..Self::new(scene)
+        }
+    }
+
+    /// Prints a line of the table.
+    fn say(&self, name: &str, after: &str, of: &dyn Distances, seconds: f64) {
+        let s = score_views(of, &self.scene.camera, &self.world, &self.cameras);
+        let l1 = [s.all, s.visible, s.occluded, s.outside, s.within_view].map(|x| x.l1_m);
+        let [all, visible, occluded, outside, within] = l1;
+        println!(
+            "{name} | {after} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | {within:.4} | {seconds:.1}"
+        );
+    }
+}
+
+/// Errors of the grid, with and without planes of the room.
+fn grid(scene: &Scene, measured: &Measured) -> Result<(), Box<dyn Error>> {
+    let views = Views::new(scene);
+    for planes in [true, false] {
+        let settings = picofarm_reconstruct::Settings {
+            nodes: NODES,
+            planes,
+            ..picofarm_reconstruct::Settings::default()
         };
-        say("network", &fitted);
-        say("its grid", &Renderer::new(&made.field));
+        let cpu = cpu_seconds();
+        let made = reconstruct(measured.clone(), settings, &Unwatched)?;
+        let seconds = cpu_seconds() - cpu;
+        let name = if planes {
+            "grid"
+        } else {
+            "grid, without planes"
+        };
+        views.say(name, "100 |", &Renderer::new(&made.field), seconds);
     }
     Ok(())
 }
