@@ -25,7 +25,7 @@ pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, Dataset
 pub use job::{Job, JobKind, ListedState};
 pub use model::Model;
 pub use network::{BenchModel, Kind, Learns, Numbers};
-pub use reconstruct::{Reconstruct, SpotsFrom, ViewsArg};
+pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use secrets::without_secrets;
 pub use sweep::{Sweep, WhichSweep};

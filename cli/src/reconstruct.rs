@@ -1,5 +1,6 @@
 //! `picofarm reconstruct`: one scene file in 3D, without a farm.
 
+mod mlp;
 mod pictures;
 mod watch;
 mod written;
@@ -12,7 +13,8 @@ use picofarm_proto::model::{
     memory::{Shape, gib},
 };
 use picofarm_reconstruct::{
-    Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Surface, World, score,
+    Measured, ReconstructError, Reconstructed, Reconstruction, Settings, Shadows, Surface, World,
+    score,
     source::{self, CaptureSettings, Disturbed},
     surface,
 };
@@ -26,7 +28,7 @@ use serde_json::{Value, json};
 
 use self::{watch::Watch, written::write};
 use crate::{
-    args::{Reconstruct, SpotsFrom, ViewsArg},
+    args::{FieldArg, Reconstruct, SpotsFrom, ViewsArg},
     error::{CliError, Code, Result},
     output::{Output, duration},
     picture::canvas::Canvas,
@@ -54,6 +56,7 @@ struct Made {
 /// # Errors
 /// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
 pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
+    mlp::check(&args)?;
     free_folder(&args.out)?;
     let options = ImportOptions::default();
     let mut scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
@@ -132,16 +135,23 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     let measuring = lap(start);
     let settings = Settings {
         nodes,
-        planes: !args.no_planes,
+        planes: !args.no_planes && args.field == FieldArg::Grid,
+        // Networks take the grid's box and evidence; they learn from shadows themselves.
+        shadows: match args.field {
+            FieldArg::Grid => Settings::default().shadows,
+            FieldArg::Mlp => Shadows::Carve,
+        },
         seed: args.seed,
         ..Settings::default()
     };
     let start = Instant::now();
-    let mut reconstruction = Reconstruction::begin(measured, settings, watch).map_err(refused)?;
-    if !reconstruction.run(watch).map_err(refused)? {
-        return Err(signals::interrupted("nothing was written"));
-    }
-    let reconstructed = reconstruction.finish();
+    let (reconstructed, networks) = match args.field {
+        FieldArg::Grid => (fit(measured, settings, watch)?, None),
+        FieldArg::Mlp => {
+            let (made, settings) = mlp::fit(args, measured, settings, watch)?;
+            (made, Some(settings))
+        }
+    };
     let fitting = lap(start);
     let start = Instant::now();
     watch.step("errors", 0.0);
@@ -157,13 +167,16 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
             VIEW_SIDE,
         ),
     };
-    let metrics = metrics(
+    let mut metrics = metrics(
         args,
         scene,
         &settings,
         (&reconstructed, &mesh),
         (&world, &views),
     )?;
+    if let Some(settings) = networks {
+        metrics["mlp"] = settings;
+    }
     let scoring = lap(start);
     watch.step("pictures", 0.0);
     Ok(Made {
@@ -174,6 +187,15 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
         metrics,
         seconds: [measuring, fitting, scoring],
     })
+}
+
+/// The grid.
+fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstructed> {
+    let mut reconstruction = Reconstruction::begin(measured, settings, watch).map_err(refused)?;
+    match reconstruction.run(watch).map_err(refused)? {
+        true => Ok(reconstruction.finish()),
+        false => Err(signals::interrupted("nothing was written")),
+    }
 }
 
 fn measure(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Measured> {

@@ -209,3 +209,49 @@ fn one_spot_works_and_what_it_lacks_is_said() {
     let notes = metrics(&scratch.join("made"))["notes"].to_string();
     assert!(notes.contains("have no depth"), "{notes}");
 }
+
+#[test]
+fn networks_make_the_same_files_and_the_same_bytes_for_any_number_of_threads() {
+    let (scratch, cli) = room("reconstruct-mlp", "chair", "4");
+    let few = [
+        "--field", "mlp", "--steps", "16", "--width", "8", "--batch", "32",
+    ];
+    for threads in ["1", "3"] {
+        let ended = cli
+            .run(&[&TRUTH[..], &[threads, "--threads", threads], &few].concat())
+            .ok();
+        assert!(ended.stdout.contains("note: mlp:"), "{}", ended.stdout);
+    }
+    for file in ["mesh.ply", "metrics.json", "density.zarr/density/c/0/0/0"] {
+        let read = |dir: &str| std::fs::read(scratch.join(dir).join(file)).unwrap();
+        assert!(read("1") == read("3"), "{file}");
+    }
+    let kept = metrics(&scratch.join("1"));
+    assert_eq!(kept["mlp"]["distance_steps"], 2);
+    assert_eq!(kept["mlp"]["shadow_steps"], 14);
+    assert_eq!(kept["iterations"], 16);
+    assert!(kept["loss"].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn options_of_the_other_field_are_refused() {
+    let (scratch, cli) = room("reconstruct-fields", "empty", "1");
+    for (more, told) in [
+        (&["--steps", "100"][..], "--steps belongs to --field mlp"),
+        (&["--width", "64"], "--width belongs to --field mlp"),
+        (&["--batch", "64"], "--batch belongs to --field mlp"),
+        (
+            &["--shadow-loss", "squares"],
+            "--shadow-loss belongs to --field mlp",
+        ),
+        (&["--field", "mlp"], "--field mlp needs --steps"),
+        (
+            &["--field", "mlp", "--steps", "100", "--no-planes"],
+            "--no-planes belongs to --field grid",
+        ),
+    ] {
+        let ended = cli.run(&[&TRUTH[..], &["made"], more].concat()).code(3);
+        assert!(ended.stderr.contains(told), "{more:?}: {}", ended.stderr);
+        assert!(!scratch.join("made").exists(), "{more:?}");
+    }
+}

@@ -18,6 +18,11 @@ pub struct Reconstruct {
     /// Where times and shadows come from: one rendered histogram a spot, all bounces; or depth and visibility of the scene itself
     #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
     pub spots_from: SpotsFrom,
+    /// What becomes the room's density: a grid, in seconds; or PlatoNeRF's networks, the grid's oracle, in hours and more
+    #[arg(long, value_enum, default_value_t = FieldArg::Grid)]
+    pub field: FieldArg,
+    #[command(flatten)]
+    pub mlp: MlpArgs,
     /// Image width and height in pixels of the measurements
     #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: u32,
@@ -44,6 +49,35 @@ pub struct Reconstruct {
     pub threads: Option<usize>,
     #[command(flatten)]
     pub gate: GateArgs,
+}
+
+/// What belongs to `--field mlp` alone.
+#[derive(Args)]
+pub struct MlpArgs {
+    /// Steps of the networks, an eighth of them on distances alone; the paper takes 200000
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=100_000_000))]
+    pub steps: Option<u32>,
+    /// Width of the networks' layers [default: 256]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=1024))]
+    pub width: Option<u32>,
+    /// Rays of a step of the networks [default: 1024]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub batch: Option<u32>,
+    /// How the networks compare light with shadow masks: the paper's squares, or cross-entropy [default: squares]
+    #[arg(long, value_enum)]
+    pub shadow_loss: Option<ShadowLossArg>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FieldArg {
+    Grid,
+    Mlp,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ShadowLossArg {
+    Squares,
+    CrossEntropy,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]

@@ -13,6 +13,34 @@ const NEAR_M: f32 = 0.02;
 /// Nodes with logits up to this are empty.
 const BARELY: f32 = EMPTY + 0.1;
 
+/// Where a ray is stopped.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stopped {
+    /// Distance along the unit direction, metres; where nothing is met, that at which looking ends.
+    pub or_end_m: f32,
+    /// Whether something is met.
+    pub met: bool,
+}
+
+/// Distances of novel views, whatever the field is made of: a grid ([`Renderer`]) or a network.
+pub trait Distances: Sync {
+    /// Where rays from one place along unit directions are stopped, in their order.
+    fn distances(&self, origin: Vec3, directions: &[Vec3]) -> Vec<Stopped>;
+}
+
+impl Distances for Renderer<'_> {
+    fn distances(&self, origin: Vec3, directions: &[Vec3]) -> Vec<Stopped> {
+        let of = |d: &Vec3| {
+            let depth = self.depth(origin, *d);
+            Stopped {
+                or_end_m: depth.unwrap_or_else(|| self.end(origin, *d)),
+                met: depth.is_some(),
+            }
+        };
+        directions.iter().map(of).collect()
+    }
+}
+
 /// A field ready to be looked at.
 #[derive(Debug, Clone)]
 pub struct Renderer<'a> {
@@ -55,10 +83,14 @@ impl<'a> Renderer<'a> {
 
     /// The same, or where the ray leaves the grid: the grid bounds what was observed.
     pub fn depth_or_end(&self, origin: Vec3, direction: Vec3) -> f32 {
-        self.depth(origin, direction).unwrap_or_else(|| {
-            let (near, far) = self.field.span(origin, direction);
-            if far > near { far.max(0.0) } else { 0.0 }
-        })
+        self.depth(origin, direction)
+            .unwrap_or_else(|| self.end(origin, direction))
+    }
+
+    /// Where a ray leaves the grid.
+    fn end(&self, origin: Vec3, direction: Vec3) -> f32 {
+        let (near, far) = self.field.span(origin, direction);
+        if far > near { far.max(0.0) } else { 0.0 }
     }
 
     /// Share of light that gets from `a` to `b`, in [0, 1].

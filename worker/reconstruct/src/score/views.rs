@@ -4,7 +4,7 @@ use picofarm_scene::{Camera, Intrinsics, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{Measured, render::Renderer, world::World};
+use crate::{Measured, render::Distances, world::World};
 
 /// What a pixel of a novel view sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -116,7 +116,7 @@ impl Sums {
 
 /// Scores a field by its depth in other views. `measured` says what the measuring camera saw.
 pub fn score_views(
-    renderer: &Renderer,
+    renderer: &dyn Distances,
     measured: &Camera,
     world: &World,
     views: &[Camera],
@@ -150,14 +150,22 @@ pub fn score_views(
     }
 }
 
-fn of_row(renderer: &Renderer, measured: &Camera, world: &World, view: &Camera, row: u32) -> Sums {
+fn of_row(
+    renderer: &dyn Distances,
+    measured: &Camera,
+    world: &World,
+    view: &Camera,
+    row: u32,
+) -> Sums {
     let mut stack = world.stack();
     let mut sums = Sums::default();
-    for column in 0..view.intrinsics.width {
-        let ray = view.ray(column as f32 + 0.5, row as f32 + 0.5).normalized();
+    let ray = |column| view.ray(column as f32 + 0.5, row as f32 + 0.5).normalized();
+    let rays: Vec<Vec3> = (0..view.intrinsics.width).map(ray).collect();
+    let found = renderer.distances(view.origin, &rays);
+    for (&ray, found) in rays.iter().zip(found) {
         let Some(hit) = world.closest(&mut stack, view.origin, ray) else {
             sums.of[Class::Open as usize].count += 1;
-            sums.filled += u64::from(renderer.depth(view.origin, ray).is_some());
+            sums.filled += u64::from(found.met);
             continue;
         };
         let x = view.origin + ray * hit.range;
@@ -167,7 +175,7 @@ fn of_row(renderer: &Renderer, measured: &Camera, world: &World, view: &Camera, 
             () if world.sees(&mut stack, measured.origin, x) => Class::Visible,
             () => Class::Occluded,
         };
-        let error = f64::from(renderer.depth_or_end(view.origin, ray)) - f64::from(hit.range);
+        let error = f64::from(found.or_end_m) - f64::from(hit.range);
         sums.of[class as usize].add(error);
         if class == Class::Occluded && !world.is_room(hit) {
             sums.of[5].add(error);

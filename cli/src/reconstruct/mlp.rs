@@ -1,0 +1,95 @@
+//! `picofarm reconstruct --field mlp`: PlatoNeRF's networks, sampled on the grid that everything else works on.
+
+use picofarm_reconstruct::{Measured, Reconstructed, Settings};
+use serde_json::Value;
+
+use super::watch::Watch;
+use crate::{
+    args::{FieldArg, Reconstruct},
+    error::{CliError, Result},
+};
+
+/// Checks that options and field belong together.
+///
+/// # Errors
+/// An option of the other field, or none for the number of steps.
+pub fn check(args: &Reconstruct) -> Result<()> {
+    if args.field == FieldArg::Mlp {
+        if cfg!(not(feature = "networks")) {
+            return Err(crate::error::not_built("networks", "networks"));
+        }
+        if args.no_planes {
+            let what = "--no-planes belongs to --field grid: networks have no planes; leave it out";
+            return Err(CliError::input(what));
+        }
+        if args.mlp.steps.is_none() {
+            let what = "--field mlp needs --steps";
+            return Err(CliError::input(what).hint(
+                "the paper takes 200000 of 1024 rays, weeks on a CPU; --steps 1000 --width 64 --batch 256 is a look of about half an hour",
+            ));
+        }
+        return Ok(());
+    }
+    for (option, given) in [
+        ("--steps", args.mlp.steps.is_some()),
+        ("--width", args.mlp.width.is_some()),
+        ("--batch", args.mlp.batch.is_some()),
+        ("--shadow-loss", args.mlp.shadow_loss.is_some()),
+    ] {
+        if given {
+            let what = format!("{option} belongs to --field mlp");
+            return Err(CliError::input(what).hint("add --field mlp, or leave it out"));
+        }
+    }
+    Ok(())
+}
+
+/// Fits the networks: the result on a grid, and the settings for metrics.json.
+///
+/// # Errors
+/// Measurements that cannot be used, a fit that fails, or an interruption.
+#[cfg(feature = "networks")]
+pub fn fit(
+    args: &Reconstruct,
+    measured: Measured,
+    grid: Settings,
+    watch: &Watch,
+) -> Result<(Reconstructed, Value)> {
+    use picofarm_platonerf::{Settings as Networks, ShadowLoss, Training};
+    use picofarm_reconstruct::Reconstruction;
+    use serde_json::json;
+
+    use super::refused;
+    use crate::{args::ShadowLossArg, signals};
+
+    let start = Reconstruction::begin(measured.clone(), grid, watch).map_err(refused)?;
+    let start = start.finish();
+    let paper = Networks::default();
+    let settings = Networks {
+        width: args.mlp.width.map_or(paper.width, |w| w as usize),
+        batch: args.mlp.batch.map_or(paper.batch, |b| b as usize),
+        shadow_loss: match args.mlp.shadow_loss {
+            Some(ShadowLossArg::CrossEntropy) => ShadowLoss::CrossEntropy,
+            Some(ShadowLossArg::Squares) | None => ShadowLoss::Squares,
+        },
+        // Nothing that was seen lies farther away.
+        far_m: (start.field.end() - start.field.origin).length(),
+        seed: args.seed,
+        ..paper.with_steps(args.mlp.steps.unwrap_or_default())
+    };
+    let mut training = Training::begin(measured, settings).map_err(refused)?;
+    if !training.run(watch).map_err(refused)? {
+        return Err(signals::interrupted("nothing was written"));
+    }
+    watch.step("densities", 0.0);
+    Ok((training.finish(start), json!(settings)))
+}
+
+/// Says that there are no networks.
+///
+/// # Errors
+/// Always.
+#[cfg(not(feature = "networks"))]
+pub fn fit(_: &Reconstruct, _: Measured, _: Settings, _: &Watch) -> Result<(Reconstructed, Value)> {
+    Err(crate::error::not_built("networks", "networks"))
+}

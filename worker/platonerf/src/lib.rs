@@ -1,0 +1,26 @@
+//! PlatoNeRF (Klinghoffer et al., CVPR 2024): two small networks that become the density of one room, from light that
+//! bounced twice.
+//!
+//! It is the oracle of `picofarm-reconstruct`, whose grid does the same job in seconds: the same measurements, the method of
+//! the paper with its two stages, losses, samples and schedule. What it makes is sampled on that crate's grid
+//! ([`Fitted::sampled`]), so meshes, files and errors of both are made by the same code. Sampling loses detail finer than a
+//! node; [`Fitted::view`] renders novel views through the network itself, so that the loss can be measured.
+
+mod adam;
+mod checkpoint;
+mod fitted;
+mod loss;
+mod network;
+mod random;
+mod rays;
+mod render;
+mod sample;
+mod settings;
+mod training;
+
+#[cfg(test)]
+mod tests;
+
+pub use fitted::{Fitted, Ray};
+pub use settings::{Settings, ShadowLoss};
+pub use training::Training;

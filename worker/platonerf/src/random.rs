@@ -1,0 +1,80 @@
+//! Random numbers that are a function of what they are drawn for: SplitMix64 (Steele et al. 2014) of a seed and names, and
+//! a shuffled order that is computed place by place.
+
+/// What numbers are drawn for.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Purpose {
+    Weights = 1,
+    Order = 2,
+    Samples = 3,
+}
+
+/// One sequence of numbers.
+#[derive(Debug, Clone)]
+pub(crate) struct Random(u64);
+
+fn mix(mut z: u64) -> u64 {
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+impl Random {
+    /// The sequence of a purpose and two numbers.
+    pub fn new(seed: u64, purpose: Purpose, a: u64, b: u64) -> Self {
+        let mut state = mix(seed ^ 0x9e37_79b9_7f4a_7c15);
+        for part in [purpose as u64, a, b] {
+            state = mix(state ^ mix(part.wrapping_add(0xd1b5_4a32_d192_ed03)));
+        }
+        Self(state)
+    }
+
+    fn bits(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        mix(self.0)
+    }
+
+    /// Uniform in [0, 1), a multiple of 2⁻²⁴.
+    pub fn unit(&mut self) -> f32 {
+        (self.bits() >> 40) as f32 * (1.0 / 16_777_216.0)
+    }
+}
+
+/// Element `place` of the numbers 0..n in the shuffled order of an epoch: four Feistel rounds over the next power of four,
+/// repeated until the result lies below n. `place < n`.
+pub(crate) fn shuffled(seed: u64, epoch: u64, n: u64, place: u64) -> u64 {
+    let half = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
+    let mask = (1u64 << half) - 1;
+    let mut x = place;
+    loop {
+        let (mut left, mut right) = (x >> half, x & mask);
+        for round in 0..4 {
+            let key = Random::new(seed, Purpose::Order, epoch, round << 32 | right).bits();
+            (left, right) = (right, left ^ (key & mask));
+        }
+        x = left << half | right;
+        if x < n {
+            return x;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_epoch_visits_each_ray_once_and_epochs_differ() {
+        for n in [1u64, 2, 5, 16, 1000] {
+            let mut seen: Vec<u64> = (0..n).map(|i| shuffled(7, 0, n, i)).collect();
+            seen.sort_unstable();
+            assert_eq!(seen, (0..n).collect::<Vec<_>>());
+        }
+        let first = |epoch| {
+            (0..50)
+                .map(|i| shuffled(7, epoch, 1000, i))
+                .collect::<Vec<_>>()
+        };
+        assert_ne!(first(0), first(1));
+    }
+}

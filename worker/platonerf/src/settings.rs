@@ -1,0 +1,141 @@
+//! How a network is fitted to a scene. The defaults are the paper's for its simulated scenes.
+
+use picofarm_reconstruct::ReconstructError;
+use serde::Serialize;
+
+/// What stage 2 compares transmittances and shadow masks by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShadowLoss {
+    /// Mean squares, as the paper has them.
+    #[default]
+    Squares,
+    /// Cross-entropy: a lit ray whose light is all stopped still has a gradient.
+    CrossEntropy,
+}
+
+/// Settings of a fit. Lengths are metres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Settings {
+    /// Width of the layers.
+    pub width: usize,
+    /// Layers before the density. The encoded place enters again after the middle one.
+    pub layers: usize,
+    /// Stratified samples of a ray, for the coarse network.
+    pub coarse: usize,
+    /// Further samples of a ray where the coarse network has matter; the fine network takes both.
+    pub fine: usize,
+    /// Where samples begin, metres from the origin of a ray.
+    pub near_m: f32,
+    /// Where samples of camera rays end, metres. Those of light paths end at the spot.
+    pub far_m: f32,
+    /// What lengths are divided by in the losses, metres: the paper's gate.
+    pub scale_m: f32,
+    /// Weight of the distances in stage 2, beside 1 for each mean of transmittances.
+    pub distance_weight: f32,
+    /// Stage 2's comparison of transmittances.
+    pub shadow_loss: ShadowLoss,
+    /// Steps of stage 1: distances of lit pixels.
+    pub distance_steps: u32,
+    /// Steps of stage 2: distances and shadows.
+    pub shadow_steps: u32,
+    /// Rays of a step.
+    pub batch: usize,
+    /// Adam's learning rate at the first step.
+    pub learning_rate: f64,
+    /// Steps over which the learning rate falls to a tenth.
+    pub decay_steps: f64,
+    /// Seed of weights, batches and samples.
+    pub seed: u64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            width: 256,
+            layers: 8,
+            coarse: 64,
+            fine: 128,
+            near_m: 0.1,
+            far_m: 6.0,
+            scale_m: 15.0,
+            distance_weight: 6000.0,
+            shadow_loss: ShadowLoss::Squares,
+            distance_steps: 24_999,
+            shadow_steps: 175_001,
+            batch: 1024,
+            learning_rate: 5e-4,
+            decay_steps: 500_000.0,
+            seed: 0,
+        }
+    }
+}
+
+impl Settings {
+    /// The same with so many steps in all: an eighth for stage 1, as in the paper.
+    #[must_use]
+    pub fn with_steps(self, steps: u32) -> Self {
+        let distance_steps = steps / 8;
+        Self {
+            distance_steps,
+            shadow_steps: steps - distance_steps,
+            ..self
+        }
+    }
+
+    /// Steps of both stages.
+    pub fn steps(&self) -> u32 {
+        self.distance_steps.saturating_add(self.shadow_steps)
+    }
+
+    /// Learning rate of a step, counted from 0.
+    pub fn rate(&self, step: u32) -> f64 {
+        self.learning_rate * libm::pow(0.1, f64::from(step) / self.decay_steps)
+    }
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] naming the first setting out of range.
+    pub fn check(&self) -> Result<(), ReconstructError> {
+        for (field, value, least, most) in [
+            ("width", self.width, 1, 4096),
+            ("layers", self.layers, 2, 64),
+            ("coarse", self.coarse, 4, 4096),
+            ("fine", self.fine, 1, 4096),
+            ("batch", self.batch, 1, 1 << 20),
+            ("steps", self.steps() as usize, 1, 100_000_000),
+        ] {
+            if !(least..=most).contains(&value) {
+                let what = format!("is {value}, expected {least} to {most}");
+                return Err(invalid(field, what));
+            }
+        }
+        let lengths = self.near_m > 0.0 && self.near_m < self.far_m && self.far_m.is_finite();
+        if !lengths {
+            let what = format!(
+                "is {} m to {} m, expected 0 < near_m < far_m",
+                self.near_m, self.far_m
+            );
+            return Err(invalid("near_m", what));
+        }
+        for (field, value) in [
+            ("scale_m", f64::from(self.scale_m)),
+            ("distance_weight", f64::from(self.distance_weight)),
+            ("learning_rate", self.learning_rate),
+            ("decay_steps", self.decay_steps),
+        ] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(invalid(field, format!("is {value}, expected more than 0")));
+            }
+        }
+        Ok(())
+    }
+}
+
+pub(crate) fn invalid(field: &str, what: impl Into<String>) -> ReconstructError {
+    ReconstructError::Invalid {
+        field: field.to_owned(),
+        what: what.into(),
+    }
+}
