@@ -165,7 +165,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         "{}",
         damaged.stderr
     );
-    let no_data_set = farm.run(&["dataset", "export", folder.to_str().unwrap(), "--out", "x"]);
+    let no_data_set = farm.run(&["dataset", "picture", folder.to_str().unwrap(), "--out", "x"]);
     assert!(
         no_data_set.stderr.contains("holds reconstructions"),
         "{}",

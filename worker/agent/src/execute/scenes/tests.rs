@@ -128,7 +128,15 @@ fn a_scene_is_valid_and_as_large_and_lit_as_the_job_says() {
             let mut finer = place.scene(&source, 2 * SIDE, i).unwrap();
             assert_eq!(finer.camera.intrinsics.width, 2 * SIDE);
             finer.camera.intrinsics = finer.camera.intrinsics.resized(SIDE, SIDE);
-            // The notes have the least and largest depth of the pixels.
+            assert_eq!(finer.camera, scene.camera, "{source:?} {i}");
+            for (a, b) in finer.laser.beams.iter().zip(&scene.laser.beams) {
+                assert!(
+                    (a.direction - b.direction).length() < 1e-6,
+                    "{source:?} {i}"
+                );
+            }
+            // Directions are rounded; the notes have the least and largest depth of the pixels.
+            finer.laser = scene.laser.clone();
             finer.provenance = scene.provenance.clone();
             assert!(
                 glb_bytes(&finer).unwrap() == glb_bytes(&scene).unwrap(),
