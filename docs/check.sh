@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Checks that relative links and anchors in the documentation lead somewhere, and that each page is in the contents:
+# Checks that relative links and anchors in the documentation lead somewhere, that each page is in the contents, and that
+# no placeholder is left:
 # docs/check.sh; needs python3.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -18,6 +19,7 @@ def anchors(page):
 
 wrong = []
 for page in pages:
+    wrong += [f"{page}: {mark}: nothing was put in its place" for mark in re.findall(r"@@\w+@@", page.read_text())]
     text = re.sub(r"`[^`\n]*`", "", prose(page))
     links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
     links += re.findall(r"^\[[^\]]+\]: +(\S+)$", text, flags=re.M)
