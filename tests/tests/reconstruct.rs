@@ -236,7 +236,7 @@ fn networks_make_the_same_files_and_the_same_bytes_for_any_number_of_threads() {
 #[test]
 fn options_of_the_other_field_are_refused() {
     let (scratch, cli) = room("reconstruct-fields", "empty", "1");
-    for (more, told) in [
+    for (more, said) in [
         (&["--steps", "100"][..], "--steps belongs to --field mlp"),
         (&["--width", "64"], "--width belongs to --field mlp"),
         (&["--batch", "64"], "--batch belongs to --field mlp"),
@@ -251,7 +251,7 @@ fn options_of_the_other_field_are_refused() {
         ),
     ] {
         let ended = cli.run(&[&TRUTH[..], &["made"], more].concat()).code(3);
-        assert!(ended.stderr.contains(told), "{more:?}: {}", ended.stderr);
+        assert!(ended.stderr.contains(said), "{more:?}: {}", ended.stderr);
         assert!(!scratch.join("made").exists(), "{more:?}");
     }
 }
