@@ -8,9 +8,9 @@ fn a_google_store_is_probed_and_what_it_wants_is_said() {
     let scratch = Scratch::new("gcs");
     let cloud = Cloud::start(&["Bearer good-token"]);
     let cli = Cli::new(scratch.path()).with("GOOGLE_BASE_URL", &cloud.url());
-    let doctor = ["doctor", "--store", "gs://farm/sets"];
+    let doctor = ["doctor", "--store", "gs://lab/sets"];
     cli.run(&doctor)
-        .fails(7, &["gs://farm", "GOOGLE_ALLOW_HTTP=true"]);
+        .fails(7, &["gs://lab", "GOOGLE_ALLOW_HTTP=true"]);
     let cli = cli.with("GOOGLE_ALLOW_HTTP", "true");
     let good = cli.clone().with("GOOGLE_BEARER_TOKEN", "good-token");
     good.run(&doctor).ok();
@@ -18,14 +18,14 @@ fn a_google_store_is_probed_and_what_it_wants_is_said() {
     let bad = cli.clone().with("GOOGLE_BEARER_TOKEN", "bad-token");
     let ended = bad.run(&doctor).fails(
         7,
-        &["gs://farm/sets", "403", "GOOGLE_APPLICATION_CREDENTIALS"],
+        &["gs://lab/sets", "403", "GOOGLE_APPLICATION_CREDENTIALS"],
     );
     assert!(!ended.stderr.contains("bad-token"), "{}", ended.stderr);
     cli.with("GOOGLE_APPLICATION_CREDENTIALS", "none.json")
         .run(&doctor)
         .fails(7, &["GOOGLE_APPLICATION_CREDENTIALS", "No such file"]);
-    good.run(&["dataset", "info", "gs://farm/none"])
-        .fails(3, &["gs://farm/none", "no data set"]);
+    good.run(&["dataset", "info", "gs://lab/none"])
+        .fails(3, &["gs://lab/none", "no data set"]);
 }
 
 #[test]
@@ -35,9 +35,9 @@ fn an_azure_store_is_probed_and_what_it_wants_is_said() {
     let cli = Cli::new(scratch.path())
         .with("AZURE_STORAGE_ENDPOINT", &cloud.url())
         .with("AZURE_ALLOW_HTTP", "true");
-    let doctor = ["doctor", "--store", "az://farm/sets"];
+    let doctor = ["doctor", "--store", "az://lab/sets"];
     cli.run(&doctor)
-        .fails(7, &["az://farm", "AZURE_STORAGE_ACCOUNT_NAME is not set"]);
+        .fails(7, &["az://lab", "AZURE_STORAGE_ACCOUNT_NAME is not set"]);
     let key = |name: &str| {
         cli.clone()
             .with("AZURE_STORAGE_ACCOUNT_NAME", name)
@@ -47,11 +47,11 @@ fn an_azure_store_is_probed_and_what_it_wants_is_said() {
     assert_eq!(cloud.count(), 0, "the probe left nothing");
     let ended = key("other")
         .run(&doctor)
-        .fails(7, &["az://farm/sets", "403", "AZURE_STORAGE_ACCOUNT_KEY"]);
+        .fails(7, &["az://lab/sets", "403", "AZURE_STORAGE_ACCOUNT_KEY"]);
     assert!(!ended.stderr.contains("c2VjcmV0"), "{}", ended.stderr);
     key("lidar")
-        .run(&["dataset", "info", "az://farm/none"])
-        .fails(3, &["az://farm/none", "no data set"]);
+        .run(&["dataset", "info", "az://lab/none"])
+        .fails(3, &["az://lab/none", "no data set"]);
 }
 
 #[test]
@@ -74,6 +74,6 @@ fn limits_on_bandwidth_are_settings_above_zero() {
         .with("GOOGLE_BASE_URL", &cloud.url())
         .with("GOOGLE_ALLOW_HTTP", "true")
         .with("GOOGLE_BEARER_TOKEN", "good-token")
-        .run(&["doctor", "--store", "gs://farm/sets"])
+        .run(&["doctor", "--store", "gs://lab/sets"])
         .ok();
 }
