@@ -22,7 +22,7 @@ pub struct Object {
 /// Where a scene came from, stored beside every histogram.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Generator or importer with its version, e.g. `furnished-1`, `gltf`.
+    /// Generator or importer with its version, e.g. `furnished-2`, `gltf`.
     pub source: String,
     /// Seed of a generator.
     pub seed: Option<u64>,

@@ -13,11 +13,11 @@ use crate::{
     rng::Rng,
     shape::Shape,
     trace::{Model, World},
-    view::{beams_land, coarse_view, full_view},
+    view::{acceptance, beams_land, coarse_view, full_view},
 };
 
 /// Changes whenever the same seed would give another scene.
-pub const GENERATOR_VERSION: &str = "primitive-1";
+pub const GENERATOR_VERSION: &str = "primitive-2";
 
 /// Rooms tried for one seed before giving up.
 const ATTEMPTS: u32 = 64;
@@ -193,8 +193,8 @@ fn attempt_room(
             rng.range(0.2, 0.5) * room.height,
             rng.range(-0.3, 0.0) * room.depth,
         );
-        let intrinsics = Intrinsics::from_fov(fov, settings.width, settings.height);
-        let camera = Camera::look_at(eye, target, intrinsics);
+        let (width, height) = (settings.width, settings.height);
+        let mut camera = Camera::look_at(eye, target, acceptance(fov, width, height));
         let laser = grid.laser(&camera);
         let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
             continue;
@@ -204,6 +204,7 @@ fn attempt_room(
             continue;
         }
         if let Some([near, far]) = full_view(&world, &camera) {
+            camera.intrinsics = Intrinsics::from_fov(fov, width, height);
             let notes = BTreeMap::from([
                 ("attempt".to_owned(), attempt.to_string()),
                 ("depth_m".to_owned(), format!("{near:.3}..{far:.3}")),

@@ -1,17 +1,30 @@
 //! What a generated scene's camera and laser must see: bounded depth over the whole image, enough to
 //! look at, and every beam landing on a diffuse surface.
 
-use crate::{Camera, Laser, Material, Object, Vec3, trace::World};
+use crate::{Camera, Intrinsics, Laser, Material, Object, Vec3, trace::World};
 
 /// Smallest z-depth of a generated view, metres.
 pub const MIN_DEPTH_M: f32 = 0.5;
 /// Largest z-depth of a generated view, metres.
 pub const MAX_DEPTH_M: f32 = 4.5;
 
+/// Pixels along the longer side of the image by which a view is accepted. It is the same for every image
+/// size: a seed shows the same view at 64 pixels as at 1,024.
+const ACCEPTED_AT: u32 = 256;
 /// Rows and columns of the coarse look before the full check.
 const COARSE: u32 = 24;
 /// Mirrors that a beam may meet before it has to land.
 const MAX_FOLDS: usize = 8;
+
+/// Intrinsics by which the view of an image of `width` × `height` pixels is accepted.
+pub(crate) fn acceptance(fov_x_deg: f32, width: u32, height: u32) -> Intrinsics {
+    let longer = width.max(height).max(1);
+    let side = |pixels: u32| {
+        let scaled = u64::from(pixels) * u64::from(ACCEPTED_AT) + u64::from(longer / 2);
+        u32::try_from(scaled / u64::from(longer)).map_or(1, |n| n.max(1))
+    };
+    Intrinsics::from_fov(fov_x_deg, side(width), side(height))
+}
 
 /// Pixels of the coarse look (of COARSE²) that see each object; `None` where any lies outside the
 /// depth bounds. The film's corners are looked at too, since extremes tend to lie there.

@@ -3,7 +3,7 @@
 use crate::{
     Camera, Intrinsics, Laser, LaserGrid, Vec3,
     rng::Rng,
-    view::{beams_land, coarse_view, full_view, is_specular},
+    view::{acceptance, beams_land, coarse_view, full_view, is_specular},
 };
 
 use super::{FurnishedSettings, plan::Plan};
@@ -38,7 +38,8 @@ pub(super) fn choose(
     plan: &Plan<'_>,
 ) -> Option<View> {
     let (world, objects) = (plan.world(), plan.objects());
-    let intrinsics = Intrinsics::from_fov(settings.fov_deg, settings.width, settings.height);
+    let (fov, width, height) = (settings.fov_deg, settings.width, settings.height);
+    let accepted = acceptance(fov, width, height);
     for _ in 0..CAMERAS {
         let gap = rng.range(0.0, 0.35);
         let (at, _) = plan
@@ -59,7 +60,7 @@ pub(super) fn choose(
         {
             continue;
         }
-        let camera = Camera::look_at(eye, target, intrinsics);
+        let mut camera = Camera::look_at(eye, target, accepted);
         let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
             continue;
         };
@@ -87,6 +88,7 @@ pub(super) fn choose(
             continue;
         }
         if let Some(depth) = full_view(&world, &camera) {
+            camera.intrinsics = Intrinsics::from_fov(fov, width, height);
             return Some(View {
                 camera,
                 laser,

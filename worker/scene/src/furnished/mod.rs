@@ -20,7 +20,7 @@ use crate::{
 use plan::Plan;
 
 /// Changes whenever the same seed and assets would give another scene.
-pub const GENERATOR_VERSION: &str = "furnished-1";
+pub const GENERATOR_VERSION: &str = "furnished-2";
 
 /// Rooms tried for one seed before giving up.
 const ATTEMPTS: u32 = 64;
