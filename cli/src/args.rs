@@ -8,7 +8,7 @@ mod model;
 mod network;
 mod ranges;
 mod reconstruct;
-mod render;
+pub(crate) mod render;
 mod secrets;
 mod sweep;
 

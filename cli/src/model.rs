@@ -23,7 +23,7 @@ use crate::{
 };
 
 /// The object of a model that holds its weights.
-const WEIGHTS: &str = "weights.safetensors";
+pub(crate) const WEIGHTS: &str = "weights.safetensors";
 
 pub async fn run(command: Command, output: Output) -> Result<()> {
     match command {

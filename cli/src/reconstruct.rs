@@ -2,6 +2,11 @@
 
 mod mlp;
 mod pictures;
+#[cfg(feature = "networks")]
+mod predicted;
+#[cfg(not(feature = "networks"))]
+#[path = "reconstruct/without_networks.rs"]
+mod predicted;
 mod watch;
 mod written;
 
@@ -23,7 +28,7 @@ use picofarm_scene::{
     import::{self, ImportOptions},
     plato,
 };
-use picofarm_transient::{Gate, RenderError};
+use picofarm_transient::RenderError;
 use serde_json::{Value, json};
 
 use self::{watch::Watch, written::write};
@@ -57,6 +62,7 @@ struct Made {
 /// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
 pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
     mlp::check(&args)?;
+    check_networks(&args)?;
     free_folder(&args.out)?;
     let options = ImportOptions::default();
     let mut scene = import::read_scene_with(&args.file, &options, &args.root.bounds())?;
@@ -68,6 +74,10 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
             "picofarm scene export --spots 16 gives it beams; see docs/rendering.md for laser_directions",
         ));
     }
+    let networks = match args.spots_from {
+        SpotsFrom::Predictions => Some(predicted::read(&args, scene.laser.beams.len()).await?),
+        SpotsFrom::Captures | SpotsFrom::Truth => None,
+    };
     let threads = args.threads.unwrap_or_else(roles::cores).max(1);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -80,7 +90,7 @@ pub async fn run(args: Reconstruct, output: Output) -> Result<()> {
         })?;
     let watch = Watch::new(output, signals::stop_on_signal()?);
     let (args, watch, made) = tokio::task::spawn_blocking(move || {
-        let made = pool.install(|| make(&args, &scene, threads, &watch));
+        let made = pool.install(|| make(&args, &scene, networks.as_ref(), threads, &watch));
         (args, watch, made)
     })
     .await
@@ -122,7 +132,13 @@ fn check_memory(args: &Reconstruct, scene: &Scene, nodes: u32) -> Result<()> {
     }
 }
 
-fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Made> {
+fn make(
+    args: &Reconstruct,
+    scene: &Scene,
+    networks: Option<&predicted::Networks>,
+    threads: usize,
+    watch: &Watch,
+) -> Result<Made> {
     let nodes = if args.fine {
         Settings::FINE_NODES
     } else {
@@ -130,7 +146,7 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     };
     check_memory(args, scene, nodes)?;
     let start = Instant::now();
-    let measured = measure(args, scene, threads, watch)?;
+    let (measured, predictions) = measure(args, scene, networks, threads, watch)?;
     let lap = |since: Instant| since.elapsed().as_secs_f64();
     let measuring = lap(start);
     let settings = Settings {
@@ -177,6 +193,9 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     if let Some(settings) = networks {
         metrics["mlp"] = settings;
     }
+    if let Some(predictions) = predictions {
+        metrics["predictions"] = predictions;
+    }
     let scoring = lap(start);
     watch.step("pictures", 0.0);
     Ok(Made {
@@ -198,30 +217,64 @@ fn fit(measured: Measured, settings: Settings, watch: &Watch) -> Result<Reconstr
     }
 }
 
-fn measure(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Result<Measured> {
+/// Times and masks, and what is to be said of predictions.
+fn measure(
+    args: &Reconstruct,
+    scene: &Scene,
+    networks: Option<&predicted::Networks>,
+    threads: usize,
+    watch: &Watch,
+) -> Result<(Measured, Option<Value>)> {
+    if let Some(networks) = networks {
+        let (measured, facts) = predicted::measure(args, scene, networks, threads, watch)?;
+        return Ok((measured, Some(facts)));
+    }
     if args.spots_from == SpotsFrom::Truth {
         watch.step("ground truth", 0.0);
         let rendered = source::truth_of(scene, watch).map_err(refused)?;
-        return source::from_truth(scene, &rendered, &Disturbed::default()).map_err(refused);
+        let measured = source::from_truth(scene, &rendered, &Disturbed::default());
+        return Ok((measured.map_err(refused)?, None));
     }
     let settings = CaptureSettings {
-        gate: Gate {
-            start_m: args.gate.gate_start_m,
-            bin_width_m: args.gate.bin_width_m,
-            bins: args.gate.bins,
-        },
+        gate: args.gate.gate(),
         samples: args.samples,
         seed: args.seed,
     };
-    let i = &scene.camera.intrinsics;
-    picofarm_agent::check_memory(&settings.render_settings(), (i.width, i.height), threads)
-        .map_err(|e| CliError::new(Code::Resource, e))?;
+    fits_memory(&settings, scene, threads)?;
     let captures = scene.laser.beams.len();
     let progress = |capture: usize, done: f32| {
         let share = (capture as f32 + done) / captures as f32;
         watch.step(&format!("capture {} of {captures}", capture + 1), share)
     };
-    source::captures_of(scene, &settings, &progress).map_err(refused)
+    let measured = source::captures_of(scene, &settings, &progress).map_err(refused)?;
+    Ok((measured, None))
+}
+
+/// Refuses a render that does not fit into memory.
+fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Result<()> {
+    let i = &scene.camera.intrinsics;
+    picofarm_agent::check_memory(&settings.render_settings(), (i.width, i.height), threads)
+        .map_err(|e| CliError::new(Code::Resource, e))
+}
+
+/// Refuses options of predictions where times come from elsewhere.
+fn check_networks(args: &Reconstruct) -> Result<()> {
+    let given = &args.networks;
+    if args.spots_from == SpotsFrom::Predictions {
+        return Ok(());
+    }
+    for (option, value) in [
+        ("--models", &given.models),
+        ("--tof", &given.tof),
+        ("--shadow", &given.shadow),
+        ("--specular", &given.specular),
+    ] {
+        if value.is_some() {
+            let what = format!("{option} belongs to --spots-from predictions");
+            return Err(CliError::input(what).hint("add --spots-from predictions, or leave it out"));
+        }
+    }
+    Ok(())
 }
 
 fn refused(e: ReconstructError) -> CliError {
@@ -250,7 +303,11 @@ fn metrics(
     let asked = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
-        "spots_from": match args.spots_from { SpotsFrom::Captures => "captures", SpotsFrom::Truth => "truth" },
+        "spots_from": match args.spots_from {
+            SpotsFrom::Captures => "captures",
+            SpotsFrom::Truth => "truth",
+            SpotsFrom::Predictions => "predictions",
+        },
         "resolution": args.resolution,
         "settings": settings,
         "views": match args.views { ViewsArg::Around => "around", ViewsArg::Plato => "plato" },

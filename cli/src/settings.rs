@@ -3,8 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use figment::{
-    Figment,
-    providers::{Env, Format, Serialized, Toml},
+    Figment, Metadata, Profile, Provider,
+    providers::{Env, Serialized},
+    value::{Dict, Map, Value},
 };
 use picofarm_agent::Access;
 use picofarm_credentials::Secret;
@@ -13,8 +14,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     args::Global,
-    error::{CliError, Result},
+    error::{CliError, Result, io},
 };
+
+/// What a settings file is called.
+const TOML: &str = "TOML file";
 
 /// What is in force.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -149,7 +153,7 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
     };
     let mut figment = Figment::from(Serialized::defaults(Settings::default()));
     if let Some(path) = &file {
-        figment = figment.merge(Toml::file_exact(path));
+        figment = figment.merge(File::read(path)?);
     }
     figment = figment.merge(Env::prefixed("PICOFARM_").only(&FIELDS));
     let shown = |path: &Option<PathBuf>| path.as_ref().map(|p| p.display().to_string());
@@ -187,13 +191,42 @@ pub fn resolve(global: &Global) -> Result<Resolved> {
     })
 }
 
+/// A settings file.
+struct File {
+    path: PathBuf,
+    values: Dict,
+}
+
+impl File {
+    fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path).map_err(|e| io(path.display(), &e))?;
+        let table: toml::Table = toml::from_str(&text)
+            .map_err(|e| CliError::input(format!("settings: {}: {e}", path.display())))?;
+        let values = Value::serialize(table).ok().and_then(Value::into_dict);
+        Ok(Self {
+            path: path.to_owned(),
+            values: values.expect("a table is a dictionary"),
+        })
+    }
+}
+
+impl Provider for File {
+    fn metadata(&self) -> Metadata {
+        Metadata::from(TOML, self.path.as_path())
+    }
+
+    fn data(&self) -> Result<Map<Profile, Dict>, figment::Error> {
+        Ok(Profile::Default.collect(self.values.clone()))
+    }
+}
+
 fn source(figment: &Figment, name: &str, file: Option<&Path>) -> String {
     let metadata = figment.find_metadata(name).map(|m| m.name.to_string());
     match metadata.as_deref() {
         Some(n) if n.contains("environment") => {
             format!("environment PICOFARM_{}", name.to_uppercase())
         }
-        Some(n) if n.contains("TOML") => {
+        Some(TOML) => {
             format!("file {}", file.unwrap_or(Path::new("?")).display())
         }
         _ => "default".into(),

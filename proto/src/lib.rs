@@ -12,7 +12,7 @@ pub mod trace;
 /// Generated protobuf and gRPC types, package `picofarm.v1`. They never leave the rpc modules.
 #[expect(missing_docs, reason = "generated from the schema, which documents it")]
 pub mod wire {
-    tonic::include_proto!("picofarm.v1");
+    include!("generated/picofarm.v1.rs");
 }
 
 /// Version of the worker protocol; coordinator and worker must agree exactly.

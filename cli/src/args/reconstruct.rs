@@ -15,9 +15,12 @@ pub struct Reconstruct {
     /// Folder for mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where times and shadows come from: one rendered histogram a spot, all bounces; or depth and visibility of the scene itself
+    /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and visibility of the scene itself; or
+    /// networks that see one rendered histogram of all spots at once
     #[arg(long, value_enum, default_value_t = SpotsFrom::Captures)]
     pub spots_from: SpotsFrom,
+    #[command(flatten)]
+    pub networks: NetworksArgs,
     /// What becomes the room's density: a grid, in seconds; or PlatoNeRF's networks, the grid's oracle, in hours and more
     #[arg(long, value_enum, default_value_t = FieldArg::Grid)]
     pub field: FieldArg,
@@ -49,6 +52,23 @@ pub struct Reconstruct {
     pub threads: Option<usize>,
     #[command(flatten)]
     pub gate: GateArgs,
+}
+
+/// What belongs to `--spots-from predictions` alone.
+#[derive(Args)]
+pub struct NetworksArgs {
+    /// Store with the models: a folder or URL, as `picofarm model list` takes it
+    #[arg(long, value_name = "STORE")]
+    pub models: Option<String>,
+    /// Model that predicts depth
+    #[arg(long, value_name = "NAME")]
+    pub tof: Option<String>,
+    /// Model that predicts which pixels each spot lights
+    #[arg(long, value_name = "NAME")]
+    pub shadow: Option<String>,
+    /// Model that predicts mirrors, whose pixels are left out [default: none, mirrors are not known]
+    #[arg(long, value_name = "NAME")]
+    pub specular: Option<String>,
 }
 
 /// What belongs to `--field mlp` alone.
@@ -84,6 +104,7 @@ pub enum ShadowLossArg {
 pub enum SpotsFrom {
     Captures,
     Truth,
+    Predictions,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]

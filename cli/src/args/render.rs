@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use picofarm_scene::import::Bounds;
+use picofarm_transient::Gate;
 
 use crate::{
     choices::{Chosen, Ways},
@@ -139,15 +140,33 @@ pub struct BenchRender {
     pub gate: GateArgs,
 }
 
-#[derive(Args)]
+#[derive(Args, Clone, Copy, PartialEq)]
 pub struct GateArgs {
     /// Start of the time gate, metres of optical path
-    #[arg(long, default_value_t = 1.0, value_name = "M")]
+    #[arg(long, default_value_t = GateArgs::USUAL.gate_start_m, value_name = "M")]
     pub gate_start_m: f64,
     /// Bin width, metres of optical path
-    #[arg(long, default_value_t = 0.0384, value_name = "M")]
+    #[arg(long, default_value_t = GateArgs::USUAL.bin_width_m, value_name = "M")]
     pub bin_width_m: f64,
     /// Number of bins
-    #[arg(long, default_value_t = 637)]
+    #[arg(long, default_value_t = GateArgs::USUAL.bins)]
     pub bins: u32,
+}
+
+impl GateArgs {
+    /// What is meant where nothing is said.
+    pub const USUAL: Self = Self {
+        gate_start_m: 1.0,
+        bin_width_m: 0.0384,
+        bins: 637,
+    };
+
+    /// The gate.
+    pub fn gate(&self) -> Gate {
+        Gate {
+            start_m: self.gate_start_m,
+            bin_width_m: self.bin_width_m,
+            bins: self.bins,
+        }
+    }
 }

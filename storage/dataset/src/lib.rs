@@ -19,6 +19,12 @@ mod scenes;
 mod store;
 mod verify;
 
+/// What a program says that was built without the feature `formats`, and how to get one with it.
+#[cfg(not(feature = "formats"))]
+const WITHOUT_FORMATS: &str = "this picofarm was built without OpenEXR and HDF5";
+#[cfg(not(feature = "formats"))]
+const BUILD_WITH_FORMATS: &str = "build it with `cargo build --release --features formats`, or with `--features full` for everything";
+
 pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use coding::transient::{CodedImage, TransientCodec};
 pub use error::DatasetError;

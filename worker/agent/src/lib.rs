@@ -13,7 +13,7 @@ pub use execute::{
 };
 pub use execute::{export, reconstruct, repair, reprocess, split};
 #[cfg(feature = "networks")]
-pub use execute::{infer_version, model_version, report};
+pub use execute::{infer_version, model_version, report, takes};
 pub use picofarm_session::{
     Access, AccessError, AgentConfig, AgentError, Bearer, Control, Executor, Memory, MemoryLimit,
     Output, StorePrefixes, Summary, Target, Task, TaskError, Trouble, cores, lost_connection,

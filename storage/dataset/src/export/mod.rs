@@ -3,11 +3,16 @@
 //! create-only, and equal ones count as written.
 
 mod card;
+#[cfg(feature = "formats")]
+mod exr;
+#[cfg(feature = "formats")]
 mod hdf5;
 mod packed;
 mod plain;
 mod sb3d;
 mod webdataset;
+#[cfg(not(feature = "formats"))]
+mod without_formats;
 
 use bytes::Bytes;
 use object_store::ObjectStore;
@@ -20,7 +25,11 @@ use crate::layout::quantity::Quantity;
 use crate::scenes::dataset::Dataset;
 use crate::store::objects;
 
+#[cfg(feature = "formats")]
+use hdf5::file as hdf5_file;
 pub(crate) use sb3d::{ASIDE, Aside};
+#[cfg(not(feature = "formats"))]
+use without_formats::file as hdf5_file;
 
 use card::Row;
 
@@ -127,6 +136,8 @@ impl<'a> Exporter<'a> {
             let what = "expected at least one published scene, found none";
             return Err(DatasetError::invalid("scenes", what));
         }
+        #[cfg(not(feature = "formats"))]
+        without_formats::check(format)?;
         packed::check(source)?;
         if format == ExportFormat::Sb3d {
             sb3d::check(source.spec())?;
@@ -184,7 +195,7 @@ impl<'a> Exporter<'a> {
                 let scene = self.source.plain(self.scenes[k]).await?;
                 let name = format!("{:06}.h5", self.scenes[k]);
                 self.out
-                    .put(&name, hdf5::file(&scene, self.source.spec())?.into())
+                    .put(&name, hdf5_file(&scene, self.source.spec())?.into())
                     .await?;
                 self.note(&scene.manifest, &name);
             }

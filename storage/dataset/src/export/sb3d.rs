@@ -8,20 +8,33 @@
 use std::io::{Cursor, Write};
 
 use bytes::Bytes;
-use exr::prelude::{
-    AnyChannel, AnyChannels, Compression, Encoding, FlatSamples, Image, Layer, LayerAttributes,
-    SmallVec, WritableImage,
-};
 use half::f16;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+#[cfg(feature = "formats")]
+use super::exr::image;
+#[cfg(not(feature = "formats"))]
+use super::without_formats::image;
 use crate::error::DatasetError;
 use crate::import::npy;
 use crate::layout::quantity::Quantity;
 use crate::layout::record::{Intrinsics, Spot};
 use crate::layout::spec::{DatasetSpec, Gate};
 use crate::scenes::dataset::Dataset;
+
+/// Values of an OpenEXR image.
+#[derive(Debug)]
+#[cfg_attr(
+    not(feature = "formats"),
+    expect(dead_code, reason = "nothing reads them")
+)]
+pub(super) enum Samples {
+    /// 16 bits.
+    Half(Vec<f16>),
+    /// 32 bits.
+    Float(Vec<f32>),
+}
 
 /// Name of the file with what the layout has no place for.
 pub(crate) const ASIDE: &str = "picofarm.json";
@@ -103,12 +116,12 @@ impl Dataset {
             let size = (spec.gate.bins as usize, spec.pixels());
             out.put(
                 &format!("lidar_{spots}.exr"),
-                image(size, FlatSamples::F16(halves))?,
+                image(size, Samples::Half(halves))?,
             );
         }
         let (w, h) = (spec.width as usize, spec.height as usize);
         let depth: Vec<f32> = self.read(scene, Quantity::Depth).await?;
-        out.put("depth.exr", image((w, h), FlatSamples::F32(depth))?);
+        out.put("depth.exr", image((w, h), Samples::Float(depth))?);
         let specular: Vec<u8> = self.read(scene, Quantity::Specular).await?;
         out.put("specular_mask.png", grey(w, h, &specular)?);
         let lit: Vec<f32> = self
@@ -201,34 +214,6 @@ fn factor_of(h: &[f32]) -> f32 {
     // brightest ≤ 2^exponent, and more than half of it unless it is that half.
     let (_, most) = libm::frexpf(BRIGHTEST);
     libm::ldexpf(1.0, (most - 1 - exponent).clamp(-100, 100))
-}
-
-/// An OpenEXR file with one channel, Y.
-fn image(size: (usize, usize), samples: FlatSamples) -> Result<Vec<u8>, DatasetError> {
-    let mut channels = SmallVec::new();
-    channels.push(AnyChannel::new("Y", samples));
-    let encoding = Encoding {
-        compression: Compression::ZIP16,
-        ..Encoding::default()
-    };
-    let encoding = Encoding {
-        blocks: exr::image::Blocks::ScanLines,
-        line_order: exr::meta::attribute::LineOrder::Increasing,
-        ..encoding
-    };
-    let layer = Layer::new(
-        size,
-        LayerAttributes::default(),
-        encoding,
-        AnyChannels::sort(channels),
-    );
-    let mut bytes = Cursor::new(Vec::new());
-    let written = Image::from_layer(layer)
-        .write()
-        .non_parallel()
-        .to_buffered(&mut bytes);
-    written.map_err(|e| DatasetError::codec("cannot encode an OpenEXR image", e))?;
-    Ok(bytes.into_inner())
 }
 
 /// A grey PNG, 255 where the mask is 1.

@@ -7,6 +7,10 @@ use std::path::{Path, PathBuf};
 
 use super::ImportError;
 use super::files::Files;
+#[cfg(feature = "formats")]
+use super::hdf5::Hdf5;
+#[cfg(not(feature = "formats"))]
+use super::without_formats::Hdf5;
 
 const HINT: &str = "save it again with save('file.mat', '-v7'), or in Python with scipy.io.savemat";
 
@@ -25,22 +29,20 @@ pub(super) struct Mat {
 
 enum Content {
     V5(BTreeMap<String, Matrix>),
-    V73(Box<hdf5_pure::File>),
+    V73(Hdf5),
 }
 
 impl Mat {
     /// Opens a file; version 7.3 stays on disk until an array is read.
     pub fn open(path: &Path, files: &Files) -> Result<Self, ImportError> {
-        let mut head = [0; 128];
-        let mut file = files.open(path)?;
-        let whole_head = file.read_exact(&mut head).is_ok();
-        let hdf5 = hdf5_pure::is_hdf5(path).map_err(|e| ImportError::io("read", path, e))?;
-        let content = if hdf5 {
+        let mut head = Vec::new();
+        let io = |e| ImportError::io("read", path, e);
+        let mut file = files.open(path)?.take(HDF5_AT.end + 8);
+        file.read_to_end(&mut head).map_err(io)?;
+        let whole_head = head.len() >= 128;
+        let content = if is_hdf5(&head) {
             files.hash(path)?;
-            let opened = hdf5_pure::File::open_streaming(path);
-            Content::V73(Box::new(
-                opened.map_err(|e| ImportError::unreadable(path, e, HINT))?,
-            ))
+            Content::V73(Hdf5::open(path).map_err(|e| ImportError::unreadable(path, e, HINT))?)
         } else if whole_head && matches!(&head[126..128], b"IM" | b"MI") {
             let bytes = files.bytes(path)?;
             let arrays = version_5(&bytes).map_err(|e| ImportError::unreadable(path, e, HINT))?;
@@ -63,8 +65,8 @@ impl Mat {
                 .map(|m| m.dims.clone())
                 .ok_or_else(|| self.absent(name)),
             Content::V73(file) => {
-                let set = file.dataset(name).map_err(|_| self.absent(name))?;
-                let shape = set.shape().map_err(|e| self.broken(name, e))?;
+                let shape = file.shape(name).map_err(|e| self.broken(name, e))?;
+                let shape = shape.ok_or_else(|| self.absent(name))?;
                 Ok(shape.iter().rev().map(|s| *s as usize).collect())
             }
         }
@@ -77,8 +79,7 @@ impl Mat {
             Content::V5(arrays) => Ok(arrays[name].clone()),
             Content::V73(file) => {
                 self.check_size(name, &dims)?;
-                let set = file.dataset(name).map_err(|_| self.absent(name))?;
-                let values = set.read_f64().map_err(|e| self.broken(name, e))?;
+                let values = file.all(name).map_err(|e| self.broken(name, e))?;
                 Ok(Matrix { dims, values })
             }
         }
@@ -120,12 +121,11 @@ impl Mat {
                 }
             }
             Content::V73(file) => {
-                let set = file.dataset(name).map_err(|_| self.absent(name))?;
                 // HDF5 tells the axes the other way round: a column is a row there.
                 const AT_ONCE: usize = 64;
                 for first in columns.clone().step_by(AT_ONCE) {
                     let n = AT_ONCE.min(columns.end - first);
-                    let read = set.read_f64_rows(first as u64, n as u64);
+                    let read = file.rows(name, first as u64, n as u64);
                     let values = read.map_err(|e| self.broken(name, e))?;
                     for (k, column) in values.chunks_exact(rows).enumerate() {
                         put(first + k, column);
@@ -149,7 +149,7 @@ impl Mat {
     fn absent(&self, name: &str) -> ImportError {
         let found = match &self.content {
             Content::V5(arrays) => format!("{:?}", arrays.keys().collect::<Vec<_>>()),
-            Content::V73(file) => format!("{:?}", file.root().datasets().unwrap_or_default()),
+            Content::V73(file) => format!("{:?}", file.names()),
         };
         ImportError::refused(
             &self.path,
@@ -160,9 +160,18 @@ impl Mat {
         )
     }
 
-    fn broken(&self, name: &str, error: hdf5_pure::Error) -> ImportError {
+    fn broken(&self, name: &str, error: String) -> ImportError {
         ImportError::unreadable(&self.path, format!("{name}: {error}"), HINT)
     }
+}
+
+/// Bytes at which an HDF5 file may begin, doubling from 512 on: before it stands what another program keeps there.
+const HDF5_AT: std::ops::Range<u64> = 0..4096;
+
+/// Whether these first bytes of a file are HDF5's.
+fn is_hdf5(head: &[u8]) -> bool {
+    let begins = |at: u64| head[(at as usize).min(head.len())..].starts_with(b"\x89HDF\r\n\x1a\n");
+    begins(HDF5_AT.start) || [512, 1024, 2048, HDF5_AT.end].into_iter().any(begins)
 }
 
 /// One element: type and contents.

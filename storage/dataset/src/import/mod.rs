@@ -7,7 +7,11 @@
 mod bf_lidar;
 mod check;
 mod error;
+#[cfg(feature = "formats")]
+mod exr;
 mod files;
+#[cfg(feature = "formats")]
+mod hdf5;
 mod image;
 mod mask_order;
 mod masks;
@@ -21,6 +25,8 @@ mod publish;
 mod sb3d;
 mod scene;
 mod vector;
+#[cfg(not(feature = "formats"))]
+mod without_formats;
 
 use std::path::{Path, PathBuf};
 

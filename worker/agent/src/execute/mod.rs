@@ -25,6 +25,10 @@ pub use kinds::{
 #[cfg(feature = "networks")]
 use kinds::{evaluate, train};
 #[cfg(feature = "networks")]
-pub use kinds::{infer::infer_version, report, train::model_version};
+pub use kinds::{
+    infer::infer_version,
+    report,
+    train::{model_version, takes},
+};
 pub use memory::{check_memory, render_bytes};
 pub use submission::{Submission, absolute};

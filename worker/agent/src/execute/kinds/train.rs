@@ -34,6 +34,7 @@ mod results;
 mod trial;
 
 use along::{Reporter, Saver, loading};
+pub use known::takes;
 pub(in crate::execute) use known::{CheckedModel, Known};
 pub(in crate::execute) use results::WEIGHTS;
 use results::{lines, metrics, output, pretty};

@@ -35,6 +35,21 @@ pub(super) fn asked(plan: &Plan, spec: &DatasetSpec) -> serde_json::Value {
     serde_json::to_value(asked).expect("plain data")
 }
 
+/// What histograms a model knows, and of what multiples of pixels images must be.
+///
+/// # Errors
+/// A sentence where another version of networks made the model.
+pub fn takes(manifest: &ModelManifest) -> Result<(Gate, u32), String> {
+    let asked = serde_json::from_value(manifest.plan.clone());
+    let Asked { plan, gate } = asked.map_err(|e| {
+        format!(
+            "{:?} was made by {}, and this version does not know how to ask it: {e}",
+            manifest.name, manifest.lineage.code
+        )
+    })?;
+    Ok((gate, plan.net.multiple() as u32))
+}
+
 /// A model of a store that fits a data set; its weights are not read yet.
 pub(in crate::execute) struct CheckedModel {
     pub(in crate::execute) manifest: ModelManifest,

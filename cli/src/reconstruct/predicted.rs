@@ -1,0 +1,271 @@
+//! `picofarm reconstruct --spots-from predictions`: times and masks by networks that see one histogram of all spots at once
+//! (Shoot-Bounce-3D, appendices C and E). No truth enters: the networks are given the histogram, and where the spots are.
+
+use picofarm_model::{Model, ModelError, cpu, input::Target, masks, scene};
+use picofarm_reconstruct::{
+    Measured,
+    source::{self, CaptureSettings, Given},
+};
+use picofarm_scene::Scene;
+use picofarm_transient::{Gate, Rendered, render};
+use serde_json::{Value, json};
+
+use super::{fits_memory, refused, watch::Watch};
+use crate::{
+    args::{Reconstruct, render::GateArgs},
+    dataset::failed,
+    error::{CliError, Code, Result},
+    model::{WEIGHTS, open},
+    signals,
+};
+
+/// The networks that are asked.
+pub struct Networks {
+    tof: Member,
+    shadow: Member,
+    specular: Option<Member>,
+    gate: Gate,
+}
+
+struct Member {
+    name: String,
+    manifest_sha256: String,
+    model: Model,
+}
+
+/// Reads the models, each of which must predict what its option says, of the same histograms, for images and beams as they are.
+///
+/// # Errors
+/// A model that is not there, or does not fit; the option is named.
+pub async fn read(args: &Reconstruct, beams: usize) -> Result<Networks> {
+    let given = &args.networks;
+    let needed = |option: &str, value: &Option<String>| {
+        value.clone().ok_or_else(|| {
+            CliError::input(format!("--spots-from predictions needs {option}")).hint(
+                "--models STORE --tof NAME --shadow NAME; `picofarm model list STORE` shows the models that a store keeps",
+            )
+        })
+    };
+    let store = needed("--models", &given.models)?;
+    let tof = needed("--tof", &given.tof)?;
+    let shadow = needed("--shadow", &given.shadow)?;
+    let mut wanted = vec![
+        ("--tof", tof, Target::Tof),
+        ("--shadow", shadow, Target::Shadow),
+    ];
+    if let Some(name) = &given.specular {
+        wanted.push(("--specular", name.clone(), Target::Specular));
+    }
+    let models = open(&store)?;
+    let (mut found, mut gates) = (Vec::new(), Vec::new());
+    for (option, name, target) in wanted {
+        let wrong = |what: String| CliError::input(format!("{option} {name}: {what}"));
+        let manifest = models.manifest(&name).await.map_err(failed)?;
+        if manifest.kind != target.name() {
+            return Err(wrong(format!(
+                "predicts {:?}, expected a model of {:?}",
+                manifest.kind,
+                target.name()
+            )));
+        }
+        let (knows, multiple) = picofarm_agent::takes(&manifest).map_err(&wrong)?;
+        if !args.resolution.is_multiple_of(multiple) {
+            return Err(wrong(format!(
+                "takes images whose sides are multiples of {multiple}, --resolution is {}",
+                args.resolution
+            )));
+        }
+        let weights = models.read(&manifest, WEIGHTS).await.map_err(failed)?;
+        let model = Model::read(&weights, &cpu()).map_err(|e| wrong(e.to_string()))?;
+        let spots = model.question().spots;
+        if spots > 0 && spots != beams {
+            return Err(wrong(format!(
+                "was trained on histograms of {spots} spots, the scene has {beams} beams; \
+                 `picofarm scene export --spots {spots}` gives it others"
+            )));
+        }
+        gates.push((option, knows));
+        found.push(Member {
+            name,
+            manifest_sha256: manifest.sha256(),
+            model,
+        });
+    }
+    let (_, knows) = gates[0];
+    let shown = |g: &Gate| {
+        format!(
+            "{} bins of {} m from {} m",
+            g.bins, g.bin_width_m, g.start_m
+        )
+    };
+    if let Some((option, other)) = gates.iter().find(|(_, g)| *g != knows) {
+        return Err(CliError::input(format!(
+            "{option} knows histograms of {}, --tof of {}; choose models that were trained on the same",
+            shown(other),
+            shown(&knows)
+        )));
+    }
+    let asked = args.gate.gate();
+    if asked != knows && args.gate != GateArgs::USUAL {
+        return Err(CliError::input(format!(
+            "the models know histograms of {}, asked for are {}; leave --gate-start-m, --bin-width-m and --bins out",
+            shown(&knows),
+            shown(&asked)
+        )));
+    }
+    let mut found = found.into_iter();
+    let (Some(tof), Some(shadow)) = (found.next(), found.next()) else {
+        unreachable!("both were read");
+    };
+    Ok(Networks {
+        tof,
+        shadow,
+        specular: found.next(),
+        gate: knows,
+    })
+}
+
+/// Renders the histogram and asks the networks: the measurements, and how good the predictions are for metrics.json.
+///
+/// # Errors
+/// A render that fails, models that do not fit, or an interruption.
+pub fn measure(
+    args: &Reconstruct,
+    scene: &Scene,
+    networks: &Networks,
+    threads: usize,
+    watch: &Watch,
+) -> Result<(Measured, Value)> {
+    let settings = CaptureSettings {
+        gate: networks.gate,
+        samples: args.samples,
+        seed: args.seed,
+    };
+    fits_memory(&settings, scene, threads)?;
+    let rendered = render(scene, &settings.render_settings(), &Capture(watch))
+        .map_err(|e| refused(e.into()))?;
+    let shown = seen(scene, &rendered);
+    let failed = |e: ModelError| CliError::new(Code::Failed, e.to_string());
+    let depth = networks.tof.model.depth_m(&shown).map_err(failed)?;
+    let ask = |member: &Member, depth: Option<&[f32]>| -> Result<Vec<u8>> {
+        let mut tell = |done: usize, of: usize| {
+            watch.step(
+                &format!("{} {done} of {of}", member.name),
+                done as f32 / of as f32,
+            )
+        };
+        masks(&member.model, depth, &shown, &mut tell)
+            .map_err(failed)?
+            .map(|said| said.into_iter().map(|p| u8::from(p >= 128)).collect())
+            .ok_or_else(|| signals::interrupted("nothing was written"))
+    };
+    let lit = ask(&networks.shadow, Some(&depth))?;
+    let mirror = match &networks.specular {
+        Some(member) => ask(member, None)?,
+        None => vec![0; depth.len()],
+    };
+    let range: Vec<f32> = (0..depth.len())
+        .map(|p| depth[p] * slant(scene, p))
+        .collect();
+    let spots: Vec<_> = rendered
+        .spots
+        .iter()
+        .map(|s| s.as_ref().map(|s| (s.point, s.path_m)))
+        .collect();
+    let beams: Vec<u32> = (0..spots.len() as u32).collect();
+    let measured = source::given(&Given {
+        camera: scene.camera,
+        laser: scene.laser.origin,
+        spots: &spots,
+        beams: &beams,
+        range_m: &range,
+        lit: &lit,
+        mirror: &mirror,
+    })
+    .map_err(refused)?;
+    let named = |m: &Member| json!({"name": m.name, "manifest_sha256": m.manifest_sha256});
+    let facts = json!({
+        "models": {
+            "tof": named(&networks.tof), "shadow": named(&networks.shadow),
+            "specular": networks.specular.as_ref().map(named),
+        },
+        "depth_mae_m": depth_error(&depth, &rendered),
+        "lit_iou": iou(&lit, &rendered.truth.visibility),
+        "lit_share": share(&rendered.truth.visibility),
+    });
+    Ok((measured, facts))
+}
+
+/// The render's progress.
+struct Capture<'a>(&'a Watch);
+
+impl picofarm_transient::Progress for Capture<'_> {
+    fn at(&self, done: f32) -> bool {
+        self.0.step("capture of all spots", done)
+    }
+}
+
+/// The scene as a network sees it: nothing of its truth but the spots.
+fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
+    let i = &scene.camera.intrinsics;
+    let pixels = (i.width * i.height) as usize;
+    let spots = rendered.spots.iter();
+    scene::Scene {
+        height: i.height as usize,
+        width: i.width as usize,
+        bins: rendered.gate.bins as usize,
+        first_m: rendered.gate.start_m,
+        bin_width_m: rendered.gate.bin_width_m,
+        histogram: rendered.transient.clone(),
+        depth_m: vec![f32::INFINITY; pixels],
+        specular: vec![0; pixels],
+        lit: vec![0; pixels * rendered.spots.len()],
+        spots: spots
+            .clone()
+            .map(|s| {
+                let place = |s: &picofarm_scene::Spot| scene.camera.to_camera(s.point).into();
+                s.as_ref().map_or([f32::NAN; 3], place)
+            })
+            .collect(),
+        beams_m: spots
+            .map(|s| s.as_ref().map_or(f32::NAN, |s| s.path_m))
+            .collect(),
+        intrinsics: [i.fx, i.fy, i.cx, i.cy].map(f64::from),
+    }
+}
+
+/// Distance along a pixel's ray for each metre of z-depth.
+fn slant(scene: &Scene, pixel: usize) -> f32 {
+    let width = scene.camera.intrinsics.width as usize;
+    let (u, v) = ((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
+    scene.camera.ray(u, v).length()
+}
+
+/// Mean error of z-depth over the pixels that see something, metres.
+fn depth_error(depth: &[f32], rendered: &Rendered) -> f64 {
+    let there = rendered
+        .truth
+        .depth
+        .iter()
+        .zip(depth)
+        .filter(|(z, _)| **z > 0.0);
+    let (sum, n) = there.fold((0.0, 0usize), |(sum, n), (z, found)| {
+        (sum + f64::from((z - found).abs()), n + 1)
+    });
+    sum / n.max(1) as f64
+}
+
+/// Intersection over union of what is lit; 1 where nothing is and nothing is said to be.
+fn iou(said: &[u8], truth: &[u8]) -> f64 {
+    let pairs = || said.iter().zip(truth).map(|(a, b)| (*a != 0, *b != 0));
+    let both = pairs().filter(|(a, b)| *a && *b).count();
+    let either = pairs().filter(|(a, b)| *a || *b).count();
+    match either {
+        0 => 1.0,
+        _ => both as f64 / either as f64,
+    }
+}
+
+fn share(mask: &[u8]) -> f64 {
+    mask.iter().filter(|m| **m != 0).count() as f64 / mask.len().max(1) as f64
+}
