@@ -221,4 +221,121 @@ output = {{ store = {store:?}, dataset = "mixed-3d" }}
         &["reconstruct.predictions", "\"rooms\"", "\"others\""],
     );
     worker.signal(Signal::Terminate);
+    one_command_asks_the_same_networks(&farm);
+}
+
+/// `picofarm reconstruct --spots-from predictions` with the farm's models.
+fn one_command_asks_the_same_networks(farm: &Farm) {
+    let store = farm.store();
+    let store = store.to_str().unwrap();
+    for (spots, file) in [("4", "room.glb"), ("16", "other.glb")] {
+        let made = [
+            "scene",
+            "generate",
+            "--kind",
+            "primitive",
+            "--seed",
+            "77",
+            "--spots",
+            spots,
+        ];
+        farm.run(&[&made[..], &["--resolution", "32", "--out", file]].concat())
+            .ok();
+    }
+    let ask = |file: &str, resolution: &str, options: &[&str], out: &str| {
+        let base = [
+            "reconstruct",
+            file,
+            "--spots-from",
+            "predictions",
+            "--resolution",
+            resolution,
+            "--nodes",
+            "48",
+            "--samples",
+            "2",
+            "--out",
+            out,
+        ];
+        farm.run(&[&base[..], options].concat())
+    };
+    let models = ["--models", store, "--tof", "tof", "--shadow", "shadow"];
+    let with = |more: &[&'static str]| [&models[..], more].concat();
+    let made = |out: &str| fs::read(farm.scratch.join(out).join("metrics.json")).unwrap();
+    ask("room.glb", "32", &with(&["--threads", "1"]), "one").ok();
+    ask(
+        "room.glb",
+        "32",
+        &with(&["--threads", "3", "--bins", "200", "--bin-width-m", "0.0768"]),
+        "three",
+    )
+    .ok();
+    assert!(made("one") == made("three"));
+    let metrics: Value = serde_json::from_slice(&made("one")).unwrap();
+    assert_eq!(metrics["spots_from"], "predictions");
+    let predictions = &metrics["predictions"];
+    assert_eq!(
+        predictions["models"]["shadow"]["name"], "shadow",
+        "{predictions}"
+    );
+    let error = predictions["depth_mae_m"].as_f64().unwrap();
+    assert!(error > 0.0 && error < 2.0, "{predictions}");
+    let iou = predictions["lit_iou"].as_f64().unwrap();
+    assert!(iou > 0.3 && iou < 1.0, "{predictions}");
+    let l1 = metrics["novel_views"]["all"]["l1_m"].as_f64().unwrap();
+    assert!(l1 > 0.0 && l1 < 2.0, "{metrics}");
+    for (file, resolution, options, words) in [
+        (
+            "room.glb",
+            "32",
+            vec!["--models", store, "--tof", "tof"],
+            &["--shadow", "needs"][..],
+        ),
+        (
+            "room.glb",
+            "32",
+            vec!["--models", store, "--tof", "shadow", "--shadow", "shadow"],
+            &["--tof shadow", "\"tof\""],
+        ),
+        (
+            "room.glb",
+            "30",
+            with(&[]),
+            &["--tof tof", "multiples of 4", "30"],
+        ),
+        (
+            "room.glb",
+            "32",
+            with(&["--bins", "100"]),
+            &["--bins", "200 bins"],
+        ),
+        (
+            "other.glb",
+            "32",
+            with(&[]),
+            &["--shadow shadow", "4 spots", "16 beams"],
+        ),
+    ] {
+        let refused = ask(file, resolution, &options, "refused").code(3);
+        for word in words {
+            assert!(refused.stderr.contains(word), "{word}: {}", refused.stderr);
+        }
+        assert!(!farm.scratch.join("refused").exists());
+    }
+    let plain = [
+        "reconstruct",
+        "room.glb",
+        "--out",
+        "refused",
+        "--tof",
+        "tof",
+    ];
+    let refused = farm.run(&plain).code(3);
+    assert!(
+        refused
+            .stderr
+            .contains("--tof belongs to --spots-from predictions"),
+        "{}",
+        refused.stderr
+    );
 }

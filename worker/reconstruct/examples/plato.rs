@@ -74,9 +74,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         return Ok(());
     }
+    if asked("captures") && !asked("peers") {
+        return captured(every);
+    }
     let rows = match asked("peers") {
         true => peers(asked("captures")),
-        false => rows(asked("captures")),
+        false => rows(),
     };
     for row in rows {
         measure(&row, every)?;
@@ -84,7 +87,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn rows(captures: bool) -> Vec<Row> {
+fn rows() -> Vec<Row> {
     let base = Row {
         name: "chair, 192 nodes",
         room: PlatoSettings::default(),
@@ -104,17 +107,6 @@ fn rows(captures: bool) -> Vec<Row> {
     };
     let how = |name, how| Row { name, how, ..base };
     let (r, s, d) = (base.room, base.settings, base.how);
-    if captures {
-        let pixels = |name, resolution| Row {
-            captures: true,
-            ..room(name, PlatoSettings { resolution, ..r })
-        };
-        return vec![
-            pixels("chair, captures of 128 pixels", 128),
-            pixels("chair, captures of 256 pixels", 256),
-            pixels("chair, captures of 512 pixels", 512),
-        ];
-    }
     let object = |name, object| room(name, PlatoSettings { object, ..r });
     let spots = |name, spots| room(name, PlatoSettings { spots, ..r });
     let dark = |row: Row, name| Row {
@@ -213,6 +205,49 @@ fn rows(captures: bool) -> Vec<Row> {
     ]
 }
 
+/// Rooms from rendered captures, each with several settings.
+fn captured(every: usize) -> Result<(), Box<dyn Error>> {
+    let s = Settings::default();
+    let dark = Settings {
+        shadows: Shadows::Ignore,
+        ..s
+    };
+    let open = Settings { planes: false, ..s };
+    let fine = Settings {
+        nodes: Settings::FINE_NODES,
+        ..s
+    };
+    let coarse: &[(&str, Settings)] = &[("192 nodes", s)];
+    let all = &[
+        ("192 nodes", s),
+        ("256 nodes", fine),
+        ("without planes", open),
+        ("without shadows", dark),
+    ];
+    for (name, object, resolution, variants) in [
+        ("chair", PlatoObject::Chair, 128, coarse),
+        ("chair", PlatoObject::Chair, 256, coarse),
+        ("chair", PlatoObject::Chair, 512, all),
+        ("hidden box", PlatoObject::HiddenBox, 512, all),
+        ("armchair", PlatoObject::Armchair, 512, all),
+    ] {
+        let room = PlatoSettings {
+            object,
+            resolution,
+            ..PlatoSettings::default()
+        };
+        let scene = plato::generate(&room)?;
+        let measured = measured(&scene, &Disturbed::default(), true)?;
+        for (variant, settings) in variants {
+            let measured = measured.clone();
+            let made = timed(|| Ok(reconstruct(measured, *settings, &Unwatched)?.field))?;
+            let name = format!("{name}, {resolution} pixels, {variant}");
+            judge(&name, &scene, made, every)?;
+        }
+    }
+    Ok(())
+}
+
 /// Each method on two rooms; from captures, at 256 pixels.
 fn peers(captures: bool) -> Vec<Row> {
     let rooms = [
@@ -252,22 +287,26 @@ fn peers(captures: bool) -> Vec<Row> {
 fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
     let scene = plato::generate(&row.room)?;
     let measured = measured(&scene, &row.how, row.captures)?;
-    let (field, seconds) = timed(|| row.field(measured))?;
+    judge(row.name, &scene, timed(|| row.field(measured))?, every)
+}
+
+/// A field's errors in PlatoNeRF's views, every so manieth.
+fn judge(
+    name: &str,
+    scene: &Scene,
+    (field, seconds): (Field, f64),
+    every: usize,
+) -> Result<(), Box<dyn Error>> {
     let views: Vec<_> = plato::views(SIDE)
         .into_iter()
         .skip(every / 2)
         .step_by(every)
         .collect();
-    let world = World::new(&scene);
+    let world = World::new(scene);
     let score = score_views(&Renderer::new(&field), &scene.camera, &world, &views);
     let mesh = mesh_score(&surface(&field), &world, &field, 0)?;
     let floating = floaters(&field, &world, 0)?;
-    show(
-        row.name,
-        &score,
-        (mesh.chamfer_m, floating.volume_m3),
-        seconds,
-    );
+    show(name, &score, (mesh.chamfer_m, floating.volume_m3), seconds);
     Ok(())
 }
 
