@@ -28,7 +28,7 @@ pub struct GridSettings {
     pub planes: bool,
     /// What becomes of the shadow masks.
     pub shadows: Shadows,
-    /// Iterations of the optimisation.
+    /// Iterations of the optimisation, at most: it ends once held-out rays say that more do not help.
     pub iterations: u32,
     /// Rays of an iteration.
     pub batch: u32,

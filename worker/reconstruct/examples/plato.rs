@@ -2,7 +2,8 @@
 //!
 //! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
 //! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
-//! histograms, minutes), `peers` (other methods), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view).
+//! histograms, an hour), `peers` (other methods), `sampling` (bins, pixels and grids of spots), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view), `=TEXT` (rows whose name
+//! holds the text).
 
 use std::error::Error;
 
@@ -17,7 +18,7 @@ use picofarm_reconstruct::{
     surface,
 };
 use picofarm_scene::{
-    AssetLibrary, Scene,
+    AssetLibrary, LaserGrid, Scene,
     furnished::{self, FurnishedSettings},
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
@@ -48,6 +49,8 @@ struct Row {
     how: Disturbed,
     settings: Settings,
     captures: bool,
+    /// Spots of a regular grid over the image, as multiplexed captures have them; 0 = the room's own.
+    grid: u32,
     /// How the field is made.
     method: Method,
 }
@@ -66,7 +69,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let asked = |word: &str| words.iter().any(|w| w == word);
     let every = if asked("quick") { 7 } else { 1 };
     println!(
-        "room and variant | L1 m | visible | occluded | outside | within view | Chamfer m | floaters m3 | CPU s"
+        "room and variant | L1 m | visible | occluded | outside | within view | Chamfer m | floaters m3 | iterations | CPU s"
     );
     if asked("rooms") {
         for furnished in [false, true] {
@@ -77,18 +80,24 @@ fn main() -> Result<(), Box<dyn Error>> {
     if asked("captures") && !asked("peers") {
         return captured(every);
     }
-    let rows = match asked("peers") {
-        true => peers(asked("captures")),
-        false => rows(),
+    let rows = match (asked("peers"), asked("sampling")) {
+        (true, _) => peers(asked("captures")),
+        (false, true) => sampling(),
+        (false, false) => rows(),
     };
-    for row in rows {
-        measure(&row, every)?;
+    let chosen = |name: &str| {
+        let mut choices = words.iter().filter_map(|w| w.strip_prefix('=')).peekable();
+        choices.peek().is_none() || choices.any(|text| name.contains(text))
+    };
+    for row in rows.iter().filter(|row| chosen(row.name)) {
+        measure(row, every)?;
     }
     Ok(())
 }
 
-fn rows() -> Vec<Row> {
-    let base = Row {
+/// PlatoNeRF's room from the truth in bins of 128 ps.
+fn usual() -> Row {
+    Row {
         name: "chair, 192 nodes",
         room: PlatoSettings::default(),
         how: Disturbed {
@@ -97,8 +106,48 @@ fn rows() -> Vec<Row> {
         },
         settings: Settings::default(),
         captures: false,
+        grid: 0,
         method: Method::Grid,
+    }
+}
+
+/// Coarser times and images, and grids of spots.
+fn sampling() -> Vec<Row> {
+    let base = usual();
+    let bins = |name, times: f32| Row {
+        name,
+        how: Disturbed {
+            bin_width_m: BIN_M * times,
+            ..base.how
+        },
+        ..base
     };
+    let pixels = |name, resolution| Row {
+        name,
+        room: PlatoSettings {
+            resolution,
+            ..base.room
+        },
+        ..base
+    };
+    let grid = |name, grid| Row { name, grid, ..base };
+    vec![
+        bins("bins of 32 ps", 0.25),
+        bins("bins of 128 ps", 1.0),
+        bins("bins of 256 ps", 2.0),
+        bins("bins of 512 ps", 4.0),
+        bins("bins of 1,024 ps", 8.0),
+        pixels("256 pixels", 256),
+        pixels("128 pixels", 128),
+        pixels("64 pixels", 64),
+        grid("grid of 4 spots", 4),
+        grid("grid of 25 spots", 25),
+        grid("grid of 100 spots", 100),
+    ]
+}
+
+fn rows() -> Vec<Row> {
+    let base = usual();
     let room = |name, room| Row { name, room, ..base };
     let with = |name, settings| Row {
         name,
@@ -240,7 +289,7 @@ fn captured(every: usize) -> Result<(), Box<dyn Error>> {
         let measured = measured(&scene, &Disturbed::default(), true)?;
         for (variant, settings) in variants {
             let measured = measured.clone();
-            let made = timed(|| Ok(reconstruct(measured, *settings, &Unwatched)?.field))?;
+            let made = timed(|| grid(measured, *settings))?;
             let name = format!("{name}, {resolution} pixels, {variant}");
             judge(&name, &scene, made, every)?;
         }
@@ -277,6 +326,7 @@ fn peers(captures: bool) -> Vec<Row> {
                 },
                 settings: Settings::default(),
                 captures,
+                grid: 0,
                 method,
             });
         }
@@ -285,7 +335,10 @@ fn peers(captures: bool) -> Vec<Row> {
 }
 
 fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
-    let scene = plato::generate(&row.room)?;
+    let mut scene = plato::generate(&row.room)?;
+    if let Some(grid) = LaserGrid::new(row.grid) {
+        scene.laser = grid.laser(&scene.camera);
+    }
     let measured = measured(&scene, &row.how, row.captures)?;
     judge(row.name, &scene, timed(|| row.field(measured))?, every)
 }
@@ -294,7 +347,7 @@ fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
 fn judge(
     name: &str,
     scene: &Scene,
-    (field, seconds): (Field, f64),
+    ((field, iterations), seconds): ((Field, u32), f64),
     every: usize,
 ) -> Result<(), Box<dyn Error>> {
     let views: Vec<_> = plato::views(SIDE)
@@ -306,8 +359,20 @@ fn judge(
     let score = score_views(&Renderer::new(&field), &scene.camera, &world, &views);
     let mesh = mesh_score(&surface(&field), &world, &field, 0)?;
     let floating = floaters(&field, &world, 0)?;
-    show(name, &score, (mesh.chamfer_m, floating.volume_m3), seconds);
+    show(
+        name,
+        &score,
+        (mesh.chamfer_m, floating.volume_m3),
+        iterations,
+        seconds,
+    );
     Ok(())
+}
+
+/// This crate's field, and the iterations that it took.
+fn grid(measured: Measured, settings: Settings) -> Result<(Field, u32), ReconstructError> {
+    let made = reconstruct(measured, settings, &Unwatched)?;
+    Ok((made.field, made.iterations))
 }
 
 fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, Box<dyn Error>> {
@@ -327,11 +392,11 @@ fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, 
 }
 
 impl Row {
-    fn field(&self, measured: Measured) -> Result<Field, ReconstructError> {
+    fn field(&self, measured: Measured) -> Result<(Field, u32), ReconstructError> {
         match self.method {
-            Method::Grid => Ok(reconstruct(measured, self.settings, &Unwatched)?.field),
-            Method::BounceFlash => bounce_flash(&measured, self.settings.nodes),
-            Method::DepthAlone(behind) => depth_alone(&measured, &self.settings, behind),
+            Method::Grid => grid(measured, self.settings),
+            Method::BounceFlash => Ok((bounce_flash(&measured, self.settings.nodes)?, 0)),
+            Method::DepthAlone(behind) => Ok((depth_alone(&measured, &self.settings, behind)?, 0)),
         }
     }
 }
@@ -349,11 +414,11 @@ fn timed<T>(
     Ok((made, cpu() - start))
 }
 
-fn show(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), seconds: f64) {
+fn show(name: &str, s: &ViewScore, (chamfer, floating): (f64, f64), iterations: u32, seconds: f64) {
     let [all, visible, occluded, outside, within] =
         [s.all, s.visible, s.occluded, s.outside, s.within_view].map(|split| split.l1_m);
     println!(
-        "{name} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | {within:.4} | {chamfer:.4} | {floating:.4} | {seconds:.1}"
+        "{name} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | {within:.4} | {chamfer:.4} | {floating:.4} | {iterations} | {seconds:.1}"
     );
 }
 
@@ -383,7 +448,7 @@ fn rooms(furnished: bool, captures: bool) -> Result<(), Box<dyn Error>> {
     let source = if captures { "captures" } else { "truth" };
     let [all, visible, occluded, outside] = sums.map(|sum| sum / count.max(1.0));
     println!(
-        "{count} {kind} rooms, {source} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | | | | {:.1}",
+        "{count} {kind} rooms, {source} | {all:.4} | {visible:.4} | {occluded:.4} | {outside:.4} | | | | | {:.1}",
         seconds / count.max(1.0)
     );
     Ok(())

@@ -6,7 +6,7 @@ use crate::{
 };
 
 /// First bytes of a checkpoint: its form and version.
-const MAGIC: &[u8; 8] = b"pfrecon1";
+const MAGIC: &[u8; 8] = b"pfrecon2";
 
 impl Reconstruction {
     /// The state as bytes: little-endian, a few MB.
@@ -17,7 +17,9 @@ impl Reconstruction {
             return out;
         };
         out.extend(saved.done.to_le_bytes());
+        out.extend(saved.settles.unwrap_or(u32::MAX).to_le_bytes());
         out.extend(saved.loss.to_le_bytes());
+        out.extend(saved.held_out.to_le_bytes());
         for values in [&saved.logits, &saved.first, &saved.second] {
             out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
         }
@@ -50,15 +52,15 @@ impl Reconstruction {
             return Ok(begun);
         }
         let nodes = begun.trainable_nodes().len();
-        if rest.len() != 12 + 12 * nodes {
+        if rest.len() != 24 + 12 * nodes {
             return Err(bad("is cut off; begin anew"));
         }
-        let (done, rest) = rest
-            .split_first_chunk()
-            .ok_or_else(|| bad("is cut off; begin anew"))?;
-        let (loss, rest) = rest
-            .split_first_chunk()
-            .ok_or_else(|| bad("is cut off; begin anew"))?;
+        let cut = || bad("is cut off; begin anew");
+        let (done, rest) = rest.split_first_chunk().ok_or_else(cut)?;
+        let (settles, rest) = rest.split_first_chunk().ok_or_else(cut)?;
+        let (loss, rest) = rest.split_first_chunk().ok_or_else(cut)?;
+        let (held_out, rest) = rest.split_first_chunk().ok_or_else(cut)?;
+        let settles = u32::from_le_bytes(*settles);
         let (words, _) = rest.as_chunks::<4>();
         let values = |part: usize| -> Vec<f32> {
             let part = &words[part * nodes..(part + 1) * nodes];
@@ -67,6 +69,8 @@ impl Reconstruction {
         begun.set_saved(Saved {
             done: u32::from_le_bytes(*done),
             loss: f64::from_le_bytes(*loss),
+            held_out: f64::from_le_bytes(*held_out),
+            settles: (settles != u32::MAX).then_some(settles),
             logits: values(0),
             first: values(1),
             second: values(2),

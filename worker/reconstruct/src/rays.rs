@@ -12,6 +12,9 @@ use crate::{
 
 /// Most light paths that are looked at; beyond, every n-th is.
 const MOST: usize = 2_200_000;
+/// Most rays of a class that are held out, and one of at least so many.
+const HELD_OUT: usize = 4096;
+const HELD_OUT_EVERY: usize = 20;
 /// Steps of the look, voxels.
 const STEP: f32 = 0.7;
 
@@ -42,6 +45,8 @@ pub(crate) struct Rays<'a> {
     spacing: f32,
     /// Class → candidates, each a number for [`Rays::get`].
     pub classes: [Vec<u32>; 3],
+    /// Class → candidates that are never learnt from: their loss says whether learning still helps.
+    pub held_out: [Vec<u32>; 3],
 }
 
 impl<'a> Rays<'a> {
@@ -60,6 +65,7 @@ impl<'a> Rays<'a> {
             ranges: &depth.range,
             spacing: field.spacing,
             classes: Default::default(),
+            held_out: Default::default(),
         };
         let stride = (k * pixels).div_ceil(MOST).max(1);
         let meets = |ray: &Ray| {
@@ -100,6 +106,18 @@ impl<'a> Rays<'a> {
             for (class, q) in found {
                 rays.classes[class].push(q);
             }
+        }
+        for (class, held_out) in rays.classes.iter_mut().zip(&mut rays.held_out) {
+            let every = class.len().div_ceil(HELD_OUT).max(HELD_OUT_EVERY);
+            let mut n = 0;
+            class.retain(|q| {
+                n += 1;
+                let learnt = n % every != 0;
+                if !learnt {
+                    held_out.push(*q);
+                }
+                learnt
+            });
         }
         Ok(rays)
     }

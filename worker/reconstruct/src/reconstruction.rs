@@ -46,6 +46,8 @@ pub struct Reconstructed {
     pub measured: Measured,
     /// Loss per ray of the last iteration, where there was one.
     pub loss: Option<f64>,
+    /// Loss per ray that was held out, when it was last looked at.
+    pub held_out_loss: Option<f64>,
     /// Iterations done.
     pub iterations: u32,
     /// What somebody should know before trusting it.
@@ -72,6 +74,8 @@ type Trainable = (Vec<u32>, Vec<crate::optimise::Kind>);
 pub(crate) struct Saved {
     pub done: u32,
     pub loss: f64,
+    pub held_out: f64,
+    pub settles: Option<u32>,
     pub logits: Vec<f32>,
     pub first: Vec<f32>,
     pub second: Vec<f32>,
@@ -167,13 +171,17 @@ impl Reconstruction {
             moments.first = saved.first;
             moments.second = saved.second;
             (optimiser.done, optimiser.loss) = (saved.done, saved.loss);
+            (optimiser.held_out, optimiser.settles) = (saved.held_out, saved.settles);
         }
         let ended = optimiser.run(&mut field, progress);
         let (done, loss) = (optimiser.done, optimiser.loss);
+        let (held_out, settles) = (optimiser.held_out, optimiser.settles);
         let (nodes, moments) = optimiser.state();
         self.saved = Some(Saved {
             done,
             loss,
+            held_out,
+            settles,
             logits: nodes.iter().map(|&i| field.logit[i as usize]).collect(),
             first: std::mem::take(&mut moments.first),
             second: std::mem::take(&mut moments.second),
@@ -184,12 +192,14 @@ impl Reconstruction {
     /// The result so far.
     pub fn finish(self) -> Reconstructed {
         let mut field = self.field;
-        let (mut loss, mut iterations) = (None, 0);
+        let (mut loss, mut held_out_loss, mut iterations) = (None, None, 0);
         if let Some(saved) = self.saved {
             for (&i, u) in self.trainable.0.iter().zip(&saved.logits) {
                 field.logit[i as usize] = *u;
             }
-            (loss, iterations) = (saved.loss.is_finite().then_some(saved.loss), saved.done);
+            let known = |x: f64| x.is_finite().then_some(x);
+            (loss, held_out_loss) = (known(saved.loss), known(saved.held_out));
+            iterations = saved.done;
         }
         Reconstructed {
             field,
@@ -198,6 +208,7 @@ impl Reconstruction {
             planes: self.planes,
             measured: self.measured,
             loss,
+            held_out_loss,
             iterations,
             notes: self.notes,
         }

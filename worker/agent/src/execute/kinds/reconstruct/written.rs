@@ -31,6 +31,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
         "planes": planes,
         "iterations": made.iterations,
         "loss": made.loss,
+        "held_out_loss": made.held_out_loss,
         "vertices": mesh.positions.len(),
         "triangles": mesh.triangles.len(),
         "evidence": {
