@@ -24,7 +24,7 @@ use crate::{
     args::Dataset as Command,
     error::{CliError, Code, Result, io},
     output::{Output, bytes},
-    picture::{View, flight, sheet},
+    picture::{View, flight, save, sheet},
     settings::Settings,
     signals,
 };
@@ -224,7 +224,7 @@ pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
         (scenes.to_vec(), drawn.sheet.clone(), drawn.flight.clone());
     tokio::task::spawn_blocking(move || {
         let read = |scene| handle.block_on(view(&dataset, scene));
-        sheet::sheet(&scenes, read)?.save(&sheet_path)?;
+        save(&sheet::sheet(&scenes, read)?, &sheet_path)?;
         flight::animate(&read(first)?, &flight_path)
     })
     .await

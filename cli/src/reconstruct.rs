@@ -1,13 +1,14 @@
 //! `picofarm reconstruct`: one scene file in 3D, without a farm.
 
 mod mlp;
-mod pictures;
+mod orbit;
 mod watch;
 mod written;
 
 use std::time::Instant;
 
-use picofarm_agent::Memory;
+use picofarm_agent::{Memory, reconstruct};
+use picofarm_figures::Canvas;
 use picofarm_proto::model::{
     kinds::reconstruct::grid_bytes,
     memory::{Shape, gib},
@@ -31,7 +32,6 @@ use crate::{
     args::{FieldArg, Reconstruct, SpotsFrom, ViewsArg},
     error::{CliError, Code, Result},
     output::{Output, duration},
-    picture::canvas::Canvas,
     render::free_folder,
     roles, signals,
 };
@@ -180,8 +180,8 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     let scoring = lap(start);
     watch.step("pictures", 0.0);
     Ok(Made {
-        views: pictures::views(&reconstructed, &world, &views),
-        orbit: pictures::orbit(&reconstructed, &views)?,
+        views: reconstruct::views(&reconstructed, &world, &views),
+        orbit: orbit::orbit(&reconstructed, &views)?,
         reconstructed,
         mesh,
         metrics,
@@ -242,11 +242,8 @@ fn metrics(
     (made, mesh): (&Reconstructed, &Surface),
     (world, views): (&World, &[Camera]),
 ) -> Result<Value> {
-    let mut all = picofarm_agent::reconstruct::facts(made, mesh);
-    all.extend(
-        picofarm_agent::reconstruct::errors(made, mesh, world, views, args.seed)
-            .map_err(refused)?,
-    );
+    let mut all = reconstruct::facts(made, mesh);
+    all.extend(reconstruct::errors(made, mesh, world, views, args.seed).map_err(refused)?);
     let asked = json!({
         "scene": scene.name,
         "provenance": scene.provenance,

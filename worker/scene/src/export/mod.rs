@@ -5,7 +5,6 @@ mod binary;
 mod document;
 pub(crate) mod mitsuba;
 mod ply;
-mod rgb_png;
 mod textures;
 
 use std::{
@@ -14,10 +13,11 @@ use std::{
     sync::Arc,
 };
 
+use picofarm_figures::rgb_png;
+
 use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
 pub use mitsuba::write_mitsuba;
-pub use rgb_png::rgb_png;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;

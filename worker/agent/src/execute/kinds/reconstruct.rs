@@ -3,6 +3,7 @@
 //! A task takes seconds, so it keeps no checkpoint: one that is stopped begins again, and comes to the same bytes.
 
 mod captured;
+mod pictures;
 mod written;
 
 use std::collections::BTreeMap;
@@ -40,6 +41,7 @@ use crate::execute::{
 };
 
 use captured::{Frame, captures, slant};
+pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
 
 /// Pixels a side of a novel view.
