@@ -45,6 +45,7 @@ const AROUND: usize = 24;
 struct Made {
     reconstructed: Reconstructed,
     mesh: Surface,
+    glb: Vec<u8>,
     metrics: Value,
     views: Canvas,
     orbit: Vec<u8>,
@@ -182,6 +183,7 @@ fn make(args: &Reconstruct, scene: &Scene, threads: usize, watch: &Watch) -> Res
     Ok(Made {
         views: reconstruct::views(&reconstructed, &world, &views),
         orbit: orbit::orbit(&reconstructed, &views)?,
+        glb: mesh.glb(&reconstructed.measured).map_err(refused)?,
         reconstructed,
         mesh,
         metrics,

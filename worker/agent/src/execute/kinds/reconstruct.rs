@@ -386,6 +386,8 @@ impl Work<'_> {
             .map(|(key, bytes)| (format!("density.zarr/{key}"), bytes))
             .collect();
         files.insert("mesh.ply".into(), mesh.ply().into());
+        let glb = mesh.glb(&made.measured).map_err(of_reconstruction)?;
+        files.insert("mesh.glb".into(), glb.into());
         let text = serde_json::to_string_pretty(&metrics).expect("metrics are plain data");
         files.insert("metrics.json".into(), (text + "\n").into());
         Ok(files)

@@ -97,7 +97,7 @@ pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetE
         "axes": "x, y, z of the scene, metres; node (k, j, i) lies at origin + spacing * (i, j, k)",
         "density": "1/m at the nodes: 4/spacing * sigmoid(logit); between nodes the logit is trilinear, logit = ln(s/(1 - s)) with s = density * spacing/4",
         "surface_density_per_m": PEAK / field.spacing * sigmoid(surface_logit()),
-        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.ply is this level",
+        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.glb and mesh.ply are this level",
         "evidence": "what tells of a node: 0 nothing (its density is a guess), 1 a plane of the room, 2 light paths, 3 the camera",
     });
     let attributes = attributes.as_object().expect("written as an object");
