@@ -367,9 +367,9 @@ pub enum Dataset {
     /// Find objects that belong to no finished scene, left by killed workers, and delete them if asked to
     #[command(alias = "collect")]
     Gc(DatasetGc),
-    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
+    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set; of reconstructions, a contact sheet
     Picture {
-        /// Folder or URL of the data set
+        /// Folder or URL of the data set, or of reconstructions
         #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Folder for the pictures

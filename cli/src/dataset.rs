@@ -53,6 +53,14 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Split(args) => split::run(args, output).await,
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
+            if let Some(there) = reconstructions::find(&dataset).await? {
+                let sheet = out.join("contact-sheet.png");
+                reconstructions::draw(&dataset, &there, rows, &sheet).await?;
+                output.result(&json!({"contact_sheet": sheet}), || {
+                    sheet.display().to_string()
+                });
+                return Ok(());
+            }
             let present = open(&dataset)
                 .await?
                 .scenes_present()

@@ -19,6 +19,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
     let left_out: Vec<Value> = left_out
         .map(|l| json!({"beam": l.beam, "why": l.why}))
         .collect();
+    let image = &made.measured.camera.intrinsics;
     let planes = made.planes.iter();
     let planes: Vec<Value> = planes
         .map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset}))
@@ -27,6 +28,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
         |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
     let facts = json!({
         "spots": made.measured.spots.len(),
+        "image": [image.width, image.height],
         "left_out": left_out,
         "planes": planes,
         "iterations": made.iterations,
