@@ -18,7 +18,8 @@ use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use picofarm_database::CatalogPlace;
 
 pub use data::{
-    BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs,
+    BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
+    SensorArgs,
 };
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
@@ -379,6 +380,9 @@ pub enum Dataset {
         #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
+    /// Write a page about reconstructions, and the same as JSON beside it: errors in novel views beside published ones,
+    /// meshes, the best and the worst scene
+    Report(DatasetReport),
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
     Reprocess(DatasetReprocess),
     /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's layout; again to resume

@@ -51,6 +51,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Export(args) => export::run(args, output).await,
         Command::Import(args) => import::run(*args, output).await,
         Command::Split(args) => split::run(args, output).await,
+        Command::Report(args) => reconstructions::report(&args, output).await,
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
             if let Some(there) = reconstructions::find(&dataset).await? {

@@ -79,10 +79,10 @@ fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
-/// What commands say of the folder `truth-3d`.
+/// What commands say of the folders `truth-3d` and `seen-3d`.
 fn looked_at(farm: &Farm) {
     let place = |name: &str| farm.store().join(name).to_str().unwrap().to_owned();
-    let truth = place("truth-3d");
+    let (truth, seen) = (place("truth-3d"), place("seen-3d"));
     let pictures = place("pictures");
     let drawn = farm.json(&[
         "dataset", "picture", &truth, "--out", &pictures, "--rows", "3",
@@ -92,6 +92,51 @@ fn looked_at(farm: &Farm) {
     // Three rows of pictures of 160 pixels.
     let height = u32::from_be_bytes(sheet[20..24].try_into().unwrap());
     assert!((480..600).contains(&height), "{height}");
+
+    let page = place("rooms.html");
+    let written = farm.json(&["dataset", "report", &truth, &seen, "--out", &page]);
+    assert_eq!(written["scenes"], 24, "{written}");
+    let html = fs::read_to_string(&page).unwrap();
+    for said in [
+        "truth-3d",
+        "from predictions, 4 spots, 32×32 pixels, 48 nodes",
+        "0.0862",
+    ] {
+        assert!(html.contains(said), "{said}");
+    }
+    let pictures = html.matches("data:image/png;base64,").count();
+    assert_eq!(pictures, 6, "best, median and worst of either");
+    let told = fs::read_to_string(written["json"].as_str().unwrap()).unwrap();
+    let told: Value = serde_json::from_str(&told).unwrap();
+    let info = farm.json(&["dataset", "info", &truth]);
+    let of_truth = &told["groups"][0];
+    assert_eq!(
+        of_truth["figures"]["l1_m"]["mean"], info["means"]["l1_m"]["mean"],
+        "{told}"
+    );
+    assert!(
+        of_truth["figures"]["l1_m"]["standard_error"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
+    // Other rooms, spots and images than the paper's.
+    assert_eq!(of_truth["as_published"], false, "{told}");
+    let ranks: Vec<&str> = of_truth["extremes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|e| e["rank"].as_str().unwrap())
+        .collect();
+    assert_eq!(ranks, ["best", "median", "worst"]);
+
+    let rooms = place("rooms");
+    let refused = farm.run(&["dataset", "report", &rooms]).code(3);
+    assert!(
+        refused.stderr.contains("holds no reconstructions"),
+        "{}",
+        refused.stderr
+    );
 }
 
 #[test]
@@ -114,6 +159,11 @@ fn reconstructions_without_views_have_no_pictures_and_say_so() {
         .code(3);
     assert!(refused.stderr.contains("views = 0"), "{}", refused.stderr);
     assert!(refused.stderr.contains("views = 24"), "{}", refused.stderr);
+    let page = farm.store().join("rooms.html");
+    farm.run(&["dataset", "report", place, "--out", page.to_str().unwrap()])
+        .ok();
+    let html = fs::read_to_string(page).unwrap();
+    assert!(html.contains("No novel views") && !html.contains("data:image"));
 }
 
 #[test]

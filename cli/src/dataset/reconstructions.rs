@@ -1,12 +1,16 @@
-//! `dataset info` of reconstructions: the means of their errors; whether they are whole; and their pictures.
+//! `dataset info` of reconstructions: the means of their errors; whether they are whole; their pictures; and a page
+//! about them.
 
+mod page;
 mod picture;
+mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
 use picofarm_dataset::{DatasetError, Problem, Reconstructions, open_store};
 use serde_json::{Map, Value, json};
 
 pub use picture::draw;
+pub use report::run as report;
 
 use super::{
     failed,
@@ -46,6 +50,22 @@ pub async fn find(place: &str) -> Result<Option<Reconstructions>> {
         Err(error @ DatasetError::Store { .. }) => Err(failed(error)),
         // What else may lie there is not for this to say.
         Err(_) => Ok(None),
+    }
+}
+
+/// The reconstructions at a place, which must have some.
+///
+/// # Errors
+/// Something else lies there, or nothing.
+pub async fn opened(place: &str) -> Result<Reconstructions> {
+    match find(place).await? {
+        Some(there) => Ok(there),
+        None => {
+            let what = format!("{place}: holds no reconstructions");
+            Err(CliError::input(what).hint(
+                "name the folder that a reconstruct stage has written; `picofarm model report` tells of models",
+            ))
+        }
     }
 }
 

@@ -240,7 +240,7 @@ fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetE
     }
     if is_reconstructions(&root) {
         let what = "holds reconstructions of the scenes of a data set, and is no data set itself; `dataset info`, \
-                    `verify` and `picture` read it";
+                    `verify`, `picture` and `report` read it";
         return Err(DatasetError::invalid(object, what));
     }
     let ours = &root["attributes"]["picofarm"];
