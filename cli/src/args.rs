@@ -219,6 +219,9 @@ pub struct Demo {
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
+    /// Then reconstruct each room in 3D, from the depth and shadows of its ground truth: meshes, errors, pictures
+    #[arg(long)]
+    pub reconstruct: bool,
     #[command(flatten)]
     pub traces: Traces,
 }

@@ -6,7 +6,7 @@ pub mod import;
 mod late;
 mod predictions;
 mod problems;
-mod reconstructions;
+pub mod reconstructions;
 pub mod repair;
 pub mod reprocess;
 pub mod show;

@@ -6,7 +6,9 @@ mod picture;
 mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{DatasetError, Problem, Reconstructions, open_store};
+use picofarm_dataset::{
+    DatasetError, Problem, Reconstructions, Verification, VerifyMode, open_store,
+};
 use serde_json::{Map, Value, json};
 
 pub use picture::draw;
@@ -156,6 +158,19 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
     match report.is_sound() {
         true => Ok(()),
         false => Err(broken_by(&args.dataset, &report.problems, hint)),
+    }
+}
+
+/// Verifies reconstructions in full, for other commands.
+///
+/// # Errors
+/// Exit code 6 naming what is broken.
+pub async fn check(place: &str, there: &Reconstructions) -> Result<Verification> {
+    let report = there.verify(VerifyMode::Full, &|_, _| ()).await;
+    let report = report.map_err(failed)?;
+    match report.is_sound() {
+        true => Ok(report),
+        false => Err(broken_by(place, &report.problems, hint)),
     }
 }
 
