@@ -104,8 +104,8 @@ pub(super) const PUBLISHED: [Published; 4] = [
 
 const DIFFERS: &str = "Published figures are those of PlatoNeRF's paper for its chair. They are not of these conditions: \
     its chair is another one, which pixels its mean covers is not stated, its depth is a mean along the ray and ours the median, \
-    and its captures come from another renderer. So they compare in kind, not in digits. A dash stands where the settings are not \
-    the paper's: 16 spots, 512 × 512 pixels, its room.";
+    and its captures come from another renderer; rows from truth use no captures at all. So they compare in kind, not in digits. \
+    A dash stands where the settings are not the paper's: 16 spots, 512 × 512 pixels, its room.";
 
 /// A scene's manifest and metrics.
 struct Scene {

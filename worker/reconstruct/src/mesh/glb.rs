@@ -18,7 +18,8 @@ impl Surface {
     /// triangles gives a file that holds the camera and the laser alone.
     ///
     /// # Errors
-    /// [`ReconstructError::Invalid`] where a camera is none that scenes can have, or for more than the 4 GiB of a `.glb`.
+    /// [`ReconstructError::Invalid`] where the measuring camera's axes are not orthonormal, or for more than the 4 GiB of a
+    /// `.glb`.
     pub fn glb(&self, measured: &Measured) -> Result<Vec<u8>, ReconstructError> {
         let mesh = Mesh {
             name: "surface".into(),
