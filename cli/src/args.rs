@@ -18,7 +18,8 @@ use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use picofarm_database::CatalogPlace;
 
 pub use data::{
-    BenchStore, DatasetExport, DatasetImport, DatasetReprocess, DatasetSplit, SensorArgs,
+    BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
+    SensorArgs,
 };
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
@@ -218,6 +219,9 @@ pub struct Demo {
     /// Furniture: auto, parametric, sweethome3d or gltf (a folder of your own models)
     #[arg(long, default_value = "auto")]
     pub assets: String,
+    /// Then reconstruct each room in 3D, from the depth and shadows of its ground truth: meshes, errors, pictures
+    #[arg(long)]
+    pub reconstruct: bool,
     #[command(flatten)]
     pub traces: Traces,
 }
@@ -367,9 +371,9 @@ pub enum Dataset {
     /// Find objects that belong to no finished scene, left by killed workers, and delete them if asked to
     #[command(alias = "collect")]
     Gc(DatasetGc),
-    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set
+    /// Draw a contact sheet (PNG) and a light-in-flight animation (GIF) of a data set; of reconstructions, a contact sheet
     Picture {
-        /// Folder or URL of the data set
+        /// Folder or URL of the data set, or of reconstructions
         #[arg(value_parser = crate::paths::place)]
         dataset: String,
         /// Folder for the pictures
@@ -379,6 +383,9 @@ pub enum Dataset {
         #[arg(long, default_value_t = 8, value_parser = ranges::rows)]
         rows: usize,
     },
+    /// Write a page about reconstructions, and the same as JSON beside it: errors in novel views beside published ones,
+    /// meshes, the best and the worst scene
+    Report(DatasetReport),
     /// Measure every scene with a sensor into another data set, without rendering; again to resume
     Reprocess(DatasetReprocess),
     /// Pack a data set, or a part of it, into few files for sharing, or write it in the paper's layout; again to resume

@@ -6,7 +6,7 @@ pub mod import;
 mod late;
 mod predictions;
 mod problems;
-mod reconstructions;
+pub mod reconstructions;
 pub mod repair;
 pub mod reprocess;
 pub mod show;
@@ -24,7 +24,7 @@ use crate::{
     args::Dataset as Command,
     error::{CliError, Code, Result, io},
     output::{Output, bytes},
-    picture::{View, flight, sheet},
+    picture::{View, flight, save, sheet},
     settings::Settings,
     signals,
 };
@@ -51,8 +51,17 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
         Command::Export(args) => export::run(args, output).await,
         Command::Import(args) => import::run(*args, output).await,
         Command::Split(args) => split::run(args, output).await,
+        Command::Report(args) => reconstructions::report(&args, output).await,
         Command::Picture { dataset, out, rows } => {
             std::fs::create_dir_all(&out).map_err(|e| io(out.display(), &e))?;
+            if let Some(there) = reconstructions::find(&dataset).await? {
+                let sheet = out.join("contact-sheet.png");
+                reconstructions::draw(&dataset, &there, rows, &sheet).await?;
+                output.result(&json!({"contact_sheet": sheet}), || {
+                    sheet.display().to_string()
+                });
+                return Ok(());
+            }
             let present = open(&dataset)
                 .await?
                 .scenes_present()
@@ -224,7 +233,7 @@ pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
         (scenes.to_vec(), drawn.sheet.clone(), drawn.flight.clone());
     tokio::task::spawn_blocking(move || {
         let read = |scene| handle.block_on(view(&dataset, scene));
-        sheet::sheet(&scenes, read)?.save(&sheet_path)?;
+        save(&sheet::sheet(&scenes, read)?, &sheet_path)?;
         flight::animate(&read(first)?, &flight_path)
     })
     .await

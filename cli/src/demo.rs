@@ -1,5 +1,7 @@
 //! `picofarm demo` and `picofarm up`: the whole farm on one machine.
 
+mod rooms;
+
 use std::{net::SocketAddr, path::Path};
 
 use picofarm_agent::Access;
@@ -12,6 +14,8 @@ use picofarm_proto::{
     show,
 };
 use serde_json::json;
+
+use rooms::Rooms;
 
 use crate::{
     args::{Demo, Up},
@@ -57,6 +61,25 @@ fn place(task: &RenderTask) -> String {
     format!("{}/{}", task.output.store, task.output.dataset)
 }
 
+/// What is to be done, once places and versions are pinned.
+struct Asked<'a> {
+    reconstruct: bool,
+    dir: &'a Path,
+    settings: &'a Settings,
+}
+
+impl Asked<'_> {
+    fn job(&self, task: &RenderTask) -> Result<JobSpec> {
+        let mut job = JobSpec::render("demo", task.clone());
+        if self.reconstruct {
+            let stage = rooms::stage(task, self.dir, self.settings)?;
+            job.stages.push(stage);
+            job.resolve()?;
+        }
+        Ok(job)
+    }
+}
+
 /// Whether the data set holds scenes of other settings.
 async fn taken(task: &RenderTask) -> Result<bool> {
     let place = place(task);
@@ -75,11 +98,11 @@ async fn taken(task: &RenderTask) -> Result<bool> {
 async fn submit(
     client: &mut Client,
     mut task: RenderTask,
+    asked: &Asked<'_>,
     output: Output,
 ) -> Result<(RenderTask, JobSpec, Submitted)> {
-    let spec = |task: &RenderTask| JobSpec::render("demo", task.clone());
     if !taken(&task).await? {
-        let first = spec(&task);
+        let first = asked.job(&task)?;
         match client.submit(first.clone(), false).await {
             Ok(submitted) => return Ok((task, first, submitted)),
             // A job of other settings was to write there, and made nothing yet.
@@ -95,12 +118,12 @@ async fn submit(
          go to {}",
         place(&task)
     ));
-    let own = spec(&task);
+    let own = asked.job(&task)?;
     let submitted = client.submit(own.clone(), false).await?;
     Ok((task, own, submitted))
 }
 
-/// Renders, verifies and shows a data set.
+/// Renders, verifies and shows a data set, and rooms in 3D where they are asked for.
 ///
 /// # Errors
 /// Bad arguments, a folder that holds another demo, an interruption, or a failure on the way.
@@ -120,7 +143,14 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
         if workers == 1 { "" } else { "s" },
         dir.display(),
     ));
-
+    if args.reconstruct {
+        output.say(rooms::announced());
+    }
+    let asked = Asked {
+        reconstruct: args.reconstruct,
+        dir: &dir,
+        settings,
+    };
     let stop = signals::stop_on_signal()?;
     let any = SocketAddr::from(([127, 0, 0, 1], 0));
     let mut farm = Local::start(
@@ -136,7 +166,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
     // This process's own coordinator asks nobody who they are.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
     let rendered = tokio::select! {
-        status = render(&mut client, task, output) => Some(status),
+        status = render(&mut client, task, &asked, output) => Some(status),
         lost = farm.worker_lost() => Some(Err(lost)),
         () = stop.cancelled() => None,
     };
@@ -155,9 +185,10 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
 async fn render(
     client: &mut Client,
     task: RenderTask,
+    asked: &Asked<'_>,
     output: Output,
 ) -> Result<(String, JobId, JobStatus)> {
-    let (task, spec, mut submitted) = submit(client, task, output).await?;
+    let (task, spec, mut submitted) = submit(client, task, asked, output).await?;
     let earlier = client.status(submitted.job).await?;
     match earlier.state {
         JobState::Failed => {
@@ -166,11 +197,15 @@ async fn render(
         JobState::Cancelled => submitted = client.submit(spec, true).await?,
         JobState::Active | JobState::Done => {}
     }
-    if submitted.existed && earlier.tasks.done > 0 {
-        output.say(format!(
-            "{} scenes are finished already and stay as they are",
-            earlier.tasks.done
-        ));
+    if submitted.existed {
+        for (stage, what) in earlier.stages.iter().zip(["scenes", "reconstructions"]) {
+            if stage.tasks.done > 0 {
+                let done = stage.tasks.done;
+                output.say(format!(
+                    "{done} {what} are finished already and stay as they are"
+                ));
+            }
+        }
     }
     let progress = if output.json {
         Show::Nothing
@@ -194,20 +229,30 @@ async fn tell(
     let scenes: Vec<u64> = (0..args.scenes).collect();
     output.say("drawing …");
     let pictures = dataset::draw(place, &scenes[..scenes.len().min(16)], dir).await?;
+    let rooms = match args.reconstruct {
+        true => Some(Rooms::of(place, dir).await?),
+        false => None,
+    };
     let took = status.ended_at_ms.map_or(0, |e| e - status.submitted_at_ms) as f64 / 1000.0;
-    let summary = json!({
-        "job": job, "dataset": place, "scenes": args.scenes, "reused": status.tasks.reused,
+    let reused = status.stages.first().map_or(0, |s| s.tasks.reused);
+    let mut summary = json!({
+        "job": job, "dataset": place, "scenes": args.scenes, "reused": reused,
         "bytes": report.bytes, "objects": report.objects, "seconds": took,
         "contact_sheet": pictures.sheet, "light_in_flight": pictures.flight,
     });
+    if let Some(rooms) = &rooms {
+        summary["reconstructions"] = rooms.facts();
+    }
     output.result(&summary, || {
         format!(
             "{} scenes, {} in {} objects, all verified\n\
              data set         {}\n\
              contact sheet    {}\n\
              light in flight  {}\n\
+             {}\
              next:\n  \
              picofarm dataset info {}\n  \
+             {}\
              python3 -c {}\n  \
              picofarm job init && picofarm up\n",
             args.scenes,
@@ -216,7 +261,9 @@ async fn tell(
             show::line(place),
             pictures.sheet.display(),
             pictures.flight.display(),
+            rooms.as_ref().map(Rooms::told).unwrap_or_default(),
             show::argument(place),
+            rooms.as_ref().map(Rooms::next).unwrap_or_default(),
             show::argument(&format!(
                 "import xarray; print(xarray.open_zarr({place:?}))"
             )),

@@ -1,7 +1,7 @@
 //! `picofarm reconstruct`: one scene file in 3D, without a farm.
 
 mod mlp;
-mod pictures;
+mod orbit;
 #[cfg(feature = "networks")]
 mod predicted;
 #[cfg(not(feature = "networks"))]
@@ -12,7 +12,8 @@ mod written;
 
 use std::time::Instant;
 
-use picofarm_agent::Memory;
+use picofarm_agent::{Memory, reconstruct};
+use picofarm_figures::Canvas;
 use picofarm_proto::model::{
     kinds::reconstruct::grid_bytes,
     memory::{Shape, gib},
@@ -36,7 +37,6 @@ use crate::{
     args::{FieldArg, Reconstruct, SpotsFrom, ViewsArg},
     error::{CliError, Code, Result},
     output::{Output, duration},
-    picture::canvas::Canvas,
     render::free_folder,
     roles, signals,
 };
@@ -50,6 +50,7 @@ const AROUND: usize = 24;
 struct Made {
     reconstructed: Reconstructed,
     mesh: Surface,
+    glb: Vec<u8>,
     metrics: Value,
     views: Canvas,
     orbit: Vec<u8>,
@@ -199,8 +200,9 @@ fn make(
     let scoring = lap(start);
     watch.step("pictures", 0.0);
     Ok(Made {
-        views: pictures::views(&reconstructed, &world, &views),
-        orbit: pictures::orbit(&reconstructed, &views)?,
+        views: reconstruct::views(&reconstructed, &world, &views),
+        orbit: orbit::orbit(&reconstructed, &views)?,
+        glb: mesh.glb(&reconstructed.measured).map_err(refused)?,
         reconstructed,
         mesh,
         metrics,
@@ -295,11 +297,8 @@ fn metrics(
     (made, mesh): (&Reconstructed, &Surface),
     (world, views): (&World, &[Camera]),
 ) -> Result<Value> {
-    let mut all = picofarm_agent::reconstruct::facts(made, mesh);
-    all.extend(
-        picofarm_agent::reconstruct::errors(made, mesh, world, views, args.seed)
-            .map_err(refused)?,
-    );
+    let mut all = reconstruct::facts(made, mesh);
+    all.extend(reconstruct::errors(made, mesh, world, views, args.seed).map_err(refused)?);
     let asked = json!({
         "scene": scene.name,
         "provenance": scene.provenance,

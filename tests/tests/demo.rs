@@ -78,6 +78,49 @@ fn the_demo_makes_a_data_set_and_pictures_and_a_second_run_renders_nothing() {
 }
 
 #[test]
+fn the_demo_goes_on_to_rooms_in_3d_and_a_second_run_makes_nothing_again() {
+    let scratch = Scratch::new("demo-3d");
+    let cli = Cli::new(scratch.path());
+    let small = [
+        "demo",
+        "--dir",
+        "demo",
+        "--scenes",
+        "2",
+        "--samples",
+        "2",
+        "--resolution",
+        "48",
+        "--spots",
+        "4",
+        "--assets",
+        "parametric",
+    ];
+    let said = cli.run(&[&small[..], &["--reconstruct"]].concat()).ok();
+    assert!(said.stderr.contains("ground truth"), "{}", said.stderr);
+    let dir = scratch.join("demo");
+    let place = dir.join("store/rooms-3d");
+    for shown in ["mesh.glb", "reconstructions.png", "rooms-3d"] {
+        assert!(said.stdout.contains(shown), "{shown}: {}", said.stdout);
+    }
+    begins_with(&dir.join("reconstructions.png"), b"\x89PNG\r\n\x1a\n");
+    for scene in ["0", "1"] {
+        let files = place.join("scenes").join(scene);
+        begins_with(&files.join("mesh.glb"), b"glTF");
+        begins_with(&files.join("views.png"), b"\x89PNG");
+    }
+    let times = store::times(&place);
+    let again = [&small[..], &["--reconstruct", "--json"]].concat();
+    let second = cli.run(&again).ok().json();
+    assert_eq!(second["reconstructions"]["scenes"], 2, "{second}");
+    assert_eq!(store::times(&place), times, "nothing is written again");
+    // The rooms alone are another job, and are there already.
+    let rooms = cli.run(&[&small[..], &["--json"]].concat()).ok().json();
+    assert_eq!(rooms["reused"], 2, "{rooms}");
+    assert!(rooms["reconstructions"].is_null(), "{rooms}");
+}
+
+#[test]
 fn an_interrupted_demo_exits_130_and_goes_on_where_it_stopped() {
     let scratch = Scratch::new("demo-interrupted");
     let cli = Cli::new(scratch.path());

@@ -30,6 +30,15 @@ const TRUTH: [&str; 9] = [
     "--out",
 ];
 
+/// Files whose bytes depend on scene and arguments alone.
+const ALWAYS_SAME: [&str; 5] = [
+    "mesh.glb",
+    "mesh.ply",
+    "metrics.json",
+    "views.png",
+    "density.zarr/density/c/0/0/0",
+];
+
 fn metrics(dir: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(dir.join("metrics.json")).unwrap()).unwrap()
 }
@@ -46,6 +55,7 @@ fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
     names.sort();
     let files = [
         "density.zarr",
+        "mesh.glb",
         "mesh.ply",
         "metrics.json",
         "orbit.gif",
@@ -101,6 +111,11 @@ fn a_scene_becomes_a_mesh_a_density_and_its_errors_and_nothing_else() {
     );
     assert_eq!(ply.len() as u64, header as u64 + 12 * vertices + 13 * faces);
 
+    // The importer reads it, and the renderer takes it: it has the camera and the beams of the measurement.
+    let shown = cli.json(&["scene", "show", "made/mesh.glb"]);
+    assert_eq!(shown["triangles"], kept["triangles"], "{shown}");
+    assert_eq!(shown["beams"], 16, "{shown}");
+
     let store = Arc::new(FilesystemStore::new(dir.join("density.zarr")).unwrap());
     let array = Array::open(store, "/density").unwrap();
     let density: Vec<f32> = array.retrieve_array_subset(&array.subset_all()).unwrap();
@@ -124,7 +139,7 @@ fn threads_change_no_byte() {
         cli.run(&[&TRUTH[..], &[threads, "--threads", threads, "--no-planes"]].concat())
             .ok();
     }
-    for file in ["mesh.ply", "metrics.json", "density.zarr/density/c/0/0/0"] {
+    for file in ALWAYS_SAME {
         let read = |dir: &str| std::fs::read(scratch.join(dir).join(file)).unwrap();
         assert!(read("1") == read("3"), "{file}");
     }
@@ -222,7 +237,7 @@ fn networks_make_the_same_files_and_the_same_bytes_for_any_number_of_threads() {
             .ok();
         assert!(ended.stdout.contains("note: mlp:"), "{}", ended.stdout);
     }
-    for file in ["mesh.ply", "metrics.json", "density.zarr/density/c/0/0/0"] {
+    for file in ALWAYS_SAME {
         let read = |dir: &str| std::fs::read(scratch.join(dir).join(file)).unwrap();
         assert!(read("1") == read("3"), "{file}");
     }

@@ -79,6 +79,93 @@ fn metrics(farm: &Farm, folder: &str, scene: u64) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
+/// What commands say of the folders `truth-3d` and `seen-3d`.
+fn looked_at(farm: &Farm) {
+    let place = |name: &str| farm.store().join(name).to_str().unwrap().to_owned();
+    let (truth, seen) = (place("truth-3d"), place("seen-3d"));
+    let pictures = place("pictures");
+    let drawn = farm.json(&[
+        "dataset", "picture", &truth, "--out", &pictures, "--rows", "3",
+    ]);
+    let sheet = fs::read(drawn["contact_sheet"].as_str().unwrap()).unwrap();
+    assert!(sheet.starts_with(b"\x89PNG"));
+    // Three rows of pictures of 160 pixels.
+    let height = u32::from_be_bytes(sheet[20..24].try_into().unwrap());
+    assert!((480..600).contains(&height), "{height}");
+
+    let page = place("rooms.html");
+    let written = farm.json(&["dataset", "report", &truth, &seen, "--out", &page]);
+    assert_eq!(written["scenes"], 24, "{written}");
+    let html = fs::read_to_string(&page).unwrap();
+    for said in [
+        "truth-3d",
+        "from predictions, 4 spots, 32×32 pixels, 48 nodes",
+        "0.0862",
+    ] {
+        assert!(html.contains(said), "{said}");
+    }
+    let pictures = html.matches("data:image/png;base64,").count();
+    assert_eq!(pictures, 6, "best, median and worst of either");
+    let told = fs::read_to_string(written["json"].as_str().unwrap()).unwrap();
+    let told: Value = serde_json::from_str(&told).unwrap();
+    let info = farm.json(&["dataset", "info", &truth]);
+    let of_truth = &told["groups"][0];
+    assert_eq!(
+        of_truth["figures"]["l1_m"]["mean"], info["means"]["l1_m"]["mean"],
+        "{told}"
+    );
+    assert!(
+        of_truth["figures"]["l1_m"]["standard_error"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
+    // Other rooms, spots and images than the paper's.
+    assert_eq!(of_truth["as_published"], false, "{told}");
+    let ranks: Vec<&str> = of_truth["extremes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|e| e["rank"].as_str().unwrap())
+        .collect();
+    assert_eq!(ranks, ["best", "median", "worst"]);
+
+    let rooms = place("rooms");
+    let refused = farm.run(&["dataset", "report", &rooms]).code(3);
+    assert!(
+        refused.stderr.contains("holds no reconstructions"),
+        "{}",
+        refused.stderr
+    );
+}
+
+#[test]
+fn reconstructions_without_views_have_no_pictures_and_say_so() {
+    let farm = Farm::start("rooms-unseen");
+    let id = submit(&farm, &job(&farm.store(), 2));
+    let _worker = farm.worker("worker");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    let place = farm.store().join("captures-3d");
+    let place = place.to_str().unwrap();
+    let pictures = farm.store().join("pictures");
+    let refused = farm
+        .run(&[
+            "dataset",
+            "picture",
+            place,
+            "--out",
+            pictures.to_str().unwrap(),
+        ])
+        .code(3);
+    assert!(refused.stderr.contains("views = 0"), "{}", refused.stderr);
+    assert!(refused.stderr.contains("views = 24"), "{}", refused.stderr);
+    let page = farm.store().join("rooms.html");
+    farm.run(&["dataset", "report", place, "--out", page.to_str().unwrap()])
+        .ok();
+    let html = fs::read_to_string(page).unwrap();
+    assert!(html.contains("No novel views") && !html.contains("data:image"));
+}
+
 #[test]
 fn rooms_come_from_predictions_and_truth_alike_and_what_is_missing_is_named() {
     let farm = Farm::start("rooms-predicted");
@@ -143,10 +230,17 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
             let most = if folder == "truth-3d" { 0.25 } else { 1.2 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
             assert_eq!(found["spots"], 4, "{found}");
-            let mesh = farm
-                .store()
-                .join(format!("{folder}/scenes/{scene}/mesh.ply"));
-            assert!(fs::read(mesh).unwrap().starts_with(b"ply\n"));
+            assert_eq!(found["image"], serde_json::json!([32, 32]), "{found}");
+            let source = found["provenance"]["source"].as_str().unwrap();
+            assert!(source.starts_with("primitive-"), "{found}");
+            let files = farm.store().join(format!("{folder}/scenes/{scene}"));
+            let begins = |name: &str, magic: &[u8]| {
+                let bytes = fs::read(files.join(name)).unwrap();
+                assert!(bytes.starts_with(magic), "{folder} {scene}: {name}");
+            };
+            begins("mesh.ply", b"ply\n");
+            begins("mesh.glb", b"glTF");
+            begins("views.png", b"\x89PNG");
         }
     }
     // A damaged result is found, and put back by the same job again.
@@ -165,7 +259,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
         "{}",
         damaged.stderr
     );
-    let no_data_set = farm.run(&["dataset", "picture", folder.to_str().unwrap(), "--out", "x"]);
+    let no_data_set = farm.run(&["dataset", "show", folder.to_str().unwrap(), "3"]);
     assert!(
         no_data_set.stderr.contains("holds reconstructions"),
         "{}",
@@ -174,6 +268,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
     let again = submit(&farm, &text);
     assert_eq!(farm.until_ended(&again)["state"], "done");
     assert_eq!(fs::read(&mesh).unwrap(), whole);
+    looked_at(&farm);
     // No histogram of each spot alone; predictions of other rooms.
     let before = text
         .split("[[stage]]\nname = \"from-truth\"")

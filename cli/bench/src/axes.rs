@@ -2,7 +2,7 @@
 
 use font8x8::UnicodeFonts;
 
-use picofarm_cli::picture::canvas::Canvas;
+use picofarm_figures::Canvas;
 
 pub const INK: [u8; 3] = [40, 40, 40];
 const GRID: [u8; 3] = [225, 225, 225];

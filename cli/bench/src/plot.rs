@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use picofarm_cli::{error::Result, picture::canvas::Canvas};
+use picofarm_cli::{error::Result, picture::save};
+use picofarm_figures::Canvas;
 
 use super::{
     axes::{Axes, INK, LETTER, Span},
@@ -76,7 +77,7 @@ pub fn draw(found: &[Outcome], targets: &[f64], path: &Path) -> Result<()> {
         }
     }
     legend(&mut axes, &lines);
-    axes.canvas.save(path)
+    save(&axes.canvas, path)
 }
 
 fn lines(found: &[Outcome]) -> Vec<Line> {

@@ -76,6 +76,19 @@ pub struct DatasetReprocess {
 }
 
 #[derive(Args)]
+pub struct DatasetReport {
+    /// Folders or URLs of reconstructions, in the order in which they shall appear
+    #[arg(required = true, value_name = "PLACE", value_parser = crate::paths::place)]
+    pub places: Vec<String>,
+    /// The page to write; the same as JSON lies beside it
+    #[arg(long, value_name = "FILE", default_value = "reconstructions.html")]
+    pub out: PathBuf,
+    /// Title of the page
+    #[arg(long, default_value = "Reconstructed rooms")]
+    pub title: String,
+}
+
+#[derive(Args)]
 pub struct BenchStore {
     /// Folder or URL of a data set with the profile lossless to take scenes from, instead of rendering some
     #[arg(long, value_name = "DATASET", value_parser = crate::paths::place, conflicts_with_all = ["keep", "resolution", "samples", "seed"])]

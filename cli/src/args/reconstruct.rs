@@ -12,7 +12,7 @@ pub struct Reconstruct {
     pub file: PathBuf,
     #[command(flatten)]
     pub root: SceneRoot,
-    /// Folder for mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not exist, or be empty)
+    /// Folder for mesh.glb, mesh.ply, density.zarr, metrics.json, views.png and orbit.gif (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Where times and shadows come from: one rendered histogram a spot, all bounces; depth and visibility of the scene itself; or

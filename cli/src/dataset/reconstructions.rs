@@ -1,8 +1,18 @@
-//! `dataset info` of reconstructions: the means of their errors; and whether they are whole.
+//! `dataset info` of reconstructions: the means of their errors; whether they are whole; their pictures; and a page
+//! about them.
+
+mod page;
+mod picture;
+mod report;
 
 use futures::{StreamExt, TryStreamExt, stream};
-use picofarm_dataset::{DatasetError, Problem, Reconstructions, open_store};
+use picofarm_dataset::{
+    DatasetError, Problem, Reconstructions, Verification, VerifyMode, open_store,
+};
 use serde_json::{Map, Value, json};
+
+pub use picture::draw;
+pub use report::run as report;
 
 use super::{
     failed,
@@ -19,13 +29,14 @@ use crate::{
 const CONCURRENCY: usize = 16;
 
 /// Figures of `metrics.json` of which means are given: a name, and the way to it.
-const FIGURES: [(&str, &str); 11] = [
+const FIGURES: [(&str, &str); 12] = [
     ("l1_m", "/novel_views/all/l1_m"),
     ("rmse_m", "/novel_views/all/rmse_m"),
     ("psnr_db", "/novel_views/psnr_db"),
     ("visible_l1_m", "/novel_views/visible/l1_m"),
     ("occluded_l1_m", "/novel_views/occluded/l1_m"),
     ("outside_l1_m", "/novel_views/outside/l1_m"),
+    ("within_view_l1_m", "/novel_views/within_view/l1_m"),
     ("specular_l1_m", "/novel_views/specular/l1_m"),
     ("chamfer_m", "/mesh/chamfer_m"),
     ("f_score", "/mesh/f_score"),
@@ -44,38 +55,33 @@ pub async fn find(place: &str) -> Result<Option<Reconstructions>> {
     }
 }
 
+/// The reconstructions at a place, which must have some.
+///
+/// # Errors
+/// Something else lies there, or nothing.
+pub async fn opened(place: &str) -> Result<Reconstructions> {
+    match find(place).await? {
+        Some(there) => Ok(there),
+        None => {
+            let what = format!("{place}: holds no reconstructions");
+            Err(CliError::input(what).hint(
+                "name the folder that a reconstruct stage has written; `picofarm model report` tells of models",
+            ))
+        }
+    }
+}
+
 /// `dataset info`.
 pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Result<()> {
     let scenes = there.scenes_present().await.map_err(failed)?;
-    let read = scenes
-        .iter()
-        .map(|scene| there.read(*scene, "metrics.json"));
-    let all: Vec<bytes::Bytes> = stream::iter(read)
+    let read = scenes.iter().map(|scene| metrics(place, there, *scene));
+    let all: Vec<Value> = stream::iter(read)
         .buffered(CONCURRENCY)
         .try_collect()
-        .await
-        .map_err(failed)?;
-    let all: Vec<Value> = all
-        .iter()
-        .map(|bytes| serde_json::from_slice(bytes))
-        .collect::<std::result::Result<_, _>>()
-        .map_err(|e| {
-            CliError::new(
-                Code::Failed,
-                format!("{place}: metrics.json of a scene: {e}"),
-            )
-        })?;
+        .await?;
     let mut means = Map::new();
     for (name, way) in FIGURES {
-        // A class without pixels has no error.
-        let empty = |m: &Value| {
-            let class = way.rsplit_once('/').map_or("", |(class, _)| class);
-            m.pointer(&format!("{class}/pixels")) == Some(&json!(0))
-        };
-        let of = all.iter().filter(|m| !empty(m));
-        let values: Vec<f64> = of
-            .filter_map(|m| m.pointer(way).and_then(Value::as_f64))
-            .collect();
+        let values: Vec<f64> = all.iter().filter_map(|m| figure(m, way)).collect();
         if !values.is_empty() {
             let mean = values.iter().sum::<f64>() / values.len() as f64;
             means.insert(name.into(), json!({"mean": mean, "scenes": values.len()}));
@@ -86,7 +92,7 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
         let mut text = format!("{place}: reconstructions of {} scenes\n", scenes.len());
         for (name, mean) in &means {
             text += &format!(
-                "{name:>14} {:.4}, mean over {}\n",
+                "{name:>16} {:.4}, mean over {}\n",
                 mean["mean"].as_f64().unwrap_or_default(),
                 mean["scenes"]
             );
@@ -94,6 +100,24 @@ pub async fn info(place: &str, there: &Reconstructions, output: Output) -> Resul
         text
     });
     Ok(())
+}
+
+/// The metrics of a scene.
+async fn metrics(place: &str, there: &Reconstructions, scene: u64) -> Result<Value> {
+    let bytes = there.read(scene, "metrics.json").await.map_err(failed)?;
+    serde_json::from_slice(&bytes).map_err(|e| {
+        let what = format!("{place}: scenes/{scene}/metrics.json is not JSON: {e}");
+        CliError::new(Code::Damaged, what)
+    })
+}
+
+/// A figure of a scene's metrics by its way; `None` where it was not measured, or the class has no pixels.
+fn figure(metrics: &Value, way: &str) -> Option<f64> {
+    let class = way.rsplit_once('/').map_or("", |(class, _)| class);
+    if metrics.pointer(&format!("{class}/pixels")) == Some(&json!(0)) {
+        return None;
+    }
+    metrics.pointer(way).and_then(Value::as_f64)
 }
 
 /// `dataset verify`.
@@ -134,6 +158,19 @@ pub async fn verify(args: &DatasetVerify, there: &Reconstructions, output: Outpu
     match report.is_sound() {
         true => Ok(()),
         false => Err(broken_by(&args.dataset, &report.problems, hint)),
+    }
+}
+
+/// Verifies reconstructions in full, for other commands.
+///
+/// # Errors
+/// Exit code 6 naming what is broken.
+pub async fn check(place: &str, there: &Reconstructions) -> Result<Verification> {
+    let report = there.verify(VerifyMode::Full, &|_, _| ()).await;
+    let report = report.map_err(failed)?;
+    match report.is_sound() {
+        true => Ok(report),
+        false => Err(broken_by(place, &report.problems, hint)),
     }
 }
 

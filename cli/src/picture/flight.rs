@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use super::{View, cannot_write, colour::inferno, quantile, write_atomically};
+use picofarm_figures::inferno;
+
+use super::{View, cannot_write, quantile, write_atomically};
 use crate::error::Result;
 
 /// Frames at most; bins are summed to stay below it.

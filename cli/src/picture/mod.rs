@@ -1,9 +1,9 @@
 //! Pictures of stored scenes, for people: a contact sheet and light in flight.
 
-pub mod canvas;
-pub mod colour;
 pub mod flight;
 pub mod sheet;
+
+use picofarm_figures::Canvas;
 
 use crate::error::{CliError, Code, Result};
 
@@ -79,7 +79,15 @@ pub(crate) fn cannot_write(path: &std::path::Path, error: impl std::fmt::Display
         Code::Resource,
         format!("cannot write {}: {error}", path.display()),
     )
-    .hint("check the folder and the free space, then draw again with `picofarm dataset picture`")
+    .hint("check the folder and the free space, then run the same command again")
+}
+
+/// Writes a picture as PNG, whole or not at all.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn save(canvas: &Canvas, path: &std::path::Path) -> Result<()> {
+    write_atomically(path, &canvas.png())
 }
 
 /// Writes a file whole or not at all.

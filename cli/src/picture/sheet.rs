@@ -1,11 +1,8 @@
 //! The contact sheet: one row a scene, one column a quantity.
 
-use super::{
-    View,
-    canvas::{Canvas, TEXT},
-    colour::{inferno, viridis},
-    quantile,
-};
+use picofarm_figures::{Canvas, TEXT, inferno, viridis};
+
+use super::{View, quantile};
 
 const CELL: usize = 144;
 const GAP: usize = 4;

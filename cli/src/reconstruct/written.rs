@@ -50,6 +50,7 @@ fn into(dir: &Path, made: &Made) -> Result<()> {
         fs::write(&path, bytes).map_err(|e| io(path.display(), &e))?;
     }
     save("mesh.ply", &made.mesh.ply())?;
+    save("mesh.glb", &made.glb)?;
     save("views.png", &made.views.png())?;
     save("orbit.gif", &made.orbit)?;
     let text = serde_json::to_string_pretty(&made.metrics).expect("metrics are plain data");

@@ -1,5 +1,5 @@
 //! Reconstructions of scenes: a folder of their own in a store, beside the data set whose scenes they are. Each scene has
-//! `scenes/<scene>/` with `density.zarr` (a Zarr v3 group), `mesh.ply` and `metrics.json`.
+//! `scenes/<scene>/` with `density.zarr` (a Zarr v3 group), `mesh.glb`, `mesh.ply` and `metrics.json`.
 //!
 //! They are published as scenes are: objects first, `manifests/<scene>.json` last, all create-only and pure functions of the
 //! task.

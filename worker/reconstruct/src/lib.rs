@@ -38,4 +38,4 @@ pub use reconstruction::{Evidence, Reconstructed, Reconstruction, reconstruct};
 pub use world::{Hit, World};
 
 /// Version of the reconstruction: part of every task key. Change it whenever any bit of a result may change.
-pub const VERSION: &str = "reconstruct-3";
+pub const VERSION: &str = "reconstruct-4";

@@ -5,6 +5,8 @@
 //! surface crosses, at the mean of its crossings; Newton steps along the gradient then move it onto the surface between the
 //! nodes. Where the grid ends, solid matter is left open.
 
+mod glb;
+
 use fast_surface_nets::{SurfaceNetsBuffer, surface_nets};
 use ndshape::{RuntimeShape, Shape};
 use picofarm_scene::Vec3;

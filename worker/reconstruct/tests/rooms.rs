@@ -9,7 +9,10 @@ use picofarm_reconstruct::{
     score::{floaters, mesh_score, score_views},
     surface,
 };
-use picofarm_scene::plato::{self, PlatoObject};
+use picofarm_scene::{
+    import::read_scene,
+    plato::{self, PlatoObject},
+};
 
 #[test]
 fn visible_depth_is_found_to_a_centimetre() {
@@ -103,6 +106,23 @@ fn the_mesh_lies_on_the_true_surfaces_and_little_floats() {
     assert!(volume < 0.0, "signed volume {volume}");
     let ply = mesh.ply();
     assert!(ply.starts_with(b"ply\nformat binary_little_endian 1.0\n"));
+    // The importer of scenes reads the other form exactly, with the camera and the beams of the measurement.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mesh.glb");
+    std::fs::write(&path, mesh.glb(&made.measured).unwrap()).unwrap();
+    let back = read_scene(&path).unwrap();
+    back.validate().unwrap();
+    let [object] = &back.objects[..] else {
+        panic!("{} objects", back.objects.len());
+    };
+    assert_eq!(object.mesh.positions, mesh.positions);
+    assert_eq!(object.mesh.triangles, mesh.triangles);
+    assert!(object.mesh.materials[0].two_sided);
+    assert_eq!(back.camera, made.measured.camera);
+    assert_eq!(back.laser.beams.len(), 16);
+    let nothing = picofarm_reconstruct::Surface::default();
+    std::fs::write(&path, nothing.glb(&made.measured).unwrap()).unwrap();
+    assert!(read_scene(&path).unwrap().objects.is_empty());
     assert!(
         made.evidence.contains(&Evidence::None),
         "some nodes are guesses, and said to be"

@@ -70,6 +70,32 @@ fn other_programs_see_metal_with_the_square_root_of_alpha() {
 }
 
 #[test]
+fn normals_are_of_unit_length_and_do_not_change_what_is_read() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("room.glb");
+    let bytes = export::glb_bytes_with_normals(&scene()).expect("valid");
+    std::fs::write(&path, &bytes).expect("writes");
+    let back = read_scene(&path).expect("reads");
+    assert_eq!(
+        export::glb_bytes(&back).expect("valid"),
+        export::glb_bytes(&scene()).expect("valid")
+    );
+    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&bytes).expect("standard glTF");
+    for mesh in document.meshes() {
+        for primitive in mesh.primitives() {
+            let reader = primitive.reader(|_| blob.as_deref());
+            let positions = reader.read_positions().expect("positions").count();
+            let normals: Vec<[f32; 3]> = reader.read_normals().expect("normals").collect();
+            assert_eq!(normals.len(), positions, "{:?}", mesh.name());
+            for n in normals {
+                let square: f32 = n.iter().map(|x| x * x).sum();
+                assert!((square - 1.0).abs() < 1e-5, "{n:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn a_roughness_edited_elsewhere_takes_effect() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("edited.glb");

@@ -4,7 +4,8 @@ use std::path::Path;
 
 use super::{Report, Row, method::Kind};
 use crate::axes::{Axes, INK, LETTER, Span};
-use picofarm_cli::{error::Result, picture::canvas::Canvas};
+use picofarm_cli::{error::Result, picture::save};
+use picofarm_figures::Canvas;
 
 const SIZE: (usize, usize) = (1140, 760);
 const LEFT: usize = 72;
@@ -94,5 +95,5 @@ pub fn draw(report: &Report, path: &Path) -> Result<()> {
             INK,
         );
     }
-    axes.canvas.save(path)
+    save(&axes.canvas, path)
 }

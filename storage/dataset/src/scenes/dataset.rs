@@ -239,8 +239,8 @@ fn parse_root(bytes: &[u8], object: &str) -> Result<(DatasetSpec, u32), DatasetE
         return Err(DatasetError::invalid(object, what));
     }
     if is_reconstructions(&root) {
-        let what = "holds reconstructions of the scenes of a data set, and is no data set itself; `dataset info` and `dataset \
-                    verify` read it";
+        let what = "holds reconstructions of the scenes of a data set, and is no data set itself; `dataset info`, \
+                    `verify`, `picture` and `report` read it";
         return Err(DatasetError::invalid(object, what));
     }
     let ours = &root["attributes"]["picofarm"];

@@ -1,7 +1,5 @@
 //! Pictures as PNG inside of the page.
 
-use base64::{Engine, engine::general_purpose::STANDARD};
-
 use super::colour::Rgb;
 
 /// A data URL of a picture, row by row.
@@ -23,11 +21,13 @@ pub(super) fn data_url(width: usize, height: usize, pixels: &[Rgb]) -> String {
         writer.finish()
     });
     written.expect("memory takes every byte, and the sizes fit");
-    format!("data:image/png;base64,{}", STANDARD.encode(bytes))
+    picofarm_figures::data_url(&bytes)
 }
 
 #[cfg(test)]
 mod tests {
+    use base64::{Engine, engine::general_purpose::STANDARD};
+
     use super::*;
 
     #[test]

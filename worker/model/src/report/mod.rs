@@ -9,7 +9,6 @@ mod curves;
 mod image;
 mod made;
 mod maps;
-mod number;
 mod page;
 mod paper;
 mod picture;
@@ -17,11 +16,11 @@ mod summary;
 mod table;
 #[cfg(test)]
 mod tests;
-mod text;
 mod ticks;
 mod trade;
 pub mod trials;
 
+use picofarm_figures::{number, text};
 use serde::{Deserialize, Serialize};
 
 use crate::{Evaluated, Model, train::Line, train::Plan};

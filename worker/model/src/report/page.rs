@@ -1,9 +1,8 @@
 //! The page.
 
-use super::{Report, curves, made, maps, summary::summary, table, text::Safe, trade};
+use picofarm_figures::STYLE;
 
-/// How it looks: light and dark, on screen and on paper.
-pub(super) const STYLE: &str = include_str!("page.css");
+use super::{Report, curves, made, maps, summary::summary, table, text::Safe, trade};
 
 /// The report as one HTML page that needs nothing beside it: no script, no other file, no network.
 pub fn html(report: &Report) -> String {

@@ -3,12 +3,12 @@
 
 use std::fmt::Write;
 
+use picofarm_figures::STYLE;
 use serde::{Deserialize, Serialize};
 
 use super::{
     chart::{Axis, Series, chart, legend},
     number::{digits, short},
-    page::STYLE,
     text::Safe,
 };
 use crate::train::Line;

@@ -80,6 +80,20 @@ impl Binary {
         self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
     }
 
+    /// Unit normals, one a vertex.
+    pub(super) fn normals(&mut self, normals: &[Vec3]) -> usize {
+        let accessor = Accessor {
+            buffer_view: self.views.len(),
+            component_type: COMPONENT_F32,
+            count: normals.len(),
+            r#type: "VEC3",
+            min: None,
+            max: None,
+        };
+        let words = normals.iter().flat_map(|n| [n.x, n.y, n.z]);
+        self.push(words.map(f32::to_le_bytes), TARGET_VERTICES, accessor)
+    }
+
     /// Texture coordinates; `None` for a mesh without.
     pub(super) fn coordinates(&mut self, mesh: &Mesh) -> Option<usize> {
         let accessor = Accessor {

@@ -11,6 +11,7 @@ use crate::{
 
 use super::{
     binary::{Accessor, Binary, BufferView},
+    normals::Normals,
     textures::{ImageEntry, SamplerEntry, TextureEntry, TextureInfo, Textures},
 };
 
@@ -99,6 +100,8 @@ struct Primitive {
 struct Attributes {
     #[serde(rename = "POSITION")]
     position: usize,
+    #[serde(rename = "NORMAL", skip_serializing_if = "Option::is_none")]
+    normal: Option<usize>,
     #[serde(rename = "TEXCOORD_0", skip_serializing_if = "Option::is_none")]
     coordinates: Option<usize>,
 }
@@ -130,7 +133,12 @@ struct Buffer {
 
 impl Document {
     /// The document and its binary chunk; `mesh_of[i]` is the mesh of object i.
-    pub(super) fn new(scene: &Scene, meshes: &[Arc<Mesh>], mesh_of: &[usize]) -> (Self, Vec<u8>) {
+    pub(super) fn new(
+        scene: &Scene,
+        meshes: &[Arc<Mesh>],
+        mesh_of: &[usize],
+        normals: Normals,
+    ) -> (Self, Vec<u8>) {
         let mut binary = Binary::default();
         let mut textures = Textures::default();
         let mut materials: Vec<MaterialEntry> = Vec::new();
@@ -144,7 +152,7 @@ impl Document {
                 materials.extend(entries.map(|m| material_entry(m, &mut textures)));
                 MeshEntry {
                     name: grouped.name.clone(),
-                    primitives: primitives(&grouped, base, &mut binary),
+                    primitives: primitives(&grouped, base, normals, &mut binary),
                 }
             })
             .collect();
@@ -204,8 +212,9 @@ impl Document {
 }
 
 /// One primitive a material that is used; all share the mesh's vertices.
-fn primitives(mesh: &Mesh, base: usize, binary: &mut Binary) -> Vec<Primitive> {
+fn primitives(mesh: &Mesh, base: usize, normals: Normals, binary: &mut Binary) -> Vec<Primitive> {
     let position = binary.positions(mesh);
+    let normal = normals.of(mesh).map(|normals| binary.normals(&normals));
     let coordinates = binary.coordinates(mesh);
     let mut out = Vec::new();
     let mut start = 0;
@@ -213,6 +222,7 @@ fn primitives(mesh: &Mesh, base: usize, binary: &mut Binary) -> Vec<Primitive> {
         out.push(Primitive {
             attributes: Attributes {
                 position,
+                normal,
                 coordinates,
             },
             indices: binary.indices(&mesh.triangles[start..start + run.len()]),

@@ -4,8 +4,8 @@
 mod binary;
 mod document;
 pub(crate) mod mitsuba;
+mod normals;
 mod ply;
-mod rgb_png;
 mod textures;
 
 use std::{
@@ -14,10 +14,12 @@ use std::{
     sync::Arc,
 };
 
+use picofarm_figures::rgb_png;
+
 use crate::{Mesh, Scene, SceneError, Texture};
 use document::Document;
 pub use mitsuba::write_mitsuba;
-pub use rgb_png::rgb_png;
+use normals::Normals;
 
 const GLB_MAGIC: u32 = 0x4654_6c67;
 const GLB_VERSION: u32 = 2;
@@ -30,6 +32,19 @@ const CHUNK_BIN: u32 = 0x004e_4942;
 /// # Errors
 /// [`SceneError::Invalid`] for a scene that fails [`Scene::validate`] or would pass glTF's 4 GiB.
 pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
+    glb(scene, Normals::Flat)
+}
+
+/// The same with a normal at each vertex, so that viewers shade curved surfaces smoothly. [`crate::import`] does not read
+/// normals: it reads the same scene.
+///
+/// # Errors
+/// As [`glb_bytes`].
+pub fn glb_bytes_with_normals(scene: &Scene) -> Result<Vec<u8>, SceneError> {
+    glb(scene, Normals::Smooth)
+}
+
+fn glb(scene: &Scene, normals: Normals) -> Result<Vec<u8>, SceneError> {
     scene.validate()?;
     if let Some(i) = scene
         .objects
@@ -54,7 +69,7 @@ pub fn glb_bytes(scene: &Scene) -> Result<Vec<u8>, SceneError> {
             })
         })
         .collect();
-    let (document, binary) = Document::new(scene, &meshes, &mesh_of);
+    let (document, binary) = Document::new(scene, &meshes, &mesh_of, normals);
     let invalid = |what: String| SceneError::Invalid {
         scene: scene.name.clone(),
         field: "glb".into(),

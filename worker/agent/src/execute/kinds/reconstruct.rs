@@ -3,6 +3,7 @@
 //! A task takes seconds, so it keeps no checkpoint: one that is stopped begins again, and comes to the same bytes.
 
 mod captured;
+mod pictures;
 mod written;
 
 use std::collections::BTreeMap;
@@ -40,6 +41,7 @@ use crate::execute::{
 };
 
 use captured::{Frame, captures, slant};
+pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
 
 /// Pixels a side of a novel view.
@@ -358,6 +360,7 @@ impl Work<'_> {
         let mesh = surface(&made.field);
         proceed(control, FITTED)?;
         let mut metrics = facts(&made, &mesh);
+        let mut files: BTreeMap<String, Bytes> = BTreeMap::new();
         if self.0.reconstruct.views > 0 {
             control.say("compares with the scene".into(), &[]);
             let scene =
@@ -366,7 +369,7 @@ impl Work<'_> {
                     other => other,
                 })?;
             let world = World::new(&scene);
-            let views = score::around(
+            let cameras = score::around(
                 &made.measured,
                 &made.depth.range,
                 &world,
@@ -375,15 +378,18 @@ impl Work<'_> {
             );
             proceed(control, 0.9)?;
             let errors =
-                errors(&made, &mesh, &world, &views, grid.seed).map_err(of_reconstruction)?;
+                errors(&made, &mesh, &world, &cameras, grid.seed).map_err(of_reconstruction)?;
             metrics.extend(errors);
+            metrics.insert("scene".into(), json!(scene.name));
+            metrics.insert("provenance".into(), json!(scene.provenance));
+            let drawn = views(&made, &world, &cameras);
+            files.insert("views.png".into(), drawn.png().into());
         }
-        let mut files: BTreeMap<String, Bytes> = density(&made)
-            .map_err(of_dataset)?
-            .into_iter()
-            .map(|(key, bytes)| (format!("density.zarr/{key}"), bytes))
-            .collect();
+        let objects = density(&made).map_err(of_dataset)?.into_iter();
+        files.extend(objects.map(|(key, bytes)| (format!("density.zarr/{key}"), bytes)));
         files.insert("mesh.ply".into(), mesh.ply().into());
+        let glb = mesh.glb(&made.measured).map_err(of_reconstruction)?;
+        files.insert("mesh.glb".into(), glb.into());
         let text = serde_json::to_string_pretty(&metrics).expect("metrics are plain data");
         files.insert("metrics.json".into(), (text + "\n").into());
         Ok(files)

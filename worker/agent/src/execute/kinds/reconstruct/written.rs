@@ -19,6 +19,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
     let left_out: Vec<Value> = left_out
         .map(|l| json!({"beam": l.beam, "why": l.why}))
         .collect();
+    let image = &made.measured.camera.intrinsics;
     let planes = made.planes.iter();
     let planes: Vec<Value> = planes
         .map(|p| json!({"normal": <[f32; 3]>::from(p.normal), "offset_m": p.offset}))
@@ -27,6 +28,7 @@ pub fn facts(made: &Reconstructed, mesh: &Surface) -> serde_json::Map<String, Va
         |of| made.evidence.iter().filter(|e| **e == of).count() as f64 / made.evidence.len() as f64;
     let facts = json!({
         "spots": made.measured.spots.len(),
+        "image": [image.width, image.height],
         "left_out": left_out,
         "planes": planes,
         "iterations": made.iterations,
@@ -98,7 +100,7 @@ pub fn density(made: &Reconstructed) -> Result<BTreeMap<String, Bytes>, DatasetE
         "axes": "x, y, z of the scene, metres; node (k, j, i) lies at origin + spacing * (i, j, k)",
         "density": "1/m at the nodes: 4/spacing * sigmoid(logit); between nodes the logit is trilinear, logit = ln(s/(1 - s)) with s = density * spacing/4",
         "surface_density_per_m": PEAK / field.spacing * sigmoid(surface_logit()),
-        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.ply is this level",
+        "surface": "where a ray at a right angle has lost half its light (T = 0.5); mesh.glb and mesh.ply are this level",
         "evidence": "what tells of a node: 0 nothing (its density is a guess), 1 a plane of the room, 2 light paths, 3 the camera",
     });
     let attributes = attributes.as_object().expect("written as an object");

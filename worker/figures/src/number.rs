@@ -1,7 +1,7 @@
 //! Numbers as people read them.
 
 /// With about so many digits that count; no exponent between 0.001 and 999,999.
-pub(super) fn digits(value: f64, count: i32) -> String {
+pub fn digits(value: f64, count: i32) -> String {
     if !value.is_finite() {
         return "–".to_owned();
     }
@@ -17,7 +17,7 @@ pub(super) fn digits(value: f64, count: i32) -> String {
 }
 
 /// Without the zeros that say nothing.
-pub(super) fn short(value: f64) -> String {
+pub fn short(value: f64) -> String {
     let text = digits(value, 6);
     let (number, exponent) = text
         .split_once('e')
@@ -30,7 +30,7 @@ pub(super) fn short(value: f64) -> String {
 }
 
 /// With a prefix: 356.4 M.
-pub(super) fn prefixed(value: f64) -> String {
+pub fn prefixed(value: f64) -> String {
     let prefixes = [
         (1e15, " P"),
         (1e12, " T"),
@@ -47,7 +47,7 @@ pub(super) fn prefixed(value: f64) -> String {
 }
 
 /// The same without the zeros that say nothing: 20 M.
-pub(super) fn prefixed_short(value: f64) -> String {
+pub fn prefixed_short(value: f64) -> String {
     let text = prefixed(value);
     match text.split_once(' ') {
         Some((number, prefix)) if number.contains('.') => {
@@ -59,7 +59,7 @@ pub(super) fn prefixed_short(value: f64) -> String {
 }
 
 /// Seconds as hours and minutes.
-pub(super) fn duration(seconds: f64) -> String {
+pub fn duration(seconds: f64) -> String {
     if !(seconds.is_finite() && seconds >= 0.0) {
         return "–".to_owned();
     }
@@ -75,7 +75,7 @@ pub(super) fn duration(seconds: f64) -> String {
 }
 
 /// A whole number with its thousands apart.
-pub(super) fn thousands(value: u64) -> String {
+pub fn thousands(value: u64) -> String {
     let text = value.to_string();
     let mut out = String::new();
     for (i, c) in text.chars().enumerate() {
@@ -88,12 +88,12 @@ pub(super) fn thousands(value: u64) -> String {
 }
 
 /// Metres, to a tenth of a millimetre where they are few.
-pub(super) fn metres(value: f64) -> String {
+pub fn metres(value: f64) -> String {
     digits(value, 3)
 }
 
 /// A share such as IoU: four places.
-pub(super) fn share(value: f64) -> String {
+pub fn share(value: f64) -> String {
     if value.is_finite() {
         format!("{value:.4}")
     } else {

@@ -3,7 +3,7 @@
 use std::fmt::{self, Display, Write};
 
 /// Displays with everything escaped that HTML would understand; control and directional characters become U+FFFD.
-pub(super) struct Safe<T>(pub T);
+pub struct Safe<T>(pub T);
 
 impl<T: Display> Display for Safe<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

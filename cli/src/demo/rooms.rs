@@ -1,0 +1,120 @@
+//! What `demo --reconstruct` does after the rooms are rendered: each of them in 3D.
+
+use std::path::{Path, PathBuf};
+
+use picofarm_proto::{
+    model::{
+        OutputSettings, RenderTask, SourceSettings, StageSpec, TaskSpec,
+        kinds::{ReconstructTask, reconstruct::ReconstructSettings},
+    },
+    show,
+};
+use picofarm_reconstruct::Settings as GridSettings;
+use serde_json::{Value, json};
+
+use crate::{
+    dataset::reconstructions::{check, draw, opened},
+    error::Result,
+    jobfile,
+    output::bytes,
+    settings::Settings,
+};
+
+/// Nodes of the grids: two thirds of the default, in half its time.
+const NODES: u32 = 128;
+/// Novel views of each room to compare.
+const VIEWS: u32 = 24;
+/// Rows of the contact sheet at most.
+const ROWS: usize = 16;
+
+/// What is said before it begins.
+pub fn announced() -> String {
+    format!(
+        "then each room in 3D: a grid of {NODES} nodes, from the depth and shadows of the ground truth. That is quick, and shows \
+         what the method reaches at best; from histograms, in a job: from = \"captures\""
+    )
+}
+
+/// The stage that reconstructs what `task` renders. It takes the ground truth: a demo has no networks, and renders no
+/// histogram of each spot alone.
+///
+/// # Errors
+/// Places that cannot be used.
+pub fn stage(task: &RenderTask, dir: &Path, settings: &Settings) -> Result<StageSpec> {
+    let mut spec = TaskSpec::Reconstruct(ReconstructTask {
+        source: SourceSettings {
+            store: task.output.store.clone(),
+            dataset: task.output.dataset.clone(),
+        },
+        count: task.scenes.count,
+        reconstruct: ReconstructSettings {
+            views: VIEWS,
+            grid: GridSettings {
+                nodes: NODES,
+                ..GridSettings::default()
+            },
+            ..ReconstructSettings::default()
+        },
+        output: OutputSettings {
+            dataset: beside(&task.output.dataset),
+            ..task.output.clone()
+        },
+    });
+    jobfile::resolve_task(&mut spec, dir, &settings.assets)?;
+    Ok(StageSpec::new(spec))
+}
+
+/// Where the reconstructions of a data set go.
+fn beside(dataset: &str) -> String {
+    format!("{dataset}-3d")
+}
+
+/// Reconstructions, verified and drawn.
+pub struct Rooms {
+    place: String,
+    sheet: PathBuf,
+    scenes: u64,
+    bytes: u64,
+}
+
+impl Rooms {
+    /// Verifies the reconstructions of the data set at `place`, and draws them into `dir`.
+    ///
+    /// # Errors
+    /// Exit code 6 naming what is broken; a folder that cannot be written.
+    pub async fn of(place: &str, dir: &Path) -> Result<Self> {
+        let place = beside(place);
+        let there = opened(&place).await?;
+        let report = check(&place, &there).await?;
+        let sheet = dir.join("reconstructions.png");
+        draw(&place, &there, ROWS, &sheet).await?;
+        Ok(Self {
+            place,
+            sheet,
+            scenes: report.scenes,
+            bytes: report.bytes,
+        })
+    }
+
+    /// For JSON.
+    pub fn facts(&self) -> Value {
+        json!({"folder": self.place, "scenes": self.scenes, "bytes": self.bytes, "contact_sheet": self.sheet})
+    }
+
+    /// Where they are.
+    pub fn told(&self) -> String {
+        format!(
+            "rooms in 3D      {} ({}, all verified): scenes/<scene>/ with mesh.glb, views.png, metrics.json\n\
+             novel views      {}\n",
+            show::line(&self.place),
+            bytes(self.bytes),
+            self.sheet.display(),
+        )
+    }
+
+    /// What to do next.
+    pub fn next(&self) -> String {
+        let place = show::argument(&self.place);
+        format!("picofarm dataset info {place}\n  picofarm dataset report {place}\n  ")
+    }
+}
