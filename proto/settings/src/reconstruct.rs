@@ -42,7 +42,7 @@ impl Default for GridSettings {
             nodes: 192,
             planes: true,
             shadows: Shadows::Optimise,
-            iterations: 100,
+            iterations: 200,
             batch: 16_384,
             seed: 0,
         }

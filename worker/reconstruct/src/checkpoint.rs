@@ -17,6 +17,7 @@ impl Reconstruction {
             return out;
         };
         out.extend(saved.done.to_le_bytes());
+        out.extend(saved.misses.to_le_bytes());
         out.extend(saved.settles.unwrap_or(u32::MAX).to_le_bytes());
         out.extend(saved.loss.to_le_bytes());
         out.extend(saved.held_out.to_le_bytes());
@@ -52,11 +53,12 @@ impl Reconstruction {
             return Ok(begun);
         }
         let nodes = begun.trainable_nodes().len();
-        if rest.len() != 24 + 12 * nodes {
+        if rest.len() != 28 + 12 * nodes {
             return Err(bad("is cut off; begin anew"));
         }
         let cut = || bad("is cut off; begin anew");
         let (done, rest) = rest.split_first_chunk().ok_or_else(cut)?;
+        let (misses, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let (settles, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let (loss, rest) = rest.split_first_chunk().ok_or_else(cut)?;
         let (held_out, rest) = rest.split_first_chunk().ok_or_else(cut)?;
@@ -70,6 +72,7 @@ impl Reconstruction {
             done: u32::from_le_bytes(*done),
             loss: f64::from_le_bytes(*loss),
             held_out: f64::from_le_bytes(*held_out),
+            misses: u32::from_le_bytes(*misses),
             settles: (settles != u32::MAX).then_some(settles),
             logits: values(0),
             first: values(1),

@@ -5,7 +5,7 @@
 //! s (saturating: 10·ln(1 + s/10)); of one whose light is stopped −ln(1 − T + 0.02). Both classes and the camera's rays
 //! make a third of a batch each. Gradients are summed in fixed point: integer sums are the same in any order.
 //!
-//! One ray of twenty is held out. Every ten iterations its loss is looked at; once that falls by less than [`GAIN`], half as many
+//! One ray of twenty is held out. Every ten iterations their loss is looked at. Once it was hardly lower twice in a row, half as many
 //! iterations at a lower rate follow, and then the end.
 
 mod adam;
@@ -36,8 +36,10 @@ const EVEN: f32 = 0.35;
 
 /// Iterations from one look at the held-out rays to the next.
 const LOOK: u32 = 10;
-/// Share of the held-out loss that [`LOOK`] iterations must take off it to go on.
-const GAIN: f64 = 0.02;
+/// Share of the held-out loss by which it must fall to count as lower.
+const GAIN: f64 = 0.01;
+/// Looks in a row that find it not so much lower, after which the rate is lowered.
+const PATIENCE: u32 = 2;
 /// Least iterations at the lower rate.
 const SETTLE: u32 = 10;
 
@@ -65,8 +67,10 @@ pub(crate) struct Optimiser<'a> {
     pub done: u32,
     /// Loss per ray of the last iteration.
     pub loss: f64,
-    /// Loss per held-out ray at the last look.
+    /// Least loss per held-out ray so far.
     pub held_out: f64,
+    /// Looks since then that found it no lower.
+    pub misses: u32,
     /// Iteration from which on the rate is lower.
     pub settles: Option<u32>,
 }
@@ -148,6 +152,7 @@ impl<'a> Optimiser<'a> {
             done: 0,
             loss: f64::NAN,
             held_out: f64::NAN,
+            misses: 0,
             settles: None,
         })
     }
@@ -191,11 +196,14 @@ impl<'a> Optimiser<'a> {
             .map(|class| class.par_iter().map(loss).sum::<i64>() as f64 / class.len() as f64)
             .collect();
         let held_out = means.iter().sum::<f64>() / f64::from(UNIT) / means.len().max(1) as f64;
-        let falls = self.held_out.is_nan() || held_out < self.held_out * (1.0 - GAIN);
-        if !falls || self.done * 3 >= self.settings.iterations * 2 {
+        if self.held_out.is_nan() || held_out < self.held_out * (1.0 - GAIN) {
+            (self.held_out, self.misses) = (held_out, 0);
+        } else {
+            self.misses += 1;
+        }
+        if self.misses >= PATIENCE || self.done * 3 >= self.settings.iterations * 2 {
             self.settles = Some(self.done);
         }
-        self.held_out = held_out;
     }
 
     fn iterate(&mut self, field: &mut Field, sums: &mut [Vec<i64>]) {

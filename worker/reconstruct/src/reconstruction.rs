@@ -46,7 +46,7 @@ pub struct Reconstructed {
     pub measured: Measured,
     /// Loss per ray of the last iteration, where there was one.
     pub loss: Option<f64>,
-    /// Loss per ray that was held out, when it was last looked at.
+    /// Least loss per ray that was held out.
     pub held_out_loss: Option<f64>,
     /// Iterations done.
     pub iterations: u32,
@@ -75,6 +75,7 @@ pub(crate) struct Saved {
     pub done: u32,
     pub loss: f64,
     pub held_out: f64,
+    pub misses: u32,
     pub settles: Option<u32>,
     pub logits: Vec<f32>,
     pub first: Vec<f32>,
@@ -171,16 +172,18 @@ impl Reconstruction {
             moments.first = saved.first;
             moments.second = saved.second;
             (optimiser.done, optimiser.loss) = (saved.done, saved.loss);
-            (optimiser.held_out, optimiser.settles) = (saved.held_out, saved.settles);
+            (optimiser.held_out, optimiser.misses) = (saved.held_out, saved.misses);
+            optimiser.settles = saved.settles;
         }
         let ended = optimiser.run(&mut field, progress);
         let (done, loss) = (optimiser.done, optimiser.loss);
-        let (held_out, settles) = (optimiser.held_out, optimiser.settles);
+        let (held_out, misses, settles) = (optimiser.held_out, optimiser.misses, optimiser.settles);
         let (nodes, moments) = optimiser.state();
         self.saved = Some(Saved {
             done,
             loss,
             held_out,
+            misses,
             settles,
             logits: nodes.iter().map(|&i| field.logit[i as usize]).collect(),
             first: std::mem::take(&mut moments.first),
