@@ -468,6 +468,643 @@ pub struct ConnectedWorker {
     #[prost(bool, tag = "9")]
     pub quarantined: bool,
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SessionRequest {
+    #[prost(oneof = "session_request::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    pub message: ::core::option::Option<session_request::Message>,
+}
+/// Nested message and enum types in `SessionRequest`.
+pub mod session_request {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Message {
+        #[prost(message, tag = "1")]
+        Hello(super::Hello),
+        #[prost(message, tag = "2")]
+        Credit(super::Credit),
+        #[prost(message, tag = "3")]
+        Heartbeat(super::Heartbeat),
+        #[prost(message, tag = "4")]
+        Done(super::TaskDone),
+        #[prost(message, tag = "5")]
+        Failed(super::TaskFailed),
+        #[prost(message, tag = "6")]
+        Release(super::Release),
+        #[prost(message, tag = "7")]
+        Log(super::TaskLog),
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SessionResponse {
+    #[prost(oneof = "session_response::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    pub message: ::core::option::Option<session_response::Message>,
+}
+/// Nested message and enum types in `SessionResponse`.
+pub mod session_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Message {
+        #[prost(message, tag = "1")]
+        Welcome(super::Welcome),
+        #[prost(message, tag = "2")]
+        Lease(super::Lease),
+        #[prost(message, tag = "3")]
+        Acknowledge(super::Acknowledge),
+        #[prost(message, tag = "4")]
+        Renewed(super::Renewed),
+        #[prost(message, tag = "5")]
+        Revoke(super::Revoke),
+        #[prost(message, tag = "6")]
+        Trim(super::Trim),
+        #[prost(message, tag = "7")]
+        Drain(super::Drain),
+    }
+}
+/// First message of a session. A reconnecting worker names the leases it still holds.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Hello {
+    #[prost(string, tag = "1")]
+    pub worker_id: ::prost::alloc::string::String,
+    /// New at each process start; a restarted worker never passes for its predecessor.
+    #[prost(string, tag = "2")]
+    pub incarnation: ::prost::alloc::string::String,
+    #[prost(string, tag = "3")]
+    pub name: ::prost::alloc::string::String,
+    #[prost(string, tag = "4")]
+    pub version: ::prost::alloc::string::String,
+    #[prost(uint32, tag = "5")]
+    pub protocol: u32,
+    #[prost(uint32, tag = "6")]
+    pub cores: u32,
+    #[prost(message, repeated, tag = "7")]
+    pub held: ::prost::alloc::vec::Vec<LeaseRef>,
+    /// The kinds of task it runs, each with the version of its code, which must equal the stage's.
+    #[prost(map = "string, string", tag = "8")]
+    pub kinds: ::std::collections::HashMap<
+        ::prost::alloc::string::String,
+        ::prost::alloc::string::String,
+    >,
+    /// Asset fingerprints at hand.
+    #[prost(string, repeated, tag = "9")]
+    pub assets: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// 0 = not known.
+    #[prost(uint64, tag = "10")]
+    pub memory_mib: u64,
+    #[prost(uint32, tag = "11")]
+    pub gpus: u32,
+    #[prost(string, repeated, tag = "12")]
+    pub labels: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// How the process of this worker before this one ended, where its parent knows; at most 256 bytes, empty = not known.
+    #[prost(string, tag = "13")]
+    pub ended: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Welcome {
+    #[prost(string, tag = "1")]
+    pub coordinator_version: ::prost::alloc::string::String,
+    #[prost(uint32, tag = "2")]
+    pub heartbeat_ms: u32,
+    #[prost(uint32, tag = "3")]
+    pub lease_ms: u32,
+}
+/// The worker can take this many more leases; 0 takes back all credit. Whatever was granted before comes ahead of the
+/// answer to the next heartbeat.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Credit {
+    #[prost(uint32, tag = "1")]
+    pub leases: u32,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct LeaseRef {
+    #[prost(string, tag = "1")]
+    pub range_id: ::prost::alloc::string::String,
+    #[prost(uint64, tag = "2")]
+    pub epoch: u64,
+}
+/// Tasks lo ≤ i \< hi of a stage, less those already done.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Lease {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(string, tag = "2")]
+    pub job_id: ::prost::alloc::string::String,
+    #[prost(uint64, tag = "3")]
+    pub lo: u64,
+    #[prost(uint64, tag = "4")]
+    pub hi: u64,
+    #[prost(uint64, repeated, tag = "5")]
+    pub skip: ::prost::alloc::vec::Vec<u64>,
+    /// Time to live from receipt, milliseconds.
+    #[prost(uint32, tag = "6")]
+    pub ttl_ms: u32,
+    /// Of its lists as much as these tasks need.
+    #[prost(message, optional, tag = "7")]
+    pub stage: ::core::option::Option<StageSpec>,
+    /// Position of the stage in the job.
+    #[prost(uint32, tag = "8")]
+    pub ordinal: u32,
+    /// 64 hexadecimal digits.
+    #[prost(string, tag = "9")]
+    pub stage_key: ::prost::alloc::string::String,
+    /// Where it belongs in a trace (W3C Trace Context); empty = nowhere.
+    #[prost(string, tag = "10")]
+    pub traceparent: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Heartbeat {
+    #[prost(message, repeated, tag = "1")]
+    pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
+    #[prost(message, repeated, tag = "2")]
+    pub progress: ::prost::alloc::vec::Vec<TaskProgress>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TaskProgress {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub index: u64,
+    #[prost(float, tag = "3")]
+    pub fraction: f32,
+    /// What it is at, for people; at most 256 bytes, empty = nothing to say.
+    #[prost(string, tag = "4")]
+    pub text: ::prost::alloc::string::String,
+    /// The same for programs: loss, samples_per_s, …; at most 16 of names of at most 32 bytes.
+    #[prost(map = "string, double", tag = "5")]
+    pub figures: ::std::collections::HashMap<::prost::alloc::string::String, f64>,
+}
+/// Answer to a heartbeat: these leases live on for ttl_ms; those not named are lost.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Renewed {
+    #[prost(message, repeated, tag = "1")]
+    pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
+    #[prost(uint32, tag = "2")]
+    pub ttl_ms: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TaskDone {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub index: u64,
+    #[prost(string, tag = "3")]
+    pub task_key: ::prost::alloc::string::String,
+    /// SHA-256 of the published manifest, hexadecimal.
+    #[prost(string, tag = "4")]
+    pub manifest_sha256: ::prost::alloc::string::String,
+    #[prost(uint64, tag = "5")]
+    pub bytes: u64,
+    #[prost(double, tag = "6")]
+    pub seconds: f64,
+    /// The output was found in the store and not computed.
+    #[prost(bool, tag = "7")]
+    pub adopted: bool,
+    /// Where the task was in a trace (W3C Trace Context); empty = nowhere.
+    #[prost(string, tag = "8")]
+    pub traceparent: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TaskFailed {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub index: u64,
+    #[prost(enumeration = "FailureKind", tag = "3")]
+    pub kind: i32,
+    #[prost(string, tag = "4")]
+    pub message: ::prost::alloc::string::String,
+}
+/// Answers TaskDone, TaskFailed and Release.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Acknowledge {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub index: u64,
+    /// Not accepted: the lease was no longer this worker's. Nothing to do: the output stands or another has the task.
+    #[prost(bool, tag = "3")]
+    pub accepted: bool,
+    #[prost(string, tag = "4")]
+    pub reason: ::prost::alloc::string::String,
+}
+/// What the task in hand has logged since the last of these. Best effort: nothing answers it, and it counts only while the
+/// lease is live and has the task to do.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TaskLog {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub index: u64,
+    /// In order. At most 200 lines and 16 KiB of text for a task, over all of these together.
+    #[prost(message, repeated, tag = "3")]
+    pub lines: ::prost::alloc::vec::Vec<LogLine>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct LogLine {
+    /// Milliseconds from its writing to the sending of this message: the two clocks need not agree.
+    #[prost(uint32, tag = "1")]
+    pub ago_ms: u32,
+    #[prost(enumeration = "LogLevel", tag = "2")]
+    pub level: i32,
+    /// At most 2 KiB.
+    #[prost(string, tag = "3")]
+    pub text: ::prost::alloc::string::String,
+}
+/// The worker gives a lease back; what it finished stays committed.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Release {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(string, tag = "2")]
+    pub reason: ::prost::alloc::string::String,
+}
+/// Stop working on this lease (cancelled or lost).
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Revoke {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(string, tag = "2")]
+    pub reason: ::prost::alloc::string::String,
+}
+/// Of this lease, tasks from `hi` on are another worker's now.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Trim {
+    #[prost(message, optional, tag = "1")]
+    pub lease: ::core::option::Option<LeaseRef>,
+    #[prost(uint64, tag = "2")]
+    pub hi: u64,
+}
+/// Finish the task in hand, give the rest back, and end.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Drain {}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum FailureKind {
+    Unspecified = 0,
+    /// The task's own input or settings.
+    User = 1,
+    /// The executor panicked or ran out of a resource.
+    Crash = 2,
+    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Free.
+    Interrupted = 3,
+    /// Nothing is wrong with the task: its store cannot be reached or written. Free; the store is tried again later.
+    Store = 4,
+}
+impl FailureKind {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "FAILURE_KIND_UNSPECIFIED",
+            Self::User => "FAILURE_KIND_USER",
+            Self::Crash => "FAILURE_KIND_CRASH",
+            Self::Interrupted => "FAILURE_KIND_INTERRUPTED",
+            Self::Store => "FAILURE_KIND_STORE",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "FAILURE_KIND_UNSPECIFIED" => Some(Self::Unspecified),
+            "FAILURE_KIND_USER" => Some(Self::User),
+            "FAILURE_KIND_CRASH" => Some(Self::Crash),
+            "FAILURE_KIND_INTERRUPTED" => Some(Self::Interrupted),
+            "FAILURE_KIND_STORE" => Some(Self::Store),
+            _ => None,
+        }
+    }
+}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum LogLevel {
+    Unspecified = 0,
+    Error = 1,
+    Warn = 2,
+    Info = 3,
+}
+impl LogLevel {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "LOG_LEVEL_UNSPECIFIED",
+            Self::Error => "LOG_LEVEL_ERROR",
+            Self::Warn => "LOG_LEVEL_WARN",
+            Self::Info => "LOG_LEVEL_INFO",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "LOG_LEVEL_UNSPECIFIED" => Some(Self::Unspecified),
+            "LOG_LEVEL_ERROR" => Some(Self::Error),
+            "LOG_LEVEL_WARN" => Some(Self::Warn),
+            "LOG_LEVEL_INFO" => Some(Self::Info),
+            _ => None,
+        }
+    }
+}
+/// Generated client implementations.
+pub mod farm_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    #[derive(Debug, Clone)]
+    pub struct FarmClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl FarmClient<tonic::transport::Channel> {
+        /// Attempt to create a new client by connecting to a given endpoint.
+        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
+        where
+            D: TryInto<tonic::transport::Endpoint>,
+            D::Error: Into<StdError>,
+        {
+            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
+            Ok(Self::new(conn))
+        }
+    }
+    impl<T> FarmClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> FarmClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            FarmClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        pub async fn session(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<Message = super::SessionRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::SessionResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/picofarm.v1.Farm/Session");
+            let mut req = request.into_streaming_request();
+            req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Farm", "Session"));
+            self.inner.streaming(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod farm_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with FarmServer.
+    #[async_trait]
+    pub trait Farm: std::marker::Send + std::marker::Sync + 'static {
+        /// Server streaming response type for the Session method.
+        type SessionStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::SessionResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        async fn session(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::SessionRequest>>,
+        ) -> std::result::Result<tonic::Response<Self::SessionStream>, tonic::Status>;
+    }
+    #[derive(Debug)]
+    pub struct FarmServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> FarmServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for FarmServer<T>
+    where
+        T: Farm,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/picofarm.v1.Farm/Session" => {
+                    #[allow(non_camel_case_types)]
+                    struct SessionSvc<T: Farm>(pub Arc<T>);
+                    impl<T: Farm> tonic::server::StreamingService<super::SessionRequest>
+                    for SessionSvc<T> {
+                        type Response = super::SessionResponse;
+                        type ResponseStream = T::SessionStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::SessionRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Farm>::session(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SessionSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for FarmServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "picofarm.v1.Farm";
+    impl<T> tonic::server::NamedService for FarmServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoRequest {}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -2009,643 +2646,6 @@ pub mod jobs_server {
     /// Generated gRPC service name
     pub const SERVICE_NAME: &str = "picofarm.v1.Jobs";
     impl<T> tonic::server::NamedService for JobsServer<T> {
-        const NAME: &'static str = SERVICE_NAME;
-    }
-}
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct SessionRequest {
-    #[prost(oneof = "session_request::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
-    pub message: ::core::option::Option<session_request::Message>,
-}
-/// Nested message and enum types in `SessionRequest`.
-pub mod session_request {
-    #[derive(Clone, PartialEq, ::prost::Oneof)]
-    pub enum Message {
-        #[prost(message, tag = "1")]
-        Hello(super::Hello),
-        #[prost(message, tag = "2")]
-        Credit(super::Credit),
-        #[prost(message, tag = "3")]
-        Heartbeat(super::Heartbeat),
-        #[prost(message, tag = "4")]
-        Done(super::TaskDone),
-        #[prost(message, tag = "5")]
-        Failed(super::TaskFailed),
-        #[prost(message, tag = "6")]
-        Release(super::Release),
-        #[prost(message, tag = "7")]
-        Log(super::TaskLog),
-    }
-}
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct SessionResponse {
-    #[prost(oneof = "session_response::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
-    pub message: ::core::option::Option<session_response::Message>,
-}
-/// Nested message and enum types in `SessionResponse`.
-pub mod session_response {
-    #[derive(Clone, PartialEq, ::prost::Oneof)]
-    pub enum Message {
-        #[prost(message, tag = "1")]
-        Welcome(super::Welcome),
-        #[prost(message, tag = "2")]
-        Lease(super::Lease),
-        #[prost(message, tag = "3")]
-        Acknowledge(super::Acknowledge),
-        #[prost(message, tag = "4")]
-        Renewed(super::Renewed),
-        #[prost(message, tag = "5")]
-        Revoke(super::Revoke),
-        #[prost(message, tag = "6")]
-        Trim(super::Trim),
-        #[prost(message, tag = "7")]
-        Drain(super::Drain),
-    }
-}
-/// First message of a session. A reconnecting worker names the leases it still holds.
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct Hello {
-    #[prost(string, tag = "1")]
-    pub worker_id: ::prost::alloc::string::String,
-    /// New at each process start; a restarted worker never passes for its predecessor.
-    #[prost(string, tag = "2")]
-    pub incarnation: ::prost::alloc::string::String,
-    #[prost(string, tag = "3")]
-    pub name: ::prost::alloc::string::String,
-    #[prost(string, tag = "4")]
-    pub version: ::prost::alloc::string::String,
-    #[prost(uint32, tag = "5")]
-    pub protocol: u32,
-    #[prost(uint32, tag = "6")]
-    pub cores: u32,
-    #[prost(message, repeated, tag = "7")]
-    pub held: ::prost::alloc::vec::Vec<LeaseRef>,
-    /// The kinds of task it runs, each with the version of its code, which must equal the stage's.
-    #[prost(map = "string, string", tag = "8")]
-    pub kinds: ::std::collections::HashMap<
-        ::prost::alloc::string::String,
-        ::prost::alloc::string::String,
-    >,
-    /// Asset fingerprints at hand.
-    #[prost(string, repeated, tag = "9")]
-    pub assets: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// 0 = not known.
-    #[prost(uint64, tag = "10")]
-    pub memory_mib: u64,
-    #[prost(uint32, tag = "11")]
-    pub gpus: u32,
-    #[prost(string, repeated, tag = "12")]
-    pub labels: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// How the process of this worker before this one ended, where its parent knows; at most 256 bytes, empty = not known.
-    #[prost(string, tag = "13")]
-    pub ended: ::prost::alloc::string::String,
-}
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Welcome {
-    #[prost(string, tag = "1")]
-    pub coordinator_version: ::prost::alloc::string::String,
-    #[prost(uint32, tag = "2")]
-    pub heartbeat_ms: u32,
-    #[prost(uint32, tag = "3")]
-    pub lease_ms: u32,
-}
-/// The worker can take this many more leases; 0 takes back all credit. Whatever was granted before comes ahead of the
-/// answer to the next heartbeat.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Credit {
-    #[prost(uint32, tag = "1")]
-    pub leases: u32,
-}
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct LeaseRef {
-    #[prost(string, tag = "1")]
-    pub range_id: ::prost::alloc::string::String,
-    #[prost(uint64, tag = "2")]
-    pub epoch: u64,
-}
-/// Tasks lo ≤ i \< hi of a stage, less those already done.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Lease {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(string, tag = "2")]
-    pub job_id: ::prost::alloc::string::String,
-    #[prost(uint64, tag = "3")]
-    pub lo: u64,
-    #[prost(uint64, tag = "4")]
-    pub hi: u64,
-    #[prost(uint64, repeated, tag = "5")]
-    pub skip: ::prost::alloc::vec::Vec<u64>,
-    /// Time to live from receipt, milliseconds.
-    #[prost(uint32, tag = "6")]
-    pub ttl_ms: u32,
-    /// Of its lists as much as these tasks need.
-    #[prost(message, optional, tag = "7")]
-    pub stage: ::core::option::Option<StageSpec>,
-    /// Position of the stage in the job.
-    #[prost(uint32, tag = "8")]
-    pub ordinal: u32,
-    /// 64 hexadecimal digits.
-    #[prost(string, tag = "9")]
-    pub stage_key: ::prost::alloc::string::String,
-    /// Where it belongs in a trace (W3C Trace Context); empty = nowhere.
-    #[prost(string, tag = "10")]
-    pub traceparent: ::prost::alloc::string::String,
-}
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct Heartbeat {
-    #[prost(message, repeated, tag = "1")]
-    pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
-    #[prost(message, repeated, tag = "2")]
-    pub progress: ::prost::alloc::vec::Vec<TaskProgress>,
-}
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct TaskProgress {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub index: u64,
-    #[prost(float, tag = "3")]
-    pub fraction: f32,
-    /// What it is at, for people; at most 256 bytes, empty = nothing to say.
-    #[prost(string, tag = "4")]
-    pub text: ::prost::alloc::string::String,
-    /// The same for programs: loss, samples_per_s, …; at most 16 of names of at most 32 bytes.
-    #[prost(map = "string, double", tag = "5")]
-    pub figures: ::std::collections::HashMap<::prost::alloc::string::String, f64>,
-}
-/// Answer to a heartbeat: these leases live on for ttl_ms; those not named are lost.
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct Renewed {
-    #[prost(message, repeated, tag = "1")]
-    pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
-    #[prost(uint32, tag = "2")]
-    pub ttl_ms: u32,
-}
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct TaskDone {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub index: u64,
-    #[prost(string, tag = "3")]
-    pub task_key: ::prost::alloc::string::String,
-    /// SHA-256 of the published manifest, hexadecimal.
-    #[prost(string, tag = "4")]
-    pub manifest_sha256: ::prost::alloc::string::String,
-    #[prost(uint64, tag = "5")]
-    pub bytes: u64,
-    #[prost(double, tag = "6")]
-    pub seconds: f64,
-    /// The output was found in the store and not computed.
-    #[prost(bool, tag = "7")]
-    pub adopted: bool,
-    /// Where the task was in a trace (W3C Trace Context); empty = nowhere.
-    #[prost(string, tag = "8")]
-    pub traceparent: ::prost::alloc::string::String,
-}
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct TaskFailed {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub index: u64,
-    #[prost(enumeration = "FailureKind", tag = "3")]
-    pub kind: i32,
-    #[prost(string, tag = "4")]
-    pub message: ::prost::alloc::string::String,
-}
-/// Answers TaskDone, TaskFailed and Release.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Acknowledge {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub index: u64,
-    /// Not accepted: the lease was no longer this worker's. Nothing to do: the output stands or another has the task.
-    #[prost(bool, tag = "3")]
-    pub accepted: bool,
-    #[prost(string, tag = "4")]
-    pub reason: ::prost::alloc::string::String,
-}
-/// What the task in hand has logged since the last of these. Best effort: nothing answers it, and it counts only while the
-/// lease is live and has the task to do.
-#[derive(Clone, PartialEq, ::prost::Message)]
-pub struct TaskLog {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub index: u64,
-    /// In order. At most 200 lines and 16 KiB of text for a task, over all of these together.
-    #[prost(message, repeated, tag = "3")]
-    pub lines: ::prost::alloc::vec::Vec<LogLine>,
-}
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct LogLine {
-    /// Milliseconds from its writing to the sending of this message: the two clocks need not agree.
-    #[prost(uint32, tag = "1")]
-    pub ago_ms: u32,
-    #[prost(enumeration = "LogLevel", tag = "2")]
-    pub level: i32,
-    /// At most 2 KiB.
-    #[prost(string, tag = "3")]
-    pub text: ::prost::alloc::string::String,
-}
-/// The worker gives a lease back; what it finished stays committed.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Release {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(string, tag = "2")]
-    pub reason: ::prost::alloc::string::String,
-}
-/// Stop working on this lease (cancelled or lost).
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Revoke {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(string, tag = "2")]
-    pub reason: ::prost::alloc::string::String,
-}
-/// Of this lease, tasks from `hi` on are another worker's now.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Trim {
-    #[prost(message, optional, tag = "1")]
-    pub lease: ::core::option::Option<LeaseRef>,
-    #[prost(uint64, tag = "2")]
-    pub hi: u64,
-}
-/// Finish the task in hand, give the rest back, and end.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct Drain {}
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
-#[repr(i32)]
-pub enum FailureKind {
-    Unspecified = 0,
-    /// The task's own input or settings.
-    User = 1,
-    /// The executor panicked or ran out of a resource.
-    Crash = 2,
-    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Free.
-    Interrupted = 3,
-    /// Nothing is wrong with the task: its store cannot be reached or written. Free; the store is tried again later.
-    Store = 4,
-}
-impl FailureKind {
-    /// String value of the enum field names used in the ProtoBuf definition.
-    ///
-    /// The values are not transformed in any way and thus are considered stable
-    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
-    pub fn as_str_name(&self) -> &'static str {
-        match self {
-            Self::Unspecified => "FAILURE_KIND_UNSPECIFIED",
-            Self::User => "FAILURE_KIND_USER",
-            Self::Crash => "FAILURE_KIND_CRASH",
-            Self::Interrupted => "FAILURE_KIND_INTERRUPTED",
-            Self::Store => "FAILURE_KIND_STORE",
-        }
-    }
-    /// Creates an enum from field names used in the ProtoBuf definition.
-    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
-        match value {
-            "FAILURE_KIND_UNSPECIFIED" => Some(Self::Unspecified),
-            "FAILURE_KIND_USER" => Some(Self::User),
-            "FAILURE_KIND_CRASH" => Some(Self::Crash),
-            "FAILURE_KIND_INTERRUPTED" => Some(Self::Interrupted),
-            "FAILURE_KIND_STORE" => Some(Self::Store),
-            _ => None,
-        }
-    }
-}
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
-#[repr(i32)]
-pub enum LogLevel {
-    Unspecified = 0,
-    Error = 1,
-    Warn = 2,
-    Info = 3,
-}
-impl LogLevel {
-    /// String value of the enum field names used in the ProtoBuf definition.
-    ///
-    /// The values are not transformed in any way and thus are considered stable
-    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
-    pub fn as_str_name(&self) -> &'static str {
-        match self {
-            Self::Unspecified => "LOG_LEVEL_UNSPECIFIED",
-            Self::Error => "LOG_LEVEL_ERROR",
-            Self::Warn => "LOG_LEVEL_WARN",
-            Self::Info => "LOG_LEVEL_INFO",
-        }
-    }
-    /// Creates an enum from field names used in the ProtoBuf definition.
-    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
-        match value {
-            "LOG_LEVEL_UNSPECIFIED" => Some(Self::Unspecified),
-            "LOG_LEVEL_ERROR" => Some(Self::Error),
-            "LOG_LEVEL_WARN" => Some(Self::Warn),
-            "LOG_LEVEL_INFO" => Some(Self::Info),
-            _ => None,
-        }
-    }
-}
-/// Generated client implementations.
-pub mod farm_client {
-    #![allow(
-        unused_variables,
-        dead_code,
-        missing_docs,
-        clippy::wildcard_imports,
-        clippy::let_unit_value,
-    )]
-    use tonic::codegen::*;
-    use tonic::codegen::http::Uri;
-    #[derive(Debug, Clone)]
-    pub struct FarmClient<T> {
-        inner: tonic::client::Grpc<T>,
-    }
-    impl FarmClient<tonic::transport::Channel> {
-        /// Attempt to create a new client by connecting to a given endpoint.
-        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
-        where
-            D: TryInto<tonic::transport::Endpoint>,
-            D::Error: Into<StdError>,
-        {
-            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
-            Ok(Self::new(conn))
-        }
-    }
-    impl<T> FarmClient<T>
-    where
-        T: tonic::client::GrpcService<tonic::body::Body>,
-        T::Error: Into<StdError>,
-        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
-        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
-    {
-        pub fn new(inner: T) -> Self {
-            let inner = tonic::client::Grpc::new(inner);
-            Self { inner }
-        }
-        pub fn with_origin(inner: T, origin: Uri) -> Self {
-            let inner = tonic::client::Grpc::with_origin(inner, origin);
-            Self { inner }
-        }
-        pub fn with_interceptor<F>(
-            inner: T,
-            interceptor: F,
-        ) -> FarmClient<InterceptedService<T, F>>
-        where
-            F: tonic::service::Interceptor,
-            T::ResponseBody: Default,
-            T: tonic::codegen::Service<
-                http::Request<tonic::body::Body>,
-                Response = http::Response<
-                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
-                >,
-            >,
-            <T as tonic::codegen::Service<
-                http::Request<tonic::body::Body>,
-            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
-        {
-            FarmClient::new(InterceptedService::new(inner, interceptor))
-        }
-        /// Compress requests with the given encoding.
-        ///
-        /// This requires the server to support it otherwise it might respond with an
-        /// error.
-        #[must_use]
-        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
-            self.inner = self.inner.send_compressed(encoding);
-            self
-        }
-        /// Enable decompressing responses.
-        #[must_use]
-        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
-            self.inner = self.inner.accept_compressed(encoding);
-            self
-        }
-        /// Limits the maximum size of a decoded message.
-        ///
-        /// Default: `4MB`
-        #[must_use]
-        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
-            self.inner = self.inner.max_decoding_message_size(limit);
-            self
-        }
-        /// Limits the maximum size of an encoded message.
-        ///
-        /// Default: `usize::MAX`
-        #[must_use]
-        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
-            self.inner = self.inner.max_encoding_message_size(limit);
-            self
-        }
-        pub async fn session(
-            &mut self,
-            request: impl tonic::IntoStreamingRequest<Message = super::SessionRequest>,
-        ) -> std::result::Result<
-            tonic::Response<tonic::codec::Streaming<super::SessionResponse>>,
-            tonic::Status,
-        > {
-            self.inner
-                .ready()
-                .await
-                .map_err(|e| {
-                    tonic::Status::unknown(
-                        format!("Service was not ready: {}", e.into()),
-                    )
-                })?;
-            let codec = tonic_prost::ProstCodec::default();
-            let path = http::uri::PathAndQuery::from_static("/picofarm.v1.Farm/Session");
-            let mut req = request.into_streaming_request();
-            req.extensions_mut().insert(GrpcMethod::new("picofarm.v1.Farm", "Session"));
-            self.inner.streaming(req, path, codec).await
-        }
-    }
-}
-/// Generated server implementations.
-pub mod farm_server {
-    #![allow(
-        unused_variables,
-        dead_code,
-        missing_docs,
-        clippy::wildcard_imports,
-        clippy::let_unit_value,
-    )]
-    use tonic::codegen::*;
-    /// Generated trait containing gRPC methods that should be implemented for use with FarmServer.
-    #[async_trait]
-    pub trait Farm: std::marker::Send + std::marker::Sync + 'static {
-        /// Server streaming response type for the Session method.
-        type SessionStream: tonic::codegen::tokio_stream::Stream<
-                Item = std::result::Result<super::SessionResponse, tonic::Status>,
-            >
-            + std::marker::Send
-            + 'static;
-        async fn session(
-            &self,
-            request: tonic::Request<tonic::Streaming<super::SessionRequest>>,
-        ) -> std::result::Result<tonic::Response<Self::SessionStream>, tonic::Status>;
-    }
-    #[derive(Debug)]
-    pub struct FarmServer<T> {
-        inner: Arc<T>,
-        accept_compression_encodings: EnabledCompressionEncodings,
-        send_compression_encodings: EnabledCompressionEncodings,
-        max_decoding_message_size: Option<usize>,
-        max_encoding_message_size: Option<usize>,
-    }
-    impl<T> FarmServer<T> {
-        pub fn new(inner: T) -> Self {
-            Self::from_arc(Arc::new(inner))
-        }
-        pub fn from_arc(inner: Arc<T>) -> Self {
-            Self {
-                inner,
-                accept_compression_encodings: Default::default(),
-                send_compression_encodings: Default::default(),
-                max_decoding_message_size: None,
-                max_encoding_message_size: None,
-            }
-        }
-        pub fn with_interceptor<F>(
-            inner: T,
-            interceptor: F,
-        ) -> InterceptedService<Self, F>
-        where
-            F: tonic::service::Interceptor,
-        {
-            InterceptedService::new(Self::new(inner), interceptor)
-        }
-        /// Enable decompressing requests with the given encoding.
-        #[must_use]
-        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
-            self.accept_compression_encodings.enable(encoding);
-            self
-        }
-        /// Compress responses with the given encoding, if the client supports it.
-        #[must_use]
-        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
-            self.send_compression_encodings.enable(encoding);
-            self
-        }
-        /// Limits the maximum size of a decoded message.
-        ///
-        /// Default: `4MB`
-        #[must_use]
-        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
-            self.max_decoding_message_size = Some(limit);
-            self
-        }
-        /// Limits the maximum size of an encoded message.
-        ///
-        /// Default: `usize::MAX`
-        #[must_use]
-        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
-            self.max_encoding_message_size = Some(limit);
-            self
-        }
-    }
-    impl<T, B> tonic::codegen::Service<http::Request<B>> for FarmServer<T>
-    where
-        T: Farm,
-        B: Body + std::marker::Send + 'static,
-        B::Error: Into<StdError> + std::marker::Send + 'static,
-    {
-        type Response = http::Response<tonic::body::Body>;
-        type Error = std::convert::Infallible;
-        type Future = BoxFuture<Self::Response, Self::Error>;
-        fn poll_ready(
-            &mut self,
-            _cx: &mut Context<'_>,
-        ) -> Poll<std::result::Result<(), Self::Error>> {
-            Poll::Ready(Ok(()))
-        }
-        fn call(&mut self, req: http::Request<B>) -> Self::Future {
-            match req.uri().path() {
-                "/picofarm.v1.Farm/Session" => {
-                    #[allow(non_camel_case_types)]
-                    struct SessionSvc<T: Farm>(pub Arc<T>);
-                    impl<T: Farm> tonic::server::StreamingService<super::SessionRequest>
-                    for SessionSvc<T> {
-                        type Response = super::SessionResponse;
-                        type ResponseStream = T::SessionStream;
-                        type Future = BoxFuture<
-                            tonic::Response<Self::ResponseStream>,
-                            tonic::Status,
-                        >;
-                        fn call(
-                            &mut self,
-                            request: tonic::Request<
-                                tonic::Streaming<super::SessionRequest>,
-                            >,
-                        ) -> Self::Future {
-                            let inner = Arc::clone(&self.0);
-                            let fut = async move {
-                                <T as Farm>::session(&inner, request).await
-                            };
-                            Box::pin(fut)
-                        }
-                    }
-                    let accept_compression_encodings = self.accept_compression_encodings;
-                    let send_compression_encodings = self.send_compression_encodings;
-                    let max_decoding_message_size = self.max_decoding_message_size;
-                    let max_encoding_message_size = self.max_encoding_message_size;
-                    let inner = self.inner.clone();
-                    let fut = async move {
-                        let method = SessionSvc(inner);
-                        let codec = tonic_prost::ProstCodec::default();
-                        let mut grpc = tonic::server::Grpc::new(codec)
-                            .apply_compression_config(
-                                accept_compression_encodings,
-                                send_compression_encodings,
-                            )
-                            .apply_max_message_size_config(
-                                max_decoding_message_size,
-                                max_encoding_message_size,
-                            );
-                        let res = grpc.streaming(method, req).await;
-                        Ok(res)
-                    };
-                    Box::pin(fut)
-                }
-                _ => {
-                    Box::pin(async move {
-                        let mut response = http::Response::new(
-                            tonic::body::Body::default(),
-                        );
-                        let headers = response.headers_mut();
-                        headers
-                            .insert(
-                                tonic::Status::GRPC_STATUS,
-                                (tonic::Code::Unimplemented as i32).into(),
-                            );
-                        headers
-                            .insert(
-                                http::header::CONTENT_TYPE,
-                                tonic::metadata::GRPC_CONTENT_TYPE,
-                            );
-                        Ok(response)
-                    })
-                }
-            }
-        }
-    }
-    impl<T> Clone for FarmServer<T> {
-        fn clone(&self) -> Self {
-            let inner = self.inner.clone();
-            Self {
-                inner,
-                accept_compression_encodings: self.accept_compression_encodings,
-                send_compression_encodings: self.send_compression_encodings,
-                max_decoding_message_size: self.max_decoding_message_size,
-                max_encoding_message_size: self.max_encoding_message_size,
-            }
-        }
-    }
-    /// Generated gRPC service name
-    pub const SERVICE_NAME: &str = "picofarm.v1.Farm";
-    impl<T> tonic::server::NamedService for FarmServer<T> {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
