@@ -181,10 +181,12 @@ fn what_cannot_be_used_is_refused_by_name_and_nothing_is_written() {
         (&["--resolution", "0"][..], 2, "--resolution"),
         (&["--nodes", "8"], 2, "--nodes"),
         (&["--fine", "--nodes", "64"], 2, "--fine"),
+        (&["--spots-from", "guesses"], 2, "captures, truth"),
+        (&["--spots-from", "predictions"], 3, "needs --models"),
         (
-            &["--spots-from", "predictions"],
-            2,
-            "possible values: captures, truth",
+            &["--tof", "depth"],
+            3,
+            "--tof belongs to --spots-from predictions",
         ),
         // All light comes later than this gate.
         (
