@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy};
+use picofarm_transient::{Budget, Progress, RenderError, Rendered, Settings, Strategy};
 use rustix::time::{ClockId, clock_gettime};
 use tokio_util::sync::CancellationToken;
 
@@ -37,11 +37,7 @@ pub(super) fn cpu_time() -> Duration {
 /// Settings of a benchmark's renders: without one-bounce peaks, which are analytic.
 pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
     Settings {
-        gate: Gate {
-            start_m: args.gate.gate_start_m,
-            bin_width_m: args.gate.bin_width_m,
-            bins: args.gate.bins,
-        },
+        gate: args.gate.gate(),
         budget,
         max_bounces: None,
         one_bounce: false,
