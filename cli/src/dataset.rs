@@ -18,13 +18,14 @@ use std::path::{Path, PathBuf};
 
 use picofarm_agent::TaskError;
 use picofarm_dataset::{Dataset, DatasetError, Summary, open_store};
+use picofarm_figures::scene::{View, flight, sheet};
 use serde_json::json;
 
 use crate::{
     args::Dataset as Command,
     error::{CliError, Code, Result, io},
     output::{Output, bytes},
-    picture::{View, flight, save, sheet},
+    picture::{save, write_atomically},
     settings::Settings,
     signals,
 };
@@ -233,8 +234,8 @@ pub async fn draw(place: &str, scenes: &[u64], dir: &Path) -> Result<Drawn> {
         (scenes.to_vec(), drawn.sheet.clone(), drawn.flight.clone());
     tokio::task::spawn_blocking(move || {
         let read = |scene| handle.block_on(view(&dataset, scene));
-        save(&sheet::sheet(&scenes, read)?, &sheet_path)?;
-        flight::animate(&read(first)?, &flight_path)
+        save(&sheet(&scenes, read)?, &sheet_path)?;
+        write_atomically(&flight_path, &flight(&read(first)?))
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("drawing broke: {e}")))??;

@@ -201,7 +201,7 @@ fn make(
     watch.step("pictures", 0.0);
     Ok(Made {
         views: reconstruct::views(&reconstructed, &world, &views),
-        orbit: orbit::orbit(&reconstructed, &views)?,
+        orbit: orbit::orbit(&reconstructed, &views),
         glb: mesh.glb(&reconstructed.measured).map_err(refused)?,
         reconstructed,
         mesh,

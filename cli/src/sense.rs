@@ -8,7 +8,7 @@ use picofarm_dataset::{DatasetError, RenderArray, RenderGroup, write_render_grou
 use picofarm_transient::{
     Gate,
     sensor::{
-        Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values,
+        Histograms, PS_PER_M, SENSOR_VERSION, Scale, Sensed, Sensor, SensorError, Values, narrow,
         sense as measure,
     },
 };
@@ -232,22 +232,15 @@ fn write(
             )
         };
     }
-    let (name, data_type, written, sum) = match values {
-        Values::Rate(rate) => {
-            let sum = rate.iter().map(|r| f64::from(*r)).sum();
-            ("rate", "float32", array!("rate", rate), sum)
-        }
-        Values::Counts(counts) => {
-            let sum = counts.iter().map(|c| u64::from(*c)).sum::<u64>() as f64;
-            let narrow: Result<Vec<u16>, _> = counts.iter().map(|c| u16::try_from(*c)).collect();
-            match narrow {
-                Ok(narrow) => ("counts", "uint16", array!("counts", &narrow), sum),
-                Err(_) => ("counts", "uint32", array!("counts", counts), sum),
-            }
-        }
+    let (name, data_type, written) = match values {
+        Values::Rate(rate) => ("rate", "float32", array!("rate", rate)),
+        Values::Counts(counts) => match narrow(counts) {
+            Some(narrow) => ("counts", "uint16", array!("counts", &narrow)),
+            None => ("counts", "uint32", array!("counts", counts)),
+        },
     };
     written.map_err(|e| CliError::new(Code::Resource, e))?;
-    Ok((name, data_type, sum))
+    Ok((name, data_type, values.sum()))
 }
 
 #[cfg(test)]

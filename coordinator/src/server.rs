@@ -2,6 +2,7 @@
 
 use std::{io, net::SocketAddr, sync::Arc, time::Duration};
 
+use futures::{FutureExt, future::BoxFuture};
 use picofarm_catalog::{CatalogError, CatalogSource};
 use picofarm_credentials::CredentialError;
 use picofarm_proto::wire::{farm_server::FarmServer, jobs_server::JobsServer};
@@ -187,7 +188,15 @@ async fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Coordi
 ///
 /// # Errors
 /// [`CoordinatorError`] when the address or the catalog cannot be used.
-pub async fn serve(
+pub fn serve(
+    config: CoordinatorConfig,
+    shutdown: CancellationToken,
+) -> BoxFuture<'static, Result<Running, CoordinatorError>> {
+    // Boxed, so that a crate that awaits it does not compile the server again.
+    start(config, shutdown).boxed()
+}
+
+async fn start(
     config: CoordinatorConfig,
     shutdown: CancellationToken,
 ) -> Result<Running, CoordinatorError> {

@@ -1,13 +1,16 @@
-//! What pictures and pages of results are made with: a canvas, colour maps, PNG; numbers and texts in HTML. Knows nothing of
-//! what is shown.
+//! What pictures and pages of results are made with: a canvas, colour maps, PNG, GIF; numbers and texts in HTML. [`scene`]
+//! draws stored scenes; the rest knows nothing of what is shown.
 
+mod animation;
 mod canvas;
 mod colour;
 pub mod number;
 mod page;
 mod rgb_png;
+pub mod scene;
 pub mod text;
 
+pub use animation::animation;
 pub use canvas::{Canvas, TEXT};
 pub use colour::{inferno, viridis};
 pub use page::{STYLE, data_url};

@@ -53,7 +53,16 @@ const SHUTDOWN: &str = "the worker is shutting down";
 /// # Errors
 /// [`AgentError`]: a setting that cannot be used, or the coordinator refuses this worker. An unreachable
 /// coordinator is no error: the worker tries again for ever.
-pub async fn run_with(
+pub fn run_with(
+    config: AgentConfig,
+    executor: Arc<dyn Executor>,
+    shutdown: CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<Summary, AgentError>> + Send>> {
+    // Boxed, so that a crate that awaits it does not compile the session again.
+    Box::pin(work(config, executor, shutdown))
+}
+
+async fn work(
     config: AgentConfig,
     executor: Arc<dyn Executor>,
     shutdown: CancellationToken,

@@ -37,6 +37,21 @@ pub enum Values {
     Rate(Vec<f32>),
 }
 
+impl Values {
+    /// Sum of all.
+    pub fn sum(&self) -> f64 {
+        match self {
+            Self::Rate(rate) => rate.iter().map(|r| f64::from(*r)).sum(),
+            Self::Counts(counts) => counts.iter().map(|c| u64::from(*c)).sum::<u64>() as f64,
+        }
+    }
+}
+
+/// Counts in 16 bits; `None` where one is too large for them.
+pub fn narrow(counts: &[u32]) -> Option<Vec<u16>> {
+    counts.iter().map(|c| u16::try_from(*c).ok()).collect()
+}
+
 /// What was measured, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sensed {

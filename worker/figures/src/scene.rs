@@ -1,25 +1,32 @@
 //! Pictures of stored scenes, for people: a contact sheet and light in flight.
 
-pub mod flight;
-pub mod sheet;
+mod flight;
+mod sheet;
 
-use picofarm_figures::Canvas;
-
-use crate::error::{CliError, Code, Result};
+pub use flight::flight;
+pub use sheet::sheet;
 
 /// One stored scene, decoded. Images are `[row][column]`.
 pub struct View {
+    /// Number.
     pub scene: u64,
+    /// Columns.
     pub width: usize,
+    /// Rows.
     pub height: usize,
+    /// Bins of a histogram.
     pub bins: usize,
+    /// Path length at the first bin's start, metres.
     pub gate_start_m: f64,
+    /// Path length of a bin, metres.
     pub bin_width_m: f64,
     /// `[row][column][bin]`.
     pub transient: Vec<f32>,
+    /// Along the axis, metres; 0 = nothing.
     pub depth: Vec<f32>,
     /// sRGB, `[row][column][3]`.
     pub rgb: Vec<u8>,
+    /// 1 = a mirror.
     pub specular: Vec<u8>,
     /// `[spot][row][column]`, 1 = lit.
     pub visibility: Vec<u8>,
@@ -28,6 +35,7 @@ pub struct View {
 }
 
 impl View {
+    /// How many pixels.
     pub fn pixels(&self) -> usize {
         self.width * self.height
     }
@@ -72,33 +80,4 @@ pub fn quantile(values: &[f32], q: f64) -> f32 {
     let mut sorted = values.to_vec();
     let k = ((sorted.len() - 1) as f64 * q) as usize;
     *sorted.select_nth_unstable_by(k, f32::total_cmp).1
-}
-
-pub(crate) fn cannot_write(path: &std::path::Path, error: impl std::fmt::Display) -> CliError {
-    CliError::new(
-        Code::Resource,
-        format!("cannot write {}: {error}", path.display()),
-    )
-    .hint("check the folder and the free space, then run the same command again")
-}
-
-/// Writes a picture as PNG, whole or not at all.
-///
-/// # Errors
-/// The file cannot be written.
-pub fn save(canvas: &Canvas, path: &std::path::Path) -> Result<()> {
-    write_atomically(path, &canvas.png())
-}
-
-/// Writes a file whole or not at all.
-pub(crate) fn write_atomically(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let partial = path.with_file_name(format!(".{name}.partial"));
-    std::fs::write(&partial, bytes)
-        .and_then(|()| std::fs::rename(&partial, path))
-        .map_err(|e| {
-            // The partial file is ours; nothing is lost if it cannot be removed.
-            let _ = std::fs::remove_file(&partial);
-            cannot_write(path, e)
-        })
 }

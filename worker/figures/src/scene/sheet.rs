@@ -1,8 +1,7 @@
 //! The contact sheet: one row a scene, one column a quantity.
 
-use picofarm_figures::{Canvas, TEXT, inferno, viridis};
-
 use super::{View, quantile};
+use crate::{Canvas, TEXT, inferno, viridis};
 
 const CELL: usize = 144;
 const GAP: usize = 4;

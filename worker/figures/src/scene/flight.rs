@@ -1,53 +1,29 @@
 //! Light in flight: one scene's transient as an animated GIF, a few bins a frame.
 
-use std::path::Path;
-
-use picofarm_figures::inferno;
-
-use super::{View, cannot_write, quantile, write_atomically};
-use crate::error::Result;
+use super::{View, quantile};
+use crate::{animation, inferno};
 
 /// Frames at most; bins are summed to stay below it.
 const FRAMES: usize = 160;
 /// Hundredths of a second a frame.
 const DELAY: u16 = 6;
 
-/// Writes the animation. Exposure is common to all frames (the signal to the power 0.4), so brightness can
+/// The animation. Exposure is common to all frames (the signal to the power 0.4), so brightness can
 /// be compared over time; the palette is the colour map itself, so no colour is approximated.
-///
-/// # Errors
-/// The file cannot be written.
-pub fn animate(view: &View, path: &Path) -> Result<()> {
+pub fn flight(view: &View) -> Vec<u8> {
     let (first, last) = lively(&view.energy_by_bin());
     let step = (last - first).div_ceil(FRAMES).max(1);
     let white = exposure(view, step, first, last);
-
     let palette: Vec<u8> = (0..=255u8)
         .flat_map(|i| inferno(f32::from(i) / 255.0))
         .collect();
-    let mut bytes = Vec::new();
-    let failed = |e: gif::EncodingError| cannot_write(path, e);
-    {
-        let (w, h) = (view.width as u16, view.height as u16);
-        let mut encoder = gif::Encoder::new(&mut bytes, w, h, &palette).map_err(failed)?;
-        encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
-        for lo in (first..last).step_by(step) {
-            let slice = view.slice(lo, (lo + step).min(view.bins));
-            let indices: Vec<u8> = slice
-                .iter()
-                .map(|v| ((v / white).clamp(0.0, 1.0).powf(0.4) * 255.0).round() as u8)
-                .collect();
-            let frame = gif::Frame {
-                width: w,
-                height: h,
-                delay: DELAY,
-                buffer: indices.into(),
-                ..gif::Frame::default()
-            };
-            encoder.write_frame(&frame).map_err(failed)?;
-        }
-    }
-    write_atomically(path, &bytes)
+    let frame = |lo: usize| -> Vec<u8> {
+        let slice = view.slice(lo, (lo + step).min(view.bins));
+        let bright = |v: &f32| ((v / white).clamp(0.0, 1.0).powf(0.4) * 255.0).round() as u8;
+        slice.iter().map(bright).collect()
+    };
+    let mut frames = (first..last).step_by(step).map(frame);
+    animation((view.width, view.height), &palette, DELAY, &mut frames)
 }
 
 /// The bins between the first light and the arrival of 92 % of the energy: after that there is only a faint,
@@ -98,9 +74,6 @@ mod tests {
             visibility: vec![0; 12],
             spots: vec![None],
         };
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("dark.gif");
-        animate(&view, &path).unwrap();
-        assert!(std::fs::read(&path).unwrap().starts_with(b"GIF89a"));
+        assert!(flight(&view).starts_with(b"GIF89a"));
     }
 }

@@ -1,0 +1,34 @@
+//! Pictures and pages as files.
+
+use picofarm_figures::Canvas;
+
+use crate::error::{CliError, Code, Result};
+
+fn cannot_write(path: &std::path::Path, error: impl std::fmt::Display) -> CliError {
+    CliError::new(
+        Code::Resource,
+        format!("cannot write {}: {error}", path.display()),
+    )
+    .hint("check the folder and the free space, then run the same command again")
+}
+
+/// Writes a picture as PNG, whole or not at all.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn save(canvas: &Canvas, path: &std::path::Path) -> Result<()> {
+    write_atomically(path, &canvas.png())
+}
+
+/// Writes a file whole or not at all.
+pub(crate) fn write_atomically(path: &std::path::Path, bytes: &[u8]) -> Result<()> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let partial = path.with_file_name(format!(".{name}.partial"));
+    std::fs::write(&partial, bytes)
+        .and_then(|()| std::fs::rename(&partial, path))
+        .map_err(|e| {
+            // The partial file is ours; nothing is lost if it cannot be removed.
+            let _ = std::fs::remove_file(&partial);
+            cannot_write(path, e)
+        })
+}
