@@ -30,8 +30,9 @@ pub fn lacks_memory(stage: &StageSpec, known: &Known, worker: &Abilities) -> Opt
 /// Why not, in words.
 pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(), String> {
     let (kind, version) = (stage.task.kind(), stage.task.version());
-    match worker.kinds.get(kind) {
-        None => return Err(format!("the worker runs no {kind} tasks")),
+    let ability = stage.task.ability();
+    match worker.kinds.get(&*ability) {
+        None => return Err(format!("the worker runs no {ability} tasks")),
         Some(theirs) if theirs != version => {
             return Err(format!(
                 "the job needs {} {version:?}, the worker has {theirs:?}",

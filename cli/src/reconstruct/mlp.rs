@@ -55,28 +55,27 @@ pub fn fit(
     grid: Settings,
     watch: &Watch,
 ) -> Result<(Reconstructed, Value)> {
-    use picofarm_platonerf::{Settings as Networks, ShadowLoss, Training};
+    use picofarm_platonerf::{MlpSettings, Settings as Networks, ShadowLoss, Training};
     use picofarm_reconstruct::Reconstruction;
     use serde_json::json;
 
     use super::refused;
     use crate::{args::ShadowLossArg, signals};
 
-    let start = Reconstruction::begin(measured.clone(), grid, watch).map_err(refused)?;
+    let start = Reconstruction::begin(measured.clone(), picofarm_platonerf::grid(grid), watch)
+        .map_err(refused)?;
     let start = start.finish();
-    let paper = Networks::default();
-    let settings = Networks {
-        width: args.mlp.width.map_or(paper.width, |w| w as usize),
-        batch: args.mlp.batch.map_or(paper.batch, |b| b as usize),
+    let paper = MlpSettings::default();
+    let asked = MlpSettings {
+        steps: args.mlp.steps.unwrap_or(paper.steps),
+        width: args.mlp.width.unwrap_or(paper.width),
+        batch: args.mlp.batch.unwrap_or(paper.batch),
         shadow_loss: match args.mlp.shadow_loss {
             Some(ShadowLossArg::CrossEntropy) => ShadowLoss::CrossEntropy,
             Some(ShadowLossArg::Squares) | None => ShadowLoss::Squares,
         },
-        // Nothing that was seen lies farther away.
-        far_m: (start.field.end() - start.field.origin).length(),
-        seed: args.seed,
-        ..paper.with_steps(args.mlp.steps.unwrap_or_default())
     };
+    let settings = Networks::of(&asked, &start, args.seed);
     let mut training = Training::begin(measured, settings).map_err(refused)?;
     if !training.run(watch).map_err(refused)? {
         return Err(signals::interrupted("nothing was written"));

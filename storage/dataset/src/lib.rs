@@ -4,6 +4,7 @@
 //! A scene counts as published once `manifests/<scene>.json` exists. Objects and manifests are pure functions of the
 //! task, so whoever runs a task again writes the same bytes.
 
+mod checkpoints;
 mod coding;
 mod error;
 mod export;
@@ -25,6 +26,7 @@ const WITHOUT_FORMATS: &str = "this picofarm was built without OpenEXR and HDF5"
 #[cfg(not(feature = "formats"))]
 const BUILD_WITH_FORMATS: &str = "build it with `cargo build --release --features formats`, or with `--features full` for everything";
 
+pub use checkpoints::{Checkpoint, Checkpoints};
 pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use coding::transient::{CodedImage, TransientCodec};
 pub use error::DatasetError;
@@ -37,9 +39,8 @@ pub use layout::quantity::Quantity;
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use models::{
-    Checkpoint, Dependents, Evaluation, Lineage, MODELS, ModelCheck, ModelManifest, ModelRepair,
-    Models, NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd,
-    TrialRecord,
+    Dependents, Evaluation, Lineage, MODELS, ModelCheck, ModelManifest, ModelRepair, Models,
+    NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd, TrialRecord,
 };
 pub use predictions::{
     EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,

@@ -2,7 +2,7 @@
 //! `scenes/<scene>/` with `density.zarr` (a Zarr v3 group), `mesh.glb`, `mesh.ply` and `metrics.json`.
 //!
 //! They are published as scenes are: objects first, `manifests/<scene>.json` last, all create-only and pure functions of the
-//! task.
+//! task. A task that runs for long keeps `checkpoints/<task key>/` until then.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,6 +14,7 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use crate::checkpoints::Checkpoints;
 use crate::error::DatasetError;
 use crate::layout::group::{METADATA, pretty};
 use crate::layout::manifest::{Manifest, ObjectEntry, read_sealed, sha256_hex};
@@ -172,6 +173,11 @@ impl Reconstructions {
                 object: self.shown(&path),
             }),
         }
+    }
+
+    /// The checkpoints of a task that makes one of a scene.
+    pub fn checkpoints_of(&self, task_key: &str) -> Checkpoints {
+        Checkpoints::new(self.store.clone(), &self.prefix, task_key)
     }
 
     /// One of a scene's objects, by its name below the scene's folder, checked against its manifest.

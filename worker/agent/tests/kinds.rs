@@ -52,9 +52,17 @@ fn first_job(store: &str) -> Value {
          "output": {"store": store, "dataset": "seen"}},
         {"kind": "reconstruct", "source": "rooms", "reconstruct": {"views": 2, "grid": {"nodes": 32, "iterations": 3}},
          "output": {"store": store, "dataset": "rooms-3d"}},
+        networks(store, 8),
         {"kind": "report", "report": {"name": "all", "models": ["train"], "pictures": 1}},
         {"kind": "export", "source": "rooms", "export": {"dest": format!("{store}/release"), "format": "sb3d"}},
     ]})
+}
+
+/// PlatoNeRF's networks, small ones, of each room.
+fn networks(store: &str, steps: u32) -> Value {
+    json!({"name": "networks", "kind": "reconstruct", "source": "rooms",
+        "reconstruct": {"field": "mlp", "grid": {"nodes": 24}, "mlp": {"steps": steps, "width": 8, "batch": 16}},
+        "output": {"store": store, "dataset": "rooms-mlp"}})
 }
 
 fn import_job(store: &str) -> Value {
@@ -175,6 +183,7 @@ fn every_kind(
             let results = place.run_all(&stage, 2);
             after(&stage, results);
             seen.insert(stage.task.kind().to_owned());
+            seen.insert(stage.task.ability().into_owned());
         }
     }
     let kinds: BTreeSet<String> = place.executor().kinds().into_keys().collect();
@@ -394,4 +403,62 @@ fn a_beam_that_a_mirror_folds_is_left_out_of_captures_and_named() {
         let why = left["why"].as_str().unwrap();
         assert!(why.contains("a mirror folds the beam"), "{why}");
     }
+}
+
+#[test]
+fn networks_that_are_stopped_go_on_from_their_checkpoint_to_the_same_bytes() {
+    let (calm, struck) = (Place::new(), Place::new());
+    let stages = |place: &Place| {
+        let store = place.store();
+        let first = first_job(&store)["stage"][0].clone();
+        let job = json!({"name": "networks", "stage": [first, networks(&store, 60)]});
+        let stages = place.stages(job);
+        place.run_all(&stages[0], 2);
+        stages
+    };
+    let (of_calm, of_struck) = (stages(&calm), stages(&struck));
+    calm.run_all(&of_calm[1], 2);
+
+    let newest = || {
+        let files = struck.files().into_keys();
+        let steps = files.filter_map(|f| {
+            let name = f.file_name()?.to_str()?.strip_suffix(".ckpt")?;
+            name.parse::<u64>().ok()
+        });
+        steps.max()
+    };
+    let mut steps = vec![0];
+    for strike in 0..20u8 {
+        let control = Arc::new(Control::default());
+        let hand = Arc::clone(&control);
+        // From .49 to .85 the networks learn.
+        let at = 0.5 + 0.3 * f32::from(strike) / 20.0;
+        let striker = std::thread::spawn(move || {
+            while hand.fraction() < at {
+                std::thread::yield_now();
+            }
+            hand.stop();
+        });
+        let found = struck.run(&of_struck[1], 0, (1 + usize::from(strike) % 3, &control));
+        assert!(matches!(found, Err(TaskError::Stopped)), "{found:?}");
+        striker.join().unwrap();
+        steps.extend(newest());
+    }
+    assert!(steps.is_sorted() && steps.last() > Some(&30), "{steps:?}");
+    steps.dedup();
+    assert!(steps.len() > 10, "{steps:?}");
+
+    // One that is damaged costs no more than itself.
+    let newest = struck
+        .files()
+        .into_keys()
+        .filter(|f| f.extension().is_some_and(|e| e == "ckpt"))
+        .max();
+    let newest = struck.dir.path().join(newest.unwrap());
+    let mut bytes = fs::read(&newest).unwrap();
+    bytes[100] ^= 1;
+    fs::write(&newest, bytes).unwrap();
+    struck.run_all(&of_struck[1], 2);
+    // The same files: no checkpoint is left.
+    assert_same(&struck.files(), &calm.files(), "after 20 strikes");
 }

@@ -22,5 +22,6 @@ mod training;
 mod tests;
 
 pub use fitted::{Fitted, Ray};
-pub use settings::{Settings, ShadowLoss};
+pub use picofarm_settings::{MlpSettings, ShadowLoss};
+pub use settings::{Settings, grid};
 pub use training::Training;

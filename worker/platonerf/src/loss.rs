@@ -3,12 +3,14 @@
 
 use burn::tensor::{Device, Tensor};
 
+use picofarm_settings::ShadowLoss;
+
 use crate::{
     network::Network,
     rays::Batch,
     render::{Rays, Rendered, Sampling, length, matrix},
     sample::Draws,
-    settings::{Settings, ShadowLoss},
+    settings::Settings,
 };
 
 /// Factor of both losses.

@@ -1,17 +1,17 @@
 //! How a network is fitted to a scene. The defaults are the paper's for its simulated scenes.
 
-use picofarm_reconstruct::ReconstructError;
+use picofarm_reconstruct::{ReconstructError, Reconstructed};
+use picofarm_settings::{GridSettings, MlpSettings, ShadowLoss, Shadows};
 use serde::Serialize;
 
-/// What stage 2 compares transmittances and shadow masks by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ShadowLoss {
-    /// Mean squares, as the paper has them.
-    #[default]
-    Squares,
-    /// Cross-entropy: a lit ray whose light is all stopped still has a gradient.
-    CrossEntropy,
+/// The grid on which networks are sampled: they have no planes, and learn from shadows themselves. Its evidence is that of
+/// carving.
+pub fn grid(settings: GridSettings) -> GridSettings {
+    GridSettings {
+        planes: false,
+        shadows: Shadows::Carve,
+        ..settings
+    }
 }
 
 /// Settings of a fit. Lengths are metres.
@@ -72,6 +72,19 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// As a job or a command has them, for the box of [`grid`]: nothing that was seen lies farther away.
+    pub fn of(asked: &MlpSettings, start: &Reconstructed, seed: u64) -> Self {
+        let paper = Self {
+            width: asked.width as usize,
+            batch: asked.batch as usize,
+            shadow_loss: asked.shadow_loss,
+            far_m: (start.field.end() - start.field.origin).length(),
+            seed,
+            ..Self::default()
+        };
+        paper.with_steps(asked.steps)
+    }
+
     /// The same with so many steps in all: an eighth for stage 1, as in the paper.
     #[must_use]
     pub fn with_steps(self, steps: u32) -> Self {

@@ -96,6 +96,11 @@ impl Training {
         &self.settings
     }
 
+    /// Steps done.
+    pub fn step(&self) -> u64 {
+        self.state.step.into()
+    }
+
     /// Weights, moments and counts.
     pub fn state(&self) -> &State {
         &self.state
@@ -118,6 +123,18 @@ impl Training {
     /// # Errors
     /// [`ReconstructError::Invalid`] where the loss is no number any more, or no first weights give any density.
     pub fn run(&mut self, progress: &dyn Progress) -> Result<bool, ReconstructError> {
+        self.run_with(progress, &mut |_| ())
+    }
+
+    /// The same, and calls `after` after each step.
+    ///
+    /// # Errors
+    /// As [`Training::run`].
+    pub fn run_with(
+        &mut self,
+        progress: &dyn Progress,
+        after: &mut dyn FnMut(&Self),
+    ) -> Result<bool, ReconstructError> {
         while self.state.step < self.settings.steps() {
             let Some((loss, gradients)) = self.gradients(progress) else {
                 return Ok(false);
@@ -136,6 +153,7 @@ impl Training {
             }
             self.apply(&gradients);
             self.state.loss = loss;
+            after(self);
         }
         Ok(true)
     }

@@ -14,6 +14,9 @@ use crate::model::{
     spec_error::SpecError,
 };
 
+/// What a worker calls OpenEXR and HDF5, which not every program writes.
+pub const FORMATS: &str = "formats";
+
 /// Packing a data set: one task.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ExportTask {
@@ -64,6 +67,10 @@ impl Declared for ExportTask {
 impl TaskKind for ExportTask {
     fn versioned(&self) -> (&'static str, &str) {
         ("export.version", Self::VERSION)
+    }
+
+    fn variant(&self) -> Option<&'static str> {
+        matches!(&*self.export.format, "sb3d" | "hdf5").then_some(FORMATS)
     }
 
     fn check(&self) -> Result<(), SpecError> {

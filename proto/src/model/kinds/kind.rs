@@ -89,6 +89,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         false
     }
 
+    /// What its tasks need of a worker beyond the kind: see [`TaskSpec::ability`](super::TaskSpec::ability).
+    fn variant(&self) -> Option<&'static str> {
+        None
+    }
+
     /// The data set that is read.
     fn reads(&self) -> Option<&SourceSettings> {
         None

@@ -6,7 +6,7 @@
 
 mod division;
 pub mod evaluate;
-mod export;
+pub mod export;
 mod fields;
 pub mod generate;
 pub mod import;
@@ -24,7 +24,7 @@ mod split;
 pub mod train;
 mod verify;
 
-use std::ops;
+use std::{borrow::Cow, ops};
 
 use serde::Serialize;
 
@@ -151,6 +151,15 @@ impl TaskSpec {
     /// Version of the code that decides the bytes of its results; a worker's must equal it.
     pub fn version(&self) -> &str {
         self.versioned().1
+    }
+
+    /// What a worker must announce to be given its tasks: the kind, and where not every program that runs the kind can run
+    /// these, a colon and what is needed.
+    pub fn ability(&self) -> Cow<'static, str> {
+        match self.variant() {
+            None => self.kind().into(),
+            Some(variant) => format!("{}:{variant}", self.kind()).into(),
+        }
     }
 
     /// Reads a task of the kind that the fields name; those that every stage has were taken out of them.

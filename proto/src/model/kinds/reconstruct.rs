@@ -1,6 +1,6 @@
 //! Reconstruction: each scene of a data set becomes a room in 3D, from light that bounced twice. One task a scene.
 
-use picofarm_settings::GridSettings;
+use picofarm_settings::{FieldKind, GridSettings, MlpSettings, Shadows};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -17,8 +17,14 @@ use crate::model::{
 
 /// Bytes of a node of the grid while it is fitted: 19 to 25 were measured at 256 to 128 nodes.
 const NODE: f64 = 28.0;
+/// Bytes of networks for each neuron of a layer: what 64 rays leave behind on the way to their gradients.
+const NEURON: f64 = 0.0;
+/// Bytes of networks for each weight of a layer.
+const WEIGHT: f64 = 0.0;
 /// Bytes of a pixel for each spot: its time, its mask, its strongest return, and all of them twice while masks are compared.
 const PATH: f64 = 40.0;
+/// What a worker calls the networks that it can fit.
+pub const MLP: &str = "mlp";
 /// Most novel views of a scene.
 const MOST_VIEWS: u32 = 1_000;
 
@@ -49,8 +55,14 @@ pub struct ReconstructSettings {
     pub spots: Vec<u32>,
     /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
     pub views: u32,
-    /// The grid.
+    /// What the density is: a grid, or PlatoNeRF's networks.
+    #[serde(skip_serializing_if = "is_grid")]
+    pub field: FieldKind,
+    /// The grid. Networks are sampled on it: their `nodes` and `seed` are its own.
     pub grid: GridSettings,
+    /// With `field = "mlp"`: the networks.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mlp: Option<MlpSettings>,
     /// Version of the reconstruction, part of every task key; filled in at submission where left out.
     pub version: String,
 }
@@ -68,10 +80,19 @@ pub enum Measurements {
     Captures,
 }
 
+fn is_grid(field: &FieldKind) -> bool {
+    *field == FieldKind::Grid
+}
+
 /// Bytes that a grid of `nodes` nodes along its longest side takes at most while it is fitted to images of this shape.
 pub fn grid_bytes(nodes: u32, shape: &Shape) -> u64 {
     let paths = PATH * shape.pixels() * f64::from(shape.spots);
     (NODE * f64::from(nodes).powi(3) + paths) as u64
+}
+
+/// Bytes that networks of this width take at most while they are fitted.
+fn mlp_bytes(width: u32) -> f64 {
+    NEURON * f64::from(width) + WEIGHT * f64::from(width).powi(2)
 }
 
 impl Declared for ReconstructTask {
@@ -144,11 +165,20 @@ impl TaskKind for ReconstructTask {
             _ => 0.0,
         };
         let grid = grid_bytes(self.reconstruct.grid.nodes, &used) as f64;
-        Some(BASE + source.truth() + histogram + grid)
+        let networks = self.reconstruct.mlp.map_or(0.0, |mlp| mlp_bytes(mlp.width));
+        Some(BASE + source.truth() + histogram + grid + networks)
     }
 
     fn tasks(&self) -> u64 {
         self.count
+    }
+
+    fn resumes(&self) -> bool {
+        self.reconstruct.field == FieldKind::Mlp
+    }
+
+    fn variant(&self) -> Option<&'static str> {
+        (self.reconstruct.field == FieldKind::Mlp).then_some(MLP)
     }
 
     fn reads(&self) -> Option<&SourceSettings> {
@@ -218,6 +248,26 @@ impl ReconstructSettings {
                 "views",
                 format!("is {}, at most {MOST_VIEWS} are compared", self.views),
             );
+        }
+        match (self.field, &self.mlp) {
+            (FieldKind::Grid, None) => {}
+            (FieldKind::Grid, Some(_)) => {
+                let what = "is of networks; add field = \"mlp\", or remove it";
+                return fail("mlp", what.into());
+            }
+            (FieldKind::Mlp, None) => {
+                let what = "is missing; say how many, as in mlp = { steps = 1000, width = 64, batch = 256 }. The paper takes \
+                            200,000 of width 256 and 1,024 rays: weeks on a CPU";
+                return fail("mlp.steps", what.into());
+            }
+            (FieldKind::Mlp, Some(mlp)) => {
+                mlp.check()
+                    .or_else(|(field, what)| fail(&format!("mlp.{field}"), what))?;
+                if self.grid.shadows != Shadows::default() {
+                    let what = "is of grids: networks learn from shadows themselves; remove it";
+                    return fail("grid.shadows", what.into());
+                }
+            }
         }
         self.grid
             .check()

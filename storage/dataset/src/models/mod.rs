@@ -27,7 +27,6 @@ use crate::error::DatasetError;
 use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects;
 
-pub use checkpoint::Checkpoint;
 pub use evaluation::Evaluation;
 pub use manifest::{Lineage, ModelManifest, Promoted, SplitUsed};
 pub use remove::{Dependents, Removed};

@@ -4,8 +4,9 @@ use object_store::ObjectMeta;
 
 use super::{
     Evaluation, MANIFEST, ModelManifest, Models, Rung, TrainingSpeed, TrialRecord, check_name,
-    checkpoint, key_below, object_folder, remove::REMOVING,
+    key_below, object_folder, remove::REMOVING,
 };
+use crate::checkpoints;
 use crate::error::DatasetError;
 use crate::layout::manifest::sha256_hex;
 use crate::store::objects;
@@ -128,10 +129,10 @@ impl Models {
                     Err(error) => return Err(error),
                 }
             }
-            Some((checkpoint::FOLDER, _)) => {
+            Some((checkpoints::FOLDER, _)) => {
                 check.checkpoints += 1;
                 let bytes = objects::require(&*self.store, &object.location).await?;
-                match checkpoint::whole(bytes) {
+                match checkpoints::whole(bytes) {
                     Some(_) => None,
                     None => bad("its content has not the checkpoint's checksum"),
                 }

@@ -16,6 +16,8 @@ pub(super) mod render;
 #[cfg(feature = "networks")]
 pub mod report;
 pub mod reprocess;
+#[cfg(feature = "networks")]
+mod saver;
 pub mod split;
 #[cfg(feature = "networks")]
 pub(super) mod train;
@@ -29,7 +31,7 @@ use picofarm_files::Opener;
 use picofarm_proto::model::{
     EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask, PromoteTask,
     RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
-    kinds::{Declared, ReconstructTask, VerifyTask},
+    kinds::{Declared, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP},
 };
 use picofarm_scene::AssetLibrary;
 use tokio::runtime::Handle;
@@ -122,6 +124,12 @@ kinds! {
     Part(PartTask),
 }
 
+/// Parts of kinds that not every program has, and whether this one does: see [`TaskSpec::ability`].
+const PARTS: [(&str, &str, bool); 2] = [
+    (ExportTask::NAME, FORMATS, cfg!(feature = "formats")),
+    (ReconstructTask::NAME, MLP, cfg!(feature = "networks")),
+];
+
 /// The version of this program's code for a kind.
 fn version(kind: &str) -> String {
     let found = versions().into_iter().find(|(name, _)| *name == kind);
@@ -196,8 +204,11 @@ impl Executor for TaskExecutor {
         let built = versions()
             .into_iter()
             .filter(|(_, version)| !version.is_empty());
+        let parts = PARTS.iter().filter(|(_, _, built)| *built);
+        let parts = parts.map(|(kind, part, _)| (format!("{kind}:{part}"), version(kind)));
         built
             .map(|(kind, version)| (kind.to_owned(), version))
+            .chain(parts)
             .collect()
     }
 

@@ -1,8 +1,14 @@
 //! Reconstruction: a scene of a data set as a density field, a mesh and their errors. Adopt, or measure, fit and publish.
 //!
-//! A task takes seconds, so it keeps no checkpoint: one that is stopped begins again, and comes to the same bytes.
+//! A grid takes seconds, so it keeps no checkpoint: a task that is stopped begins again, and comes to the same bytes. Networks
+//! take minutes to days: they go on from their newest checkpoint.
 
 mod captured;
+#[cfg(feature = "networks")]
+mod mlp;
+#[cfg(not(feature = "networks"))]
+#[path = "reconstruct/without_networks.rs"]
+mod mlp;
 mod pictures;
 mod written;
 
@@ -16,15 +22,16 @@ use picofarm_dataset::{
 use picofarm_proto::{
     key::TaskKey,
     model::{
-        TaskSpec,
+        SpecError, TaskSpec,
         kinds::{
-            ReconstructTask,
+            ReconstructTask, TaskKind,
             reconstruct::{Measurements, ReconstructSettings},
         },
     },
 };
 use picofarm_reconstruct::{
-    Measured, Phase, Progress, ReconstructError, Reconstruction, VERSION, World, score,
+    Measured, Phase, Progress, ReconstructError, Reconstructed, Reconstruction, VERSION, World,
+    score,
     source::{Given, given},
     surface,
 };
@@ -34,7 +41,7 @@ use sha2::{Digest, Sha256};
 use tracing::{info, warn};
 
 use crate::execute::{
-    Context, Control, Output, RunTask, Task, TaskError,
+    Context, Control, Output, RunTask, Submission, Task, TaskError,
     output::{Stores, manifest_sha256, of_dataset},
     remade,
     reprocess::source_manifest,
@@ -55,6 +62,13 @@ impl RunTask for ReconstructTask {
         VERSION.to_owned()
     }
 
+    fn resolve(&mut self, _: &Submission<'_>) -> Result<(), SpecError> {
+        match (self.variant(), mlp::NOT_BUILT) {
+            (Some(_), Some(what)) => Err(SpecError::new("reconstruct.field", what)),
+            _ => Ok(()),
+        }
+    }
+
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, place, index) = (&context.stores, &self.source, task.index);
         let dataset = stores.open_source(&place.store, &place.dataset, control)?;
@@ -69,14 +83,17 @@ impl RunTask for ReconstructTask {
         if !task.spec.force
             && let Some(there) = finished(stores, &folder, &manifest, control)?
         {
+            mlp::forget(self, &folder, &manifest, (stores, control))?;
             return Ok(output(&there, true));
         }
         let predictions = predictions.map(|(predictions, _)| predictions);
         let measured = work.measured(stores, &dataset, &found, predictions.as_ref(), control)?;
-        let files = work.files(context, index, measured, control)?;
+        let made = work.fit(stores, (&folder, &manifest), measured, control)?;
+        let files = work.files(context, index, &made, control)?;
         let made = stores.patiently(control, async || {
             folder.restore(manifest.clone(), files.clone()).await
         })?;
+        mlp::forget(self, &folder, &manifest, (stores, control))?;
         control.at(1.0);
         Ok(output(&made, false))
     }
@@ -338,28 +355,44 @@ impl Work<'_> {
         })
     }
 
-    /// Fits the field and gives the scene's files by their names.
+    /// Fits the field.
+    fn fit(
+        &self,
+        stores: &Stores,
+        (folder, manifest): (&Reconstructions, &ReconstructionManifest),
+        measured: Measured,
+        control: &Control,
+    ) -> Result<Reconstructed, TaskError> {
+        let (grid, watch) = (self.0.reconstruct.grid, Watch(control));
+        let made = if let Some(networks) = &self.0.reconstruct.mlp {
+            let checkpoints = folder.checkpoints_of(&manifest.task_key);
+            mlp::fit(measured, (&grid, networks), (stores, checkpoints), &watch)?
+        } else {
+            let mut fitting =
+                Reconstruction::begin(measured, grid, &watch).map_err(of_reconstruction)?;
+            if !fitting.run(&watch).map_err(of_reconstruction)? {
+                return Err(TaskError::Stopped);
+            }
+            fitting.finish()
+        };
+        for note in &made.notes {
+            info!(note, "reconstruction");
+        }
+        Ok(made)
+    }
+
+    /// The scene's files by their names.
     fn files(
         &self,
         context: &Context,
         index: u64,
-        measured: Measured,
+        made: &Reconstructed,
         control: &Control,
     ) -> Result<BTreeMap<String, Bytes>, TaskError> {
-        let grid = self.0.reconstruct.grid;
-        let watch = Watch(control);
-        let mut fitting =
-            Reconstruction::begin(measured, grid, &watch).map_err(of_reconstruction)?;
-        if !fitting.run(&watch).map_err(of_reconstruction)? {
-            return Err(TaskError::Stopped);
-        }
-        let made = fitting.finish();
-        for note in &made.notes {
-            info!(note, "reconstruction");
-        }
+        let seed = self.0.reconstruct.grid.seed;
         let mesh = surface(&made.field);
         proceed(control, FITTED)?;
-        let mut metrics = facts(&made, &mesh);
+        let mut metrics = facts(made, &mesh);
         let mut files: BTreeMap<String, Bytes> = BTreeMap::new();
         if self.0.reconstruct.views > 0 {
             control.say("compares with the scene".into(), &[]);
@@ -377,15 +410,14 @@ impl Work<'_> {
                 VIEW_SIDE,
             );
             proceed(control, 0.9)?;
-            let errors =
-                errors(&made, &mesh, &world, &cameras, grid.seed).map_err(of_reconstruction)?;
+            let errors = errors(made, &mesh, &world, &cameras, seed).map_err(of_reconstruction)?;
             metrics.extend(errors);
             metrics.insert("scene".into(), json!(scene.name));
             metrics.insert("provenance".into(), json!(scene.provenance));
-            let drawn = views(&made, &world, &cameras);
+            let drawn = views(made, &world, &cameras);
             files.insert("views.png".into(), drawn.png().into());
         }
-        let objects = density(&made).map_err(of_dataset)?.into_iter();
+        let objects = density(made).map_err(of_dataset)?.into_iter();
         files.extend(objects.map(|(key, bytes)| (format!("density.zarr/{key}"), bytes)));
         files.insert("mesh.ply".into(), mesh.ply().into());
         let glb = mesh.glb(&made.measured).map_err(of_reconstruction)?;

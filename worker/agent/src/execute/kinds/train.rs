@@ -33,7 +33,8 @@ mod plan;
 mod results;
 mod trial;
 
-use along::{Reporter, Saver, loading};
+use super::saver::Saver;
+use along::{Reporter, loading};
 pub use known::takes;
 pub(in crate::execute) use known::{CheckedModel, Known};
 pub(in crate::execute) use results::WEIGHTS;
@@ -301,7 +302,8 @@ impl<'a> TrainingRun<'a> {
         }
         .map_err(of_model)?
         .loading(loading());
-        let mut saver = Saver::new(stores, &self.models, name, key);
+        let checkpoints = self.models.checkpoints_of(name, key).map_err(of_dataset)?;
+        let mut saver = Saver::new(stores, checkpoints);
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
         let mut saved = Instant::now();
         let epochs = self.task.train.optimise.epochs;

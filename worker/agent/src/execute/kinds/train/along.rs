@@ -1,23 +1,13 @@
-//! What happens along a training: it is saved, and it tells how far it is.
+//! What happens along a training: it tells how far it is.
 
-use std::time::Duration;
-
-use bytes::Bytes;
-use picofarm_dataset::{DatasetError, Models};
 use picofarm_model::{
     metric::Metrics,
     train::{Event, Line, Loading},
 };
-use tokio::task::JoinHandle;
-use tracing::{info, warn};
+use tracing::info;
 
-use crate::{
-    execute::{Control, output::Stores},
-    memory_mib,
-};
+use crate::{execute::Control, memory_mib};
 
-/// How long a training that shall stop may take to save what it has reached.
-const LAST_SAVE: Duration = Duration::from_secs(240);
 /// Share of a task's progress that is training.
 const TRAINED: f32 = 0.99;
 /// Lines of an epoch that a task logs at most: its allowance holds few more.
@@ -35,55 +25,6 @@ pub(super) fn loading() -> Loading {
             room: usize::try_from(mib / AHEAD_SHARE).map_or(usize::MAX, |mib| mib << 20),
             ..standard
         },
-    }
-}
-
-/// Saves checkpoints while the training goes on, one at a time.
-pub(super) struct Saver<'a> {
-    stores: &'a Stores,
-    models: &'a Models,
-    name: &'a str,
-    key: &'a str,
-    under_way: Option<JoinHandle<Result<(), DatasetError>>>,
-}
-
-impl<'a> Saver<'a> {
-    pub(super) fn new(stores: &'a Stores, models: &'a Models, name: &'a str, key: &'a str) -> Self {
-        Self {
-            stores,
-            models,
-            name,
-            key,
-            under_way: None,
-        }
-    }
-
-    pub(super) fn save(&mut self, step: u64, content: Bytes) {
-        self.last();
-        let (models, name, key) = (
-            self.models.clone(),
-            self.name.to_owned(),
-            self.key.to_owned(),
-        );
-        let put = async move { models.put_checkpoint(&name, &key, step, content).await };
-        self.under_way = Some(self.stores.runtime().spawn(put));
-    }
-
-    /// Waits for the checkpoint that is under way. Without it, the training goes on from the one before.
-    pub(super) fn last(&mut self) {
-        let Some(under_way) = self.under_way.take() else {
-            return;
-        };
-        let within = async { tokio::time::timeout(LAST_SAVE, under_way).await };
-        match self.stores.runtime().block_on(within) {
-            Ok(Ok(Ok(()))) => {}
-            Ok(Ok(Err(error))) => warn!(%error, "a checkpoint was not saved"),
-            Ok(Err(error)) => warn!(%error, "a checkpoint was not saved: saving broke down"),
-            Err(_) => warn!(
-                "a checkpoint was not saved within {} s",
-                LAST_SAVE.as_secs()
-            ),
-        }
     }
 }
 

@@ -1,0 +1,34 @@
+//! PlatoNeRF's networks, in a program that was built without them: such a worker does not offer them.
+
+use picofarm_dataset::{Checkpoints, ReconstructionManifest, Reconstructions};
+use picofarm_proto::model::kinds::ReconstructTask;
+use picofarm_reconstruct::{Measured, Reconstructed, Settings};
+use picofarm_settings::MlpSettings;
+
+use crate::execute::{Control, TaskError, output::Stores};
+
+/// How to have them.
+pub const NOT_BUILT: Option<&str> = Some(
+    "is \"mlp\", but this picofarm was built without networks; build it with `--features networks`",
+);
+
+/// Says that there are none.
+pub fn fit(
+    _: Measured,
+    _: (&Settings, &MlpSettings),
+    _: (&Stores, Checkpoints),
+    _: &super::Watch<'_>,
+) -> Result<Reconstructed, TaskError> {
+    let what = NOT_BUILT.unwrap_or_default();
+    Err(TaskError::User(format!("reconstruct.field {what}")))
+}
+
+/// Nothing was kept.
+pub fn forget(
+    _: &ReconstructTask,
+    _: &Reconstructions,
+    _: &ReconstructionManifest,
+    _: (&Stores, &Control),
+) -> Result<(), TaskError> {
+    Ok(())
+}
