@@ -99,3 +99,56 @@ pub fn lease_size(mean: Option<f64>, pending: u64, in_range: u64, workers: u64) 
     let fair = pending.div_ceil(SHARE * workers.max(1));
     wanted.min(fair).min(MOST).clamp(1, in_range.max(1))
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn stage(text: Value) -> StageSpec {
+        serde_json::from_value(text).unwrap()
+    }
+
+    #[test]
+    fn a_worker_is_given_what_not_every_program_does_only_where_it_says_so() {
+        let export = |format: &str| {
+            stage(json!({
+                "kind": "export",
+                "source": {"store": "/store", "dataset": "rooms"},
+                "export": {"dest": "/out", "format": format},
+            }))
+        };
+        let rooms = |field: Value| {
+            stage(json!({
+                "kind": "reconstruct",
+                "source": {"store": "/store", "dataset": "rooms"},
+                "reconstruct": field,
+                "output": {"store": "/store", "dataset": "rooms-3d"},
+            }))
+        };
+        let grid = rooms(json!({"version": "r"}));
+        let mlp = rooms(json!({"version": "r", "field": "mlp", "mlp": {"steps": 100}}));
+        let known = Known::default();
+        let mut worker = Abilities {
+            cores: 2,
+            ..Abilities::default()
+        };
+        for (plain, special, ability) in [
+            (export("zarr"), export("hdf5"), "export:formats"),
+            (export("webdataset"), export("sb3d"), "export:formats"),
+            (grid, mlp, "reconstruct:mlp"),
+        ] {
+            let version = plain.task.version().to_owned();
+            worker.kinds.clear();
+            worker
+                .kinds
+                .insert(plain.task.kind().into(), version.clone());
+            may_run(&plain, &known, &worker).unwrap();
+            let why = may_run(&special, &known, &worker).unwrap_err();
+            assert_eq!(why, format!("the worker runs no {ability} tasks"));
+            worker.kinds.insert(ability.into(), version);
+            may_run(&special, &known, &worker).unwrap();
+        }
+    }
+}

@@ -101,3 +101,52 @@ fn what_cannot_be_used_is_named() {
     let wrong = read("", "strategy = { path_reuse = \"much\" }").unwrap_err();
     assert!(wrong.to_string().contains("path_reuse"), "{wrong}");
 }
+
+#[test]
+fn networks_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() {
+    let check = |settings: &str| {
+        let spec: JobSpec = toml::from_str(&format!(
+            "name = \"test\"\n[[stage]]\nkind = \"reconstruct\"\nsource = {{ store = \"/store\", dataset = \"rooms\" }}\n\
+             output = {{ store = \"/store\", dataset = \"rooms-3d\" }}\n[stage.reconstruct]\n{settings}\n"
+        ))
+        .unwrap();
+        spec.check().map(|()| stage_key(&spec.stages[0]))
+    };
+    let grid = check("").unwrap();
+    assert_eq!(check("field = \"grid\"").unwrap(), grid);
+    let networks = check("field = \"mlp\"\nmlp = { steps = 8 }").unwrap();
+    assert_ne!(networks, grid);
+    let other = check("field = \"mlp\"\nmlp = { steps = 8, shadow_loss = \"cross_entropy\" }");
+    assert_ne!(other.unwrap(), networks);
+    for (settings, field, word) in [
+        ("field = \"mlp\"", "mlp.steps", "steps = 1000"),
+        ("mlp = { steps = 8 }", "mlp", "field = \"mlp\""),
+        (
+            "field = \"mlp\"\nmlp = { steps = 7 }",
+            "mlp.steps",
+            "choose 8 to",
+        ),
+        (
+            "field = \"mlp\"\nmlp = { width = 4 }",
+            "mlp.width",
+            "choose 8 to 1024",
+        ),
+        (
+            "field = \"mlp\"\nmlp = { batch = 0 }",
+            "mlp.batch",
+            "choose 1 to",
+        ),
+        (
+            "field = \"mlp\"\nmlp = { steps = 8 }\ngrid = { shadows = \"ignore\" }",
+            "grid.shadows",
+            "learn from shadows",
+        ),
+    ] {
+        let error = check(settings).unwrap_err();
+        assert!(
+            error.field.ends_with(&format!("reconstruct.{field}")),
+            "{error}"
+        );
+        assert!(error.what.contains(word), "{error}");
+    }
+}

@@ -33,7 +33,8 @@ pub struct WorkerHello {
 /// What a worker is able to do and what it has.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Abilities {
-    /// The kinds of task that it runs, each with the version of its code.
+    /// The kinds of task that it runs, and parts of kinds that not every worker has
+    /// ([`TaskSpec::ability`](crate::model::TaskSpec::ability)), each with the version of its code.
     pub kinds: BTreeMap<String, String>,
     /// Fingerprints of the furniture it has.
     pub assets: Vec<String>,

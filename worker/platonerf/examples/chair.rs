@@ -3,7 +3,7 @@
 //! `cargo run --release -p picofarm-platonerf --example chair -- step` measures a step of each stage at full size, and at
 //! smaller ones. `-- curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy` fits PlatoNeRF's room
 //! with a chair, from times and shadows of its truth at 512 pixels in bins of 128 ps, and says the errors at each quarter of
-//! the work. `-- grid` says those of the grid in the same views.
+//! the work. `-- grid` says those of the grid in the same views. `-- memory WIDTH` says what a step of stage 2 takes of memory.
 
 use std::error::Error;
 
@@ -58,6 +58,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     match words.as_slice() {
         ["step"] => steps(&measured),
         ["grid"] => grid(&scene, &measured),
+        ["memory", width] => memory(&measured, width.parse()?),
         ["curve", width, batch, coarse, fine, distance, shadow, how] => {
             let settings = Settings {
                 width: width.parse()?,
@@ -75,7 +76,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             curve(&scene, measured, settings)
         }
         _ => Err(
-            "expected: step, grid, or curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy".into(),
+            "expected: step, grid, memory WIDTH, or curve WIDTH BATCH COARSE FINE DISTANCE_STEPS SHADOW_STEPS squares|cross_entropy".into(),
         ),
     }
 }
@@ -83,6 +84,29 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn cpu_seconds() -> f64 {
     let t = clock_gettime(ClockId::ProcessCPUTime);
     t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+}
+
+/// Memory at most that one step of stage 2 takes beside the measurements, MiB.
+fn memory(measured: &Measured, width: usize) -> Result<(), Box<dyn Error>> {
+    let peak = || -> Result<f64, Box<dyn Error>> {
+        let status = std::fs::read_to_string("/proc/self/status")?;
+        let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+        let kib = line.and_then(|l| l.split_whitespace().next());
+        Ok(kib.ok_or("no VmHWM in /proc/self/status")?.parse::<f64>()? / 1024.0)
+    };
+    let settings = Settings {
+        width,
+        distance_steps: 0,
+        shadow_steps: 1,
+        ..Settings::default()
+    };
+    // Forgets the peak of what was before.
+    std::fs::write("/proc/self/clear_refs", "5")?;
+    let mut training = Training::begin(measured.clone(), settings)?;
+    let before = peak()?;
+    training.run(&Unwatched)?;
+    println!("width {width}: {:.0} MiB", peak()? - before);
+    Ok(())
 }
 
 /// CPU-seconds and seconds of a step of each stage.
