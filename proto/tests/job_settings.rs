@@ -106,7 +106,7 @@ fn what_cannot_be_used_is_named() {
 fn networks_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() {
     let check = |settings: &str| {
         let spec: JobSpec = toml::from_str(&format!(
-            "name = \"test\"\n[[stage]]\nkind = \"reconstruct\"\nsource = {{ store = \"/store\", dataset = \"rooms\" }}\n\
+            "name = \"test\"\n[[stage]]\nkind = \"reconstruct\"\nsource = {{ store = \"/store\", dataset = \"rooms\" }}\ncount = 3\n\
              output = {{ store = \"/store\", dataset = \"rooms-3d\" }}\n[stage.reconstruct]\n{settings}\n"
         ))
         .unwrap();

@@ -1,6 +1,7 @@
 //! `picofarm reconstruct --spots-from predictions`: times and masks by networks that see one histogram of all spots at once
 //! (Shoot-Bounce-3D, appendices C and E). No truth enters: the networks are given the histogram, and where the spots are.
 
+use picofarm_agent::reconstruct::slant;
 use picofarm_model::{Model, ModelError, cpu, input::Target, masks, scene};
 use picofarm_reconstruct::{
     Measured,
@@ -165,7 +166,7 @@ pub fn measure(
         None => vec![0; depth.len()],
     };
     let range: Vec<f32> = (0..depth.len())
-        .map(|p| depth[p] * slant(scene, p))
+        .map(|p| depth[p] * slant(&scene.camera, p))
         .collect();
     let spots: Vec<_> = rendered
         .spots
@@ -232,13 +233,6 @@ fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
             .collect(),
         intrinsics: [i.fx, i.fy, i.cx, i.cy].map(f64::from),
     }
-}
-
-/// Distance along a pixel's ray for each metre of z-depth.
-fn slant(scene: &Scene, pixel: usize) -> f32 {
-    let width = scene.camera.intrinsics.width as usize;
-    let (u, v) = ((pixel % width) as f32 + 0.5, (pixel / width) as f32 + 0.5);
-    scene.camera.ray(u, v).length()
 }
 
 /// Mean error of z-depth over the pixels that see something, metres.

@@ -47,7 +47,8 @@ use crate::execute::{
     reprocess::source_manifest,
 };
 
-use captured::{Frame, captures, slant};
+pub use captured::slant;
+use captured::{Frame, captures};
 pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
 

@@ -83,7 +83,7 @@ impl Frame<'_> {
 }
 
 /// Distance along a pixel's ray for each metre of z-depth.
-pub(super) fn slant(camera: &Camera, pixel: usize) -> f32 {
+pub fn slant(camera: &Camera, pixel: usize) -> f32 {
     let i = &camera.intrinsics;
     let (u, v) = (
         (pixel % i.width as usize) as f32 + 0.5,
