@@ -183,6 +183,32 @@ mod tests {
     }
 
     #[test]
+    fn no_experiment_of_the_paper_learns_from_mirrored_scenes() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/experiments");
+        let mut networks = 0;
+        for file in std::fs::read_dir(&folder).unwrap() {
+            let path = file.unwrap().path();
+            // An example of a sweep, not one of the paper's.
+            if path.ends_with("sweep.toml") {
+                continue;
+            }
+            for scale in ["mini", "paper"] {
+                let text = std::fs::read_to_string(&path).unwrap();
+                let dir = tempfile::tempdir().unwrap();
+                let job = written(dir.path(), &text.replace("\"furnished\"", "\"primitive\""));
+                let spec = read_uncounted(&job, Some(scale), dir.path()).unwrap();
+                for stage in &spec.stages {
+                    if let TaskSpec::Train(task) = &stage.task {
+                        assert!(!task.train.augment, "{path:?}, {}", stage.name);
+                        networks += 1;
+                    }
+                }
+            }
+        }
+        assert!(networks > 40, "{networks}");
+    }
+
+    #[test]
     fn experiments_keep_their_models_where_the_readme_looks_for_them() {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
         let root = root.canonicalize().unwrap();

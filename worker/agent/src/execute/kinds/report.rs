@@ -293,6 +293,15 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
         line("training key", manifest.training_key.clone()),
         line("manifest SHA-256", manifest.sha256()),
     ];
+    if let Some(augment) = manifest.settings["augment"].as_bool() {
+        let numbered = matches!(setting("/shadow/variant"), Some("index" | "all"));
+        let how = match (augment, numbered) {
+            (false, _) => "not shown",
+            (true, false) => "shown",
+            (true, true) => "not shown: spots are known by their number",
+        };
+        entry.lineage.push(line("mirrored scenes", how.into()));
+    }
     for (name, sha256) in &from.models {
         entry
             .lineage
