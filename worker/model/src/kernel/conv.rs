@@ -259,11 +259,13 @@ impl<const K: usize> Chunk<'_, '_, K> {
         for (v, at) in at.iter_mut().enumerate() {
             *at = self.units[u + v].at;
         }
+        // Without inputs there are no weights.
+        let weights = (b * self.block + half).min(self.weights.len());
         let acc = shifted::<L, M, V, K>(
             self.x,
             at,
             (self.inputs, self.plane, self.row),
-            &self.weights[b * self.block + half..],
+            &self.weights[weights..],
             acc,
         );
         for (m, acc) in acc.iter().enumerate().take(valid) {

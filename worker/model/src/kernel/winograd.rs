@@ -314,11 +314,13 @@ impl Multiply<'_> {
         for (v, start) in starts.iter_mut().enumerate() {
             *start = at + v * LANES;
         }
+        // Without inputs there are no weights.
+        let weights = ((b * TILE + f) * self.inputs * BLOCK + half).min(self.weights.len());
         let acc = shifted::<L, M, V, 1>(
             &self.v[f * self.step..],
             starts,
             (self.inputs, self.len, 0),
-            &self.weights[(b * TILE + f) * self.inputs * BLOCK + half..],
+            &self.weights[weights..],
             [[L::splat(0.0); V]; M],
         );
         for (m, acc) in acc.iter().enumerate() {

@@ -136,10 +136,18 @@ fn odd_and_exact_sizes_agree() {
 
 #[test]
 fn no_input_channels_give_the_bias() {
-    let s = shape(1, 0, 2, 2, 3);
-    let mut y = vec![9.0; 12];
-    Kernels::best().conv1x1(&s, &[], &[], Some(&[1.0, 2.0]), &mut y);
-    assert_eq!(y, [[1.0; 6], [2.0; 6]].concat());
+    for (height, width) in [(2, 3), (19, 18)] {
+        let pixels = height * width;
+        let s = shape(1, 0, 2, height, width);
+        let found = same_bits(|k| {
+            let (mut one, mut three) = (vec![9.0; 2 * pixels], vec![9.0; 2 * pixels]);
+            k.conv1x1(&s, &[], &[], Some(&[1.0, 2.0]), &mut one);
+            k.conv3x3(&s, &[], &[], &mut three);
+            vec![one, three]
+        });
+        assert_eq!(found[0], [vec![1.0; pixels], vec![2.0; pixels]].concat());
+        assert_eq!(found[1], vec![0.0; 2 * pixels]);
+    }
 }
 
 #[test]
