@@ -1,4 +1,4 @@
-//! `picofarm sweep …`: what trials have told of themselves.
+//! `picofarm sweep …`: records of trials.
 
 use std::{collections::BTreeMap, fs, path::Path, time::SystemTime};
 
@@ -95,7 +95,7 @@ fn report(sweep: &Sweep, out: &Path, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// What the trials of a sweep have told.
+/// The records of a sweep's trials.
 async fn read(which: &WhichSweep) -> Result<Sweep> {
     let models = open(&which.store)?;
     let id = the_one(&models, which).await?;
@@ -103,7 +103,7 @@ async fn read(which: &WhichSweep) -> Result<Sweep> {
     let (ended, rungs) = found.map_err(failed)?;
     let kind = ended.first().map(|trial| trial.kind.clone());
     let mut all: BTreeMap<u64, Tried> = BTreeMap::new();
-    // Rungs come in order: the last that a trial has told of counts.
+    // Rungs come in order: the last that a trial has reached counts.
     for rung in rungs {
         all.insert(rung.index, open_trial(which, &rung));
     }

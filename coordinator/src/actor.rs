@@ -198,7 +198,7 @@ impl Actor {
                 () = tokio::time::sleep(RETRY_AFTER) => {}
                 () = self.stop.cancelled() => {}
             }
-            // Those who asked meanwhile are told at once rather than kept waiting.
+            // Those who asked meanwhile get an error at once rather than kept waiting.
             while let Ok(command) = commands.try_recv() {
                 refuse(command, &why);
             }
@@ -647,7 +647,7 @@ impl Life<'_> {
 }
 
 /// Answers a request. What the catalog refuses for its content is the asker's error, and no reason to begin anew; any other
-/// failure of the catalog is told and ends this life.
+/// failure of the catalog is logged and ends this life.
 fn answer<T>(
     reply: Reply<T>,
     found: Result<Result<T, Refusal>, CatalogError>,

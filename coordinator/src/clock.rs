@@ -18,7 +18,7 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// A clock of one's own. Whether the process was stalled is told by the system's monotonic clock.
+    /// A clock of one's own. Whether the process was stalled is what the system's monotonic clock says.
     pub fn new(now_ms: impl Fn() -> i64 + Send + Sync + 'static) -> Self {
         let since = Instant::now();
         Self::with_stalls(now_ms, move || {

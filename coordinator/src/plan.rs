@@ -150,7 +150,7 @@ fn shaping(stage: &StageSpec) -> Value {
     tree
 }
 
-/// Most differences that are told.
+/// Most differences that are listed.
 const MOST_LINES: usize = 8;
 
 fn differences(lines: &mut Vec<String>, path: String, was: Option<&Value>, is: Option<&Value>) {

@@ -23,7 +23,7 @@ pub trait Stored: fmt::Debug + Send + Sync + 'static {
     /// the same order.
     ///
     /// # Errors
-    /// Why that cannot be told from here, in words that follow "because": the store is not one that may be looked into, it
+    /// Why that cannot be found out from here, in words that follow "because": the store is not one that may be looked into, it
     /// cannot be read, or the kind of stage keeps nothing that tells.
     fn look<'a>(
         &'a self,

@@ -1,4 +1,4 @@
-//! A TCP proxy that can be told to fail: cut its connections, or hold back what passes.
+//! A TCP proxy that fails when asked to: cut its connections, or hold back what passes.
 
 use std::{
     io::{ErrorKind, Read, Write},

@@ -1,4 +1,4 @@
-//! Who gets in: real processes with certificates and tokens, right and wrong ones, and what each is told.
+//! Who gets in: real processes with certificates and tokens, right and wrong ones, and the answer to each.
 
 use std::{fs, os::unix::fs::PermissionsExt, path::Path};
 
@@ -273,7 +273,7 @@ fn a_coordinator_with_unusable_files_says_which() {
     run(&["--tokens", "nowhere.toml"]).fails(3, &["nowhere.toml"]);
     run(&["--tokens", "broken.toml"]).fails(3, &["broken.toml", "name"]);
 
-    // An expired certificate is the clients' to refuse, and a plain port is told from one with TLS.
+    // An expired certificate is the clients' to refuse, and a plain port is distinguished from one with TLS.
     let old = [
         "--allow-insecure",
         "--tls-cert",

@@ -3,7 +3,7 @@
 
 use picofarm_tests::{Farm, Job, Slurm, store, wait::until};
 
-/// Scenes long enough that a worker told to end is not about to finish one anyway.
+/// Scenes long enough that a worker asked to end is not about to finish one anyway.
 fn job(farm: &Farm, count: u64) -> Job {
     let job = Job::slow(&farm.store(), count);
     Job {

@@ -250,7 +250,7 @@ fn text(report: &Report) -> String {
     out
 }
 
-/// Another program that takes steps when told to.
+/// Another program that takes steps when asked to.
 struct Peer {
     name: String,
     child: Child,

@@ -1,4 +1,4 @@
-//! Scenes without light: their tasks warn of it in their logs. Where many do, the whole job is told about it.
+//! Scenes without light: their tasks warn of it in their logs. Where many do, that is said of the whole job.
 
 use std::collections::BTreeSet;
 

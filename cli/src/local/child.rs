@@ -24,7 +24,7 @@ pub(super) const STOP: &str = "stop";
 /// coordinator or anything else.
 const OOM_SCORE: &str = "800";
 
-/// What a worker's process is told.
+/// Arguments of a worker's process.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Order {
     /// The parent's settings.
@@ -52,7 +52,7 @@ pub struct Order {
 /// The last line that a worker's process writes: how it ended.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Verdict {
-    /// Exit code of an error; 0 = it was told to end.
+    /// Exit code of an error; 0 = it was asked to end.
     code: u8,
     message: String,
     hint: Option<String>,

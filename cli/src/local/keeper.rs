@@ -41,7 +41,7 @@ struct State {
 
 impl Keeper {
     /// Starts a worker's thread and with it the first process. What is sent comes when the worker has ended for good:
-    /// because it was told to, or with the reason why no further process would do better.
+    /// because it was asked to, or with the reason why no further process would do better.
     ///
     /// # Errors
     /// The system starts no thread.

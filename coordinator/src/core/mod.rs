@@ -108,7 +108,7 @@ struct StageEntry {
     free: Option<u64>,
     /// The catalog is not asked for tasks before this time: it had none to give just now.
     ask_at_ms: i64,
-    /// Why no connected worker may run it, as last told.
+    /// Why no connected worker may run it, as last reported.
     waiting: Option<String>,
     /// The workers on which its tasks failed.
     blocklist: Blocklist,
@@ -155,7 +155,7 @@ struct WorkerEntry {
     leases: BTreeSet<RangeId>,
     /// It holds a range under suspicion and gets nothing else.
     quarantined: bool,
-    /// It has been told to end, and gets nothing more.
+    /// It has been asked to end, and gets nothing more.
     drains: bool,
 }
 

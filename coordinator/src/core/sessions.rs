@@ -105,7 +105,7 @@ impl Core {
         }
     }
 
-    /// Workers of this id or name are told to finish what is in hand and to end; returns how many there are.
+    /// Workers of this id or name are asked to finish what is in hand and to end; returns how many there are.
     pub(crate) fn drain(&mut self, worker: &str) -> u32 {
         let mut count = 0;
         for (id, entry) in &mut self.workers {

@@ -49,7 +49,7 @@ enum Op {
     Beat(u8),
     /// The connection breaks; with `true`, the process dies too.
     Drop(u8, bool),
-    /// The worker connects to the nth instance, without having told another that it left.
+    /// The worker connects to the nth instance, without having left another.
     Connect(u8, u8),
     Pass(u16),
     /// An instance beats: it hears what is new.

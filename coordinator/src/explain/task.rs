@@ -161,7 +161,7 @@ fn reruns(events: &[Event]) -> Vec<String> {
                 why = None;
                 continue;
             }
-            // A loss is told twice, for the lease and for the task in hand: the first says enough.
+            // A loss is reported twice, for the lease and for the task in hand: the first says enough.
             _ if why.is_some() => continue,
             EventKind::Expired => event.message.clone(),
             EventKind::Released => format!("{} gave it back: {}", event.worker, event.message),

@@ -1,4 +1,4 @@
-//! What people are told, on the wire.
+//! Reports on jobs, on the wire.
 
 use super::{ConvertError, parse, required};
 use crate::{

@@ -23,7 +23,7 @@ pub enum Act {
     Resume,
     /// A job's given-up tasks are pending again.
     Retry,
-    /// A worker is told to end.
+    /// A worker is asked to end.
     Drain,
     /// The coordinator read the token file again.
     Tokens,

@@ -1,4 +1,4 @@
-//! What people are told about jobs. Every count is derived from ranges and outputs.
+//! Reports on jobs, for people. Every count is derived from ranges and outputs.
 
 use std::collections::BTreeMap;
 

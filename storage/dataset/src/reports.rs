@@ -57,7 +57,7 @@ pub struct ReportedModel {
     /// Key of the evaluation whose figures are shown; `None` where it was not evaluated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation: Option<String>,
-    /// SHA-256 of what is told of the training's speed, hexadecimal; `None` where nothing is.
+    /// SHA-256 of the record of the training's speed, hexadecimal; `None` where nothing is.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed: Option<String>,
 }

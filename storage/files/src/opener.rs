@@ -11,7 +11,7 @@ use crate::{FileError, read_bounded};
 
 /// Opens files that lie below the folders it was given, wherever links lead; regular files only.
 ///
-/// Hard links cannot be told from files: who may write to a folder decides what lies in it.
+/// Hard links cannot be distinguished from files: who may write to a folder decides what lies in it.
 #[derive(Debug, Clone, Default)]
 pub struct Opener {
     /// A file must lie in one folder of every set.

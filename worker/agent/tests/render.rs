@@ -365,7 +365,7 @@ async fn a_rendered_scene_waits_for_its_store_and_is_published_once_it_can_be() 
     let (output, ()) = tokio::join!(run, clear);
     assert_eq!(output.unwrap().manifest_sha256, sha256(&place.manifest(1)));
 
-    // A worker that is told to stop does not wait on.
+    // A worker that is asked to stop does not wait on.
     fs::write(place.dataset().join("transient/c/2"), b"").unwrap();
     let control = Arc::new(Control::default());
     let stop = async {

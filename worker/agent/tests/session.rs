@@ -243,7 +243,7 @@ async fn shutdown_lets_a_task_finish_that_is_nearly_done() {
     let (mut c, _) = farm.welcome(60_000).await;
     c.grant(lease(1, 0, 5)).await;
     assert_eq!(worker.starts().await, 0);
-    // The first heartbeat with progress shows that the task has told how far it is.
+    // The first heartbeat with progress shows that the task reports its progress.
     c.listen_until("progress", |c| c.fractions.last() == Some(&0.99))
         .await;
     worker.shutdown.cancel();

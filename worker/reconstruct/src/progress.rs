@@ -33,7 +33,7 @@ impl Phase {
     }
 }
 
-/// Told how far a reconstruction is; may end it.
+/// Called with the progress of a reconstruction; may end it.
 pub trait Progress: Sync {
     /// Share of the phase that is done in [0, 1], and the loss per ray where there is one. Return `false` to stop.
     fn at(&self, phase: Phase, done: f32, loss: Option<f64>) -> bool;

@@ -228,7 +228,7 @@ pub enum Trouble {
 }
 
 impl Target {
-    /// What went wrong with a connection or a call, as far as it can be told.
+    /// What went wrong with a connection or a call, as far as it is known.
     pub async fn trouble(
         &self,
         error: &(dyn std::error::Error + Send + Sync + 'static),

@@ -173,7 +173,7 @@ enum Haste {
 /// The way out.
 struct Leaving {
     haste: Haste,
-    /// The running task is told to stop at this time.
+    /// The running task is asked to stop at this time.
     stop_at: Instant,
     /// Leave whatever still runs or waits.
     give_up: Instant,

@@ -135,7 +135,7 @@ impl Assignments {
         self.outbox.finished()
     }
 
-    /// The connection is gone: what it was asked and told must be said again.
+    /// The connection is gone: what was sent over it must be sent again.
     pub(crate) fn disconnected(&mut self) {
         self.outbox.rewind();
         self.beats.clear();
@@ -292,7 +292,7 @@ impl Assignments {
         }
     }
 
-    /// The task in hand ended. What is to be told goes to the outbox: every finished task, even if its lease
+    /// The task in hand ended. What is to be reported goes to the outbox: every finished task, even if its lease
     /// is lost (the output stands); failures only where the lease is still held.
     pub(crate) fn ended(&mut self, now: Instant, result: &Result<Output, TaskError>) -> InHand {
         let hand = self

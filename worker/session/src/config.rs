@@ -1,4 +1,4 @@
-//! What a worker is told at its start, what it says at its end, and why it may end early.
+//! A worker's settings, its summary at the end, and why it may end early.
 
 use std::{path::PathBuf, time::Duration};
 

@@ -76,7 +76,7 @@ pub trait Executor: Send + Sync + 'static {
     /// Fingerprints of the furniture at hand.
     fn assets(&self) -> Vec<String>;
 
-    /// Runs `task` to its end, telling `control` how far it is and stopping when told to.
+    /// Runs `task` to its end, reporting its progress to `control`, and stops when asked to.
     ///
     /// # Errors
     /// [`TaskError`], by who is to blame.

@@ -258,7 +258,7 @@ impl<'a> Mount<'a> {
         })
     }
 
-    /// The folder of a group. A container may see a hierarchy from its own group down only, and may be told a path that
+    /// The folder of a group. A container may see a hierarchy from its own group down only, and may be given a path that
     /// lies outside: then what it sees is its own.
     fn folder(&self, group: &str) -> PathBuf {
         let inside = match &*self.part {

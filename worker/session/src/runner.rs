@@ -1,7 +1,7 @@
 //! The thread that runs tasks, with its own rayon pool. A plain thread and not one of tokio's: a task that
 //! will not stop must not keep the process from ending.
 //!
-//! A task that is told to stop looks up often, but not everywhere: a library decodes a file, an optimiser takes a step. So
+//! A task that is asked to stop looks up often, but not everywhere: a library decodes a file, an optimiser takes a step. So
 //! it is given a moment, and then left: the session hears that it was stopped, and the next task waits until the one that
 //! was left has noticed. What it may still write in between is what any worker may write: whole, and the same bytes.
 
@@ -142,7 +142,7 @@ fn begin(means: &Arc<Means>, task: Task, control: Arc<Control>, span: Span) -> R
     result
 }
 
-/// Waits for a task's end; `None` where it was told to stop and has not noticed. One that saves what it has done may take
+/// Waits for a task's end; `None` where it was asked to stop and has not noticed. One that saves what it has done may take
 /// its time, if anybody wants that.
 fn wait(running: &Receiver<Ended>, control: &Control, saves: bool) -> Option<Ended> {
     let mut asked: Option<Instant> = None;

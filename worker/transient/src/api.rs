@@ -32,7 +32,7 @@ pub struct Settings {
     pub strategy: Strategy,
 }
 
-/// Told how far a render is; may end it.
+/// Called with the progress of a render; may end it.
 pub trait Progress: Sync {
     /// Share done in [0, 1], from any thread, not necessarily increasing. Return `false` to stop the render.
     fn at(&self, done: f32) -> bool;

@@ -152,7 +152,7 @@ pub async fn run(args: &DatasetReport, output: Output) -> Result<()> {
     Ok(())
 }
 
-/// What is told of a place.
+/// The figures of a folder.
 async fn collected(place: &str) -> Result<Vec<Group>> {
     let there = opened(place).await?;
     let present = there.scenes_present().await.map_err(failed)?;

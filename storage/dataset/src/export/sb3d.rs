@@ -186,7 +186,7 @@ pub(super) fn check(spec: &DatasetSpec) -> Result<(), DatasetError> {
     Err(DatasetError::invalid("spec.spots", what))
 }
 
-/// A scene has what the layout has files of: a file of fill values could not be told from the truth.
+/// A scene has what the layout has files of: a file of fill values could not be distinguished from the truth.
 fn check_known(scene: u64, missing: &[String]) -> Result<(), DatasetError> {
     let filed = ["depth", "specular", "visibility"];
     let lacking: Vec<&str> = filed

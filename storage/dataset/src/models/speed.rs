@@ -39,7 +39,7 @@ impl TrainingSpeed {
 }
 
 impl Models {
-    /// Stores how fast a model was trained; what was told before stands.
+    /// Stores how fast a model was trained; a record that is there stands.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
@@ -50,7 +50,7 @@ impl Models {
         Ok(())
     }
 
-    /// How fast a model was trained, if it was told of this training.
+    /// How fast a model was trained, if the record is of this training.
     ///
     /// # Errors
     /// [`DatasetError::Store`], [`DatasetError::Damaged`].

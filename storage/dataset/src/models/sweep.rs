@@ -118,7 +118,7 @@ impl Models {
         found.map(|bytes| self.parse(&path, &bytes)).transpose()
     }
 
-    /// Stores how good a trial is at a rung; what was told before stands, and is the same.
+    /// Stores how good a trial is at a rung; a record that is there stands, and is the same.
     ///
     /// # Errors
     /// [`DatasetError::Store`].

@@ -1,4 +1,4 @@
-//! Checking a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and what trials told.
+//! Checking a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and records of trials.
 
 use object_store::ObjectMeta;
 

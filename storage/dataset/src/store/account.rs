@@ -1,4 +1,4 @@
-//! What is told of a failure of a store.
+//! Reports on failures of a store.
 
 /// An error of a store in words.
 pub(crate) struct Failure {

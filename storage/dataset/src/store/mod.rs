@@ -33,7 +33,7 @@ use place::Place;
 /// `az://container/prefix` (Azure). Neither folder, nor prefix need exist. Nothing is asked of the store yet.
 ///
 /// Local writes are flushed to the disk before they count, so that a manifest that exists after a power cut has its
-/// objects. Other stores need the feature `clouds`, and are told where and who by the environment, as docs/stores.md lists. A store from here keeps its
+/// objects. Other stores need the feature `clouds`, and take place and credentials from the environment, as docs/stores.md lists. A store from here keeps its
 /// connections and the limit of its requests in flight: open once, use for long. See [`limit_bandwidth`] too.
 ///
 /// # Errors

@@ -23,7 +23,7 @@ pub(crate) fn path_of(prefix: &Path, key: &str) -> Path {
 
 /// A path as a person would look for it: with the leading `/` for local stores, whose keys are paths from the root.
 pub(crate) fn shown(store: &dyn ObjectStore, path: &Path) -> String {
-    // The store's root is told only by how it displays itself.
+    // The store's root is known only from how it displays itself.
     let named = |kind: &str| {
         let name = store.to_string();
         let (_, rest) = name.split_once(kind)?;

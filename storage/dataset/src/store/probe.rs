@@ -107,7 +107,7 @@ async fn probe_at(
     race: &Path,
 ) -> Result<Finding, DatasetError> {
     let broken = |what: &str| Ok(Finding::Broken(what.into()));
-    // Told apart from any other writer's, so that one can recognise one's own.
+    // Different from any other writer's, so that one can recognise one's own.
     let body = |i: usize| Bytes::from(format!("writer {i:02} of {sequential}\n").repeat(64));
     if !objects::create(store, sequential, body(0)).await? {
         return match objects::get(store, sequential).await? {

@@ -39,12 +39,12 @@ pub struct VerifyOptions<'a> {
     pub complete: bool,
     /// Only the scenes of this snapshot, which must be as they were then.
     pub snapshot: Option<&'a Snapshot>,
-    /// Told now and then.
+    /// Called with the progress now and then.
     pub watch: Watch<'a>,
 }
 
 impl VerifyOptions<'_> {
-    /// Everything there is, told to nobody.
+    /// Everything there is, without progress.
     pub fn new(mode: VerifyMode) -> Self {
         Self {
             mode,
@@ -64,7 +64,7 @@ impl Dataset {
         self.verify_with(&VerifyOptions::new(mode)).await
     }
 
-    /// The same, as told.
+    /// The same, with these options.
     ///
     /// # Errors
     /// [`DatasetError::Store`] where the store fails; faults of the data are in the report.

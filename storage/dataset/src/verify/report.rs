@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// Told how many scenes are checked, of how many.
+/// Called with the number of scenes checked, and of all.
 pub type Watch<'a> = &'a (dyn Fn(u64, u64) + Sync);
 
 /// How thoroughly to check.

@@ -401,7 +401,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
     }
 }
 
-/// Blocks an executor's task until the test opens the gate or the task is told to stop.
+/// Blocks an executor's task until the test opens the gate or the task is asked to stop.
 #[derive(Clone)]
 pub struct Gate(pub CancellationToken);
 
@@ -410,7 +410,7 @@ impl Gate {
         Self(CancellationToken::new())
     }
 
-    /// `Err` if told to stop first.
+    /// `Err` if asked to stop first.
     pub fn pass(&self, control: &Control) -> Result<(), TaskError> {
         while !self.0.is_cancelled() {
             if control.stopped() {

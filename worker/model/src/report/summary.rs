@@ -362,7 +362,7 @@ struct Example<'a> {
     metrics: &'a Metrics,
 }
 
-/// The report as JSON: everything that is told of the models, the pictures' figures without their pixels, and
+/// The report as JSON: everything about the models, the pictures' figures without their pixels, and
 /// [`summary`]. A figure that is no number is null.
 pub fn json(report: &Report) -> String {
     let document = Document {

@@ -44,7 +44,7 @@ pub struct Tried {
     pub why: String,
     /// Epochs done.
     pub epochs: u64,
-    /// The error at its end, or at the last rung that it told of.
+    /// The error at its end, or at the last rung that it reached.
     pub loss: Option<f64>,
     /// A line for each epoch, once it has ended.
     #[serde(default)]

@@ -58,7 +58,7 @@ pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, Reco
     Ok(render(scene, &settings, progress)?)
 }
 
-/// Told how far captures are: the number of the capture, from 0, and the share of it that is done. Returns `false` to stop.
+/// Called with the progress of captures: the number of the capture, from 0, and the share of it that is done. Returns `false` to stop.
 pub type CaptureProgress<'a> = &'a (dyn Fn(usize, f32) -> bool + Sync);
 
 struct OfCapture<'a>(usize, CaptureProgress<'a>);

@@ -218,7 +218,7 @@ impl Bench {
         }
     }
 
-    /// Renders a region into `done`; `None` when `go_on`, told the share done, says
+    /// Renders a region into `done`; `None` when `go_on`, called with the share done, says
     /// to stop.
     pub fn render(
         &mut self,

@@ -1,4 +1,4 @@
-//! Azure Blob Storage: `az://container/prefix`, told where and who by the usual `AZURE_…` variables.
+//! Azure Blob Storage: `az://container/prefix`, with place and credentials from the usual `AZURE_…` variables.
 
 use object_store::ClientConfigKey;
 use object_store::azure::{AzureConfigKey, MicrosoftAzure, MicrosoftAzureBuilder};

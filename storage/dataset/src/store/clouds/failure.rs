@@ -82,7 +82,7 @@ impl Request {
         }
     }
 
-    /// Whether it was for credentials, where machines of the services are told who they are: nobody asks there who was
+    /// Whether it was for credentials, where machines of the services get their credentials: nobody asks there who was
     /// given any.
     fn asks_who(&self) -> bool {
         ["latest/", "computeMetadata/", "metadata/identity/"]

@@ -1,4 +1,4 @@
-//! Google Cloud Storage: `gs://bucket/prefix`, told who by the usual `GOOGLE_…` variables, `gcloud`'s file or the machine.
+//! Google Cloud Storage: `gs://bucket/prefix`, with credentials from the usual `GOOGLE_…` variables, `gcloud`'s file or the machine.
 
 use std::fs::File;
 

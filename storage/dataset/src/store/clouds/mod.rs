@@ -19,7 +19,7 @@ use crate::error::DatasetError;
 use client::{CONCURRENCY, Settings};
 use limited::Limited;
 
-/// A client of the place's bucket, told where and who by the environment. Asks nothing of the server.
+/// A client of the place's bucket, with place and credentials from the environment. Asks nothing of the server.
 ///
 /// # Errors
 /// [`DatasetError::StoreSettings`] names a missing or unusable variable.

@@ -1,4 +1,4 @@
-//! S3 and servers that speak it: `s3://bucket/prefix`, told where and who by the usual `AWS_…` variables.
+//! S3 and servers that speak it: `s3://bucket/prefix`, with place and credentials from the usual `AWS_…` variables.
 
 use object_store::ClientConfigKey;
 use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};

@@ -104,7 +104,7 @@ pub(in crate::execute) fn make(
     make_by(dataset, with, spec, index, key, render)
 }
 
-/// The same, rendered as told.
+/// The same, with these settings.
 fn make_by(
     dataset: &Dataset,
     with: With<'_>,

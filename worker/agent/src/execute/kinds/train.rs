@@ -1,6 +1,6 @@
 //! Training: adopt, or go on from the newest checkpoint, or begin; save what is reached now and then; publish.
 //!
-//! A training may run for days and on many workers, one after the other. So it is saved every few minutes, when it is told
+//! A training may run for days and on many workers, one after the other. So it is saved every few minutes, when it is asked
 //! to stop, and never waits for the store while it computes; a store that is away costs checkpoints, not the training.
 
 use std::{
@@ -308,7 +308,7 @@ impl<'a> TrainingRun<'a> {
         let mut saved = Instant::now();
         let epochs = self.task.train.optimise.epochs;
         let mut teller = Reporter::new(control, epochs);
-        // What the trial is told at its latest rung.
+        // The answer to the trial at its latest rung.
         let mut answer = Ok(true);
         let mut ask = |line: &Line| {
             answer = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));

@@ -74,7 +74,7 @@ impl<'a> Course<'a> {
             return Ok(None);
         }
         if let Some(ended) = &found {
-            // Whoever told may have died right after.
+            // The worker that reported it may have died right after.
             self.forget(ended, control)?;
         }
         Ok(found)
