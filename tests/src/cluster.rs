@@ -6,8 +6,8 @@ use std::net::SocketAddr;
 use serde_json::Value;
 
 use crate::{
-    cli::Cli, job::Job, postgres::Postgres, process::Process, proxy::Proxy, scratch::Scratch,
-    wait::until,
+    cli::Cli, job::Job, ports::lasting, postgres::Postgres, process::Process, proxy::Proxy,
+    scratch::Scratch, wait::until,
 };
 
 /// One of several coordinators.
@@ -53,7 +53,7 @@ impl Cluster {
             scratch,
         };
         for _ in 0..coordinators {
-            let (process, address) = cluster.launch("127.0.0.1:0");
+            let (process, address) = cluster.launch(&format!("127.0.0.1:{}", lasting()));
             cluster.coordinators.push(Coordinator {
                 process: Some(process),
                 address,

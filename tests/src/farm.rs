@@ -7,6 +7,7 @@ use serde_json::Value;
 use crate::{
     cli::{Cli, Ended},
     job::Job,
+    ports::lasting,
     process::Process,
     s3::Server,
     scratch::Scratch,
@@ -59,14 +60,14 @@ impl Farm {
         }
     }
 
-    /// Starts the coordinator: the first time on any free port, then on the same one.
+    /// Starts the coordinator: the first time on a free port, then on the same one.
     ///
     /// # Panics
     /// When it does not come up.
     pub fn start_coordinator(&mut self) {
         let listen = match &self.url {
             Some(url) => url.trim_start_matches("http://").to_owned(),
-            None => "127.0.0.1:0".into(),
+            None => format!("127.0.0.1:{}", lasting()),
         };
         let lease = self.lease_s.to_string();
         let stores = self.scratch.path().display().to_string();

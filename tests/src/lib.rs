@@ -13,6 +13,7 @@ pub mod http;
 pub mod job;
 pub mod mount;
 pub mod poison;
+pub mod ports;
 pub mod postgres;
 pub mod process;
 pub mod proxy;

@@ -5,7 +5,7 @@
 use std::{
     collections::BTreeMap,
     io::{Read, Write},
-    net::{TcpListener, TcpStream},
+    net::TcpStream,
     path::PathBuf,
     process::Command,
     sync::{
@@ -22,7 +22,7 @@ use object_store::{
 };
 use sha2::{Digest, Sha256};
 
-use crate::{cli::Cli, process::Process, scratch::Scratch, wait::until};
+use crate::{cli::Cli, ports::lasting, process::Process, scratch::Scratch, wait::until};
 
 /// Who may read and write.
 pub const KEY: &str = "farmkey0";
@@ -255,13 +255,7 @@ fn runtime() -> tokio::runtime::Runtime {
         .expect("a runtime can be made")
 }
 
-/// Ports that were free a moment ago. The server cannot choose its own.
+/// Free ports, which the server cannot choose itself.
 fn free_ports() -> [(u16, u16); 4] {
-    let listen = || TcpListener::bind("127.0.0.1:0").expect("loopback has free ports");
-    // All held at once, so that they differ.
-    let listeners = PARTS.map(|_| (listen(), listen()));
-    let port = |l: &TcpListener| l.local_addr().expect("it is bound").port();
-    listeners
-        .each_ref()
-        .map(|(http, grpc)| (port(http), port(grpc)))
+    PARTS.map(|_| (lasting(), lasting()))
 }

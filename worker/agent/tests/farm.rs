@@ -12,6 +12,7 @@ use picofarm_proto::{
     model::{JobSpec, JobState, JobStatus, RenderTask},
     wire::{self, jobs_client::JobsClient},
 };
+use picofarm_tests::ports::lasting;
 use tokio_util::sync::CancellationToken;
 
 /// A coordinator that keeps its catalog in `dir`.
@@ -24,7 +25,8 @@ impl Farm {
     async fn start(dir: &Path, listen: SocketAddr) -> Self {
         let stop = CancellationToken::new();
         let config = CoordinatorConfig {
-            lease_ms: 6_000,
+            // No lease runs out here, however long a busy disk keeps a transaction.
+            lease_ms: 60_000,
             heartbeat_ms: 100,
             ..CoordinatorConfig::new(CatalogPlace::from(dir.join("catalog.sqlite")), listen)
         };
@@ -94,7 +96,7 @@ impl Farm {
 }
 
 fn anywhere() -> SocketAddr {
-    "127.0.0.1:0".parse().unwrap()
+    ([127, 0, 0, 1], lasting()).into()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -21,6 +21,7 @@ use picofarm_proto::{
         session_response::Message as Answer,
     },
 };
+use picofarm_tests::ports::lasting;
 use tokio::{net::TcpListener, sync::mpsc, task::JoinHandle};
 use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tokio_util::sync::CancellationToken;
@@ -28,7 +29,7 @@ use tonic::{Request, Response, Status, Streaming, transport::Server};
 use uuid::Uuid;
 
 /// No wait in these tests comes near this; it only keeps a broken test from hanging.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Waits for `what`, but not for ever.
 pub async fn soon<T>(what: &str, future: impl Future<Output = T>) -> T {
@@ -83,7 +84,7 @@ pub struct FakeFarm {
 
 impl FakeFarm {
     pub async fn start() -> Self {
-        Self::start_at("127.0.0.1:0".parse().unwrap()).await
+        Self::start_at(([127, 0, 0, 1], lasting()).into()).await
     }
 
     pub async fn start_at(address: SocketAddr) -> Self {
