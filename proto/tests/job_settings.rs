@@ -103,7 +103,7 @@ fn what_cannot_be_used_is_named() {
 }
 
 #[test]
-fn networks_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() {
+fn settings_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() {
     let check = |settings: &str| {
         let spec: JobSpec = toml::from_str(&format!(
             "name = \"test\"\n[[stage]]\nkind = \"reconstruct\"\nsource = {{ store = \"/store\", dataset = \"rooms\" }}\ncount = 3\n\
@@ -114,6 +114,9 @@ fn networks_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() 
     };
     let grid = check("").unwrap();
     assert_eq!(check("field = \"grid\"").unwrap(), grid);
+    assert_eq!(check("mirrors = \"leave_out\"").unwrap(), grid);
+    assert_ne!(check("mirrors = \"keep\"").unwrap(), grid);
+    assert_ne!(check("from = \"given\"").unwrap(), grid);
     let networks = check("field = \"mlp\"\nmlp = { steps = 8 }").unwrap();
     assert_ne!(networks, grid);
     let other = check("field = \"mlp\"\nmlp = { steps = 8, shadow_loss = \"cross_entropy\" }");
@@ -140,6 +143,16 @@ fn networks_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() 
             "field = \"mlp\"\nmlp = { steps = 8 }\ngrid = { shadows = \"ignore\" }",
             "grid.shadows",
             "learn from shadows",
+        ),
+        (
+            "from = \"captures\"\nmirrors = \"keep\"",
+            "mirrors",
+            "does not know",
+        ),
+        (
+            "from = \"given\"\npredictions = \"seen\"",
+            "predictions",
+            "only from = \"predictions\" reads",
         ),
     ] {
         let error = check(settings).unwrap_err();

@@ -106,13 +106,13 @@ fn looked_at(farm: &Farm) {
     }
     let pictures = html.matches("data:image/png;base64,").count();
     assert_eq!(pictures, 6, "best, median and worst of either");
-    let told = fs::read_to_string(written["json"].as_str().unwrap()).unwrap();
-    let told: Value = serde_json::from_str(&told).unwrap();
+    let said_of = fs::read_to_string(written["json"].as_str().unwrap()).unwrap();
+    let said_of: Value = serde_json::from_str(&said_of).unwrap();
     let info = farm.json(&["dataset", "info", &truth]);
-    let of_truth = &told["groups"][0];
+    let of_truth = &said_of["groups"][0];
     assert_eq!(
         of_truth["figures"]["l1_m"]["mean"], info["means"]["l1_m"]["mean"],
-        "{told}"
+        "{said_of}"
     );
     assert!(
         of_truth["figures"]["l1_m"]["standard_error"]
@@ -121,7 +121,7 @@ fn looked_at(farm: &Farm) {
             > 0.0
     );
     // Other rooms, spots and images than the paper's.
-    assert_eq!(of_truth["as_published"], false, "{told}");
+    assert_eq!(of_truth["as_published"], false, "{said_of}");
     let ranks: Vec<&str> = of_truth["extremes"]
         .as_array()
         .unwrap()

@@ -5,7 +5,7 @@ use picofarm_agent::reconstruct::slant;
 use picofarm_model::{Model, ModelError, cpu, input::Target, masks, scene};
 use picofarm_reconstruct::{
     Measured,
-    source::{self, CaptureSettings, Given},
+    source::{self, CaptureSettings, Given, Times},
 };
 use picofarm_scene::Scene;
 use picofarm_transient::{Gate, Rendered, render};
@@ -179,7 +179,7 @@ pub fn measure(
         laser: scene.laser.origin,
         spots: &spots,
         beams: &beams,
-        range_m: &range,
+        times: Times::Range(&range),
         lit: &lit,
         mirror: &mirror,
     })

@@ -201,6 +201,7 @@ async fn nothing_damaged_missing_or_oversized_is_exported() {
     assert!(error.contains("source/depth/c/4/0/0"), "{error}");
     let each = DatasetSpec {
         per_spot: true,
+        two_bounce: false,
         ..spec(Profile::default())
     };
     let (_, dataset) = in_memory(&each).await;

@@ -25,6 +25,7 @@ async fn source(room: &Room) -> Dataset {
         spots: 100,
         subsets: Subsets::of(&[4, 25]).unwrap(),
         per_spot: false,
+        two_bounce: false,
         gate: Gate {
             start_m: room.gate[0],
             bin_width_m: room.gate[1],
@@ -61,6 +62,7 @@ async fn source(room: &Room) -> Dataset {
         depth: &room.depth,
         specular: &room.specular,
         visibility: &room.lit,
+        two_bounce: &[],
         spots: &spots,
         intrinsics: Intrinsics {
             fx: SIDE as f32 / 2.0,

@@ -15,6 +15,7 @@ fn rich(profile: Profile) -> DatasetSpec {
         spots: 100,
         subsets: Subsets::of(&[25, 4]).unwrap(),
         per_spot: true,
+        two_bounce: false,
         gate: Gate {
             bins: 8,
             ..plain.gate
@@ -143,6 +144,7 @@ async fn a_data_set_with_other_subsets_is_another_data_set_and_the_field_is_name
     assert!(text.contains("subsets = [4, 25], but [4]"), "{text}");
     let without = DatasetSpec {
         per_spot: false,
+        two_bounce: false,
         ..spec
     };
     let other = Dataset::create_or_open(store, prefix, &without).await;

@@ -114,6 +114,7 @@ impl Place {
             label: &vec![3; PIXELS],
             specular: &vec![1; PIXELS],
             visibility: &visibility,
+            two_bounce: &[],
             rgb: &vec![0.25; PIXELS * 3],
             spots: &spots,
             intrinsics: Intrinsics {
@@ -214,6 +215,7 @@ fn spec(spots: u32) -> DatasetSpec {
         spots,
         subsets: Subsets::NONE,
         per_spot: false,
+        two_bounce: false,
         gate: Gate {
             start_m: 0.9,
             bin_width_m: 0.002_398_34,
@@ -434,6 +436,7 @@ async fn chosen_spots_are_summed_and_only_theirs_is_the_truth() {
     let mut place = Place::new(ideal());
     let hundred = DatasetSpec {
         per_spot: true,
+        two_bounce: false,
         subsets: Subsets::of(&[4]).unwrap(),
         ..spec(100)
     };

@@ -7,6 +7,6 @@ mod rendered;
 mod truth;
 
 pub use captures::{Captures, LIT_THRESHOLD};
-pub use given::{Given, given};
+pub use given::{Given, Times, given};
 pub use rendered::{CaptureProgress, CaptureSettings, captures_of, truth_of};
 pub use truth::{Disturbed, from_truth, surface_normals};

@@ -36,6 +36,7 @@ impl Simulated {
             spots: 1,
             subsets: Subsets::NONE,
             per_spot: false,
+            two_bounce: false,
             gate: Gate {
                 start_m: 1.0,
                 bin_width_m: 0.0384,
@@ -57,6 +58,7 @@ impl Simulated {
             label: &[1],
             specular: &[0],
             visibility: &[1],
+            two_bounce: &[],
             rgb: &[0.5; 3],
             spots: &[None],
             intrinsics: Intrinsics {

@@ -163,6 +163,7 @@ async fn written(
         profile: Profile::default(),
         subsets: Subsets::NONE,
         per_spot: false,
+        two_bounce: false,
         ..*source.spec()
     };
     let (store, prefix) = open_store(&folder.display().to_string())?;

@@ -54,6 +54,9 @@ pub struct ReconstructSettings {
     /// Only these spots, ascending; empty = all.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
+    /// What becomes of pixels that are known to see a mirror.
+    #[serde(skip_serializing_if = "Mirrors::is_default")]
+    pub mirrors: Mirrors,
     /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
     pub views: u32,
     /// What the density is: a grid, or PlatoNeRF's networks.
@@ -79,6 +82,26 @@ pub enum Measurements {
     Predictions,
     /// A histogram of each spot alone (`per_spot = true` in the render stage), through PlatoNeRF's matched filter.
     Captures,
+    /// Two-bounce paths and masks that an import brought along (`two_bounce_path`): of bounce-flash lidar, or of one's own.
+    Given,
+}
+
+/// What becomes of pixels that see a mirror. Light comes to and from a mirror by other ways than two-bounce times suppose, so the
+/// method leaves open what to do (Shoot-Bounce-3D, appendix E).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mirrors {
+    /// They take no part.
+    #[default]
+    LeaveOut,
+    /// They take part as any other pixel: a network that predicts depth predicts the mirror's own.
+    Keep,
+}
+
+impl Mirrors {
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 fn is_grid(field: &FieldKind) -> bool {
@@ -228,7 +251,7 @@ impl ReconstructSettings {
                     "is empty; name an infer stage, or the folder that one wrote, as in predictions = \"seen\"".into(),
                 );
             }
-            (Measurements::Truth | Measurements::Captures, named) if !named.is_empty() => {
+            (from, named) if from != Measurements::Predictions && !named.is_empty() => {
                 return fail(
                     "predictions",
                     format!(
@@ -237,6 +260,11 @@ impl ReconstructSettings {
                 );
             }
             _ => {}
+        }
+        if self.from == Measurements::Captures && self.mirrors != Mirrors::default() {
+            let what =
+                "says what becomes of mirrors, which from = \"captures\" does not know; remove it";
+            return fail("mirrors", what.into());
         }
         if !self.spots.is_sorted_by(|a, b| a < b) {
             return fail(

@@ -49,6 +49,9 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
         }
         Quantity::Specular => "1 = mirror",
         Quantity::Visibility => "[spot][row][column]: 1 = the spot lights the point",
+        Quantity::TwoBouncePath => {
+            "[spot][row][column]: measured optical path of the spot's two-bounce light, metres; 0 = not measured"
+        }
         Quantity::Rgb => "colour, sRGB",
         Quantity::Spots => {
             "[spot]: position and normal (camera frame, metres), path from the laser; NaN = the beam meets nothing"
@@ -87,6 +90,10 @@ impl Dataset {
                 Quantity::Visibility => (
                     vec![s, h, w],
                     Values::U8(self.read_visibility(scene).await?),
+                ),
+                Quantity::TwoBouncePath => (
+                    vec![s, h, w],
+                    Values::F32(self.read(scene, quantity).await?),
                 ),
                 Quantity::Rgb => (vec![h, w, 3], Values::U8(self.read(scene, quantity).await?)),
                 Quantity::Specular => (vec![h, w], Values::U8(self.read(scene, quantity).await?)),

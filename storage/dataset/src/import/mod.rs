@@ -185,6 +185,7 @@ impl Source {
             spots: self.shape.spots,
             subsets: self.shape.subsets,
             per_spot: false,
+            two_bounce: self.shape.two_bounce,
             gate: self.shape.gate,
             profile,
         }

@@ -151,6 +151,7 @@ fn shape_of(
         width: width as u32,
         spots: spots as u32,
         subsets: Subsets::NONE,
+        two_bounce: false,
         gate: Gate {
             start_m: options.gate_start_m.unwrap_or(0.0),
             bin_width_m: options.bin_width_m.unwrap_or(0.0384),

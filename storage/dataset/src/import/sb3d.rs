@@ -111,6 +111,7 @@ pub(super) fn shape(item: &Item, options: &ImportOptions) -> Result<Shape, Impor
         width: width as u32,
         spots,
         subsets,
+        two_bounce: false,
         gate: Gate {
             start_m: options.gate_start_m.unwrap_or(gate.start_m),
             bin_width_m: options.bin_width_m.unwrap_or(gate.bin_width_m),

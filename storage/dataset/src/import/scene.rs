@@ -27,6 +27,8 @@ pub(super) struct Shape {
     pub width: u32,
     pub spots: u32,
     pub subsets: Subsets,
+    /// Whether two-bounce paths came with it.
+    pub two_bounce: bool,
     pub gate: Gate,
 }
 
@@ -45,6 +47,11 @@ impl Shape {
                 "subsets",
                 format!("{:?}", self.subsets.sizes()),
                 format!("{:?}", other.subsets.sizes()),
+            ),
+            (
+                "two_bounce",
+                self.two_bounce.to_string(),
+                other.two_bounce.to_string(),
             ),
             (
                 "gate",
@@ -79,6 +86,8 @@ pub struct ImportedScene {
     pub(super) label: Vec<u16>,
     pub(super) specular: Vec<u8>,
     pub(super) visibility: Vec<u8>,
+    /// `[spot][row][column]`, metres; empty where the shape has none.
+    pub(super) two_bounce: Vec<f32>,
     pub(super) rgb: Vec<f32>,
     pub(super) spots: Vec<Option<Spot>>,
     pub(super) intrinsics: Intrinsics,
@@ -112,6 +121,7 @@ impl ImportedScene {
             label: vec![0; n],
             specular: vec![0; n],
             visibility: vec![0; n * shape.spots as usize],
+            two_bounce: Vec::new(),
             rgb: vec![0.0; n * 3],
             spots: vec![None; shape.spots as usize],
             intrinsics,
@@ -242,6 +252,7 @@ impl ImportedScene {
             label: &self.label,
             specular: &self.specular,
             visibility: &self.visibility,
+            two_bounce: &self.two_bounce,
             rgb: &self.rgb,
             spots: &self.spots,
             intrinsics: self.intrinsics,

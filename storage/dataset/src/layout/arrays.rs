@@ -90,6 +90,11 @@ impl Quantity {
                     let dims = &["scene", "spot_byte", "row", "column"];
                     (U8, vec![n.div_ceil(8), h, w], dims, a)
                 }
+                Self::TwoBouncePath => {
+                    let a = json!({"long_name": "measured optical path of each spot's two-bounce light; 0 = not measured", "units": "m"});
+                    let dims = &["scene", "spot", "row", "column"];
+                    (F32, vec![n, h, w], dims, a)
+                }
                 Self::Rgb => {
                     let a = json!({"long_name": "colour image, red green blue, sRGB-encoded"});
                     (U8, vec![h, w, 3], &["scene", "row", "column", "channel"], a)

@@ -21,6 +21,9 @@ pub enum Quantity {
     Specular,
     /// Visibility bits, u8 `[⌈spots/8⌉][row][column]`; bit s mod 8 (little order) of byte s/8, 1 = lit.
     Visibility,
+    /// Measured optical path of the two-bounce light of each spot in metres, f32 `[spot][row][column]`, 0 = not measured. Only
+    /// data sets whose source gave it have it.
+    TwoBouncePath,
     /// sRGB-encoded colour, u8 `[row][column][3]`.
     Rgb,
     /// f32 `[spot][7]`: position and normal in the camera frame, path from the laser in metres; NaN = no spot.
@@ -85,7 +88,7 @@ impl Element {
 
 impl Quantity {
     /// All quantities there are, in the order of their objects in a manifest; see [`crate::DatasetSpec::quantities`].
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Transient,
         Self::Intensity,
         Self::Depth,
@@ -95,6 +98,7 @@ impl Quantity {
         Self::Label,
         Self::Specular,
         Self::Visibility,
+        Self::TwoBouncePath,
         Self::Rgb,
         Self::Spots,
         Self::Intrinsics,
@@ -135,6 +139,7 @@ impl Quantity {
             Self::Label => "label",
             Self::Specular => "specular",
             Self::Visibility => "visibility",
+            Self::TwoBouncePath => "two_bounce_path",
             Self::Rgb => "rgb",
             Self::Spots => "spots",
             Self::Intrinsics => "intrinsics",

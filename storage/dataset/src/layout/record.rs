@@ -52,6 +52,8 @@ pub struct SceneRecord<'a> {
     pub specular: &'a [u8],
     /// `[spot][row][column]`, 1 = lit.
     pub visibility: &'a [u8],
+    /// Measured two-bounce paths, metres, `[spot][row][column]`, 0 = not measured; empty where the data set has none.
+    pub two_bounce: &'a [f32],
     /// Linear colour `[row][column][3]`; stored clamped to [0, 1] and sRGB-encoded in 8 bits.
     pub rgb: &'a [f32],
     /// The spots; `None` where a beam meets nothing.
@@ -126,6 +128,7 @@ impl SceneRecord<'_> {
     pub(crate) fn check(&self, spec: &DatasetSpec) -> Result<(), DatasetError> {
         let pixels = spec.pixels();
         let spots = spec.spots as usize;
+        let paths = if spec.two_bounce { pixels * spots } else { 0 };
         let lengths = [
             ("transient", self.transient.len(), spec.transient_len()),
             ("depth", self.depth.len(), pixels),
@@ -135,6 +138,7 @@ impl SceneRecord<'_> {
             ("label", self.label.len(), pixels),
             ("specular", self.specular.len(), pixels),
             ("visibility", self.visibility.len(), pixels * spots),
+            ("two_bounce", self.two_bounce.len(), paths),
             ("rgb", self.rgb.len(), pixels * 3),
             ("spots", self.spots.len(), spots),
         ];
@@ -157,6 +161,12 @@ impl SceneRecord<'_> {
         check_values(
             "range",
             self.range,
+            |x| (0.0..=f32::MAX).contains(&x),
+            "a finite length of at least 0",
+        )?;
+        check_values(
+            "two_bounce",
+            self.two_bounce,
             |x| (0.0..=f32::MAX).contains(&x),
             "a finite length of at least 0",
         )?;

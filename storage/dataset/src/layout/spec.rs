@@ -69,6 +69,9 @@ pub struct DatasetSpec {
     /// Each spot has a transient of its own (`transient_spots`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
+    /// Two-bounce paths came with the scenes (`two_bounce_path`).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub two_bounce: bool,
     /// The gate.
     pub gate: Gate,
     /// Codec of the transients.
@@ -269,6 +272,7 @@ impl DatasetSpec {
             Quantity::Transient4 => self.subsets.four,
             Quantity::Transient25 => self.subsets.twenty_five,
             Quantity::TransientSpots => self.per_spot,
+            Quantity::TwoBouncePath => self.two_bounce,
             _ => true,
         };
         Quantity::ALL.into_iter().filter(has).collect()
@@ -289,6 +293,11 @@ impl DatasetSpec {
                 "per_spot",
                 self.per_spot.to_string(),
                 asked.per_spot.to_string(),
+            ),
+            (
+                "two_bounce",
+                self.two_bounce.to_string(),
+                asked.two_bounce.to_string(),
             ),
             (
                 "gate.start_m",

@@ -35,6 +35,7 @@ pub async fn remains(store: Arc<dyn ObjectStore>, prefix: Path) -> Result<Remain
         spots: 1,
         subsets: Subsets::NONE,
         per_spot: false,
+        two_bounce: false,
         gate: Gate {
             start_m: 0.0,
             bin_width_m: 1.0,

@@ -12,7 +12,7 @@ use crate::scenes::encode::{Content, EncodedScene, assemble, intensity};
 use crate::store::objects;
 
 /// Everything of a published scene that is neither a histogram nor made from one: depth, range, normals, instances,
-/// labels, specular, visibility, RGB, spots, intrinsics, pose and laser, as stored.
+/// labels, specular, visibility, two-bounce paths, RGB, spots, intrinsics, pose and laser, as stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneTruth {
     spec: DatasetSpec,
@@ -82,6 +82,10 @@ impl Dataset {
             let what = "a derived data set has one histogram a scene; found subsets of spots too";
             return Err(DatasetError::invalid("spec.subsets", what));
         }
+        if spec.two_bounce != truth.spec.two_bounce {
+            let what = "one of both has two-bounce paths, the other has not";
+            return Err(DatasetError::invalid("spec.two_bounce", what));
+        }
         if transient.len() != spec.transient_len() {
             let (expected, found) = (spec.transient_len(), transient.len());
             let what = format!("expected {expected} values, found {found}");
@@ -133,6 +137,11 @@ impl SceneTruth {
         let rows: Vec<&[u8]> = self.arrays[&Quantity::Spots].chunks_exact(7 * 4).collect();
         let rows = chosen.iter().map(|s| rows[*s as usize]);
         let rows = rows.collect::<Vec<_>>().concat();
+        if let Some(paths) = self.arrays.get_mut(&Quantity::TwoBouncePath) {
+            let spots: Vec<&[u8]> = paths.chunks_exact(pixels * 4).collect();
+            let kept: Vec<&[u8]> = chosen.iter().map(|s| spots[*s as usize]).collect();
+            *paths = kept.concat();
+        }
         self.arrays.insert(Quantity::Visibility, visibility);
         self.arrays.insert(Quantity::Spots, rows);
         self.spec.spots = chosen.len() as u32;

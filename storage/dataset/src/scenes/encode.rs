@@ -195,6 +195,7 @@ fn small_array(spec: &DatasetSpec, quantity: Quantity, record: &SceneRecord<'_>)
             }
             packed
         }
+        Quantity::TwoBouncePath => bytemuck::cast_slice(record.two_bounce).to_vec(),
         Quantity::Rgb => record.rgb.iter().map(|x| srgb_u8(*x)).collect(),
         Quantity::Spots => {
             let row = |spot: &Option<crate::layout::record::Spot>| {

@@ -5,6 +5,7 @@
     reason = "each test binary uses a part of this"
 )]
 
+pub mod mat;
 pub mod npy;
 pub mod room;
 mod scene;

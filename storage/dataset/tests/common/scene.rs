@@ -16,6 +16,7 @@ pub fn spec(profile: Profile) -> DatasetSpec {
         spots: 9,
         subsets: Subsets::NONE,
         per_spot: false,
+        two_bounce: false,
         gate: Gate {
             start_m: 1.0,
             bin_width_m: 0.0384,
@@ -110,6 +111,7 @@ impl Scene {
             label: &self.label,
             specular: &self.specular,
             visibility: &self.visibility,
+            two_bounce: &[],
             rgb: &self.rgb,
             spots: &self.spots,
             intrinsics: Intrinsics {

@@ -292,6 +292,7 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
         subsets: Subsets::of(&render.subsets)
             .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,
         per_spot: render.per_spot,
+        two_bounce: false,
         gate: render.gate(),
         profile: Profile::parse(&spec.output.profile)
             .map_err(|e| TaskError::User(format!("output.profile: {e}")))?,

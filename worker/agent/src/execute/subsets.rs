@@ -58,6 +58,7 @@ mod tests {
             spots: 100,
             subsets: Subsets::of(&[4, 25]).unwrap(),
             per_spot: true,
+            two_bounce: false,
             gate: Gate {
                 start_m: 1.0,
                 bin_width_m: 0.1,

@@ -85,6 +85,7 @@ impl Place {
             spots: 2,
             subsets: Subsets::NONE,
             per_spot: true,
+            two_bounce: false,
             gate: Gate {
                 start_m: 1.0,
                 bin_width_m: 1.5,
@@ -132,6 +133,7 @@ impl Place {
             visibility: &(0..pixels * 2)
                 .map(|i| u8::from(i % 3 > 0))
                 .collect::<Vec<_>>(),
+            two_bounce: &[],
             rgb: &vec![0.25; pixels * 3],
             spots: &spots,
             intrinsics: Intrinsics {

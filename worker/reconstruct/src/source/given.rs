@@ -1,5 +1,6 @@
-//! Measurements from depth and masks that are given: a data set's truth, or what networks predict of one multiplexed
-//! histogram (Shoot-Bounce-3D, appendices C and E: two-bounce times follow from depth by geometry).
+//! Measurements from masks that are given, and from depth or two-bounce paths: a data set's truth, what networks predict of one
+//! multiplexed histogram (Shoot-Bounce-3D, appendices C and E: two-bounce times follow from depth by geometry), or what another
+//! instrument's own processing found.
 
 use picofarm_scene::{Camera, Vec3};
 
@@ -16,15 +17,29 @@ pub struct Given<'a> {
     pub spots: &'a [Option<(Vec3, f32)>],
     /// The beams that are used, ascending.
     pub beams: &'a [u32],
-    /// Distance along the ray, metres; 0 or not finite = nothing is seen.
-    pub range_m: &'a [f32],
+    /// Where two-bounce times come from.
+    pub times: Times<'a>,
     /// 1 where lit, of each used beam: `[beam][row][column]`.
     pub lit: &'a [u8],
     /// 1 where a mirror is seen: such pixels take no part, since what light they show came by other ways.
     pub mirror: &'a [u8],
 }
 
-/// Times by geometry, and the masks as they are.
+/// Where two-bounce times come from.
+#[derive(Debug, Clone, Copy)]
+pub enum Times<'a> {
+    /// They follow from the distance along each pixel's ray, metres; 0 or not finite = nothing is seen.
+    Range(&'a [f32]),
+    /// They were measured.
+    Paths {
+        /// Optical path of each used beam, `[beam][row][column]`; 0 or not finite = not measured.
+        metres: &'a [f32],
+        /// Width of the bins in which they were measured, metres.
+        bin_width_m: f32,
+    },
+}
+
+/// Times as they were measured, else by geometry; and the masks as they are.
 ///
 /// # Errors
 /// [`ReconstructError::Invalid`] naming what has another size.
@@ -36,25 +51,34 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         tau: Vec::new(),
         lit: Vec::new(),
         used: Vec::new(),
-        bin_width_m: 0.0,
+        bin_width_m: match given.times {
+            Times::Range(_) => 0.0,
+            Times::Paths { bin_width_m, .. } => bin_width_m,
+        },
         mirror: given.mirror.to_vec(),
         left_out: Vec::new(),
     };
     let pixels = measured.pixels();
+    let images = given.beams.len() * pixels;
+    let times = match given.times {
+        Times::Range(metres) => ("times.range", metres.len(), pixels),
+        Times::Paths { metres, .. } => ("times.paths", metres.len(), images),
+    };
     for (field, found, expected) in [
-        ("range_m", given.range_m.len(), pixels),
+        times,
         ("mirror", given.mirror.len(), pixels),
-        ("lit", given.lit.len(), given.beams.len() * pixels),
+        ("lit", given.lit.len(), images),
     ] {
         if found != expected {
             let what = format!("has {found} values, expected {expected}");
             return Err(ReconstructError::invalid(field, what));
         }
     }
-    for (&number, lit) in given
+    for (image, (&number, lit)) in given
         .beams
         .iter()
         .zip(given.lit.chunks_exact(pixels.max(1)))
+        .enumerate()
     {
         let beam = number as usize;
         let leave_out = |why: &str| LeftOut {
@@ -74,16 +98,28 @@ pub fn given(given: &Given<'_>) -> Result<Measured, ReconstructError> {
         };
         let straight = (point - given.laser).length();
         let to_spot = (point - given.camera.origin).normalized();
+        // No light of two bounces is faster.
+        let shortest = path_m + (point - given.camera.origin).length();
         for (p, &lit) in lit.iter().enumerate() {
-            let (ray, range) = (measured.ray(p), given.range_m[p]);
+            let ray = measured.ray(p);
             let near = ray.cross(to_spot).length() < NEAR_SPOT_SINE && ray.dot(to_spot) > 0.0;
-            let seen = range.is_finite() && range > 0.0 && given.mirror[p] == 0;
-            let x = given.camera.origin + ray * range;
-            let usable = seen && !near && (x - point).length() > 0.0;
-            let tau = match usable && lit != 0 {
-                true => path_m + (x - point).length() + range,
-                false => 0.0,
+            let (usable, path) = match given.times {
+                // In shadow there is no path to be measured.
+                Times::Paths { metres, .. } => {
+                    let path = metres[image * pixels + p];
+                    let possible = path.is_finite() && path > shortest;
+                    (lit == 0 || possible, path)
+                }
+                Times::Range(metres) => {
+                    let range = metres[p];
+                    let x = given.camera.origin + ray * range;
+                    let away = (x - point).length();
+                    let seen = range.is_finite() && range > 0.0 && away > 0.0;
+                    (seen, path_m + away + range)
+                }
             };
+            let usable = usable && !near && given.mirror[p] == 0;
+            let tau = if usable && lit != 0 { path } else { 0.0 };
             measured.tau.push(tau);
             measured.lit.push(u8::from(lit != 0));
             measured.used.push(u8::from(usable));

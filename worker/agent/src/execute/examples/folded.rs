@@ -101,6 +101,7 @@ fn seen() -> Arc<Seen> {
         spots: 1,
         subsets: Subsets::NONE,
         per_spot: false,
+        two_bounce: false,
         gate,
         profile: Profile::LOSSLESS,
     };

@@ -4,6 +4,7 @@
 //! take minutes to days: they go on from their newest checkpoint.
 
 mod captured;
+mod measured;
 #[cfg(feature = "networks")]
 mod mlp;
 #[cfg(not(feature = "networks"))]
@@ -16,26 +17,19 @@ use std::collections::BTreeMap;
 
 use bytes::Bytes;
 use picofarm_dataset::{
-    Dataset, DatasetError, Manifest, Predictions, Quantity, ReconstructionManifest,
-    Reconstructions, SceneUsed,
+    DatasetError, Manifest, ReconstructionManifest, Reconstructions, SceneUsed,
 };
 use picofarm_proto::{
     key::TaskKey,
     model::{
         SpecError, TaskSpec,
-        kinds::{
-            ReconstructTask, TaskKind,
-            reconstruct::{Measurements, ReconstructSettings},
-        },
+        kinds::{ReconstructTask, TaskKind, reconstruct::ReconstructSettings},
     },
 };
 use picofarm_reconstruct::{
     Measured, Phase, Progress, ReconstructError, Reconstructed, Reconstruction, VERSION, World,
-    score,
-    source::{Given, given},
-    surface,
+    score, surface,
 };
-use picofarm_scene::{Intrinsics, Vec3};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 use tracing::{info, warn};
@@ -48,7 +42,6 @@ use crate::execute::{
 };
 
 pub use captured::slant;
-use captured::{Frame, captures};
 pub use pictures::{CELL, STEP, columns, first_row, shaded, views};
 pub use written::{density, errors, facts};
 
@@ -163,197 +156,6 @@ impl Work<'_> {
             settings,
             ..ReconstructionManifest::default()
         }
-    }
-
-    /// The predictions that are read, and which they are.
-    fn predictions(
-        &self,
-        stores: &Stores,
-        found: &Manifest,
-        control: &Control,
-    ) -> Result<Option<(Predictions, SceneUsed)>, TaskError> {
-        let index = found.scene;
-        let folder = &self.0.reconstruct.predictions;
-        if folder.is_empty() {
-            return Ok(None);
-        }
-        let at = |e: TaskError| match e {
-            TaskError::User(what) => TaskError::User(format!("reconstruct.predictions: {what}")),
-            other => other,
-        };
-        let (store, prefix) = stores.source(&self.0.source.store)?;
-        let opened = Predictions::open(store, prefix.join(&**folder));
-        let predictions = stores.wait(control, opened).map_err(at)?;
-        let spec = predictions.spec();
-        if !spec.depth || spec.spots.is_empty() {
-            return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds {}; depth and masks are needed: give its infer stage a \"tof\" and a \
-                 \"shadow\" model",
-                predictions.place(),
-                match (spec.depth, spec.spots.is_empty()) {
-                    (true, _) => "no masks of spots",
-                    (_, false) => "no depth",
-                    _ => "neither depth nor masks",
-                }
-            )));
-        }
-        let manifest = stores
-            .wait(control, predictions.manifest(index))
-            .map_err(at)?;
-        if manifest.source.manifest_sha256 != manifest_sha256(found) {
-            return Err(TaskError::User(format!(
-                "reconstruct.predictions: {} holds what networks predict of scene {index} of {:?}, which is not the scene of \
-                 this stage's source, {:?}; name the data set that the infer stage has read",
-                predictions.place(),
-                manifest.source.dataset,
-                self.0.source.dataset,
-            )));
-        }
-        let used = SceneUsed {
-            dataset: folder.clone(),
-            task_key: manifest.task_key.clone(),
-            manifest_sha256: manifest.sha256(),
-        };
-        Ok(Some((predictions, used)))
-    }
-
-    /// Times and masks of the scene, in the axes of the scene.
-    fn measured(
-        &self,
-        stores: &Stores,
-        dataset: &Dataset,
-        found: &Manifest,
-        predictions: Option<&Predictions>,
-        control: &Control,
-    ) -> Result<Measured, TaskError> {
-        let (scene, from) = (found.scene, self.0.reconstruct.from);
-        let needed: &[&str] = match from {
-            Measurements::Truth => &["depth", "visibility", "spots.path"],
-            Measurements::Predictions => &["spots.path"],
-            Measurements::Captures => &["spots.path"],
-        };
-        let missing = found.missing();
-        if let Some(missing) = missing.iter().find(|m| needed.contains(&m.as_str())) {
-            return Err(TaskError::User(format!(
-                "source: scene {scene} of {} was imported without {missing:?}, which from = {:?} needs; import it with it, \
-                 or choose other measurements",
-                dataset.place(),
-                json!(from).as_str().unwrap_or_default(),
-            )));
-        }
-        control.say("reads the scene".into(), &[]);
-        let spec = dataset.spec();
-        let read = async {
-            futures::try_join!(
-                dataset.read_spots(scene),
-                dataset.read_intrinsics(scene),
-                dataset.read::<f32>(scene, Quantity::Camera),
-                dataset.read::<f32>(scene, Quantity::Laser),
-                dataset.read::<f32>(scene, Quantity::Depth),
-                dataset.read::<u8>(scene, Quantity::Specular),
-            )
-        };
-        let (spots, intrinsics, pose, laser, mut depth, mut mirror) = stores.wait(control, read)?;
-        let frame = Frame(&pose);
-        let camera = frame.camera(Intrinsics {
-            fx: intrinsics.fx,
-            fy: intrinsics.fy,
-            cx: intrinsics.cx,
-            cy: intrinsics.cy,
-            width: spec.width,
-            height: spec.height,
-        });
-        let laser = frame.point([laser[0], laser[1], laser[2]]);
-        let spots: Vec<Option<(Vec3, f32)>> = spots
-            .iter()
-            .map(|spot| spot.map(|s| (frame.point(s.position), s.path_m)))
-            .collect();
-        let beams = self.beams(spec.spots, predictions)?;
-        if from == Measurements::Captures {
-            return captures(
-                stores,
-                dataset,
-                scene,
-                (camera, laser, &spots, &beams),
-                control,
-            );
-        }
-        let pixels = spec.pixels();
-        let all: Vec<u8> = match predictions {
-            None => stores.wait(control, dataset.read_visibility(scene))?,
-            Some(predictions) => {
-                let predicted = stores.wait(control, predictions.read(scene))?;
-                if predicted.depth_m.len() != pixels {
-                    return Err(TaskError::User(format!(
-                        "reconstruct.predictions: {} has images of another size than {}",
-                        predictions.place(),
-                        dataset.place()
-                    )));
-                }
-                depth = predicted.depth_m;
-                // Where no network looks for mirrors, the truth is not asked instead.
-                mirror = match predicted.specular.is_empty() {
-                    true => vec![0; pixels],
-                    false => predicted
-                        .specular
-                        .iter()
-                        .map(|p| u8::from(*p >= 128))
-                        .collect(),
-                };
-                let mut all = vec![0; spots.len() * pixels];
-                for (number, mask) in predictions
-                    .spec()
-                    .spots
-                    .iter()
-                    .zip(predicted.lit.chunks_exact(pixels))
-                {
-                    let to = &mut all[*number as usize * pixels..][..pixels];
-                    for (to, p) in to.iter_mut().zip(mask) {
-                        *to = u8::from(*p >= 128);
-                    }
-                }
-                all
-            }
-        };
-        let lit: Vec<u8> = beams
-            .iter()
-            .flat_map(|b| &all[*b as usize * pixels..][..pixels])
-            .copied()
-            .collect();
-        let range: Vec<f32> = (0..pixels).map(|p| depth[p] * slant(&camera, p)).collect();
-        given(&Given {
-            camera,
-            laser,
-            spots: &spots,
-            beams: &beams,
-            range_m: &range,
-            lit: &lit,
-            mirror: &mirror,
-        })
-        .map_err(of_reconstruction)
-    }
-
-    /// The beams that are used.
-    fn beams(&self, spots: u32, predictions: Option<&Predictions>) -> Result<Vec<u32>, TaskError> {
-        let there: Vec<u32> = match predictions {
-            Some(predictions) => predictions.spec().spots.clone(),
-            None => (0..spots).collect(),
-        };
-        let wanted = &self.0.reconstruct.spots;
-        if let Some(none) = wanted.iter().find(|s| !there.contains(s)) {
-            return Err(TaskError::User(format!(
-                "reconstruct.spots: there is nothing of spot {none}; there is of {}",
-                there
-                    .iter()
-                    .map(u32::to_string)
-                    .collect::<Vec<_>>()
-                    .join(", ")
-            )));
-        }
-        Ok(match wanted.is_empty() {
-            true => there,
-            false => wanted.clone(),
-        })
     }
 
     /// Fits the field.

@@ -230,6 +230,7 @@ pub(in crate::execute) fn record<'a>(
         label: &truth.label,
         specular: &truth.specular,
         visibility: &truth.visibility,
+        two_bounce: &[],
         rgb: &truth.rgb,
         spots,
         intrinsics: Intrinsics {

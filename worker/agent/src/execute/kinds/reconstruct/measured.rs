@@ -1,0 +1,263 @@
+//! Two-bounce times and masks of a scene, by where they come from.
+
+use picofarm_dataset::{Dataset, DatasetError, Manifest, Predictions, Quantity, SceneUsed};
+use picofarm_proto::model::kinds::reconstruct::{Measurements, Mirrors};
+use picofarm_reconstruct::{
+    Measured,
+    source::{Given, Times, given},
+};
+use picofarm_scene::{Intrinsics, Vec3};
+use serde_json::json;
+
+use super::{
+    Work,
+    captured::{Frame, captures, slant},
+    of_reconstruction,
+};
+use crate::execute::{
+    Control, TaskError,
+    output::{Stores, manifest_sha256},
+};
+
+impl Work<'_> {
+    /// The predictions that are read, and which they are.
+    pub(super) fn predictions(
+        &self,
+        stores: &Stores,
+        found: &Manifest,
+        control: &Control,
+    ) -> Result<Option<(Predictions, SceneUsed)>, TaskError> {
+        let index = found.scene;
+        let folder = &self.0.reconstruct.predictions;
+        if folder.is_empty() {
+            return Ok(None);
+        }
+        let at = |e: TaskError| match e {
+            TaskError::User(what) => TaskError::User(format!("reconstruct.predictions: {what}")),
+            other => other,
+        };
+        let (store, prefix) = stores.source(&self.0.source.store)?;
+        let opened = Predictions::open(store, prefix.join(&**folder));
+        let predictions = stores.wait(control, opened).map_err(at)?;
+        let spec = predictions.spec();
+        if !spec.depth || spec.spots.is_empty() {
+            return Err(TaskError::User(format!(
+                "reconstruct.predictions: {} holds {}; depth and masks are needed: give its infer stage a \"tof\" and a \
+                 \"shadow\" model",
+                predictions.place(),
+                match (spec.depth, spec.spots.is_empty()) {
+                    (true, _) => "no masks of spots",
+                    (_, false) => "no depth",
+                    _ => "neither depth nor masks",
+                }
+            )));
+        }
+        let manifest = stores
+            .wait(control, predictions.manifest(index))
+            .map_err(at)?;
+        if manifest.source.manifest_sha256 != manifest_sha256(found) {
+            return Err(TaskError::User(format!(
+                "reconstruct.predictions: {} holds what networks predict of scene {index} of {:?}, which is not the scene of \
+                 this stage's source, {:?}; name the data set that the infer stage has read",
+                predictions.place(),
+                manifest.source.dataset,
+                self.0.source.dataset,
+            )));
+        }
+        let used = SceneUsed {
+            dataset: folder.clone(),
+            task_key: manifest.task_key.clone(),
+            manifest_sha256: manifest.sha256(),
+        };
+        Ok(Some((predictions, used)))
+    }
+
+    /// Times and masks of the scene, in the axes of the scene.
+    pub(super) fn measured(
+        &self,
+        stores: &Stores,
+        dataset: &Dataset,
+        found: &Manifest,
+        predictions: Option<&Predictions>,
+        control: &Control,
+    ) -> Result<Measured, TaskError> {
+        let (scene, from) = (found.scene, self.0.reconstruct.from);
+        let needed: &[&str] = match from {
+            Measurements::Truth => &["depth", "visibility", "spots.path"],
+            Measurements::Given => &["visibility", "spots.path"],
+            Measurements::Predictions | Measurements::Captures => &["spots.path"],
+        };
+        let missing = found.missing();
+        if let Some(missing) = missing.iter().find(|m| needed.contains(&m.as_str())) {
+            return Err(TaskError::User(format!(
+                "source: scene {scene} of {} was imported without {missing:?}, which from = {:?} needs; import it with it, \
+                 or choose other measurements",
+                dataset.place(),
+                json!(from).as_str().unwrap_or_default(),
+            )));
+        }
+        let spec = dataset.spec();
+        if from == Measurements::Given && !spec.two_bounce {
+            return Err(TaskError::User(format!(
+                "source: {} has no two-bounce paths, which from = \"given\" reads; import files that have them, or choose other \
+                 measurements",
+                dataset.place()
+            )));
+        }
+        control.say("reads the scene".into(), &[]);
+        let read = async {
+            futures::try_join!(
+                dataset.read_spots(scene),
+                dataset.read_intrinsics(scene),
+                dataset.read::<f32>(scene, Quantity::Camera),
+                dataset.read::<f32>(scene, Quantity::Laser),
+            )
+        };
+        let (spots, intrinsics, pose, laser) = stores.wait(control, read)?;
+        let frame = Frame(&pose);
+        let camera = frame.camera(Intrinsics {
+            fx: intrinsics.fx,
+            fy: intrinsics.fy,
+            cx: intrinsics.cx,
+            cy: intrinsics.cy,
+            width: spec.width,
+            height: spec.height,
+        });
+        let laser = frame.point([laser[0], laser[1], laser[2]]);
+        let spots: Vec<Option<(Vec3, f32)>> = spots
+            .iter()
+            .map(|spot| spot.map(|s| (frame.point(s.position), s.path_m)))
+            .collect();
+        let beams = self.beams(spec.spots, predictions)?;
+        if from == Measurements::Captures {
+            return captures(
+                stores,
+                dataset,
+                scene,
+                (camera, laser, &spots, &beams),
+                control,
+            );
+        }
+        let mut images = match predictions {
+            None => stores.wait(control, images_of(dataset, scene))?,
+            Some(predictions) => predicted(stores, dataset, predictions, scene, control)?,
+        };
+        if self.0.reconstruct.mirrors == Mirrors::Keep {
+            images.mirror.fill(0);
+        }
+        let pixels = spec.pixels();
+        let lit: Vec<u8> = of_beams(&images.lit, &beams, pixels);
+        let (range, paths): (Vec<f32>, Vec<f32>);
+        let times = if from == Measurements::Given {
+            let all = dataset.read::<f32>(scene, Quantity::TwoBouncePath);
+            paths = of_beams(&stores.wait(control, all)?, &beams, pixels);
+            Times::Paths {
+                metres: &paths,
+                bin_width_m: spec.gate.bin_width_m as f32,
+            }
+        } else {
+            let along = |(p, depth): (usize, &f32)| depth * slant(&camera, p);
+            range = images.depth_m.iter().enumerate().map(along).collect();
+            Times::Range(&range)
+        };
+        given(&Given {
+            camera,
+            laser,
+            spots: &spots,
+            beams: &beams,
+            times,
+            lit: &lit,
+            mirror: &images.mirror,
+        })
+        .map_err(of_reconstruction)
+    }
+
+    /// The beams that are used.
+    fn beams(&self, spots: u32, predictions: Option<&Predictions>) -> Result<Vec<u32>, TaskError> {
+        let there: Vec<u32> = match predictions {
+            Some(predictions) => predictions.spec().spots.clone(),
+            None => (0..spots).collect(),
+        };
+        let wanted = &self.0.reconstruct.spots;
+        if let Some(none) = wanted.iter().find(|s| !there.contains(s)) {
+            return Err(TaskError::User(format!(
+                "reconstruct.spots: there is nothing of spot {none}; there is of {}",
+                there
+                    .iter()
+                    .map(u32::to_string)
+                    .collect::<Vec<_>>()
+                    .join(", ")
+            )));
+        }
+        Ok(match wanted.is_empty() {
+            true => there,
+            false => wanted.clone(),
+        })
+    }
+}
+
+/// What tells of each pixel.
+struct Images {
+    depth_m: Vec<f32>,
+    /// `[spot][row][column]` of every spot.
+    lit: Vec<u8>,
+    mirror: Vec<u8>,
+}
+
+/// Those of a data set. What an import lacks is zero there.
+async fn images_of(dataset: &Dataset, scene: u64) -> Result<Images, DatasetError> {
+    let (depth_m, lit, mirror) = futures::try_join!(
+        dataset.read::<f32>(scene, Quantity::Depth),
+        dataset.read_visibility(scene),
+        dataset.read::<u8>(scene, Quantity::Specular),
+    )?;
+    Ok(Images {
+        depth_m,
+        lit,
+        mirror,
+    })
+}
+
+/// What networks predict. Where none looks for mirrors, the truth is not asked instead.
+fn predicted(
+    stores: &Stores,
+    dataset: &Dataset,
+    predictions: &Predictions,
+    scene: u64,
+    control: &Control,
+) -> Result<Images, TaskError> {
+    let (spec, pixels) = (dataset.spec(), dataset.spec().pixels());
+    let found = stores.wait(control, predictions.read(scene))?;
+    if found.depth_m.len() != pixels {
+        return Err(TaskError::User(format!(
+            "reconstruct.predictions: {} has images of another size than {}",
+            predictions.place(),
+            dataset.place()
+        )));
+    }
+    // At least one half.
+    let likely = |p: &u8| u8::from(*p >= 128);
+    let mirror = match found.specular.is_empty() {
+        true => vec![0; pixels],
+        false => found.specular.iter().map(likely).collect(),
+    };
+    let mut lit = vec![0; spec.spots as usize * pixels];
+    let masks = found.lit.chunks_exact(pixels);
+    for (number, mask) in predictions.spec().spots.iter().zip(masks) {
+        let to = &mut lit[*number as usize * pixels..][..pixels];
+        for (to, p) in to.iter_mut().zip(mask) {
+            *to = likely(p);
+        }
+    }
+    Ok(Images {
+        depth_m: found.depth_m,
+        lit,
+        mirror,
+    })
+}
+
+/// The images of these beams.
+fn of_beams<T: Copy>(all: &[T], beams: &[u32], pixels: usize) -> Vec<T> {
+    let of = beams.iter().map(|b| &all[*b as usize * pixels..][..pixels]);
+    of.collect::<Vec<_>>().concat()
+}
