@@ -164,7 +164,8 @@ impl Caustics {
                 } else {
                     cos.max(0.0)
                 };
-                if wide {
+                // What is too far away to count is left to chance.
+                if wide && world.counts(t as usize) {
                     sum += f64::from(area * cos / d2 * e.intensity(w));
                 }
                 if apart {
@@ -176,10 +177,12 @@ impl Caustics {
         }
         if !apart {
             let mut sum = 0.0;
-            self.rows.extend(self.areas.iter().map(|&a| {
-                sum += f64::from(a);
-                sum
-            }));
+            for (&t, &area) in self.triangles.iter().zip(&self.areas) {
+                if world.counts(t as usize) {
+                    sum += f64::from(area);
+                }
+                self.rows.push(sum);
+            }
         }
         Some(())
     }

@@ -34,10 +34,8 @@ const NARROW: f64 = 1.0 / 40.0;
 
 /// True where ellipsoidal connections pay.
 pub(crate) fn pays(gate: &Gate, world: &World) -> bool {
-    let all = || world.triangles.iter().flatten();
-    let low = all().fold(Vec3::ZERO, |a, &p| a.min(p));
-    let high = all().fold(Vec3::ZERO, |a, &p| a.max(p));
-    gate.bin_width_m * f64::from(gate.bins) < NARROW * world.metres((high - low).length())
+    let length = gate.bin_width_m * f64::from(gate.bins);
+    length < NARROW * world.metres(world.diagonal)
 }
 
 /// A range of optical path, metres.

@@ -7,6 +7,7 @@ mod bvh;
 mod caustic;
 mod ellipsoid;
 mod emitter;
+mod extent;
 mod film;
 mod light_vertices;
 mod mirror_images;

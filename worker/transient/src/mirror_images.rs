@@ -89,7 +89,7 @@ impl Mirrors {
         for (i, t) in world.triangles.iter().enumerate() {
             let surface = &world.surfaces[world.surface[i] as usize];
             let n = world.normals[i];
-            if !surface.specular || n == Vec3::ZERO {
+            if !surface.specular || n == Vec3::ZERO || !world.counts(i) {
                 continue;
             }
             if i % 4096 == 0 && stop.asked() {

@@ -21,6 +21,8 @@ pub(crate) enum Stream {
     Grid = 4,
     /// Light paths by way of near-mirrors.
     Caustic = 5,
+    /// How far camera and light reach.
+    Extent = 6,
 }
 
 fn splitmix(mut z: u64) -> u64 {

@@ -10,6 +10,7 @@ use crate::{
     api::{RenderError, Stop},
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
+    extent::{self, Point, wide},
     rng::Rng,
 };
 
@@ -46,6 +47,10 @@ pub(crate) struct World {
     pub laser: Vec3,
     /// Render units per metre: a power of two.
     pub scale: f32,
+    /// Diagonal of the box around what camera and light reach, render units.
+    pub diagonal: f32,
+    /// How far from the camera a surface may be for light to count that scatters there, render units.
+    horizon: f32,
     /// The camera (its origin is the origin of render units).
     pub camera: Camera,
 }
@@ -75,11 +80,12 @@ impl Hit {
 }
 
 impl World {
+    /// A world in which light counts that travels up to `horizon_m`.
+    ///
     /// # Errors
     /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
-    pub fn new(scene: &Scene, stop: Stop) -> Result<Self, RenderError> {
+    pub fn new(scene: &Scene, horizon_m: f64, stop: Stop) -> Result<Self, RenderError> {
         let origin = scene.camera.origin;
-        let wide = |v: Vec3| [f64::from(v.x), f64::from(v.y), f64::from(v.z)];
         let centre = wide(origin);
         let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
         let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
@@ -133,15 +139,29 @@ impl World {
                 ),
             });
         }
-        let scale = scale_for(widest);
-        let triangles: Vec<[Vec3; 3]> = points
-            .iter()
-            .map(|t| t.map(|p| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32))))
-            .collect();
-        let normals = triangles
-            .iter()
-            .map(|t| normal(t).unwrap_or_default())
-            .collect();
+        let reach = extent::reach(scene, &points, widest, horizon_m);
+        let scale = scale_for(reach);
+        let mut normals = None;
+        if reach < widest {
+            let mut cut = Cut::default();
+            for (k, t) in points.iter().enumerate() {
+                cut.push(k, t, uv.get(k), f64::from(scale));
+            }
+            let of = |all: &[u32]| cut.of.iter().map(|&k| all[k]).collect();
+            (surface, object) = (of(&surface), of(&object));
+            (points, uv, normals) = (cut.points, cut.uv, Some(cut.normals));
+        }
+        let unit = |p: Point| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32));
+        let triangles: Vec<[Vec3; 3]> = points.iter().map(|t| t.map(unit)).collect();
+        let normals = normals.unwrap_or_else(|| {
+            let each = triangles.iter();
+            each.map(|t| normal(t).unwrap_or_default()).collect()
+        });
+        let edge = (reach * f64::from(scale)) as f32;
+        let inside = |p: &Vec3| p.x.abs().max(p.y.abs()).max(p.z.abs()) <= edge;
+        let corners = || triangles.iter().flatten().copied().filter(inside);
+        let low = corners().fold(Vec3::ZERO, Vec3::min);
+        let high = corners().fold(Vec3::ZERO, Vec3::max);
         Ok(Self {
             bvh: Bvh::build_unless(&triangles, stop)?,
             triangles,
@@ -156,8 +176,19 @@ impl World {
             uv,
             laser: (scene.laser.origin - origin) * scale,
             scale,
+            diagonal: (high - low).length().max(edge),
+            horizon: (horizon_m * f64::from(scale)) as f32,
             camera: scene.camera,
         })
+    }
+
+    /// False where all light that scatters on a triangle comes too late to count.
+    pub fn counts(&self, triangle: usize) -> bool {
+        let t = &self.triangles[triangle];
+        let (low, high) = (t[0].min(t[1]).min(t[2]), t[0].max(t[1]).max(t[2]));
+        // From the camera, in the origin, to the nearest point of the box around it.
+        let near = low.max(Vec3::ZERO) + high.min(Vec3::ZERO);
+        near.length() <= self.horizon
     }
 
     /// World metres → render units.
@@ -259,6 +290,36 @@ impl World {
     /// True where the straight way from the camera to a surface point is free.
     pub fn seen(&self, stack: &mut Stack, p: Vec3, n: Vec3) -> bool {
         !self.bvh.occluded(stack, Vec3::ZERO, lift(p, n), 1.0)
+    }
+}
+
+/// Triangles after those that are far too wide were cut.
+#[derive(Default)]
+struct Cut {
+    points: Vec<[Point; 3]>,
+    uv: Vec<[[f32; 2]; 3]>,
+    normals: Vec<Vec3>,
+    /// Which triangle a piece was cut from.
+    of: Vec<usize>,
+}
+
+impl Cut {
+    fn push(&mut self, k: usize, t: &[Point; 3], uv: Option<&[[f32; 2]; 3]>, scale: f64) {
+        let unit = |p: Point| Vec3::from(p.map(|x| (x * scale) as f32));
+        let corner = |i: usize| (t[i], uv.map_or([0.0; 2], |uv| uv[i].map(f64::from)));
+        let pieces = extent::cut([0, 1, 2].map(corner), scale);
+        let normal = match &pieces {
+            None => normal(&t.map(unit)),
+            Some(_) => extent::normal(t),
+        };
+        for piece in pieces.unwrap_or_else(|| vec![[0, 1, 2].map(corner)]) {
+            self.points.push(piece.map(|c| c.0));
+            if uv.is_some() {
+                self.uv.push(piece.map(|c| c.1.map(|x| x as f32)));
+            }
+            self.normals.push(normal.unwrap_or_default());
+            self.of.push(k);
+        }
     }
 }
 

@@ -69,7 +69,8 @@ impl Patches {
                 let surface = &world.surfaces[world.surface[t] as usize];
                 let scatters = !surface.is_black() && (surface.diffuse() || surface.is_mixed());
                 let area = area(&world.triangles[t]);
-                let counts = scatters && world.normals[t] != Vec3::ZERO && area > 0.0;
+                let lit = world.normals[t] != Vec3::ZERO && world.counts(t);
+                let counts = scatters && lit && area > 0.0;
                 if counts { area } else { 0.0 }
             })
             .collect();

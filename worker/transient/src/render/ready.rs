@@ -47,7 +47,7 @@ pub(super) fn prepare<R>(
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let world = World::new(scene, stop)?;
+    let world = World::new(scene, settings.gate.end_m(), stop)?;
     let spots = find_spots(&world, &scene.laser.beams);
     let emitters = Emitters::new(scene, &world, &spots)?;
     let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {

@@ -1,0 +1,302 @@
+//! How far camera and light reach, and triangles cut to what f32 can hold of them. A scene's scale must not
+//! depend on what stands far outside of its rooms, nor on how far a wall goes on behind them.
+
+use picofarm_scene::{Scene, Vec3};
+
+use crate::rng::{Rng, Stream};
+
+/// A point in metres from the camera.
+pub(crate) type Point = [f64; 3];
+
+/// How many times wider than what is reached a scene is before its scale goes by what is reached.
+const SLACK: f64 = 4.0;
+/// Probes: to all sides, along each side of the image, and along beams at most; bounces of each.
+const ROUND: u32 = 64;
+const ACROSS: u32 = 8;
+const BEAMS: usize = 32;
+const BOUNCES: u32 = 3;
+/// A wall counts up to so many times as far as it was met.
+const BEYOND: f64 = 2.0;
+
+/// Where triangles are cut first, in render units: twice as far as a scene goes whose whole width is reached.
+/// Beyond it a cut comes at every further factor.
+const FIRST_CUT: f64 = 16.0;
+const FACTOR: f64 = 8.0;
+
+/// How far from the camera, along an axis, the surfaces lie that light can count by: `widest`, unless that is much
+/// farther than what probes find. No surface farther than `horizon` counts.
+pub(crate) fn reach(scene: &Scene, triangles: &[[Point; 3]], widest: f64, horizon: f64) -> f64 {
+    let i = &scene.camera.intrinsics;
+    let origin = wide(scene.camera.origin);
+    let laser = sub(wide(scene.laser.origin), origin);
+    let mut probe = Probe {
+        triangles,
+        found: 0.0,
+        enough: widest / SLACK,
+        horizon,
+        rng: Rng::new(0, Stream::Extent, 0, 0),
+    };
+    let mut starts = vec![];
+    for k in 0..ACROSS * ACROSS {
+        let at = |k: u32, length: u32| (k as f32 + 0.5) / ACROSS as f32 * length as f32;
+        let (x, y) = (at(k % ACROSS, i.width), at(k / ACROSS, i.height));
+        starts.push(([0.0; 3], wide(scene.camera.ray(x, y))));
+    }
+    for beam in scene.laser.beams.iter().take(BEAMS) {
+        starts.push((laser, wide(beam.direction)));
+    }
+    for _ in 0..ROUND {
+        let d = probe.direction();
+        starts.push(([0.0; 3], d));
+    }
+    for (from, direction) in starts {
+        if probe.walk(from, direction) {
+            return widest;
+        }
+    }
+    match probe.found > 0.0 {
+        true => probe.found,
+        false => widest,
+    }
+}
+
+struct Probe<'a> {
+    triangles: &'a [[Point; 3]],
+    /// How far surfaces were found.
+    found: f64,
+    enough: f64,
+    horizon: f64,
+    rng: Rng,
+}
+
+impl Probe<'_> {
+    /// Follows light from a place; true where what was found is all that there is to find.
+    fn walk(&mut self, mut from: Point, mut direction: Point) -> bool {
+        for _ in 0..=BOUNCES {
+            let Some((k, at)) = self.first(from, direction) else {
+                return false;
+            };
+            if largest(at) > self.horizon {
+                return false;
+            }
+            let t = &self.triangles[k];
+            let all = t.iter().fold(0.0f64, |a, &p| a.max(largest(p)));
+            let until = all.min(BEYOND * largest(at)).min(self.horizon);
+            self.found = self.found.max(until);
+            if self.found > self.enough {
+                return true;
+            }
+            let n = cross(sub(t[1], t[0]), sub(t[2], t[0]));
+            let side = dot(n, direction);
+            let d = self.direction();
+            direction = match dot(n, d) * side > 0.0 {
+                true => d.map(|x| -x),
+                false => d,
+            };
+            // Off the surface by what f64 rounds away, and more.
+            let off = 1e-9 * largest(at).max(largest(from)) / dot(n, n).sqrt();
+            let off = if side > 0.0 { -off } else { off };
+            from = std::array::from_fn(|a| at[a] + off * n[a]);
+        }
+        false
+    }
+
+    /// Uniform over all directions, by rejection: the same bits everywhere.
+    fn direction(&mut self) -> Point {
+        loop {
+            let d = std::array::from_fn(|_| 2.0 * f64::from(self.rng.uniform()) - 1.0);
+            let square = dot(d, d);
+            if square > 0.01 && square <= 1.0 {
+                return d;
+            }
+        }
+    }
+
+    /// The first surface from a place along a direction: triangle and point (Möller and Trumbore 1997).
+    fn first(&self, from: Point, d: Point) -> Option<(usize, Point)> {
+        let mut best = (f64::INFINITY, usize::MAX);
+        for (k, [a, b, c]) in self.triangles.iter().enumerate() {
+            let (e, f) = (sub(*b, *a), sub(*c, *a));
+            let p = cross(d, f);
+            let det = dot(e, p);
+            if det == 0.0 {
+                continue;
+            }
+            let s = sub(from, *a);
+            let u = dot(s, p) / det;
+            if !(0.0..=1.0).contains(&u) {
+                continue;
+            }
+            let q = cross(s, e);
+            let v = dot(d, q) / det;
+            let t = dot(f, q) / det;
+            if v >= 0.0 && u + v <= 1.0 && t > 0.0 && t < best.0 {
+                best = (t, k);
+            }
+        }
+        let at = || std::array::from_fn(|a| from[a] + best.0 * d[a]);
+        (best.1 != usize::MAX).then(|| (best.1, at()))
+    }
+}
+
+/// A corner: a point, and its texture coordinates.
+pub(crate) type Corner = (Point, [f64; 2]);
+
+/// Cuts a triangle where it leaves the nearest box around the camera and each larger one, so that every
+/// piece's corners are about as far away as the piece; `scale` is render units per metre. `None` where nothing
+/// is to be cut. Triangles that have an edge in common are cut in the same points of it: no gap opens.
+pub(crate) fn cut(triangle: [Corner; 3], scale: f64) -> Option<Vec<[Corner; 3]>> {
+    let far = triangle.iter().fold(0.0f64, |a, c| a.max(largest(c.0)));
+    let first = FIRST_CUT / scale;
+    if far <= first {
+        return None;
+    }
+    let mut pieces = vec![triangle.to_vec()];
+    for axis in 0..3 {
+        let mut at = first;
+        while at < far {
+            for plane in [-at, at] {
+                pieces = pieces
+                    .into_iter()
+                    .flat_map(|p| halves(&p, axis, plane))
+                    .collect();
+            }
+            at *= FACTOR;
+        }
+    }
+    let fan = |p: Vec<Corner>| -> Vec<[Corner; 3]> {
+        (2..p.len()).map(|k| [p[0], p[k - 1], p[k]]).collect()
+    };
+    Some(pieces.into_iter().flat_map(fan).collect())
+}
+
+/// What of a convex polygon lies below a plane across an axis, and what above.
+fn halves(polygon: &[Corner], axis: usize, plane: f64) -> Vec<Vec<Corner>> {
+    let at = |c: &Corner| c.0[axis];
+    let above = polygon.iter().any(|c| at(c) > plane);
+    let below = polygon.iter().any(|c| at(c) < plane);
+    if !(above && below) {
+        return vec![polygon.to_vec()];
+    }
+    let (mut low, mut high) = (vec![], vec![]);
+    for (k, a) in polygon.iter().enumerate() {
+        let b = &polygon[(k + 1) % polygon.len()];
+        if at(a) <= plane {
+            low.push(*a);
+        }
+        if at(a) >= plane {
+            high.push(*a);
+        }
+        if (at(a) < plane && at(b) > plane) || (at(a) > plane && at(b) < plane) {
+            let meet = meet(a, b, axis, plane);
+            low.push(meet);
+            high.push(meet);
+        }
+    }
+    vec![low, high]
+}
+
+/// Where an edge meets a plane: the same point from either end.
+fn meet(a: &Corner, b: &Corner, axis: usize, plane: f64) -> Corner {
+    let (a, b) = if a.0[axis] < b.0[axis] {
+        (a, b)
+    } else {
+        (b, a)
+    };
+    let t = (plane - a.0[axis]) / (b.0[axis] - a.0[axis]);
+    let mix = |a: f64, b: f64| a * (1.0 - t) + b * t;
+    let mut p: Point = std::array::from_fn(|k| mix(a.0[k], b.0[k]));
+    p[axis] = plane;
+    (p, std::array::from_fn(|k| mix(a.1[k], b.1[k])))
+}
+
+/// Unit normal; `None` for a triangle without area.
+pub(crate) fn normal(t: &[Point; 3]) -> Option<Vec3> {
+    let n = cross(sub(t[1], t[0]), sub(t[2], t[0]));
+    let length = dot(n, n).sqrt();
+    let unit = || Vec3::from(n.map(|x| (x / length) as f32));
+    (length.is_finite() && length > 0.0).then(unit)
+}
+
+pub(crate) fn wide(v: Vec3) -> Point {
+    [f64::from(v.x), f64::from(v.y), f64::from(v.z)]
+}
+
+fn largest(p: Point) -> f64 {
+    p.iter().fold(0.0, |a, x| a.max(x.abs()))
+}
+
+fn sub(a: Point, b: Point) -> Point {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+fn dot(a: Point, b: Point) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn cross(a: Point, b: Point) -> Point {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn area(t: &[Corner; 3]) -> f64 {
+        let n = cross(sub(t[1].0, t[0].0), sub(t[2].0, t[0].0));
+        0.5 * dot(n, n).sqrt()
+    }
+
+    #[test]
+    fn pieces_cover_their_triangle_and_meet_their_neighbours_pieces() {
+        let corner = |p: Point| (p, [p[0], p[1]]);
+        let [a, b, c, d] = [
+            [-1e5, -2e3, 30.0],
+            [7e4, -5e4, -400.0],
+            [3e3, 9e4, 1e3],
+            [2e5, 2e5, 7e3],
+        ]
+        .map(corner);
+        let (one, other) = (cut([a, b, c], 1.0).unwrap(), cut([c, b, d], 1.0).unwrap());
+        for (pieces, whole) in [(&one, [a, b, c]), (&other, [c, b, d])] {
+            let sum: f64 = pieces.iter().map(area).sum();
+            assert!((sum / area(&whole) - 1.0).abs() < 1e-9);
+            assert!(
+                pieces
+                    .iter()
+                    .flatten()
+                    .all(|c| (c.0[0] - c.1[0]).abs() < 1e-6)
+            );
+        }
+        // Along the common edge both have the same corners.
+        let along = |pieces: &[[Corner; 3]]| {
+            let e = sub(c.0, b.0);
+            let on = |p: Point| {
+                let x = cross(sub(p, b.0), e);
+                dot(x, x).sqrt() < 1e-6 * dot(e, e) / 1e5
+            };
+            let mut all: Vec<[u64; 3]> = pieces
+                .iter()
+                .flatten()
+                .filter(|c| on(c.0))
+                .map(|c| c.0.map(f64::to_bits))
+                .collect();
+            all.sort_unstable();
+            all.dedup();
+            all
+        };
+        assert!(along(&one).len() > 10, "{}", along(&one).len());
+        assert_eq!(along(&one), along(&other));
+    }
+
+    #[test]
+    fn what_is_near_is_not_cut() {
+        let corner = |p: Point| (p, [0.0; 2]);
+        let t = [[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [0.0, 8.0, 1.0]].map(corner);
+        assert!(cut(t, 1.0).is_none());
+    }
+}
