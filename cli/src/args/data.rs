@@ -206,7 +206,10 @@ npy: a folder a scene, or one of such folders, with .npy files and scene.json:
    \"laser\": [0, 0, 0], \"spots\": {\"file\": \"spots.npy\" (spots x 3), \"paths\": \"paths.npy\" (length of each beam, if known)},
    \"depth\": {\"file\": \"depth.npy\", \"kind\": \"z\" (or range)}}
 and, if there are any: visibility {file, one_means: lit or shadow} (spots x rows x columns), specular {file} (1 = mirror),
-normal {file}, instance {file} and label {file} (0 = nothing), rgb_linear {file}, photons_per_unit.";
+normal {file}, instance {file} and label {file} (0 = nothing), rgb_linear {file}, photons_per_unit, two_bounce {file} (spots x rows
+x columns: measured path of each spot's two-bounce light, 0 = none; depth may then be left out, and nothing is checked).
+
+bf-lidar: with --captures sum, t2.mat and two_bounce_detections.mat beside the captures are taken along.";
 
 /// What overrides the files, or what their format is known for.
 #[derive(Args, Clone, Default)]

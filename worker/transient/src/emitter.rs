@@ -12,9 +12,6 @@ use crate::{
 /// Mirrors a beam may meet before it is given up.
 const MAX_REFLECTIONS: u32 = 64;
 
-/// Rounding of a spot's place, in render units, that shadow rays' offsets cover.
-const ROUNDING: f32 = 1.0 / 262_144.0;
-
 /// The spots of a scene's beams in their order; `None` where a beam meets nothing. A spot stated by the
 /// beam is taken as it is; otherwise the beam is followed, through mirrors (`Material::is_specular`) by
 /// exact reflection, to the first other surface.
@@ -80,26 +77,10 @@ pub(crate) struct Emitter {
     pub surface: Surface,
 }
 
-/// Where a spot is, render units. Far from the origin f32 coordinates in the world round it off its surface, so it
-/// is put back on the one that lies within that rounding.
-fn beneath(world: &World, stack: &mut Stack, spot: &Spot) -> Vec3 {
-    let p = world.inward(spot.point);
-    let size = |v: Vec3| v.x.abs().max(v.y.abs()).max(v.z.abs());
-    let rounding = size(spot.point).max(size(world.camera.origin)) * f32::EPSILON * world.scale;
-    if rounding < ROUNDING {
-        return p;
-    }
-    let above = p + spot.normal * (2.0 * rounding);
-    match world.closest(stack, above, -spot.normal) {
-        Some(h) if (h.p - above).length() <= 4.0 * rounding => h.p,
-        _ => p,
-    }
-}
-
 impl Emitter {
     fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, material: u32) -> Self {
         let surface = world.surfaces[material as usize];
-        let p = beneath(world, stack, spot);
+        let p = world.inward(spot.point);
         // The spot does not say whether its side is the facet's front: look at the facet beneath it.
         let beneath = world.closest(stack, lift(p, spot.normal), -spot.normal);
         // It also knows the texture there.

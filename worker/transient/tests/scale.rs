@@ -136,10 +136,10 @@ fn a_large_mirror_far_outside_takes_no_strategy_from_a_mirror_in_the_room() {
 }
 
 #[test]
-fn a_room_far_from_the_origin_keeps_its_light() {
+fn a_room_kilometres_from_the_origin_keeps_its_light() {
     let s = closed();
     let plain = ok(&s, &set());
-    for shift in [v(4096.0, -8192.0, 2048.0), v(65536.0, 131072.0, -32768.0)] {
+    for shift in [v(256.0, -512.0, 128.0), v(4096.0, -8192.0, 2048.0)] {
         let mut far = s.clone();
         for o in &mut far.objects {
             o.to_world.translation = shift;
@@ -151,6 +151,6 @@ fn a_room_far_from_the_origin_keeps_its_light() {
             energy(&plain.transient),
         );
         println!("moved by {shift:?}: {:+.4} %", 100.0 * (got / whole - 1.0));
-        assert!((got / whole - 1.0).abs() < 1e-3, "{shift:?}");
+        assert!((got / whole - 1.0).abs() < 1e-4, "{shift:?}");
     }
 }
