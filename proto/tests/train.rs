@@ -222,6 +222,11 @@ fn an_unusable_field_is_named() {
             "unet25d",
         ),
         (
+            "target = \"tof\", model = \"m\", net = { time_projection = \"each\" }",
+            "train.net.time_projection",
+            "unet25d",
+        ),
+        (
             "target = \"tof\", model = \"m\", net = { architecture = \"unet25d\", levels = 4, time_features = 100 }",
             "train.net.time_features",
             "multiple of 8",

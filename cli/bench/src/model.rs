@@ -11,7 +11,7 @@ use std::{
 use picofarm_model::{
     ModelError,
     input::{Batch, Target},
-    net::{Architecture, NetSpec, Precision},
+    net::{Architecture, NetSpec, Precision, TimeProjection},
     train::Learner,
     trial::Trial,
 };
@@ -187,6 +187,10 @@ fn trial(args: &BenchModel) -> Trial {
             levels: args.levels as usize,
             stem: args.stem as usize,
             time: args.time as usize,
+            time_projection: match args.separate_streams {
+                false => TimeProjection::Shared,
+                true => TimeProjection::Each,
+            },
             frozen: false,
             precision: match args.precision {
                 Numbers::F32 => Precision::F32,

@@ -27,6 +27,9 @@ pub struct BenchModel {
     /// Moments after the projection of time (unet2.5d)
     #[arg(long, default_value_t = 32)]
     pub time: u64,
+    /// A projection of time for each stream instead of one for both (unet2.5d)
+    #[arg(long)]
+    pub separate_streams: bool,
     /// On the graphics processor (a build with --features cuda)
     #[arg(long)]
     pub gpu: bool,

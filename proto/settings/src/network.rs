@@ -53,6 +53,17 @@ pub enum Architecture {
     Unet25d,
 }
 
+/// Whether the two streams of a 2.5D network, measurement and shadow transient, share their first projection of time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TimeProjection {
+    /// One layer for both (released code).
+    #[default]
+    Shared,
+    /// A layer each.
+    Each,
+}
+
 /// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
 /// losses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

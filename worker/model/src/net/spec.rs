@@ -1,6 +1,6 @@
 //! What a network looks like: everything that decides its parameters, and nothing else.
 
-pub use picofarm_settings::{Architecture, Precision};
+pub use picofarm_settings::{Architecture, Precision, TimeProjection};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -25,17 +25,19 @@ pub struct NetSpec {
     pub stem: usize,
     /// Length of the time axis after the first projection, `Unet25d` only (the paper: 160).
     pub time: usize,
+    /// Whether two streams share that projection, `Unet25d` only.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub time_projection: TimeProjection,
     /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
     /// Numbers in which convolutions are computed.
-    #[serde(default, skip_serializing_if = "is_f32")]
+    #[serde(default, skip_serializing_if = "is_default")]
     pub precision: Precision,
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_f32(precision: &Precision) -> bool {
-    *precision == Precision::F32
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl NetSpec {
@@ -50,6 +52,7 @@ impl NetSpec {
             levels: 6,
             stem: 0,
             time: 160,
+            time_projection: TimeProjection::Shared,
             frozen: false,
             precision: Precision::F32,
         }

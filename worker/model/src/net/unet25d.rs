@@ -9,7 +9,7 @@ use burn::tensor::{Tensor, activation::relu};
 use super::{
     block::norm,
     pass::{Input, Norm, Pass},
-    spec::NetSpec,
+    spec::{NetSpec, TimeProjection},
     unet2d::Decoder,
 };
 use crate::{
@@ -20,7 +20,7 @@ use crate::{
 #[derive(Debug, Clone)]
 pub(super) struct Unet25d {
     time: usize,
-    /// One for each stream: bins to moments.
+    /// Bins to moments: one for both streams (the released code's form), or one for each.
     projections: Vec<Linear>,
     encoders: Vec<[Cbr; 2]>,
     /// One for each level: moments to one.
@@ -46,12 +46,13 @@ impl Unet25d {
     pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
         let streams = if spec.one_hot > 0 { 2 } else { 1 };
         d.frozen = spec.frozen;
-        let projections = (0..streams)
-            .map(|s| {
-                let at = format!("time_projections.{s}");
-                Linear::declare(d, &at, &[spec.time, spec.dense, 1, 1])
-            })
-            .collect();
+        let shape = [spec.time, spec.dense, 1, 1];
+        let projections = match spec.time_projection {
+            TimeProjection::Shared => vec![Linear::declare(d, "time_projection", &shape)],
+            TimeProjection::Each => (0..streams)
+                .map(|s| Linear::declare(d, &format!("time_projections.{s}"), &shape))
+                .collect(),
+        };
         let mut inputs = streams;
         let mut encoders = Vec::new();
         for (i, outputs) in spec.widths().into_iter().enumerate() {
@@ -105,7 +106,8 @@ impl Unet25d {
         if let Some(one_hot) = input.one_hot {
             streams.push(ops::plain::one_hot(one_hot, bins));
         }
-        let streams = streams.into_iter().zip(&self.projections);
+        // A shared projection is the only one, whatever the number of streams.
+        let streams = streams.into_iter().zip(self.projections.iter().cycle());
         let streams: Vec<Tensor<5>> = streams
             .map(|(x, projection)| {
                 let x = projection.forward(pass, x);

@@ -10,7 +10,7 @@ use crate::{
     Evaluated,
     input::{Normalise, Question, ShadowVariant, Target},
     metric::Metrics,
-    net::{Architecture, NetSpec},
+    net::{Architecture, NetSpec, TimeProjection},
     train::{Line, Plan, Schedule},
 };
 
@@ -33,6 +33,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         levels: 3,
         stem: 0,
         time: 0,
+        time_projection: TimeProjection::Shared,
         frozen: false,
         precision: crate::net::Precision::F32,
     };

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use picofarm_model::{
     Random,
     input::{Normalise, Question, ShadowVariant, Target},
-    net::{Architecture, NetSpec},
+    net::{Architecture, NetSpec, TimeProjection},
     scene::Scene,
     train::{Plan, Schedule, Sources},
 };
@@ -80,6 +80,7 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
             levels: 3,
             stem: 0,
             time: 0,
+            time_projection: TimeProjection::Shared,
             frozen: false,
             precision: picofarm_model::net::Precision::F32,
         },

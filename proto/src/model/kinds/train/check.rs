@@ -1,6 +1,6 @@
 //! What a training's settings may be.
 
-use picofarm_settings::{Architecture, Target};
+use picofarm_settings::{Architecture, Target, TimeProjection};
 
 use super::settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, TrainSettings,
@@ -104,6 +104,12 @@ impl NetSettings {
         ];
         for (field, value, low, high, unit) in limits {
             within(format!("train.net.{field}"), value, (low, high), unit)?;
+        }
+        if self.architecture != Architecture::Unet25d
+            && self.time_projection != TimeProjection::Shared
+        {
+            let what = "is for architecture = \"unet25d\"; remove it".into();
+            return fail("time_projection", what);
         }
         match (self.architecture, self.time_features) {
             (Architecture::Unet2d, 1..) => fail(

@@ -1,6 +1,6 @@
 //! What is learnt, and how: the settings of trainings, and the network that follows from them.
 
-use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target};
+use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target, TimeProjection};
 use serde::{Deserialize, Serialize};
 
 use crate::model::{
@@ -107,6 +107,9 @@ pub struct NetSettings {
     /// For `unet25d`: bins of time after the learnt projection of each stream; its levels halve them. 0 otherwise.
     #[serde(skip_serializing_if = "is_zero_u32")]
     pub time_features: u32,
+    /// For `unet25d`: whether both streams share that projection, as in the released code.
+    #[serde(skip_serializing_if = "is_default")]
+    pub time_projection: TimeProjection,
 }
 
 /// How shadows are predicted (appendix A.1 of the paper).
@@ -158,6 +161,7 @@ impl Default for NetSettings {
             levels: 6,
             stem: 0,
             time_features: 0,
+            time_projection: TimeProjection::Shared,
         }
     }
 }

@@ -60,6 +60,7 @@ pub(super) fn plan(
         levels: wanted.levels as usize,
         stem: wanted.stem as usize,
         time: wanted.time_features as usize,
+        time_projection: wanted.time_projection,
         frozen: !settings.specular.on.is_empty(),
         precision: optimise.precision,
     };
@@ -115,6 +116,11 @@ pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
         ("net.levels", text(&net.levels), text(&under.levels)),
         ("net.stem", text(&net.stem), text(&under.stem)),
         ("net.time_features", text(&net.time), text(&under.time)),
+        (
+            "net.time_projection",
+            text(&net.time_projection),
+            text(&under.time_projection),
+        ),
     ] {
         if ours != theirs {
             return Err(TaskError::User(format!(
