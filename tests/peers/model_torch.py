@@ -62,7 +62,11 @@ class Unet2d(Decoding):
         super().__init__()
         inputs = spec["dense"] + spec["one_hot"]
         widths = [spec["width"] << k for k in range(spec["levels"])]
-        self.stem = SingleConv(inputs, spec["stem"]) if spec["stem"] else None
+        self.stem = None
+        if spec["stem"] and spec.get("stem_form", "block") == "linear":
+            self.stem = nn.Conv2d(inputs, spec["stem"], 1)
+        elif spec["stem"]:
+            self.stem = SingleConv(inputs, spec["stem"])
         inputs = spec["stem"] or inputs
         self.encoders = nn.ModuleList()
         for width in widths:
@@ -248,7 +252,7 @@ def parity(path):
         # As far as rounding moves PyTorch itself.
         limits |= {"output": 1e-1, "evaluated": 1e-2, "gradient": rounding(trial), "losses": 1e-2, "statistics": 1e-3}
     parameters = sum(p.numel() for p in trial.model.parameters())
-    print(f"{path}: {trial.spec['task']}, {trial.spec['net']['architecture']}, {parameters} parameters, torch {torch.__version__}")
+    print(f"{path}: {trial.spec['target']}, {trial.spec['net']['architecture']}, {parameters} parameters, torch {torch.__version__}")
     for name, value in figures.items():
         verdict = "ok" if value <= limits[name] else "TOO FAR OFF"
         more = f" ({worst[0]})" if name == "gradient" else ""

@@ -24,6 +24,9 @@ pub struct BenchModel {
     /// Channels of a convolution before the first level; 0 = none
     #[arg(long, default_value_t = 0)]
     pub stem: u64,
+    /// That convolution is a 1×1 one with a bias, without norm and ReLU
+    #[arg(long, requires = "stem")]
+    pub linear_stem: bool,
     /// Moments after the projection of time (unet2.5d)
     #[arg(long, default_value_t = 32)]
     pub time: u64,

@@ -12,7 +12,7 @@ use picofarm_model::{
     evaluate,
     input::{ShadowVariant, Target},
     metric::Metrics,
-    net::{Architecture, Net, NetSpec, TimeProjection},
+    net::{Architecture, Net, NetSpec, StemForm, TimeProjection},
     scene::{Kept, Scenes},
     train::{Control, Plan, Sources, Trained, Training},
     trial::Trial,
@@ -186,21 +186,46 @@ fn the_streams_of_a_25d_network_share_their_projection_of_time_unless_each_has_i
     }
 }
 
+/// 637 bins to 128 channels: a 1×1 convolution with a bias has 81,664 values, and neither norm nor ReLU.
+#[test]
+fn a_linear_stem_is_a_1x1_convolution_with_a_bias_over_bins_and_one_hot_bins() {
+    for (one_hot, values) in [(0, 637 * 128 + 128), (637, 2 * 637 * 128 + 128)] {
+        let spec = NetSpec {
+            stem: 128,
+            stem_form: StemForm::Linear,
+            ..NetSpec::released(637, one_hot, 1)
+        };
+        let net = Net::new(spec).unwrap();
+        let declared = net.declared().iter();
+        let stem: Vec<_> = declared.filter(|d| d.name.starts_with("stem")).collect();
+        let names: Vec<&str> = stem.iter().map(|d| &*d.name).collect();
+        assert_eq!(names, ["stem.weight", "stem.bias"]);
+        let count: usize = stem.iter().map(|d| d.len()).sum();
+        assert_eq!(count, values);
+    }
+}
+
 /// The loss along the gradient: (L(p + εg) − L(p − εg)) / 2ε = |g|², for every network.
 #[test]
 fn gradients_are_the_slopes_of_the_loss() {
     let device = Device::flex();
+    let (block, linear) = (StemForm::Block, StemForm::Linear);
     let (shared, each) = (TimeProjection::Shared, TimeProjection::Each);
-    for (target, architecture, one_hot, time_projection) in [
-        (Target::Tof, Architecture::Unet2d, 0, shared),
-        (Target::Shadow, Architecture::Unet2d, 6, shared),
-        (Target::Specular, Architecture::Unet25d, 0, shared),
-        (Target::Shadow, Architecture::Unet25d, 6, shared),
-        (Target::Shadow, Architecture::Unet25d, 6, each),
+    for (target, architecture, one_hot, time_projection, stem, stem_form) in [
+        (Target::Tof, Architecture::Unet2d, 0, shared, 0, block),
+        (Target::Shadow, Architecture::Unet2d, 6, shared, 0, block),
+        (Target::Shadow, Architecture::Unet2d, 6, shared, 3, block),
+        (Target::Tof, Architecture::Unet2d, 0, shared, 3, linear),
+        (Target::Shadow, Architecture::Unet2d, 6, shared, 3, linear),
+        (Target::Specular, Architecture::Unet25d, 0, shared, 0, block),
+        (Target::Shadow, Architecture::Unet25d, 6, shared, 0, block),
+        (Target::Shadow, Architecture::Unet25d, 6, each, 0, block),
     ] {
         let net = NetSpec {
             architecture,
             time_projection,
+            stem,
+            stem_form,
             width: 4,
             levels: 2,
             time: 4,

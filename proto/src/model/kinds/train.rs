@@ -2,7 +2,7 @@
 //! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
 
 pub use picofarm_settings::{
-    Architecture, Precision, Schedule, ShadowVariant, Target, TimeProjection,
+    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
 };
 use serde::Serialize;
 use serde_json::{Value, json};

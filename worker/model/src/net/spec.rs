@@ -1,6 +1,6 @@
 //! What a network looks like: everything that decides its parameters, and nothing else.
 
-pub use picofarm_settings::{Architecture, Precision, TimeProjection};
+pub use picofarm_settings::{Architecture, Precision, StemForm, TimeProjection};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -23,6 +23,9 @@ pub struct NetSpec {
     pub levels: usize,
     /// Channels of a convolution before the first level (the appendix's form: 128); 0 = none (the released code's).
     pub stem: usize,
+    /// What that convolution is.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub stem_form: StemForm,
     /// Length of the time axis after the first projection, `Unet25d` only (the paper: 160).
     pub time: usize,
     /// Whether two streams share that projection, `Unet25d` only.
@@ -51,6 +54,7 @@ impl NetSpec {
             width: 128,
             levels: 6,
             stem: 0,
+            stem_form: StemForm::Block,
             time: 160,
             time_projection: TimeProjection::Shared,
             frozen: false,
@@ -81,7 +85,10 @@ impl NetSpec {
         let mut inputs = self.dense + self.one_hot;
         let mut sum = 0.0;
         if self.stem > 0 {
-            sum += of(inputs, self.stem, 0);
+            sum += match self.stem_form {
+                StemForm::Block => of(inputs, self.stem, 0),
+                StemForm::Linear => of(inputs, self.stem, 0) / 9.0,
+            };
             inputs = self.stem;
         }
         let widths = self.widths();

@@ -7,7 +7,7 @@
 use burn::tensor::{Tensor, activation::relu};
 
 use super::{
-    block::norm,
+    block::{Linear, norm},
     pass::{Input, Norm, Pass},
     spec::{NetSpec, TimeProjection},
     unet2d::Decoder,
@@ -26,13 +26,6 @@ pub(super) struct Unet25d {
     /// One for each level: moments to one.
     skips: Vec<Vec<Linear>>,
     decoder: Decoder,
-}
-
-/// Weights (outputs, inputs) and a bias.
-#[derive(Debug, Clone, Copy)]
-struct Linear {
-    weight: Id,
-    bias: Id,
 }
 
 /// 3×3×3 convolution without bias, batch norm, ReLU.
@@ -164,28 +157,6 @@ fn steps(time: usize) -> Vec<usize> {
     }
     sizes.push(1);
     sizes
-}
-
-impl Linear {
-    fn declare(d: &mut Declarations, at: &str, shape: &[usize]) -> Self {
-        let begin = Begin::FanIn(shape[1]);
-        Self {
-            weight: d.add(format!("{at}.weight"), shape, begin, true),
-            bias: d.add(format!("{at}.bias"), &shape[..1], begin, true),
-        }
-    }
-
-    /// Over channels.
-    fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
-        let bias: Tensor<1> = pass.get(self.bias);
-        let (outputs, inputs) = (bias.dims()[0], x.dims()[1]);
-        let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
-        pass.raise(ops::conv1x1(
-            pass.lower(x),
-            pass.lower(weight),
-            pass.lower(bias),
-        ))
-    }
 }
 
 impl Cbr {
