@@ -214,7 +214,6 @@ fn gradients_are_the_slopes_of_the_loss() {
     for (target, architecture, one_hot, time_projection, stem, stem_form) in [
         (Target::Tof, Architecture::Unet2d, 0, shared, 0, block),
         (Target::Shadow, Architecture::Unet2d, 6, shared, 0, block),
-        (Target::Shadow, Architecture::Unet2d, 6, shared, 3, block),
         (Target::Tof, Architecture::Unet2d, 0, shared, 3, linear),
         (Target::Shadow, Architecture::Unet2d, 6, shared, 3, linear),
         (Target::Specular, Architecture::Unet25d, 0, shared, 0, block),
