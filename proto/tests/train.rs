@@ -181,6 +181,7 @@ fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
         ", input = { normalise = \"log\", max = 3.0 }",
         ", net = { width = 64 }",
         ", net = { stem = 128 }",
+        ", net = { stem = 128, stem_form = \"linear\" }",
         ", shadow = { variant = \"index\" }",
         ", shadow = { tof = \"x\" }",
         ", optimise = { epochs = 1 }",
@@ -219,6 +220,16 @@ fn an_unusable_field_is_named() {
         (
             "target = \"tof\", model = \"m\", net = { time_features = 8 }",
             "train.net.time_features",
+            "unet25d",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { stem_form = \"linear\" }",
+            "train.net.stem_form",
+            "give net.stem",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { time_projection = \"each\" }",
+            "train.net.time_projection",
             "unet25d",
         ),
         (

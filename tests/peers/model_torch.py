@@ -62,7 +62,11 @@ class Unet2d(Decoding):
         super().__init__()
         inputs = spec["dense"] + spec["one_hot"]
         widths = [spec["width"] << k for k in range(spec["levels"])]
-        self.stem = SingleConv(inputs, spec["stem"]) if spec["stem"] else None
+        self.stem = None
+        if spec["stem"] and spec.get("stem_form", "block") == "linear":
+            self.stem = nn.Conv2d(inputs, spec["stem"], 1)
+        elif spec["stem"]:
+            self.stem = SingleConv(inputs, spec["stem"])
         inputs = spec["stem"] or inputs
         self.encoders = nn.ModuleList()
         for width in widths:
@@ -91,40 +95,64 @@ class Unet2d(Decoding):
 
 
 class Unet25d(Decoding):
+    """Written from the description of the network, not from picofarm's code.
+
+    A 1x1 convolution takes each stream's bins to T moments: one layer for both streams, as released; a layer each where the
+    trial says so. The streams are channels of a volume of T x H x W. The encoder is the 2D one with three-dimensional
+    convolutions, norms and pooling. Linear layers over time with ReLU between them take each level's moments to one, and
+    the 2D decoder goes on from there.
+    """
+
+    # Appendix B: a level's moments, and the widths of its layers from there to one.
+    OVER_TIME = {160: (128, 32, 1), 80: (64, 32, 1), 40: (32, 1), 20: (16, 1)}
+
     def __init__(self, spec):
         super().__init__()
-        bins, time, levels = spec["dense"], spec["time"], spec["levels"]
+        moments, levels = spec["time"], spec["levels"]
         streams = 2 if spec["one_hot"] else 1
         widths = [spec["width"] << k for k in range(levels)]
-        self.time_projections = nn.ModuleList(nn.Conv2d(bins, time, 1) for _ in range(streams))
-        self.encoders = nn.ModuleList()
-        inputs = streams
-        for width in widths:
-            self.encoders.append(Block(inputs, width, encoder=True, three=True))
-            inputs = width
-        self.skip_projections = nn.ModuleList()
-        for k in range(levels):
-            sizes = [time >> k] + [s for s in spec_steps(time >> k)] + [1]
-            layers = []
-            for a, b in zip(sizes, sizes[1:]):
-                layers += [nn.Linear(a, b), nn.ReLU(inplace=True)]
-            self.skip_projections.append(nn.Sequential(*layers[:-1]))
+        if spec.get("time_projection", "shared") == "shared":
+            self.time_projection = nn.Conv2d(spec["dense"], moments, kernel_size=1)
+        else:
+            self.time_projections = nn.ModuleList(
+                nn.Conv2d(spec["dense"], moments, kernel_size=1) for _ in range(streams)
+            )
+        self.encoders = nn.ModuleList(
+            Block(inputs, outputs, encoder=True, three=True) for inputs, outputs in zip([streams] + widths, widths)
+        )
+        self.skip_projections = nn.ModuleList(self.over_time(moments >> level) for level in range(levels))
         self.declare(widths, spec["outputs"])
+
+    @classmethod
+    def over_time(cls, moments):
+        if moments in cls.OVER_TIME:
+            widths = cls.OVER_TIME[moments]
+        elif moments <= 2:
+            widths = (1,)
+        else:
+            # The same rule for other lengths: the greatest power of two below, then 32 where that is greater, then one.
+            power = max(p for p in (1 << k for k in range(13)) if p < moments)
+            widths = (power, 32, 1) if power > 32 else (power, 1)
+        layers, last = [], moments
+        for width in widths:
+            layers += [nn.ReLU(), nn.Linear(last, width)]
+            last = width
+        return nn.Sequential(*layers[1:])
+
+    def to_moments(self, streams):
+        if hasattr(self, "time_projection"):
+            return [self.time_projection(stream) for stream in streams]
+        return [layer(stream) for layer, stream in zip(self.time_projections, streams)]
 
     def forward(self, dense, one_hot=None):
         streams = [dense] if one_hot is None else [dense, one_hot]
-        x = torch.stack([project(s) for project, s in zip(self.time_projections, streams)], 1)
+        volume = torch.stack(self.to_moments(streams), dim=1)  # N, streams, T, H, W
         features = []
-        for i, (block, skip) in enumerate(zip(self.encoders, self.skip_projections)):
-            x = block(F.max_pool3d(x, 2) if i else x)
-            features.append(skip(x.movedim(2, -1)).squeeze(-1))
+        for level, block in enumerate(self.encoders):
+            volume = block(F.max_pool3d(volume, 2) if level else volume)
+            flat = self.skip_projections[level](volume.permute(0, 1, 3, 4, 2))
+            features.append(flat[..., 0])
         return self.decode(features)
-
-
-def spec_steps(time):
-    """The widths between a level's time axis and one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 in the paper."""
-    power = 1 << (time - 1).bit_length() - 1 if time > 1 else 1
-    return [power] + ([32] if power > 32 else []) if time > 2 else []
 
 
 class Trial:
@@ -224,7 +252,7 @@ def parity(path):
         # As far as rounding moves PyTorch itself.
         limits |= {"output": 1e-1, "evaluated": 1e-2, "gradient": rounding(trial), "losses": 1e-2, "statistics": 1e-3}
     parameters = sum(p.numel() for p in trial.model.parameters())
-    print(f"{path}: {trial.spec['task']}, {trial.spec['net']['architecture']}, {parameters} parameters, torch {torch.__version__}")
+    print(f"{path}: {trial.spec['target']}, {trial.spec['net']['architecture']}, {parameters} parameters, torch {torch.__version__}")
     for name, value in figures.items():
         verdict = "ok" if value <= limits[name] else "TOO FAR OFF"
         more = f" ({worst[0]})" if name == "gradient" else ""

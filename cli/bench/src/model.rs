@@ -11,7 +11,7 @@ use std::{
 use picofarm_model::{
     ModelError,
     input::{Batch, Target},
-    net::{Architecture, NetSpec, Precision},
+    net::{Architecture, NetSpec, Precision, StemForm, TimeProjection},
     train::Learner,
     trial::Trial,
 };
@@ -186,7 +186,15 @@ fn trial(args: &BenchModel) -> Trial {
             width: args.width as usize,
             levels: args.levels as usize,
             stem: args.stem as usize,
+            stem_form: match args.linear_stem {
+                false => StemForm::Block,
+                true => StemForm::Linear,
+            },
             time: args.time as usize,
+            time_projection: match args.separate_streams {
+                false => TimeProjection::Shared,
+                true => TimeProjection::Each,
+            },
             frozen: false,
             precision: match args.precision {
                 Numbers::F32 => Precision::F32,

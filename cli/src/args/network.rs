@@ -24,9 +24,15 @@ pub struct BenchModel {
     /// Channels of a convolution before the first level; 0 = none
     #[arg(long, default_value_t = 0)]
     pub stem: u64,
+    /// That convolution is a 1×1 one with a bias, without norm and ReLU
+    #[arg(long, requires = "stem")]
+    pub linear_stem: bool,
     /// Moments after the projection of time (unet2.5d)
     #[arg(long, default_value_t = 32)]
     pub time: u64,
+    /// A projection of time for each stream instead of one for both (unet2.5d)
+    #[arg(long)]
+    pub separate_streams: bool,
     /// On the graphics processor (a build with --features cuda)
     #[arg(long)]
     pub gpu: bool,

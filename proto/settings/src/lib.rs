@@ -8,7 +8,9 @@ mod render;
 pub mod sensor;
 
 pub use gate::Gate;
-pub use network::{Architecture, Precision, Schedule, ShadowVariant, Target};
+pub use network::{
+    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
+};
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{Budget, Choice, Strategy};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};

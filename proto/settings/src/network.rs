@@ -53,6 +53,28 @@ pub enum Architecture {
     Unet25d,
 }
 
+/// What the projection before the first level is (appendix B names a convolution to 128 channels and nothing more).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StemForm {
+    /// 3×3 convolution, batch norm, ReLU: a first half of a block.
+    #[default]
+    Block,
+    /// 1×1 convolution with a bias, as the layer of that name is in the released 2.5D network.
+    Linear,
+}
+
+/// Whether the two streams of a 2.5D network, measurement and shadow transient, share their first projection of time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TimeProjection {
+    /// One layer for both (released code).
+    #[default]
+    Shared,
+    /// A layer each.
+    Each,
+}
+
 /// Numbers in which convolutions are computed; all else is 32 bits: weights, their gradients' sums and moments, batch norms,
 /// losses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

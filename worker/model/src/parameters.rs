@@ -142,7 +142,7 @@ impl Parameters {
         device: &Device,
     ) -> Result<Self, ModelError> {
         for (i, d) in self.declared.iter().enumerate() {
-            let encoder = ["stem.", "encoders.", "time_projections."];
+            let encoder = ["stem.", "encoders.", "time_projection"];
             if !encoder.iter().any(|part| d.name.starts_with(part)) {
                 continue;
             }

@@ -12,7 +12,7 @@ use picofarm_model::{
     evaluate,
     input::{ShadowVariant, Target},
     metric::Metrics,
-    net::{Architecture, NetSpec},
+    net::{Architecture, Net, NetSpec, StemForm, TimeProjection},
     scene::{Kept, Scenes},
     train::{Control, Plan, Sources, Trained, Training},
     trial::Trial,
@@ -151,10 +151,57 @@ fn the_layout_of_released_checkpoints_is_read_wrapped_or_combined() {
 #[test]
 fn the_released_network_has_the_published_number_of_parameters() {
     for (one_hot, published) in [(0, 356_404_556), (637, 368_095_417)] {
-        let net = picofarm_model::net::Net::new(NetSpec::released(637, one_hot, 1)).unwrap();
+        let net = Net::new(NetSpec::released(637, one_hot, 1)).unwrap();
         let learned = net.declared().iter().filter(|d| d.learned);
         let count: usize = learned.map(picofarm_model::parameters::Declared::len).sum();
         assert_eq!(count, published);
+    }
+}
+
+/// 375 bins to 160 moments: one layer for both streams in the released code, 60,160 values.
+#[test]
+fn the_streams_of_a_25d_network_share_their_projection_of_time_unless_each_has_its_own() {
+    let values = |one_hot, time_projection| -> usize {
+        let spec = NetSpec {
+            architecture: Architecture::Unet25d,
+            width: 4,
+            levels: 4,
+            time_projection,
+            ..NetSpec::released(375, one_hot, 1)
+        };
+        let net = Net::new(spec).unwrap();
+        let of_time = net.declared().iter();
+        let of_time = of_time.filter(|d| d.name.starts_with("time_projection"));
+        of_time.map(picofarm_model::parameters::Declared::len).sum()
+    };
+    let one = 375 * 160 + 160;
+    for (one_hot, projection, layers) in [
+        (0, TimeProjection::Shared, 1),
+        (375, TimeProjection::Shared, 1),
+        (0, TimeProjection::Each, 1),
+        (375, TimeProjection::Each, 2),
+    ] {
+        let count = values(one_hot, projection);
+        assert_eq!(count, layers * one, "{one_hot} {projection:?}");
+    }
+}
+
+/// 637 bins to 128 channels: a 1×1 convolution with a bias has 81,664 values, and neither norm nor ReLU.
+#[test]
+fn a_linear_stem_is_a_1x1_convolution_with_a_bias_over_bins_and_one_hot_bins() {
+    for (one_hot, values) in [(0, 637 * 128 + 128), (637, 2 * 637 * 128 + 128)] {
+        let spec = NetSpec {
+            stem: 128,
+            stem_form: StemForm::Linear,
+            ..NetSpec::released(637, one_hot, 1)
+        };
+        let net = Net::new(spec).unwrap();
+        let declared = net.declared().iter();
+        let stem: Vec<_> = declared.filter(|d| d.name.starts_with("stem")).collect();
+        let names: Vec<&str> = stem.iter().map(|d| &*d.name).collect();
+        assert_eq!(names, ["stem.weight", "stem.bias"]);
+        let count: usize = stem.iter().map(|d| d.len()).sum();
+        assert_eq!(count, values);
     }
 }
 
@@ -162,14 +209,22 @@ fn the_released_network_has_the_published_number_of_parameters() {
 #[test]
 fn gradients_are_the_slopes_of_the_loss() {
     let device = Device::flex();
-    for (target, architecture, one_hot) in [
-        (Target::Tof, Architecture::Unet2d, 0),
-        (Target::Shadow, Architecture::Unet2d, 6),
-        (Target::Specular, Architecture::Unet25d, 0),
-        (Target::Shadow, Architecture::Unet25d, 6),
+    let (block, linear) = (StemForm::Block, StemForm::Linear);
+    let (shared, each) = (TimeProjection::Shared, TimeProjection::Each);
+    for (target, architecture, one_hot, time_projection, stem, stem_form) in [
+        (Target::Tof, Architecture::Unet2d, 0, shared, 0, block),
+        (Target::Shadow, Architecture::Unet2d, 6, shared, 0, block),
+        (Target::Tof, Architecture::Unet2d, 0, shared, 3, linear),
+        (Target::Shadow, Architecture::Unet2d, 6, shared, 3, linear),
+        (Target::Specular, Architecture::Unet25d, 0, shared, 0, block),
+        (Target::Shadow, Architecture::Unet25d, 6, shared, 0, block),
+        (Target::Shadow, Architecture::Unet25d, 6, each, 0, block),
     ] {
         let net = NetSpec {
             architecture,
+            time_projection,
+            stem,
+            stem_form,
             width: 4,
             levels: 2,
             time: 4,

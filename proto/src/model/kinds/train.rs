@@ -1,7 +1,9 @@
 //! Training: a network learns from the scenes of a data set and is kept in its store under a name. One task. Defaults are
 //! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
 
-pub use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target};
+pub use picofarm_settings::{
+    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
+};
 use serde::Serialize;
 use serde_json::{Value, json};
 

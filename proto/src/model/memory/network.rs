@@ -29,6 +29,8 @@ pub struct Network {
     pub time: f64,
     /// Channels of a projection before the first level; 0 = none.
     pub stem: f64,
+    /// Weights of that projection for each pair of channels.
+    pub stem_taps: f64,
 }
 
 impl Network {
@@ -59,7 +61,7 @@ impl Network {
             .take(self.levels.saturating_sub(1) as usize)
             .map(|[_, _, c]| 9.0 * (3.0 * c * c + c * c))
             .sum();
-        let stem = 9.0 * self.inputs * self.stem + self.inputs * self.time;
+        let stem = self.stem_taps * self.inputs * self.stem + self.inputs * self.time;
         BIN * (encoders + decoders + stem)
     }
 

@@ -136,6 +136,39 @@ impl Block {
     }
 }
 
+/// Weights (outputs, inputs) and a bias, over channels.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Linear {
+    weight: Id,
+    bias: Id,
+}
+
+impl Linear {
+    pub(super) fn declare(d: &mut Declarations, at: &str, shape: &[usize]) -> Self {
+        let begin = Begin::FanIn(shape[1]);
+        Self {
+            weight: d.add(format!("{at}.weight"), shape, begin, true),
+            bias: d.add(format!("{at}.bias"), &shape[..1], begin, true),
+        }
+    }
+
+    /// Channels that it takes.
+    pub(super) fn inputs(&self, pass: &Pass) -> usize {
+        pass.declared(self.weight).shape[1]
+    }
+
+    pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
+        let bias: Tensor<1> = pass.get(self.bias);
+        let (outputs, inputs) = (bias.dims()[0], x.dims()[1]);
+        let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
+        pass.raise(ops::conv1x1(
+            pass.lower(x),
+            pass.lower(weight),
+            pass.lower(bias),
+        ))
+    }
+}
+
 /// The last layer: 1×1 convolution with a bias.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Final {

@@ -10,7 +10,7 @@ use burn::tensor::Tensor;
 
 pub use block::ONE_HOT;
 pub use pass::{Input, MOMENTUM, Pass};
-pub use spec::{Architecture, NetSpec, Precision};
+pub use spec::{Architecture, NetSpec, Precision, StemForm, TimeProjection};
 
 use crate::{
     ModelError,

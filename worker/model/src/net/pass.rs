@@ -87,6 +87,11 @@ impl<'a> Pass<'a> {
         shaped(&self.declared[id.0], self.leaves[id.0].clone())
     }
 
+    /// How a parameter was declared.
+    pub(super) fn declared(&self, id: Id) -> &Declared {
+        &self.declared[id.0]
+    }
+
     /// A parameter as one row.
     pub(super) fn flat(&self, id: Id) -> Tensor<1> {
         self.leaves[id.0].clone()

@@ -1,6 +1,6 @@
 //! What a network looks like: everything that decides its parameters, and nothing else.
 
-pub use picofarm_settings::{Architecture, Precision};
+pub use picofarm_settings::{Architecture, Precision, StemForm, TimeProjection};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -23,19 +23,24 @@ pub struct NetSpec {
     pub levels: usize,
     /// Channels of a convolution before the first level (the appendix's form: 128); 0 = none (the released code's).
     pub stem: usize,
+    /// What that convolution is.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub stem_form: StemForm,
     /// Length of the time axis after the first projection, `Unet25d` only (the paper: 160).
     pub time: usize,
+    /// Whether two streams share that projection, `Unet25d` only.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub time_projection: TimeProjection,
     /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
     /// Numbers in which convolutions are computed.
-    #[serde(default, skip_serializing_if = "is_f32")]
+    #[serde(default, skip_serializing_if = "is_default")]
     pub precision: Precision,
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
-fn is_f32(precision: &Precision) -> bool {
-    *precision == Precision::F32
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl NetSpec {
@@ -49,7 +54,9 @@ impl NetSpec {
             width: 128,
             levels: 6,
             stem: 0,
+            stem_form: StemForm::Block,
             time: 160,
+            time_projection: TimeProjection::Shared,
             frozen: false,
             precision: Precision::F32,
         }
@@ -78,7 +85,10 @@ impl NetSpec {
         let mut inputs = self.dense + self.one_hot;
         let mut sum = 0.0;
         if self.stem > 0 {
-            sum += of(inputs, self.stem, 0);
+            sum += match self.stem_form {
+                StemForm::Block => of(inputs, self.stem, 0),
+                StemForm::Linear => of(inputs, self.stem, 0) / 9.0,
+            };
             inputs = self.stem;
         }
         let widths = self.widths();

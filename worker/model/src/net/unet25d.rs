@@ -7,9 +7,9 @@
 use burn::tensor::{Tensor, activation::relu};
 
 use super::{
-    block::norm,
+    block::{Linear, norm},
     pass::{Input, Norm, Pass},
-    spec::NetSpec,
+    spec::{NetSpec, TimeProjection},
     unet2d::Decoder,
 };
 use crate::{
@@ -20,19 +20,12 @@ use crate::{
 #[derive(Debug, Clone)]
 pub(super) struct Unet25d {
     time: usize,
-    /// One for each stream: bins to moments.
+    /// Bins to moments: one for both streams (the released code's form), or one for each.
     projections: Vec<Linear>,
     encoders: Vec<[Cbr; 2]>,
     /// One for each level: moments to one.
     skips: Vec<Vec<Linear>>,
     decoder: Decoder,
-}
-
-/// Weights (outputs, inputs) and a bias.
-#[derive(Debug, Clone, Copy)]
-struct Linear {
-    weight: Id,
-    bias: Id,
 }
 
 /// 3×3×3 convolution without bias, batch norm, ReLU.
@@ -46,12 +39,13 @@ impl Unet25d {
     pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
         let streams = if spec.one_hot > 0 { 2 } else { 1 };
         d.frozen = spec.frozen;
-        let projections = (0..streams)
-            .map(|s| {
-                let at = format!("time_projections.{s}");
-                Linear::declare(d, &at, &[spec.time, spec.dense, 1, 1])
-            })
-            .collect();
+        let shape = [spec.time, spec.dense, 1, 1];
+        let projections = match spec.time_projection {
+            TimeProjection::Shared => vec![Linear::declare(d, "time_projection", &shape)],
+            TimeProjection::Each => (0..streams)
+                .map(|s| Linear::declare(d, &format!("time_projections.{s}"), &shape))
+                .collect(),
+        };
         let mut inputs = streams;
         let mut encoders = Vec::new();
         for (i, outputs) in spec.widths().into_iter().enumerate() {
@@ -105,7 +99,8 @@ impl Unet25d {
         if let Some(one_hot) = input.one_hot {
             streams.push(ops::plain::one_hot(one_hot, bins));
         }
-        let streams = streams.into_iter().zip(&self.projections);
+        // A shared projection is the only one, whatever the number of streams.
+        let streams = streams.into_iter().zip(self.projections.iter().cycle());
         let streams: Vec<Tensor<5>> = streams
             .map(|(x, projection)| {
                 let x = projection.forward(pass, x);
@@ -162,28 +157,6 @@ fn steps(time: usize) -> Vec<usize> {
     }
     sizes.push(1);
     sizes
-}
-
-impl Linear {
-    fn declare(d: &mut Declarations, at: &str, shape: &[usize]) -> Self {
-        let begin = Begin::FanIn(shape[1]);
-        Self {
-            weight: d.add(format!("{at}.weight"), shape, begin, true),
-            bias: d.add(format!("{at}.bias"), &shape[..1], begin, true),
-        }
-    }
-
-    /// Over channels.
-    fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
-        let bias: Tensor<1> = pass.get(self.bias);
-        let (outputs, inputs) = (bias.dims()[0], x.dims()[1]);
-        let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
-        pass.raise(ops::conv1x1(
-            pass.lower(x),
-            pass.lower(weight),
-            pass.lower(bias),
-        ))
-    }
 }
 
 impl Cbr {

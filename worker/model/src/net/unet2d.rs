@@ -1,21 +1,28 @@
 //! The 2D U-Net of Shoot-Bounce-3D: bins are channels.
 
-use burn::tensor::Tensor;
+use burn::tensor::{Int, Tensor};
 
 use super::{
-    block::{Block, Cbr, Final},
+    block::{Block, Cbr, Final, Linear},
     pass::{Input, Pass},
-    spec::NetSpec,
+    spec::{NetSpec, StemForm},
 };
 use crate::{ops, parameters::Declarations};
 
 /// Encoder blocks with max-pooling between them, decoder blocks over upsampled features beside the encoder's.
 #[derive(Debug, Clone)]
 pub(super) struct Unet2d {
-    stem: Option<Cbr>,
+    stem: Option<Stem>,
     encoders: Vec<Block>,
     frozen: bool,
     decoder: Decoder,
+}
+
+/// The projection before the first level.
+#[derive(Debug, Clone, Copy)]
+enum Stem {
+    Block(Cbr),
+    Linear(Linear),
 }
 
 /// The decoder.
@@ -28,8 +35,7 @@ pub(super) struct Decoder {
 impl Unet2d {
     pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
         d.frozen = spec.frozen;
-        let stem =
-            (spec.stem > 0).then(|| Cbr::declare(d, "stem", spec.dense, spec.one_hot, spec.stem));
+        let stem = (spec.stem > 0).then(|| Stem::declare(d, spec));
         let (mut inputs, mut one_hot) = match stem {
             Some(_) => (spec.stem, 0),
             None => (spec.dense, spec.one_hot),
@@ -74,6 +80,41 @@ impl Unet2d {
             false => self.features(pass, input),
         };
         self.decoder.forward(pass, features)
+    }
+}
+
+impl Stem {
+    fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        match spec.stem_form {
+            StemForm::Block => {
+                Self::Block(Cbr::declare(d, "stem", spec.dense, spec.one_hot, spec.stem))
+            }
+            StemForm::Linear => {
+                let inputs = spec.dense + spec.one_hot;
+                Self::Linear(Linear::declare(d, "stem", &[spec.stem, inputs, 1, 1]))
+            }
+        }
+    }
+
+    fn forward(
+        &self,
+        pass: &mut Pass,
+        x: Tensor<4>,
+        one_hot: Option<&Tensor<3, Int>>,
+    ) -> Tensor<4> {
+        match self {
+            Self::Block(cbr) => cbr.forward(pass, x, one_hot),
+            Self::Linear(linear) => {
+                let x = match one_hot {
+                    Some(bins) => {
+                        let channels = linear.inputs(pass) - x.dims()[1];
+                        Tensor::cat(vec![x, ops::plain::one_hot(bins.clone(), channels)], 1)
+                    }
+                    None => x,
+                };
+                linear.forward(pass, x)
+            }
+        }
     }
 }
 

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{
     input::{ShadowVariant, Target},
-    net::Architecture,
+    net::{Architecture, StemForm, TimeProjection},
 };
 
 /// What a target is called.
@@ -251,14 +251,18 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         Architecture::Unet2d => "2D U-Net",
         Architecture::Unet25d => "2.5D U-Net",
     };
-    let stem = if net.stem > 0 {
-        format!(", stem {}", net.stem)
-    } else {
-        String::new()
+    let stem = match (net.stem, net.stem_form) {
+        (0, _) => String::new(),
+        (width, StemForm::Block) => format!(", stem {width}"),
+        (width, StemForm::Linear) => format!(", linear stem {width}"),
+    };
+    let projection = match net.time_projection {
+        TimeProjection::Shared => "",
+        TimeProjection::Each => ", a projection of time for each stream",
     };
     let frozen = if net.frozen { ", frozen encoder" } else { "" };
     words.push(format!(
-        "{architecture}, width {}, {} levels{stem}{frozen}",
+        "{architecture}, width {}, {} levels{stem}{projection}{frozen}",
         net.width, net.levels
     ));
     words.extend(

@@ -10,7 +10,7 @@ use crate::{
     Evaluated,
     input::{Normalise, Question, ShadowVariant, Target},
     metric::Metrics,
-    net::{Architecture, NetSpec},
+    net::{Architecture, NetSpec, StemForm, TimeProjection},
     train::{Line, Plan, Schedule},
 };
 
@@ -32,7 +32,9 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         width: 8,
         levels: 3,
         stem: 0,
+        stem_form: StemForm::Block,
         time: 0,
+        time_projection: TimeProjection::Shared,
         frozen: false,
         precision: crate::net::Precision::F32,
     };

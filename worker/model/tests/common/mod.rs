@@ -5,7 +5,7 @@ use std::sync::Arc;
 use picofarm_model::{
     Random,
     input::{Normalise, Question, ShadowVariant, Target},
-    net::{Architecture, NetSpec},
+    net::{Architecture, NetSpec, StemForm, TimeProjection},
     scene::Scene,
     train::{Plan, Schedule, Sources},
 };
@@ -79,7 +79,9 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
             width: 4,
             levels: 3,
             stem: 0,
+            stem_form: StemForm::Block,
             time: 0,
+            time_projection: TimeProjection::Shared,
             frozen: false,
             precision: picofarm_model::net::Precision::F32,
         },

@@ -1,6 +1,6 @@
 //! What a training's settings may be.
 
-use picofarm_settings::{Architecture, Target};
+use picofarm_settings::{Architecture, StemForm, Target, TimeProjection};
 
 use super::settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, TrainSettings,
@@ -104,6 +104,16 @@ impl NetSettings {
         ];
         for (field, value, low, high, unit) in limits {
             within(format!("train.net.{field}"), value, (low, high), unit)?;
+        }
+        if self.architecture != Architecture::Unet25d
+            && self.time_projection != TimeProjection::Shared
+        {
+            let what = "is for architecture = \"unet25d\"; remove it".into();
+            return fail("time_projection", what);
+        }
+        if self.stem == 0 && self.stem_form != StemForm::Block {
+            let what = "is for a net with a stem; give net.stem (128 in the paper), or remove it";
+            return fail("stem_form", what.into());
         }
         match (self.architecture, self.time_features) {
             (Architecture::Unet2d, 1..) => fail(

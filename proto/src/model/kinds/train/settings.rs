@@ -1,6 +1,8 @@
 //! What is learnt, and how: the settings of trainings, and the network that follows from them.
 
-use picofarm_settings::{Architecture, Precision, Schedule, ShadowVariant, Target};
+use picofarm_settings::{
+    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::model::{
@@ -104,9 +106,15 @@ pub struct NetSettings {
     pub levels: u32,
     /// Channels of a projection before the first level, as in the paper's appendix (128); 0 = none, as in the released code.
     pub stem: u32,
+    /// What that projection is.
+    #[serde(skip_serializing_if = "is_default")]
+    pub stem_form: StemForm,
     /// For `unet25d`: bins of time after the learnt projection of each stream; its levels halve them. 0 otherwise.
     #[serde(skip_serializing_if = "is_zero_u32")]
     pub time_features: u32,
+    /// For `unet25d`: whether both streams share that projection, as in the released code.
+    #[serde(skip_serializing_if = "is_default")]
+    pub time_projection: TimeProjection,
 }
 
 /// How shadows are predicted (appendix A.1 of the paper).
@@ -157,7 +165,9 @@ impl Default for NetSettings {
             width: 128,
             levels: 6,
             stem: 0,
+            stem_form: StemForm::Block,
             time_features: 0,
+            time_projection: TimeProjection::Shared,
         }
     }
 }
@@ -237,10 +247,12 @@ impl TrainSettings {
             _ => (seen, 0.0),
         };
         let net = &self.net;
+        let linear = net.stem > 0 && net.stem_form == StemForm::Linear;
         Network {
             scene: *source,
             inputs: dense + one_hot,
-            dense,
+            // A linear stem is given one-hot channels as dense ones.
+            dense: if linear { dense + one_hot } else { dense },
             width: f64::from(net.width),
             levels: net.levels,
             time: match net.architecture {
@@ -248,6 +260,7 @@ impl TrainSettings {
                 Architecture::Unet25d => f64::from(net.time_features.max(1)),
             },
             stem: f64::from(net.stem),
+            stem_taps: if linear { 1.0 } else { 9.0 },
         }
     }
 

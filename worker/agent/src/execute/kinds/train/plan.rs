@@ -59,7 +59,9 @@ pub(super) fn plan(
         width: wanted.width as usize,
         levels: wanted.levels as usize,
         stem: wanted.stem as usize,
+        stem_form: wanted.stem_form,
         time: wanted.time_features as usize,
+        time_projection: wanted.time_projection,
         frozen: !settings.specular.on.is_empty(),
         precision: optimise.precision,
     };
@@ -114,7 +116,17 @@ pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
         ("net.width", text(&net.width), text(&under.width)),
         ("net.levels", text(&net.levels), text(&under.levels)),
         ("net.stem", text(&net.stem), text(&under.stem)),
+        (
+            "net.stem_form",
+            text(&net.stem_form),
+            text(&under.stem_form),
+        ),
         ("net.time_features", text(&net.time), text(&under.time)),
+        (
+            "net.time_projection",
+            text(&net.time_projection),
+            text(&under.time_projection),
+        ),
     ] {
         if ours != theirs {
             return Err(TaskError::User(format!(
