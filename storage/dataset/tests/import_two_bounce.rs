@@ -42,7 +42,7 @@ fn path(spot: [f64; 3], point: [f64; 3]) -> f64 {
 }
 
 fn lit(spot: usize, pixel: usize) -> bool {
-    (pixel + spot) % 5 != 0
+    !(pixel + spot).is_multiple_of(5)
 }
 
 /// What lies in the files of times and detections.
