@@ -29,6 +29,7 @@ use picofarm_scene::{
     import::{self, ImportOptions},
     plato,
 };
+use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
 use picofarm_transient::RenderError;
 use serde_json::{Value, json};
 
@@ -241,6 +242,7 @@ fn measure(
         gate: args.gate.gate(),
         samples: args.samples,
         seed: args.seed,
+        sensor: sensor(args),
     };
     fits_memory(&settings, scene, threads)?;
     let captures = scene.laser.beams.len();
@@ -250,6 +252,17 @@ fn measure(
     };
     let measured = source::captures_of(scene, &settings, &progress).map_err(refused)?;
     Ok((measured, None))
+}
+
+/// The detector of captures: photon noise and ambient light, an ideal pulse.
+fn sensor(args: &Reconstruct) -> Option<Sensor> {
+    args.detector.photons.map(|photons| Sensor {
+        pulse: Pulse::None {},
+        jitter: Jitter::Gaussian { fwhm_ps: 0.0 },
+        scale: Scale::Peak { photons },
+        dark_per_bin: args.detector.ambient.unwrap_or(0.0),
+        ..Sensor::default()
+    })
 }
 
 /// Refuses a render that does not fit into memory.
@@ -262,6 +275,10 @@ fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Res
 /// Refuses options of predictions where times come from elsewhere.
 fn check_networks(args: &Reconstruct) -> Result<()> {
     let given = &args.networks;
+    if args.spots_from != SpotsFrom::Captures && args.detector.photons.is_some() {
+        let what = "--photons belongs to --spots-from captures";
+        return Err(CliError::input(what).hint("add --spots-from captures, or leave it out"));
+    }
     if args.spots_from == SpotsFrom::Predictions {
         return Ok(());
     }
@@ -312,6 +329,9 @@ fn metrics(
         "views": match args.views { ViewsArg::Around => "around", ViewsArg::Plato => "plato" },
     });
     all.extend(asked.as_object().cloned().unwrap_or_default());
+    if let Some(sensor) = sensor(args) {
+        all.insert("sensor".into(), json!(sensor));
+    }
     Ok(Value::Object(all))
 }
 

@@ -145,6 +145,21 @@ fn settings_of_a_reconstruction_are_refused_by_field_where_they_make_no_sense() 
             "learn from shadows",
         ),
         (
+            "sensor = { dark_per_bin = 1.0 }",
+            "sensor",
+            "add from = \"captures\"",
+        ),
+        (
+            "from = \"captures\"\nsensor = { rebin = 2 }",
+            "sensor.rebin",
+            "keep their bins",
+        ),
+        (
+            "from = \"captures\"\nsensor = { dark_per_bin = -1.0 }",
+            "sensor.dark_per_bin",
+            "",
+        ),
+        (
             "from = \"captures\"\nmirrors = \"keep\"",
             "mirrors",
             "does not know",

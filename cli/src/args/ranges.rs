@@ -51,6 +51,16 @@ pub fn gib(text: &str) -> Result<f64, String> {
     within(text, 0.05..=1e6, "GiB (of 1.07 GB)")
 }
 
+/// Photons of a peak.
+pub fn photons(text: &str) -> Result<f64, String> {
+    within(text, 1e-3..=1e6, "photons")
+}
+
+/// Ambient photons of a bin.
+pub fn ambient(text: &str) -> Result<f64, String> {
+    within(text, 0.0..=1e6, "photons a bin")
+}
+
 /// A time that somebody waits.
 pub fn seconds(text: &str) -> Result<f64, String> {
     within(text, 0.0..=1e9, "seconds")

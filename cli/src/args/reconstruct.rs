@@ -44,6 +44,8 @@ pub struct Reconstruct {
     /// Camera paths per pixel of the captures, for three bounces and more
     #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_048_576))]
     pub samples: u32,
+    #[command(flatten)]
+    pub detector: DetectorArgs,
     /// Seed of all random numbers
     #[arg(long, default_value_t = 0, value_parser = super::ranges::whole)]
     pub seed: u64,
@@ -69,6 +71,17 @@ pub struct NetworksArgs {
     /// Model that predicts mirrors, whose pixels are left out [default: none, mirrors are not known]
     #[arg(long, value_name = "NAME")]
     pub specular: Option<String>,
+}
+
+/// A detector for `--spots-from captures`; without any of these, what is rendered is what is measured.
+#[derive(Args)]
+pub struct DetectorArgs {
+    /// Count photons: so many in the brightest bin of the median pixel of each capture
+    #[arg(long, value_name = "N", value_parser = super::ranges::photons)]
+    pub photons: Option<f64>,
+    /// Ambient photons in each bin of each pixel, beside those of --photons
+    #[arg(long, value_name = "N", requires = "photons", value_parser = super::ranges::ambient)]
+    pub ambient: Option<f64>,
 }
 
 /// What belongs to `--field mlp` alone.

@@ -141,6 +141,7 @@ pub fn measure(
         gate: networks.gate,
         samples: args.samples,
         seed: args.seed,
+        sensor: None,
     };
     fits_memory(&settings, scene, threads)?;
     let rendered = render(scene, &settings.render_settings(), &Capture(watch))

@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p picofarm-reconstruct --example plato` measures PlatoNeRF's room with furniture of our own, from
 //! times and shadows of its truth in bins of 128 ps. Further words choose: `captures` (times and shadows from rendered
-//! histograms, an hour), `peers` (other methods), `sampling` (bins, pixels and grids of spots), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view), `=TEXT` (rows whose name
+//! histograms, an hour), `ambient` (photon noise and ambient light in them), `peers` (other methods), `sampling` (bins, pixels and grids of spots), `rooms` (unseen primitive and furnished rooms; with `captures`, half an hour), `quick` (every seventh view), `=TEXT` (rows whose name
 //! holds the text).
 
 use std::error::Error;
@@ -14,7 +14,9 @@ use picofarm_reconstruct::{
     reconstruct,
     render::Renderer,
     score::{ViewScore, around, floaters, mesh_score, score_views},
-    source::{CaptureSettings, Disturbed, captures_of, from_truth, truth_of},
+    source::{
+        CaptureSettings, Captures, Disturbed, LIT_THRESHOLD, captures_of, from_truth, truth_of,
+    },
     surface,
 };
 use picofarm_scene::{
@@ -23,7 +25,8 @@ use picofarm_scene::{
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
 };
-use picofarm_transient::{Gate, Progress};
+use picofarm_settings::{Jitter, Pulse, Scale, Sensor};
+use picofarm_transient::{Gate, Progress, render};
 use rustix::time::{ClockId, clock_gettime};
 
 /// Width of a bin of 128 ps, metres.
@@ -76,6 +79,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             rooms(furnished, asked("captures"))?;
         }
         return Ok(());
+    }
+    if asked("ambient") {
+        return ambient(every);
     }
     if asked("captures") && !asked("peers") {
         return captured(every);
@@ -297,6 +303,60 @@ fn captured(every: usize) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
+/// The chair from captures of 256 pixels as a detector counts them.
+fn ambient(every: usize) -> Result<(), Box<dyn Error>> {
+    let room = PlatoSettings {
+        resolution: 256,
+        ..PlatoSettings::default()
+    };
+    let scene = plato::generate(&room)?;
+    let settings = rendering();
+    let sensor = |photons: f64, ambient: f64| Sensor {
+        pulse: Pulse::None {},
+        jitter: Jitter::Gaussian { fwhm_ps: 0.0 },
+        scale: Scale::Peak { photons },
+        dark_per_bin: ambient,
+        ..Sensor::default()
+    };
+    let mut variants = vec![("as rendered".to_owned(), None)];
+    for (photons, ambient) in [
+        (1000.0, 0.0),
+        (100.0, 0.0),
+        (30.0, 0.0),
+        (100.0, 1.0),
+        (100.0, 4.0),
+        (100.0, 16.0),
+        (1000.0, 100.0),
+    ] {
+        let name = format!("{photons} photons, {ambient} ambient a bin");
+        variants.push((name, Some(sensor(photons, ambient))));
+    }
+    let mut all = Vec::new();
+    for (name, sensor) in variants {
+        let laser = scene.laser.clone();
+        let empty = Captures::new(scene.camera, laser, settings.gate, LIT_THRESHOLD);
+        let captures = match &sensor {
+            Some(sensor) => empty.behind(sensor, 0)?,
+            None => empty,
+        };
+        all.push((name, captures));
+    }
+    let mut alone = scene.clone();
+    for (beam, of) in scene.laser.beams.iter().enumerate() {
+        alone.laser.beams = vec![*of];
+        let rendered = render(&alone, &settings.render_settings(), &Unstopped)?;
+        for (_, captures) in &mut all {
+            captures.add(beam, &rendered.transient)?;
+        }
+    }
+    for (name, captures) in all {
+        let measured = captures.finish();
+        let made = timed(|| grid(measured, Settings::default()))?;
+        judge(&format!("chair, 256 pixels, {name}"), &scene, made, every)?;
+    }
+    Ok(())
+}
+
 /// Each method on two rooms; from captures, at 256 pixels.
 fn peers(captures: bool) -> Vec<Row> {
     let rooms = [
@@ -379,7 +439,12 @@ fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, 
     if !captures {
         return Ok(from_truth(scene, &truth_of(scene, &Unstopped)?, how)?);
     }
-    let settings = CaptureSettings {
+    Ok(captures_of(scene, &rendering(), &|_, _| true)?)
+}
+
+/// How captures are rendered.
+fn rendering() -> CaptureSettings {
+    CaptureSettings {
         gate: Gate {
             start_m: 0.0,
             bin_width_m: f64::from(BIN_M),
@@ -387,8 +452,8 @@ fn measured(scene: &Scene, how: &Disturbed, captures: bool) -> Result<Measured, 
         },
         samples: 8,
         seed: 0,
-    };
-    Ok(captures_of(scene, &settings, &|_, _| true)?)
+        sensor: None,
+    }
 }
 
 impl Row {

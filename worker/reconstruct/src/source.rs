@@ -1,6 +1,7 @@
 //! Where measurements come from.
 
 mod captures;
+mod counted;
 mod expected;
 mod given;
 mod rendered;

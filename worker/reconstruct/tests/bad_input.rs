@@ -143,6 +143,7 @@ fn a_spot_on_a_mirror_is_left_out_and_named() {
         gate,
         samples: 1,
         seed: 0,
+        sensor: None,
     };
     let found = picofarm_reconstruct::source::captures_of(&scene, &settings, &|_, _| true).unwrap();
     let said = found.check();
@@ -155,7 +156,7 @@ fn a_spot_on_a_mirror_is_left_out_and_named() {
 }
 
 #[test]
-fn captures_of_another_size_or_without_light_are_told() {
+fn captures_of_another_size_or_without_light_are_refused_or_named() {
     let (scene, _) = room(PlatoObject::Empty, 2, 8);
     let gate = Gate {
         start_m: 1.0,

@@ -1,6 +1,6 @@
 //! Reconstruction: each scene of a data set becomes a room in 3D, from light that bounced twice. One task a scene.
 
-use picofarm_settings::{FieldKind, GridSettings, MlpSettings, Shadows};
+use picofarm_settings::{FieldKind, GridSettings, MlpSettings, Sensor, SensorError, Shadows};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -43,7 +43,7 @@ pub struct ReconstructTask {
 }
 
 /// From what a scene is reconstructed, and how.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReconstructSettings {
     /// Where two-bounce times and shadow masks come from.
@@ -57,6 +57,10 @@ pub struct ReconstructSettings {
     /// What becomes of pixels that are known to see a mirror.
     #[serde(skip_serializing_if = "Mirrors::is_default")]
     pub mirrors: Mirrors,
+    /// With `from = "captures"`: the detector that counts their photons; left out, what is rendered is what is measured. Its seed is
+    /// the grid's.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<Sensor>,
     /// Views from elsewhere on which the depth is compared with the scene's, which is made again for it; 0 = none.
     pub views: u32,
     /// What the density is: a grid, or PlatoNeRF's networks.
@@ -265,6 +269,22 @@ impl ReconstructSettings {
             let what =
                 "says what becomes of mirrors, which from = \"captures\" does not know; remove it";
             return fail("mirrors", what.into());
+        }
+        if let Some(sensor) = &self.sensor {
+            if self.from != Measurements::Captures {
+                let what = "counts the photons of captures; add from = \"captures\", or remove it";
+                return fail("sensor", what.into());
+            }
+            if sensor.rebin != 1 {
+                let what = format!(
+                    "is {}; captures keep their bins: leave it out",
+                    sensor.rebin
+                );
+                return fail("sensor.rebin", what);
+            }
+            sensor
+                .check()
+                .or_else(|SensorError::Invalid { field, what }| fail(&field, what))?;
         }
         if !self.spots.is_sorted_by(|a, b| a < b) {
             return fail(

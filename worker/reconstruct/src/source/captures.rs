@@ -6,10 +6,14 @@
 //! and compares each pixel's two-bounce light with what a lit pixel would return; [`Captures::finish_plain`] does not.
 
 use picofarm_scene::{Beam, Camera, Laser, Vec3};
+use picofarm_settings::Sensor;
 use picofarm_transient::Gate;
 use rayon::prelude::*;
 
-use super::expected::{Return, expected};
+use super::{
+    counted::{Counted, Detector},
+    expected::{Return, expected},
+};
 use crate::{LeftOut, Measured, MeasuredSpot, NEAR_SPOT_SINE, ReconstructError};
 
 /// A pixel is lit where the matched filter's response reaches this (PlatoNeRF's threshold in all four of its scenes).
@@ -18,6 +22,8 @@ pub const LIT_THRESHOLD: f32 = 0.15;
 const ASTRAY: f32 = 0.04;
 /// Bins of the pulse template below this share of it are left out.
 const TEMPLATE_FLOOR: f32 = 1e-3;
+/// With photon noise, a return is one from so many standard deviations of it on.
+const CERTAIN: f32 = 3.0;
 
 /// Takes captures one by one, so that the histograms of one spot are in memory at a time.
 #[derive(Debug)]
@@ -25,6 +31,7 @@ pub struct Captures {
     gate: Gate,
     threshold: f32,
     laser: Laser,
+    detector: Option<Detector>,
     measured: Measured,
     /// The strongest return of every pixel and spot, `[spot][row][column]`.
     returns: Vec<Return>,
@@ -48,9 +55,33 @@ impl Captures {
             gate,
             threshold,
             laser,
+            detector: None,
             measured,
             returns: Vec::new(),
         }
+    }
+
+    /// Puts a detector before the captures: photon noise, ambient light, pulse and jitter. The ambient light of each pixel is
+    /// estimated from its own bins and taken off.
+    ///
+    /// # Errors
+    /// [`ReconstructError::Invalid`] for a sensor that cannot be, or that sums bins: captures keep theirs.
+    pub fn behind(self, sensor: &Sensor, seed: u64) -> Result<Self, ReconstructError> {
+        sensor
+            .check()
+            .map_err(|e| ReconstructError::invalid("sensor", e.to_string()))?;
+        if sensor.rebin != 1 {
+            let what = format!(
+                "is {}; captures keep their bins: leave it at 1",
+                sensor.rebin
+            );
+            return Err(ReconstructError::invalid("sensor.rebin", what));
+        }
+        let sensor = sensor.clone();
+        Ok(Self {
+            detector: Some(Detector { sensor, seed }),
+            ..self
+        })
     }
 
     /// Pixels of which it is known that they see a mirror (1), `[row][column]`; they take no part.
@@ -83,8 +114,13 @@ impl Captures {
             let what = format!("pixel {} bin {} is not finite", at / bins, at % bins);
             return Err(ReconstructError::invalid(field(), what));
         }
+        let counted = match &self.detector {
+            None => None,
+            Some(detector) => Some(detector.count(beam, histogram, &self.gate)?),
+        };
+        let histogram = counted.as_ref().map_or(histogram, |c| &c.light);
         match self.spot(direction, beam, histogram) {
-            Ok((spot, template)) => self.pixels_of(spot, &template, histogram),
+            Ok((spot, template)) => self.pixels_of(spot, &template, histogram, counted.as_ref()),
             Err(why) => self.measured.left_out.push(LeftOut { beam, why }),
         }
         Ok(())
@@ -153,7 +189,13 @@ impl Captures {
     }
 
     /// Steps 3 and 5 to 7 for every pixel.
-    fn pixels_of(&mut self, spot: MeasuredSpot, template: &[f32], histogram: &[f32]) {
+    fn pixels_of(
+        &mut self,
+        spot: MeasuredSpot,
+        template: &[f32],
+        histogram: &[f32],
+        counted: Option<&Counted>,
+    ) {
         let bins = self.gate.bins as usize;
         let taps: Vec<(usize, f32)> = template
             .iter()
@@ -186,12 +228,19 @@ impl Captures {
                 response = response.max(c);
             }
             let tau = this.middle(bin);
-            let lit = response / sum >= this.threshold && tau > spot.path_m;
-            let near = h[bin.saturating_sub(1)..(bin + 2).min(bins)].iter().sum();
+            let around = &h[bin.saturating_sub(1)..(bin + 2).min(bins)];
+            let near: f32 = around.iter().sum();
+            // Counts are their own variance, ambient ones included.
+            let noise = counted.map_or(0.0, |c| {
+                (near.max(0.0) + c.ambient[p] * around.len() as f32).sqrt()
+            });
+            let certain = near >= CERTAIN * noise;
+            let lit = response / sum >= this.threshold && tau > spot.path_m && certain;
             let strongest = Return {
                 path_m: tau,
                 energy: near,
                 share: near / sum,
+                noise,
             };
             (if lit { tau } else { 0.0 }, u8::from(lit), 1, strongest)
         };

@@ -21,6 +21,8 @@ const BRIGHT: f32 = 0.7;
 const BINS: f32 = 2.0;
 /// A return with a lower share of a pixel's light is no peak.
 const LEAST_SHARE: f32 = 0.05;
+/// Where photons are counted: noise beyond this share of the expected light leaves the pixel undecided.
+const UNDECIDED: f32 = 0.25;
 /// Rounds between factors of pixels and of spots.
 const ROUNDS: usize = 2;
 
@@ -33,6 +35,8 @@ pub(super) struct Return {
     pub energy: f32,
     /// Its share of all light.
     pub share: f32,
+    /// Standard deviation of the light, where photons were counted.
+    pub noise: f32,
 }
 
 /// Replaces masks and times by those that agree with the depth from all spots. `returns`: `[spot][row][column]`.
@@ -90,6 +94,7 @@ pub(super) fn expected(mut measured: Measured, returns: &[Return]) -> Measured {
         match agrees {
             // No normal: the pixel lies on an edge, and its depth and light belong to both sides.
             _ if !share.is_finite() => (0, 0),
+            _ if expected.is_some_and(|e| found.noise > UNDECIDED * e) => (0, 0),
             true if share < DARK => (0, 1),
             true if share >= BRIGHT && found.share >= LEAST_SHARE => (1, 1),
             true => (0, 0),

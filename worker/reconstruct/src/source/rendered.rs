@@ -1,6 +1,7 @@
 //! Measurements of a scene file: what has to be rendered for them.
 
 use picofarm_scene::Scene;
+use picofarm_settings::Sensor;
 use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, Strategy, render};
 
 use super::{Captures, LIT_THRESHOLD};
@@ -10,14 +11,16 @@ use crate::{Measured, ReconstructError};
 const MOST_OUTSIDE: f64 = 0.5;
 
 /// How captures are rendered.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CaptureSettings {
     /// The gate of the histograms.
     pub gate: Gate,
     /// Camera paths per pixel for three bounces and more.
     pub samples: u32,
-    /// Seed of the renders.
+    /// Seed of the renders, and of the detector's noise.
     pub seed: u64,
+    /// The detector; `None`: what is rendered is what is measured.
+    pub sensor: Option<Sensor>,
 }
 
 impl CaptureSettings {
@@ -72,7 +75,8 @@ impl Progress for OfCapture<'_> {
 /// Renders a capture of each beam by itself, all bounces, and measures times and masks in it.
 ///
 /// # Errors
-/// [`ReconstructError::Render`]; [`ReconstructError::Invalid`] where most of a capture's light lies outside the gate.
+/// [`ReconstructError::Render`]; [`ReconstructError::Invalid`] where most of a capture's light lies outside the gate, and for a sensor that
+/// cannot be.
 pub fn captures_of(
     scene: &Scene,
     settings: &CaptureSettings,
@@ -80,6 +84,9 @@ pub fn captures_of(
 ) -> Result<Measured, ReconstructError> {
     let laser = scene.laser.clone();
     let mut captures = Captures::new(scene.camera, laser, settings.gate, LIT_THRESHOLD);
+    if let Some(sensor) = &settings.sensor {
+        captures = captures.behind(sensor, settings.seed)?;
+    }
     let mut alone = scene.clone();
     for (beam, of) in scene.laser.beams.iter().enumerate() {
         alone.laser.beams = vec![*of];

@@ -1,6 +1,7 @@
 //! Measurements from a histogram of each spot alone, and the frames in which a data set keeps places.
 
 use picofarm_dataset::Dataset;
+use picofarm_proto::model::kinds::reconstruct::ReconstructSettings;
 use picofarm_reconstruct::{
     Measured,
     source::{Captures, LIT_THRESHOLD},
@@ -21,6 +22,7 @@ pub(super) fn captures(
     dataset: &Dataset,
     scene: u64,
     (camera, origin, spots, beams): (Camera, Vec3, &Spots, &[u32]),
+    settings: &ReconstructSettings,
     control: &Control,
 ) -> Result<Measured, TaskError> {
     if !dataset.spec().per_spot {
@@ -42,6 +44,10 @@ pub(super) fn captures(
         beams: spots.iter().map(towards).collect(),
     };
     let mut all = Captures::new(camera, laser, dataset.spec().gate, LIT_THRESHOLD);
+    if let Some(sensor) = &settings.sensor {
+        let seed = settings.grid.seed;
+        all = all.behind(sensor, seed).map_err(of_reconstruction)?;
+    }
     for (done, beam) in beams.iter().enumerate() {
         control.say(format!("capture {} of {}", done + 1, beams.len()), &[]);
         proceed(control, MEASURED * done as f32 / beams.len() as f32)?;

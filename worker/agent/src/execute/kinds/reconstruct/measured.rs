@@ -135,6 +135,7 @@ impl Work<'_> {
                 dataset,
                 scene,
                 (camera, laser, &spots, &beams),
+                &self.0.reconstruct,
                 control,
             );
         }
