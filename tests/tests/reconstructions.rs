@@ -222,13 +222,17 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
     let id = submit(&farm, &text);
     let mut worker = farm.worker("worker");
     assert_eq!(farm.until_ended(&id)["state"], "done");
+    let mut from_predictions = 0.0;
     for scene in 0..12 {
         for folder in ["truth-3d", "seen-3d"] {
             let found = metrics(&farm, folder, scene);
             let l1 = found["novel_views"]["all"]["l1_m"].as_f64().unwrap();
-            // Networks of eight rooms are poor ones.
-            let most = if folder == "truth-3d" { 0.25 } else { 1.2 };
+            // Networks of eight rooms are poor ones: of one room or another they see nothing.
+            let most = if folder == "truth-3d" { 0.25 } else { 2.5 };
             assert!(l1 > 0.0 && l1 < most, "{folder} {scene}: {found}");
+            if folder == "seen-3d" {
+                from_predictions += l1 / 12.0;
+            }
             assert_eq!(found["spots"], 4, "{found}");
             assert_eq!(found["image"], serde_json::json!([32, 32]), "{found}");
             let source = found["provenance"]["source"].as_str().unwrap();
@@ -243,6 +247,7 @@ output = {{ store = {store:?}, dataset = "seen-3d" }}
             begins("views.png", b"\x89PNG");
         }
     }
+    assert!(from_predictions < 1.0, "{from_predictions}");
     // A damaged result is found, and put back by the same job again.
     let folder = farm.store().join("truth-3d");
     let verified = farm.json(&["dataset", "verify", folder.to_str().unwrap()]);
