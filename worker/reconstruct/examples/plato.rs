@@ -320,13 +320,13 @@ fn ambient(every: usize) -> Result<(), Box<dyn Error>> {
     };
     let mut variants = vec![("as rendered".to_owned(), None)];
     for (photons, ambient) in [
-        (1000.0, 0.0),
+        (300.0, 0.0),
         (100.0, 0.0),
         (30.0, 0.0),
         (100.0, 1.0),
         (100.0, 4.0),
         (100.0, 16.0),
-        (1000.0, 100.0),
+        (300.0, 100.0),
     ] {
         let name = format!("{photons} photons, {ambient} ambient a bin");
         variants.push((name, Some(sensor(photons, ambient))));
