@@ -39,8 +39,9 @@ pub use layout::quantity::Quantity;
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use models::{
-    Dependents, Evaluation, Lineage, MODELS, ModelCheck, ModelManifest, ModelRepair, Models,
-    NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd, TrialRecord,
+    Dependents, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest, ModelRepair,
+    Models, NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd,
+    TrialRecord,
 };
 pub use predictions::{
     EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,

@@ -46,6 +46,9 @@ pub struct Lineage {
     pub data: String,
     /// The split.
     pub split: SplitUsed,
+    /// What was measured in them.
+    #[serde(default)]
+    pub measurement: Measurement,
     /// Scenes learnt from.
     pub training_scenes: u64,
     /// Scenes validated on.
@@ -59,6 +62,21 @@ pub struct Lineage {
     /// Where it is another model's copy under a name of its own: how it was chosen.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub promoted: Option<Promoted>,
+}
+
+/// What was measured in scenes, as far as experiments differ by it. All zero = not known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Measurement {
+    /// Rows of an image.
+    pub rows: u32,
+    /// Columns of an image.
+    pub columns: u32,
+    /// Spots that light at once.
+    pub spots: u32,
+    /// Bounces at most; 0 = all.
+    pub max_bounces: u32,
+    /// Whether photons were counted, with their noise.
+    pub photon_noise: bool,
 }
 
 /// How a model was chosen among others.

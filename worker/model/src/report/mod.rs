@@ -26,7 +26,7 @@ use serde::{Deserialize, Serialize};
 use crate::{Evaluated, Model, train::Line, train::Plan};
 
 pub use page::html;
-pub use paper::{Published, published};
+pub use paper::{Published, published, unlike};
 pub use picture::{Picture, Plane, pictures};
 pub use summary::{Group, Order, Scaling, Spread, Summary, json, summary};
 
@@ -87,23 +87,18 @@ pub struct Data {
     /// Scenes to learn from, where their number is known.
     #[serde(default)]
     pub scenes: Option<u64>,
-    /// Bounces in the measurement.
+    /// Bounces in the measurement at most; 0 = all that there are, 2 = experiment A.4's.
     #[serde(default)]
-    pub bounces: Bounces,
+    pub max_bounces: u32,
+    /// Rows and columns of its images, and spots that light at once, where they are known.
+    #[serde(default)]
+    pub images: Option<[u32; 2]>,
+    /// See [`Self::images`].
+    #[serde(default)]
+    pub spots: Option<u32>,
     /// Photon noise is in the measurement.
     #[serde(default)]
     pub noise: bool,
-}
-
-/// Bounces in a measurement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Bounces {
-    /// As many as there are.
-    #[default]
-    All,
-    /// The first two (A.4).
-    Two,
 }
 
 /// How fast a training was.

@@ -44,8 +44,12 @@ pub struct Group {
     pub beside_best_baseline: Option<(String, f64)>,
     /// Error of single scenes: what 10, 50 and 90 % of them stay below.
     pub scene_errors: Option<[f64; 3]>,
-    /// What was published of the same experiment.
+    /// What was published of the same experiment, where its size is the paper's.
     pub published: Option<Published>,
+    /// What was published of it at the paper's size, to compare orders with.
+    pub repeats: Option<Published>,
+    /// In what its size is not the paper's.
+    pub unlike: Vec<String>,
     /// Training examples a second.
     pub samples_per_s: Option<Spread>,
     /// Error of those that were evaluated: depth MAE in metres, or 1 - IoU.
@@ -193,6 +197,12 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
         .filter_map(|e| e.speed.map(|s| s.samples_per_s))
         .collect();
     let metrics: Vec<Metrics> = evaluated.iter().map(|e| e.metrics).collect();
+    let first = of().next();
+    let repeats = first.and_then(published);
+    let unlike = match repeats {
+        Some(_) => first.map(paper::unlike).unwrap_or_default(),
+        None => Vec::new(),
+    };
     Group {
         label: common(&names),
         target,
@@ -206,7 +216,9 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
             .zip(error)
             .map(|((name, loss), e)| (name, e.mean / loss)),
         scene_errors: (!scenes.is_empty()).then(|| [0.1, 0.5, 0.9].map(quantile)),
-        published: of().next().and_then(published),
+        published: repeats.filter(|_| unlike.is_empty()),
+        repeats,
+        unlike,
         samples_per_s: Spread::of(&speeds),
         error,
         models,
@@ -266,7 +278,7 @@ fn order(report: &Report, target: Target, groups: &[Group]) -> Option<Order> {
     let known: Vec<(&Group, Spread, f64)> = groups
         .iter()
         .filter(|g| g.target == target)
-        .filter_map(|g| Some((g, g.error?, g.published?.loss()?)))
+        .filter_map(|g| Some((g, g.error?, g.repeats?.loss()?)))
         .filter(|(_, error, _)| error.mean.is_finite())
         .collect();
     let mut out = Order {

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::{
-    Group, Order, Published, Report, Spread, Summary,
+    Group, Order, Report, Spread, Summary,
     number::{digits, metres, share, thousands},
     paper,
     summary::{Figures, TARGETS},
@@ -93,7 +93,7 @@ pub(super) fn tables(report: &Report, summary: &Summary) -> String {
             }
         }
     }
-    if summary.groups.iter().any(|g| g.published.is_some()) {
+    if summary.groups.iter().any(|g| g.repeats.is_some()) {
         let _ = write!(out, "<p class=\"note\">{}</p>", Safe(paper::NOTE));
     }
     out
@@ -104,7 +104,7 @@ pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> Strin
     let mut trivial: Vec<&String> = groups.iter().flat_map(|g| g.baselines.keys()).collect();
     trivial.sort_unstable();
     trivial.dedup();
-    let published = groups.iter().any(|g| g.published.is_some());
+    let published = groups.iter().any(|g| g.repeats.is_some());
     let main = columns(target)[0].0;
     let mut out = String::from(
         "<div class=\"wide\"><table class=\"figures\"><thead><tr><th>experiment</th><th>seeds</th>",
@@ -174,7 +174,7 @@ fn row(
         }
     }
     if with_published {
-        let published = shown(target, group.published);
+        let published = shown(target, group);
         let _ = write!(out, "<td class=\"n paper\">{published}</td>");
     }
     for name in trivial {
@@ -199,9 +199,18 @@ fn row(
     out.push_str("</tr>");
 }
 
-fn shown(target: Target, published: Option<Published>) -> String {
-    let Some(published) = published else {
-        return "–".to_owned();
+fn shown(target: Target, group: &Group) -> String {
+    let published = match (group.published, group.repeats) {
+        (Some(published), _) => published,
+        (None, None) => return "–".to_owned(),
+        (None, Some(repeats)) => {
+            let (experiment, unlike) = (repeats.experiment, group.unlike.join(", "));
+            return format!(
+                "–<small>{}, but {}</small>",
+                Safe(experiment),
+                Safe(&unlike)
+            );
+        }
     };
     let figures = match (target, published.mae, published.iou) {
         (Target::Tof, Some(mae), _) => mae.to_string(),
@@ -241,8 +250,10 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         };
         words.extend([variant.to_owned(), format!("{} spots", question.spots)]);
     }
-    if entry.data.bounces == super::Bounces::Two {
-        words.push("two bounces only".to_owned());
+    match entry.data.max_bounces {
+        0 => {}
+        2 => words.push("two bounces only".to_owned()),
+        n => words.push(format!("{n} bounces at most")),
     }
     if entry.data.noise {
         words.push("photon noise".to_owned());

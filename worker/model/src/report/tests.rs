@@ -3,8 +3,7 @@
 use serde_json::Value;
 
 use super::{
-    Bounces, Data, Entry, Picture, Plane, Report, Speed, html, json, published, summary,
-    table::table,
+    Data, Entry, Picture, Plane, Report, Speed, html, json, published, summary, table::table,
 };
 use crate::{
     Evaluated,
@@ -318,7 +317,8 @@ fn published_figures_stand_beside_the_experiments_that_they_are_of() {
         published(&one).and_then(|p| p.iou)
     };
     assert_eq!(of(&|_| {}), Some(0.959));
-    assert_eq!(of(&|e| e.data.bounces = Bounces::Two), Some(0.964));
+    assert_eq!(of(&|e| e.data.max_bounces = 2), Some(0.964));
+    assert_eq!(of(&|e| e.data.max_bounces = 3), None);
     assert_eq!(of(&|e| e.plan.question.intensity_only = true), Some(0.700));
     assert_eq!(of(&|e| e.data.noise = true), None);
     assert_eq!(
@@ -326,4 +326,53 @@ fn published_figures_stand_beside_the_experiments_that_they_are_of() {
         None
     );
     assert_eq!(published(&depth("d", 1, 0.1)).unwrap().mae, Some(0.0228));
+}
+
+#[test]
+fn published_figures_stand_beside_the_papers_size_alone() {
+    let mut one = shadow("s", ShadowVariant::Concat, 1, 0.9);
+    let page = |one: &Entry| {
+        let report = report(vec![one.clone()]);
+        let summary = summary(&report);
+        let shown: Vec<&super::Group> = summary.groups.iter().collect();
+        (
+            summary.groups[0].clone(),
+            table(&report, Target::Shadow, &shown),
+        )
+    };
+    let (small, html) = page(&one);
+    assert!(small.published.is_none() && small.repeats.is_some());
+    assert!(!html.contains("0.959"), "{html}");
+    assert!(
+        html.contains("A.1 concat (A.4: IoU 0.954), but spots not known, images not known, 64 bins, 96 scenes, width 8, 3 levels"),
+        "{html}"
+    );
+    one.data.spots = Some(25);
+    one.data.images = Some([256, 256]);
+    one.data.scenes = Some(87_688);
+    one.plan.question.bins = 637;
+    (one.plan.net.width, one.plan.net.levels) = (128, 6);
+    let (whole, html) = page(&one);
+    assert_eq!(whole.unlike, Vec::<String>::new());
+    assert_eq!(whole.published.and_then(|p| p.iou), Some(0.959));
+    assert!(html.contains("0.959"), "{html}");
+    for (change, word) in [
+        (
+            (|e: &mut Entry| e.data.spots = Some(4)) as fn(&mut Entry),
+            "4 spots",
+        ),
+        (|e| e.data.images = Some([64, 128]), "128 × 64 pixels"),
+        (|e| e.plan.question.bins = 106, "106 bins"),
+        (|e| e.data.scenes = Some(300), "300 scenes"),
+        (|e| e.plan.net.width = 32, "width 32, 6 levels"),
+    ] {
+        let mut other = one.clone();
+        change(&mut other);
+        let (group, html) = page(&other);
+        assert_eq!(group.unlike, [word]);
+        assert!(
+            group.published.is_none() && !html.contains("0.959"),
+            "{html}"
+        );
+    }
 }

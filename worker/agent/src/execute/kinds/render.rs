@@ -139,7 +139,7 @@ fn make_by(
         task_key: key.to_string(),
         renderer: spec.render.renderer.clone(),
         seed: settings.seed,
-        plan: account(&scene, &rendered),
+        plan: account(&scene, &rendered, settings.max_bounces),
     };
     debug_span!(target: trace::TARGET, "encode")
         .in_scope(|| dataset.encode(index, &record, &provenance))
@@ -264,8 +264,8 @@ pub(in crate::execute) fn in_camera(spot: &picofarm_scene::Spot, camera: &Camera
 
 /// What the manifest tells of the scene and its render. Only what the task decides: no time, no machine, and
 /// not the scene's name, which may be that of a file, while the task's key holds only the file's content.
-fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
-    json!({
+fn account(scene: &Scene, rendered: &Rendered, max_bounces: Option<u32>) -> serde_json::Value {
+    let mut plan = json!({
         "scene": scene.provenance,
         "labels": scene.labels,
         "strategies": rendered.plan.strategies,
@@ -273,7 +273,11 @@ fn account(scene: &Scene, rendered: &Rendered) -> serde_json::Value {
         "overflow": rendered.overflow,
         "error": rendered.error,
         "rays": rendered.rays,
-    })
+    });
+    if let Some(most) = max_bounces {
+        plan["max_bounces"] = json!(most);
+    }
+    plan
 }
 
 pub(in crate::execute) fn of_render(error: RenderError) -> TaskError {

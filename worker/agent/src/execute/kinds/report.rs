@@ -256,13 +256,22 @@ fn evaluated(found: &Value) -> serde_json::Result<Evaluated> {
     })
 }
 
+fn known(n: u32) -> Option<u32> {
+    (n > 0).then_some(n)
+}
+
 /// Where it comes from.
 fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Evaluation>) {
     let from = &manifest.lineage;
     entry.data = Data {
         name: from.dataset.clone(),
         scenes: Some(from.training_scenes),
-        ..Data::default()
+        max_bounces: from.measurement.max_bounces,
+        images: known(from.measurement.rows)
+            .zip(known(from.measurement.columns))
+            .map(<[u32; 2]>::from),
+        spots: known(from.measurement.spots),
+        noise: from.measurement.photon_noise,
     };
     let setting = |path: &str| manifest.settings.pointer(path).and_then(|v| v.as_str());
     if let Some(histogram) = setting("/histogram") {

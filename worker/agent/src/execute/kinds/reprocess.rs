@@ -404,6 +404,10 @@ fn account(settings: &ReprocessSettings, source: &Manifest, sensed: &Sensed) -> 
     if !missing.is_empty() {
         plan["missing"] = json!(missing);
     }
+    let bounces = &source.provenance.plan["max_bounces"];
+    if !bounces.is_null() {
+        plan["max_bounces"] = bounces.clone();
+    }
     plan
 }
 

@@ -10,8 +10,8 @@ use std::{
 };
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Lineage, ModelManifest, Models, NewModel, Pinned,
-    Published, TrainingSpeed, TrialEnd,
+    Dataset, DatasetError, DatasetSpec, Lineage, Measurement, ModelManifest, Models, NewModel,
+    Pinned, Published, TrainingSpeed, TrialEnd,
 };
 use picofarm_model::{
     Device, ModelError,
@@ -130,6 +130,18 @@ impl<'a> TrainingRun<'a> {
         }
         let mut used: Vec<u64> = training.iter().chain(&validation).copied().collect();
         used.sort_unstable();
+        let histogram = (settings.histogram, &*settings.spots);
+        let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
+        let shown = training.first().copied();
+        let [training_scenes, validation_scenes] = [&training, &validation].map(|s| s.len() as u64);
+        let (training, validation) = (examples(training)?, examples(validation)?);
+        let measurement = match shown {
+            Some(scene) => {
+                let manifest = stores.wait(control, dataset.manifest(scene))?;
+                results::measurement(&spec, training.spots() as u32, &manifest)
+            }
+            None => Measurement::default(),
+        };
         let manifests = built.iter().map(|(field, known)| (*field, &known.manifest));
         let by_field = manifests.clone().map(|(field, m)| (field, m.sha256()));
         let by_field: BTreeMap<&str, String> = by_field.collect();
@@ -138,8 +150,9 @@ impl<'a> TrainingRun<'a> {
             dataset: place.dataset.clone(),
             data: pin(&used)?.id,
             split: sides.split,
-            training_scenes: training.len() as u64,
-            validation_scenes: validation.len() as u64,
+            measurement,
+            training_scenes,
+            validation_scenes,
             code: settings.version.clone(),
             seed: settings.seed,
             models: manifests
@@ -147,14 +160,12 @@ impl<'a> TrainingRun<'a> {
                 .collect(),
             promoted: None,
         };
-        let histogram = (settings.histogram, &*settings.spots);
-        let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
         Ok(Self {
             task,
             spec,
             models,
-            training: examples(training)?,
-            validation: examples(validation)?,
+            training,
+            validation,
             built,
             lineage,
             key,

@@ -1,6 +1,6 @@
 //! What a training leaves: a model's objects and figures.
 
-use picofarm_dataset::ModelManifest;
+use picofarm_dataset::{DatasetSpec, Manifest, Measurement, ModelManifest, Profile};
 use picofarm_model::train::{Line, Trained};
 use serde_json::{Value, json};
 
@@ -20,6 +20,19 @@ pub(super) fn metrics(trained: &Trained) -> Value {
     });
     metrics["validation"] = json!(kept.and_then(|line| line.validation));
     metrics
+}
+
+/// What was measured in the scenes of a data set, by the manifest of one of them.
+pub(super) fn measurement(spec: &DatasetSpec, spots: u32, scene: &Manifest) -> Measurement {
+    let plan = &scene.provenance.plan;
+    let sensed = plan["kind"] == "reprocess" && plan["sensor"]["poisson"] == true;
+    Measurement {
+        rows: spec.height,
+        columns: spec.width,
+        spots,
+        max_bounces: plan["max_bounces"].as_u64().unwrap_or(0) as u32,
+        photon_noise: sensed || spec.profile == Profile::CountsU16,
+    }
 }
 
 /// A line of JSON for each epoch.
