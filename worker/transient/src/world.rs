@@ -19,6 +19,9 @@ use crate::{
 const WIDEST_M: f64 = 1e9;
 const NARROWEST_M: f64 = 1e-6;
 
+/// Pieces that cutting may add, beside one a triangle: some hundred bytes each.
+const MOST_PIECES: usize = 1 << 22;
+
 /// Geometry, materials and camera in render units.
 #[derive(Debug)]
 pub(crate) struct World {
@@ -140,12 +143,28 @@ impl World {
             });
         }
         let reach = extent::reach(scene, &points, widest, horizon_m);
+        // A camera that all but touches a surface: pieces of a scene far wider would leave f32.
+        let reach = reach.max(NARROWEST_M.min(widest));
         let scale = scale_for(reach);
         let mut normals = None;
         if reach < widest {
             let mut cut = Cut::default();
             for (k, t) in points.iter().enumerate() {
+                if k % 1024 == 0 {
+                    stop.check()?;
+                }
                 cut.push(k, t, uv.get(k), f64::from(scale));
+                if cut.points.len() > 2 * points.len() + MOST_PIECES {
+                    return Err(RenderError::Invalid {
+                        field: "objects".into(),
+                        what: format!(
+                            "too many triangles reach far beyond what camera and light do ({reach:.3e} m of {widest:.3e} m): cut there, the first {} of {} make {} pieces; remove large surfaces that are out of sight, or check where the camera stands",
+                            k + 1,
+                            points.len(),
+                            cut.points.len(),
+                        ),
+                    });
+                }
             }
             let of = |all: &[u32]| cut.of.iter().map(|&k| all[k]).collect();
             (surface, object) = (of(&surface), of(&object));

@@ -330,3 +330,71 @@ proptest! {
         }
     }
 }
+
+/// A scene that is seen from 10⁻¹⁸ m above one of its surfaces, and 100 m wide.
+#[test]
+fn a_camera_that_all_but_touches_a_surface_is_served_in_time() {
+    let wall = |z: f32| {
+        let corner = Vec3::new(-50.0, -50.0, z);
+        let (a, b) = (Vec3::new(100.0, 0.0, 0.0), Vec3::new(0.0, 100.0, 0.0));
+        let positions = vec![corner, corner + a, corner + a + b, corner + b];
+        object(
+            "wall",
+            positions,
+            vec![[0, 1, 2], [0, 2, 3]],
+            common::grey(0.5),
+        )
+    };
+    let mut objects: Vec<Object> = (0..40).map(|k| wall(-1e-18 * (k + 1) as f32)).collect();
+    objects.push(wall(1e-18));
+    let s = common::scene(objects, 4, &[Vec3::new(0.0, 0.0, -1.0)]);
+    match render(&s, &common::settings(Budget::Samples(1)), &Quiet) {
+        Ok(r) => sane(&r).unwrap(),
+        Err(e) => panic!("{e}"),
+    }
+}
+
+/// Boxes that are all alike give a tree's builder nothing to go by.
+#[test]
+fn copies_of_one_triangle_without_number_are_served_in_time() {
+    let positions = vec![
+        Vec3::new(-1.0, -1.0, -2.0),
+        Vec3::new(1.0, -1.0, -2.0),
+        Vec3::new(0.0, 1.0, -2.5),
+    ];
+    let set = common::settings(Budget::Samples(4));
+    let [one, all] = [1, 200_000].map(|n| {
+        let copies = object(
+            "copies",
+            positions.clone(),
+            vec![[0, 1, 2]; n],
+            common::grey(0.5),
+        );
+        let s = common::scene(vec![copies], 8, &[Vec3::new(0.0, 0.0, -1.0)]);
+        render(&s, &set, &Quiet).unwrap()
+    });
+    assert!(one.transient == all.transient);
+}
+
+/// A closed box of a millimetre around the camera, and sheets of millions of kilometres behind it, each of
+/// which would be cut into hundreds of pieces.
+#[test]
+fn more_pieces_of_huge_triangles_than_fit_are_refused_by_name() {
+    let mut objects = common::room(
+        Vec3::new(-1e-3, -1e-3, -1e-3),
+        Vec3::new(1e-3, 1e-3, 1e-3),
+        &common::grey(0.5),
+    );
+    let (mut positions, mut triangles) = (vec![], vec![]);
+    for k in 0..20_000u32 {
+        let z = -1e-2 - 1e-5 * k as f32;
+        let corners = [(-9e8, -9e8), (9e8, -9e8), (0.0, 9e8)];
+        positions.extend(corners.map(|(x, y)| Vec3::new(x, y, z)));
+        triangles.push([3 * k, 3 * k + 1, 3 * k + 2]);
+    }
+    objects.push(object("sheets", positions, triangles, common::grey(0.5)));
+    let s = common::scene(objects, 4, &[Vec3::new(0.0, 0.0, -1.0)]);
+    let e = render(&s, &common::settings(Budget::Samples(1)), &Quiet).unwrap_err();
+    let e = e.to_string();
+    assert!(e.contains("objects") && e.contains("pieces"), "{e}");
+}

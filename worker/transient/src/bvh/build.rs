@@ -6,7 +6,8 @@ use std::{
 };
 
 use obvhs::{
-    BvhBuildParams,
+    Boundable, BvhBuildParams,
+    aabb::Aabb,
     bvh2::{Bvh2, builder::build_bvh2},
     triangle::Triangle,
 };
@@ -14,7 +15,7 @@ use picofarm_scene::Vec3;
 
 use crate::api::{RenderError, Stop};
 
-use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, plan::Plan, simd};
+use super::{Bvh, EMPTY, Kernel, LEAF, Node, Pack, alike, plan::Plan, simd};
 
 const NO_NODE: Node = Node {
     bounds: [
@@ -101,6 +102,17 @@ pub(super) fn build_unless(triangles: &[[Vec3; 3]], stop: Stop) -> Result<Bvh, R
 }
 
 fn binary(input: &[Triangle]) -> Bvh2 {
+    let boxes: Vec<Aabb> = input.iter().map(Boundable::aabb).collect();
+    let Some(groups) = alike::groups(&boxes) else {
+        return joined(input);
+    };
+    let bounds: Vec<Aabb> = groups.iter().map(|g| g.bounds).collect();
+    let mut tree = joined(&bounds);
+    alike::expand(&mut tree, &groups, &boxes);
+    tree
+}
+
+fn joined<T: Boundable>(input: &[T]) -> Bvh2 {
     let mut params = BvhBuildParams::medium_build();
     params.pre_split = false;
     params.max_prims_per_leaf = 1;

@@ -5,6 +5,7 @@
 //! fused multiply-add, so that no ray slips between two triangles that share an edge or a vertex.
 //! The kernels (AVX-512, AVX2, portable) run the same operations in the same order: same bits.
 
+mod alike;
 mod build;
 mod bundle;
 mod bundle_leaf;
