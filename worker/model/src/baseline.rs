@@ -1,15 +1,116 @@
-//! What networks have to beat: the best constant, the peak of each pixel's histogram, masks of one value.
+//! What networks have to beat: the best constant, the peak of each pixel's histogram, masks of one value, and images that
+//! are the same for all scenes.
+
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use crate::{
     ModelError,
-    input::DEPTH_SCALE_M,
+    input::{DEPTH_SCALE_M, Target},
     scene::{Scene, Scenes},
 };
 
+/// Answers without a network, fitted to training scenes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Baseline {
+    /// Of depths.
+    Depth(DepthBaseline),
+    /// Of masks.
+    Mask(MaskBaseline),
+}
+
+impl Baseline {
+    /// Fitted to at most `most` scenes, the first ones.
+    ///
+    /// # Errors
+    /// [`ModelError::Scene`]; [`ModelError::Invalid`] where there is none or where they are of several sizes.
+    pub fn fit(target: Target, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
+        Ok(match target {
+            Target::Tof => Self::Depth(DepthBaseline::fit(scenes, most)?),
+            Target::Shadow | Target::Specular => {
+                Self::Mask(MaskBaseline::fit(target, scenes, most)?)
+            }
+        })
+    }
+
+    /// What they are called, in the order of [`Baseline::answers`].
+    pub fn names(&self) -> &'static [&'static str] {
+        match self {
+            Self::Depth(_) => &["constant", "peak", "median image"],
+            Self::Mask(_) => &["all", "none", "mean mask"],
+        }
+    }
+
+    /// What they say of a scene in the place of a network: depth over 4.5 m, or logits of the masks from `plane` on.
+    pub(crate) fn answers(&self, scene: &Scene, plane: usize, len: usize) -> Vec<Vec<f32>> {
+        match self {
+            Self::Depth(fit) => {
+                let scaled = |z: f32| (z / DEPTH_SCALE_M).clamp(0.0, 1.0);
+                let peaks = fit.of_peaks(scene).into_iter().map(scaled).collect();
+                let median = fit.median_m.iter().copied().map(scaled).collect();
+                vec![vec![scaled(fit.constant_m as f32); len], peaks, median]
+            }
+            Self::Mask(fit) => {
+                let at = plane * scene.pixels();
+                let mean = fit.mask.iter().skip(at).take(len);
+                let mean = mean.map(|&m| if m { 1.0 } else { -1.0 }).collect();
+                vec![vec![1.0; len], vec![-1.0; len], mean]
+            }
+        }
+    }
+}
+
+/// Masks without a network: each pixel of each spot's mask is what it mostly was.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MaskBaseline {
+    /// `[spot][row][column]`, or `[row][column]` of mirrors: pixels that are set in a large enough share of the training
+    /// scenes; the share is the one with the greatest IoU on these scenes.
+    pub mask: Vec<bool>,
+}
+
+impl MaskBaseline {
+    fn fit(target: Target, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
+        let mut set: Vec<usize> = Vec::new();
+        let count = scenes.len().min(most);
+        for index in 0..count {
+            let scene = load(scenes, index)?;
+            let planes = match target {
+                Target::Shadow => &scene.lit,
+                Target::Tof | Target::Specular => &scene.specular,
+            };
+            if index == 0 {
+                set = vec![0; planes.len()];
+            }
+            same_size(set.len(), planes.len(), index)?;
+            for (sum, m) in set.iter_mut().zip(planes) {
+                *sum += usize::from(*m > 0);
+            }
+        }
+        // Pixels by the number of scenes in which they are set.
+        let mut by_count = vec![0usize; count + 1];
+        for &n in &set {
+            by_count[n] += 1;
+        }
+        let all: usize = set.iter().sum();
+        let (mut best, mut least) = (0.0, usize::MAX);
+        let (mut both, mut said) = (0, 0);
+        for n in (1..=count).rev() {
+            both += n * by_count[n];
+            said += count * by_count[n];
+            let iou = both as f64 / (said + all - both).max(1) as f64;
+            if iou > best {
+                (best, least) = (iou, n);
+            }
+        }
+        Ok(Self {
+            mask: set.iter().map(|&n| n >= least).collect(),
+        })
+    }
+}
+
 /// Depths without a network, fitted to training scenes.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DepthBaseline {
     /// The median depth, metres: no constant has a smaller mean absolute error.
     pub constant_m: f64,
@@ -18,22 +119,27 @@ pub struct DepthBaseline {
     pub slope: f64,
     /// See `slope`, metres.
     pub offset_m: f64,
+    /// Each pixel's median depth, metres, `[row][column]`: no image that is the same for all scenes has a smaller mean
+    /// absolute error.
+    pub median_m: Vec<f32>,
 }
 
 impl DepthBaseline {
     /// Fitted to at most `most` scenes, the first ones.
     ///
     /// # Errors
-    /// [`ModelError::Scene`].
+    /// [`ModelError::Scene`]; [`ModelError::Invalid`] where they are of several sizes.
     pub fn fit(scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
         let mut depths = Vec::new();
         // Σ1, Σx, Σx², Σz, Σxz
         let mut sums = [0.0f64; 5];
-        for index in 0..scenes.len().min(most) {
-            let scene = scenes.load(index).map_err(|source| ModelError::Scene {
-                scene: index,
-                source,
-            })?;
+        let (count, mut pixels) = (scenes.len().min(most), 0);
+        for index in 0..count {
+            let scene = load(scenes, index)?;
+            if index == 0 {
+                pixels = scene.pixels();
+            }
+            same_size(pixels, scene.pixels(), index)?;
             for (x, z) in peaks(&scene).iter().zip(&scene.depth_m) {
                 let (x, z) = (*x, f64::from(known(*z)));
                 depths.push(known(z as f32));
@@ -49,11 +155,20 @@ impl DepthBaseline {
         } else {
             0.0
         };
-        depths.sort_unstable_by(f32::total_cmp);
+        let median_m = (0..pixels)
+            .map(|i| {
+                median(
+                    &mut (0..count)
+                        .map(|k| depths[k * pixels + i])
+                        .collect::<Vec<_>>(),
+                )
+            })
+            .collect();
         Ok(Self {
-            constant_m: depths.get(depths.len() / 2).copied().map_or(0.0, f64::from),
+            constant_m: f64::from(median(&mut depths)),
             slope,
             offset_m: if n > 0.0 { (z - slope * x) / n } else { 0.0 },
+            median_m,
         })
     }
 
@@ -64,6 +179,31 @@ impl DepthBaseline {
             .map(|x| self.slope * x + self.offset_m);
         depth.map(|z| z as f32).collect()
     }
+}
+
+fn load(scenes: &dyn Scenes, index: usize) -> Result<Arc<Scene>, ModelError> {
+    scenes.load(index).map_err(|source| ModelError::Scene {
+        scene: index,
+        source,
+    })
+}
+
+fn same_size(first: usize, other: usize, index: usize) -> Result<(), ModelError> {
+    match first == other {
+        true => Ok(()),
+        false => Err(ModelError::invalid(
+            "scenes",
+            format!(
+                "scene {index} has {other} values, the first one {first}; use scenes of one size"
+            ),
+        )),
+    }
+}
+
+/// The middle one, the upper of two; 0 of none.
+fn median(values: &mut [f32]) -> f32 {
+    values.sort_unstable_by(f32::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 /// Depth as networks learn it: within what they can say.

@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     ModelError,
-    baseline::DepthBaseline,
-    input::{Batch, DEPTH_SCALE_M, Target, Visit, example},
-    metric::{Metrics, Tally},
+    baseline::Baseline,
+    input::{Batch, Target, Visit, example},
+    metric::{Metrics, Released, Tally},
     model::Model,
     scene::{Scene, Scenes},
 };
@@ -16,7 +16,9 @@ use crate::{
 pub struct Evaluated {
     /// Of all scenes together.
     pub metrics: Metrics,
-    /// Of trivial answers, by name: `constant` and `peak` for depths, `all` and `none` for masks.
+    /// The same by the released code's formulas.
+    pub released: Released,
+    /// Of trivial answers, by name: see [`Baseline::names`].
     pub baselines: Vec<(String, Metrics)>,
     /// Of each scene, in order.
     pub scenes: Vec<Metrics>,
@@ -24,68 +26,106 @@ pub struct Evaluated {
     pub examples: u64,
 }
 
+/// What a model and the trivial answers said of one scene: what figures follow from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Answered {
+    examples: u64,
+    model: Tally,
+    /// As [`Baseline::names`].
+    trivial: Vec<Tally>,
+}
+
+impl Evaluated {
+    /// Of scenes in order: the same to the bit in however many parts they were asked.
+    pub fn of(target: Target, baseline: &Baseline, scenes: &[Answered]) -> Self {
+        let mut whole = Tally::default();
+        let names = baseline.names();
+        let mut trivial = vec![Tally::default(); names.len()];
+        for scene in scenes {
+            whole.join(&scene.model);
+            for (all, of) in trivial.iter_mut().zip(&scene.trivial) {
+                all.join(of);
+            }
+        }
+        let named = names.iter().zip(&trivial);
+        Self {
+            metrics: whole.metrics(target),
+            released: whole.released(target),
+            baselines: named
+                .map(|(name, tally)| ((*name).to_owned(), tally.metrics(target)))
+                .collect(),
+            scenes: scenes.iter().map(|s| s.model.metrics(target)).collect(),
+            examples: scenes.iter().map(|s| s.examples).sum(),
+        }
+    }
+}
+
 /// Asks a model of every scene, spot by spot where it is a shadow network. `guide` is the model whose depths two-bounce
-/// times follow from (the truth's without it); `baseline` what depths are compared with. `tell` hears how many scenes are
+/// times follow from (the truth's without it); `baseline` what it is compared with. `tell` hears how many scenes are
 /// done of how many and says whether to go on; where it does not, there is no answer.
 ///
 /// # Errors
-/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model.
+/// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the baseline.
 pub fn evaluate(
     model: &Model,
     guide: Option<&Model>,
-    baseline: Option<&DepthBaseline>,
+    baseline: &Baseline,
     scenes: &dyn Scenes,
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Evaluated>, ModelError> {
     let target = model.question().target;
-    let mut whole = Tally::default();
-    let mut trivial: Vec<(&str, Tally)> = match (target, baseline) {
-        (Target::Tof, Some(_)) => vec![("constant", Tally::default()), ("peak", Tally::default())],
-        (Target::Tof, None) => Vec::new(),
-        _ => vec![("all", Tally::default()), ("none", Tally::default())],
-    };
-    let (mut each, mut examples) = (Vec::with_capacity(scenes.len()), 0);
+    let mut each = Vec::with_capacity(scenes.len());
     for index in 0..scenes.len() {
         let scene = scenes.load(index).map_err(|source| ModelError::Scene {
             scene: index,
             source,
         })?;
-        let mut tally = Tally::default();
-        answers(model, guide, &scene, &mut |said, batch| {
-            examples += batch.images as u64;
-            tally.add(target, said, &batch.target);
-            for (name, tally) in &mut trivial {
-                let len = batch.target.len();
-                let said: Vec<f32> = match (*name, baseline) {
-                    ("constant", Some(fit)) => vec![fit.constant_m as f32 / DEPTH_SCALE_M; len],
-                    ("peak", Some(fit)) => {
-                        let depth = fit.of_peaks(&scene);
-                        depth
-                            .iter()
-                            .map(|z| (z / DEPTH_SCALE_M).clamp(0.0, 1.0))
-                            .collect()
-                    }
-                    ("all", _) => vec![1.0; len],
-                    _ => vec![-1.0; len],
-                };
-                tally.add(target, &said, &batch.target);
-            }
-        })?;
-        each.push(tally.metrics(target));
-        whole.join(&tally);
+        each.push(answered(model, guide, baseline, &scene)?);
         if !tell(index + 1, scenes.len()) {
             return Ok(None);
         }
     }
-    let named = trivial
-        .iter()
-        .map(|(name, tally)| ((*name).to_owned(), tally.metrics(target)));
-    Ok(Some(Evaluated {
-        metrics: whole.metrics(target),
-        baselines: named.collect(),
-        scenes: each,
-        examples,
-    }))
+    Ok(Some(Evaluated::of(target, baseline, &each)))
+}
+
+/// Asks of one scene.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn answered(
+    model: &Model,
+    guide: Option<&Model>,
+    baseline: &Baseline,
+    scene: &Scene,
+) -> Result<Answered, ModelError> {
+    let target = model.question().target;
+    let mut found = Answered {
+        examples: 0,
+        model: Tally::default(),
+        trivial: vec![Tally::default(); baseline.names().len()],
+    };
+    let (mut plane, mut unlike) = (0, None);
+    answers(model, guide, scene, &mut |said, batch| {
+        let (side, truth) = ([batch.height, batch.width], &batch.target);
+        found.examples += batch.images as u64;
+        found.model.add(target, said, truth, side);
+        let trivial = baseline.answers(scene, plane, truth.len());
+        for (tally, said) in found.trivial.iter_mut().zip(trivial) {
+            if said.len() != truth.len() {
+                unlike = Some(said.len());
+                return;
+            }
+            tally.add(target, &said, truth, side);
+        }
+        plane += truth.len() / scene.pixels();
+    })?;
+    match unlike {
+        None => Ok(found),
+        Some(_) => Err(ModelError::invalid(
+            "scenes",
+            "the training scenes that trivial answers are fitted to have another size or number of spots",
+        )),
+    }
 }
 
 /// What a model says of a scene: once, or for each spot. Hears outputs (outputs, H, W) and what was asked.

@@ -22,13 +22,13 @@ pub mod weights;
 /// Where networks are computed.
 pub use burn::tensor::Device;
 pub use error::ModelError;
-pub use evaluate::{Evaluated, answers, evaluate, masks};
+pub use evaluate::{Answered, Evaluated, answered, answers, evaluate, masks};
 pub use kernel::AdamW;
 pub use model::Model;
 pub use random::Random;
 
 /// Version of everything that decides the bytes of trained weights and the figures of evaluations.
-pub const VERSION: &str = "model-3";
+pub const VERSION: &str = "model-4";
 
 /// Whether this program was built to use graphics processors.
 pub const HAS_GPUS: bool = cfg!(feature = "cuda");

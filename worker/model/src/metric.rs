@@ -1,19 +1,33 @@
 //! How good answers are: of depths in metres, of masks as overlap.
 
+mod boundary;
+
 use serde::{Deserialize, Serialize};
 
 use crate::input::{DEPTH_SCALE_M, Target};
 
-/// Sums over pixels, from which figures follow; sums of scenes add up.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+/// Masks that the released code scores together.
+const BATCH: usize = 32;
+
+/// Sums over pixels, from which figures follow; those of scenes are joined in the scenes' order.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Tally {
-    pixels: f64,
+    pixels: u64,
     absolute: f64,
     squared: f64,
-    both: f64,
-    either: f64,
-    said: f64,
-    is: f64,
+    /// Sum of the images' boundary F1, and their number.
+    boundary: f64,
+    images: u64,
+    masks: Vec<Overlap>,
+}
+
+/// Pixels of a mask as it is said and as it is.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+struct Overlap {
+    both: u64,
+    said: u64,
+    is: u64,
+    of: u64,
 }
 
 /// Figures of a network on a set of scenes.
@@ -38,6 +52,27 @@ pub enum Metrics {
     },
 }
 
+/// The same by the formulas of the code released with Shoot-Bounce-3D, where they are others.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Released {
+    /// Of z-depth.
+    Depth {
+        /// Scale-invariant boundary F1 (Depth Pro, section 3.3), the mean over images.
+        boundary_f1: f64,
+    },
+    /// Of masks: figures of 32 masks together, in the scenes' order and then the spots', averaged over these batches. Two
+    /// masks without any pixel have no overlap: 0.
+    Mask {
+        /// Share of pixels that are wrong.
+        mae_32: f64,
+        /// Intersection over union.
+        iou_32: f64,
+        /// 2·both over the sum of both masks.
+        f1_32: f64,
+    },
+}
+
 impl Metrics {
     /// Less is better: MAE, or one less IoU.
     pub fn loss(&self) -> f64 {
@@ -46,56 +81,146 @@ impl Metrics {
             Self::Mask { iou, .. } => 1.0 - iou,
         }
     }
+
+    /// Each figure with its name.
+    pub fn figures(&self) -> Vec<(&'static str, f64)> {
+        match *self {
+            Self::Depth { mae_m, rmse_m } => vec![("mae_m", mae_m), ("rmse_m", rmse_m)],
+            Self::Mask { mae, iou, f1 } => vec![("mae", mae), ("iou", iou), ("f1", f1)],
+        }
+    }
+}
+
+impl Released {
+    /// Each figure with its name.
+    pub fn figures(&self) -> Vec<(&'static str, f64)> {
+        match *self {
+            Self::Depth { boundary_f1 } => vec![("boundary_f1", boundary_f1)],
+            Self::Mask {
+                mae_32,
+                iou_32,
+                f1_32,
+            } => vec![("mae_32", mae_32), ("iou_32", iou_32), ("f1_32", f1_32)],
+        }
+    }
 }
 
 impl Tally {
-    /// Adds pixels: what a network said (depth over 4.5 m, or logits) and what is true.
-    pub fn add(&mut self, target: Target, said: &[f32], truth: &[f32]) {
-        self.pixels += said.len() as f64;
-        for (said, truth) in said.iter().zip(truth) {
+    /// Adds images: what a network said (depth over 4.5 m, or logits) and what is true, `[image][row][column]`, of `height`
+    /// rows and `width` columns.
+    pub fn add(
+        &mut self,
+        target: Target,
+        said: &[f32],
+        truth: &[f32],
+        [height, width]: [usize; 2],
+    ) {
+        self.pixels += said.len() as u64;
+        let images = said
+            .chunks_exact(height * width)
+            .zip(truth.chunks_exact(height * width));
+        for (said, truth) in images {
+            self.images += 1;
             match target {
                 Target::Tof => {
-                    let error = f64::from(said - truth) * f64::from(DEPTH_SCALE_M);
-                    self.absolute += error.abs();
-                    self.squared += error * error;
+                    for (said, truth) in said.iter().zip(truth) {
+                        let error = f64::from(said - truth) * f64::from(DEPTH_SCALE_M);
+                        self.absolute += error.abs();
+                        self.squared += error * error;
+                    }
+                    self.boundary += boundary::boundary_f1(said, truth, width);
                 }
                 Target::Shadow | Target::Specular => {
-                    let (said, is) = (*said > 0.0, *truth > 0.5);
-                    self.both += f64::from(u8::from(said && is));
-                    self.either += f64::from(u8::from(said || is));
-                    self.said += f64::from(u8::from(said));
-                    self.is += f64::from(u8::from(is));
+                    let mut mask = Overlap {
+                        of: said.len() as u64,
+                        ..Overlap::default()
+                    };
+                    for (said, truth) in said.iter().zip(truth) {
+                        let (said, is) = (*said > 0.0, *truth > 0.5);
+                        mask.both += u64::from(said && is);
+                        mask.said += u64::from(said);
+                        mask.is += u64::from(is);
+                    }
+                    self.masks.push(mask);
                 }
             }
         }
     }
 
-    /// Adds another's.
+    /// Adds another's, whose images come after these.
     pub fn join(&mut self, other: &Self) {
         self.pixels += other.pixels;
         self.absolute += other.absolute;
         self.squared += other.squared;
-        self.both += other.both;
-        self.either += other.either;
-        self.said += other.said;
-        self.is += other.is;
+        self.boundary += other.boundary;
+        self.images += other.images;
+        self.masks.extend_from_slice(&other.masks);
     }
 
     /// The figures.
     pub fn metrics(&self, target: Target) -> Metrics {
-        let n = self.pixels.max(1.0);
-        let share = |part: f64, of: f64| if of > 0.0 { part / of } else { 1.0 };
+        let n = self.pixels.max(1) as f64;
         match target {
             Target::Tof => Metrics::Depth {
                 mae_m: self.absolute / n,
                 rmse_m: (self.squared / n).sqrt(),
             },
-            Target::Shadow | Target::Specular => Metrics::Mask {
-                mae: (self.either - self.both) / n,
-                iou: share(self.both, self.either),
-                f1: share(2.0 * self.both, self.said + self.is),
-            },
+            Target::Shadow | Target::Specular => {
+                let [mae, iou, f1] = Overlap::of(&self.masks).figures(1.0);
+                Metrics::Mask { mae, iou, f1 }
+            }
         }
+    }
+
+    /// The figures as the released code has them.
+    pub fn released(&self, target: Target) -> Released {
+        match target {
+            Target::Tof => Released::Depth {
+                boundary_f1: self.boundary / self.images.max(1) as f64,
+            },
+            Target::Shadow | Target::Specular => {
+                let each: Vec<[f64; 3]> = self
+                    .masks
+                    .chunks(BATCH)
+                    .map(|batch| Overlap::of(batch).figures(0.0))
+                    .collect();
+                let mean = |k: usize| {
+                    each.iter().map(|figures| figures[k]).sum::<f64>() / each.len().max(1) as f64
+                };
+                Released::Mask {
+                    mae_32: mean(0),
+                    iou_32: mean(1),
+                    f1_32: mean(2),
+                }
+            }
+        }
+    }
+}
+
+impl Overlap {
+    /// Of masks together.
+    fn of(masks: &[Self]) -> Self {
+        masks.iter().fold(Self::default(), |a, b| Self {
+            both: a.both + b.both,
+            said: a.said + b.said,
+            is: a.is + b.is,
+            of: a.of + b.of,
+        })
+    }
+
+    /// Share of wrong pixels, intersection over union and F1; the latter two are `empty` where there is no pixel.
+    fn figures(&self, empty: f64) -> [f64; 3] {
+        let share = |part: u64, of: u64| match of {
+            0 => empty,
+            of => part as f64 / of as f64,
+        };
+        let sum = self.said + self.is;
+        let wrong = (sum - 2 * self.both) as f64 / self.of.max(1) as f64;
+        [
+            wrong,
+            share(self.both, sum - self.both),
+            share(2 * self.both, sum),
+        ]
     }
 }
 
@@ -106,7 +231,7 @@ mod tests {
     #[test]
     fn depths_are_measured_in_metres() {
         let mut tally = Tally::default();
-        tally.add(Target::Tof, &[0.0, 1.0], &[1.0, 1.0]);
+        tally.add(Target::Tof, &[0.0, 1.0], &[1.0, 1.0], [1, 2]);
         let Metrics::Depth { mae_m, rmse_m } = tally.metrics(Target::Tof) else {
             panic!("a depth")
         };
@@ -117,7 +242,7 @@ mod tests {
     fn masks_of_nothing_are_perfect_and_overlap_counts_otherwise() {
         let of = |said: &[f32], truth: &[f32]| {
             let mut tally = Tally::default();
-            tally.add(Target::Shadow, said, truth);
+            tally.add(Target::Shadow, said, truth, [1, said.len()]);
             tally.metrics(Target::Shadow)
         };
         let perfect = Metrics::Mask {
@@ -132,5 +257,23 @@ mod tests {
             f1: 2.0 / 3.0,
         };
         assert_eq!(of(&[1.0, 1.0, -1.0], &[1.0, 0.0, 0.0]), half);
+    }
+
+    #[test]
+    fn the_released_code_scores_masks_by_32_and_none_where_both_are_empty() {
+        // 32 masks of two pixels, both right; then 16 that are empty in both; and joined in two parts.
+        let mut tally = Tally::default();
+        tally.add(Target::Shadow, &[1.0; 40], &[1.0; 40], [1, 2]);
+        let mut rest = Tally::default();
+        rest.add(Target::Shadow, &[1.0; 24], &[1.0; 24], [1, 2]);
+        rest.add(Target::Shadow, &[-1.0; 32], &[0.0; 32], [1, 2]);
+        tally.join(&rest);
+        let expected = Released::Mask {
+            mae_32: 0.0,
+            iou_32: 0.5,
+            f1_32: 0.5,
+        };
+        assert_eq!(tally.released(Target::Shadow), expected);
+        assert!(matches!(tally.metrics(Target::Shadow), Metrics::Mask { iou, .. } if iou == 1.0));
     }
 }

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use burn::tensor::Device;
 use common::{plan, scenes, sources};
 use picofarm_model::{
-    Evaluated, Model, Random, answers,
-    baseline::DepthBaseline,
+    Answered, Evaluated, Model, Random, answered, answers,
+    baseline::{Baseline, DepthBaseline, MaskBaseline},
     evaluate,
     input::{ShadowVariant, Target},
     metric::Metrics,
@@ -26,16 +26,10 @@ fn trained(plan: &Plan, sources: Sources) -> Trained {
 }
 
 fn evaluated(model: &Model, guide: Option<&Model>) -> Evaluated {
-    let baseline = DepthBaseline::fit(&scenes(0, 40), 40).unwrap();
-    evaluate(
-        model,
-        guide,
-        Some(&baseline),
-        &scenes(500, 6),
-        &mut |_, _| true,
-    )
-    .unwrap()
-    .unwrap()
+    let baseline = Baseline::fit(model.question().target, &scenes(0, 40), 40).unwrap();
+    evaluate(model, guide, &baseline, &scenes(500, 6), &mut |_, _| true)
+        .unwrap()
+        .unwrap()
 }
 
 #[test]
@@ -83,6 +77,76 @@ fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_al
     };
     assert_eq!((found.examples, &*found.baselines[0].0), (12, "all"));
     assert!(iou > all + 0.1, "{iou} and {all}");
+}
+
+#[test]
+fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
+    for (target, variant) in [
+        (Target::Tof, ShadowVariant::Concat),
+        (Target::Shadow, ShadowVariant::Concat),
+        (Target::Shadow, ShadowVariant::All),
+        (Target::Specular, ShadowVariant::Concat),
+    ] {
+        let plan = Plan {
+            epochs: 1,
+            ..plan(target, variant)
+        };
+        let model = trained(&plan, sources());
+        let model = Model::read(&model.weights, &Device::flex()).unwrap();
+        let baseline = Baseline::fit(target, &scenes(0, 8), 8).unwrap();
+        let scenes = scenes(500, 7);
+        let whole = evaluate(&model, None, &baseline, &scenes, &mut |_, _| true);
+        let whole = whole.unwrap().unwrap();
+        let each = scenes.iter().rev();
+        let mut each: Vec<_> = each
+            .map(|s| answered(&model, None, &baseline, s).unwrap())
+            .map(|found| serde_json::to_string(&found).unwrap())
+            .collect();
+        each.reverse();
+        let each: Vec<Answered> = each
+            .iter()
+            .map(|t| serde_json::from_str(t).unwrap())
+            .collect();
+        assert_eq!(Evaluated::of(target, &baseline, &each), whole);
+    }
+}
+
+#[test]
+fn images_that_are_the_same_for_all_scenes_are_the_best_such_ones() {
+    let train = scenes(0, 20);
+    let fit = DepthBaseline::fit(&train, 20).unwrap();
+    let error = |image: &dyn Fn(usize) -> f32| -> f32 {
+        let each = |s: &Arc<picofarm_model::scene::Scene>| -> f32 {
+            let pixels = s.depth_m.iter().enumerate();
+            pixels.map(|(i, z)| (image(i) - z).abs()).sum()
+        };
+        train.iter().map(each).sum()
+    };
+    let best = error(&|i| fit.median_m[i]);
+    assert!(best <= error(&|_| fit.constant_m as f32));
+    for other in &train {
+        assert!(best <= error(&|i| other.depth_m[i]));
+    }
+
+    let Baseline::Mask(MaskBaseline { mask }) = Baseline::fit(Target::Shadow, &train, 20).unwrap()
+    else {
+        panic!("a mask")
+    };
+    let iou = |mask: &dyn Fn(usize) -> bool| {
+        let (mut both, mut either) = (0, 0);
+        for s in &train {
+            for (i, lit) in s.lit.iter().enumerate() {
+                both += u32::from(mask(i) && *lit > 0);
+                either += u32::from(mask(i) || *lit > 0);
+            }
+        }
+        f64::from(both) / f64::from(either)
+    };
+    let best = iou(&|i| mask[i]);
+    assert!(best >= iou(&|_| true));
+    for other in &train {
+        assert!(best >= iou(&|i| other.lit[i] > 0) - 1e-9);
+    }
 }
 
 #[test]

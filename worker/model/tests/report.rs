@@ -7,7 +7,7 @@ use std::sync::Arc;
 use common::{plan, scenes, sources};
 use picofarm_model::{
     Model,
-    baseline::DepthBaseline,
+    baseline::Baseline,
     cpu, evaluate,
     input::{ShadowVariant, Target},
     report::{Entry, Report, html, json, pictures},
@@ -16,7 +16,7 @@ use picofarm_model::{
 
 fn trained(target: Target) -> Entry {
     let (plan, sources) = (plan(target, ShadowVariant::Concat), sources());
-    let baseline = DepthBaseline::fit(sources.train.as_ref(), 9).unwrap();
+    let baseline = Baseline::fit(plan.question.target, sources.train.as_ref(), 9).unwrap();
     let mut training = Training::start(plan, None, sources, &cpu()).unwrap();
     training.run(&mut |_, _| Control::Continue).unwrap();
     let trained = training.finish();
@@ -24,7 +24,7 @@ fn trained(target: Target) -> Entry {
     let held_out = scenes(200, 3);
     let mut entry = Entry::new(format!("{target:?}"), &model, 8);
     entry.history = trained.history;
-    entry.evaluated = evaluate(&model, None, Some(&baseline), &held_out, &mut |_, _| true).unwrap();
+    entry.evaluated = evaluate(&model, None, &baseline, &held_out, &mut |_, _| true).unwrap();
     entry.pictures = pictures(&model, None, &held_out, &[0, 2], 1).unwrap();
     entry
 }

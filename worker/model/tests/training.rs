@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use common::{plan, scene, scenes, sources};
 use picofarm_model::{
     ModelError,
+    baseline::Baseline,
     input::{ShadowVariant, Target},
     scene::Scene,
     train::{Control, Ended, Event, Plan, Sources, Trained, Training},
@@ -156,7 +157,8 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     // They say of the validation scenes what that epoch's did.
     let model = picofarm_model::Model::read(&trained.weights, &Device::flex()).unwrap();
     let scenes = scenes(100, 3);
-    let found = picofarm_model::evaluate(&model, None, None, &scenes, &mut |_, _| true);
+    let baseline = Baseline::fit(plan.question.target, &scenes, 3).unwrap();
+    let found = picofarm_model::evaluate(&model, None, &baseline, &scenes, &mut |_, _| true);
     let found = found.unwrap().unwrap().metrics.loss();
     assert!((found - best).abs() < 1e-6, "{found} {best}");
     // And going on from a checkpoint after the best keeps them too.

@@ -145,7 +145,7 @@ pub fn pictures(
         })?;
         for (spot, (said, truth)) in planes.into_iter().enumerate() {
             let mut tally = Tally::default();
-            tally.add(target, &said, &truth);
+            tally.add(target, &said, &truth, [scene.height, scene.width]);
             let label = match target {
                 Target::Shadow => format!("scene {index}, spot {spot}"),
                 Target::Tof | Target::Specular => format!("scene {index}"),

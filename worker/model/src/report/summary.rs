@@ -196,7 +196,6 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
     let speeds: Vec<f64> = of()
         .filter_map(|e| e.speed.map(|s| s.samples_per_s))
         .collect();
-    let metrics: Vec<Metrics> = evaluated.iter().map(|e| e.metrics).collect();
     let first = of().next();
     let repeats = first.and_then(published);
     let unlike = match repeats {
@@ -207,10 +206,14 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
         label: common(&names),
         target,
         seeds,
-        figures: figures(&metrics),
+        figures: figures(evaluated.iter().map(|e| {
+            let mut all = e.metrics.figures();
+            all.extend(e.released.figures());
+            all
+        })),
         baselines: trivial
             .iter()
-            .map(|(name, all)| (name.clone(), figures(all)))
+            .map(|(name, all)| (name.clone(), figures(all.iter().map(Metrics::figures))))
             .collect(),
         beside_best_baseline: best
             .zip(error)
@@ -226,16 +229,10 @@ fn group(report: &Report, target: Target, models: Vec<usize>) -> Group {
 }
 
 /// Each figure of several runs.
-fn figures(of: &[Metrics]) -> Figures {
+fn figures(runs: impl Iterator<Item = Vec<(&'static str, f64)>>) -> Figures {
     let mut each: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
-    for metrics in of {
-        let named: &[(&'static str, f64)] = &match *metrics {
-            Metrics::Depth { mae_m, rmse_m } => vec![("mae_m", mae_m), ("rmse_m", rmse_m)],
-            Metrics::Mask { mae, iou, f1 } => vec![("mae", mae), ("iou", iou), ("f1", f1)],
-        };
-        for (name, value) in named {
-            each.entry(name).or_default().push(*value);
-        }
+    for (name, value) in runs.flatten() {
+        each.entry(name).or_default().push(value);
     }
     let spreads = each
         .into_iter()

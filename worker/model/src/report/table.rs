@@ -31,27 +31,42 @@ pub(super) fn error_name(target: Target) -> &'static str {
     }
 }
 
-/// Columns of a target's figures: name, heading.
-fn columns(target: Target) -> &'static [(&'static str, &'static str)] {
+const BY_32: &str =
+    "as the released code has it: of 32 masks together, averaged; 0 where there is nothing in them";
+const BOUNDARY: &str =
+    "as the released code has it: how many edges are where they are in truth, at any scale";
+
+/// Columns of a target's figures, the one that counts first: name, heading, and what it is where that does not say.
+fn columns(target: Target) -> &'static [(&'static str, &'static str, &'static str)] {
     match target {
-        Target::Tof => &[("mae_m", "MAE (m)"), ("rmse_m", "RMSE (m)")],
-        Target::Shadow | Target::Specular => &[("iou", "IoU"), ("mae", "MAE"), ("f1", "F1")],
+        Target::Tof => &[
+            ("mae_m", "MAE (m)", ""),
+            ("rmse_m", "RMSE (m)", ""),
+            ("boundary_f1", "boundary F1", BOUNDARY),
+        ],
+        Target::Shadow | Target::Specular => &[
+            ("iou", "IoU", ""),
+            ("mae", "MAE", ""),
+            ("f1", "F1", ""),
+            ("iou_32", "IoU of 32", BY_32),
+            ("mae_32", "MAE of 32", BY_32),
+            ("f1_32", "F1 of 32", BY_32),
+        ],
     }
 }
 
-/// A figure as it is written in its column.
-fn write(target: Target, value: f64) -> String {
-    match target {
-        Target::Tof => metres(value),
-        Target::Shadow | Target::Specular => share(value),
-    }
+/// The figure that counts.
+pub(super) fn main_figure(target: Target) -> &'static str {
+    columns(target)[0].0
 }
 
-/// Mean ± spread.
-pub(super) fn spread(target: Target, figure: Spread) -> String {
-    let mean = write(target, figure.mean);
+/// Mean ± spread of a figure, by its name.
+pub(super) fn spread(name: &str, figure: Spread) -> String {
+    let in_metres = name.ends_with("_m");
+    let write = if in_metres { metres } else { share };
+    let mean = write(figure.mean);
     match figure.deviation {
-        Some(deviation) if target == Target::Tof => format!("{mean} ± {}", digits(deviation, 2)),
+        Some(deviation) if in_metres => format!("{mean} ± {}", digits(deviation, 2)),
         Some(deviation) => format!("{mean} ± {}", share(deviation)),
         None => mean,
     }
@@ -105,12 +120,16 @@ pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> Strin
     trivial.sort_unstable();
     trivial.dedup();
     let published = groups.iter().any(|g| g.repeats.is_some());
-    let main = columns(target)[0].0;
+    let main = main_figure(target);
     let mut out = String::from(
         "<div class=\"wide\"><table class=\"figures\"><thead><tr><th>experiment</th><th>seeds</th>",
     );
-    for (_, heading) in columns(target) {
-        let _ = write!(out, "<th class=\"n\">{heading}</th>");
+    for (_, heading, meaning) in columns(target) {
+        let title = match *meaning {
+            "" => String::new(),
+            meaning => format!(" title=\"{}\"", Safe(meaning)),
+        };
+        let _ = write!(out, "<th class=\"n\"{title}>{heading}</th>");
     }
     if published {
         let _ = write!(
@@ -158,7 +177,7 @@ fn row(
     );
     let cell = |figures: Option<&Figures>, name: &str| {
         let figure = figures.and_then(|f| f.get(name));
-        figure.map_or_else(|| "–".to_owned(), |f| spread(target, *f))
+        figure.map_or_else(|| "–".to_owned(), |f| spread(name, *f))
     };
     if group.figures.is_empty() {
         let _ = write!(
@@ -167,7 +186,7 @@ fn row(
             columns(target).len()
         );
     } else {
-        for (name, _) in columns(target) {
+        for (name, _, _) in columns(target) {
             let class = if *name == main { "n main" } else { "n" };
             let figure = cell(Some(&group.figures), name);
             let _ = write!(out, "<td class=\"{class}\">{figure}</td>");
@@ -249,6 +268,10 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
             ShadowVariant::All => "all spots at once",
         };
         words.extend([variant.to_owned(), format!("{} spots", question.spots)]);
+        if question.variant == ShadowVariant::All {
+            // The others learn from a mask a visit.
+            words.push(format!("{} masks a visit", question.spots));
+        }
     }
     match entry.data.max_bounces {
         0 => {}

@@ -7,7 +7,7 @@ use super::{
     chart::{Axis, Series, chart, legend},
     number::{digits, duration, prefixed, prefixed_short, short, thousands},
     summary::TARGETS,
-    table::{error_name, spread, target_name},
+    table::{error_name, main_figure, spread, target_name},
     text::Safe,
 };
 
@@ -37,7 +37,12 @@ pub(super) fn speed(report: &Report, summary: &Summary) -> String {
             let points = groups.iter().enumerate().filter_map(|(style, g)| {
                 let (x, error) = (of(g)?, g.error?);
                 Some(Series {
-                    label: format!("{}: {}, {}", g.label, prefixed(x), spread(target, error)),
+                    label: format!(
+                        "{}: {}, {}",
+                        g.label,
+                        prefixed(x),
+                        spread(main_figure(target), error)
+                    ),
                     style,
                     points: vec![point(x, error)],
                     joined: false,
@@ -101,7 +106,11 @@ fn costs(report: &Report, summary: &Summary) -> String {
                 None => digits(s.mean, 3),
             });
         let error = match group.error {
-            Some(error) => format!("{} {}", spread(group.target, error), unit(group)),
+            Some(error) => format!(
+                "{} {}",
+                spread(main_figure(group.target), error),
+                unit(group)
+            ),
             None => "not evaluated".to_owned(),
         };
         let _ = write!(
@@ -179,7 +188,7 @@ pub(super) fn scale(summary: &Summary) -> String {
                 "<tr><th scope=\"row\">{}</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>",
                 Safe(&scaling.label),
                 thousands(*scenes),
-                spread(target, *error)
+                spread(main_figure(target), *error)
             );
         }
         out.push_str("</tbody></table></div>");

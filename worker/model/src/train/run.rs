@@ -353,7 +353,12 @@ impl Training {
             for _ in 0..scenes.len().div_ceil(self.plan.batch) {
                 let batch = ready.next()?;
                 let said = self.learner.predict(&batch);
-                tally.add(question.target, &said, &batch.target);
+                tally.add(
+                    question.target,
+                    &said,
+                    &batch.target,
+                    [batch.height, batch.width],
+                );
             }
             Ok::<(), ModelError>(())
         })?;

@@ -2,7 +2,7 @@
 //! a model that was evaluated on these scenes before is not asked again.
 
 use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, SplitUsed, sha256_hex};
-use picofarm_model::{baseline::DepthBaseline, evaluate, input};
+use picofarm_model::{baseline::Baseline, evaluate};
 use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateTask, Histogram, TaskSpec, TrainSettings, train::TRUTH},
@@ -15,10 +15,10 @@ use crate::execute::{
     examples::{Examples, first, sides},
     output::Stores,
     train::{Known, at, model_version, of_model, pin},
-    truth::{self, Need},
+    truth,
 };
 
-/// Training scenes that depths without a network are fitted to, at most.
+/// Training scenes that answers without a network are fitted to, at most.
 const BASELINE: usize = 64;
 
 impl RunTask for EvaluateTask {
@@ -79,7 +79,7 @@ struct EvaluationRun<'a> {
     scenes: Vec<u64>,
     /// What pins their bytes.
     data: Pinned,
-    /// Training scenes that the depths which need no model are fitted to, and what pins their bytes.
+    /// Training scenes that the answers which need no model are fitted to, and what pins their bytes.
     known: Vec<u64>,
     known_data: Pinned,
 }
@@ -102,10 +102,9 @@ impl EvaluationRun<'_> {
             None => (trained.histogram, trained.spots.clone()),
         };
         let place = self.dataset.place();
-        truth::check(&place, &truth::of_training(&trained), &self.data.missing)?;
-        if model.model.question().target == input::Target::Tof {
-            // The best constant and the peaks are fitted to them.
-            truth::check(&place, &[Need::Depth], &self.known_data.missing)?;
+        // Trivial answers are fitted to the training scenes.
+        for missing in [&self.data.missing, &self.known_data.missing] {
+            truth::check(&place, &truth::of_training(&trained), missing)?;
         }
         let (sha256, version) = (model.manifest.sha256(), &settings.version);
         let data = [&*self.data.id, &self.known_data.id];
@@ -162,15 +161,10 @@ impl EvaluationRun<'_> {
                 examples.spots()
             )));
         }
-        let baseline = match model.model.question().target {
-            input::Target::Tof => {
-                let known = self.known.clone();
-                let known =
-                    Examples::new(self.stores, &self.dataset, histogram, known, "evaluate")?;
-                Some(DepthBaseline::fit(&*known, BASELINE).map_err(of_model)?)
-            }
-            input::Target::Shadow | input::Target::Specular => None,
-        };
+        let known = self.known.clone();
+        let known = Examples::new(self.stores, &self.dataset, histogram, known, "evaluate")?;
+        let target = model.model.question().target;
+        let baseline = Baseline::fit(target, &*known, BASELINE).map_err(of_model)?;
         let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
         let mut tell = |scene: usize, of: usize| {
             let share = (which as f32 + scene as f32 / of as f32) / count as f32;
@@ -179,20 +173,15 @@ impl EvaluationRun<'_> {
             control.at(share * 0.99)
         };
         let guide = guide.map(|guide| &*guide.model);
-        let found = evaluate(
-            &model.model,
-            guide,
-            baseline.as_ref(),
-            &*examples,
-            &mut tell,
-        )
-        .map_err(of_model)?
-        .ok_or(TaskError::Stopped)?;
+        let found = evaluate(&model.model, guide, &baseline, &*examples, &mut tell)
+            .map_err(of_model)?
+            .ok_or(TaskError::Stopped)?;
         let baselines = found
             .baselines
             .iter()
             .map(|(name, m)| (name.clone(), json!(m)));
         let mut metrics = json!(found.metrics);
+        metrics["released"] = json!(found.released);
         metrics["baselines"] = baselines.collect();
         metrics["examples"] = json!(found.examples);
         metrics["by_scene"] = json!(found.scenes);

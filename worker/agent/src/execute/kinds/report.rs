@@ -250,6 +250,7 @@ fn evaluated(found: &Value) -> serde_json::Result<Evaluated> {
     let baselines: BTreeMap<String, Metrics> = serde_json::from_value(part("baselines"))?;
     Ok(Evaluated {
         metrics: serde_json::from_value(found.clone())?,
+        released: serde_json::from_value(part("released"))?,
         baselines: baselines.into_iter().collect(),
         scenes: serde_json::from_value(part("by_scene"))?,
         examples: serde_json::from_value(part("examples"))?,
