@@ -244,6 +244,39 @@ fn a_render_stage_in_parts_needs_one_that_renders_them_and_its_result_has_the_sa
 }
 
 #[test]
+fn an_evaluation_in_shards_needs_a_stage_that_asks_of_them_and_its_result_has_the_same_key() {
+    let text = "name = \"n\"\n[[stage]]\nkind = \"evaluate\"\nsource = { store = \"/s\", dataset = \"d\" }\ncount = 9\n\
+                evaluate = { models = [\"m\"], shards = 7 }\n";
+    let spec: JobSpec = toml::from_str(text).unwrap();
+    spec.check().unwrap();
+    let stages: Vec<_> = spec
+        .stages
+        .iter()
+        .map(|s| (&*s.name, s.task.kind(), s.tasks(), &s.needs[..]))
+        .collect();
+    let needs = ["evaluate.shards".to_owned()];
+    let expected = [
+        ("evaluate.shards", "evaluate_shard", 7, &[][..]),
+        ("evaluate", "evaluate", 1, &needs[..]),
+    ];
+    assert_eq!(stages, expected);
+    let whole: JobSpec = toml::from_str(&text.replace(", shards = 7", "")).unwrap();
+    assert_eq!(whole.stages.len(), 1);
+    assert_eq!(stage_key(&whole.stages[0]), stage_key(&spec.stages[1]));
+    assert_ne!(stage_key(&whole.stages[0]), stage_key(&spec.stages[0]));
+    let text_again = serde_json::to_string(&spec).unwrap();
+    assert_eq!(serde_json::from_str::<JobSpec>(&text_again).unwrap(), spec);
+    let none: JobSpec = toml::from_str(&text.replace("shards = 7", "shards = 0")).unwrap();
+    let error = none.check().unwrap_err().to_string();
+    assert!(
+        error.contains("evaluate.shards: is 0, expected 1 to 10000"),
+        "{error}"
+    );
+    let error = toml::from_str::<JobSpec>(&text.replace("\"evaluate\"", "\"evaluate_shard\""));
+    assert!(error.unwrap_err().to_string().contains("kind"));
+}
+
+#[test]
 fn parts_of_what_cannot_be_divided_are_refused() {
     let refused = |text: &str| {
         let spec: JobSpec = toml::from_str(text).unwrap();

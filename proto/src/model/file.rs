@@ -6,7 +6,8 @@
 //! another stage makes need not be said.
 //!
 //! `parts = 8` beside `[render]` divides each scene among that many tasks and the light paths' one, and joins them: the
-//! job gets a stage of kind `part`, called `NAME.parts`, before the render stage.
+//! job gets a stage of kind `part`, called `NAME.parts`, before the render stage. So do `shards = 8` in an evaluation:
+//! `NAME.shards` is of kind `evaluate_shard`.
 //!
 //! `matrix = { dark = [0.0, 0.1], bins = [1, 4] }` makes a stage for each combination of values. Anywhere in the stage,
 //! the text `"{dark}"` stands for the value, and `{dark}` inside a text for its text. An instance is called
@@ -17,7 +18,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::{
-    PartTask, RenderTask, TaskSpec,
+    EvaluateShardTask, PartTask, RenderTask, TaskSpec,
     limits::{Limits, MAX_STAGES, Resources},
     matrix,
     places::OutputSettings,
@@ -110,22 +111,16 @@ impl JobText {
     }
 }
 
-/// Puts a stage that renders the parts before each stage that joins them, unless it is there already.
+/// Puts a stage that makes the parts before each stage that joins them, unless it is there already.
 fn divided(written: Vec<StageSpec>) -> Vec<StageSpec> {
     let mut stages: Vec<StageSpec> = Vec::with_capacity(written.len());
     for mut stage in written {
-        if let TaskSpec::Render(task) = &stage.task
-            && task.parts > 1
-        {
-            let name = format!("{}.parts", stage.name);
+        if let Some((suffix, task)) = parts_of(&stage.task) {
+            let name = format!("{}.{suffix}", stage.name);
             if !stages.iter().any(|s| s.name == name) {
-                let whole = task.clone();
                 stages.push(StageSpec {
                     name: name.clone(),
-                    task: TaskSpec::Part(PartTask {
-                        whole,
-                        joined_by: String::new(),
-                    }),
+                    task,
                     ..stage.clone()
                 });
             }
@@ -136,4 +131,22 @@ fn divided(written: Vec<StageSpec>) -> Vec<StageSpec> {
         stages.push(stage);
     }
     stages
+}
+
+/// The tasks that make what a stage joins, and how the name of their stage ends.
+fn parts_of(task: &TaskSpec) -> Option<(&'static str, TaskSpec)> {
+    match task {
+        TaskSpec::Render(task) if task.parts > 1 => {
+            let task = PartTask {
+                whole: task.clone(),
+                joined_by: String::new(),
+            };
+            Some(("parts", task.into()))
+        }
+        TaskSpec::Evaluate(task) if task.evaluate.shards > 1 => {
+            let whole = task.clone();
+            Some(("shards", EvaluateShardTask { whole }.into()))
+        }
+        _ => None,
+    }
 }

@@ -27,9 +27,9 @@ pub use audit::{Act, AuditEntry, Outcome};
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::JobSpec;
 pub use kinds::{
-    EvaluateTask, ExportSettings, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
-    PromoteSettings, PromoteTask, RenderTask, ReportTask, ReprocessTask, SplitTask, TaskKind,
-    TaskSpec, TrainTask,
+    EvaluateShardTask, EvaluateTask, ExportSettings, ExportTask, GenerateTask, ImportTask,
+    InferTask, PartTask, PromoteSettings, PromoteTask, RenderTask, ReportTask, ReprocessTask,
+    SplitTask, TaskKind, TaskSpec, TrainTask,
     evaluate::{self, EvaluateSettings},
     generate::GenerateSettings,
     import::ImportSettings,

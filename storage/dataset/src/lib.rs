@@ -40,8 +40,8 @@ pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use models::{
     Dependents, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest, ModelRepair,
-    Models, NewModel, Promoted, Published, Removed, Rung, SplitUsed, TrainingSpeed, TrialEnd,
-    TrialRecord,
+    Models, NewModel, Promoted, Published, Removed, Rung, ShardName, SplitUsed, TrainingSpeed,
+    TrialEnd, TrialRecord,
 };
 pub use predictions::{
     EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,

@@ -31,28 +31,30 @@ pub struct Evaluated {
 pub struct Answered {
     examples: u64,
     model: Tally,
-    /// As [`Baseline::names`].
-    trivial: Vec<Tally>,
+    /// Those of trivial answers, by name.
+    trivial: Vec<(String, Tally)>,
 }
 
 impl Evaluated {
     /// Of scenes in order: the same to the bit in however many parts they were asked.
-    pub fn of(target: Target, baseline: &Baseline, scenes: &[Answered]) -> Self {
+    pub fn of(target: Target, scenes: &[Answered]) -> Self {
         let mut whole = Tally::default();
-        let names = baseline.names();
-        let mut trivial = vec![Tally::default(); names.len()];
+        let mut trivial: Vec<(String, Tally)> = Vec::new();
         for scene in scenes {
             whole.join(&scene.model);
-            for (all, of) in trivial.iter_mut().zip(&scene.trivial) {
-                all.join(of);
+            for (name, of) in &scene.trivial {
+                match trivial.iter_mut().find(|(n, _)| n == name) {
+                    Some((_, all)) => all.join(of),
+                    None => trivial.push((name.clone(), of.clone())),
+                }
             }
         }
-        let named = names.iter().zip(&trivial);
+        let named = trivial.into_iter();
         Self {
             metrics: whole.metrics(target),
             released: whole.released(target),
             baselines: named
-                .map(|(name, tally)| ((*name).to_owned(), tally.metrics(target)))
+                .map(|(name, tally)| (name, tally.metrics(target)))
                 .collect(),
             scenes: scenes.iter().map(|s| s.model.metrics(target)).collect(),
             examples: scenes.iter().map(|s| s.examples).sum(),
@@ -73,22 +75,13 @@ pub fn evaluate(
     scenes: &dyn Scenes,
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Evaluated>, ModelError> {
+    let answered = answered(model, guide, baseline, scenes, tell)?;
     let target = model.question().target;
-    let mut each = Vec::with_capacity(scenes.len());
-    for index in 0..scenes.len() {
-        let scene = scenes.load(index).map_err(|source| ModelError::Scene {
-            scene: index,
-            source,
-        })?;
-        each.push(answered(model, guide, baseline, &scene)?);
-        if !tell(index + 1, scenes.len()) {
-            return Ok(None);
-        }
-    }
-    Ok(Some(Evaluated::of(target, baseline, &each)))
+    Ok(answered.map(|scenes| Evaluated::of(target, &scenes)))
 }
 
-/// Asks of one scene.
+/// What is answered of every scene, in order, from which [`Evaluated::of`] makes figures; arguments and errors as
+/// [`evaluate`].
 ///
 /// # Errors
 /// As [`evaluate`].
@@ -96,32 +89,53 @@ pub fn answered(
     model: &Model,
     guide: Option<&Model>,
     baseline: &Baseline,
+    scenes: &dyn Scenes,
+    tell: &mut dyn FnMut(usize, usize) -> bool,
+) -> Result<Option<Vec<Answered>>, ModelError> {
+    let mut each = Vec::with_capacity(scenes.len());
+    for index in 0..scenes.len() {
+        let scene = scenes.load(index).map_err(|source| ModelError::Scene {
+            scene: index,
+            source,
+        })?;
+        each.push(of_scene(model, guide, baseline, &scene)?);
+        if !tell(index + 1, scenes.len()) {
+            return Ok(None);
+        }
+    }
+    Ok(Some(each))
+}
+
+fn of_scene(
+    model: &Model,
+    guide: Option<&Model>,
+    baseline: &Baseline,
     scene: &Scene,
 ) -> Result<Answered, ModelError> {
     let target = model.question().target;
+    let names = baseline.names().iter();
     let mut found = Answered {
         examples: 0,
         model: Tally::default(),
-        trivial: vec![Tally::default(); baseline.names().len()],
+        trivial: names
+            .map(|name| ((*name).to_owned(), Tally::default()))
+            .collect(),
     };
-    let (mut plane, mut unlike) = (0, None);
+    let (mut plane, mut fits) = (0, true);
     answers(model, guide, scene, &mut |said, batch| {
         let (side, truth) = ([batch.height, batch.width], &batch.target);
         found.examples += batch.images as u64;
         found.model.add(target, said, truth, side);
         let trivial = baseline.answers(scene, plane, truth.len());
-        for (tally, said) in found.trivial.iter_mut().zip(trivial) {
-            if said.len() != truth.len() {
-                unlike = Some(said.len());
-                return;
-            }
+        for ((_, tally), said) in found.trivial.iter_mut().zip(trivial) {
+            fits &= said.len() == truth.len();
             tally.add(target, &said, truth, side);
         }
         plane += truth.len() / scene.pixels();
     })?;
-    match unlike {
-        None => Ok(found),
-        Some(_) => Err(ModelError::invalid(
+    match fits {
+        true => Ok(found),
+        false => Err(ModelError::invalid(
             "scenes",
             "the training scenes that trivial answers are fitted to have another size or number of spots",
         )),

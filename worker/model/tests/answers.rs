@@ -97,17 +97,22 @@ fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
         let scenes = scenes(500, 7);
         let whole = evaluate(&model, None, &baseline, &scenes, &mut |_, _| true);
         let whole = whole.unwrap().unwrap();
-        let each = scenes.iter().rev();
-        let mut each: Vec<_> = each
-            .map(|s| answered(&model, None, &baseline, s).unwrap())
-            .map(|found| serde_json::to_string(&found).unwrap())
-            .collect();
-        each.reverse();
-        let each: Vec<Answered> = each
-            .iter()
-            .map(|t| serde_json::from_str(t).unwrap())
-            .collect();
-        assert_eq!(Evaluated::of(target, &baseline, &each), whole);
+        let part = |from: usize, to: usize| {
+            let some = scenes[from..to].to_vec();
+            let found = answered(&model, None, &baseline, &some, &mut |_, _| true);
+            let text = serde_json::to_string(&found.unwrap().unwrap()).unwrap();
+            serde_json::from_str::<Vec<Answered>>(&text).unwrap()
+        };
+        for bounds in [
+            vec![0, 7],
+            vec![0, 3, 7],
+            vec![0, 1, 2, 3, 4, 5, 6, 7],
+            vec![0, 0, 7, 7],
+        ] {
+            let parts = bounds.windows(2).flat_map(|b| part(b[0], b[1]));
+            let joined = Evaluated::of(target, &parts.collect::<Vec<_>>());
+            assert_eq!(joined, whole);
+        }
     }
 }
 

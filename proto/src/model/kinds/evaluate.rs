@@ -1,4 +1,5 @@
-//! Evaluation: trained models meet scenes that they have not seen. One task; what it finds is kept beside each model.
+//! Evaluation: trained models meet scenes that they have not seen. One task, or one for each shard of the scenes and one
+//! that joins them; what it finds is kept beside each model.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -23,6 +24,8 @@ use crate::{
 
 /// Most models in one evaluation, or in one report.
 pub(super) const MAX_MODELS: usize = 1_000;
+/// Most tasks that an evaluation is divided among.
+const MAX_SHARDS: u32 = 10_000;
 
 /// Evaluating models: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -56,9 +59,102 @@ pub struct EvaluateSettings {
     /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
+    /// The scenes are asked of in so many tasks, 1 to 10,000, whose sums one more task joins: the figures are the same to
+    /// the bit. Default 1: one task for all.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub shards: u32,
     /// Version of networks and metrics, part of every task key; filled in at submission where left out.
     #[serde(default)]
     pub version: String,
+}
+
+fn one() -> u32 {
+    1
+}
+
+fn is_one(shards: &u32) -> bool {
+    *shards == 1
+}
+
+/// Asking models of a shard of the scenes, which the evaluation that needs it joins: one task a shard.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EvaluateShardTask {
+    /// The evaluation.
+    #[serde(flatten)]
+    pub whole: EvaluateTask,
+}
+
+impl Declared for EvaluateShardTask {
+    const NAME: &'static str = "evaluate_shard";
+    const FIELDS: &'static [&'static str] = EvaluateTask::FIELDS;
+    /// An evaluation with `shards` stands for it.
+    const WRITTEN: bool = false;
+
+    fn read(fields: &mut Fields) -> Result<Self, SpecError> {
+        Ok(Self {
+            whole: EvaluateTask::read(fields)?,
+        })
+    }
+}
+
+impl TaskKind for EvaluateShardTask {
+    fn versioned(&self) -> (&'static str, &str) {
+        self.whole.versioned()
+    }
+
+    fn version_mut(&mut self) -> Option<&mut String> {
+        self.whole.version_mut()
+    }
+
+    fn check(&self) -> Result<(), SpecError> {
+        self.whole.check()
+    }
+
+    fn shaping(&self) -> Value {
+        json!({
+            "stage": "evaluate_shard",
+            "whole": self.whole.shaping(),
+            "shards": self.whole.evaluate.shards,
+        })
+    }
+
+    fn results(&self) -> Results<'_> {
+        let source = &self.whole.source;
+        Results {
+            field: "source.store",
+            store: &source.store,
+            folder: format!("{}/evaluate/shards", source.dataset),
+            manifest: Manifest::None,
+        }
+    }
+
+    fn memory(&self, known: &Known, threads: u32) -> Option<f64> {
+        self.whole.memory(known, threads)
+    }
+
+    fn tasks(&self) -> u64 {
+        u64::from(self.whole.evaluate.shards)
+    }
+
+    fn reads(&self) -> Option<&SourceSettings> {
+        self.whole.reads()
+    }
+
+    fn reads_mut(&mut self) -> Option<(&mut SourceSettings, &mut u64)> {
+        self.whole.reads_mut()
+    }
+
+    fn split(&self) -> Option<&String> {
+        self.whole.split()
+    }
+
+    fn models(&self) -> Vec<(&'static str, &String)> {
+        self.whole.models()
+    }
+
+    fn models_mut(&mut self) -> ModelNames<'_> {
+        self.whole.models_mut()
+    }
 }
 
 fn default_split() -> String {
@@ -98,11 +194,15 @@ impl TaskKind for EvaluateTask {
     }
 
     fn shaping(&self) -> Value {
+        let settings = EvaluateSettings {
+            shards: 1,
+            ..self.evaluate.clone()
+        };
         json!({
             "stage": "evaluate",
             "source": self.source.shaping(),
             "count": self.count,
-            "settings": self.evaluate,
+            "settings": settings,
         })
     }
 
@@ -164,6 +264,10 @@ impl EvaluateSettings {
             if self.models[..i].contains(model) {
                 return fail(&format!("models[{i}]"), format!("{model:?} is named twice"));
             }
+        }
+        if !(1..=MAX_SHARDS).contains(&self.shards) {
+            let what = format!("is {}, expected 1 to {MAX_SHARDS}", self.shards);
+            return fail("shards", what);
         }
         check_split("evaluate.split", &self.split)?;
         if !SIDES.contains(&&*self.side) {

@@ -32,7 +32,7 @@ use super::spec_error::SpecError;
 use crate::show;
 
 pub use division::Division;
-pub use evaluate::EvaluateTask;
+pub use evaluate::{EvaluateShardTask, EvaluateTask};
 pub use export::{ExportSettings, ExportTask};
 pub use fields::Fields;
 pub use generate::GenerateTask;
@@ -137,6 +137,8 @@ kinds! {
     Verify(VerifyTask),
     /// Parts of heavy scenes are rendered, for a render stage to join: one task a part.
     Part(PartTask),
+    /// Models meet shards of the scenes, for an evaluation to join: one task a shard.
+    EvaluateShard(EvaluateShardTask),
 }
 
 /// A kind, as job files are read.

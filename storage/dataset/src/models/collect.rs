@@ -1,5 +1,5 @@
-//! What nobody needs of a store's models: checkpoints of trainings that nobody goes on with, and objects that no
-//! manifest names.
+//! What nobody needs of a store's models: checkpoints of trainings that nobody goes on with, shards of evaluations that
+//! nobody joined, and objects that no manifest names.
 //!
 //! A checkpoint is never a result: whoever misses one trains again from the one before, or from the beginning. Objects are
 //! guarded as a scene's are: the manifest is looked at right before one is deleted and once more right after, and the
@@ -20,7 +20,7 @@ use crate::store::objects;
 
 impl Models {
     /// Finds what nobody needs and was last written at `limit` or earlier, `grace` before now: checkpoints of trainings
-    /// all of whose checkpoints are that old, objects that no manifest names, and unfinished files of killed writes.
+    /// all of whose checkpoints are that old, shards of evaluations, objects that no manifest names, and unfinished files of killed writes.
     /// Deletes it if `delete` says so.
     pub(crate) async fn collect(
         &self,
@@ -43,6 +43,14 @@ impl Models {
                     }
                     found.push(self.orphan(&object));
                 }
+            }
+            // Who joins an evaluation makes missing shards again.
+            let shards = self.list(&self.path(&name, super::shard::FOLDER)).await?;
+            for object in shards.into_iter().filter(old) {
+                if delete {
+                    self.delete(&object.location).await?;
+                }
+                found.push(self.orphan(&object));
             }
             let folder = self.folder.clone().join(&*name);
             for object in self.list(&folder).await? {

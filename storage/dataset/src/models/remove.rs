@@ -254,6 +254,9 @@ impl Models {
                 self.remove_one(&object.location, removed).await?;
             }
         }
+        for object in self.list(&self.path(name, super::shard::FOLDER)).await? {
+            self.remove_one(&object.location, removed).await?;
+        }
         for checkpoint in self.checkpoints(name).await? {
             if all || checkpoint.training_key == note.training_key {
                 self.remove_one(&checkpoint.object.location, removed)

@@ -137,6 +137,11 @@ impl Models {
                     None => bad("its content has not the checkpoint's checksum"),
                 }
             }
+            // Of an evaluation that goes on or was given up; who reads a damaged one makes it again.
+            Some((super::shard::FOLDER, _)) => {
+                check.unused.push(at.clone());
+                None
+            }
             Some(("sweeps", _)) => {
                 let bytes = objects::require(&*self.store, &object.location).await?;
                 let said = match key.contains("/trials/") {

@@ -50,12 +50,7 @@ impl Dataset {
     /// [`DatasetError::Store`].
     pub async fn put_part(&self, name: &PartName, bytes: &[u8]) -> Result<(), DatasetError> {
         let path = self.path(&name.key());
-        // With a checksum, so that whoever reads it knows that it is whole.
-        let packed = zstd::bulk::Compressor::new(LEVEL).and_then(|mut packer| {
-            packer.include_checksum(true)?;
-            packer.compress(bytes)
-        });
-        let packed = packed.map_err(|e| DatasetError::codec("part of a scene", e))?;
+        let packed = pack(bytes).map_err(|e| DatasetError::codec("part of a scene", e))?;
         objects::overwrite(&*self.store, &path, packed.into()).await
     }
 
@@ -104,8 +99,15 @@ impl Dataset {
     }
 }
 
+/// Packs a part, with a checksum, so that whoever reads it knows that it is whole.
+pub(crate) fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
+    let mut packer = zstd::bulk::Compressor::new(LEVEL)?;
+    packer.include_checksum(true)?;
+    packer.compress(bytes)
+}
+
 /// Unpacks a part that says how large it is, and is no larger than `most`.
-fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
+pub(crate) fn unpack(packed: &[u8], most: u64) -> std::io::Result<Vec<u8>> {
     let invalid = |what: &str| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
     let size = zstd::zstd_safe::get_frame_content_size(packed);
     let size = size

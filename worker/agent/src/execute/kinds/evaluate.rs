@@ -1,14 +1,20 @@
-//! Evaluation: one task in which trained models meet scenes that they have not seen. What it finds lies beside each model;
-//! a model that was evaluated on these scenes before is not asked again.
+//! Evaluation: one task in which trained models meet scenes that they have not seen, or one for each shard of the scenes and
+//! one that joins their sums, in the scenes' order: the same figures to the bit. What it finds lies beside each model; a model
+//! that was evaluated on these scenes before is not asked again. Nothing depends on shards: who joins them asks of those that
+//! are missing or damaged.
 
-use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, SplitUsed, sha256_hex};
-use picofarm_model::{baseline::Baseline, evaluate};
+use std::ops::Range;
+
+use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, sha256_hex};
+use picofarm_model::{Answered, Evaluated, answered, baseline::Baseline};
 use picofarm_proto::{
     key::evaluation_key,
-    model::{EvaluateTask, Histogram, TaskSpec, TrainSettings, train::TRUTH},
+    model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings, train::TRUTH},
 };
+use serde::{Deserialize, Serialize};
 use serde_json::json;
-use tracing::info;
+use sha2::{Digest, Sha256};
+use tracing::{info, warn};
 
 use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
@@ -26,36 +32,11 @@ impl RunTask for EvaluateTask {
         model_version()
     }
 
-    /// Evaluates the models that `task` names.
+    /// Evaluates the models that `task` names; joins their shards where they have some.
     fn run(&self, context: &Context, _task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let stores = &context.stores;
-        let task = self;
-        let (place, settings) = (&task.source, &task.evaluate);
-        let dataset = stores
-            .open_source(&place.store, &place.dataset, control)
-            .map_err(|e| at("source", e))?;
-        stores.fits(TaskSpec::Evaluate(task.clone()), Some(dataset.spec()))?;
-        let models = stores
-            .models(&place.store, control)
-            .map_err(|e| at("source.store", e))?;
-        let split = ("evaluate.split", &*settings.split);
-        let sides = sides(stores, &dataset, split, [&*settings.side, "train"], control)?;
-        let [mut scenes, mut known] = sides.scenes;
-        first(&mut scenes, settings.scenes, "evaluate.scenes")?;
-        known.truncate(BASELINE);
-        let evaluation = EvaluationRun {
-            data: pin(stores, &dataset, &scenes, control)?,
-            known_data: pin(stores, &dataset, &known, control)?,
-            known,
-            stores,
-            task,
-            dataset,
-            models,
-            split: sides.split,
-            scenes,
-        };
+        let evaluation = EvaluationRun::new(context, self, control)?;
         let (mut documents, mut computed) = (Vec::new(), false);
-        for which in 0..settings.models.len() {
+        for which in 0..self.evaluate.models.len() {
             let (found, new) = evaluation.of(which, control)?;
             computed |= new;
             documents.extend(found.to_bytes());
@@ -64,6 +45,45 @@ impl RunTask for EvaluateTask {
         Ok(Output {
             manifest_sha256: sha256_hex(&documents),
             bytes: documents.len() as u64,
+            adopted: !computed,
+        })
+    }
+}
+
+impl RunTask for EvaluateShardTask {
+    fn code_version() -> String {
+        model_version()
+    }
+
+    /// Asks the models of the scenes of shard `task.index`, but those whose evaluation or shard is there.
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let evaluation = EvaluationRun::new(context, &self.whole, control)?;
+        let (mut bytes, mut computed) = (0, false);
+        for which in 0..self.whole.evaluate.models.len() {
+            let asked = evaluation.asked(which, control)?;
+            if evaluation.found(&asked, control)?.is_some() {
+                continue;
+            }
+            let name = evaluation.shard(&asked, task.index as u32);
+            if evaluation.read(&name, control)?.is_some() {
+                continue;
+            }
+            let record = ShardRecord {
+                evaluation: name.evaluation.clone(),
+                shard: name.shard,
+                answered: evaluation.ask(&asked, name.shard.0, control)?,
+            };
+            let text = serde_json::to_vec(&record).expect("sums are plain data");
+            let put = async || evaluation.models.put_shard(&name, &text).await;
+            context.stores.patiently(control, put)?;
+            bytes += text.len() as u64;
+            computed = true;
+        }
+        control.at(1.0);
+        Ok(Output {
+            // A shard goes when its evaluation is there: its name is all that stays the same.
+            manifest_sha256: hex::encode(Sha256::digest(task.key().0)),
+            bytes,
             adopted: !computed,
         })
     }
@@ -84,9 +104,65 @@ struct EvaluationRun<'a> {
     known_data: Pinned,
 }
 
-impl EvaluationRun<'_> {
-    /// What one of the models has found or finds now; and whether it is new.
-    fn of(&self, which: usize, control: &Control) -> Result<(Evaluation, bool), TaskError> {
+/// A shard as it lies in the store.
+#[derive(Serialize, Deserialize)]
+struct ShardRecord {
+    /// Key of the evaluation.
+    evaluation: String,
+    /// Which shard, and of how many.
+    shard: (u32, u32),
+    /// Of each scene, in order.
+    answered: Vec<Answered>,
+}
+
+/// A model as it is asked.
+struct Asked {
+    /// Which of the evaluation's.
+    which: usize,
+    model: Known,
+    guide: Option<Known>,
+    histogram: Histogram,
+    spots: Vec<u32>,
+    sha256: String,
+    /// Key of what is found.
+    key: String,
+}
+
+impl<'a> EvaluationRun<'a> {
+    fn new(
+        context: &'a Context,
+        task: &'a EvaluateTask,
+        control: &Control,
+    ) -> Result<Self, TaskError> {
+        let stores = &context.stores;
+        let (place, settings) = (&task.source, &task.evaluate);
+        let dataset = stores
+            .open_source(&place.store, &place.dataset, control)
+            .map_err(|e| at("source", e))?;
+        stores.fits(TaskSpec::Evaluate(task.clone()), Some(dataset.spec()))?;
+        let models = stores
+            .models(&place.store, control)
+            .map_err(|e| at("source.store", e))?;
+        let split = ("evaluate.split", &*settings.split);
+        let sides = sides(stores, &dataset, split, [&*settings.side, "train"], control)?;
+        let [mut scenes, mut known] = sides.scenes;
+        first(&mut scenes, settings.scenes, "evaluate.scenes")?;
+        known.truncate(BASELINE);
+        Ok(Self {
+            data: pin(stores, &dataset, &scenes, control)?,
+            known_data: pin(stores, &dataset, &known, control)?,
+            known,
+            stores,
+            task,
+            dataset,
+            models,
+            split: sides.split,
+            scenes,
+        })
+    }
+
+    /// One of the models, and what it is asked of.
+    fn asked(&self, which: usize, control: &Control) -> Result<Asked, TaskError> {
         let (stores, models, settings) = (self.stores, &self.models, &self.task.evaluate);
         let name = &settings.models[which];
         let field = format!("evaluate.models[{which}]");
@@ -106,12 +182,6 @@ impl EvaluationRun<'_> {
         for missing in [&self.data.missing, &self.known_data.missing] {
             truth::check(&place, &truth::of_training(&trained), missing)?;
         }
-        let (sha256, version) = (model.manifest.sha256(), &settings.version);
-        let data = [&*self.data.id, &self.known_data.id];
-        let key = evaluation_key(&sha256, data, histogram, &spots, version).to_string();
-        if let Some(found) = stores.wait(control, models.evaluation(name, &key))? {
-            return Ok((found, false));
-        }
         let guide = match &*trained.shadow.tof {
             TRUTH => None,
             tof => {
@@ -119,52 +189,158 @@ impl EvaluationRun<'_> {
                 Some(Known::read(stores, models, (&field, tof), spec, control)?)
             }
         };
-        let metrics = self.ask(which, &model, guide.as_ref(), (histogram, &spots), control)?;
+        let (sha256, version) = (model.manifest.sha256(), &settings.version);
+        let data = [&*self.data.id, &self.known_data.id];
+        Ok(Asked {
+            key: evaluation_key(&sha256, data, histogram, &spots, version).to_string(),
+            which,
+            model,
+            guide,
+            histogram,
+            spots,
+            sha256,
+        })
+    }
+
+    /// What was found of it before.
+    fn found(&self, asked: &Asked, control: &Control) -> Result<Option<Evaluation>, TaskError> {
+        let name = &self.task.evaluate.models[asked.which];
+        let found = self.models.evaluation(name, &asked.key);
+        self.stores.wait(control, found)
+    }
+
+    /// What one of the models has found or finds now; and whether it is new.
+    fn of(&self, which: usize, control: &Control) -> Result<(Evaluation, bool), TaskError> {
+        let (stores, models, settings) = (self.stores, &self.models, &self.task.evaluate);
+        let name = &settings.models[which];
+        let asked = self.asked(which, control)?;
+        if let Some(found) = self.found(&asked, control)? {
+            return Ok((found, false));
+        }
+        let mut answered = Vec::with_capacity(self.scenes.len());
+        for shard in 0..settings.shards {
+            answered.extend(match self.read(&self.shard(&asked, shard), control)? {
+                Some(shard) => shard,
+                None => {
+                    if settings.shards > 1 {
+                        warn!(
+                            "{name}: shard {shard} of {} is missing; it is made here",
+                            settings.shards
+                        );
+                    }
+                    self.ask(&asked, shard, control)?
+                }
+            });
+        }
+        let target = asked.model.model.question().target;
+        let metrics = metrics(&Evaluated::of(target, &answered), &self.scenes);
         info!("{name}: {}", summary(&metrics));
         let made = Evaluation {
-            key: key.clone(),
+            key: asked.key.clone(),
             model: name.clone(),
-            model_sha256: sha256,
+            model_sha256: asked.sha256.clone(),
             dataset: self.task.source.dataset.clone(),
             data: self.data.id.clone(),
             split: self.split.clone(),
             side: settings.side.clone(),
             scenes: self.scenes.len() as u64,
-            histogram: histogram.name().to_owned(),
-            code: version.clone(),
+            histogram: asked.histogram.name().to_owned(),
+            code: settings.version.clone(),
             metrics,
         };
-        if stores.patiently(control, async || models.put_evaluation(&made).await)? {
+        let new = stores.patiently(control, async || models.put_evaluation(&made).await)?;
+        // What cannot be deleted now is left: nobody reads it.
+        for shard in 0..settings.shards {
+            let name = self.shard(&asked, shard);
+            if settings.shards > 1
+                && let Err(error) = stores.wait(control, models.delete_shard(&name))
+            {
+                warn!(%error, "a shard that was joined is left behind");
+            }
+        }
+        if new {
             return Ok((made, true));
         }
         // Somebody else was faster, and what stands is what counts.
-        let stands = stores.wait(control, models.evaluation(name, &key))?;
-        Ok((stands.unwrap_or(made), true))
+        Ok((self.found(&asked, control)?.unwrap_or(made), true))
     }
 
-    /// Shows every scene to a model.
+    fn shard(&self, asked: &Asked, index: u32) -> ShardName {
+        let settings = &self.task.evaluate;
+        ShardName {
+            model: settings.models[asked.which].clone(),
+            evaluation: asked.key.clone(),
+            shard: (index, settings.shards),
+        }
+    }
+
+    /// The scenes of a shard, as indices into those of the evaluation.
+    fn range(&self, shard: u32) -> Range<usize> {
+        let (scenes, of) = (
+            self.scenes.len() as u64,
+            u64::from(self.task.evaluate.shards),
+        );
+        let begin = |shard: u64| (shard * scenes / of) as usize;
+        begin(u64::from(shard))..begin(u64::from(shard) + 1)
+    }
+
+    /// What was answered of a shard; `None` where that is not there, or not whole.
+    fn read(
+        &self,
+        name: &ShardName,
+        control: &Control,
+    ) -> Result<Option<Vec<Answered>>, TaskError> {
+        if name.shard.1 == 1 {
+            return Ok(None);
+        }
+        let Some(bytes) = self.stores.wait(control, self.models.shard(name))? else {
+            return Ok(None);
+        };
+        match serde_json::from_slice::<ShardRecord>(&bytes) {
+            Ok(found) if found.shard == name.shard && found.evaluation == name.evaluation => {
+                Ok(Some(found.answered))
+            }
+            Ok(found) => {
+                warn!(shard = name.shard.0, found = ?found.shard, "a shard is another one; it is made again");
+                Ok(None)
+            }
+            Err(error) => {
+                warn!(shard = name.shard.0, %error, "a shard is damaged; it is made again");
+                Ok(None)
+            }
+        }
+    }
+
+    /// Shows the scenes of a shard to a model.
     fn ask(
         &self,
-        which: usize,
-        model: &Known,
-        guide: Option<&Known>,
-        histogram: (Histogram, &[u32]),
+        asked: &Asked,
+        shard: u32,
         control: &Control,
-    ) -> Result<serde_json::Value, TaskError> {
-        let scenes = self.scenes.clone();
-        let examples = Examples::new(self.stores, &self.dataset, histogram, scenes, "evaluate")?;
+    ) -> Result<Vec<Answered>, TaskError> {
+        let (model, which) = (&asked.model, asked.which);
+        let examples = |scenes: &[u64]| {
+            let histogram = (asked.histogram, &*asked.spots);
+            Examples::new(
+                self.stores,
+                &self.dataset,
+                histogram,
+                scenes.to_vec(),
+                "evaluate",
+            )
+        };
+        let scenes = examples(&self.scenes[self.range(shard)])?;
         let spots = model.model.question().spots;
-        if spots > 0 && spots != examples.spots() {
+        if spots > 0 && spots != scenes.spots() {
             return Err(TaskError::User(format!(
                 "evaluate.models[{which}]: {:?} was trained on histograms of {spots} spots, these are of {}",
                 model.manifest.name,
-                examples.spots()
+                scenes.spots()
             )));
         }
-        let known = self.known.clone();
-        let known = Examples::new(self.stores, &self.dataset, histogram, known, "evaluate")?;
         let target = model.model.question().target;
-        let baseline = Baseline::fit(target, &*known, BASELINE).map_err(of_model)?;
+        let baseline =
+            Baseline::fit(target, &*examples(&self.known)?, BASELINE).map_err(of_model)?;
         let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
         let mut tell = |scene: usize, of: usize| {
             let share = (which as f32 + scene as f32 / of as f32) / count as f32;
@@ -172,22 +348,26 @@ impl EvaluationRun<'_> {
             control.say(text, &[]);
             control.at(share * 0.99)
         };
-        let guide = guide.map(|guide| &*guide.model);
-        let found = evaluate(&model.model, guide, &baseline, &*examples, &mut tell)
+        let guide = asked.guide.as_ref().map(|guide| &*guide.model);
+        answered(&model.model, guide, &baseline, &*scenes, &mut tell)
             .map_err(of_model)?
-            .ok_or(TaskError::Stopped)?;
-        let baselines = found
-            .baselines
-            .iter()
-            .map(|(name, m)| (name.clone(), json!(m)));
-        let mut metrics = json!(found.metrics);
-        metrics["released"] = json!(found.released);
-        metrics["baselines"] = baselines.collect();
-        metrics["examples"] = json!(found.examples);
-        metrics["by_scene"] = json!(found.scenes);
-        metrics["by_scene_index"] = json!(self.scenes);
-        Ok(metrics)
+            .ok_or(TaskError::Stopped)
     }
+}
+
+/// The figures as they lie in the store.
+fn metrics(found: &Evaluated, scenes: &[u64]) -> serde_json::Value {
+    let baselines = found
+        .baselines
+        .iter()
+        .map(|(name, m)| (name.clone(), json!(m)));
+    let mut metrics = json!(found.metrics);
+    metrics["released"] = json!(found.released);
+    metrics["baselines"] = baselines.collect();
+    metrics["examples"] = json!(found.examples);
+    metrics["by_scene"] = json!(found.scenes);
+    metrics["by_scene_index"] = json!(scenes);
+    metrics
 }
 
 /// The figures of all scenes together, for people.

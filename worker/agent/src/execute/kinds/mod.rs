@@ -29,8 +29,8 @@ use std::{collections::BTreeMap, path::PathBuf, time::Duration};
 
 use picofarm_files::Opener;
 use picofarm_proto::model::{
-    EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask, PromoteTask,
-    RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
+    EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
+    PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
     kinds::{Declared, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP},
 };
 use picofarm_scene::AssetLibrary;
@@ -122,6 +122,7 @@ kinds! {
     Reconstruct(ReconstructTask),
     Verify(VerifyTask),
     Part(PartTask),
+    EvaluateShard(EvaluateShardTask),
 }
 
 /// Parts of kinds that not every program has, and whether this one does: see [`TaskSpec::ability`].

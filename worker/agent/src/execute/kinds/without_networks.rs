@@ -1,7 +1,9 @@
 //! The kinds that need networks, in a program that was built without them: such a worker does not offer them, and such a
 //! program cannot submit them.
 
-use picofarm_proto::model::{EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask};
+use picofarm_proto::model::{
+    EvaluateShardTask, EvaluateTask, InferTask, PromoteTask, ReportTask, TrainTask,
+};
 
 use crate::execute::{Context, Control, Output, RunTask, Task, TaskError};
 
@@ -19,4 +21,11 @@ macro_rules! absent {
     )*};
 }
 
-absent!(TrainTask, EvaluateTask, PromoteTask, InferTask, ReportTask);
+absent!(
+    TrainTask,
+    EvaluateShardTask,
+    EvaluateTask,
+    PromoteTask,
+    InferTask,
+    ReportTask
+);
