@@ -2,6 +2,8 @@
 
 mod care;
 #[cfg(feature = "networks")]
+mod import;
+#[cfg(feature = "networks")]
 mod report;
 
 use std::{
@@ -33,6 +35,16 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
             export(&store, &name, &out, output).await
         }
+        #[cfg(not(feature = "networks"))]
+        Command::Import { .. } => Err(not_built("networks", "imports of models")),
+        #[cfg(feature = "networks")]
+        Command::Import {
+            store,
+            name,
+            file,
+            dataset,
+            settings,
+        } => import::run(&store, &name, (&file, &settings), &dataset, output).await,
         Command::Verify { store, names } => care::verify(&store, &names, output).await,
         Command::Repair {
             store,

@@ -4,6 +4,12 @@ use std::path::PathBuf;
 
 use clap::Subcommand;
 
+const IMPORT_HELP: &str = "\
+The network of the settings must have the file's tensors, each in its shape; what does not fit is named, and nothing is
+written. PyTorch's own files (.pth) become safetensors so, with torch and safetensors installed:
+  python3 -c 'import sys, torch, safetensors.torch as s; d = torch.load(sys.argv[1], map_location=\"cpu\"); \
+d = d.get(\"model_state_dict\", d); s.save_file({k: v.contiguous() for k, v in d.items()}, sys.argv[2])' IN.pth OUT.safetensors";
+
 const REPAIR_HELP: &str = "\
 An object of the manifest comes from another model of the store that has the same one (as a promoted model has its trial's),
 from a checkpoint, or from the manifest itself. It is written only if its SHA-256 is the recorded one. Damaged evaluations,
@@ -39,6 +45,23 @@ pub enum Model {
         /// Where to write it [default: NAME.safetensors]
         #[arg(long, value_name = "FILE")]
         out: Option<PathBuf>,
+    },
+    /// Take a network that was trained elsewhere into a store: weights by PyTorch's names, as safetensors
+    #[command(after_help = IMPORT_HELP)]
+    Import {
+        /// Folder or URL of the store
+        #[arg(value_parser = crate::paths::place)]
+        store: String,
+        /// Name of the model
+        name: String,
+        /// The weights (safetensors)
+        file: PathBuf,
+        /// Data set of the store whose histograms the network knows: its bins, gate and spots
+        #[arg(long, value_name = "FOLDER")]
+        dataset: String,
+        /// What the network is: a TOML file with the fields of [stage.train] (target, net, input, shadow, histogram, …)
+        #[arg(long, value_name = "FILE")]
+        settings: PathBuf,
     },
     /// Check models: manifest, size and SHA-256 of each object, evaluations, checkpoints (exit code 6 where something is broken)
     Verify {

@@ -8,12 +8,12 @@
 pub mod execute;
 mod run;
 
+#[cfg(feature = "networks")]
+pub use execute::{ImportFor, imported, infer_version, model_version, report, takes};
 pub use execute::{
     Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version, resolve,
 };
 pub use execute::{export, reconstruct, repair, reprocess, split};
-#[cfg(feature = "networks")]
-pub use execute::{infer_version, model_version, report, takes};
 pub use picofarm_session::{
     Access, AccessError, AgentConfig, AgentError, Bearer, Control, Executor, Memory, MemoryLimit,
     Output, StorePrefixes, Summary, Target, Task, TaskError, Trouble, cores, lost_connection,

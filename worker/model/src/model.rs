@@ -47,6 +47,24 @@ impl Model {
         })
     }
 
+    /// Weights that were trained elsewhere, by PyTorch's names, as those of a network of `plan`: bytes for [`Model::read`].
+    /// Of a file that holds a depth and a shadow network together, the one that the plan asks for.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`] where the bytes are damaged, or a tensor is missing or has another shape.
+    pub fn import(bytes: &[u8], plan: &Plan, device: &Device) -> Result<Vec<u8>, ModelError> {
+        let net = Net::new(plan.net.clone())?;
+        let declared = net.declared();
+        let (named, _) = weights::read(bytes)?;
+        let named = weights::from_torch(named, declared, plan.question.part())?;
+        let parameters = Parameters::from_named(declared.to_vec(), named, device)?;
+        let named = weights::to_torch(parameters.to_named());
+        Ok(weights::write(
+            &named,
+            &[(PLAN.to_owned(), plan.text())].into(),
+        ))
+    }
+
     /// How it was trained, and what it is asked.
     pub fn plan(&self) -> &Plan {
         &self.plan

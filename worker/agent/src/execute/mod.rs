@@ -28,7 +28,7 @@ use kinds::{evaluate, train};
 pub use kinds::{
     infer::infer_version,
     report,
-    train::{model_version, takes},
+    train::{ImportFor, imported, model_version, takes},
 };
 pub use memory::{check_memory, render_bytes};
 pub use submission::{Submission, absolute};

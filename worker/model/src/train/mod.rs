@@ -87,7 +87,7 @@ impl Plan {
         schedule::check(self.schedule, self.steps(scenes))
     }
 
-    fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         serde_json::to_string(self).expect("plain data")
     }
 }

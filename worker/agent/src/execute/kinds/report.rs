@@ -266,7 +266,8 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
     let from = &manifest.lineage;
     entry.data = Data {
         name: from.dataset.clone(),
-        scenes: Some(from.training_scenes),
+        // Nothing is known of how an imported model was trained.
+        scenes: (from.training_scenes > 0).then_some(from.training_scenes),
         max_bounces: from.measurement.max_bounces,
         images: known(from.measurement.rows)
             .zip(known(from.measurement.columns))

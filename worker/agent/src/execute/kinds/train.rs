@@ -28,6 +28,7 @@ use picofarm_proto::{
 use tracing::{info, warn};
 
 mod along;
+mod imported;
 mod known;
 mod plan;
 mod results;
@@ -35,6 +36,7 @@ mod trial;
 
 use super::saver::Saver;
 use along::{Reporter, loading};
+pub use imported::{ImportFor, imported};
 pub use known::takes;
 pub(in crate::execute) use known::{CheckedModel, Known};
 pub(in crate::execute) use results::WEIGHTS;

@@ -1,0 +1,65 @@
+//! `picofarm model import`: a network that was trained elsewhere, as a model of a store.
+
+use std::{fs, path::Path};
+
+use picofarm_agent::{ImportFor, imported};
+use serde_json::json;
+
+use super::open;
+use crate::{
+    dataset::{self, failed},
+    error::{CliError, Result, io},
+    output::{Output, bytes},
+};
+
+pub(super) async fn run(
+    store: &str,
+    name: &str,
+    (file, settings): (&Path, &Path),
+    dataset: &str,
+    output: Output,
+) -> Result<()> {
+    let models = open(store)?;
+    let place = format!("{}/{dataset}", store.trim_end_matches('/'));
+    let rooms = dataset::open(&place).await?;
+    let first = rooms.scenes_present().await.map_err(failed)?;
+    let Some(first) = first.into_iter().min() else {
+        let what =
+            format!("{place} has no scene yet, by whose manifest models know what was measured");
+        return Err(CliError::input(what).hint("render one, or choose another --dataset"));
+    };
+    let scene = rooms.manifest(first).await.map_err(failed)?;
+    let text = fs::read_to_string(settings).map_err(|e| io(settings.display(), &e))?;
+    let table: toml::Table = toml::from_str(&text)
+        .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
+    let mut wanted = serde_json::to_value(table)
+        .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
+    wanted["model"] = json!(name);
+    let weights = fs::read(file).map_err(|e| io(file.display(), &e))?;
+    let called = file.file_name().unwrap_or_default().to_string_lossy();
+    let of = ImportFor {
+        dataset,
+        spec: rooms.spec(),
+        scene: &scene,
+    };
+    let new = imported(&weights, wanted, of, &called).map_err(|what| {
+        let what = format!("{} as {}: {what}", file.display(), settings.display());
+        CliError::input(what).hint(
+            "the file must hold the tensors of the network that the settings describe, by PyTorch's names; `picofarm model export` \
+             of a model of such a network shows which they are",
+        )
+    })?;
+    let published = models.publish(new, false).await.map_err(failed)?;
+    let manifest = &published.manifest;
+    let facts = json!({"model": name, "kind": manifest.kind, "bytes": manifest.total_bytes(),
+                       "place": models.place(name)});
+    output.result(&facts, || {
+        format!(
+            "{}: predicts {}, {}; evaluate it in a job, `evaluate = {{ models = [\"{name}\"] }}`",
+            models.place(name),
+            manifest.kind,
+            bytes(manifest.total_bytes())
+        )
+    });
+    Ok(())
+}

@@ -1,0 +1,107 @@
+//! Networks that were trained elsewhere, as models of a store: released checkpoints, and one's own.
+
+use picofarm_dataset::{
+    DatasetSpec, Lineage, Manifest, ModelManifest, NewModel, SplitUsed, sha256_hex,
+};
+use picofarm_model::{Model, cpu, train::Plan};
+use picofarm_proto::model::{Histogram, TrainSettings, train::Normalise};
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use super::{
+    WEIGHTS, known, model_version, plan,
+    results::{measurement, pretty},
+    trial,
+};
+use crate::execute::{TaskError, reprocess::quantity};
+
+/// The data set whose histograms an imported network knows.
+#[derive(Debug, Clone, Copy)]
+pub struct ImportFor<'a> {
+    /// Folder of the data set.
+    pub dataset: &'a str,
+    /// What it is of.
+    pub spec: &'a DatasetSpec,
+    /// One of its scenes.
+    pub scene: &'a Manifest,
+}
+
+/// A network that was trained elsewhere as a model of a store: `weights` are safetensors by PyTorch's names, alone, of a
+/// wrapped or of a combined network; `settings` say what it is, as `train` in a job file does; `from` is what the file is
+/// called. Trained settings that shape no answer (rates, epochs) may be left out.
+///
+/// # Errors
+/// A sentence that names the setting, or the tensor that is missing or has another shape.
+pub fn imported(
+    weights: &[u8],
+    settings: Value,
+    of: ImportFor<'_>,
+    from: &str,
+) -> Result<NewModel, String> {
+    let settings: TrainSettings = serde_json::from_value(settings).map_err(|e| e.to_string())?;
+    settings.check().map_err(|e| e.to_string())?;
+    for (field, given) in [
+        ("from", !settings.from.is_empty()),
+        ("trial", settings.trial.is_some()),
+        ("specular.on", !settings.specular.on.is_empty()),
+    ] {
+        if given {
+            return Err(format!(
+                "train.{field}: says how a training begins, and nothing is trained here; remove it"
+            ));
+        }
+    }
+    let quantity = quantity(settings.histogram);
+    if !of.spec.quantities().contains(&quantity) {
+        return Err(format!(
+            "train.histogram: {} has no {}",
+            of.dataset,
+            quantity.name()
+        ));
+    }
+    let spots = match settings.histogram {
+        Histogram::Transient => of.spec.spots as usize,
+        Histogram::TransientSpots => settings.spots.len(),
+        _ => quantity.spots_of_100().len(),
+    };
+    let greatest = match (settings.input.normalise, settings.input.max) {
+        (Normalise::Log, 0.0) => {
+            return Err(
+                "train.input.max: is missing; with normalise = \"log\" it is the largest bin of the scenes that were learnt from"
+                    .into(),
+            );
+        }
+        (_, max) => max as f32,
+    };
+    let plan: Plan = plan::plan(&settings, of.spec, spots, greatest).map_err(|e| match e {
+        TaskError::User(what) => what,
+        other => other.to_string(),
+    })?;
+    let ours = Model::import(weights, &plan, &cpu()).map_err(|e| e.to_string())?;
+    let sha256 = sha256_hex(weights);
+    let key = json!({"import": sha256, "settings": settings.shaping(), "gate": of.spec.gate, "code": model_version()});
+    let metrics = json!({"imported": {"file": from, "sha256": sha256}});
+    Ok(NewModel {
+        manifest: ModelManifest {
+            name: settings.model.clone(),
+            kind: settings.target.name().to_owned(),
+            training_key: hex::encode(Sha256::digest(key.to_string())),
+            settings: settings.shaping(),
+            plan: known::asked(&plan, of.spec),
+            lineage: Lineage {
+                dataset: of.dataset.to_owned(),
+                split: SplitUsed::default(),
+                measurement: measurement(of.spec, spots as u32, of.scene),
+                code: model_version(),
+                ..Lineage::default()
+            },
+            metrics: metrics.clone(),
+            ..ModelManifest::default()
+        },
+        objects: vec![
+            (WEIGHTS.into(), ours.into()),
+            (trial::HISTORY.into(), Vec::new().into()),
+            ("metrics.json".into(), pretty(&metrics).into()),
+        ],
+    })
+}
