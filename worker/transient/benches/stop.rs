@@ -89,7 +89,7 @@ fn main() {
         }
         let first = match asked[0] > 0.0 {
             true => run(&scene, Budget::Error(asked[0]), 0),
-            false => run(&scene, Budget::Samples(128), 0),
+            false => run(&scene, Budget::Samples(64), 0),
         };
         println!("{name}: {} paths at first", first.error.samples);
         for line in first
@@ -114,7 +114,7 @@ fn main() {
             100.0 * noise[noise.len() / 2]
         );
         if asked[0] == 0.0 {
-            for passes in [8, 16, 32, 64, 128] {
+            for passes in [8, 16, 32, 64] {
                 fixed(&scene, passes, &truth);
             }
         }

@@ -165,7 +165,11 @@ pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
         ("furnished-5", furnished(5)),
         ("furnished-8", furnished(8)),
     ];
-    all.extend((1..=FAR).map(|seed| (&*format!("far-{seed}.").leak(), far(seed, pixels))));
+    all.extend((1..=FAR).map(|seed| (&*format!("far-{seed}.").leak(), far(seed, None, pixels))));
+    let outers = [("a", mixed(0.01, 0.5)), ("b", mixed(0.05, 0.6)), ("c", rough(0.12)), ("d", mixed(0.01, 0.15)), ("e", rough(0.05))];
+    for (name, outer) in outers {
+        all.extend((1..=3).map(|seed| (&*format!("shiny-{name}-{seed}.").leak(), far(seed, Some(&outer), pixels))));
+    }
     all
 }
 
@@ -185,7 +189,7 @@ fn cylinder(foot: Vec3, radius: f32, height: f32, m: Material) -> Object {
 
 /// A deep room with five spots far from the camera, and with near-mirrors, glossy and mixed things at random places: what
 /// the renderer's constants were not chosen for.
-fn far(seed: u64, pixels: u32) -> Scene {
+fn far(seed: u64, outer_asked: Option<&Material>, pixels: u32) -> Scene {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut uniform = move |low: f32, high: f32| {
         // Xorshift64* (Vigna 2016).
@@ -213,7 +217,8 @@ fn far(seed: u64, pixels: u32) -> Scene {
         1 => grey(0.4),
         _ => grey(0.75),
     };
-    let mut things = room(v(-half, -tall, back), v(half, tall, 1.0), &outer);
+    let outer = outer_asked.unwrap_or(&outer);
+    let mut things = room(v(-half, -tall, back), v(half, tall, 1.0), outer);
     for _ in 0..2 {
         let m = pick(uniform(0.0, 8.0));
         let at = v(

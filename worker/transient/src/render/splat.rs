@@ -85,11 +85,16 @@ impl Splats {
                         let before = stack.rays;
                         let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
                         let paths = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
-                        let splats = paths.filter_map(|l| {
-                            let z = caustics.trace(&within, (l, count), &mut rng, stack)?;
-                            splat(within.world, frame.film, &z, stack)
-                        });
-                        (splats.collect(), stack.rays - before)
+                        let (mut ends, mut splats) = (vec![], vec![]);
+                        for l in paths {
+                            ends.clear();
+                            caustics.trace(&within, (l, count), &mut rng, stack, |z| ends.push(z));
+                            let seen = ends.iter();
+                            splats.extend(
+                                seen.filter_map(|z| splat(within.world, frame.film, z, stack)),
+                            );
+                        }
+                        (splats, stack.rays - before)
                     },
                 )
                 .collect();
