@@ -166,9 +166,20 @@ pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
         ("furnished-8", furnished(8)),
     ];
     all.extend((1..=FAR).map(|seed| (&*format!("far-{seed}.").leak(), far(seed, None, pixels))));
-    let outers = [("a", mixed(0.01, 0.5)), ("b", mixed(0.05, 0.6)), ("c", rough(0.12)), ("d", mixed(0.01, 0.15)), ("e", rough(0.05))];
+    let outers = [
+        ("a", mixed(0.01, 0.5)),
+        ("b", mixed(0.05, 0.6)),
+        ("c", rough(0.12)),
+        ("d", mixed(0.01, 0.15)),
+        ("e", rough(0.05)),
+    ];
     for (name, outer) in outers {
-        all.extend((1..=3).map(|seed| (&*format!("shiny-{name}-{seed}.").leak(), far(seed, Some(&outer), pixels))));
+        all.extend((1..=3).map(|seed| {
+            (
+                &*format!("shiny-{name}-{seed}.").leak(),
+                far(seed, Some(&outer), pixels),
+            )
+        }));
     }
     all
 }
@@ -234,7 +245,12 @@ fn far(seed: u64, outer_asked: Option<&Material>, pixels: u32) -> Scene {
         things.extend(block(low, low + size, &pick(uniform(0.0, 8.0))));
     }
     let at = v(uniform(-half, half - 0.6), -tall, uniform(back + 0.5, -2.0));
-    things.push(cylinder(at, uniform(0.15, 0.35), uniform(0.8, 2.0), pick(uniform(0.0, 8.0))));
+    things.push(cylinder(
+        at,
+        uniform(0.15, 0.35),
+        uniform(0.8, 2.0),
+        pick(uniform(0.0, 8.0)),
+    ));
     // Panes on three walls: one of them always a near-mirror.
     let pane = |u: f32| Material::mirror("pane", if u < 0.5 { 0.01 } else { 0.05 });
     things.push(quad(

@@ -334,6 +334,7 @@ impl Bench {
                     width: frame.width,
                     seed: frame.seed,
                     pass: u64::from(pass),
+                    mirrors: &frame.sampling.refined,
                 };
                 self.sharing.pass(
                     (&frame.walk, film, &frame.effort),
