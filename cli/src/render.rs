@@ -351,6 +351,7 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         arrays.extend([
             histogram("two", &s.two),
             histogram("two_se", &s.two_se),
+            histogram("two_noise", &s.two_noise),
             histogram("multi", &s.multi),
             histogram("multi_se", &s.multi_se),
             histogram("multi_noise", &s.multi_noise),
@@ -364,7 +365,7 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
+        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; two_noise, multi_noise: draws of the errors of two and multi; the square of their sum over any pixels and bins estimates that sum's variance",
         "subsets": beams,
         "gate": r.gate,
         "settings": settings,

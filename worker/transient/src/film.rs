@@ -67,6 +67,8 @@ pub(crate) struct Blocks {
     pub square: Vec<f32>,
     /// Σ over blocks of (contrast of the whole)².
     pub total_square: f64,
+    /// Σ over blocks of ± contrast by slot of channel 0: what its slots have in common stays.
+    pub noise: Vec<f32>,
     contrast: Vec<f32>,
     touched: Vec<u32>,
 }
@@ -77,6 +79,7 @@ impl Blocks {
             sum: vec![0.0; film.pixel()],
             square: vec![0.0; film.slots],
             total_square: 0.0,
+            noise: vec![0.0; film.slots],
             contrast: vec![0.0; film.slots],
             touched: vec![],
         }
@@ -85,6 +88,7 @@ impl Blocks {
     pub fn clear(&mut self) {
         self.sum.fill(0.0);
         self.square.fill(0.0);
+        self.noise.fill(0.0);
         self.total_square = 0.0;
     }
 
@@ -98,12 +102,13 @@ impl Blocks {
         self.contrast[slot] += sign * value;
     }
 
-    /// Ends a block.
-    pub fn finish(&mut self) {
+    /// Ends a block; `sign` is the one that its contrast counts with in `noise`.
+    pub fn finish(&mut self, sign: f32) {
         let mut total = 0.0f64;
         for b in self.touched.drain(..) {
             let v = std::mem::take(&mut self.contrast[b as usize]);
             self.square[b as usize] += v * v;
+            self.noise[b as usize] += sign * v;
             total += f64::from(v);
         }
         self.total_square += total * total;

@@ -173,7 +173,7 @@ impl Strata {
                 }
             }
             if stratum % 4 == 3 {
-                blocks.finish();
+                blocks.finish(if rng.uniform() < 0.5 { 1.0 } else { -1.0 });
             }
         }
         count as u32

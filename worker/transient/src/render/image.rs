@@ -30,6 +30,7 @@ const MANY: usize = 5;
 pub(super) struct Parts {
     pub two: Vec<f32>,
     pub two_se: Vec<f32>,
+    pub two_noise: Vec<f32>,
     pub multi: Vec<f32>,
     pub multi_se: Vec<f32>,
     pub multi_noise: Vec<f32>,
@@ -138,7 +139,7 @@ impl Image {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
-        let all = frame.film.channels + if frame.split { 5 } else { 0 };
+        let all = frame.film.channels + if frame.split { 6 } else { 0 };
         room::<f32>(pixels * bins * all, "the histograms of the image")?;
         let empty = || zeros(pixels * bins, "the histograms of the image");
         let side = if pixels >= LARGE && frame.film.channels < MANY {
@@ -161,6 +162,7 @@ impl Image {
             true => Some(Parts {
                 two: empty()?,
                 two_se: empty()?,
+                two_noise: empty()?,
                 multi: empty()?,
                 multi_se: empty()?,
                 multi_noise: empty()?,
@@ -204,13 +206,13 @@ impl Image {
     fn planes(&mut self) -> Vec<&mut Vec<f32>> {
         let mut planes = vec![&mut self.transient];
         if let Some(s) = &mut self.split {
-            let noise = &mut s.multi_noise;
             planes.extend([
                 &mut s.two,
                 &mut s.two_se,
+                &mut s.two_noise,
                 &mut s.multi,
                 &mut s.multi_se,
-                noise,
+                &mut s.multi_noise,
             ]);
         }
         planes.extend(&mut self.groups);
@@ -374,6 +376,7 @@ impl Image {
                     };
                     s.two[at] = mean(s.two[at], m.two);
                     s.two_se[at] = error(s.two_se[at], m.two_variance);
+                    s.two_noise[at] = mean(s.two_noise[at], done.two_noise(film, k, bin + 1));
                     s.multi[at] = mean(s.multi[at], m.multi);
                     s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
                     s.multi_se[at] = error(s.multi_se[at], m.multi_variance);

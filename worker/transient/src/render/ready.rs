@@ -229,6 +229,7 @@ impl Ready<'_> {
             split: image.split.map(|s| Split {
                 two: s.two,
                 two_se: s.two_se,
+                two_noise: s.two_noise,
                 multi: s.multi,
                 multi_se: s.multi_se,
                 multi_noise: s.multi_noise,

@@ -63,6 +63,8 @@ pub(super) struct Done {
     two: Vec<f32>,
     /// Variance of that mean, channel 0.
     two_variance: Vec<f32>,
+    /// A draw of that mean's error, channel 0; empty where not wanted.
+    two_noise: Vec<f32>,
     /// Variance of the sum over slots of the two-bounce mean.
     two_total_variance: Vec<f64>,
     /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
@@ -115,6 +117,10 @@ impl Done {
         );
         zero(&mut self.two, pixels * film.pixel());
         zero(&mut self.two_variance, pixels * film.slots);
+        zero(
+            &mut self.two_noise,
+            if split { pixels * film.slots } else { 0 },
+        );
         self.two_total_variance.clear();
         self.two_total_variance.resize(pixels, 0.0);
         self.pixel_variance.clear();
@@ -149,6 +155,11 @@ impl Done {
         let x = f64::from(self.alternating[k * film.slots + slot]);
         // Σ±x over n passes has n times a pass' variance; the mean has 1/n of it.
         x / (pairs * f64::from(self.passes)).sqrt().max(1.0)
+    }
+
+    /// The same of the two-bounce part.
+    pub fn two_noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
+        f64::from(self.two_noise[k * film.slots + slot])
     }
 
     /// Brings the variances up to the passes done.
@@ -290,6 +301,12 @@ impl Bench {
             let narrow = &mut self.done.two_variance[k * film.slots..(k + 1) * film.slots];
             for (out, v) in narrow.iter_mut().zip(&self.blocks.square) {
                 *out = v * n * n;
+            }
+            if frame.split {
+                let noise = &mut self.done.two_noise[k * film.slots..(k + 1) * film.slots];
+                for (out, v) in noise.iter_mut().zip(&self.blocks.noise) {
+                    *out = v * n;
+                }
             }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
