@@ -90,24 +90,23 @@ fn sums(h: &[f32]) -> Vec<f64> {
     out
 }
 
-/// Scatter of the sums over their stated error: of all sums together, and the median of the sums by themselves. Sums that
-/// less than a thousandth of the light falls into are left out.
+/// Scatter of the sums over their stated error: in the quadratic mean over the sums, and the median. Sums that less than a
+/// thousandth of the light falls into are left out.
 fn grouped(name: &str, values: &[Vec<f64>], squares: &[Vec<f64>]) -> (f64, f64) {
     let n = values.len() as f64;
-    let (mut found, mut said, mut all) = (0.0, 0.0, vec![]);
+    let mut all = vec![];
     let whole: f64 = values.iter().flatten().sum::<f64>() / n;
     for g in 0..values[0].len() {
         let mean = values.iter().map(|x| x[g]).sum::<f64>() / n;
         let spread = values.iter().map(|x| (x[g] - mean).powi(2)).sum::<f64>() / (n - 1.0);
         let stated = squares.iter().map(|x| x[g]).sum::<f64>() / n;
         if mean > 1e-3 * whole && stated > 0.0 {
-            found += spread;
-            said += stated;
             all.push((spread / stated).sqrt());
         }
     }
     all.sort_by(f64::total_cmp);
-    let (rms, median) = ((found / said).sqrt(), all[all.len() / 2]);
+    let mean = all.iter().map(|z| z * z).sum::<f64>() / all.len() as f64;
+    let (rms, median) = (mean.sqrt(), all[all.len() / 2]);
     println!("{name}: {} sums, z {rms:.3}, median {median:.3}", all.len());
     (rms, median)
 }
@@ -144,9 +143,15 @@ fn total(name: &str, all: &[Rendered]) -> f64 {
     let totals: Vec<f64> = all.iter().map(|r| energy(&r.transient)).collect();
     let mean = totals.iter().sum::<f64>() / n;
     let spread = totals.iter().map(|t| (t - mean).powi(2)).sum::<f64>() / (n - 1.0);
-    let stated = all.iter().map(|r| f64::from(r.error.total_relative).powi(2));
+    let stated = all
+        .iter()
+        .map(|r| f64::from(r.error.total_relative).powi(2));
     let (is, says) = (spread.sqrt() / mean, (stated.sum::<f64>() / n).sqrt());
-    println!("{name}: whole image says {:.3} %, is {:.3} %", 100.0 * says, 100.0 * is);
+    println!(
+        "{name}: whole image says {:.3} %, is {:.3} %",
+        100.0 * says,
+        100.0 * is
+    );
     is / says
 }
 
