@@ -160,6 +160,11 @@ pub struct ErrorEstimate {
     pub p95_relative: f32,
     /// Standard error of the total energy / total energy, with what pixels have in common.
     pub total_relative: f32,
+    /// How far `total_relative` itself can be trusted: the relative standard error of its square, from the fourth moment
+    /// of the passes, as far as it exceeds that of normal ones. Near 0 where passes scatter normally, near 1 where a single
+    /// bright path holds the variance.
+    #[serde(default)]
+    pub total_uncertainty: f32,
     /// Camera paths per pixel used, on average over the pixels.
     pub samples: u32,
 }

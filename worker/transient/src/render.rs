@@ -93,7 +93,7 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
         rays += image.round(frame, 0..image.tiles(), &waves, &watch)?;
         done = until;
         let error = match &mut splats {
-            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            None => estimate(&image.stats, image.total_spread, image.mean_passes()),
             Some((caustics, splats)) => {
                 let wave = image.mean_passes() - before;
                 rays += splats.round((frame, caustics), wave, &watch)?;

@@ -169,9 +169,27 @@ fn errors_of_sums_with_two_bounce_light_are_those_of_the_noise_draws() {
 }
 
 #[test]
+fn an_error_that_few_bright_paths_hold_is_said_to_be_uncertain_and_no_other() {
+    let warned = |r: &Rendered| r.warnings.iter().any(|w| w.contains("few bright paths"));
+    let quiet = runs(&plain(), 16);
+    for r in &quiet {
+        assert!(!warned(r), "{:?}", r.warnings);
+    }
+    // Rare paths by way of several near-mirrors hold it in some of the renders, and where they do, it is said.
+    let all = runs(&corner(), 16);
+    let bright = all.iter().filter(|r| r.error.total_uncertainty > 0.5);
+    let count = bright.inspect(|r| assert!(warned(r))).count();
+    println!("{count} of {} are warned of", all.len());
+    assert!(count > 0);
+}
+
+#[test]
 fn the_error_of_the_whole_image_holds_where_spots_are_seen_in_two_mirrors() {
-    let all = runs(&corner(), 64);
-    parts("corner", &all);
+    let all = runs(&corner(), 32);
+    for (rms, median) in parts("corner", &all) {
+        assert!((rms - 1.0).abs() < 0.15, "{rms}");
+        assert!((median - 1.0).abs() < 0.15, "median {median}");
+    }
     let z = total("corner", &all);
     assert!((0.7..1.4).contains(&z), "{z}");
 }

@@ -219,7 +219,8 @@ impl Ready<'_> {
         } else {
             0.0
         };
-        let warnings = self.warnings(&truth, inside, overflow.energy);
+        let mut warnings = self.warnings(&truth, inside, overflow.energy);
+        warnings.extend(warn::tails(&error));
         Ok(Rendered {
             warnings,
             width: frame.width,

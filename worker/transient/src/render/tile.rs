@@ -2,7 +2,7 @@
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
 use super::{
-    error::{MULTI_REACH, TWO_REACH, pool, shut_out},
+    error::{MULTI_REACH, Spread, TWO_REACH, pool, shut_out},
     region::Region,
 };
 use crate::{
@@ -70,8 +70,8 @@ pub(super) struct Done {
     /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
     /// many slots are sure enough by themselves, and pooling would lend bright pixels' noise to dim ones.
     pixel_variance: Vec<(f64, f64)>,
-    /// Σ and Σ² over passes of the whole tile.
-    all: (f64, f64),
+    /// Energy of the whole tile by pass.
+    all: Vec<f64>,
     pub passes: u32,
     pub rays: u64,
 }
@@ -125,7 +125,7 @@ impl Done {
         self.two_total_variance.resize(pixels, 0.0);
         self.pixel_variance.clear();
         self.pixel_variance.resize(pixels, (0.0, 0.0));
-        self.all = (0.0, 0.0);
+        self.all.clear();
         self.passes = 0;
     }
 
@@ -192,11 +192,13 @@ impl Done {
         self.pixel_variance[k]
     }
 
-    /// Variance of the tile's whole energy. Pixels that share vertices err together, so this is not the
+    /// Spread of the tile's whole energy. Pixels that share vertices err together, so this is not the
     /// sum of theirs.
-    pub fn total_variance(&self) -> f64 {
-        let (_, multi) = mean(self.all.0, self.all.1, f64::from(self.passes));
-        multi + self.two_total_variance.iter().sum::<f64>()
+    pub fn total_spread(&self) -> Spread {
+        Spread::of(&self.all).plus(Spread {
+            variance: self.two_total_variance.iter().sum(),
+            of_variance: 0.0,
+        })
     }
 
     /// Energy outside the gate.
@@ -366,8 +368,7 @@ impl Bench {
                 }
             }
         }
-        self.done.all.0 += all;
-        self.done.all.1 += all * all;
+        self.done.all.push(all);
         self.done.passes += 1;
     }
 
