@@ -1,5 +1,6 @@
 //! Whether the error that a render states, and stops by, is its true one, on scenes that are hard to sample:
 //! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
+//! ERROR 0 renders numbers of passes instead.
 
 #[path = "../tests/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
@@ -76,10 +77,11 @@ fn main() {
         .collect();
     let number = |k: usize, or: u32| args.get(k).and_then(|a| a.parse().ok()).unwrap_or(or);
     let (seeds, pixels) = (number(1, 10), number(2, 24));
-    let asked: Vec<f64> = match args.get(3..) {
-        Some(all) if !all.is_empty() => all.iter().filter_map(|a| a.parse().ok()).collect(),
-        _ => vec![0.1],
-    };
+    let asked = args.iter().skip(3);
+    let mut asked: Vec<f64> = asked.filter_map(|a| a.parse().ok()).collect();
+    if asked.is_empty() {
+        asked.push(0.1);
+    }
     for (name, scene) in scenes::all(pixels) {
         if args
             .first()

@@ -42,7 +42,7 @@ fn walls() -> Vec<Object> {
 }
 
 /// How many rooms of [`far`] there are.
-const FAR: u64 = 40;
+const FAR: u64 = 16;
 
 const BEAMS: [Vec3; 5] = [
     Vec3::new(0.75, 0.55, -1.0),
@@ -53,7 +53,7 @@ const BEAMS: [Vec3; 5] = [
 ];
 
 /// Every class of scene by name.
-pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
+pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     let mut everything = walls();
     everything.push(sphere(
         v(0.7, -0.9, -2.6),
@@ -155,7 +155,7 @@ pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
     };
     let furnished = |seed| furnished::generate(seed, &furniture, &library).expect("sound settings");
 
-    let mut all = vec![
+    let mut all: Vec<(String, Scene)> = [
         ("everything", scene(everything, pixels, &BEAMS)),
         ("coated", scene(coated, pixels, &BEAMS)),
         ("angled", scene(angled, pixels, &BEAMS)),
@@ -164,22 +164,20 @@ pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
         ("pair", scene(pair, pixels, &BEAMS)),
         ("furnished-5", furnished(5)),
         ("furnished-8", furnished(8)),
+    ]
+    .map(|(name, scene)| (name.to_owned(), scene))
+    .into();
+    all.extend((1..=FAR).map(|seed| (format!("far-{seed:02}"), far(seed, None, pixels))));
+    // The same rooms with walls of other materials.
+    let walls = [
+        ("walls-mixed-0.01", mixed(0.01, 0.5)),
+        ("walls-mixed-0.05", mixed(0.05, 0.6)),
+        ("walls-rough-0.12", rough(0.12)),
+        ("walls-rough-0.05", rough(0.05)),
     ];
-    all.extend((1..=FAR).map(|seed| (&*format!("far-{seed}.").leak(), far(seed, None, pixels))));
-    let outers = [
-        ("a", mixed(0.01, 0.5)),
-        ("b", mixed(0.05, 0.6)),
-        ("c", rough(0.12)),
-        ("d", mixed(0.01, 0.15)),
-        ("e", rough(0.05)),
-    ];
-    for (name, outer) in outers {
-        all.extend((1..=3).map(|seed| {
-            (
-                &*format!("shiny-{name}-{seed}.").leak(),
-                far(seed, Some(&outer), pixels),
-            )
-        }));
+    for (name, walls) in walls {
+        let rooms = (1..=3).map(|k| (format!("{name}-{k}"), far(k, Some(&walls), pixels)));
+        all.extend(rooms);
     }
     all
 }
@@ -199,8 +197,8 @@ fn cylinder(foot: Vec3, radius: f32, height: f32, m: Material) -> Object {
 }
 
 /// A deep room with five spots far from the camera, and with near-mirrors, glossy and mixed things at random places: what
-/// the renderer's constants were not chosen for.
-fn far(seed: u64, outer_asked: Option<&Material>, pixels: u32) -> Scene {
+/// the renderer's constants were not chosen for. `walls` in place of grey or mixed ones.
+fn far(seed: u64, walls: Option<&Material>, pixels: u32) -> Scene {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut uniform = move |low: f32, high: f32| {
         // Xorshift64* (Vigna 2016).
@@ -228,7 +226,7 @@ fn far(seed: u64, outer_asked: Option<&Material>, pixels: u32) -> Scene {
         1 => grey(0.4),
         _ => grey(0.75),
     };
-    let outer = outer_asked.unwrap_or(&outer);
+    let outer = walls.unwrap_or(&outer);
     let mut things = room(v(-half, -tall, back), v(half, tall, 1.0), outer);
     for _ in 0..2 {
         let m = pick(uniform(0.0, 8.0));
