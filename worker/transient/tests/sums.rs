@@ -44,8 +44,9 @@ fn caustics() -> Scene {
     furnished(vec![sphere(v(0.1, -0.4, -1.7), 0.35, 3, ball)])
 }
 
-/// Two mirrors at an angle, a spot between them and one on the wall: the spots are seen in two mirrors, one after another.
-fn corner() -> Scene {
+/// Two mirrors at an angle: the spots are seen in two mirrors, one after another. The ball adds caustics that the camera sees
+/// in mirrors, which only chance finds.
+fn corner(ball: bool) -> Scene {
     let left = quad(
         v(-1.4, -0.9, -2.3),
         v(1.3, 0.0, -0.15),
@@ -58,8 +59,12 @@ fn corner() -> Scene {
         v(0.0, 1.8, 0.0),
         Material::mirror("right", 0.01),
     );
-    let ball = Material::mirror("ball", 0.01);
-    let mut s = furnished(vec![left, right, sphere(v(0.0, -0.6, -1.6), 0.3, 3, ball)]);
+    let mut things = vec![left, right];
+    if ball {
+        let mirror = Material::mirror("ball", 0.01);
+        things.push(sphere(v(0.0, -0.6, -1.6), 0.3, 3, mirror));
+    }
+    let mut s = furnished(things);
     s.laser.beams[1] = beam_to(v(0.3, -1.0, -1.2), v(0.0, 1.0, 0.0), 3);
     s
 }
@@ -176,7 +181,7 @@ fn an_error_that_few_bright_paths_hold_is_said_to_be_uncertain_and_no_other() {
         assert!(!warned(r), "{:?}", r.warnings);
     }
     // Rare paths by way of several near-mirrors hold it in some of the renders, and where they do, it is said.
-    let all = runs(&corner(), 16);
+    let all = runs(&corner(true), 16);
     let bright = all.iter().filter(|r| r.error.total_uncertainty > 0.5);
     let count = bright.inspect(|r| assert!(warned(r))).count();
     println!("{count} of {} are warned of", all.len());
@@ -185,7 +190,7 @@ fn an_error_that_few_bright_paths_hold_is_said_to_be_uncertain_and_no_other() {
 
 #[test]
 fn the_error_of_the_whole_image_holds_where_spots_are_seen_in_two_mirrors() {
-    let all = runs(&corner(), 32);
+    let all = runs(&corner(false), 32);
     for (rms, median) in parts("corner", &all) {
         assert!((rms - 1.0).abs() < 0.15, "{rms}");
         assert!((median - 1.0).abs() < 0.15, "median {median}");
