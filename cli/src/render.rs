@@ -50,6 +50,9 @@ impl Progress for Watcher {
     }
 }
 
+/// Samples of a render that time alone bounds: more than any takes.
+const MOST_SAMPLES: u32 = 1 << 20;
+
 /// A scene and how it is rendered.
 struct Order {
     scene: Scene,
@@ -138,7 +141,11 @@ impl Order {
 /// A scene or arguments that cannot be used, too little memory, a folder that is taken, or an interruption.
 pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     free_folder(&args.out)?;
-    let order = Order::new(&args.render, args.split)?;
+    let mut order = Order::new(&args.render, args.split)?;
+    if args.seconds.is_some() && args.render.error.is_none() && args.render.samples.is_none() {
+        // Time alone bounds it.
+        order.settings.budget = Budget::Samples(MOST_SAMPLES);
+    }
     order.fits().map_err(|e| CliError::new(Code::Resource, e))?;
     let watcher = Watcher {
         done: AtomicU32::new(0),
@@ -147,8 +154,14 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     };
     let pool = order.pool()?;
     let start = Instant::now();
-    let (order, watcher, rendered) = tokio::task::spawn_blocking(move || {
-        let run = || picofarm_transient::render(&order.scene, &order.settings, &watcher);
+    let (mut order, watcher, rendered) = tokio::task::spawn_blocking(move || {
+        let run = || match args.seconds {
+            None => picofarm_transient::render(&order.scene, &order.settings, &watcher),
+            Some(seconds) => {
+                let left = || seconds - start.elapsed().as_secs_f64();
+                picofarm_transient::render_within(&order.scene, &order.settings, &left, &watcher)
+            }
+        };
         let rendered = pool.install(run);
         (order, watcher, rendered)
     })
@@ -164,6 +177,10 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
     })?;
     let seconds = start.elapsed().as_secs_f64();
     let subsets = subsets(&mut rendered, &order.wanted);
+    if args.seconds.is_some() {
+        // What was done, so that it can be done again.
+        order.settings.budget = Budget::Samples(rendered.error.samples);
+    }
     write(&args.out, &order, &rendered, &subsets)?;
     let (e, threads) = (&rendered.error, order.threads);
     let arrays: Vec<&str> = order.wanted.iter().map(|w| w.array.as_str()).collect();
@@ -351,6 +368,7 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         arrays.extend([
             histogram("two", &s.two),
             histogram("two_se", &s.two_se),
+            histogram("two_noise", &s.two_noise),
             histogram("multi", &s.multi),
             histogram("multi_se", &s.multi_se),
             histogram("multi_noise", &s.multi_noise),
@@ -364,7 +382,7 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
-        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; multi_noise: a draw of the error of multi, whose square summed over any pixels and bins estimates that sum's variance",
+        "transient": "all bounces; two: exactly two; multi: three and more; *_se: standard errors; two_noise, multi_noise: draws of the errors of two and multi; the square of their sum over any pixels and bins estimates that sum's variance",
         "subsets": beams,
         "gate": r.gate,
         "settings": settings,

@@ -74,9 +74,14 @@ pub struct SceneRender {
     /// Folder for the Zarr group (must not exist, or be empty)
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Keep two-bounce and 3+ parts and their standard errors: arrays two, multi, two_se, multi_se
+    /// Keep two-bounce and 3+ parts and their errors: arrays two, multi, two_se, multi_se, two_noise,
+    /// multi_noise
     #[arg(long)]
     pub split: bool,
+    /// Render for about this many seconds and state the error reached; ends sooner where --error or
+    /// --samples is reached. The result depends on the machine's speed
+    #[arg(long, value_name = "S", value_parser = seconds)]
+    pub seconds: Option<f64>,
 }
 
 #[derive(Args)]
@@ -168,5 +173,15 @@ impl GateArgs {
             bin_width_m: self.bin_width_m,
             bins: self.bins,
         }
+    }
+}
+
+/// A positive time.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(s) if s > 0.0 && f64::is_finite(s) => Ok(s),
+        _ => Err(format!(
+            "{text:?} is no time: expected a positive number of seconds, such as 30"
+        )),
     }
 }

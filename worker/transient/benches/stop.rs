@@ -1,5 +1,6 @@
 //! Whether the error that a render states, and stops by, is its true one, on scenes that are hard to sample:
-//! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS]]]`.
+//! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
+//! ERROR 0 renders numbers of passes instead.
 
 #[path = "../tests/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
@@ -52,8 +53,8 @@ fn truth(scene: &Scene, passes: u32) -> Truth {
     Truth { mean, noise }
 }
 
-/// Median over pixels of ‖h − r‖ / ‖r‖, and the quadratic mean, the truth's own noise taken off.
-fn deviation(h: &[f32], t: &Truth) -> (f64, f64) {
+/// Median over pixels of ‖h − r‖ / ‖r‖, the truth's own noise taken off.
+fn deviation(h: &[f32], t: &Truth) -> f64 {
     let mut all: Vec<f64> = h
         .chunks(BINS)
         .zip(t.mean.chunks(BINS))
@@ -66,8 +67,7 @@ fn deviation(h: &[f32], t: &Truth) -> (f64, f64) {
         })
         .collect();
     all.sort_by(f64::total_cmp);
-    let mean = all.iter().map(|x| x * x).sum::<f64>() / all.len() as f64;
-    (all[all.len() / 2], mean.sqrt())
+    all[all.len() / 2]
 }
 
 fn main() {
@@ -77,6 +77,11 @@ fn main() {
         .collect();
     let number = |k: usize, or: u32| args.get(k).and_then(|a| a.parse().ok()).unwrap_or(or);
     let (seeds, pixels) = (number(1, 10), number(2, 24));
+    let asked = args.iter().skip(3);
+    let mut asked: Vec<f64> = asked.filter_map(|a| a.parse().ok()).collect();
+    if asked.is_empty() {
+        asked.push(0.1);
+    }
     for (name, scene) in scenes::all(pixels) {
         if args
             .first()
@@ -84,7 +89,10 @@ fn main() {
         {
             continue;
         }
-        let first = run(&scene, Budget::Error(0.1), 0);
+        let first = match asked[0] > 0.0 {
+            true => run(&scene, Budget::Error(asked[0]), 0),
+            false => run(&scene, Budget::Samples(64), 0),
+        };
         println!("{name}: {} paths at first", first.error.samples);
         for line in first
             .plan
@@ -97,7 +105,7 @@ fn main() {
         for line in &first.warnings {
             println!("    warning: {line}");
         }
-        let truth = truth(&scene, (24 * first.error.samples).clamp(1024, 32768));
+        let truth = truth(&scene, (16 * first.error.samples).clamp(768, 32768));
         let noise = truth.noise.iter().zip(truth.mean.chunks(BINS));
         let mut noise: Vec<f64> = noise
             .map(|(n, r)| (n / r.iter().map(|r| r * r).sum::<f64>()).sqrt())
@@ -107,42 +115,65 @@ fn main() {
             "    truth: median noise {:.2} %",
             100.0 * noise[noise.len() / 2]
         );
-        for passes in [8, 32, 128] {
-            let (mut says, mut is, mut rms) = (0.0, 0.0, 0.0);
-            for seed in 0..4u32 {
-                let r = run(&scene, Budget::Samples(passes), u64::from(seed));
-                let (median, mean) = deviation(&r.transient, &truth);
-                says += 25.0 * f64::from(r.error.median_relative);
-                is += 25.0 * median;
-                rms += 25.0 * mean;
+        if asked[0] == 0.0 {
+            for passes in [8, 16, 32, 64] {
+                fixed(&scene, passes, &truth);
             }
-            println!(
-                "    {passes} paths: says {says:.2} %, is {is:.2} %, rms over pixels {rms:.2} %"
-            );
         }
-        let mut found = vec![];
-        for seed in 0..seeds {
-            let before = cpu_seconds();
-            let r = run(&scene, Budget::Error(0.1), u64::from(seed));
-            let (is, _) = deviation(&r.transient, &truth);
-            found.push((
-                is,
-                f64::from(r.error.median_relative),
-                r.error.samples,
-                cpu_seconds() - before,
-            ));
+        for &asked in asked.iter().filter(|&&a| a > 0.0) {
+            stopped(&scene, asked, seeds, &truth);
         }
-        found.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let n = found.len() as f64;
-        let mean = |f: fn(&(f64, f64, u32, f64)) -> f64| found.iter().map(f).sum::<f64>() / n;
-        println!(
-            "    asked for 10 %: is {:.2} % in the mean ({:.2} to {:.2}), says {:.2} %, {:.0} paths, {:.2} CPU s",
-            100.0 * mean(|f| f.0),
-            100.0 * found[0].0,
-            100.0 * found[found.len() - 1].0,
-            100.0 * mean(|f| f.1),
-            mean(|f| f64::from(f.2)),
-            mean(|f| f.3),
-        );
     }
+}
+
+/// Renders of so many passes: what they say and what is true, per pixel and of the whole image.
+fn fixed(scene: &Scene, passes: u32, truth: &Truth) {
+    const SEEDS: u32 = 8;
+    let (mut says, mut is, mut total) = (0.0, 0.0, 0.0);
+    let mut sums = vec![];
+    for seed in 0..SEEDS {
+        let r = run(scene, Budget::Samples(passes), u64::from(seed));
+        says += f64::from(r.error.median_relative) / f64::from(SEEDS);
+        is += deviation(&r.transient, truth) / f64::from(SEEDS);
+        total += f64::from(r.error.total_relative).powi(2) / f64::from(SEEDS);
+        sums.push(r.transient.iter().map(|&x| f64::from(x)).sum::<f64>());
+    }
+    let whole = truth.mean.iter().sum::<f64>();
+    let spread = sums.iter().map(|s| (s / whole - 1.0).powi(2)).sum::<f64>() / f64::from(SEEDS);
+    println!(
+        "    {passes} paths: says {:.2} %, is {:.2} % ({:.2}); whole image says {:.3} %, is {:.3} %",
+        100.0 * says,
+        100.0 * is,
+        is / says,
+        100.0 * total.sqrt(),
+        100.0 * spread.sqrt()
+    );
+}
+
+/// Renders that stop by the error asked for.
+fn stopped(scene: &Scene, asked: f64, seeds: u32, truth: &Truth) {
+    let mut found = vec![];
+    for seed in 0..seeds {
+        let before = cpu_seconds();
+        let r = run(scene, Budget::Error(asked), u64::from(seed));
+        found.push((
+            deviation(&r.transient, truth),
+            f64::from(r.error.median_relative),
+            r.error.samples,
+            cpu_seconds() - before,
+        ));
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let n = found.len() as f64;
+    let mean = |f: fn(&(f64, f64, u32, f64)) -> f64| found.iter().map(f).sum::<f64>() / n;
+    println!(
+        "    asked for {:.1} %: is {:.2} % in the mean ({:.2} to {:.2}), says {:.2} %, {:.0} paths, {:.2} CPU s",
+        100.0 * asked,
+        100.0 * mean(|f| f.0),
+        100.0 * found[0].0,
+        100.0 * found[found.len() - 1].0,
+        100.0 * mean(|f| f.1),
+        mean(|f| f64::from(f.2)),
+        mean(|f| f.3),
+    );
 }

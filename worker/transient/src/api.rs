@@ -6,7 +6,7 @@ pub use picofarm_settings::{Budget, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-4";
+pub const RENDERER_VERSION: &str = "transient-5";
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -106,12 +106,16 @@ pub struct Split {
     pub two: Vec<f32>,
     /// Its standard error.
     pub two_se: Vec<f32>,
+    /// A draw of its error: the square of any weighted sum of it estimates the variance of that sum of `two`. What a
+    /// path brings falls into one bin or the next, so that sums over bins err far less than `two_se` alone says.
+    pub two_noise: Vec<f32>,
     /// Three bounces and more.
     pub multi: Vec<f32>,
     /// Its standard error.
     pub multi_se: Vec<f32>,
     /// A draw of its error, with what pixels and bins have in common: the square of any weighted sum of
-    /// it estimates the variance of that sum of `multi`, where `multi_se` alone cannot.
+    /// it estimates the variance of that sum of `multi`, where `multi_se` alone cannot. Both parts are independent: for sums
+    /// of `two` and `multi` together the two squares add up.
     pub multi_noise: Vec<f32>,
 }
 
@@ -156,6 +160,11 @@ pub struct ErrorEstimate {
     pub p95_relative: f32,
     /// Standard error of the total energy / total energy, with what pixels have in common.
     pub total_relative: f32,
+    /// How far `total_relative` itself can be trusted: the relative standard error of its square, from the fourth moment
+    /// of the passes, as far as it exceeds that of normal ones. Near 0 where passes scatter normally, near 1 where a single
+    /// bright path holds the variance.
+    #[serde(default)]
+    pub total_uncertainty: f32,
     /// Camera paths per pixel used, on average over the pixels.
     pub samples: u32,
 }

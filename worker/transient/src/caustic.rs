@@ -8,12 +8,15 @@
 //! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point z;
 //! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::mirror_images`] knows and the spot is
 //!    Lambertian: those have images to aim at;
-//! 3. z is what the camera sees directly, or the event before z (read from the camera) is not specular.
+//! 3. z, or a later point that is no near-mirror's, is what the camera sees directly, or the event before it (read from
+//!    the camera) is not specular.
 //!
-//! Light paths cover that class and nothing else: z is drawn into the image where the camera sees it, and
-//! is a light vertex ([`crate::light_vertices`]) for every other point. [`crate::walk`] leaves out just these:
-//! [`crate::vertex::Vertex::open`] carries condition 3 along a camera path. What is left to chance are
-//! caustics seen by way of a near-mirror.
+//! Light paths cover that class and nothing else. Let z be the first point of which 3 holds: it is drawn into the image
+//! where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for every other point. A light path goes on
+//! from z by the surface's own scattering, and ends unless it meets a near-mirror: a caustic that diffuse surfaces see by
+//! way of a near-mirror is covered as well. [`crate::walk`] leaves out just these: [`crate::vertex::Vertex::open`] carries
+//! condition 3 along a camera path. What is left to chance are caustics that the camera sees through near-mirrors, up to
+//! the last caustic of the path.
 //!
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
 //! scattering, joined by the balance heuristic.
@@ -35,7 +38,7 @@ use crate::{
 const ALONE: f32 = 1e30;
 /// Entries of the table of near-mirror triangles by spot; beyond that all spots share one row.
 const TABLE: usize = 1 << 22;
-/// Specular events before Russian roulette sets in.
+/// Events before Russian roulette sets in.
 const SURE: u32 = 3;
 /// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
 const PROBE: u32 = 4096;
@@ -218,59 +221,71 @@ impl Caustics {
         }
     }
 
-    /// Light path `l` of a batch of `count`: calls `each` with the surface point z that it ends on, if it
-    /// ends on one. The sum over the batch is an estimate.
+    /// Light path `l` of a batch of `count`: calls `each` with every surface point z that it may end on. The sum over the
+    /// batch is an estimate.
     pub fn trace(
         &self,
         within: &Surroundings<'_>,
         (l, count): (u32, u32),
         rng: &mut Rng,
         stack: &mut Stack,
-    ) -> Option<LightVertex> {
+        mut each: impl FnMut(LightVertex),
+    ) {
         let world = within.world;
+        let Some(start) = self.start(within, (l, self.shares(count)), rng, stack) else {
+            return;
+        };
         let Start {
             spot,
             mut hit,
             back: mut wo,
             mut flux,
             mut path_m,
-        } = self.start(within, (l, self.shares(count)), rng, stack)?;
+        } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
         let aimed_at = images && within.mirrors.of(hit.triangle).is_some();
-        let mut events = 1;
-        loop {
-            // The spot, the events, and z.
-            if events + 2 > within.max_bounces || path_m >= within.gate.end_m() {
-                return None;
-            }
-            let (w, mut weight, _) = hit.surface.sample(hit.n, wo, rng)?;
-            if events >= SURE {
+        // The spot and the first event.
+        let (mut bounces, mut ended) = (2, false);
+        while bounces < within.max_bounces && path_m < within.gate.end_m() {
+            let Some((w, mut weight, _)) = hit.surface.sample(hit.n, wo, rng) else {
+                return;
+            };
+            if ended || bounces > SURE {
                 let survive = weight.min(0.95);
                 if rng.uniform() >= survive {
-                    return None;
+                    return;
                 }
                 weight /= survive;
             }
             flux *= weight;
-            let mut next = world.closest(stack, lift(hit.p, hit.n), w)?;
+            let Some(mut next) = world.closest(stack, lift(hit.p, hit.n), w) else {
+                return;
+            };
             next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
+            let before = hit.surface.specular;
             (hit, wo) = (next, -w);
+            bounces += 1;
             if hit.surface.is_black() || flux == 0.0 {
-                return None;
+                return;
             }
             if hit.surface.specular {
-                events += 1;
                 continue;
             }
-            return (events > 1 || !aimed_at).then_some(LightVertex {
+            // What is left by another lobe and meets no near-mirror is found from the camera's side, and a single planar
+            // mirror by its images.
+            if !before || (bounces == 3 && aimed_at) {
+                return;
+            }
+            ended = true;
+            each(LightVertex {
                 hit,
                 back: wo,
                 flux,
                 density: ALONE,
                 path_m,
                 spot,
-                bounces: events + 2,
+                bounces,
             });
         }
     }
@@ -286,9 +301,7 @@ impl Caustics {
     ) {
         vertices.clear();
         for l in 0..count {
-            if let Some(z) = self.trace(within, (l, count), rng, stack) {
-                vertices.push(z);
-            }
+            self.trace(within, (l, count), rng, stack, |z| vertices.push(z));
         }
     }
 
@@ -353,8 +366,14 @@ impl Caustics {
     pub fn pay(&self, within: &Surroundings<'_>, seed: u64) -> bool {
         let mut stack = within.world.bvh.stack();
         let mut rng = Rng::new(seed, Stream::Caustic, 0, u64::MAX);
-        let found = (0..PROBE).filter_map(|l| self.trace(within, (l, PROBE), &mut rng, &mut stack));
-        let flux: f64 = found.map(|z| f64::from(z.flux)).sum();
+        let mut flux = 0.0;
+        for l in 0..PROBE {
+            let mut first = None;
+            self.trace(within, (l, PROBE), &mut rng, &mut stack, |z| {
+                first.get_or_insert(z.flux);
+            });
+            flux += first.map_or(0.0, f64::from);
+        }
         flux > PAYS * within.emitters.list.len() as f64
     }
 }

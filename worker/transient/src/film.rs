@@ -57,8 +57,9 @@ impl Film {
     }
 }
 
-/// Two-bounce contributions of one pixel: sums, and squared contrasts of blocks of 2×2 strata (one
-/// diagonal less the other: what changes linearly over the pixel cancels, what chance does stays).
+/// Two-bounce contributions of one pixel: sums, and squared contrasts. A block of 2×2 strata has one stratum, chosen at
+/// random, sampled twice; the difference of its two samples is the block's contrast, scaled so that its square estimates
+/// the block's variance without bias, whatever edges cross it.
 #[derive(Debug)]
 pub(crate) struct Blocks {
     /// Σ of contributions, as [`Film::pixel`] slots.
@@ -67,9 +68,15 @@ pub(crate) struct Blocks {
     pub square: Vec<f32>,
     /// Σ over blocks of (contrast of the whole)².
     pub total_square: f64,
+    /// Σ over blocks of ± contrast by slot of channel 0: what its slots have in common stays.
+    pub noise: Vec<f32>,
     contrast: Vec<f32>,
     touched: Vec<u32>,
 }
+
+/// √(7/4). Of four strata of variance v each, three have one sample and one has the mean of two: their sum has variance
+/// 3.5 v, and the squared difference of the two samples is 2 v on average.
+const CONTRAST: f32 = 1.322_875_7;
 
 impl Blocks {
     pub fn new(film: &Film) -> Self {
@@ -77,6 +84,7 @@ impl Blocks {
             sum: vec![0.0; film.pixel()],
             square: vec![0.0; film.slots],
             total_square: 0.0,
+            noise: vec![0.0; film.slots],
             contrast: vec![0.0; film.slots],
             touched: vec![],
         }
@@ -85,25 +93,33 @@ impl Blocks {
     pub fn clear(&mut self) {
         self.sum.fill(0.0);
         self.square.fill(0.0);
+        self.noise.fill(0.0);
         self.total_square = 0.0;
     }
 
-    /// Adds one stratum's contribution; `sign` tells its diagonal.
+    /// Adds the contribution of a sample that is its stratum's only one.
     #[inline]
-    pub fn add(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
+    pub fn add(&mut self, film: &Film, slot: usize, value: f32, spot: usize) {
         film.add(&mut self.sum, slot, value, spot);
+    }
+
+    /// Adds that of one of a stratum's two samples; `sign` tells which.
+    #[inline]
+    pub fn add_half(&mut self, film: &Film, slot: usize, value: f32, sign: f32, spot: usize) {
+        film.add(&mut self.sum, slot, 0.5 * value, spot);
         if self.contrast[slot] == 0.0 {
             self.touched.push(slot as u32);
         }
-        self.contrast[slot] += sign * value;
+        self.contrast[slot] += sign * CONTRAST * value;
     }
 
-    /// Ends a block.
-    pub fn finish(&mut self) {
+    /// Ends a block; `sign` is the one that its contrast counts with in `noise`.
+    pub fn finish(&mut self, sign: f32) {
         let mut total = 0.0f64;
         for b in self.touched.drain(..) {
             let v = std::mem::take(&mut self.contrast[b as usize]);
             self.square[b as usize] += v * v;
+            self.noise[b as usize] += sign * v;
             total += f64::from(v);
         }
         self.total_square += total * total;

@@ -15,7 +15,7 @@
 mod arrivals;
 mod draw;
 
-use self::draw::gather_point;
+use self::draw::{gather_point, only_mirrors};
 use picofarm_scene::Vec3;
 
 use crate::{
@@ -48,6 +48,9 @@ pub(crate) struct Effort {
     pub beyond: f32,
 }
 
+/// Camera paths of a pass by way of near-mirrors alone, where a pixel sees one: few of them meet a narrow lobe that a spot
+/// lights, and a single one in a pass made that light a rare event of many times the image's error.
+const MIRROR_PATHS: u32 = 16;
 /// Light vertices beyond near-mirrors that a gather point is connected to at most.
 const BEYOND: u32 = 2;
 /// Glossy light vertices that a gather point is connected to at most.
@@ -113,13 +116,15 @@ impl Sink for ArrivalSink<'_> {
 
 /// Where a pass stands: the tile's first pixel and its columns, the image's width, and the pass' number.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Tile {
+pub(crate) struct Tile<'a> {
     pub row: u32,
     pub col: u32,
     pub cols: u32,
     pub width: u32,
     pub seed: u64,
     pub pass: u64,
+    /// Row-major, of the whole image: pixels that may see a near-mirror. Chosen without any sample.
+    pub mirrors: &'a [bool],
 }
 
 /// Buffers of one thread's passes.
@@ -171,8 +176,21 @@ impl Sharing {
                 pixel,
                 factor: 1.0,
             };
-            let (x, y) = (col as f32 + rng.uniform(), row as f32 + rng.uniform());
-            if let Some(v) = gather_point(walk, &mut rng, (x, y), scratch, &mut sink) {
+            let (x, y) = (rng.uniform(), rng.uniform());
+            let paths = match tile.mirrors[row as usize * tile.width as usize + col as usize] {
+                true => MIRROR_PATHS,
+                false => 1,
+            };
+            let share = 1.0 / paths as f32;
+            for j in 1..paths {
+                // Spread over the pixel beside the first (Roberts 2018).
+                let at = |start: f32, step: f32| (start + j as f32 * step).fract();
+                let at = (at(x, 0.754_877_7), at(y, 0.569_840_3));
+                let at = (col as f32 + at.0, row as f32 + at.1);
+                only_mirrors(walk, &mut rng, at, share, scratch, &mut sink);
+            }
+            let at = (col as f32 + x, row as f32 + y);
+            if let Some(v) = gather_point(walk, &mut rng, at, share, scratch, &mut sink) {
                 self.gathers.push((v, k));
             }
         }

@@ -41,7 +41,7 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
                 "light paths: caustics from curved near-mirrors and from several in a row".into(),
             );
             approximations.push(
-                "caustics that are seen by way of a near-mirror are unbiased but noisy".into(),
+                "caustics that the camera sees in a near-mirror are unbiased but noisy".into(),
             );
         } else if curved {
             approximations.push(format!(

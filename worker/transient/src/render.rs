@@ -33,6 +33,12 @@ const MAX_PASSES: u32 = 1 << 16;
 const FIRST_PASSES: u32 = 8;
 /// Share of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
+/// Passes of the first round of a render that is bound in time, and how much longer than all before it a round may be:
+/// each tells how long the next will take.
+const FIRST_TIMED: u32 = 4;
+const GROWTH: u32 = 3;
+/// Share of the time left that a round is made for.
+const TIMED: f64 = 0.85;
 /// Aimed at, as a share of the error asked for, since the estimate is itself an estimate.
 const GOAL: f32 = 0.98;
 
@@ -48,7 +54,25 @@ pub fn render(
     progress: &dyn Progress,
 ) -> Result<Rendered, RenderError> {
     prepare(scene, settings, Stop(progress), |ready| {
-        whole(ready, progress)
+        whole(ready, None, progress)
+    })
+}
+
+/// Renders as many passes as time allows: `left` says how many seconds are left, and is asked between rounds. The budget of
+/// `settings` bounds it as well: it ends where the error is reached, or after so many samples. It makes 4 passes even
+/// where time is too short for them. How many passes there are depends on the machine and its load, so the same call gives
+/// other bytes each time; [`render`] with the samples that [`crate::ErrorEstimate::samples`] states comes near to it.
+///
+/// # Errors
+/// Those of [`render`].
+pub fn render_within(
+    scene: &Scene,
+    settings: &Settings,
+    left: &dyn Fn() -> f64,
+    progress: &dyn Progress,
+) -> Result<Rendered, RenderError> {
+    prepare(scene, settings, Stop(progress), |ready| {
+        whole(ready, Some(left), progress)
     })
 }
 
@@ -69,7 +93,11 @@ pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError>
     })
 }
 
-fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError> {
+fn whole(
+    ready: &Ready,
+    left: Option<&dyn Fn() -> f64>,
+    progress: &dyn Progress,
+) -> Result<Rendered, RenderError> {
     let (frame, stop) = (&ready.frame, Stop(progress));
     // Before anything that takes long: where there is no room, it is known at once.
     let mut image = Image::new(frame)?;
@@ -79,12 +107,17 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
     };
     let seen = ready.seen(stop)?;
     let walks = ready.walks();
-    let passes = ready.first_passes();
+    let passes = match left {
+        Some(_) => ready.first_passes().min(FIRST_TIMED),
+        None => ready.first_passes(),
+    };
     let mut waves = vec![passes; image.tiles()];
     let (mut rays, mut done) = (0, 0.0);
     let budget = ready.settings.budget;
     let error = loop {
+        let began = left.map(|left| left());
         let until = match budget {
+            _ if left.is_some() && walks && done == 0.0 => FIRST_SHARE,
             Budget::Error(_) if walks && done == 0.0 => FIRST_SHARE,
             _ => 1.0,
         };
@@ -93,25 +126,52 @@ fn whole(ready: &Ready, progress: &dyn Progress) -> Result<Rendered, RenderError
         rays += image.round(frame, 0..image.tiles(), &waves, &watch)?;
         done = until;
         let error = match &mut splats {
-            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            None => estimate(&image.stats, image.total_spread, image.mean_passes()),
             Some((caustics, splats)) => {
                 let wave = image.mean_passes() - before;
                 rays += splats.round((frame, caustics), wave, &watch)?;
                 splats.estimate(frame, &image, stop)?
             }
         };
+        let spent = error.samples;
+        let enough = match budget {
+            Budget::Error(e) => error.median_relative <= e as f32 || spent >= MAX_PASSES,
+            Budget::Samples(n) => spent >= n,
+        };
+        if !walks || enough {
+            break error;
+        }
+        if let (Some(left), Some(began)) = (left, began) {
+            let round = spent - before;
+            let most = match budget {
+                Budget::Error(_) => MAX_PASSES - spent,
+                Budget::Samples(n) => n - spent,
+            };
+            let next = in_time((began, left()), round)
+                .min(GROWTH * spent)
+                .min(most);
+            if next == 0 {
+                break error;
+            }
+            waves.fill(next);
+            continue;
+        }
         let Budget::Error(target) = budget else {
             break error;
         };
         let target = target as f32;
-        if !walks || error.median_relative <= target || error.samples >= MAX_PASSES {
-            break error;
-        }
         waves = further(&image, frame.sampling, target, error.samples, stop)?;
     };
     let plan = ready.plan(passes);
     let splats = splats.map(|(_, splats)| splats);
     ready.finish((image, splats), seen, (error, rays), (plan, stop))
+}
+
+/// Passes that fit into the time left, where `round` of them took it from `began` to `left`.
+fn in_time((began, left): (f64, f64), round: u32) -> u32 {
+    let each = (began - left).max(1e-6) / f64::from(round.max(1));
+    // Casting saturates.
+    (TIMED * left / each) as u32
 }
 
 /// How many more passes each tile needs for the median error of the image to reach `target`. What the

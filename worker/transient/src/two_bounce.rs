@@ -85,17 +85,19 @@ pub(crate) struct Strata {
     /// Places of the hits, lifted off the surface.
     lifted: Vec<Vec3>,
     range_m: Vec<f64>,
-    /// `[stratum][spot]`.
+    /// `[sample][spot]`.
     weights: Vec<f32>,
+    /// Which of its strata each block samples twice; those samples come after all others.
+    twice: Vec<u32>,
     ends: Vec<Vec3>,
     ends_of: Vec<usize>,
     blocked: Vec<bool>,
-    /// `[stratum][spot]`: slot, and value where the spot is seen.
+    /// `[sample][spot]`: slot, and value where the spot is seen.
     found: Vec<(u32, f32)>,
 }
 
 impl Strata {
-    /// Adds one pixel's two-bounce samples to `blocks`; returns how many there were. `side` is even.
+    /// Adds one pixel's two-bounce samples to `blocks`; returns how many strata there were. `side` is even.
     pub fn sample_pixel(
         &mut self,
         walk: &Walk,
@@ -110,11 +112,19 @@ impl Strata {
         self.hits.clear();
         self.lifted.clear();
         self.range_m.clear();
+        let samples = count + count / 4;
         self.weights.clear();
-        self.weights.resize(count * spots, 0.0);
+        self.weights.resize(samples * spots, 0.0);
         self.found.clear();
-        self.found.resize(count * spots, (0, 0.0));
-        for (stratum, weights) in self.weights.chunks_mut(spots).enumerate() {
+        self.found.resize(samples * spots, (0, 0.0));
+        self.twice.clear();
+        let choice = (0..count / 4).map(|_| ((4.0 * rng.uniform()) as u32).min(3));
+        self.twice.extend(choice);
+        for (sample, weights) in self.weights.chunks_mut(spots).enumerate() {
+            let stratum = match sample.checked_sub(count) {
+                None => sample,
+                Some(block) => 4 * block + self.twice[block] as usize,
+            };
             // Four in a row are a block: two above, two below.
             let (block, corner) = (stratum as u32 / 4, stratum as u32 % 4);
             let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
@@ -138,10 +148,10 @@ impl Strata {
         for (spot, e) in emitters.list.iter().enumerate() {
             self.ends.clear();
             self.ends_of.clear();
-            for stratum in 0..count {
-                if self.weights[stratum * spots + spot] > 0.0 {
-                    self.ends.push(self.lifted[stratum]);
-                    self.ends_of.push(stratum);
+            for sample in 0..samples {
+                if self.weights[sample * spots + spot] > 0.0 {
+                    self.ends.push(self.lifted[sample]);
+                    self.ends_of.push(sample);
                 }
             }
             self.blocked.resize(self.ends.len(), false);
@@ -151,30 +161,35 @@ impl Strata {
                 &self.ends,
                 &mut self.blocked,
             );
-            for (&stratum, &blocked) in self.ends_of.iter().zip(&self.blocked) {
-                let hit = self.hits[stratum].as_ref().filter(|_| !blocked);
+            for (&sample, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                let hit = self.hits[sample].as_ref().filter(|_| !blocked);
                 if let Some(h) = hit {
                     let leg = world.metres((e.p - h.p).length());
-                    let slot = film.slot(e.path_m + leg + self.range_m[stratum]);
-                    let at = stratum * spots + spot;
+                    let slot = film.slot(e.path_m + leg + self.range_m[sample]);
+                    let at = sample * spots + spot;
                     self.found[at] = (slot as u32, self.weights[at]);
                 }
             }
         }
-        for (stratum, found) in self.found.chunks(spots).enumerate() {
-            let sign = if matches!(stratum % 4, 0 | 3) {
-                1.0
-            } else {
-                -1.0
-            };
-            for (spot, &(slot, value)) in found.iter().enumerate() {
-                if value > 0.0 {
-                    blocks.add(film, slot as usize, value, sign, spot);
+        let found = |sample: usize| {
+            let row = &self.found[sample * spots..(sample + 1) * spots];
+            let lit = row.iter().enumerate().filter(|(_, f)| f.1 > 0.0);
+            lit.map(|(spot, &(slot, value))| (spot, slot as usize, value))
+        };
+        for (block, &twice) in self.twice.iter().enumerate() {
+            for corner in 0..4 {
+                let half = corner == twice as usize;
+                for (spot, slot, value) in found(4 * block + corner) {
+                    match half {
+                        true => blocks.add_half(film, slot, value, 1.0, spot),
+                        false => blocks.add(film, slot, value, spot),
+                    }
                 }
             }
-            if stratum % 4 == 3 {
-                blocks.finish();
+            for (spot, slot, value) in found(count + block) {
+                blocks.add_half(film, slot, value, -1.0, spot);
             }
+            blocks.finish(if rng.uniform() < 0.5 { 1.0 } else { -1.0 });
         }
         count as u32
     }

@@ -23,14 +23,11 @@ pub(crate) struct Vertex {
 }
 
 impl Vertex {
-    /// True where light paths ([`crate::caustic`]) reach the last vertex up to here that is not a
-    /// near-mirror's: it is what the camera sees directly, or such a vertex comes before it too.
+    /// True where light paths ([`crate::caustic`]) end on a vertex up to here that is not a near-mirror's: one that the
+    /// camera sees directly, or before which another such vertex comes.
     #[inline]
     pub fn open(&self) -> bool {
-        if self.hit.surface.specular {
-            self.open_before
-        } else {
-            !self.after_mirror
-        }
+        let directly = !self.hit.surface.specular && !self.after_mirror;
+        directly || self.open_before
     }
 }

@@ -102,7 +102,7 @@ fn parts(r: &Rendered) -> Vec<f64> {
 
 /// With and without light paths: the same within a few errors of the means over seeds, which are `small`.
 fn same(name: &str, s: &Scene, (off, on): (u32, u32), max_bounces: Option<u32>, small: f64) {
-    let seeds = 8;
+    let seeds = 24;
     let make = |caustics, passes| {
         move |seed| Settings {
             max_bounces,

@@ -275,6 +275,7 @@ fn sane(r: &Rendered) -> Result<(), TestCaseError> {
             ("multi_se", &s.multi_se),
         ]);
         signed.push(("multi_noise", &s.multi_noise));
+        signed.push(("two_noise", &s.two_noise));
     }
     for (name, list) in amounts {
         let bad = list.iter().position(|x| !(x.is_finite() && *x >= 0.0));

@@ -1,4 +1,4 @@
-//! A render that is asked to stop does so wherever it is.
+//! A render ends where it is asked to stop, and where its time is over.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -6,7 +6,9 @@ use picofarm_scene::{
     AssetLibrary,
     furnished::{self, FurnishedSettings},
 };
-use picofarm_transient::{Budget, Gate, Progress, RenderError, Settings, Strategy, render};
+use picofarm_transient::{
+    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, render, render_within,
+};
 
 /// Counts how often it is asked, and says stop from one of them on.
 struct Asked {
@@ -95,4 +97,38 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
             at += 1 + at / 3;
         }
     }
+}
+
+/// A clock that each look takes a second of.
+fn within(seconds: u64, budget: Budget) -> Rendered {
+    let library = AssetLibrary::find("parametric", &[]).unwrap();
+    let room = FurnishedSettings {
+        spots: 4,
+        width: 16,
+        height: 16,
+        ..FurnishedSettings::default()
+    };
+    let scene = furnished::generate(5, &room, &library).unwrap();
+    let looks = AtomicU64::new(0);
+    let left = || seconds as f64 - looks.fetch_add(1, Ordering::Relaxed) as f64;
+    render_within(&scene, &settings(budget), &left, &Asked::until(u64::MAX)).unwrap()
+}
+
+#[test]
+fn a_render_bound_in_time_uses_what_there_is_and_states_the_error_reached() {
+    let budget = Budget::Samples(1 << 20);
+    let (short, long) = (within(1, budget), within(6, budget));
+    assert_eq!(short.error.samples, 4);
+    // Rounds of one second each, of up to three times the passes of all before: 4, 12, 48.
+    assert!(long.error.samples >= 16, "{}", long.error.samples);
+    assert!(long.error.median_relative < 0.8 * short.error.median_relative);
+    assert_eq!(long.transient, within(6, budget).transient);
+}
+
+#[test]
+fn a_render_bound_in_time_ends_sooner_where_its_error_or_its_samples_are_reached() {
+    assert_eq!(within(1000, Budget::Samples(21)).error.samples, 21);
+    let r = within(1000, Budget::Error(0.3));
+    assert!(r.error.median_relative <= 0.3, "{:?}", r.error);
+    assert!(r.error.samples < 1000, "{:?}", r.error);
 }

@@ -35,9 +35,9 @@ impl Rendering {
         BIN * (f64::from(self.shape.bins) + 2.0)
     }
 
-    /// Histograms of the image, in bytes: 4·pixels·bins for each, and for the five parts of [`Rendering::split`].
+    /// Histograms of the image, in bytes: 4·pixels·bins for each, and for the six parts of [`Rendering::split`].
     pub(in crate::model) fn images(&self) -> f64 {
-        let parts = if self.split { 5.0 } else { 0.0 };
+        let parts = if self.split { 6.0 } else { 0.0 };
         self.shape.histogram() * (f64::from(self.histograms) + parts)
     }
 

@@ -74,7 +74,7 @@ pub fn check_memory(settings: &Settings, size: (u32, u32), threads: usize) -> Re
         Some(there) if needed > there.for_tasks_mib() << 20 => Err(format!(
             "{} histograms of {}x{} pixels x {} bins take about {} of memory, but there is {there}; ask for fewer of \
              them, or for fewer pixels or bins",
-            rendering(settings, size, threads).histograms + if settings.split { 5 } else { 0 },
+            rendering(settings, size, threads).histograms + if settings.split { 6 } else { 0 },
             size.0,
             size.1,
             settings.gate.bins,

@@ -1,8 +1,12 @@
 //! Scenes that are hard to sample: near-mirrors, glossy and mixed surfaces, spots in far corners.
 
-use picofarm_scene::{Bsdf, Distribution, Material, Object, Scene, Vec3, primitive};
+use picofarm_scene::{
+    AssetLibrary, Bsdf, Distribution, Material, Object, Scene, Vec3,
+    furnished::{self, FurnishedSettings},
+    primitive,
+};
 
-use crate::common::{grey, quad, room, scene, sphere, v};
+use crate::common::{grey, object, quad, room, scene, sphere, v};
 
 fn mixed(alpha: f32, weight: f32) -> Material {
     Material {
@@ -37,6 +41,9 @@ fn walls() -> Vec<Object> {
     room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6))
 }
 
+/// How many rooms of [`far`] there are.
+const FAR: u64 = 16;
+
 const BEAMS: [Vec3; 5] = [
     Vec3::new(0.75, 0.55, -1.0),
     Vec3::new(-0.8, -0.5, -1.0),
@@ -46,7 +53,7 @@ const BEAMS: [Vec3; 5] = [
 ];
 
 /// Every class of scene by name.
-pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
+pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     let mut everything = walls();
     everything.push(sphere(
         v(0.7, -0.9, -2.6),
@@ -112,11 +119,161 @@ pub fn all(pixels: u32) -> Vec<(&'static str, Scene)> {
         ..primitive::PrimitiveSettings::default()
     };
     let plain = primitive::generate(3, &plain).expect("the settings are sound");
-    vec![
+    let mut pair = walls();
+    pair.push(quad(
+        v(-1.9, -1.2, -3.7),
+        v(1.5, 0.0, -0.2),
+        v(0.0, 2.0, 0.0),
+        Material::mirror("left", 0.01),
+    ));
+    pair.push(quad(
+        v(1.2, -1.2, -3.9),
+        v(0.7, 0.0, 1.4),
+        v(0.0, 2.0, 0.0),
+        Material::mirror("right", 0.01),
+    ));
+    pair.push(sphere(
+        v(0.6, -0.8, -2.6),
+        0.4,
+        4,
+        Material::mirror("ball", 0.01),
+    ));
+    pair.push(cylinder(
+        v(-0.6, -1.5, -2.8),
+        0.3,
+        1.6,
+        Material::mirror("column", 0.01),
+    ));
+
+    let library = AssetLibrary::find("parametric", &[]).expect("it is built in");
+    let furniture = FurnishedSettings {
+        spots: 4,
+        width: pixels,
+        height: pixels,
+        specular_at_least: 0,
+        ..FurnishedSettings::default()
+    };
+    let furnished = |seed| furnished::generate(seed, &furniture, &library).expect("sound settings");
+
+    let mut all: Vec<(String, Scene)> = [
         ("everything", scene(everything, pixels, &BEAMS)),
         ("coated", scene(coated, pixels, &BEAMS)),
         ("angled", scene(angled, pixels, &BEAMS)),
         ("glossy", scene(glossy, pixels, &BEAMS[..2])),
         ("primitive", plain),
+        ("pair", scene(pair, pixels, &BEAMS)),
+        ("furnished-5", furnished(5)),
+        ("furnished-8", furnished(8)),
     ]
+    .map(|(name, scene)| (name.to_owned(), scene))
+    .into();
+    all.extend((1..=FAR).map(|seed| (format!("far-{seed:02}"), far(seed, None, pixels))));
+    // The same rooms with walls of other materials.
+    let walls = [
+        ("walls-mixed-0.01", mixed(0.01, 0.5)),
+        ("walls-mixed-0.05", mixed(0.05, 0.6)),
+        ("walls-rough-0.12", rough(0.12)),
+        ("walls-rough-0.05", rough(0.05)),
+    ];
+    for (name, walls) in walls {
+        let rooms = (1..=3).map(|k| (format!("{name}-{k}"), far(k, Some(&walls), pixels)));
+        all.extend(rooms);
+    }
+    all
+}
+
+/// The side of a standing cylinder.
+fn cylinder(foot: Vec3, radius: f32, height: f32, m: Material) -> Object {
+    let sides = 48;
+    let (mut positions, mut triangles) = (vec![], vec![]);
+    for k in 0..sides {
+        let angle = std::f32::consts::TAU * k as f32 / sides as f32;
+        let out = v(radius * angle.cos(), 0.0, radius * angle.sin());
+        positions.extend([foot + out, foot + out + v(0.0, height, 0.0)]);
+        let (a, b) = (2 * k, 2 * ((k + 1) % sides));
+        triangles.extend([[a, a + 1, b], [b, a + 1, b + 1]]);
+    }
+    object("cylinder", positions, triangles, m)
+}
+
+/// A deep room with five spots far from the camera, and with near-mirrors, glossy and mixed things at random places: what
+/// the renderer's constants were not chosen for. `walls` in place of grey or mixed ones.
+fn far(seed: u64, walls: Option<&Material>, pixels: u32) -> Scene {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut uniform = move |low: f32, high: f32| {
+        // Xorshift64* (Vigna 2016).
+        state ^= state >> 12;
+        state ^= state << 25;
+        state ^= state >> 27;
+        let bits = state.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 40;
+        low + (high - low) * bits as f32 / (1u64 << 24) as f32
+    };
+    let (half, tall, deep) = (uniform(1.5, 3.0), uniform(1.2, 1.8), uniform(4.0, 7.0));
+    let back = -deep;
+    let any = |k: u32, u: f32| match k {
+        0 => Material::mirror("near-mirror", 0.01),
+        1 => rough(0.05),
+        2 => rough(0.12),
+        3 => rough(0.2),
+        4 => rough(0.35),
+        5 => mixed(0.01, u),
+        6 => mixed(0.05, u),
+        _ => mixed(0.2, u),
+    };
+    let pick = |u: f32| any(u as u32, 0.2 + 0.6 * u.fract());
+    let outer = match seed % 3 {
+        0 => mixed(0.2, 0.4),
+        1 => grey(0.4),
+        _ => grey(0.75),
+    };
+    let outer = walls.unwrap_or(&outer);
+    let mut things = room(v(-half, -tall, back), v(half, tall, 1.0), outer);
+    for _ in 0..2 {
+        let m = pick(uniform(0.0, 8.0));
+        let at = v(
+            uniform(-half + 0.5, half - 0.5),
+            uniform(-tall + 0.4, tall - 0.4),
+            uniform(back + 0.6, -2.0),
+        );
+        things.push(sphere(at, uniform(0.25, 0.5), 4, m));
+    }
+    for _ in 0..2 {
+        let low = v(uniform(-half, half - 0.9), -tall, uniform(back, -2.4));
+        let size = v(uniform(0.3, 0.9), uniform(0.4, 1.6), uniform(0.3, 0.8));
+        things.extend(block(low, low + size, &pick(uniform(0.0, 8.0))));
+    }
+    let at = v(uniform(-half, half - 0.6), -tall, uniform(back + 0.5, -2.0));
+    things.push(cylinder(
+        at,
+        uniform(0.15, 0.35),
+        uniform(0.8, 2.0),
+        pick(uniform(0.0, 8.0)),
+    ));
+    // Panes on three walls: one of them always a near-mirror.
+    let pane = |u: f32| Material::mirror("pane", if u < 0.5 { 0.01 } else { 0.05 });
+    things.push(quad(
+        v(-half + 0.02, uniform(-tall, 0.0), uniform(back, -3.0)),
+        v(0.0, uniform(0.6, 1.4), 0.0),
+        v(0.0, 0.0, uniform(0.6, 1.8)),
+        pane(uniform(0.0, 1.0)),
+    ));
+    things.push(quad(
+        v(half - 0.02, uniform(-tall, 0.0), uniform(back, -3.0)),
+        v(0.0, 0.0, uniform(0.6, 1.8)),
+        v(0.0, uniform(0.6, 1.4), 0.0),
+        pick(uniform(0.0, 8.0)),
+    ));
+    things.push(quad(
+        v(uniform(-half, half - 1.0), uniform(-tall, 0.0), back + 0.02),
+        v(uniform(0.5, 1.0), 0.0, 0.0),
+        v(0.0, uniform(0.6, 1.4), 0.0),
+        pick(uniform(0.0, 8.0)),
+    ));
+    let beams: Vec<Vec3> = (0..5)
+        .map(|_| match seed % 2 {
+            0 => v(uniform(-0.9, 0.9) * half, uniform(-0.9, 0.9) * tall, back),
+            _ => v(uniform(-1.6, 1.6) * half, uniform(-1.6, 1.6) * tall, back),
+        })
+        .collect();
+    scene(things, pixels, &beams)
 }

@@ -216,29 +216,24 @@ impl Turns {
 }
 
 /// Follows a camera ray through near-mirrors to the first other surface. What the spots send to vertices
-/// past the first goes to `sink`.
+/// past the first goes to `sink`; to near-mirrors this path finds `share` of it.
 pub(super) fn gather_point(
     walk: &Walk,
     rng: &mut Rng,
-    (x, y): (f32, f32),
+    at: (f32, f32),
+    share: f32,
     scratch: &mut Scratch,
     sink: &mut PixelSink,
 ) -> Option<Vertex> {
-    let world = walk.world;
-    let hit = world.closest(&mut scratch.stack, Vec3::ZERO, world.camera.ray(x, y))?;
-    let range = hit.p.length();
-    let mut vertex = Vertex {
-        hit,
-        wo: -hit.p / range,
-        beta: 1.0,
-        length_m: world.metres(range),
-        bounce: 1,
-        after_mirror: false,
-        open_before: false,
-    };
+    let mut vertex = first(walk, at, scratch)?;
     loop {
         vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
+            sink.factor = if vertex.hit.surface.specular {
+                share
+            } else {
+                1.0
+            };
             walk.connect(rng, &vertex, None, ALL, scratch, sink);
         }
         if !walk.goes_on(&vertex) {
@@ -250,4 +245,53 @@ pub(super) fn gather_point(
         let roulette = vertex.bounce > 1;
         (_, vertex) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack)?;
     }
+}
+
+/// Follows a camera ray as [`gather_point`] does, for what the spots send to near-mirrors past the first vertex: `share` of
+/// that goes to `sink`.
+pub(super) fn only_mirrors(
+    walk: &Walk,
+    rng: &mut Rng,
+    at: (f32, f32),
+    share: f32,
+    scratch: &mut Scratch,
+    sink: &mut PixelSink,
+) {
+    let Some(mut vertex) = first(walk, at, scratch) else {
+        return;
+    };
+    sink.factor = share;
+    loop {
+        vertex.hit.choose_lobe(rng);
+        if !vertex.hit.surface.specular {
+            return;
+        }
+        if vertex.bounce > 1 {
+            walk.connect(rng, &vertex, None, ALL, scratch, sink);
+        }
+        if !walk.goes_on(&vertex) {
+            return;
+        }
+        let roulette = vertex.bounce > 1;
+        let Some((_, next)) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack) else {
+            return;
+        };
+        vertex = next;
+    }
+}
+
+/// What a camera ray meets.
+fn first(walk: &Walk, (x, y): (f32, f32), scratch: &mut Scratch) -> Option<Vertex> {
+    let world = walk.world;
+    let hit = world.closest(&mut scratch.stack, Vec3::ZERO, world.camera.ray(x, y))?;
+    let range = hit.p.length();
+    Some(Vertex {
+        hit,
+        wo: -hit.p / range,
+        beta: 1.0,
+        length_m: world.metres(range),
+        bounce: 1,
+        after_mirror: false,
+        open_before: false,
+    })
 }

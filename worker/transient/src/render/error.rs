@@ -109,18 +109,77 @@ pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
 
-/// The estimate for a whole image of `variance` in its whole energy, after `samples` passes on average.
-pub(super) fn estimate(stats: &[Stat], variance: f64, samples: u32) -> ErrorEstimate {
+/// Variance of an energy's mean over passes, and the variance of that variance beyond what it is where passes scatter
+/// normally (2/n of its square).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Spread {
+    pub variance: f64,
+    pub of_variance: f64,
+}
+
+impl Spread {
+    /// That of the mean of `passes`; of a single one, its square.
+    pub fn of(passes: &[f64]) -> Self {
+        let n = passes.len() as f64;
+        if passes.len() < 2 {
+            let variance = passes.iter().map(|x| x * x).sum();
+            return Self {
+                variance,
+                of_variance: variance * variance,
+            };
+        }
+        let mean = passes.iter().sum::<f64>() / n;
+        let shares = || {
+            let share = |x: &f64| (x - mean).powi(2) / (n * (n - 1.0));
+            passes.iter().map(share)
+        };
+        let variance: f64 = shares().sum();
+        let square: f64 = shares().map(|s| s * s).sum();
+        Self {
+            variance,
+            of_variance: (square - 3.0 * variance * variance / n).max(0.0),
+        }
+    }
+
+    /// That of the energy times `factor`.
+    pub fn scaled(self, factor: f64) -> Self {
+        let square = factor * factor;
+        Self {
+            variance: self.variance * square,
+            of_variance: self.of_variance * square * square,
+        }
+    }
+
+    /// That of a sum of two independent energies.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            variance: self.variance + other.variance,
+            of_variance: self.of_variance + other.of_variance,
+        }
+    }
+
+    /// Relative standard error of the variance.
+    fn uncertainty(self) -> f64 {
+        match self.variance > 0.0 {
+            true => self.of_variance.sqrt() / self.variance,
+            false => 0.0,
+        }
+    }
+}
+
+/// The estimate for a whole image of that `spread` in its whole energy, after `samples` passes on average.
+pub(super) fn estimate(stats: &[Stat], spread: Spread, samples: u32) -> ErrorEstimate {
     let all = sorted(stats.iter().copied());
     let total: f64 = stats.iter().map(|s| s.total).sum();
     ErrorEstimate {
         median_relative: quantile(&all, 0.5) as f32,
         p95_relative: quantile(&all, 0.95) as f32,
         total_relative: if total > 0.0 {
-            (variance.sqrt() / total) as f32
+            (spread.variance.sqrt() / total) as f32
         } else {
             0.0
         },
+        total_uncertainty: spread.uncertainty() as f32,
         samples,
     }
 }

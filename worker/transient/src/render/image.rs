@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::Stat,
+    error::{Spread, Stat},
     region::Region,
     tile::{Bench, Done, Frame, Order},
 };
@@ -30,6 +30,7 @@ const MANY: usize = 5;
 pub(super) struct Parts {
     pub two: Vec<f32>,
     pub two_se: Vec<f32>,
+    pub two_noise: Vec<f32>,
     pub multi: Vec<f32>,
     pub multi_se: Vec<f32>,
     pub multi_noise: Vec<f32>,
@@ -42,14 +43,14 @@ pub(super) struct Image {
     pub split: Option<Parts>,
     pub groups: Vec<Vec<f32>>,
     pub stats: Vec<Stat>,
-    /// Variance of the image's whole energy.
-    pub total_variance: f64,
+    /// Spread of the image's whole energy.
+    pub total_spread: Spread,
     /// Energy outside the gate.
     pub overflow: f64,
     tiles: Vec<Region>,
     /// Passes of each tile.
     spent: Vec<u32>,
-    tile_variance: Vec<f64>,
+    tile_spread: Vec<Spread>,
     tile_overflow: Vec<f64>,
     width: usize,
     bins: usize,
@@ -61,8 +62,8 @@ pub(super) struct Slice {
     /// The planes of [`Image::planes`], pixels in the order of the tiles.
     planes: Vec<Vec<f32>>,
     stats: Vec<Stat>,
-    /// Passes, variance and overflow of each tile.
-    tiles: Vec<(u32, f64, f64)>,
+    /// Passes, spread and overflow of each tile.
+    tiles: Vec<(u32, Spread, f64)>,
 }
 
 /// Tells the caller how far the render is and hears whether to stop.
@@ -138,7 +139,7 @@ impl Image {
         let (width, height) = (frame.width, frame.height);
         let pixels = width as usize * height as usize;
         let bins = frame.film.gate.bins as usize;
-        let all = frame.film.channels + if frame.split { 5 } else { 0 };
+        let all = frame.film.channels + if frame.split { 6 } else { 0 };
         room::<f32>(pixels * bins * all, "the histograms of the image")?;
         let empty = || zeros(pixels * bins, "the histograms of the image");
         let side = if pixels >= LARGE && frame.film.channels < MANY {
@@ -161,6 +162,7 @@ impl Image {
             true => Some(Parts {
                 two: empty()?,
                 two_se: empty()?,
+                two_noise: empty()?,
                 multi: empty()?,
                 multi_se: empty()?,
                 multi_noise: empty()?,
@@ -173,10 +175,10 @@ impl Image {
             split,
             groups: groups?,
             stats: vec![Stat::default(); pixels],
-            total_variance: 0.0,
+            total_spread: Spread::default(),
             overflow: 0.0,
             spent: vec![0; tiles.len()],
-            tile_variance: vec![0.0; tiles.len()],
+            tile_spread: vec![Spread::default(); tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
             tiles,
             width: width as usize,
@@ -204,13 +206,13 @@ impl Image {
     fn planes(&mut self) -> Vec<&mut Vec<f32>> {
         let mut planes = vec![&mut self.transient];
         if let Some(s) = &mut self.split {
-            let noise = &mut s.multi_noise;
             planes.extend([
                 &mut s.two,
                 &mut s.two_se,
+                &mut s.two_noise,
                 &mut s.multi,
                 &mut s.multi_se,
-                noise,
+                &mut s.multi_noise,
             ]);
         }
         planes.extend(&mut self.groups);
@@ -240,7 +242,7 @@ impl Image {
         let stats = runs
             .iter()
             .flat_map(|&(first, count)| &self.stats[first..first + count]);
-        let tile = |t| (self.spent[t], self.tile_variance[t], self.tile_overflow[t]);
+        let tile = |t| (self.spent[t], self.tile_spread[t], self.tile_overflow[t]);
         Slice {
             planes,
             stats: stats.copied().collect(),
@@ -273,9 +275,9 @@ impl Image {
             self.stats[first..first + count].copy_from_slice(run);
             from = rest;
         }
-        for (t, &(spent, variance, overflow)) in range.zip(&slice.tiles) {
+        for (t, &(spent, spread, overflow)) in range.zip(&slice.tiles) {
             self.spent[t] = spent;
-            self.tile_variance[t] = variance;
+            self.tile_spread[t] = spread;
             self.tile_overflow[t] = overflow;
         }
         true
@@ -335,7 +337,8 @@ impl Image {
 
     /// Sums over the tiles, in their order.
     pub fn total(&mut self) {
-        self.total_variance = self.tile_variance.iter().sum();
+        let each = self.tile_spread.iter();
+        self.total_spread = each.fold(Spread::default(), |all, &s| all.plus(s));
         self.overflow = self.tile_overflow.iter().sum();
     }
 
@@ -374,6 +377,7 @@ impl Image {
                     };
                     s.two[at] = mean(s.two[at], m.two);
                     s.two_se[at] = error(s.two_se[at], m.two_variance);
+                    s.two_noise[at] = mean(s.two_noise[at], done.two_noise(film, k, bin + 1));
                     s.multi[at] = mean(s.multi[at], m.multi);
                     s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
                     s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
@@ -394,7 +398,8 @@ impl Image {
                 ..stat
             };
         }
-        self.tile_variance[t] = blend(self.tile_variance[t], done.total_variance() * unit2);
+        let before = self.tile_spread[t].scaled(a);
+        self.tile_spread[t] = before.plus(done.total_spread().scaled(unit * b));
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
         self.spent[t] += done.passes;
     }

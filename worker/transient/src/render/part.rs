@@ -225,7 +225,7 @@ pub fn join_parts(
         }
         image.total();
         let error = match &splats {
-            None => estimate(&image.stats, image.total_variance, image.mean_passes()),
+            None => estimate(&image.stats, image.total_spread, image.mean_passes()),
             Some(splats) => splats.estimate(frame, &image, stop)?,
         };
         let plan = ready.plan(shape.passes);

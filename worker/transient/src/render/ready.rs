@@ -219,7 +219,8 @@ impl Ready<'_> {
         } else {
             0.0
         };
-        let warnings = self.warnings(&truth, inside, overflow.energy);
+        let mut warnings = self.warnings(&truth, inside, overflow.energy);
+        warnings.extend(warn::tails(&error));
         Ok(Rendered {
             warnings,
             width: frame.width,
@@ -229,6 +230,7 @@ impl Ready<'_> {
             split: image.split.map(|s| Split {
                 two: s.two,
                 two_se: s.two_se,
+                two_noise: s.two_noise,
                 multi: s.multi,
                 multi_se: s.multi_se,
                 multi_noise: s.multi_noise,

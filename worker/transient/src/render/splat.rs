@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::{MULTI_REACH, Stat, estimate, pool},
+    error::{MULTI_REACH, Spread, Stat, estimate, pool},
     image::{Image, Watch, zeros},
     region::Region,
     tile::Frame,
@@ -30,8 +30,8 @@ pub(super) struct Splats {
     square: Vec<f32>,
     /// Σ with alternating sign, channel 0; empty where not wanted.
     alternating: Vec<f32>,
-    /// Σ and Σ² over passes of the whole image.
-    all: (f64, f64),
+    /// Energy of the whole image by pass.
+    all: Vec<f64>,
     passes: u32,
 }
 
@@ -43,7 +43,7 @@ impl Splats {
             sum: zeros(sum)?,
             square: zeros(square)?,
             alternating: zeros(alternating)?,
-            all: (0.0, 0.0),
+            all: vec![],
             passes: 0,
         })
     }
@@ -85,11 +85,16 @@ impl Splats {
                         let before = stack.rays;
                         let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
                         let paths = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
-                        let splats = paths.filter_map(|l| {
-                            let z = caustics.trace(&within, (l, count), &mut rng, stack)?;
-                            splat(within.world, frame.film, &z, stack)
-                        });
-                        (splats.collect(), stack.rays - before)
+                        let (mut ends, mut splats) = (vec![], vec![]);
+                        for l in paths {
+                            ends.clear();
+                            caustics.trace(&within, (l, count), &mut rng, stack, |z| ends.push(z));
+                            let seen = ends.iter();
+                            splats.extend(
+                                seen.filter_map(|z| splat(within.world, frame.film, z, stack)),
+                            );
+                        }
+                        (splats, stack.rays - before)
                     },
                 )
                 .collect();
@@ -134,8 +139,7 @@ impl Splats {
                 all += f64::from(sum);
             }
         }
-        self.all.0 += all;
-        self.all.1 += all * all;
+        self.all.push(all);
         self.passes += 1;
     }
 
@@ -190,14 +194,6 @@ impl Splats {
         Ok(())
     }
 
-    /// Variance of the whole image's energy.
-    fn total_variance(&self, frame: &Frame) -> f64 {
-        let n = f64::from(self.passes.max(1));
-        let (sum, square) = self.all;
-        let unit = unit(frame);
-        (square - sum * sum / n).max(0.0) / ((n - 1.0).max(1.0) * n) * unit * unit
-    }
-
     /// The error of the image with these passes.
     pub fn estimate(
         &self,
@@ -213,8 +209,12 @@ impl Splats {
             stat.total += mean;
             stat.multi_variance += variance;
         })?;
-        let variance = image.total_variance + self.total_variance(frame);
-        Ok(estimate(&stats, variance, image.mean_passes()))
+        let own = Spread::of(&self.all).scaled(unit(frame));
+        Ok(estimate(
+            &stats,
+            image.total_spread.plus(own),
+            image.mean_passes(),
+        ))
     }
 
     /// Adds these passes to the finished image.

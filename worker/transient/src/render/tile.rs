@@ -2,7 +2,7 @@
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
 use super::{
-    error::{MULTI_REACH, TWO_REACH, pool, shut_out},
+    error::{MULTI_REACH, Spread, TWO_REACH, pool, shut_out},
     region::Region,
 };
 use crate::{
@@ -63,13 +63,15 @@ pub(super) struct Done {
     two: Vec<f32>,
     /// Variance of that mean, channel 0.
     two_variance: Vec<f32>,
+    /// A draw of that mean's error, channel 0; empty where not wanted.
+    two_noise: Vec<f32>,
     /// Variance of the sum over slots of the two-bounce mean.
     two_total_variance: Vec<f64>,
     /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
     /// many slots are sure enough by themselves, and pooling would lend bright pixels' noise to dim ones.
     pixel_variance: Vec<(f64, f64)>,
-    /// Σ and Σ² over passes of the whole tile.
-    all: (f64, f64),
+    /// Energy of the whole tile by pass.
+    all: Vec<f64>,
     pub passes: u32,
     pub rays: u64,
 }
@@ -115,11 +117,15 @@ impl Done {
         );
         zero(&mut self.two, pixels * film.pixel());
         zero(&mut self.two_variance, pixels * film.slots);
+        zero(
+            &mut self.two_noise,
+            if split { pixels * film.slots } else { 0 },
+        );
         self.two_total_variance.clear();
         self.two_total_variance.resize(pixels, 0.0);
         self.pixel_variance.clear();
         self.pixel_variance.resize(pixels, (0.0, 0.0));
-        self.all = (0.0, 0.0);
+        self.all.clear();
         self.passes = 0;
     }
 
@@ -149,6 +155,11 @@ impl Done {
         let x = f64::from(self.alternating[k * film.slots + slot]);
         // Σ±x over n passes has n times a pass' variance; the mean has 1/n of it.
         x / (pairs * f64::from(self.passes)).sqrt().max(1.0)
+    }
+
+    /// The same of the two-bounce part.
+    pub fn two_noise(&self, film: &Film, k: usize, slot: usize) -> f64 {
+        f64::from(self.two_noise[k * film.slots + slot])
     }
 
     /// Brings the variances up to the passes done.
@@ -181,11 +192,13 @@ impl Done {
         self.pixel_variance[k]
     }
 
-    /// Variance of the tile's whole energy. Pixels that share vertices err together, so this is not the
+    /// Spread of the tile's whole energy. Pixels that share vertices err together, so this is not the
     /// sum of theirs.
-    pub fn total_variance(&self) -> f64 {
-        let (_, multi) = mean(self.all.0, self.all.1, f64::from(self.passes));
-        multi + self.two_total_variance.iter().sum::<f64>()
+    pub fn total_spread(&self) -> Spread {
+        Spread::of(&self.all).plus(Spread {
+            variance: self.two_total_variance.iter().sum(),
+            of_variance: 0.0,
+        })
     }
 
     /// Energy outside the gate.
@@ -291,6 +304,12 @@ impl Bench {
             for (out, v) in narrow.iter_mut().zip(&self.blocks.square) {
                 *out = v * n * n;
             }
+            if frame.split {
+                let noise = &mut self.done.two_noise[k * film.slots..(k + 1) * film.slots];
+                for (out, v) in noise.iter_mut().zip(&self.blocks.noise) {
+                    *out = v * n;
+                }
+            }
             self.done.two_total_variance[k] = self.blocks.total_square * f64::from(n * n);
         }
         shut_out(&mut self.done.two_variance, film.slots);
@@ -334,6 +353,7 @@ impl Bench {
                     width: frame.width,
                     seed: frame.seed,
                     pass: u64::from(pass),
+                    mirrors: &frame.sampling.refined,
                 };
                 self.sharing.pass(
                     (&frame.walk, film, &frame.effort),
@@ -348,8 +368,7 @@ impl Bench {
                 }
             }
         }
-        self.done.all.0 += all;
-        self.done.all.1 += all * all;
+        self.done.all.push(all);
         self.done.passes += 1;
     }
 

@@ -3,7 +3,17 @@
 
 use picofarm_scene::{Spot, Vec3};
 
-use crate::{api::Gate, emitter::Emitters, truth::Centres, world::World};
+use crate::{
+    api::{ErrorEstimate, Gate},
+    emitter::Emitters,
+    truth::Centres,
+    world::World,
+};
+
+/// Uncertainty of the variance from which an error is worth a warning: about that of four equal bright paths.
+const UNCERTAIN: f32 = 0.5;
+/// Error of the whole image beneath which nobody asks how sure it is.
+const NEGLIGIBLE: f32 = 1e-3;
 
 /// Optical paths of two-bounce light, metres: over the spots and the points seen by the pixels' centres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -115,6 +125,19 @@ pub(super) fn empty(
             "{WORDS}: no light finds a way from the spots to the camera; is the camera enclosed?"
         ),
     }
+}
+
+/// That few bright paths hold most of the error of the whole image, and how uncertain it is by that.
+pub(super) fn tails(error: &ErrorEstimate) -> Option<String> {
+    let u = error.total_uncertainty;
+    (u > UNCERTAIN && error.total_relative > NEGLIGIBLE).then(|| {
+        format!(
+            "few bright paths hold most of the whole image's error: its {:.2} % may as well be {:.2} %; more paths make it \
+             surer",
+            100.0 * error.total_relative,
+            100.0 * error.total_relative * (1.0 + 2.0 * u).sqrt()
+        )
+    })
 }
 
 fn end(gate: &Gate) -> f64 {
