@@ -3,7 +3,10 @@
 
 use picofarm_scene::{Scene, Vec3};
 
-use crate::rng::{Rng, Stream};
+use crate::{
+    api::{RenderError, Stop},
+    rng::{Rng, Stream},
+};
 
 /// A point in metres from the camera.
 pub(crate) type Point = [f64; 3];
@@ -25,7 +28,15 @@ const FACTOR: f64 = 8.0;
 
 /// How far from the camera, along an axis, the surfaces lie that light can count by: `widest`, unless that is much
 /// farther than what probes find. No surface farther than `horizon` counts.
-pub(crate) fn reach(scene: &Scene, triangles: &[[Point; 3]], widest: f64, horizon: f64) -> f64 {
+///
+/// # Errors
+/// [`RenderError::Stopped`].
+pub(crate) fn reach(
+    scene: &Scene,
+    triangles: &[[Point; 3]],
+    (widest, horizon): (f64, f64),
+    stop: Stop,
+) -> Result<f64, RenderError> {
     let i = &scene.camera.intrinsics;
     let origin = wide(scene.camera.origin);
     let laser = sub(wide(scene.laser.origin), origin);
@@ -50,14 +61,16 @@ pub(crate) fn reach(scene: &Scene, triangles: &[[Point; 3]], widest: f64, horizo
         starts.push(([0.0; 3], d));
     }
     for (from, direction) in starts {
+        // Each looks at all triangles.
+        stop.check()?;
         if probe.walk(from, direction) {
-            return widest;
+            return Ok(widest);
         }
     }
-    match probe.found > 0.0 {
+    Ok(match probe.found > 0.0 {
         true => probe.found,
         false => widest,
-    }
+    })
 }
 
 struct Probe<'a> {

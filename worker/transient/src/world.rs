@@ -142,7 +142,7 @@ impl World {
                 ),
             });
         }
-        let reach = extent::reach(scene, &points, widest, horizon_m);
+        let reach = extent::reach(scene, &points, (widest, horizon_m), stop)?;
         // A camera that all but touches a surface: pieces of a scene far wider would leave f32.
         let reach = reach.max(NARROWEST_M.min(widest));
         let scale = scale_for(reach);

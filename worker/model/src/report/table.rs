@@ -131,13 +131,6 @@ pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> Strin
         };
         let _ = write!(out, "<th class=\"n\"{title}>{heading}</th>");
     }
-    if published {
-        let _ = write!(
-            out,
-            "<th class=\"n paper\">published<br>{}</th>",
-            columns(target)[0].1
-        );
-    }
     for name in &trivial {
         let _ = write!(
             out,
@@ -152,6 +145,13 @@ pub(super) fn table(report: &Report, target: Target, groups: &[&Group]) -> Strin
          <th class=\"n\" title=\"what 10, 50 and 90 % of single scenes stay below\">{} of scenes<br>10 · 50 · 90 %</th>",
         error_name(target)
     );
+    if published {
+        let _ = write!(
+            out,
+            "<th class=\"n paper\">published<br>{}</th>",
+            columns(target)[0].1
+        );
+    }
     out.push_str("</tr></thead><tbody>");
     for group in groups {
         row(&mut out, report, group, main, &trivial, published);
@@ -192,10 +192,6 @@ fn row(
             let _ = write!(out, "<td class=\"{class}\">{figure}</td>");
         }
     }
-    if with_published {
-        let published = shown(target, group);
-        let _ = write!(out, "<td class=\"n paper\">{published}</td>");
-    }
     for name in trivial {
         let figure = cell(group.baselines.get(*name), main);
         // The same scenes give trivial answers the same figures.
@@ -215,6 +211,10 @@ fn row(
         out,
         "<td class=\"n\">{beside}</td><td class=\"n\">{errors}</td>"
     );
+    if with_published {
+        let published = shown(target, group);
+        let _ = write!(out, "<td class=\"n paper\">{published}</td>");
+    }
     out.push_str("</tr>");
 }
 
