@@ -46,7 +46,7 @@ fn first_job(store: &str) -> Value {
         {"kind": "verify", "source": "rooms"},
         {"kind": "train", "source": "rooms", "needs": ["split"], "train": {"target": "tof", "model": "m",
          "input": {"bins": 8}, "net": network, "optimise": {"epochs": 2, "batch": 2}}},
-        {"kind": "evaluate", "source": "rooms", "evaluate": {"models": ["train"]}},
+        {"kind": "evaluate", "source": "rooms", "evaluate": {"models": ["train"], "shards": 2}},
         {"kind": "promote", "source": "rooms", "promote": {"model": "best", "among": ["train"]}},
         {"kind": "infer", "source": "rooms", "infer": {"models": ["train"]},
          "output": {"store": store, "dataset": "seen"}},

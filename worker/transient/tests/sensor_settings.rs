@@ -76,10 +76,10 @@ fn unusable_settings_and_histograms_are_named() {
     let unblurred = Sensor {
         pulse: Pulse::None {},
         jitter: Jitter::Gaussian { fwhm_ps: 0.0 },
-        ..fixed(2e9)
+        ..fixed(5e9)
     };
     let error = fails(&[0.0, 0.0, 1.0, 0.0], &unblurred);
-    assert!(error.contains("[bin 2]: 2.000e9 photons"), "{error}");
+    assert!(error.contains("[bin 2]: 5.000e9 photons"), "{error}");
     let error = fails(&[1.0; 7], &fixed(1.0));
     assert!(
         error.starts_with("transient: expected a whole number"),

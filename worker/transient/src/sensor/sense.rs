@@ -11,8 +11,8 @@ use super::{
     kernel::Kernel,
 };
 
-/// Highest rate a bin may have, photons; sums of bins must fit u32 besides.
-const MAX_RATE: f64 = 1e9;
+/// Highest rate a bin may have, photons: its count fits u32, as sums of bins must besides.
+const MAX_RATE: f64 = 4e9;
 
 /// What a sensor looks at.
 #[derive(Debug, Clone, Copy)]

@@ -59,12 +59,14 @@ impl RunTask for EvaluateShardTask {
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let evaluation = EvaluationRun::new(context, &self.whole, control)?;
         let (mut bytes, mut computed) = (0, false);
+        let mut names = Sha256::new();
         for which in 0..self.whole.evaluate.models.len() {
             let asked = evaluation.asked(which, control)?;
+            let name = evaluation.shard(&asked, task.index as u32);
+            names.update(format!("{} {:?}\n", name.evaluation, name.shard));
             if evaluation.found(&asked, control)?.is_some() {
                 continue;
             }
-            let name = evaluation.shard(&asked, task.index as u32);
             if evaluation.read(&name, control)?.is_some() {
                 continue;
             }
@@ -81,8 +83,8 @@ impl RunTask for EvaluateShardTask {
         }
         control.at(1.0);
         Ok(Output {
-            // A shard goes when its evaluation is there: its name is all that stays the same.
-            manifest_sha256: hex::encode(Sha256::digest(task.key().0)),
+            // Shards go when their evaluations are there: their names are all that stays the same.
+            manifest_sha256: hex::encode(names.finalize()),
             bytes,
             adopted: !computed,
         })
