@@ -124,14 +124,20 @@ fn training() -> String {
      optimise = { epochs = 30, batch = 8, learning_rate = 1e-2, schedule = \"onecycle\" }\n\
      seed = 1\n\
      checkpoint_minutes = 1.0  # lost at most when a worker dies\n\n\
-     [[stage]]                 # which pixels each spot lights, with two-bounce times from the predicted depth\n\
+     [[stage]]                 # the depth that it sees in every room\n\
+     name = \"depths\"\n\
+     kind = \"infer\"\n\
+     source = \"render\"\n\
+     infer = { models = [\"tof\"] }\n\
+     output = { store = \"picofarm-data/store\", dataset = \"small-rooms-depths\" }\n\n\
+     [[stage]]                 # which pixels each spot lights, with two-bounce times from that depth\n\
      name = \"shadow\"\n\
      kind = \"train\"\n\
      source = \"render\"\n\
      [stage.train]\n\
      target = \"shadow\"\n\
      model = \"shadow\"\n\
-     shadow = { variant = \"concat\", tof = \"tof\" }   # a stage or a model; or: truth\n\
+     shadow = { variant = \"concat\", times = \"depths\" }   # an infer stage, or the folder that one wrote; or: truth\n\
      input = { bins = 40 }\n\
      net = { width = 16, levels = 3 }\n\
      optimise = { epochs = 30, batch = 8 }\n\n\

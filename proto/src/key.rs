@@ -33,11 +33,12 @@ pub fn split_key(settings: &SplitSettings, source: &StageKey, scenes: u64) -> Ta
 }
 
 /// Names what a training makes: settings and code, the scenes learnt from and validated on by what pins their bytes, in
-/// order, and the models that it builds on (by field: SHA-256 of the manifest). No name and no place counts.
+/// order, and what it builds on by field: models by the SHA-256 of their manifests, predictions by what pins their bytes. No name
+/// and no place counts.
 pub fn training_key(
     settings: &TrainSettings,
     [training, validation]: [&str; 2],
-    models: &BTreeMap<&str, String>,
+    built_on: &BTreeMap<&str, String>,
 ) -> TaskKey {
     let mut shaping = settings.clone();
     shaping.split = String::new();
@@ -45,21 +46,26 @@ pub fn training_key(
     for (_, name) in shaping.models_mut() {
         *name = "model".into();
     }
+    if shaping.times().is_some() {
+        shaping.shadow.times = "predictions".into();
+    }
     let description = serde_json::json!({
         "task": "train",
         "settings": shaping.shaping(),
         "training": training,
         "validation": validation,
-        "models": models,
+        "models": built_on,
     });
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())
 }
 
 /// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the bytes of the scenes
-/// and of those that plain answers are fitted to, in order, the histogram and the code.
+/// and of those that plain answers are fitted to, in order, the histogram, what two-bounce times follow from (`truth`, or what
+/// pins predictions; empty where none are given) and the code.
 pub fn evaluation_key(
     model_sha256: &str,
     data: [&str; 2],
+    times: &str,
     histogram: Histogram,
     spots: &[u32],
     version: &str,
@@ -70,6 +76,7 @@ pub fn evaluation_key(
         "data": data,
         "histogram": histogram,
         "spots": spots,
+        "times": times,
         "version": version,
     });
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())

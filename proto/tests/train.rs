@@ -37,6 +37,14 @@ fn train(name: &str, settings: &str) -> String {
     )
 }
 
+/// What a model predicts, kept in `of-MODEL`.
+fn infer(name: &str, model: &str) -> String {
+    format!(
+        "[[stage]]\nname = \"{name}\"\nkind = \"infer\"\nsource = \"render\"\ninfer = {{ models = [\"{model}\"] }}\n\
+         output = {{ store = \"/s\", dataset = \"of-{model}\" }}\n"
+    )
+}
+
 fn evaluate(settings: &str) -> String {
     format!("[[stage]]\nkind = \"evaluate\"\nsource = \"render\"\nevaluate = {{ {settings} }}\n")
 }
@@ -61,7 +69,7 @@ fn what_is_left_out_is_as_in_the_paper() {
     assert_eq!(s.net.architecture, Architecture::Unet2d);
     assert_eq!((s.net.width, s.net.levels, s.net.stem), (128, 6, 0));
     assert_eq!(
-        (s.shadow.variant, &*s.shadow.tof),
+        (s.shadow.variant, &*s.shadow.times),
         (ShadowVariant::Concat, "truth")
     );
     let o = &s.optimise;
@@ -77,9 +85,10 @@ fn what_is_left_out_is_as_in_the_paper() {
 #[test]
 fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
     let stages = train("tof", "target = \"tof\", model = \"first\"")
+        + &infer("seen", "first")
         + &train(
             "shadow",
-            "target = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
+            "target = \"shadow\", model = \"s\", shadow = { times = \"seen\" }",
         )
         + &train(
             "mirror",
@@ -90,13 +99,14 @@ fn a_training_needs_the_data_the_split_and_the_models_it_reads() {
             "target = \"tof\", model = \"o\", split = \"half\", from = \"from-last-year\"",
         );
     let spec = good(&stages);
-    let [_, _, tof, shadow, mirror, other] = &spec.stages[..] else {
+    let [_, _, tof, seen, shadow, mirror, other] = &spec.stages[..] else {
         panic!("{spec:?}");
     };
     assert_eq!(tof.needs, ["render", "split"]);
     assert_eq!(tof.tasks(), 1);
-    assert_eq!(settings(shadow).shadow.tof, "first");
-    assert_eq!(shadow.needs, ["render", "split", "tof"]);
+    assert_eq!(seen.needs, ["render", "tof"]);
+    assert_eq!(settings(shadow).shadow.times, "of-first");
+    assert_eq!(shadow.needs, ["render", "split", "seen"]);
     assert_eq!(mirror.needs, ["render", "split", "tof"]);
     assert_eq!(settings(other).from, "from-last-year");
     assert_eq!(other.needs, ["render"]);
@@ -152,10 +162,7 @@ fn a_matrix_goes_over_any_field_and_its_models_are_evaluated_together() {
         evaluation.needs,
         ["render", "split", "tof[0.01,8]", "tof[0.001,8]"]
     );
-    let one_of_many = train(
-        "s",
-        "target = \"shadow\", model = \"s\", shadow = { tof = \"tof\" }",
-    );
+    let one_of_many = train("s", "target = \"tof\", model = \"s\", from = \"tof\"");
     let said = refused(&(sweep.to_owned() + &one_of_many));
     assert!(said.contains("stands for 2 models"), "{said}");
 }
@@ -183,7 +190,7 @@ fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
         ", net = { stem = 128 }",
         ", net = { stem = 128, stem_form = \"linear\" }",
         ", shadow = { variant = \"index\" }",
-        ", shadow = { tof = \"x\" }",
+        ", shadow = { times = \"x\" }",
         ", optimise = { epochs = 1 }",
         ", optimise = { precision = \"bf16\" }",
         ", from = \"x\"",
@@ -248,7 +255,7 @@ fn an_unusable_field_is_named() {
             "..=10",
         ),
         (
-            "target = \"tof\", model = \"m\", shadow = { tof = \"x\" }",
+            "target = \"tof\", model = \"m\", shadow = { times = \"x\" }",
             "train.shadow",
             "remove",
         ),
@@ -308,6 +315,42 @@ fn an_unusable_field_is_named() {
         let said = refused(&evaluate(settings));
         assert!(said.contains(part), "{settings}: {said}");
     }
+    let seen = train("tof", "target = \"tof\", model = \"m\"")
+        + &train("mirrors", "target = \"specular\", model = \"s\"")
+        + &infer("masks", "s")
+        + &infer("seen", "m");
+    for (times, part) in [
+        (
+            "tof",
+            "stage that keeps nothing of scenes; name an infer stage",
+        ),
+        ("masks", "holds no depths"),
+        ("of-s", "holds no depths"),
+        ("", "give \"truth\""),
+        ("a/b", "plain name"),
+        ("..", "plain name"),
+    ] {
+        let shadow =
+            format!("target = \"shadow\", model = \"x\", shadow = {{ times = \"{times}\" }}");
+        let said = refused(&(seen.clone() + &train("t", &shadow)));
+        assert!(
+            said.contains("train.shadow.times") && said.contains(part),
+            "{times}: {said}"
+        );
+        if !times.is_empty() {
+            let asked = format!("models = [\"m\"], times = \"{times}\"");
+            let said = refused(&(seen.clone() + &evaluate(&asked)));
+            assert!(
+                said.contains("evaluate.times") && said.contains(part),
+                "{times}: {said}"
+            );
+        }
+    }
+    let all =
+        "target = \"shadow\", model = \"x\", shadow = { variant = \"all\", times = \"seen\" }";
+    assert!(refused(&(seen.clone() + &train("t", all))).contains("is given no times"));
+    let asked = good(&(seen + &evaluate("models = [\"m\"], times = \"seen\"")));
+    assert_eq!(asked.stages[6].needs, ["render", "split", "tof", "seen"]);
     let twice = train("a", "target = \"tof\", model = \"m\"")
         + &train("b", "target = \"tof\", model = \"m\"");
     assert!(refused(&twice).contains("stage \"a\" trains"));

@@ -40,13 +40,19 @@ net = {{ width = 8, levels = 3 }}
 optimise = {{ epochs = 600, batch = 4 }}
 checkpoint_minutes = 0.01
 [[stage]]
+name = "depths"
+kind = "infer"
+source = "rooms"
+infer = {{ models = ["tof"] }}
+output = {{ store = {store:?}, dataset = "depths" }}
+[[stage]]
 name = "shadow"
 kind = "train"
 source = "rooms"
 [stage.train]
 target = "shadow"
 model = "shadow"
-shadow = {{ tof = "tof" }}
+shadow = {{ times = "depths" }}
 net = {{ width = 4, levels = 2 }}
 optimise = {{ epochs = 20, batch = 4 }}
 [[stage]]

@@ -146,24 +146,25 @@ pub fn measure(
     fits_memory(&settings, scene, threads)?;
     let rendered = render(scene, &settings.render_settings(), &Capture(watch))
         .map_err(|e| refused(e.into()))?;
-    let shown = seen(scene, &rendered);
+    let mut shown = seen(scene, &rendered);
     let failed = |e: ModelError| CliError::new(Code::Failed, e.to_string());
     let depth = networks.tof.model.depth_m(&shown).map_err(failed)?;
-    let ask = |member: &Member, depth: Option<&[f32]>| -> Result<Vec<u8>> {
+    shown.seen_depth_m = Some(depth.clone());
+    let ask = |member: &Member| -> Result<Vec<u8>> {
         let mut tell = |done: usize, of: usize| {
             watch.step(
                 &format!("{} {done} of {of}", member.name),
                 done as f32 / of as f32,
             )
         };
-        masks(&member.model, depth, &shown, &mut tell)
+        masks(&member.model, &shown, &mut tell)
             .map_err(failed)?
             .map(|said| said.into_iter().map(|p| u8::from(p >= 128)).collect())
             .ok_or_else(|| signals::interrupted("nothing was written"))
     };
-    let lit = ask(&networks.shadow, Some(&depth))?;
+    let lit = ask(&networks.shadow)?;
     let mirror = match &networks.specular {
-        Some(member) => ask(member, None)?,
+        Some(member) => ask(member)?,
         None => vec![0; depth.len()],
     };
     let range: Vec<f32> = (0..depth.len())
@@ -213,6 +214,7 @@ fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
     let pixels = (i.width * i.height) as usize;
     let spots = rendered.spots.iter();
     scene::Scene {
+        seen_depth_m: None,
         height: i.height as usize,
         width: i.width as usize,
         bins: rendered.gate.bins as usize,

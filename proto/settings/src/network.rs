@@ -42,6 +42,23 @@ pub enum ShadowVariant {
     All,
 }
 
+impl ShadowVariant {
+    /// Its name, as in a job file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Concat => "concat",
+            Self::Difference => "difference",
+            Self::Index => "index",
+            Self::All => "all",
+        }
+    }
+
+    /// Whether the network is given two-bounce times.
+    pub fn is_timed(self) -> bool {
+        matches!(self, Self::Concat | Self::Difference)
+    }
+}
+
 /// The kinds of network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

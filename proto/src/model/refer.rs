@@ -81,19 +81,14 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
     let Some(store) = stage.task.shelf().cloned() else {
         return Ok(());
     };
-    if let Some(folder) = stage.task.reads_beside_mut() {
-        // A folder that a stage writes means itself, so that a job may be read again.
-        let written = |s: &&StageSpec| s.task.writes().is_some_and(|(_, to)| to == folder);
-        let named = before.iter().find(|s| s.name == *folder);
-        if !before.iter().any(|s| written(&s))
-            && let Some((place, to)) = named.and_then(|s| s.task.writes())
-            && *place == store
-        {
-            *folder = to.clone();
-        }
-    }
     let source = stage.task.reads().cloned();
     let at = |field: &str| format!("stage.{}.{field}", stage.name);
+    if let Some((field, folder)) = stage.task.reads_beside_mut() {
+        let found = beside(folder, before, &store).map_err(|e| SpecError::new(at(field), e))?;
+        if let Some(found) = found {
+            *folder = found;
+        }
+    }
     match stage.task.models_mut() {
         ModelNames::Single(names) => {
             for (field, name) in names {
@@ -133,7 +128,7 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
             .is_some_and(|(place, model)| *place == store && read(model));
         let beside = task
             .reads_beside()
-            .is_some_and(|folder| s.task.writes() == Some((&store, folder)));
+            .is_some_and(|(_, folder)| s.task.writes() == Some((&store, folder)));
         divides || evaluates || trains || beside
     });
     let wanted: Vec<String> = wanted.map(|s| s.name.clone()).collect();
@@ -143,6 +138,34 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
         }
     }
     Ok(())
+}
+
+/// The folder that the stage of this name writes; `None` where the name is a folder's.
+fn beside(name: &str, before: &[StageSpec], store: &str) -> Result<Option<String>, String> {
+    // A folder that a stage writes means itself, so that a job may be read again.
+    let written = |s: &StageSpec| s.task.writes().is_some_and(|(_, to)| to == name);
+    if before.iter().any(written) {
+        return Ok(None);
+    }
+    let instance = format!("{name}[");
+    if let Some(one) = before.iter().find(|s| s.name.starts_with(&instance)) {
+        return Err(format!(
+            "{name:?} stands for several stages; name one, as {:?}",
+            one.name
+        ));
+    }
+    let Some(stage) = before.iter().find(|s| s.name == name) else {
+        return Ok(None);
+    };
+    match stage.task.writes() {
+        Some((place, to)) if place == store => Ok(Some(to.clone())),
+        Some((place, _)) => Err(format!(
+            "{name:?} writes into {place}, but its folder is looked for in the store of the data set, {store}"
+        )),
+        None => Err(format!(
+            "{name:?} is a stage that keeps nothing of scenes; name an infer stage"
+        )),
+    }
 }
 
 /// Puts all models that each name stands for in its place.

@@ -39,13 +39,13 @@ pub use layout::quantity::Quantity;
 pub use layout::record::{Intrinsics, Provenance, SceneRecord, Spot, SubsetRecord};
 pub use layout::spec::{DatasetSpec, Gate, Profile, Subsets};
 pub use models::{
-    Dependents, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest, ModelRepair,
-    Models, NewModel, Promoted, Published, Removed, Rung, ShardName, SplitUsed, TrainingSpeed,
-    TrialEnd, TrialRecord,
+    Dependents, DepthsUsed, Evaluation, Lineage, MODELS, Measurement, ModelCheck, ModelManifest,
+    ModelRepair, Models, NewModel, Promoted, Published, Removed, Rung, ShardName, SplitUsed,
+    TrainingSpeed, TrialEnd, TrialRecord,
 };
 pub use predictions::{
-    EncodedPredictions, ModelUsed, Predicted, PredictionManifest, PredictionSpec, Predictions,
-    SceneUsed, TimesUsed,
+    EncodedPredictions, ModelUsed, PinnedDepths, Predicted, PredictionManifest, PredictionSpec,
+    Predictions, SceneUsed, TimesUsed,
 };
 pub use reconstructions::{ReconstructionManifest, Reconstructions};
 pub use render_group::read::RenderGroup;

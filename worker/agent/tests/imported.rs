@@ -54,7 +54,7 @@ async fn an_imported_network_answers_as_the_one_it_was() {
         ("m", json!({"target": "tof", "model": "m2", "net": net})),
         (
             "sh",
-            json!({"target": "shadow", "model": "sh2", "net": net, "shadow": {"tof": "m2"}}),
+            json!({"target": "shadow", "model": "sh2", "net": net}),
         ),
         (
             "s",
@@ -70,7 +70,8 @@ async fn an_imported_network_answers_as_the_one_it_was() {
         // Once more is the same model.
         let again = models.publish(new, false).await.unwrap();
         assert_eq!(again.manifest, published.manifest);
-        run(place.evaluation(json!({"models": [model, name]})))
+        let times = if model == "sh" { "depths" } else { "" };
+        run(place.evaluation(json!({"models": [model, name], "times": times})))
             .await
             .unwrap();
         let found = |found: Vec<picofarm_dataset::Evaluation>| found[0].metrics.clone();
@@ -108,6 +109,10 @@ async fn what_does_not_fit_is_named() {
         (json!({"input": {"bins": 4}}), "input.bins"),
         (json!({"target": "shadow"}), "has shape"),
         (json!({"from": "m"}), "train.from"),
+        (
+            json!({"shadow": {"times": "depths"}, "target": "shadow"}),
+            "train.shadow.times",
+        ),
         (
             json!({"specular": {"on": "m"}, "target": "specular"}),
             "train.specular.on",

@@ -107,7 +107,8 @@ async fn models_build_on_models_of_the_store() {
         models.manifest("s").await.unwrap(),
     );
     assert_eq!(mirrors.lineage.models["m"], tof.sha256());
-    let shadows = json!({"target": "shadow", "model": "sh", "shadow": {"tof": "m"}, "histogram": "transient_spots", "spots": [1]});
+    place.predict("m", "depths").await;
+    let shadows = json!({"target": "shadow", "model": "sh", "shadow": {"times": "depths"}, "histogram": "transient_spots", "spots": [1]});
     run(place.training(shadows)).await.unwrap();
     run(place.evaluation(json!({"models": ["s", "sh"]})))
         .await
@@ -125,10 +126,6 @@ async fn models_build_on_models_of_the_store() {
         2
     );
     for (more, part) in [
-        (
-            json!({"target": "shadow", "model": "x", "shadow": {"tof": "s"}}),
-            "train.shadow.tof: \"s\" predicts \"specular\"",
-        ),
         (
             json!({"target": "specular", "model": "x", "specular": {"on": "m"}, "net": {"width": 4, "levels": 2}}),
             "train.net.width: is 4, but 2",
@@ -277,6 +274,12 @@ async fn models_are_not_judged_by_truth_that_is_missing() {
     let alone =
         json!({"target": "shadow", "model": "given", "optimise": {"epochs": 1, "batch": 2}});
     run(place.training(alone)).await.unwrap();
+    let link = |other: &Place| {
+        for folder in ["models", "depths"] {
+            let (from, to) = (place.dir.path().join(folder), other.dir.path().join(folder));
+            std::os::unix::fs::symlink(from, to).unwrap();
+        }
+    };
     for (missing, model) in [
         ("depth", "m"),
         ("depth", "given"),
@@ -285,20 +288,148 @@ async fn models_are_not_judged_by_truth_that_is_missing() {
         ("spots.path", "sh"),
     ] {
         let other = Place::lacking(&[missing]).await;
-        let models = place.dir.path().join("models");
-        std::os::unix::fs::symlink(models, other.dir.path().join("models")).unwrap();
+        link(&other);
         let evaluation = json!({"models": [model], "side": "train"});
         let said = refused(other.evaluation(evaluation)).await;
         assert!(said.contains(&format!(" lack {missing} (scene ")), "{said}");
     }
     // What is only asked needs no truth, but for what it is given.
     let other = Place::lacking(&["depth", "visibility", "specular"]).await;
-    let models = place.dir.path().join("models");
-    std::os::unix::fs::symlink(models, other.dir.path().join("models")).unwrap();
+    link(&other);
     run(other.inference(json!({}))).await.unwrap();
     let said = refused(other.inference(json!({"models": ["given"]}))).await;
     assert!(
         said.contains("1 scene of") && said.contains("lack depth (scene 0)"),
         "{said}"
     );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_bounce_times_follow_from_the_depths_that_an_infer_stage_has_kept() {
+    let place = Place::new().await;
+    place.train_all().await;
+    let short = json!({"epochs": 10, "batch": 2});
+    let shadows = |model: &str, times: &str| {
+        let shadow = json!({"times": times});
+        place.training(
+            json!({"target": "shadow", "model": model, "shadow": shadow, "optimise": short}),
+        )
+    };
+    let models = place.models();
+    let (tof, kept) = (
+        models.manifest("m").await.unwrap(),
+        models.manifest("sh").await.unwrap(),
+    );
+    assert_eq!(kept.lineage.models["m"], tof.sha256());
+    assert_eq!(kept.lineage.times.as_ref().unwrap().predictions, "depths");
+
+    // The folder's name is no part of what comes out; its bytes are.
+    place.predict("m", "again").await;
+    place
+        .predict_with(json!({"model": "other", "seed": 9}), "others")
+        .await;
+    for (name, times) in [("copy", "again"), ("else", "others"), ("true", "truth")] {
+        run(shadows(name, times)).await.unwrap();
+    }
+    let of = async |name: &str| models.manifest(name).await.unwrap();
+    let key = async |name: &str| of(name).await.training_key;
+    assert_eq!(key("copy").await, kept.training_key);
+    assert_ne!(key("else").await, kept.training_key);
+    assert_ne!(key("true").await, kept.training_key);
+    assert!(of("true").await.lineage.times.is_none());
+    let hash = |manifest: &picofarm_dataset::ModelManifest| {
+        manifest
+            .object("weights.safetensors")
+            .unwrap()
+            .sha256
+            .clone()
+    };
+    assert_eq!(hash(&of("copy").await), hash(&kept));
+    assert_ne!(hash(&of("else").await), hash(&kept));
+    assert_ne!(hash(&of("true").await), hash(&kept));
+
+    // An evaluation takes the training's times, or those that it is told to take.
+    for (model, times, found) in [
+        ("sh", "", "depths"),
+        ("sh", "others", "others"),
+        ("sh", "truth", "truth"),
+        ("copy", "", "again"),
+        ("true", "", "truth"),
+        ("m", "truth", ""),
+    ] {
+        let (there, asked) = (
+            models.evaluations(model).await.unwrap(),
+            json!({"models": [model], "times": times}),
+        );
+        run(place.evaluation(asked)).await.unwrap();
+        let mut after = models.evaluations(model).await.unwrap();
+        after.retain(|e| there.iter().all(|other| other.key != e.key));
+        let said: Vec<&str> = after.iter().map(|e| &*e.times).collect();
+        assert_eq!(said, [found], "{model} {times}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn predictions_that_do_not_fit_are_refused_by_name_before_anything_is_learnt() {
+    let place = Place::new().await;
+    place.train_all().await;
+    let short = json!({"epochs": 1, "batch": 2});
+    let shadows = |times: &str| {
+        let shadow = json!({"times": times});
+        place.training(
+            json!({"target": "shadow", "model": "x", "shadow": shadow, "optimise": short}),
+        )
+    };
+    // Masks alone.
+    place.predict("s", "mirrors").await;
+    // A scene is missing.
+    place.predict("m", "short").await;
+    std::fs::remove_file(place.dir.path().join("short/manifests/4.json")).unwrap();
+    // Depths by two models.
+    place.predict("m", "mixed").await;
+    place
+        .predict_with(json!({"model": "other", "seed": 9}), "others")
+        .await;
+    for file in ["manifests/4.json", "depth/c/4/0/0"] {
+        let [from, to] = ["others", "mixed"].map(|f| place.dir.path().join(f).join(file));
+        std::fs::copy(from, to).unwrap();
+    }
+    for (times, part) in [
+        ("nowhere", "nowhere"),
+        ("rooms", "rooms"),
+        (
+            "mirrors",
+            "holds no depths; give its infer stage a \"tof\" model",
+        ),
+        ("short", "holds nothing of scene 4"),
+        ("mixed", "holds depths by "),
+    ] {
+        let said = refused(shadows(times)).await;
+        assert!(
+            said.starts_with("train.shadow.times: ") && said.contains(part),
+            "{said}"
+        );
+    }
+    // The scenes are made anew; what was predicted of them before is not of them.
+    let other = Place::lacking(&["normal"]).await;
+    for folder in ["models", "depths"] {
+        let (from, to) = (place.dir.path().join(folder), other.dir.path().join(folder));
+        std::os::unix::fs::symlink(from, to).unwrap();
+    }
+    let said = refused(other.evaluation(json!({"models": ["sh"], "side": "train"}))).await;
+    assert!(
+        said.contains("which is not the scene that is read here"),
+        "{said}"
+    );
+    assert!(said.contains("evaluate.times gives others"), "{said}");
+    let said = refused(other.inference(json!({"models": ["sh"]}))).await;
+    assert!(
+        said.contains("a \"tof\" model in infer.models gives others"),
+        "{said}"
+    );
+    assert!(models_are(&place, &["m", "other", "s", "sh"]).await);
+}
+
+async fn models_are(place: &Place, names: &[&str]) -> bool {
+    place.models().names().await.unwrap() == names
 }

@@ -62,20 +62,18 @@ impl Evaluated {
     }
 }
 
-/// Asks a model of every scene, spot by spot where it is a shadow network. `guide` is the model whose depths two-bounce
-/// times follow from (the truth's without it); `baseline` what it is compared with. `tell` hears how many scenes are
-/// done of how many and says whether to go on; where it does not, there is no answer.
+/// Asks a model of every scene, spot by spot where it is a shadow network. `baseline` is what it is compared with. `tell` hears
+/// how many scenes are done of how many and says whether to go on; where it does not, there is no answer.
 ///
 /// # Errors
 /// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or the baseline.
 pub fn evaluate(
     model: &Model,
-    guide: Option<&Model>,
     baseline: &Baseline,
     scenes: &dyn Scenes,
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Evaluated>, ModelError> {
-    let answered = answered(model, guide, baseline, scenes, tell)?;
+    let answered = answered(model, baseline, scenes, tell)?;
     let target = model.question().target;
     Ok(answered.map(|scenes| Evaluated::of(target, &scenes)))
 }
@@ -87,7 +85,6 @@ pub fn evaluate(
 /// As [`evaluate`].
 pub fn answered(
     model: &Model,
-    guide: Option<&Model>,
     baseline: &Baseline,
     scenes: &dyn Scenes,
     tell: &mut dyn FnMut(usize, usize) -> bool,
@@ -98,7 +95,7 @@ pub fn answered(
             scene: index,
             source,
         })?;
-        each.push(of_scene(model, guide, baseline, &scene)?);
+        each.push(of_scene(model, baseline, &scene)?);
         if !tell(index + 1, scenes.len()) {
             return Ok(None);
         }
@@ -106,12 +103,7 @@ pub fn answered(
     Ok(Some(each))
 }
 
-fn of_scene(
-    model: &Model,
-    guide: Option<&Model>,
-    baseline: &Baseline,
-    scene: &Scene,
-) -> Result<Answered, ModelError> {
+fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answered, ModelError> {
     let target = model.question().target;
     let names = baseline.names().iter();
     let mut found = Answered {
@@ -122,7 +114,7 @@ fn of_scene(
             .collect(),
     };
     let (mut plane, mut fits) = (0, true);
-    answers(model, guide, scene, &mut |said, batch| {
+    answers(model, scene, &mut |said, batch| {
         let (side, truth) = ([batch.height, batch.width], &batch.target);
         found.examples += batch.images as u64;
         found.model.add(target, said, truth, side);
@@ -148,23 +140,19 @@ fn of_scene(
 /// [`ModelError::Invalid`] for a scene that does not fit the model.
 pub fn answers(
     model: &Model,
-    guide: Option<&Model>,
     scene: &Scene,
     hear: &mut dyn FnMut(&[f32], &Batch),
 ) -> Result<(), ModelError> {
-    let depth_m = guide.map(|guide| guide.depth_m(scene)).transpose()?;
-    answers_at(model, depth_m.as_deref(), scene, &mut |said, batch| {
+    answers_while(model, scene, &mut |said, batch| {
         hear(said, batch);
         true
     })
     .map(drop)
 }
 
-/// The same where the depths that two-bounce times follow from are known, and `hear` says whether to go on; `false` where it
-/// did not.
-fn answers_at(
+/// The same where `hear` says whether to go on; `false` where it did not.
+fn answers_while(
     model: &Model,
-    depth_m: Option<&[f32]>,
     scene: &Scene,
     hear: &mut dyn FnMut(&[f32], &Batch) -> bool,
 ) -> Result<bool, ModelError> {
@@ -180,7 +168,7 @@ fn answers_at(
             spot,
             ..Visit::default()
         };
-        example(&mut batch, question, scene, depth_m, visit)?;
+        example(&mut batch, question, scene, visit)?;
         if !hear(&model.answer(&batch), &batch) {
             return Ok(false);
         }
@@ -189,14 +177,13 @@ fn answers_at(
 }
 
 /// The masks that a model says of a scene: probabilities times 255, rounded, `[row][column]` of mirrors,
-/// `[spot][row][column]` of light. `depth_m` is what two-bounce times follow from (the truth without it). `tell` hears how
-/// many visits are done of how many and says whether to go on; where it does not, there is no answer.
+/// `[spot][row][column]` of light. `tell` hears how many visits are done of how many and says whether to go on; where it does
+/// not, there is no answer.
 ///
 /// # Errors
 /// [`ModelError::Invalid`] for a depth network, and for a scene that does not fit the model.
 pub fn masks(
     model: &Model,
-    depth_m: Option<&[f32]>,
     scene: &Scene,
     tell: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Option<Vec<u8>>, ModelError> {
@@ -212,7 +199,7 @@ pub fn masks(
         false => 1,
     };
     let (mut masks, mut done) = (Vec::new(), 0);
-    let whole = answers_at(model, depth_m, scene, &mut |said, _| {
+    let whole = answers_while(model, scene, &mut |said, _| {
         masks.extend(said.iter().map(|logit| probability(*logit)));
         done += 1;
         tell(done, visits)

@@ -92,10 +92,10 @@ impl Model {
     pub fn depth_m(&self, scene: &Scene) -> Result<Vec<f32>, ModelError> {
         if self.question().target != Target::Tof {
             let what = "two-bounce times follow from depths; this model predicts none";
-            return Err(ModelError::invalid("shadow.tof", what));
+            return Err(ModelError::invalid("shadow.times", what));
         }
         let mut batch = Batch::default();
-        example(&mut batch, self.question(), scene, None, Visit::default())?;
+        example(&mut batch, self.question(), scene, Visit::default())?;
         let scaled = self.answer(&batch);
         let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * DEPTH_SCALE_M);
         Ok(depth.collect())

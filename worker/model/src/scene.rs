@@ -23,6 +23,8 @@ pub struct Scene {
     pub histogram: Vec<f32>,
     /// z-depth, metres: `[row][column]`.
     pub depth_m: Vec<f32>,
+    /// z-depth that two-bounce times follow from where that is not the truth but a network's, metres: `[row][column]`.
+    pub seen_depth_m: Option<Vec<f32>>,
     /// 1 where the first surface is a mirror: `[row][column]`.
     pub specular: Vec<u8>,
     /// Illumination spots L_i in camera coordinates, metres.
@@ -107,7 +109,8 @@ impl Scenes for Kept {
 impl Scene {
     /// About how much memory it takes.
     pub fn bytes(&self) -> usize {
-        let floats = self.histogram.len() + self.depth_m.len();
+        let seen = self.seen_depth_m.as_ref().map_or(0, Vec::len);
+        let floats = self.histogram.len() + self.depth_m.len() + seen;
         4 * floats + self.specular.len() + self.lit.len()
     }
 
@@ -116,14 +119,10 @@ impl Scene {
         self.height * self.width
     }
 
-    /// Two-bounce path lengths of a spot, metres, from the true depth: `[row][column]`.
+    /// Two-bounce path lengths of a spot, metres, from [`Self::seen_depth_m`], else from the true depth: `[row][column]`. The
+    /// beam's length + |x_p − L| + |x_p|, with the camera at the origin; NaN for a beam that meets nothing.
     pub fn tof(&self, spot: usize) -> Vec<f32> {
-        self.tof_of(spot, &self.depth_m)
-    }
-
-    /// Two-bounce path lengths of a spot, metres, from any depths, such as a network's: `[row][column]`. The beam's length
-    /// + |x_p − L| + |x_p|, with the camera at the origin; NaN for a beam that meets nothing.
-    pub fn tof_of(&self, spot: usize, depth_m: &[f32]) -> Vec<f32> {
+        let depth_m = self.seen_depth_m.as_ref().unwrap_or(&self.depth_m);
         let [fx, fy, cx, cy] = self.intrinsics;
         let to_spot = f64::from(self.beams_m[spot]);
         let spot = self.spots[spot].map(f64::from);

@@ -13,7 +13,7 @@ use picofarm_model::{
     input::{ShadowVariant, Target},
     metric::Metrics,
     net::{Architecture, Net, NetSpec, StemForm, TimeProjection},
-    scene::{Kept, Scenes},
+    scene::{Kept, Scene, Scenes},
     train::{Control, Plan, Sources, Trained, Training},
     trial::Trial,
     weights,
@@ -25,9 +25,9 @@ fn trained(plan: &Plan, sources: Sources) -> Trained {
     training.finish()
 }
 
-fn evaluated(model: &Model, guide: Option<&Model>) -> Evaluated {
+fn evaluated(model: &Model, scenes_before: &Vec<Arc<Scene>>) -> Evaluated {
     let baseline = Baseline::fit(model.question().target, &scenes(0, 40), 40).unwrap();
-    evaluate(model, guide, &baseline, &scenes(500, 6), &mut |_, _| true)
+    evaluate(model, &baseline, scenes_before, &mut |_, _| true)
         .unwrap()
         .unwrap()
 }
@@ -44,8 +44,8 @@ fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_al
         ..plan(Target::Tof, ShadowVariant::Concat)
     };
     let tof = trained(&depth, many());
-    let tof = Arc::new(Model::read(&tof.weights, &device).unwrap());
-    let found = evaluated(&tof, None);
+    let tof = Model::read(&tof.weights, &device).unwrap();
+    let found = evaluated(&tof, &scenes(500, 6));
     let of = |name: &str| {
         found
             .baselines
@@ -62,13 +62,20 @@ fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_al
         epochs: 25,
         ..plan(Target::Shadow, ShadowVariant::Concat)
     };
-    let guided = Sources {
-        guide: Some(Arc::clone(&tof)),
-        ..many()
+    let timed = |scenes: Vec<Arc<Scene>>| -> Vec<Arc<Scene>> {
+        let by_network = |scene: Arc<Scene>| Scene {
+            seen_depth_m: Some(tof.depth_m(&scene).unwrap()),
+            ..scene.as_ref().clone()
+        };
+        scenes.into_iter().map(by_network).map(Arc::new).collect()
     };
-    let shadow = trained(&shadow, guided);
+    let predicted = Sources {
+        train: Arc::new(timed(scenes(0, 40))),
+        validation: Arc::new(timed(scenes(100, 3))),
+    };
+    let shadow = trained(&shadow, predicted);
     let shadow = Model::read(&shadow.weights, &device).unwrap();
-    let found = evaluated(&shadow, Some(&tof));
+    let found = evaluated(&shadow, &timed(scenes(500, 6)));
     let Metrics::Mask { iou, .. } = found.metrics else {
         panic!("a mask")
     };
@@ -95,11 +102,11 @@ fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
         let model = Model::read(&model.weights, &Device::flex()).unwrap();
         let baseline = Baseline::fit(target, &scenes(0, 8), 8).unwrap();
         let scenes = scenes(500, 7);
-        let whole = evaluate(&model, None, &baseline, &scenes, &mut |_, _| true);
+        let whole = evaluate(&model, &baseline, &scenes, &mut |_, _| true);
         let whole = whole.unwrap().unwrap();
         let part = |from: usize, to: usize| {
             let some = scenes[from..to].to_vec();
-            let found = answered(&model, None, &baseline, &some, &mut |_, _| true);
+            let found = answered(&model, &baseline, &some, &mut |_, _| true);
             let text = serde_json::to_string(&found.unwrap().unwrap()).unwrap();
             serde_json::from_str::<Vec<Answered>>(&text).unwrap()
         };
@@ -323,7 +330,7 @@ fn a_scene_is_asked_spot_by_spot() {
     let model = Model::read(&trained(&plan, sources()).weights, &Device::flex()).unwrap();
     let mut asked = 0;
     let scene = scenes(7, 1).load(0).unwrap();
-    answers(&model, None, &scene, &mut |said, batch| {
+    answers(&model, &scene, &mut |said, batch| {
         asked += 1;
         assert_eq!((said.len(), batch.target.len()), (64, 64));
     })

@@ -24,8 +24,8 @@ fn trained(target: Target) -> Entry {
     let held_out = scenes(200, 3);
     let mut entry = Entry::new(format!("{target:?}"), &model, 8);
     entry.history = trained.history;
-    entry.evaluated = evaluate(&model, None, &baseline, &held_out, &mut |_, _| true).unwrap();
-    entry.pictures = pictures(&model, None, &held_out, &[0, 2], 1).unwrap();
+    entry.evaluated = evaluate(&model, &baseline, &held_out, &mut |_, _| true).unwrap();
+    entry.pictures = pictures(&model, &held_out, &[0, 2], 1).unwrap();
     entry
 }
 
@@ -68,7 +68,7 @@ fn a_scene_that_is_not_there_is_named() {
     let entry = plan(Target::Tof, ShadowVariant::Concat);
     let training = Training::start(entry, None, sources(), &cpu()).unwrap();
     let model = Model::read(&training.finish().weights, &cpu()).unwrap();
-    let error = pictures(&model, None, &scenes(0, 2), &[2], 1).unwrap_err();
+    let error = pictures(&model, &scenes(0, 2), &[2], 1).unwrap_err();
     assert_eq!(
         error.to_string(),
         "report.scenes: there is no scene 2, only 2"

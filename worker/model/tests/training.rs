@@ -158,7 +158,7 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     let model = picofarm_model::Model::read(&trained.weights, &Device::flex()).unwrap();
     let scenes = scenes(100, 3);
     let baseline = Baseline::fit(plan.question.target, &scenes, 3).unwrap();
-    let found = picofarm_model::evaluate(&model, None, &baseline, &scenes, &mut |_, _| true);
+    let found = picofarm_model::evaluate(&model, &baseline, &scenes, &mut |_, _| true);
     let found = found.unwrap().unwrap().metrics.loss();
     assert!((found - best).abs() < 1e-6, "{found} {best}");
     // And going on from a checkpoint after the best keeps them too.

@@ -6,10 +6,10 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
-    names::{check_model, check_split},
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
+    names::{check_model, check_split, check_times},
     reprocess::Histogram,
-    train::{check_spots, is_zero},
+    train::{TRUTH, check_spots, is_zero},
 };
 use crate::{
     model::{
@@ -26,6 +26,9 @@ use crate::{
 pub(super) const MAX_MODELS: usize = 1_000;
 /// Most tasks that an evaluation is divided among.
 const MAX_SHARDS: u32 = 10_000;
+
+/// The field of [`EvaluateSettings::times`].
+const TIMES: &str = "evaluate.times";
 
 /// Evaluating models: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -59,6 +62,10 @@ pub struct EvaluateSettings {
     /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
+    /// For shadow networks that are given two-bounce times: what those follow from, as `train.shadow.times`; left out: for each
+    /// model what it was trained with.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub times: String,
     /// The scenes are asked of in so many tasks, 1 to 10,000, whose sums one more task joins: the figures are the same to
     /// the bit. Default 1: one task for all.
     #[serde(default = "one", skip_serializing_if = "is_one")]
@@ -144,6 +151,18 @@ impl TaskKind for EvaluateShardTask {
         self.whole.reads_mut()
     }
 
+    fn reads_beside(&self) -> Option<(&'static str, &String)> {
+        self.whole.reads_beside()
+    }
+
+    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
+        self.whole.reads_beside_mut()
+    }
+
+    fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
+        self.whole.check_among(before)
+    }
+
     fn split(&self) -> Option<&String> {
         self.whole.split()
     }
@@ -155,6 +174,10 @@ impl TaskKind for EvaluateShardTask {
     fn models_mut(&mut self) -> ModelNames<'_> {
         self.whole.models_mut()
     }
+}
+
+fn is_folder(times: &str) -> bool {
+    !times.is_empty() && times != TRUTH
 }
 
 fn default_split() -> String {
@@ -233,6 +256,19 @@ impl TaskKind for EvaluateTask {
         Some(&self.evaluate.split)
     }
 
+    fn reads_beside(&self) -> Option<(&'static str, &String)> {
+        is_folder(&self.evaluate.times).then_some((TIMES, &self.evaluate.times))
+    }
+
+    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
+        is_folder(&self.evaluate.times).then_some((TIMES, &mut self.evaluate.times))
+    }
+
+    /// Depths are predicted by then.
+    fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
+        predicts_depth(self, before)
+    }
+
     fn evaluates(&self) -> &[String] {
         &self.evaluate.models
     }
@@ -268,6 +304,9 @@ impl EvaluateSettings {
         if !(1..=MAX_SHARDS).contains(&self.shards) {
             let what = format!("is {}, expected 1 to {MAX_SHARDS}", self.shards);
             return fail("shards", what);
+        }
+        if !self.times.is_empty() {
+            check_times("evaluate.times", &self.times)?;
         }
         check_split("evaluate.split", &self.split)?;
         if !SIDES.contains(&&*self.side) {

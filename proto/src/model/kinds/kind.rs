@@ -104,13 +104,14 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         None
     }
 
-    /// What is read beside it: a folder of the same store, into which a stage may put something of each scene.
-    fn reads_beside(&self) -> Option<&String> {
+    /// What is read beside it: a folder of the same store, into which a stage may put something of each scene; and the field
+    /// that names it.
+    fn reads_beside(&self) -> Option<(&'static str, &String)> {
         None
     }
 
     /// The same, for the name of a stage to be replaced by its folder.
-    fn reads_beside_mut(&mut self) -> Option<&mut String> {
+    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
         None
     }
 
@@ -276,4 +277,42 @@ pub enum Manifest<'a> {
         /// Its name.
         name: &'a str,
     },
+}
+
+/// Refuses a folder that [`TaskKind::reads_beside`] names where a stage before writes it and predicts no depth. Folders of
+/// which no stage is known are looked at when the stage runs.
+///
+/// # Errors
+/// [`SpecError`] at the field that names it.
+pub(super) fn predicts_depth(
+    task: &dyn TaskKind,
+    before: &[&dyn TaskKind],
+) -> Result<(), SpecError> {
+    let (Some((field, folder)), Some(store)) = (task.reads_beside(), task.shelf()) else {
+        return Ok(());
+    };
+    let Some(writer) = before
+        .iter()
+        .find(|task| task.writes() == Some((store, folder)))
+    else {
+        return Ok(());
+    };
+    let predicts = |model: &String| {
+        let trained = before
+            .iter()
+            .find(|task| task.trains() == Some((store, model)));
+        // Of a model that exists, only the store knows what it predicts.
+        trained.is_none_or(|task| task.predicts() == Some("tof"))
+    };
+    if writer
+        .models()
+        .into_iter()
+        .any(|(_, model)| predicts(model))
+    {
+        return Ok(());
+    }
+    let what = format!(
+        "{folder:?} is written by a stage before this one, and holds no depths; name an infer stage with a \"tof\" model"
+    );
+    Err(SpecError::new(field, what))
 }

@@ -1,4 +1,4 @@
-//! Names of models and splits.
+//! Names of models, splits and predictions.
 
 use crate::model::spec_error::SpecError;
 
@@ -24,5 +24,17 @@ pub(super) fn check_split(field: &str, name: &str) -> Result<(), SpecError> {
         return Ok(());
     }
     let what = format!("{name:?} must be up to 64 letters, digits, '-' and '_'");
+    Err(SpecError::new(field, what))
+}
+
+/// Checks what two-bounce times follow from: `truth`, or the folder of predictions.
+pub(super) fn check_times(field: &str, name: &str) -> Result<(), SpecError> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    if !name.is_empty() && !name.starts_with('.') && name.chars().all(plain) {
+        return Ok(());
+    }
+    let what = format!(
+        "is {name:?}; give \"truth\", an infer stage, or the plain name of a folder that one wrote"
+    );
     Err(SpecError::new(field, what))
 }

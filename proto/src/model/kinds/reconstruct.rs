@@ -123,6 +123,9 @@ fn mlp_bytes(width: u32) -> f64 {
     NETWORKS + NEURON * f64::from(width) + WEIGHT * f64::from(width).powi(2)
 }
 
+/// The field of [`ReconstructSettings::predictions`].
+const PREDICTIONS: &str = "reconstruct.predictions";
+
 impl Declared for ReconstructTask {
     const NAME: &'static str = "reconstruct";
     const FIELDS: &'static [&'static str] = &["source", "count", "reconstruct", "output"];
@@ -217,14 +220,14 @@ impl TaskKind for ReconstructTask {
         Some((&mut self.source, &mut self.count))
     }
 
-    fn reads_beside(&self) -> Option<&String> {
+    fn reads_beside(&self) -> Option<(&'static str, &String)> {
         let folder = &self.reconstruct.predictions;
-        (!folder.is_empty()).then_some(folder)
+        (!folder.is_empty()).then_some((PREDICTIONS, folder))
     }
 
-    fn reads_beside_mut(&mut self) -> Option<&mut String> {
+    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
         let folder = &mut self.reconstruct.predictions;
-        (!folder.is_empty()).then_some(folder)
+        (!folder.is_empty()).then_some((PREDICTIONS, folder))
     }
 
     fn stores_mut(&mut self) -> Vec<(&'static str, &mut String)> {

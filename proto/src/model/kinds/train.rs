@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::{
     fields::Fields,
-    kind::{Declared, Manifest, ModelNames, Results, TaskKind},
+    kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
 };
 use crate::model::{
     limits::check_count,
@@ -28,6 +28,9 @@ pub use settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, SpecularSettings,
     TRUTH, TrainSettings,
 };
+
+/// The field of [`ShadowSettings::times`].
+const TIMES: &str = "train.shadow.times";
 
 /// Training a network: one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -130,6 +133,20 @@ impl TaskKind for TrainTask {
 
     fn network(&self, source: &Shape) -> Option<Network> {
         Some(self.train.network(source))
+    }
+
+    fn reads_beside(&self) -> Option<(&'static str, &String)> {
+        Some((TIMES, self.train.times()?))
+    }
+
+    fn reads_beside_mut(&mut self) -> Option<(&'static str, &mut String)> {
+        self.train.times()?;
+        Some((TIMES, &mut self.train.shadow.times))
+    }
+
+    /// Depths are predicted by then.
+    fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
+        predicts_depth(self, before)
     }
 
     fn models(&self) -> Vec<(&'static str, &String)> {

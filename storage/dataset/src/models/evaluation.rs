@@ -30,6 +30,9 @@ pub struct Evaluation {
     pub scenes: u64,
     /// Name of the histogram that the model saw.
     pub histogram: String,
+    /// For a shadow network that is given two-bounce times: `truth`, or the folder of the predictions that they follow from.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub times: String,
     /// Version of networks and metrics.
     pub code: String,
     /// The figures.

@@ -57,11 +57,23 @@ pub struct Lineage {
     pub code: String,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// Models that it builds on: name, and SHA-256 of the manifest.
+    /// Models that it builds on, that whose predictions it learns from among them: name, and SHA-256 of the manifest.
     pub models: BTreeMap<String, String>,
+    /// For shadows: the predictions that two-bounce times follow from, by their folder and what pins their bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub times: Option<DepthsUsed>,
     /// Where it is another model's copy under a name of its own: how it was chosen.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub promoted: Option<Promoted>,
+}
+
+/// Predicted depths as they were used.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct DepthsUsed {
+    /// Folder of the predictions in the same store.
+    pub predictions: String,
+    /// [`crate::PinnedDepths::id`] of the scenes that were used.
+    pub id: String,
 }
 
 /// What was measured in scenes, as far as experiments differ by it. All zero = not known.

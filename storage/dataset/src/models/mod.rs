@@ -29,7 +29,7 @@ use crate::layout::manifest::{ObjectEntry, sha256_hex};
 use crate::store::objects;
 
 pub use evaluation::Evaluation;
-pub use manifest::{Lineage, Measurement, ModelManifest, Promoted, SplitUsed};
+pub use manifest::{DepthsUsed, Lineage, Measurement, ModelManifest, Promoted, SplitUsed};
 pub use remove::{Dependents, Removed};
 pub use repair::ModelRepair;
 pub use shard::ShardName;

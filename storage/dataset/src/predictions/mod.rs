@@ -12,11 +12,12 @@ mod verify;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures::{StreamExt, TryStreamExt, stream};
+use futures::{FutureExt, StreamExt, TryStreamExt, stream};
 use object_store::ObjectStore;
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
 
 use crate::error::DatasetError;
 use crate::layout::group::{METADATA, create_metadata, is_predictions, pretty};
@@ -57,6 +58,15 @@ pub struct Predicted {
     pub lit: Vec<u8>,
     /// Probability times 255 of a mirror: `[row][column]`.
     pub specular: Vec<u8>,
+}
+
+/// Depths of scenes as they are used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PinnedDepths {
+    /// Pins every byte of them, and the order of the scenes, hexadecimal.
+    pub id: String,
+    /// The model that predicted them; `None` for no scene.
+    pub model: Option<ModelUsed>,
 }
 
 /// Predictions of one scene, ready to be published.
@@ -306,6 +316,101 @@ impl Predictions {
         put_again(&*self.store, &all).await
     }
 
+    /// What pins every byte of the depths of these scenes, in order, and the model that predicted them. `seen` are the scenes'
+    /// manifests as SHA-256, which the model must have seen ([`crate::Pinned::manifests`]). No object is looked at.
+    ///
+    /// # Errors
+    /// [`DatasetError::Invalid`] where there are no depths, or those of another scene or of several models;
+    /// [`DatasetError::NotPublished`], [`DatasetError::Damaged`], [`DatasetError::Store`].
+    pub async fn pin_depths(
+        &self,
+        scenes: &[u64],
+        seen: &[[u8; 32]],
+    ) -> Result<PinnedDepths, DatasetError> {
+        let invalid = |what: String| DatasetError::invalid("predictions", what);
+        if !self.spec.depth {
+            return Err(invalid(format!(
+                "{} holds no depths; give its infer stage a \"tof\" model",
+                self.place()
+            )));
+        }
+        let looks = scenes.iter().map(|scene| self.manifest(*scene).boxed());
+        let looks = stream::iter(looks).buffered(CONCURRENCY);
+        let found: Vec<PredictionManifest> = looks.try_collect().await?;
+        let mut hash = Sha256::new();
+        let mut by: Option<ModelUsed> = None;
+        for (manifest, seen) in found.iter().zip(seen) {
+            if manifest.source.manifest_sha256 != hex::encode(seen) {
+                return Err(invalid(format!(
+                    "{} holds what networks predict of scene {} of {:?}, which is not the scene that is read here; name \
+                     predictions of this data set",
+                    self.place(),
+                    manifest.scene,
+                    manifest.source.dataset,
+                )));
+            }
+            let Some(model) = manifest.models.get("tof") else {
+                return Err(invalid(format!(
+                    "{} does not say which model predicts the depth of scene {}",
+                    self.place(),
+                    manifest.scene
+                )));
+            };
+            match &by {
+                Some(other) if other != model => {
+                    return Err(invalid(format!(
+                        "{} holds depths by {:?} and by {:?}; one model must predict all",
+                        self.place(),
+                        other.name,
+                        model.name
+                    )));
+                }
+                Some(_) => {}
+                None => by = Some(model.clone()),
+            }
+            hash.update(manifest.scene.to_le_bytes());
+            hash.update(Sha256::digest(manifest.to_bytes()));
+        }
+        Ok(PinnedDepths {
+            id: hex::encode(hash.finalize()),
+            model: by,
+        })
+    }
+
+    /// The depth that is predicted of a scene, metres, `[row][column]`, checked against its manifest.
+    ///
+    /// # Errors
+    /// As [`Self::read`]; [`DatasetError::Invalid`] where there are no depths.
+    pub async fn read_depth(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+        let Some(plate) = self.plates.iter().find(|plate| plate.name == "depth") else {
+            let what = format!("{} holds no depths", self.place());
+            return Err(DatasetError::invalid("predictions", what));
+        };
+        let manifest = self.manifest(scene).await?;
+        let values = self.values(plate, &manifest).await?;
+        Ok(bytemuck::pod_collect_to_vec(&values))
+    }
+
+    /// A scene's values of an array, checked against its manifest.
+    async fn values(
+        &self,
+        plate: &Plate,
+        manifest: &PredictionManifest,
+    ) -> Result<Vec<u8>, DatasetError> {
+        let key = plate.key(manifest.scene);
+        let path = self.path(&key);
+        let bytes = objects::require(&*self.store, &path).await?;
+        let hash = sha256_hex(&bytes);
+        let stated = |o: &ObjectEntry| o.key == key && o.sha256 == hash;
+        if !manifest.objects.iter().any(stated) {
+            return Err(DatasetError::Damaged {
+                object: self.shown(&path),
+                what: "its SHA-256 is not the manifest's".into(),
+            });
+        }
+        plate.codec.decode(&bytes)
+    }
+
     /// What is predicted of a scene, checked against its manifest.
     ///
     /// # Errors
@@ -314,17 +419,7 @@ impl Predictions {
         let manifest = self.manifest(scene).await?;
         let mut predicted = Predicted::default();
         for plate in self.plates.iter() {
-            let path = self.path(&plate.key(scene));
-            let bytes = objects::require(&*self.store, &path).await?;
-            let hash = sha256_hex(&bytes);
-            let stated = |o: &&ObjectEntry| o.key == plate.key(scene) && o.sha256 == hash;
-            if manifest.objects.iter().find(stated).is_none() {
-                return Err(DatasetError::Damaged {
-                    object: self.shown(&path),
-                    what: "its SHA-256 is not the manifest's".into(),
-                });
-            }
-            let values = plate.codec.decode(&bytes)?;
+            let values = self.values(plate, &manifest).await?;
             match plate.name {
                 "depth" => predicted.depth_m = bytemuck::pod_collect_to_vec(&values),
                 "lit" => predicted.lit = values,

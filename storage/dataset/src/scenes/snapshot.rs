@@ -32,6 +32,8 @@ pub struct Pinned {
     pub id: String,
     /// Scenes of which something is not known, with [`Manifest::missing`], in their order.
     pub missing: Vec<(u64, Vec<String>)>,
+    /// SHA-256 of each scene's manifest, in their order.
+    pub manifests: Vec<[u8; 32]>,
 }
 
 /// Which scenes a data set had, and which manifests.
@@ -299,9 +301,11 @@ impl Dataset {
         let looks = stream::iter(scenes.iter().map(|scene| look(*scene))).buffered(CONCURRENCY);
         let found: Vec<([u8; 32], Vec<String>)> = looks.try_collect().await?;
         let (mut hash, mut missing) = (Sha256::new(), Vec::new());
+        let mut manifests = Vec::with_capacity(scenes.len());
         for (scene, (manifest, of_scene)) in scenes.iter().zip(found) {
             hash.update(scene.to_le_bytes());
             hash.update(manifest);
+            manifests.push(manifest);
             if !of_scene.is_empty() {
                 missing.push((*scene, of_scene));
             }
@@ -309,6 +313,7 @@ impl Dataset {
         Ok(Pinned {
             id: hex::encode(hash.finalize()),
             missing,
+            manifests,
         })
     }
 

@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use picofarm_dataset::{Dataset, DatasetError, Quantity, SplitUsed, sha256_hex};
+use picofarm_dataset::{Dataset, DatasetError, Predictions, Quantity, SplitUsed, sha256_hex};
 use picofarm_model::scene::{Scene, Scenes};
 use picofarm_proto::{
     model::Histogram,
@@ -31,6 +31,8 @@ pub(super) struct Examples {
     /// The spots whose light the histogram holds; `None` = all.
     spots: Option<Vec<u32>>,
     scenes: Vec<u64>,
+    /// Depths that two-bounce times follow from; the truth's where there are none.
+    depths: Option<Predictions>,
     kept: Mutex<Kept>,
 }
 
@@ -58,7 +60,7 @@ pub(super) struct Sides<const N: usize> {
 }
 
 impl Examples {
-    /// The given scenes with one of the data set's histograms.
+    /// The given scenes with one of the data set's histograms, and true two-bounce times.
     ///
     /// # Errors
     /// [`TaskError::User`] naming the field below `of`, where the data set has no such histogram or spot.
@@ -68,7 +70,7 @@ impl Examples {
         (histogram, spots): (Histogram, &[u32]),
         scenes: Vec<u64>,
         of: &str,
-    ) -> Result<Arc<Self>, TaskError> {
+    ) -> Result<Self, TaskError> {
         let quantity = quantity(histogram);
         let spec = dataset.spec();
         if !spec.quantities().contains(&quantity) {
@@ -91,7 +93,7 @@ impl Examples {
                 spec.spots
             )));
         }
-        Ok(Arc::new(Self {
+        Ok(Self {
             dataset: dataset.clone(),
             runtime: stores.runtime().clone(),
             quantity,
@@ -101,11 +103,18 @@ impl Examples {
                 _ => Some(quantity.spots_of_100().to_vec()),
             },
             scenes,
+            depths: None,
             kept: Mutex::new(Kept {
                 scenes: HashMap::new(),
                 room: (memory_mib() / KEPT_SHARE) as usize * (1 << 20),
             }),
-        }))
+        })
+    }
+
+    /// The same with two-bounce times that follow from these depths; from the truth's where there are none.
+    #[must_use]
+    pub(super) fn timed_by(self, depths: Option<Predictions>) -> Self {
+        Self { depths, ..self }
     }
 
     /// Spots whose light the histogram holds.
@@ -139,8 +148,15 @@ impl Examples {
     async fn scene(&self, scene: u64) -> Result<Scene, DatasetError> {
         let dataset = &self.dataset;
         let spec = dataset.spec();
-        let (histogram, depth, specular, lit, spots, intrinsics) = futures::try_join!(
+        let seen = async {
+            match &self.depths {
+                Some(depths) => depths.read_depth(scene).await.map(Some),
+                None => Ok(None),
+            }
+        };
+        let (histogram, seen_depth_m, depth, specular, lit, spots, intrinsics) = futures::try_join!(
             self.histogram(scene),
+            seen,
             dataset.read::<f32>(scene, Quantity::Depth),
             dataset.read::<u8>(scene, Quantity::Specular),
             dataset.read_visibility(scene),
@@ -171,6 +187,7 @@ impl Examples {
             first_m: spec.gate.start_m,
             bin_width_m: spec.gate.bin_width_m,
             depth_m,
+            seen_depth_m,
             specular,
             spots: spots
                 .iter()

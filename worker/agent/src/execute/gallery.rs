@@ -7,13 +7,14 @@ use picofarm_model::{
     Model,
     report::{Picture, pictures},
 };
-use picofarm_proto::model::{Histogram, train::TRUTH};
+use picofarm_proto::model::Histogram;
 
 use super::{
     Control, TaskError,
     evaluate::trained,
     examples::{Examples, sides},
     output::Stores,
+    times::Times,
     train::{Known, of_model, pin},
     truth,
 };
@@ -45,26 +46,32 @@ pub(super) fn show(
     let found = sides(stores, &dataset, split, [&*evaluation.side], control)?;
     let [mut scenes] = found.scenes;
     scenes.truncate(count);
-    let read = |name: &str| Known::read(stores, &models, ("report", name), dataset.spec(), control);
-    let known = read(&evaluation.model)?;
+    let model = ("report", &*evaluation.model);
+    let known = Known::read(stores, &models, model, dataset.spec(), control)?;
     let settings = trained(&known.manifest.settings)
         .map_err(|what| TaskError::User(format!("{}: its settings: {what}", evaluation.model)))?;
     let pinned = pin(stores, &dataset, &scenes, control)?;
+    let times = match &*evaluation.times {
+        "" => None,
+        name => Some(Times::of(
+            stores,
+            store,
+            &dataset,
+            ("report", name),
+            control,
+        )?),
+    };
     truth::check(
         &dataset.place(),
-        &truth::of_training(&settings),
+        &truth::of_training(&settings, times.as_ref().is_some_and(Times::are_true)),
         &pinned.missing,
     )?;
-    let guide = match &*settings.shadow.tof {
-        TRUTH => None,
-        tof => Some(read(tof)?),
-    };
+    let depths = times.and_then(|times| times.predictions);
     let histogram = Histogram::parse(&evaluation.histogram).map_err(TaskError::User)?;
     let indices: Vec<usize> = (0..scenes.len()).collect();
     let histogram = (histogram, &*settings.spots);
-    let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?;
-    let guide = guide.as_ref().map(|guide| &*guide.model);
-    let pictures = pictures(&known.model, guide, &*examples, &indices, 2).map_err(of_model)?;
+    let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?.timed_by(depths);
+    let pictures = pictures(&known.model, &examples, &indices, 2).map_err(of_model)?;
     Ok(Shown {
         side: dataset.spec().height as usize,
         model: known.model,

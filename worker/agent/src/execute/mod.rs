@@ -14,6 +14,8 @@ mod scenes;
 mod submission;
 mod subsets;
 #[cfg(feature = "networks")]
+mod times;
+#[cfg(feature = "networks")]
 mod truth;
 
 pub use picofarm_session::{Control, Executor, Output, Task, TaskError};

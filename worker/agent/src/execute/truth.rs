@@ -1,10 +1,7 @@
 //! What a stage needs to be known of scenes. Imports may lack some of the truth; what is stored in its place stands for
 //! nothing, and a network would learn it as if it were true.
 
-use picofarm_proto::model::{
-    TrainSettings,
-    train::{ShadowVariant, TRUTH, Target},
-};
+use picofarm_proto::model::{TrainSettings, train::Target};
 
 use super::TaskError;
 
@@ -44,7 +41,7 @@ impl Need {
             Self::Depth => ("a \"tof\" network learns it and is judged by it", own),
             Self::DepthOfTimes => (
                 "the shadow network is given two-bounce times that follow from it",
-                "import these scenes with it, or take the times from a \"tof\" model",
+                "import these scenes with it, or take the times from what a \"tof\" model predicts",
             ),
             Self::Visibility => ("a \"shadow\" network learns it and is judged by it", own),
             Self::Specular => ("a \"specular\" network learns it and is judged by it", own),
@@ -65,15 +62,14 @@ pub(super) fn of_times(timed: bool, from_truth: bool) -> Vec<Need> {
     }
 }
 
-/// What a network of these settings is trained and judged with.
-pub(super) fn of_training(settings: &TrainSettings) -> Vec<Need> {
+/// What a network of these settings is trained and judged with; its two-bounce times follow from the truth's depth or not.
+pub(super) fn of_training(settings: &TrainSettings, from_truth: bool) -> Vec<Need> {
     match settings.target {
         Target::Tof => vec![Need::Depth],
         Target::Specular => vec![Need::Specular],
         Target::Shadow => {
-            let variant = settings.shadow.variant;
-            let timed = matches!(variant, ShadowVariant::Concat | ShadowVariant::Difference);
-            let mut needs = of_times(timed, settings.shadow.tof == TRUTH);
+            let timed = settings.shadow.variant.is_timed();
+            let mut needs = of_times(timed, from_truth);
             needs.insert(0, Need::Visibility);
             needs
         }

@@ -242,15 +242,38 @@ impl Place {
         StageSpec::new(TaskSpec::Report(ReportTask { report }))
     }
 
-    /// Trains a network of each kind: `m`, `sh` on its depths, `s` on its features.
+    /// Trains a network of each kind: `m`, `sh` on its depths in `depths`, `s` on its features.
     pub async fn train_all(&self) {
         let short = json!({"epochs": 10, "batch": 2});
+        run(self.training(json!({"optimise": short})))
+            .await
+            .unwrap();
+        self.predict("m", "depths").await;
         for settings in [
-            json!({"optimise": short}),
-            json!({"target": "shadow", "model": "sh", "shadow": {"tof": "m"}, "optimise": short}),
+            json!({"target": "shadow", "model": "sh", "shadow": {"times": "depths"}, "optimise": short}),
             json!({"target": "specular", "model": "s", "specular": {"on": "m"}, "optimise": short}),
         ] {
             run(self.training(settings)).await.unwrap();
+        }
+    }
+
+    /// The same by a model that is trained for it.
+    pub async fn predict_with(&self, mut settings: serde_json::Value, folder: &str) {
+        settings["optimise"] = json!({"epochs": 10, "batch": 2});
+        let model = settings["model"].as_str().unwrap().to_owned();
+        run(self.training(settings)).await.unwrap();
+        self.predict(&model, folder).await;
+    }
+
+    /// Puts what a model predicts of every scene into a folder.
+    pub async fn predict(&self, model: &str, folder: &str) {
+        let mut stage = self.inference(json!({"models": [model]}));
+        let TaskSpec::Infer(task) = &mut stage.task else {
+            panic!("{stage:?}")
+        };
+        task.output.dataset = folder.into();
+        for scene in 0..SCENES {
+            run_at(stage.clone(), scene, Arc::default()).await.unwrap();
         }
     }
 

@@ -33,7 +33,7 @@ pub struct Batch {
     pub target: Vec<f32>,
 }
 
-/// Adds a visit to a batch. `depth_m` is what two-bounce times follow from; the truth where it is none.
+/// Adds a visit to a batch.
 ///
 /// # Errors
 /// [`ModelError::Invalid`] where the scene has another size than the batch, or not what the question needs.
@@ -41,7 +41,6 @@ pub fn example(
     batch: &mut Batch,
     question: &Question,
     scene: &Scene,
-    depth_m: Option<&[f32]>,
     visit: Visit,
 ) -> Result<(), ModelError> {
     check(batch, question, scene)?;
@@ -63,10 +62,7 @@ pub fn example(
     if question.by_spot() {
         match question.variant {
             ShadowVariant::Concat | ShadowVariant::Difference => {
-                let tof = match depth_m {
-                    Some(depth_m) => scene.tof_of(visit.spot, depth_m),
-                    None => scene.tof(visit.spot),
-                };
+                let tof = scene.tof(visit.spot);
                 let bins = tof.iter().map(|t| bin(scene, question.bins, *t));
                 if question.variant == ShadowVariant::Concat {
                     let from = batch.one_hot.len();
@@ -154,6 +150,11 @@ fn check(batch: &Batch, question: &Question, scene: &Scene) -> Result<(), ModelE
     let wanted = [
         ("histogram", scene.histogram.len(), pixels * scene.bins),
         ("depth", scene.depth_m.len(), pixels),
+        (
+            "depth by a network",
+            scene.seen_depth_m.as_ref().map_or(pixels, Vec::len),
+            pixels,
+        ),
         (
             "specular mask",
             scene.specular.len(),

@@ -80,11 +80,7 @@ impl Question {
 
     /// Whether it is given two-bounce times.
     pub fn timed(&self) -> bool {
-        let given = matches!(
-            self.variant,
-            ShadowVariant::Concat | ShadowVariant::Difference
-        );
-        self.target == Target::Shadow && given
+        self.target == Target::Shadow && self.variant.is_timed()
     }
 
     /// Whether mirrored scenes may be shown: not where spots are known by their number, because a mirrored spot is at

@@ -107,13 +107,11 @@ fn read<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<f32>, D::Error> {
 }
 
 /// Examples of a model: of the scenes with these indices, and of each the first `spots` spots where shadows are asked.
-/// `guide` as in [`crate::evaluate`].
 ///
 /// # Errors
 /// [`ModelError::Scene`], [`ModelError::Invalid`] for scenes that do not fit the model or are not there.
 pub fn pictures(
     model: &Model,
-    guide: Option<&Model>,
     scenes: &dyn Scenes,
     indices: &[usize],
     spots: usize,
@@ -133,7 +131,7 @@ pub fn pictures(
         intensity(&scene, &mut seen);
         let plane = |values: Vec<f32>| Plane::new(scene.width, scene.height, values);
         let mut planes = Vec::new();
-        answers(model, guide, &scene, &mut |said, batch| {
+        answers(model, &scene, &mut |said, batch| {
             let both = said
                 .chunks_exact(pixels)
                 .zip(batch.target.chunks_exact(pixels));

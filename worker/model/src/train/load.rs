@@ -4,7 +4,7 @@
 //! out does not depend on the number of threads.
 
 use std::{
-    collections::{BTreeMap, HashMap},
+    collections::BTreeMap,
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     thread,
 };
@@ -13,15 +13,11 @@ use super::{Plan, order, position::Position};
 use crate::{
     ModelError,
     input::{Batch, Visit, example},
-    model::Model,
-    scene::{Scene, Scenes},
+    scene::Scenes,
 };
 
 /// Batches of examples that wait for the network, at most.
 const AHEAD: usize = 2;
-
-/// Depths that a guide keeps: 1 GiB of them.
-const MOST_KNOWN: usize = 1 << 28;
 
 /// How examples are made ready for the network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,36 +35,6 @@ impl Default for Loading {
             threads: rayon::current_num_threads(),
             room: 1 << 30,
         }
-    }
-}
-
-/// A depth network that two-bounce times follow from, instead of from the truth.
-pub struct Guide {
-    model: Arc<Model>,
-    known: Mutex<HashMap<usize, Arc<Vec<f32>>>>,
-}
-
-impl Guide {
-    /// A guide that has looked at nothing yet.
-    pub fn new(model: Arc<Model>) -> Self {
-        Self {
-            model,
-            known: Mutex::default(),
-        }
-    }
-
-    /// Its depths of a scene, metres; asked for once, while there is room to keep them.
-    fn depth_m(&self, index: usize, scene: &Scene) -> Result<Arc<Vec<f32>>, ModelError> {
-        let lock = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(known) = lock().get(&index) {
-            return Ok(Arc::clone(known));
-        }
-        let depth = Arc::new(self.model.depth_m(scene)?);
-        let mut known = lock();
-        if (known.len() + 1) * depth.len() <= MOST_KNOWN {
-            known.insert(index, Arc::clone(&depth));
-        }
-        Ok(depth)
     }
 }
 
@@ -121,7 +87,6 @@ impl<'a> Course<'a> {
 /// What examples are made of.
 pub(super) struct Making<'a> {
     pub(super) plan: &'a Plan,
-    pub(super) guide: Option<&'a Guide>,
     pub(super) scenes: &'a dyn Scenes,
     /// The visits, in order: which scene, and how.
     pub(super) visit: &'a (dyn Fn(u64) -> (usize, Visit) + Sync),
@@ -178,13 +143,8 @@ impl Making<'_> {
             scene: index,
             source,
         })?;
-        let depth = match self.guide {
-            Some(guide) => Some(guide.depth_m(index, &scene)?),
-            None => None,
-        };
-        let depth = depth.as_ref().map(|d| d.as_slice());
         let mut made = Batch::default();
-        example(&mut made, &self.plan.question, &scene, depth, visit)?;
+        example(&mut made, &self.plan.question, &scene, visit)?;
         *bytes = scene.bytes() + made.bytes();
         Ok(made)
     }

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 pub use checkpoint::left_by;
 pub use learner::{Gradients, Learner, predict};
-pub use load::{Guide, Loading};
+pub use load::Loading;
 pub use picofarm_settings::Schedule;
 pub use position::{Line, Position};
 pub use run::{Control, Ended, Event, Sources, Trained, Training};

@@ -10,7 +10,7 @@ use burn::tensor::Device;
 use super::{
     Plan, checkpoint,
     learner::{Gradients, Learner},
-    load::{Course, Guide, Loading, Making, Ready},
+    load::{Course, Loading, Making, Ready},
     position::{Line, Position},
     schedule,
 };
@@ -18,7 +18,7 @@ use crate::{
     ModelError,
     input::Visit,
     metric::{Metrics, Tally},
-    model::{Model, PLAN},
+    model::PLAN,
     net::Net,
     parameters::Parameters,
     scene::Scenes,
@@ -71,8 +71,6 @@ pub struct Sources {
     pub train: Arc<dyn Scenes>,
     /// Scenes to look at after each epoch; may be none.
     pub validation: Arc<dyn Scenes>,
-    /// For shadows: the depth network that two-bounce times follow from; the truth where there is none.
-    pub guide: Option<Arc<Model>>,
 }
 
 /// A training.
@@ -224,24 +222,20 @@ impl Training {
         }
         let plan = self.plan.clone();
         let train = Arc::clone(&self.sources.train);
-        // One for each set of scenes: what it knows of them is kept by their number.
-        let [guide, of_validation] = [(); 2].map(|()| self.sources.guide.clone().map(Guide::new));
         let course = Course::new(&plan, train.len(), &self.position);
         let making = Making {
             plan: &plan,
-            guide: guide.as_ref(),
             scenes: &*train,
             visit: &|which| course.visit(which),
             count: course.len(),
             loading: self.loading,
         };
-        making.ahead(|ready| self.learn(ready, of_validation.as_ref(), say))
+        making.ahead(|ready| self.learn(ready, say))
     }
 
     fn learn(
         &mut self,
         ready: &Ready<'_>,
-        guide: Option<&Guide>,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
     ) -> Result<Ended, ModelError> {
         let mut clock = Clock::new();
@@ -273,7 +267,7 @@ impl Training {
             }];
             if self.position.batches == per_epoch {
                 let since = Instant::now();
-                events.push(Event::Epoch(self.end_epoch(pace.learning_rate, guide)?));
+                events.push(Event::Epoch(self.end_epoch(pace.learning_rate)?));
                 clock.began += since.elapsed();
             }
             for event in &events {
@@ -289,10 +283,10 @@ impl Training {
         self.position.epoch == self.plan.epochs || self.position.stopped_early
     }
 
-    fn end_epoch(&mut self, learning_rate: f64, guide: Option<&Guide>) -> Result<Line, ModelError> {
+    fn end_epoch(&mut self, learning_rate: f64) -> Result<Line, ModelError> {
         let validation = match self.sources.validation.is_empty() {
             true => None,
-            false => Some(self.validate(guide)?),
+            false => Some(self.validate()?),
         };
         let position = &mut self.position;
         let line = Line {
@@ -325,7 +319,7 @@ impl Training {
     }
 
     /// Figures on the validation scenes, as they are; of each scene another spot, always the same.
-    fn validate(&self, guide: Option<&Guide>) -> Result<Metrics, ModelError> {
+    fn validate(&self) -> Result<Metrics, ModelError> {
         let scenes = &*self.sources.validation;
         let mut tally = Tally::default();
         let question = &self.plan.question;
@@ -343,7 +337,6 @@ impl Training {
         };
         let making = Making {
             plan: &self.plan,
-            guide,
             scenes,
             visit: &visit,
             count: scenes.len() as u64,

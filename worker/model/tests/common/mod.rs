@@ -55,7 +55,6 @@ pub fn sources() -> Sources {
     Sources {
         train: Arc::new(scenes(0, 9)),
         validation: Arc::new(scenes(100, 3)),
-        guide: None,
     }
 }
 

@@ -7,7 +7,7 @@ use super::settings::{
 };
 use crate::model::{
     kinds::{
-        names::{check_model, check_split},
+        names::{check_model, check_split, check_times},
         reprocess::Histogram,
     },
     spec_error::{SpecError, within},
@@ -46,9 +46,14 @@ impl TrainSettings {
             let what = "is not for a network on the features of another (train.specular.on); remove one of them";
             return fail("from", what.into());
         }
-        if self.shadow.tof.is_empty() {
-            let what = "is empty; give \"truth\" or a trained ToF model".into();
-            return fail("shadow.tof", what);
+        check_times("train.shadow.times", &self.shadow.times)?;
+        if self.times().is_some() && !self.shadow.variant.is_timed() {
+            let what = format!(
+                "is {:?}, but a network of variant {:?} is given no times; leave it out",
+                self.shadow.times,
+                self.shadow.variant.name()
+            );
+            return fail("shadow.times", what);
         }
         if let Some(trial) = &self.trial {
             trial.check()?;

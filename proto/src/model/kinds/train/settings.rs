@@ -123,8 +123,9 @@ pub struct NetSettings {
 pub struct ShadowSettings {
     /// What the network is given of a spot.
     pub variant: ShadowVariant,
-    /// Where the two-bounce times come from: `truth`, or a trained ToF model, or the stage that trains it.
-    pub tof: String,
+    /// What two-bounce times follow from: the depths of the `truth`, or those of an infer stage, or of the folder in the source's
+    /// store that one wrote.
+    pub times: String,
 }
 
 /// What mirrors are predicted from.
@@ -176,7 +177,7 @@ impl Default for ShadowSettings {
     fn default() -> Self {
         Self {
             variant: ShadowVariant::Concat,
-            tof: TRUTH.into(),
+            times: TRUTH.into(),
         }
     }
 }
@@ -196,7 +197,7 @@ impl Default for OptimiseSettings {
     }
 }
 
-/// [`ShadowSettings::tof`] where two-bounce times are the ground truth's.
+/// [`ShadowSettings::times`] where two-bounce times are the ground truth's.
 pub const TRUTH: &str = "truth";
 
 fn default_split() -> String {
@@ -275,12 +276,14 @@ impl TrainSettings {
         settings
     }
 
+    /// The folder of predictions that two-bounce times follow from, if any.
+    pub fn times(&self) -> Option<&String> {
+        Some(&self.shadow.times).filter(|times| *times != TRUTH)
+    }
+
     /// The models that it builds on: field and name.
     pub fn models(&self) -> Vec<(&'static str, &String)> {
         let mut models = Vec::new();
-        if self.shadow.tof != TRUTH {
-            models.push(("train.shadow.tof", &self.shadow.tof));
-        }
         if !self.specular.on.is_empty() {
             models.push(("train.specular.on", &self.specular.on));
         }
@@ -293,9 +296,6 @@ impl TrainSettings {
     /// The same, to be filled in.
     pub(crate) fn models_mut(&mut self) -> Vec<(&'static str, &mut String)> {
         let mut models = Vec::new();
-        if self.shadow.tof != TRUTH {
-            models.push(("train.shadow.tof", &mut self.shadow.tof));
-        }
         if !self.specular.on.is_empty() {
             models.push(("train.specular.on", &mut self.specular.on));
         }

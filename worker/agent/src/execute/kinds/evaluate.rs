@@ -9,7 +9,7 @@ use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed
 use picofarm_model::{Answered, Evaluated, answered, baseline::Baseline};
 use picofarm_proto::{
     key::evaluation_key,
-    model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings, train::TRUTH},
+    model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -20,6 +20,7 @@ use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
     examples::{Examples, first, sides},
     output::Stores,
+    times::Times,
     train::{Known, at, model_version, of_model, pin},
     truth,
 };
@@ -122,7 +123,8 @@ struct Asked {
     /// Which of the evaluation's.
     which: usize,
     model: Known,
-    guide: Option<Known>,
+    /// For a shadow network that is given two-bounce times.
+    times: Option<Times>,
     histogram: Histogram,
     spots: Vec<u32>,
     sha256: String,
@@ -180,24 +182,42 @@ impl<'a> EvaluationRun<'a> {
             None => (trained.histogram, trained.spots.clone()),
         };
         let place = self.dataset.place();
-        // Trivial answers are fitted to the training scenes.
-        for missing in [&self.data.missing, &self.known_data.missing] {
-            truth::check(&place, &truth::of_training(&trained), missing)?;
-        }
-        let guide = match &*trained.shadow.tof {
-            TRUTH => None,
-            tof => {
-                let field = format!("{field}: its two-bounce times");
-                Some(Known::read(stores, models, (&field, tof), spec, control)?)
-            }
+        let at_times = match &*settings.times {
+            "" => (
+                format!("{field}: its two-bounce times (evaluate.times gives others)"),
+                &*trained.shadow.times,
+            ),
+            name => ("evaluate.times".to_owned(), name),
+        };
+        let (store, timed) = (&self.task.source.store, model.model.question().timed());
+        let at_times = (&*at_times.0, at_times.1);
+        let times = timed.then(|| Times::of(stores, store, &self.dataset, at_times, control));
+        let times = times.transpose()?;
+        let from_truth = times.as_ref().is_some_and(Times::are_true);
+        truth::check(
+            &place,
+            &truth::of_training(&trained, from_truth),
+            &self.data.missing,
+        )?;
+        // Trivial answers are fitted to the training scenes, and need no times.
+        truth::check(
+            &place,
+            &truth::of_training(&trained, false),
+            &self.known_data.missing,
+        )?;
+        let pinned = match &times {
+            None => String::new(),
+            Some(times) => times
+                .pin(stores, at_times.0, &self.scenes, &self.data, control)?
+                .map_or_else(|| times.name.clone(), |depths| depths.id),
         };
         let (sha256, version) = (model.manifest.sha256(), &settings.version);
         let data = [&*self.data.id, &self.known_data.id];
         Ok(Asked {
-            key: evaluation_key(&sha256, data, histogram, &spots, version).to_string(),
+            key: evaluation_key(&sha256, data, &pinned, histogram, &spots, version).to_string(),
             which,
             model,
-            guide,
+            times,
             histogram,
             spots,
             sha256,
@@ -247,6 +267,10 @@ impl<'a> EvaluationRun<'a> {
             side: settings.side.clone(),
             scenes: self.scenes.len() as u64,
             histogram: asked.histogram.name().to_owned(),
+            times: asked
+                .times
+                .as_ref()
+                .map_or_else(String::new, |times| times.name.clone()),
             code: settings.version.clone(),
             metrics,
         };
@@ -331,7 +355,9 @@ impl<'a> EvaluationRun<'a> {
                 "evaluate",
             )
         };
-        let scenes = examples(&self.scenes[self.range(shard)])?;
+        let depths = asked.times.as_ref();
+        let depths = depths.and_then(|times| times.predictions.clone());
+        let scenes = examples(&self.scenes[self.range(shard)])?.timed_by(depths);
         let spots = model.model.question().spots;
         if spots > 0 && spots != scenes.spots() {
             return Err(TaskError::User(format!(
@@ -342,7 +368,7 @@ impl<'a> EvaluationRun<'a> {
         }
         let target = model.model.question().target;
         let baseline =
-            Baseline::fit(target, &*examples(&self.known)?, BASELINE).map_err(of_model)?;
+            Baseline::fit(target, &examples(&self.known)?, BASELINE).map_err(of_model)?;
         let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
         let mut tell = |scene: usize, of: usize| {
             let share = (which as f32 + scene as f32 / of as f32) / count as f32;
@@ -350,8 +376,7 @@ impl<'a> EvaluationRun<'a> {
             control.say(text, &[]);
             control.at(share * 0.99)
         };
-        let guide = asked.guide.as_ref().map(|guide| &*guide.model);
-        answered(&model.model, guide, &baseline, &*scenes, &mut tell)
+        answered(&model.model, &baseline, &scenes, &mut tell)
             .map_err(of_model)?
             .ok_or(TaskError::Stopped)
     }

@@ -1,7 +1,7 @@
 //! Inference: what trained models see in a scene, kept beside the data set. Adopt, or ask each model and publish.
 //!
 //! A shadow network that is given two-bounce times is given those that follow from the depths of the stage's own ToF model;
-//! where the stage has none, those it is evaluated with: of the ToF model that it was trained with, or the truth's.
+//! where the stage has none, those that it was trained with: from predictions of the data set, or the truth's.
 
 use std::{
     collections::BTreeMap,
@@ -61,7 +61,7 @@ impl RunTask for InferTask {
         let models = stores
             .source_models(&place.store)
             .map_err(|e| at("source.store", e))?;
-        let panel = Panel::of(stores, &models, &dataset, task, control)?;
+        let panel = Panel::of(stores, &models, &dataset, (task, &found), control)?;
         truth::check(
             &dataset.place(),
             &panel.needs(),
@@ -151,9 +151,11 @@ impl Panel {
             let depth = match &self.times {
                 None | Some(Times::Truth) => None,
                 Some(Times::Own) => Some(predicted.depth_m.clone()),
-                Some(Times::Other(tof)) => Some(asked.depth(tof)?),
+                Some(Times::Kept(depths, _)) => {
+                    Some(stores.wait(control, depths.read_depth(index))?)
+                }
             };
-            predicted.lit = asked.masks(shadow, depth.as_deref(), 0.3..0.8)?;
+            predicted.lit = asked.masks(shadow, depth, 0.3..0.8)?;
         }
         if let Some(specular) = &self.specular {
             predicted.specular = asked.masks(specular, None, 0.8..ASKED)?;
@@ -217,13 +219,21 @@ impl Asked<'_> {
         model.depth_m(&scene).map_err(of_model)
     }
 
+    /// Two-bounce times follow from `depth_m`, where there is some.
     fn masks(
         &mut self,
         member: &Member,
-        depth_m: Option<&[f32]>,
+        depth_m: Option<Vec<f32>>,
         share: std::ops::Range<f32>,
     ) -> Result<Vec<u8>, TaskError> {
-        let (model, scene) = (self.model(member)?, self.scene(member)?);
+        let (model, mut scene) = (self.model(member)?, self.scene(member)?);
+        if depth_m.is_some() {
+            // The scene is not copied: nothing else has it in hand.
+            self.seen.retain(|(_, other)| !Arc::ptr_eq(other, &scene));
+            Arc::make_mut(&mut scene).seen_depth_m = depth_m;
+            let shown = (member.histogram, member.spots.clone());
+            self.seen.push((shown, scene.clone()));
+        }
         let name = &member.checked.manifest.name;
         let mut tell = |mask: usize, of: usize| {
             let text = match of {
@@ -235,7 +245,7 @@ impl Asked<'_> {
             self.control
                 .at(share.start + part * (share.end - share.start))
         };
-        let said = masks(&model, depth_m, &scene, &mut tell).map_err(of_model)?;
+        let said = masks(&model, &scene, &mut tell).map_err(of_model)?;
         said.ok_or(TaskError::Stopped)
     }
 

@@ -280,15 +280,16 @@ fn describe(entry: &mut Entry, manifest: &ModelManifest, evaluation: Option<&Eva
         let histogram = histogram.to_owned();
         entry.conditions.push(("histogram".into(), histogram));
     }
-    if let Some(tof) = setting("/shadow/tof") {
-        let tof = if tof == TRUTH {
-            "the truth"
-        } else {
-            "a depth network"
+    let times = evaluation
+        .map(|e| &*e.times)
+        .filter(|times| !times.is_empty());
+    if let Some(times) = times.or_else(|| setting("/shadow/times")) {
+        let from = match times {
+            TRUTH => "the truth",
+            _ => "a depth network",
         };
-        entry
-            .conditions
-            .push(("two-bounce times from".into(), tof.into()));
+        let from = ("two-bounce times from".into(), from.into());
+        entry.conditions.push(from);
     }
     if setting("/from").is_some() {
         entry.conditions.push(("begins".into(), "trained".into()));

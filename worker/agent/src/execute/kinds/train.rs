@@ -47,6 +47,7 @@ use crate::execute::{
     Context, Control, Output, RunTask, Task, TaskError,
     examples::{Examples, first, sides},
     output::{Stores, of_dataset},
+    times::Times,
     truth,
 };
 
@@ -126,14 +127,21 @@ impl<'a> TrainingRun<'a> {
         let built = read_models(stores, &models, settings, &spec, control)?;
         let pin = |scenes: &[u64]| pin(stores, &dataset, scenes, control);
         let pins = [pin(&training)?, pin(&validation)?];
-        let needs = truth::of_training(settings);
+        let named = ("train.shadow.times", &*settings.shadow.times);
+        let times = Times::of(stores, &place.store, &dataset, named, control)?;
+        let needs = truth::of_training(settings, times.are_true());
         for pinned in &pins {
             truth::check(&dataset.place(), &needs, &pinned.missing)?;
         }
         let mut used: Vec<u64> = training.iter().chain(&validation).copied().collect();
         used.sort_unstable();
+        let data = pin(&used)?;
+        let depths = times.pin(stores, named.0, &used, &data, control)?;
         let histogram = (settings.histogram, &*settings.spots);
-        let examples = |scenes| Examples::new(stores, &dataset, histogram, scenes, "train");
+        let examples = |scenes| {
+            let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?;
+            Ok(Arc::new(scenes.timed_by(times.predictions.clone())))
+        };
         let shown = training.first().copied();
         let [training_scenes, validation_scenes] = [&training, &validation].map(|s| s.len() as u64);
         let (training, validation) = (examples(training)?, examples(validation)?);
@@ -146,11 +154,13 @@ impl<'a> TrainingRun<'a> {
         };
         let manifests = built.iter().map(|(field, known)| (*field, &known.manifest));
         let by_field = manifests.clone().map(|(field, m)| (field, m.sha256()));
-        let by_field: BTreeMap<&str, String> = by_field.collect();
+        let predicted = depths.iter().map(|depths| (named.0, depths.id.clone()));
+        let by_field: BTreeMap<&str, String> = by_field.chain(predicted).collect();
+        let tof = depths.as_ref().and_then(|depths| depths.model.as_ref());
         let key = training_key(settings, [&pins[0].id, &pins[1].id], &by_field).to_string();
         let lineage = Lineage {
             dataset: place.dataset.clone(),
-            data: pin(&used)?.id,
+            data: data.id,
             split: sides.split,
             measurement,
             training_scenes,
@@ -159,7 +169,9 @@ impl<'a> TrainingRun<'a> {
             seed: settings.seed,
             models: manifests
                 .map(|(_, m)| (m.name.clone(), m.sha256()))
+                .chain(tof.map(|tof| (tof.name.clone(), tof.manifest_sha256.clone())))
                 .collect(),
+            times: times.used(depths.as_ref()),
             promoted: None,
         };
         Ok(Self {
@@ -296,11 +308,9 @@ impl<'a> TrainingRun<'a> {
     ) -> Result<Result<Trained, Left>, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
         let device = self.device()?;
-        let guide = self.built.get("train.shadow.tof");
         let sources = Sources {
             train: self.training.clone(),
             validation: self.validation.clone(),
-            guide: guide.map(|tof| tof.model.clone()),
         };
         let from = ["train.from", "train.specular.on"];
         let from = from.iter().find_map(|field| self.built.get(*field));

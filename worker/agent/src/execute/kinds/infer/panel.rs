@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 use picofarm_dataset::{
-    Dataset, Manifest, ModelUsed, Models, PredictionManifest, PredictionSpec, SceneUsed, TimesUsed,
+    Dataset, Manifest, ModelUsed, Models, PinnedDepths, PredictionManifest, PredictionSpec,
+    Predictions, SceneUsed, TimesUsed,
 };
-use picofarm_model::input::ShadowVariant;
 use picofarm_proto::{
     key::inference_key,
     model::{
@@ -19,6 +19,7 @@ use crate::execute::{
     evaluate::trained,
     examples::Examples,
     output::{Stores, manifest_sha256},
+    times,
     train::CheckedModel,
     truth::{self, Need},
 };
@@ -42,7 +43,7 @@ pub(super) struct Panel {
     pub(super) tof: Option<Member>,
     pub(super) shadow: Option<Member>,
     pub(super) specular: Option<Member>,
-    /// Whether the shadow network is given two-bounce times, and by which model where by none of the stage's.
+    /// What two-bounce times follow from, where the shadow network is given some.
     pub(super) times: Option<Times>,
 }
 
@@ -51,8 +52,8 @@ pub(super) enum Times {
     Truth,
     /// The stage's own ToF model.
     Own,
-    /// The one that the shadow network was trained with.
-    Other(Box<Member>),
+    /// Predictions of the scene that are kept, as the shadow network was trained with.
+    Kept(Predictions, PinnedDepths),
 }
 
 impl Panel {
@@ -60,11 +61,11 @@ impl Panel {
         stores: &Stores,
         models: &Models,
         dataset: &Dataset,
-        task: &InferTask,
+        (task, found): (&InferTask, &Manifest),
         control: &Control,
     ) -> Result<Self, TaskError> {
         let mut by_kind: BTreeMap<String, Member> = BTreeMap::new();
-        let mut tof_of_shadow = TRUTH.to_owned();
+        let mut times_of_shadow = TRUTH.to_owned();
         for (i, name) in task.infer.models.iter().enumerate() {
             let field = format!("infer.models[{i}]");
             let checked =
@@ -80,7 +81,7 @@ impl Panel {
             };
             let kind = checked.manifest.kind.clone();
             if kind == Target::Shadow.name() {
-                tof_of_shadow = settings.shadow.tof;
+                times_of_shadow = settings.shadow.times;
             }
             let member = Member::new(stores, dataset, field, checked, (histogram, spots))?;
             if let Some(other) = by_kind.insert(kind.clone(), member) {
@@ -97,21 +98,25 @@ impl Panel {
             take(Target::Shadow),
             take(Target::Specular),
         );
-        let timed = |member: &&Member| {
-            let variant = member.checked.plan.question.variant;
-            matches!(variant, ShadowVariant::Concat | ShadowVariant::Difference)
-        };
+        let timed = |member: &&Member| member.checked.plan.question.timed();
         let times = match (shadow.as_ref().filter(timed), &tof) {
             (None, _) => None,
             (Some(_), Some(_)) => Some(Times::Own),
-            (Some(_), None) if tof_of_shadow == TRUTH => Some(Times::Truth),
+            (Some(_), None) if times_of_shadow == TRUTH => Some(Times::Truth),
             (Some(shadow), None) => {
-                let field = format!("{}: its two-bounce times", shadow.field);
-                let at = (&*field, &*tof_of_shadow);
-                let checked = CheckedModel::look(stores, models, at, dataset.spec(), control)?;
-                let shown = (shadow.histogram, shadow.spots.clone());
-                let member = Member::new(stores, dataset, field, checked, shown)?;
-                Some(Times::Other(Box::new(member)))
+                let field = format!(
+                    "{}: its two-bounce times (a \"tof\" model in infer.models gives others)",
+                    shadow.field
+                );
+                let (store, named) = (&task.source.store, (&*field, &*times_of_shadow));
+                let times = times::Times::of(stores, store, dataset, named, control)?;
+                let scene = [found.scene];
+                let seen = stores.wait(control, dataset.pin(&scene))?;
+                let pinned = times.pin(stores, &field, &scene, &seen, control)?;
+                times
+                    .predictions
+                    .zip(pinned)
+                    .map(|(p, d)| Times::Kept(p, d))
             }
         };
         Ok(Self {
@@ -165,7 +170,7 @@ impl Panel {
             None => None,
             Some(Times::Truth) => Some(TimesUsed::Truth),
             Some(Times::Own) => self.tof.as_ref().map(|tof| TimesUsed::Model(tof.used())),
-            Some(Times::Other(tof)) => Some(TimesUsed::Model(tof.used())),
+            Some(Times::Kept(_, pinned)) => pinned.model.clone().map(TimesUsed::Model),
         };
         let source = SceneUsed {
             dataset: task.source.dataset.clone(),
@@ -179,10 +184,11 @@ impl Panel {
                 (sha256, member.histogram, member.spots.clone()),
             )
         });
-        let times_of = match &times {
-            None => "",
-            Some(TimesUsed::Truth) => TRUTH,
-            Some(TimesUsed::Model(model)) => &model.manifest_sha256,
+        let times_of = match (&self.times, &times) {
+            (Some(Times::Kept(_, pinned)), _) => &*pinned.id,
+            (_, None) => "",
+            (_, Some(TimesUsed::Truth)) => TRUTH,
+            (_, Some(TimesUsed::Model(model))) => &model.manifest_sha256,
         };
         let version = &task.infer.version;
         let shown = shown.collect();

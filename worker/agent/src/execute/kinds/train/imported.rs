@@ -44,10 +44,11 @@ pub fn imported(
         ("from", !settings.from.is_empty()),
         ("trial", settings.trial.is_some()),
         ("specular.on", !settings.specular.on.is_empty()),
+        ("shadow.times", settings.times().is_some()),
     ] {
         if given {
             return Err(format!(
-                "train.{field}: says how a training begins, and nothing is trained here; remove it"
+                "train.{field}: says what a training begins with or learns from, and nothing is trained here; remove it"
             ));
         }
     }
