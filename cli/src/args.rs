@@ -338,6 +338,10 @@ pub struct Worker {
     /// Graphics processors it may use
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=1024))]
     pub gpus: u32,
+    /// Address of this machine at which other workers reach this one, to train a network together (`train.processes`);
+    /// whoever reaches it and can read the store can join
+    #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]
+    pub peers: String,
     /// Label that stages may ask for (give it again for more)
     #[arg(long, value_name = "LABEL")]
     pub label: Vec<String>,

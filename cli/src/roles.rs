@@ -277,6 +277,7 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         memory_mib: memory.as_ref().map_or(0, Memory::for_tasks_mib),
         memory_from: memory.map_or_else(String::new, |memory| memory.to_string()),
         gpus: args.gpus,
+        peers: args.peers,
         labels: args.label,
         exit_idle: args.exit_idle_s.map(Duration::from_secs),
         asset_dirs: vec![settings.assets.clone()],

@@ -175,6 +175,8 @@ fn whatever_shapes_a_model_is_in_its_key_and_how_often_it_is_saved_is_not() {
     };
     let plain = key("");
     assert_eq!(key(", checkpoint_minutes = 1.0"), plain);
+    let parts = ", optimise = { batch = 32, accumulate = 4 }";
+    assert_eq!(key(&format!("{parts}, processes = 4")), key(parts));
     assert_eq!(
         key(", optimise = { learning_rate = 0.01 }, seed = 0"),
         plain
@@ -258,6 +260,16 @@ fn an_unusable_field_is_named() {
             "target = \"tof\", model = \"m\", shadow = { times = \"x\" }",
             "train.shadow",
             "remove",
+        ),
+        (
+            "target = \"tof\", model = \"m\", processes = 3, optimise = { batch = 32, accumulate = 2 }",
+            "train.processes",
+            "expected 1 to 2",
+        ),
+        (
+            "target = \"tof\", model = \"m\", processes = 0",
+            "train.processes",
+            "expected 1 to 1",
         ),
         (
             "target = \"tof\", model = \"m\", specular = { on = \"x\" }",

@@ -132,6 +132,7 @@ async fn work(order: Order) -> Result<()> {
         memory_mib: order.memory_mib,
         memory_from: order.memory_from,
         gpus: 0,
+        peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,
         asset_dirs: vec![order.settings.assets],

@@ -120,7 +120,9 @@ impl Core {
             return false;
         };
         let store = store_of(&entry.spec(id).task).to_owned();
-        let count = match self.away.is_try(&store) {
+        // A task that may run for days holds up no other.
+        let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
+        let count = match alone {
             true => 1,
             false => self.lease_size(entry, able, range.len()),
         };

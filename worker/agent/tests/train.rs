@@ -433,3 +433,31 @@ async fn predictions_that_do_not_fit_are_refused_by_name_before_anything_is_lear
 async fn models_are(place: &Place, names: &[&str]) -> bool {
     place.models().names().await.unwrap() == names
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn processes_train_together_to_the_bits_of_one_and_leave_nothing_behind() {
+    let alone = Place::new().await;
+    let settings = |processes: u32| json!({"processes": processes, "optimise": {"epochs": 60, "batch": 4, "accumulate": 4}});
+    run(alone.training(settings(1))).await.unwrap();
+    let place = Place::new().await;
+    let stage = place.training(settings(3));
+    assert_eq!(stage.tasks(), 3);
+    let all = (0..3).map(|task| run_at(stage.clone(), task, Arc::default()));
+    let found = futures::future::join_all(all).await;
+    let outputs: Vec<_> = found.into_iter().map(Result::unwrap).collect();
+    // One of them has kept it, whoever that was.
+    assert!(outputs.iter().any(|output| !output.adopted), "{outputs:?}");
+    for output in &outputs {
+        assert_eq!(output.manifest_sha256, outputs[0].manifest_sha256);
+    }
+    assert_same(&place.files("models"), &alone.files("models"));
+    // Asked again, each finds it.
+    for task in 0..3 {
+        assert!(
+            run_at(stage.clone(), task, Arc::default())
+                .await
+                .unwrap()
+                .adopted
+        );
+    }
+}

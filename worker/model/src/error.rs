@@ -36,6 +36,9 @@ pub enum ModelError {
         /// Which quantity, and where it was first seen.
         what: String,
     },
+    /// What keeps a process from training together with others.
+    #[error("{0}")]
+    Group(String),
 }
 
 impl ModelError {

@@ -28,7 +28,7 @@ pub use model::Model;
 pub use random::Random;
 
 /// Version of everything that decides the bytes of trained weights and the figures of evaluations.
-pub const VERSION: &str = "model-4";
+pub const VERSION: &str = "model-5";
 
 /// Whether this program was built to use graphics processors.
 pub const HAS_GPUS: bool = cfg!(feature = "cuda");

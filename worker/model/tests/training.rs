@@ -199,9 +199,9 @@ fn parts_of_a_step_give_the_bits_that_they_gave_together() {
     let pace = trial(5).pace();
     let loss = one.step(&[batch.clone(), other.clone()], pace).unwrap();
     let mut sum = picofarm_model::train::Gradients::default();
-    two.add(&mut sum, batch).unwrap();
-    two.add(&mut sum, other).unwrap();
-    assert_eq!(two.finish(sum, pace), loss);
+    two.add(&mut sum, 0, batch).unwrap();
+    two.add(&mut sum, 1, other).unwrap();
+    assert_eq!(two.finish(sum, 2, pace), loss);
     assert_eq!(one.parameters().to_named(), two.parameters().to_named());
 }
 

@@ -26,6 +26,9 @@ pub struct AgentConfig {
     pub memory_from: String,
     /// Graphics processors.
     pub gpus: u32,
+    /// Where other workers reach this one, which train a network together with it: an address of this machine, and a port
+    /// where it must be a certain one.
+    pub peers: String,
     /// Labels that stages may ask for.
     pub labels: Vec<String>,
     /// The worker ends when it has had nothing to do for so long, while connected; `None` = never.

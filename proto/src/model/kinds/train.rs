@@ -32,7 +32,7 @@ pub use settings::{
 /// The field of [`ShadowSettings::times`].
 const TIMES: &str = "train.shadow.times";
 
-/// Training a network: one task.
+/// Training a network: a task for each process that does.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrainTask {
     /// The data set that is learnt from. The model is kept in the same store.
@@ -104,7 +104,15 @@ impl TaskKind for TrainTask {
         let others = known.networks.iter().map(|n| n.ask(source));
         let images = self.train.optimise.batch / self.train.optimise.accumulate.max(1);
         let learns = ours.learn(source, images.max(1));
-        Some(BASE + source.two() + learns + others.fold(0.0, f64::max))
+        // Sums of blocks of 2, 4, … parts of a batch wait for one another; and what others have comes beside.
+        let waiting = self.train.optimise.accumulate.max(2).ilog2() - 1;
+        let exchanged = if self.train.processes > 1 { 3 } else { 0 };
+        let sums = f64::from(waiting + exchanged) * ours.weights();
+        Some(BASE + source.two() + learns + sums + others.fold(0.0, f64::max))
+    }
+
+    fn tasks(&self) -> u64 {
+        u64::from(self.train.processes)
     }
 
     fn resumes(&self) -> bool {

@@ -49,7 +49,7 @@ impl Models {
         self.checkpoints_of(name, training_key)?.newest().await
     }
 
-    /// As [`Checkpoints::delete`], of a training.
+    /// As [`Checkpoints::delete`], of a training, and its calls.
     ///
     /// # Errors
     /// [`DatasetError::Invalid`] for a name that cannot be used; [`DatasetError::Store`].
@@ -58,6 +58,7 @@ impl Models {
         name: &str,
         training_key: &str,
     ) -> Result<(), DatasetError> {
+        self.delete_calls(name, training_key).await?;
         self.checkpoints_of(name, training_key)?.delete().await
     }
 

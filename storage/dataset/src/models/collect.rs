@@ -20,7 +20,7 @@ use crate::store::objects;
 
 impl Models {
     /// Finds what nobody needs and was last written at `limit` or earlier, `grace` before now: checkpoints of trainings
-    /// all of whose checkpoints are that old, shards of evaluations, objects that no manifest names, and unfinished files of killed writes.
+    /// all of whose checkpoints are that old, shards of evaluations, calls of processes, objects that no manifest names, and unfinished files of killed writes.
     /// Deletes it if `delete` says so.
     pub(crate) async fn collect(
         &self,
@@ -46,7 +46,9 @@ impl Models {
             }
             // Who joins an evaluation makes missing shards again.
             let shards = self.list(&self.path(&name, super::shard::FOLDER)).await?;
-            for object in shards.into_iter().filter(old) {
+            // Whoever trains and finds no call makes one.
+            let calls = self.list(&self.path(&name, super::call::FOLDER)).await?;
+            for object in shards.into_iter().chain(calls).filter(old) {
                 if delete {
                     self.delete(&object.location).await?;
                 }

@@ -6,6 +6,7 @@
 //! create-only. Trainings of other settings, killed half-way under the same name, leave objects in other folders and
 //! checkpoints under other keys: they are in nobody's way, and [`crate::Dataset::collect`] deletes them in the end.
 
+mod call;
 mod checkpoint;
 mod collect;
 mod evaluation;

@@ -254,8 +254,10 @@ impl Models {
                 self.remove_one(&object.location, removed).await?;
             }
         }
-        for object in self.list(&self.path(name, super::shard::FOLDER)).await? {
-            self.remove_one(&object.location, removed).await?;
+        for folder in [super::shard::FOLDER, super::call::FOLDER] {
+            for object in self.list(&self.path(name, folder)).await? {
+                self.remove_one(&object.location, removed).await?;
+            }
         }
         for checkpoint in self.checkpoints(name).await? {
             if all || checkpoint.training_key == note.training_key {

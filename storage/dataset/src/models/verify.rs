@@ -137,8 +137,8 @@ impl Models {
                     None => bad("its content has not the checkpoint's checksum"),
                 }
             }
-            // Of an evaluation that goes on or was given up; who reads a damaged one makes it again.
-            Some((super::shard::FOLDER, _)) => {
+            // Of an evaluation or a training that goes on or was given up; who reads a damaged one makes it again.
+            Some((super::shard::FOLDER | super::call::FOLDER, _)) => {
                 check.unused.push(at.clone());
                 None
             }

@@ -394,6 +394,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         memory_mib: 4096,
         memory_from: String::new(),
         gpus: 0,
+        peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,
         asset_dirs: Vec::new(),

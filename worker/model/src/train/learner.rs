@@ -2,14 +2,18 @@
 
 use burn::tensor::{Device, Tensor};
 
-use super::{loss::loss, schedule::Pace};
+use super::{
+    group::{Block, Blocks, Part},
+    loss::loss,
+    schedule::Pace,
+};
 use crate::{
     ModelError,
     input::{Batch, Target},
     kernel::AdamW,
     net::{Net, Pass},
     ops,
-    parameters::{Declared, Id, Parameters, upload},
+    parameters::{Declared, Id, Parameters, download, upload},
 };
 
 /// AdamW's decay of the second moment: PyTorch's default.
@@ -30,13 +34,34 @@ pub struct Learner {
     device: Device,
 }
 
-/// Gradients of a step's batches, summed in their order: as much memory as one batch's.
+/// What follows from a batch: gradients and loss, and running statistics after it.
+struct OfBatch {
+    summed: Summed,
+    moved: Vec<(Id, Tensor<1>)>,
+}
+
+/// Gradients of a step's batches, summed as [`Blocks`] are.
 #[derive(Default)]
 pub struct Gradients {
-    /// Of every parameter by declaration; none of those that are not learned.
-    sums: Vec<Option<Tensor<1>>>,
+    blocks: Blocks<Summed>,
+    /// Running statistics after the step's first batch, where that is among them.
+    moved: Vec<(Id, Tensor<1>)>,
+}
+
+/// Gradients of every parameter by declaration, none of those that are not learned, and losses; summed over batches.
+struct Summed {
+    gradients: Vec<Option<Tensor<1>>>,
     losses: f32,
-    batches: usize,
+}
+
+impl Summed {
+    fn add(one: Self, other: Self) -> Self {
+        let both = one.gradients.into_iter().zip(other.gradients);
+        Self {
+            gradients: both.map(|(a, b)| Some(a? + b?)).collect(),
+            losses: one.losses + other.losses,
+        }
+    }
 }
 
 impl Learner {
@@ -77,12 +102,20 @@ impl Learner {
     /// What the network said, loss, and the gradient of every learned parameter by declaration; moves the running
     /// statistics.
     pub(crate) fn gradients(&mut self, batch: Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
-        let (output, loss, gradients) = self.backward(batch);
+        let (output, of) = self.backward(batch);
+        self.move_statistics(of.moved);
         let said = output.into_data_as::<f32>();
-        (said.try_into_vec().expect("asked for f32"), loss, gradients)
+        let said = said.try_into_vec().expect("asked for f32");
+        (said, of.summed.losses, of.summed.gradients)
     }
 
-    fn backward(&mut self, batch: Batch) -> (Tensor<4>, f32, Vec<Option<Tensor<1>>>) {
+    fn move_statistics(&mut self, moved: Vec<(Id, Tensor<1>)>) {
+        for (id, value) in moved {
+            self.parameters.set(id, value);
+        }
+    }
+
+    fn backward(&self, batch: Batch) -> (Tensor<4>, OfBatch) {
         let device = self.device.clone().autodiff();
         let leaves: Vec<Tensor<1>> = self
             .net
@@ -101,54 +134,59 @@ impl Learner {
         let (loss, root) = loss(self.target, output.clone(), &target);
         let mut gradients = root.backward();
         let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
-        let of = of.collect();
-        for (id, value) in moved {
-            self.parameters.set(id, value);
-        }
-        (output.inner(), loss, of)
+        let summed = Summed {
+            gradients: of.collect(),
+            losses: loss,
+        };
+        (output.inner(), OfBatch { summed, moved })
     }
 
     /// One step of the optimiser over batches, whose gradients are averaged. Returns the mean loss.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; the parameters are then as before, the running statistics are not.
+    /// [`ModelError::NotFinite`]; everything is then as before.
     pub fn step(&mut self, batches: &[Batch], pace: Pace) -> Result<f32, ModelError> {
         let mut sum = Gradients::default();
-        for batch in batches {
-            self.add(&mut sum, batch.clone())?;
+        for (at, batch) in batches.iter().enumerate() {
+            self.add(&mut sum, at, batch.clone())?;
         }
-        Ok(self.finish(sum, pace))
+        Ok(self.finish(sum, batches.len(), pace))
     }
 
-    /// Adds a batch's gradients to those of a step, and lets go of the batch.
+    /// Adds the gradients of batch `at` of a step to those before it, and lets go of the batch. Running statistics follow the
+    /// first batch of a step.
     ///
     /// # Errors
-    /// [`ModelError::NotFinite`]; the parameters are then as before, the running statistics are not.
-    pub fn add(&mut self, sum: &mut Gradients, batch: Batch) -> Result<(), ModelError> {
-        let (_, loss, gradients) = self.backward(batch);
-        if !loss.is_finite() {
-            return Err(self.not_finite(loss));
+    /// [`ModelError::NotFinite`]; everything is then as before.
+    pub fn add(&self, sum: &mut Gradients, at: usize, batch: Batch) -> Result<(), ModelError> {
+        let (_, of) = self.backward(batch);
+        if !of.summed.losses.is_finite() {
+            return Err(self.not_finite(of.summed.losses));
         }
-        sum.losses += loss;
-        sum.sums = match sum.batches {
-            0 => gradients,
-            _ => std::mem::take(&mut sum.sums)
-                .into_iter()
-                .zip(gradients)
-                .map(|(a, b)| Some(a? + b?))
-                .collect(),
+        if at == 0 {
+            sum.moved = of.moved;
+        }
+        let block = Block {
+            begin: at,
+            len: 1,
+            sum: of.summed,
         };
-        sum.batches += 1;
+        sum.blocks.push(block, &mut Summed::add);
         Ok(())
     }
 
-    /// Takes the step of the optimiser along the mean of gradients. Returns the mean loss.
+    /// Takes the step of the optimiser along the mean of the gradients of all its batches. Returns the mean loss.
     ///
     /// # Panics
-    /// Where there are none.
-    pub fn finish(&mut self, sum: Gradients, pace: Pace) -> f32 {
-        assert!(sum.batches > 0, "a step has a batch");
-        let share = 1.0 / sum.batches as f32;
+    /// Where some of them are missing.
+    pub fn finish(&mut self, sum: Gradients, batches: usize, pace: Pace) -> f32 {
+        assert!(sum.blocks.is_whole(batches), "a step has all its batches");
+        let summed = sum
+            .blocks
+            .total(&mut Summed::add)
+            .expect("a step has a batch");
+        self.move_statistics(sum.moved);
+        let share = 1.0 / batches as f32;
         self.steps += 1;
         let settings = AdamW {
             learning_rate: pace.learning_rate,
@@ -158,11 +196,11 @@ impl Learner {
             decay: self.decay,
             step: u32::try_from(self.steps).unwrap_or(u32::MAX),
         };
-        for (i, gradient) in sum.sums.into_iter().enumerate() {
+        for (i, gradient) in summed.gradients.into_iter().enumerate() {
             let Some(mut gradient) = gradient else {
                 continue;
             };
-            if sum.batches > 1 {
+            if batches > 1 {
                 gradient = gradient.mul_scalar(share);
             }
             let value = self.parameters.take(Id(i));
@@ -172,7 +210,90 @@ impl Learner {
             self.parameters.set(Id(i), value);
             self.moments[i] = moments;
         }
-        sum.losses * share
+        summed.losses * share
+    }
+
+    /// What a process has of a step, in numbers.
+    pub fn part(&self, sum: Gradients) -> Part {
+        let flat = |summed: Summed| {
+            let mut values = Vec::with_capacity(self.gradient_len());
+            for gradient in summed.gradients.iter().flatten() {
+                values.extend(download(gradient));
+            }
+            values.push(summed.losses);
+            values
+        };
+        Part {
+            len: self.gradient_len(),
+            blocks: sum.blocks.map(flat),
+            moved: sum
+                .moved
+                .iter()
+                .map(|(id, value)| (id.0, download(value)))
+                .collect(),
+        }
+    }
+
+    /// The same from numbers, as all processes together have them.
+    ///
+    /// # Errors
+    /// [`ModelError::Weights`] where there are more or fewer than a step has.
+    pub fn gradients_of(&self, part: Part) -> Result<Gradients, ModelError> {
+        let wrong = |what: &str, there: usize, needed: usize| {
+            ModelError::weights(format!("a step's {what} have {there} values, not {needed}"))
+        };
+        let needed = self.gradient_len();
+        if let Some(block) = part
+            .blocks
+            .as_slice()
+            .iter()
+            .find(|b| b.sum.len() != needed)
+        {
+            return Err(wrong("gradients", block.sum.len(), needed));
+        }
+        let declared = self.net.declared();
+        let mut moved = Vec::with_capacity(part.moved.len());
+        for (which, values) in part.moved {
+            let needed = declared.get(which).filter(|d| !d.learned);
+            let needed = needed.map_or(0, Declared::len);
+            if values.len() != needed {
+                return Err(wrong("running statistics", values.len(), needed));
+            }
+            moved.push((Id(which), upload(values, &self.device)));
+        }
+        let deep = |values: Vec<f32>| {
+            let mut rest = &values[..];
+            let mut take = |len: usize| {
+                let (taken, left) = rest.split_at(len);
+                rest = left;
+                upload(taken.to_vec(), &self.device)
+            };
+            Summed {
+                gradients: declared
+                    .iter()
+                    .map(|d| d.learned.then(|| take(d.len())))
+                    .collect(),
+                losses: values[values.len() - 1],
+            }
+        };
+        Ok(Gradients {
+            blocks: part.blocks.map(deep),
+            moved,
+        })
+    }
+
+    /// A digest of all parameters (FNV-1a over their bits): processes that train together have the same.
+    pub fn digest(&self) -> u64 {
+        let values = self.parameters.values().iter().flat_map(download);
+        values.fold(0xcbf2_9ce4_8422_2325, |hash, value| {
+            (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0100_0000_01b3)
+        })
+    }
+
+    /// Gradients of all learned parameters, and the loss.
+    fn gradient_len(&self) -> usize {
+        let learned = self.net.declared().iter().filter(|d| d.learned);
+        learned.map(Declared::len).sum::<usize>() + 1
     }
 
     /// What the network says in evaluation: (N, outputs, H, W), row by row.

@@ -5,6 +5,7 @@
 
 use std::{
     collections::BTreeMap,
+    ops::Range,
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     thread,
 };
@@ -46,29 +47,50 @@ pub(super) struct Course<'a> {
     each: u64,
     /// Visits done.
     first: u64,
+    /// Which batches of each step are visited here.
+    share: Range<usize>,
     /// The orders of the epochs asked for last.
     orders: Mutex<BTreeMap<u64, Arc<Vec<usize>>>>,
 }
 
 impl<'a> Course<'a> {
-    pub(super) fn new(plan: &'a Plan, scenes: usize, from: &Position) -> Self {
+    pub(super) fn new(
+        plan: &'a Plan,
+        scenes: usize,
+        from: &Position,
+        share: &Range<usize>,
+    ) -> Self {
         let each = plan.batches(scenes) * plan.batch as u64;
         Self {
             plan,
             scenes,
             each,
             first: from.epoch * each + from.batches * plan.batch as u64,
+            share: share.clone(),
             orders: Mutex::default(),
         }
     }
 
+    /// Visits of a step, and those of them that are made here.
+    fn of_step(&self) -> (u64, u64) {
+        let batch = self.plan.batch as u64;
+        (
+            batch * self.plan.accumulate as u64,
+            batch * self.share.len() as u64,
+        )
+    }
+
     /// How many are left.
     pub(super) fn len(&self) -> u64 {
-        self.plan.epochs * self.each - self.first
+        let (all, ours) = self.of_step();
+        (self.plan.epochs * self.each - self.first) / all * ours
     }
 
     /// One of them: the scene's index, and how it is visited.
     pub(super) fn visit(&self, which: u64) -> (usize, Visit) {
+        let (all, ours) = self.of_step();
+        let before = self.share.start as u64 * self.plan.batch as u64;
+        let which = which / ours * all + before + which % ours;
         let (plan, which) = (self.plan, self.first + which);
         let (epoch, at) = (which / self.each, which % self.each);
         let mut orders = self.orders.lock().unwrap_or_else(PoisonError::into_inner);

@@ -1,6 +1,7 @@
 //! Training: from scenes to weights.
 
 mod checkpoint;
+pub mod group;
 mod learner;
 mod load;
 mod loss;

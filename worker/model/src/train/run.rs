@@ -1,6 +1,7 @@
 //! A training from where it stands to its end.
 
 use std::{
+    ops::Range,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -9,6 +10,7 @@ use burn::tensor::Device;
 
 use super::{
     Plan, checkpoint,
+    group::{Group, Member, Next, Standing},
     learner::{Gradients, Learner},
     load::{Course, Loading, Making, Ready},
     position::{Line, Position},
@@ -38,7 +40,7 @@ pub enum Event {
         epoch: u64,
         /// Its mean loss.
         loss: f32,
-        /// Training examples a second, since this process took it up.
+        /// Training examples a second, of all processes that train it together, since this one took it up.
         samples_per_s: f64,
         /// Share of that time in which the network waited for data.
         data_wait_share: f64,
@@ -63,6 +65,8 @@ pub enum Ended {
     Finished,
     /// It was asked to stop; it can go on from a checkpoint.
     Stopped,
+    /// Everything is done, and another process keeps what came out.
+    Elsewhere,
 }
 
 /// What it learns from, and beside what.
@@ -82,6 +86,8 @@ pub struct Training {
     kept: Option<Parameters>,
     sources: Sources,
     loading: Loading,
+    device: Device,
+    leads: bool,
 }
 
 /// What comes out.
@@ -142,6 +148,8 @@ impl Training {
             kept: None,
             sources,
             loading: Loading::default(),
+            device: device.clone(),
+            leads: true,
         })
     }
 
@@ -159,19 +167,16 @@ impl Training {
         let net = Net::new(plan.net.clone())?;
         let parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
         let mut learner = Learner::new(net, parameters, plan.question.target, plan.decay);
-        let (header, kept) = checkpoint::read(checkpoint, &mut learner, device)?;
-        if header.plan != plan.text() {
-            let what =
-                "the checkpoint was made with other settings; remove it, or train with those";
-            return Err(ModelError::weights(what));
-        }
+        let (position, kept) = restored(&plan, checkpoint, &mut learner, device)?;
         Ok(Self {
             plan,
             learner,
-            position: header.position,
+            position,
             kept,
             sources,
             loading: Loading::default(),
+            device: device.clone(),
+            leads: true,
         })
     }
 
@@ -208,6 +213,11 @@ impl Training {
         self.plan.steps(self.sources.train.len())
     }
 
+    /// Whether this process validates and keeps what comes out: not where another one leads.
+    pub fn leads(&self) -> bool {
+        self.leads
+    }
+
     /// Goes on until the end, or until `say` wants it to stop. `say` is given the training, so that it may take a
     /// checkpoint of it.
     ///
@@ -217,12 +227,55 @@ impl Training {
         &mut self,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
     ) -> Result<Ended, ModelError> {
+        let share = 0..self.plan.accumulate;
+        self.go(&share, None, say)
+            .map(|ended| ended.expect("nobody else is lost"))
+    }
+
+    /// The same together with other processes, to the same bits.
+    ///
+    /// # Errors
+    /// As [`Self::run`], and what keeps this process from going on with the others.
+    pub fn run_among(
+        &mut self,
+        group: &mut dyn Group,
+        say: &mut dyn FnMut(&Self, &Event) -> Control,
+    ) -> Result<Ended, ModelError> {
+        loop {
+            let share = match group.agree(self)? {
+                Next::Over => return Ok(Ended::Elsewhere),
+                Next::Stop => return Ok(Ended::Stopped),
+                Next::Train { share, leads } => {
+                    self.leads = leads;
+                    share
+                }
+            };
+            if self.is_over() && !self.leads {
+                // The leading process keeps what came out, and says so.
+                continue;
+            }
+            if let Some(ended) = self.go(&share, Some(group), say)? {
+                match ended {
+                    Ended::Finished if !self.leads => {}
+                    ended => return Ok(ended),
+                }
+            }
+        }
+    }
+
+    /// Trains with a share of each step's batches; `None` where the group has changed.
+    fn go(
+        &mut self,
+        share: &Range<usize>,
+        group: Option<&mut (dyn Group + '_)>,
+        say: &mut dyn FnMut(&Self, &Event) -> Control,
+    ) -> Result<Option<Ended>, ModelError> {
         if self.is_over() {
-            return Ok(Ended::Finished);
+            return Ok(Some(Ended::Finished));
         }
         let plan = self.plan.clone();
         let train = Arc::clone(&self.sources.train);
-        let course = Course::new(&plan, train.len(), &self.position);
+        let course = Course::new(&plan, train.len(), &self.position, share);
         let making = Making {
             plan: &plan,
             scenes: &*train,
@@ -230,72 +283,108 @@ impl Training {
             count: course.len(),
             loading: self.loading,
         };
-        making.ahead(|ready| self.learn(ready, say))
+        making.ahead(|ready| self.learn(ready, share, group, say))
     }
 
     fn learn(
         &mut self,
         ready: &Ready<'_>,
+        share: &Range<usize>,
+        mut group: Option<&mut (dyn Group + '_)>,
         say: &mut dyn FnMut(&Self, &Event) -> Control,
-    ) -> Result<Ended, ModelError> {
+    ) -> Result<Option<Ended>, ModelError> {
         let mut clock = Clock::new();
         let (of, per_epoch) = (self.steps(), self.plan.batches(self.sources.train.len()));
+        let batches = self.plan.accumulate;
         while !self.is_over() {
-            let mut sum = Gradients::default();
-            for _ in 0..self.plan.accumulate {
-                let since = Instant::now();
-                let batch = ready.next()?;
-                clock.waited += since.elapsed();
-                clock.samples += batch.images;
-                self.learner.add(&mut sum, batch)?;
+            let mut events = Vec::new();
+            if self.position.batches < per_epoch {
+                if let Some(group) = group.as_deref_mut()
+                    && !group.go_on()?
+                {
+                    return Ok(None);
+                }
+                let mut sum = Gradients::default();
+                for at in share.clone() {
+                    let since = Instant::now();
+                    let batch = ready.next()?;
+                    clock.waited += since.elapsed();
+                    self.learner.add(&mut sum, at, batch)?;
+                }
+                if let Some(group) = group.as_deref_mut()
+                    && !group.is_alone()
+                {
+                    let part = self.learner.part(sum);
+                    let Some(whole) = group.sum(self.learner.steps(), part)? else {
+                        return Ok(None);
+                    };
+                    sum = self.learner.gradients_of(whole)?;
+                }
+                clock.samples += batches * self.plan.batch;
+                let pace = self.pace(self.learner.steps());
+                let loss = self.learner.finish(sum, batches, pace);
+                let position = &mut self.position;
+                position.batches += batches as u64;
+                position.losses += f64::from(loss);
+                position.steps += 1;
+                events.push(Event::Step {
+                    step: self.learner.steps(),
+                    of,
+                    epoch: position.epoch + 1,
+                    loss,
+                    samples_per_s: clock.samples as f64 / clock.began.elapsed().as_secs_f64(),
+                    data_wait_share: clock.share(),
+                });
             }
-            let (plan, step) = (&self.plan, self.learner.steps());
-            let pace = schedule::pace(plan.schedule, step, of, plan.learning_rate);
-            let loss = self.learner.finish(sum, pace);
-            let position = &mut self.position;
-            position.batches += self.plan.accumulate as u64;
-            position.losses += f64::from(loss);
-            position.steps += 1;
-            let epoch = position.epoch + 1;
-            let mut events = vec![Event::Step {
-                step: self.learner.steps(),
-                of,
-                epoch,
-                loss,
-                samples_per_s: clock.samples as f64 / clock.began.elapsed().as_secs_f64(),
-                data_wait_share: clock.share(),
-            }];
             if self.position.batches == per_epoch {
                 let since = Instant::now();
-                events.push(Event::Epoch(self.end_epoch(pace.learning_rate)?));
+                let Some(line) = self.end_epoch(group.as_deref_mut())? else {
+                    return Ok(None);
+                };
+                events.push(Event::Epoch(line));
                 clock.began += since.elapsed();
             }
             for event in &events {
                 if say(self, event) == Control::Stop && !self.is_over() {
-                    return Ok(Ended::Stopped);
+                    return Ok(Some(Ended::Stopped));
                 }
             }
         }
-        Ok(Ended::Finished)
+        Ok(Some(Ended::Finished))
+    }
+
+    /// The optimiser's pace at a step.
+    fn pace(&self, step: u64) -> schedule::Pace {
+        let plan = &self.plan;
+        schedule::pace(plan.schedule, step, self.steps(), plan.learning_rate)
     }
 
     fn is_over(&self) -> bool {
         self.position.epoch == self.plan.epochs || self.position.stopped_early
     }
 
-    fn end_epoch(&mut self, learning_rate: f64) -> Result<Line, ModelError> {
-        let validation = match self.sources.validation.is_empty() {
-            true => None,
-            false => Some(self.validate()?),
+    /// Validates where this process leads, and hears it from the one that does where not; `None` where that was lost.
+    fn end_epoch(
+        &mut self,
+        group: Option<&mut (dyn Group + '_)>,
+    ) -> Result<Option<Line>, ModelError> {
+        let line = match group {
+            Some(group) if !self.leads => match group.hear(self.learner.digest())? {
+                Some(line) => line,
+                None => return Ok(None),
+            },
+            group => {
+                let line = self.line()?;
+                if let Some(group) = group
+                    && !group.is_alone()
+                {
+                    group.tell(&line, self.learner.digest());
+                }
+                line
+            }
         };
+        let validation = line.validation;
         let position = &mut self.position;
-        let line = Line {
-            epoch: position.epoch + 1,
-            step: self.learner.steps(),
-            loss: position.losses / position.steps as f64,
-            learning_rate,
-            validation,
-        };
         position.history.push(line);
         (position.losses, position.steps) = (0.0, 0);
         position.epoch += 1;
@@ -315,7 +404,23 @@ impl Training {
             let patience = self.plan.early_stop;
             position.stopped_early = patience > 0 && position.since_best >= patience;
         }
-        Ok(line)
+        Ok(Some(line))
+    }
+
+    /// The epoch whose steps are done, with figures on the validation scenes.
+    fn line(&self) -> Result<Line, ModelError> {
+        let validation = match self.sources.validation.is_empty() {
+            true => None,
+            false => Some(self.validate()?),
+        };
+        let (position, step) = (&self.position, self.learner.steps());
+        Ok(Line {
+            epoch: position.epoch + 1,
+            step,
+            loss: position.losses / position.steps as f64,
+            learning_rate: self.pace(step - 1).learning_rate,
+            validation,
+        })
     }
 
     /// Figures on the validation scenes, as they are; of each scene another spot, always the same.
@@ -373,6 +478,44 @@ impl Training {
             stopped_early: self.position.stopped_early,
         }
     }
+}
+
+impl Member for Training {
+    fn standing(&self) -> Standing {
+        Standing {
+            step: self.learner.steps(),
+            epoch: self.position.epoch,
+        }
+    }
+
+    fn batches(&self) -> usize {
+        self.plan.accumulate
+    }
+
+    fn state(&self) -> Vec<u8> {
+        self.checkpoint()
+    }
+
+    fn become_state(&mut self, state: &[u8]) -> Result<(), ModelError> {
+        let (position, kept) = restored(&self.plan, state, &mut self.learner, &self.device)?;
+        (self.position, self.kept) = (position, kept);
+        Ok(())
+    }
+}
+
+/// Puts a learner where a checkpoint of the same plan was made; its position, and what is kept.
+fn restored(
+    plan: &Plan,
+    checkpoint: &[u8],
+    learner: &mut Learner,
+    device: &Device,
+) -> Result<(Position, Option<Parameters>), ModelError> {
+    let (header, kept) = checkpoint::read(checkpoint, learner, device)?;
+    if header.plan != plan.text() {
+        let what = "the checkpoint was made with other settings; remove it, or train with those";
+        return Err(ModelError::weights(what));
+    }
+    Ok((header.position, kept))
 }
 
 /// How long the network waited.

@@ -13,6 +13,9 @@ use crate::model::{
     spec_error::{SpecError, within},
 };
 
+/// Most processes that train a network together.
+const MOST_PROCESSES: u32 = 1_000;
+
 impl TrainSettings {
     /// Checks every field against its limits.
     ///
@@ -57,6 +60,21 @@ impl TrainSettings {
         }
         if let Some(trial) = &self.trial {
             trial.check()?;
+            if self.processes != 1 {
+                let what = format!(
+                    "is {}, but a trial of a sweep is one task; leave it out, and let workers take trials side by side",
+                    self.processes
+                );
+                return fail("processes", what);
+            }
+        }
+        let most = self.optimise.accumulate.clamp(1, MOST_PROCESSES);
+        if !(1..=most).contains(&self.processes) {
+            let what = format!(
+                "is {}, expected 1 to {most}: processes share the optimise.accumulate = {} parts of each batch",
+                self.processes, self.optimise.accumulate
+            );
+            return fail("processes", what);
         }
         self.input.check()?;
         self.net.check()?;

@@ -56,6 +56,10 @@ pub struct TrainSettings {
     /// A trained model of the same network, or the stage that trains it, to start from; empty = random weights.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub from: String,
+    /// Processes that train it together, each a task of the stage that any worker takes; they share the `accumulate` parts of each
+    /// batch. They come and go as workers do, and the result is the same to the bit however many there are. Default 1.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub processes: u32,
     /// Minutes between checkpoints: as much is lost at most when a worker dies. Changes no result.
     #[serde(default = "ten")]
     pub checkpoint_minutes: f64,
@@ -208,6 +212,15 @@ fn yes() -> bool {
     true
 }
 
+fn one() -> u32 {
+    1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_one(n: &u32) -> bool {
+    *n == 1
+}
+
 fn ten() -> f64 {
     10.0
 }
@@ -265,13 +278,14 @@ impl TrainSettings {
         }
     }
 
-    /// What of them decides the bytes of the model: all but its name, how often it is saved on the way, and whether it is
-    /// one of a sweep.
+    /// What of them decides the bytes of the model: all but its name, by how many processes it is trained, how often it is
+    /// saved on the way, and whether it is one of a sweep.
     pub fn shaping(&self) -> serde_json::Value {
         let mut settings = serde_json::to_value(self).expect("settings are plain data");
         let table = settings.as_object_mut().expect("settings are a table");
         table.remove("model");
         table.remove("checkpoint_minutes");
+        table.remove("processes");
         table.remove("trial");
         settings
     }

@@ -41,6 +41,9 @@ use super::{Control, Executor, Output, Submission, Task, TaskError, output::Stor
 /// How long a finished scene waits at most for a store that is full or away before its task is handed back.
 pub(in crate::execute) const STORE_PATIENCE: Duration = Duration::from_secs(120);
 
+/// Where workers of this machine alone reach one another.
+const LOOPBACK: &str = "127.0.0.1";
+
 /// How tasks of a kind run.
 pub(in crate::execute) trait RunTask {
     /// Version of the code that decides the bytes of its results; empty where this program was built without it.
@@ -74,6 +77,8 @@ pub(in crate::execute) struct Context {
     pub sources: import::Sources,
     /// What opens scene files and imports.
     pub files: Opener,
+    /// Where other workers reach this one.
+    pub peers: String,
     /// The networks that were asked last.
     #[cfg(feature = "networks")]
     pub models: infer::ModelCache,
@@ -185,8 +190,18 @@ impl TaskExecutor {
             libraries: scenes::find_libraries(asset_dirs),
             stores: Stores::new(runtime, STORE_PATIENCE),
             sources: import::Sources::default(),
+            peers: LOOPBACK.to_owned(),
             #[cfg(feature = "networks")]
             models: infer::ModelCache::default(),
+        })
+    }
+
+    /// The same where other workers reach it at an address of this machine: host, or host and port.
+    #[must_use]
+    pub fn reached_at(self, peers: &str) -> Self {
+        Self(Context {
+            peers: peers.to_owned(),
+            ..self.0
         })
     }
 

@@ -13,6 +13,7 @@ use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Lineage, Measurement, ModelManifest, Models, NewModel,
     Pinned, Published, TrainingSpeed, TrialEnd,
 };
+use picofarm_members::Members;
 use picofarm_model::{
     Device, ModelError,
     scene::Scenes,
@@ -28,6 +29,7 @@ use picofarm_proto::{
 use tracing::{info, warn};
 
 mod along;
+mod board;
 mod imported;
 mod known;
 mod plan;
@@ -36,6 +38,7 @@ mod trial;
 
 use super::saver::Saver;
 use along::{Reporter, loading};
+use board::Board;
 pub use imported::{ImportFor, imported};
 pub use known::takes;
 pub(in crate::execute) use known::{CheckedModel, Known};
@@ -68,6 +71,7 @@ impl RunTask for TrainTask {
         let task = self;
         let training = TrainingRun {
             gpus,
+            peers: &context.peers,
             ..TrainingRun::of(stores, task, control)?
         };
         let Some(trial) = &task.train.trial else {
@@ -101,6 +105,8 @@ struct TrainingRun<'a> {
     key: String,
     /// Graphics processors that the job asks for.
     gpus: u32,
+    /// Where other workers reach this one.
+    peers: &'a str,
 }
 
 impl<'a> TrainingRun<'a> {
@@ -184,6 +190,7 @@ impl<'a> TrainingRun<'a> {
             lineage,
             key,
             gpus: 0,
+            peers: "",
         })
     }
 
@@ -249,9 +256,26 @@ impl<'a> TrainingRun<'a> {
         }
         let plan = self.plan(control)?;
         let asked = known::asked(&plan, &self.spec);
-        let trained = match self.train(plan, stores, course, control)? {
-            Ok(trained) => trained,
-            Err(left) => return Ok(Err(left)),
+        let board = Board::of(stores, self, control);
+        let stopped = || control.stopped();
+        let mut members = match self.task.train.processes {
+            1 => None,
+            _ => Some(board.members(self.peers, &stopped)?),
+        };
+        let trained = match self.train(plan, stores, (course, members.as_mut()), control)? {
+            Came::Out(trained) => trained,
+            Came::Left(left) => return Ok(Err(left)),
+            Came::OutElsewhere => {
+                let there = finished(stores, models, name, key, control)?;
+                let missing = "the process that led the training says that the model is kept, but it is not there";
+                return match there {
+                    Some(manifest) => Ok(Ok(Published {
+                        manifest,
+                        adopted: true,
+                    })),
+                    None => Err(TaskError::Interrupted(missing.into())),
+                };
+            }
         };
         let metrics = metrics(&trained);
         let new = NewModel {
@@ -273,6 +297,9 @@ impl<'a> TrainingRun<'a> {
         };
         let published =
             stores.patiently(control, async || models.publish(new.clone(), force).await)?;
+        if let Some(members) = &mut members {
+            members.over();
+        }
         stores.wait(control, models.delete_checkpoints(name, key))?;
         control.at(1.0);
         Ok(Ok(published))
@@ -303,9 +330,9 @@ impl<'a> TrainingRun<'a> {
         &self,
         plan: Plan,
         stores: &Stores,
-        course: Option<&Course<'_>>,
+        (course, members): (Option<&Course<'_>>, Option<&mut Members<'_>>),
         control: &Control,
-    ) -> Result<Result<Trained, Left>, TaskError> {
+    ) -> Result<Came, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
         let device = self.device()?;
         let sources = Sources {
@@ -342,22 +369,28 @@ impl<'a> TrainingRun<'a> {
         let at_rung = position.history.last().filter(|_| position.batches == 0);
         let ended = match at_rung.copied().is_none_or(|line| ask(&line)) {
             false => Ok(Ended::Stopped),
-            true => training.run(&mut |training, event| {
-                teller.hear(event);
-                if let Event::Epoch(line) = event
-                    && !ask(line)
-                {
-                    return picofarm_model::train::Control::Stop;
+            true => {
+                let mut hear = |training: &Training, event: &Event| {
+                    teller.hear(event);
+                    if let Event::Epoch(line) = event
+                        && !ask(line)
+                    {
+                        return picofarm_model::train::Control::Stop;
+                    }
+                    if control.stopped() {
+                        return picofarm_model::train::Control::Stop;
+                    }
+                    if saved.elapsed() >= every && training.leads() {
+                        saver.save(training.learner().steps(), training.checkpoint().into());
+                        saved = Instant::now();
+                    }
+                    picofarm_model::train::Control::Continue
+                };
+                match members {
+                    Some(members) => training.run_among(members, &mut hear),
+                    None => training.run(&mut hear),
                 }
-                if control.stopped() {
-                    return picofarm_model::train::Control::Stop;
-                }
-                if saved.elapsed() >= every {
-                    saver.save(training.learner().steps(), training.checkpoint().into());
-                    saved = Instant::now();
-                }
-                picofarm_model::train::Control::Continue
-            }),
+            }
         };
         let left = |training: &Training, end| Left {
             end,
@@ -366,7 +399,10 @@ impl<'a> TrainingRun<'a> {
         match ended {
             Err(error @ ModelError::NotFinite { .. }) if course.is_some() => {
                 saver.last();
-                Ok(Err(left(&training, TrialEnd::Diverged(error.to_string()))))
+                Ok(Came::Left(left(
+                    &training,
+                    TrialEnd::Diverged(error.to_string()),
+                )))
             }
             Err(error) => Err(of_model(error)),
             Ok(Ended::Finished) => {
@@ -374,20 +410,36 @@ impl<'a> TrainingRun<'a> {
                 if let Some(pace) = teller.pace() {
                     self.tell_speed(stores, pace, control);
                 }
-                Ok(Ok(training.finish()))
+                Ok(Came::Out(training.finish()))
             }
             Ok(Ended::Stopped) if matches!(answer, Ok(false)) => {
                 saver.last();
-                Ok(Err(left(&training, TrialEnd::Pruned)))
+                Ok(Came::Left(left(&training, TrialEnd::Pruned)))
+            }
+            Ok(Ended::Elsewhere) => {
+                saver.last();
+                Ok(Came::OutElsewhere)
             }
             Ok(Ended::Stopped) => {
-                saver.save(training.learner().steps(), training.checkpoint().into());
+                if training.leads() {
+                    saver.save(training.learner().steps(), training.checkpoint().into());
+                }
                 saver.last();
                 // Where the store was away at a rung, the trial goes on from there.
                 answer.and(Err(TaskError::Stopped))
             }
         }
     }
+}
+
+/// How a training came to its end here.
+enum Came {
+    /// With a network.
+    Out(Trained),
+    /// A trial was left before its end.
+    Left(Left),
+    /// Another process has kept the network.
+    OutElsewhere,
 }
 
 /// The model if this very training has published it.
@@ -456,6 +508,7 @@ pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
         },
         // What is in the store has its checksum: this program made it, and does not know it again.
         ModelError::Weights { what } => TaskError::Crash(what),
+        ModelError::Group(what) => TaskError::Interrupted(what),
         other => TaskError::User(other.to_string()),
     }
 }

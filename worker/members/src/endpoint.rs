@@ -1,0 +1,212 @@
+//! Where a process listens: what comes is asked for its secret, and handed on.
+
+use std::{
+    io,
+    net::{Shutdown, TcpListener, TcpStream, ToSocketAddrs},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+        mpsc::{Receiver, Sender, channel},
+    },
+    thread,
+    time::Duration,
+};
+
+use subtle::ConstantTimeEq;
+use tracing::{debug, warn};
+use uuid::Uuid;
+
+use crate::message::{Address, Message, Payload, Wish, receive, send};
+
+/// How long a connection may take to say who it is, and to be answered.
+const INTRODUCTION: Duration = Duration::from_secs(10);
+/// Connections that may say who they are at a time.
+const MOST_STRANGERS: usize = 64;
+
+/// Whoever came.
+pub struct Arrived {
+    pub wish: Wish,
+    pub stream: TcpStream,
+}
+
+/// A listening process.
+pub struct Endpoint {
+    address: Address,
+    leads: Arc<AtomicBool>,
+    closed: Arc<AtomicBool>,
+    arrived: Receiver<Arrived>,
+    local: std::net::SocketAddr,
+}
+
+impl Endpoint {
+    /// Listens on a host, at a port that is free where it names none.
+    pub fn open(host: &str, training: &str) -> io::Result<Self> {
+        let (name, port) = match host.rsplit_once(':') {
+            Some((name, port)) if !name.contains(':') || name.ends_with(']') => {
+                let port: u16 = port.parse().map_err(io::Error::other)?;
+                (name.trim_matches(['[', ']']), port)
+            }
+            _ => (host.trim_matches(['[', ']']), 0),
+        };
+        let addresses: Vec<_> = (name, port).to_socket_addrs()?.collect();
+        let listener = TcpListener::bind(&addresses[..])?;
+        let local = listener.local_addr()?;
+        let port = local.port();
+        let address = match name.contains(':') {
+            true => format!("[{name}]:{port}"),
+            false => format!("{name}:{port}"),
+        };
+        let address = Address {
+            address,
+            secret: format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple()),
+        };
+        let (outbox, arrived) = channel();
+        let closed = Arc::new(AtomicBool::new(false));
+        let leads = Arc::new(AtomicBool::new(false));
+        let door = Arc::new(Door {
+            secret: address.secret.clone(),
+            training: training.to_owned(),
+            leads: leads.clone(),
+            closed: closed.clone(),
+            strangers: AtomicUsize::new(0),
+            outbox,
+        });
+        thread::Builder::new()
+            .name("members".into())
+            .spawn(move || door.serve(&listener))?;
+        Ok(Self {
+            address,
+            leads,
+            closed,
+            arrived,
+            local,
+        })
+    }
+
+    /// Where others reach it.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// From now on those who want to take part are welcome, or not.
+    pub fn lead(&self, leads: bool) {
+        self.leads.store(leads, Ordering::SeqCst);
+    }
+
+    /// Whoever came since.
+    pub fn arrived(&self) -> Option<Arrived> {
+        self.arrived.try_recv().ok()
+    }
+}
+
+impl Drop for Endpoint {
+    fn drop(&mut self) {
+        self.closed.store(true, Ordering::SeqCst);
+        // Wakes whoever accepts.
+        let _ = TcpStream::connect_timeout(&self.local, Duration::from_secs(1));
+    }
+}
+
+struct Door {
+    secret: String,
+    training: String,
+    leads: Arc<AtomicBool>,
+    closed: Arc<AtomicBool>,
+    strangers: AtomicUsize,
+    outbox: Sender<Arrived>,
+}
+
+impl Door {
+    fn serve(self: &Arc<Self>, listener: &TcpListener) {
+        for stream in listener.incoming() {
+            if self.closed.load(Ordering::SeqCst) {
+                return;
+            }
+            let stream = match stream {
+                Ok(stream) => stream,
+                Err(error) => {
+                    warn!(%error, "a connection of another process of the training is not taken");
+                    thread::sleep(Duration::from_millis(100));
+                    continue;
+                }
+            };
+            if self.strangers.fetch_add(1, Ordering::SeqCst) >= MOST_STRANGERS {
+                self.strangers.fetch_sub(1, Ordering::SeqCst);
+                let _ = stream.shutdown(Shutdown::Both);
+                continue;
+            }
+            let door = self.clone();
+            let begun = thread::Builder::new().spawn(move || {
+                if let Err(error) = door.ask(stream) {
+                    debug!(%error, "a connection is closed before it says what it wants");
+                }
+                door.strangers.fetch_sub(1, Ordering::SeqCst);
+            });
+            if begun.is_err() {
+                self.strangers.fetch_sub(1, Ordering::SeqCst);
+            }
+        }
+    }
+
+    /// Asks a connection who it is, and hands it on.
+    fn ask(&self, mut stream: TcpStream) -> io::Result<()> {
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(INTRODUCTION))?;
+        stream.set_write_timeout(Some(INTRODUCTION))?;
+        let (
+            Message::Hello {
+                secret,
+                training,
+                wish,
+            },
+            _,
+        ) = receive(&mut stream, Payload::None)?
+        else {
+            return Err(io::Error::other("no greeting"));
+        };
+        if !bool::from(secret.as_bytes().ct_eq(self.secret.as_bytes())) {
+            return Err(io::Error::other("another secret"));
+        }
+        let why = if training != self.training {
+            Some("another training")
+        } else if matches!(wish, Wish::Join(_)) && !self.leads.load(Ordering::SeqCst) {
+            Some("this process does not lead")
+        } else {
+            None
+        };
+        if let Some(why) = why {
+            let why = why.to_owned();
+            return send(&mut stream, &Message::Refused { why }, &[]);
+        }
+        send(&mut stream, &Message::Welcome, &[])?;
+        let _ = self.outbox.send(Arrived { wish, stream });
+        Ok(())
+    }
+}
+
+/// Goes to another process.
+pub fn visit(to: &Address, training: &str, wish: Wish) -> io::Result<TcpStream> {
+    let mut last = io::Error::other(format!("{} has no address", to.address));
+    for address in to.address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, INTRODUCTION / 2) {
+            Ok(mut stream) => {
+                stream.set_nodelay(true)?;
+                stream.set_read_timeout(Some(INTRODUCTION))?;
+                stream.set_write_timeout(Some(INTRODUCTION))?;
+                let hello = Message::Hello {
+                    secret: to.secret.clone(),
+                    training: training.to_owned(),
+                    wish,
+                };
+                send(&mut stream, &hello, &[])?;
+                return match receive(&mut stream, Payload::None)? {
+                    (Message::Welcome, _) => Ok(stream),
+                    (Message::Refused { why }, _) => Err(io::Error::other(why)),
+                    _ => Err(io::Error::other("no answer to a greeting")),
+                };
+            }
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}

@@ -1,0 +1,208 @@
+//! What processes say to one another, and how it is written: a header of JSON, and bytes after it.
+
+use std::io::{self, Read, Write};
+
+use picofarm_model::train::{Line, group::Standing};
+use serde::{Deserialize, Serialize};
+
+/// First bytes of every message.
+const MAGIC: &[u8; 4] = b"pfm1";
+/// Longest header: the list of all members is the longest.
+const MOST_HEADER: u32 = 1 << 20;
+/// Most bytes after a header: a training's whole state.
+const MOST_PAYLOAD: u64 = 1 << 37;
+/// Bytes that are reserved before they are there.
+const RESERVED: u64 = 1 << 24;
+
+/// A message.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Message {
+    /// The first of every connection.
+    Hello {
+        /// What whoever is called wants to be shown.
+        secret: String,
+        /// The training, by its key.
+        training: String,
+        /// What the connection is for.
+        wish: Wish,
+    },
+    /// The answer: it is heard.
+    Welcome,
+    /// The answer: it is not.
+    Refused {
+        /// Why.
+        why: String,
+    },
+    /// Somebody is there.
+    Alive,
+    /// By the leading process: where do you stand? Nobody goes on until there is a new [`Message::Form`].
+    Where,
+    /// By the leading process: send your state.
+    SendState,
+    /// A training's state, as bytes after the header.
+    State,
+    /// By the leading process: who takes part from now on.
+    Form {
+        /// Number of this agreement.
+        generation: u64,
+        /// The rank of whoever gets this.
+        rank: usize,
+        /// All, by rank.
+        members: Vec<Address>,
+    },
+    /// By the leading process: go on.
+    Go {
+        /// From this step.
+        step: u64,
+    },
+    /// By the leading process: an epoch is over.
+    Epoch {
+        /// How it ended.
+        line: Line,
+        /// Of the leading process's numbers.
+        digest: u64,
+    },
+    /// By the leading process: everything is done and kept.
+    Over,
+    /// To the leading process: where one stands.
+    Stands(Standing),
+    /// To the leading process: connected with all others.
+    Formed {
+        /// Of this agreement.
+        generation: u64,
+    },
+    /// To the leading process: somebody was lost.
+    Failed {
+        /// Of this agreement.
+        generation: u64,
+    },
+}
+
+/// What a connection is for.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Wish {
+    /// To take part.
+    Join(Address),
+    /// To add up.
+    Add {
+        /// Of this agreement.
+        generation: u64,
+        /// Who calls.
+        rank: usize,
+    },
+}
+
+/// Where a process is reached.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Address {
+    /// Address and port.
+    pub address: String,
+    /// What it wants to be shown.
+    pub secret: String,
+}
+
+/// Writes a message.
+pub fn send(to: &mut impl Write, message: &Message, payload: &[u8]) -> io::Result<()> {
+    let header = serde_json::to_vec(message).expect("messages are plain data");
+    let len = u32::try_from(header.len()).map_err(io::Error::other)?;
+    let mut head = MAGIC.to_vec();
+    head.extend(len.to_le_bytes());
+    head.extend((payload.len() as u64).to_le_bytes());
+    head.extend(header);
+    to.write_all(&head)?;
+    to.write_all(payload)?;
+    to.flush()
+}
+
+/// Reads a message.
+pub fn receive(from: &mut impl Read, most_payload: Payload) -> io::Result<(Message, Vec<u8>)> {
+    let bad = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what);
+    let mut head = [0; 16];
+    from.read_exact(&mut head)?;
+    let (magic, lens) = head.split_at(4);
+    if magic != MAGIC {
+        return Err(bad("no message of a training"));
+    }
+    let (header, payload) = lens.split_at(4);
+    let header = u32::from_le_bytes(header.try_into().expect("four bytes"));
+    let payload = u64::from_le_bytes(payload.try_into().expect("eight bytes"));
+    let most = match most_payload {
+        Payload::None => 0,
+        Payload::State => MOST_PAYLOAD,
+    };
+    if header > MOST_HEADER || payload > most {
+        return Err(bad("a message that is too long"));
+    }
+    let header = read(from, header.into())?;
+    let message: Message = serde_json::from_slice(&header)?;
+    if payload > 0 && message != Message::State {
+        return Err(bad("bytes after a message that has none"));
+    }
+    Ok((message, read(from, payload)?))
+}
+
+/// What may follow a header.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Payload {
+    /// Nothing.
+    None,
+    /// A training's state.
+    State,
+}
+
+/// Reads so many bytes; what is stated but never comes takes no memory.
+fn read(from: &mut impl Read, len: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(len.min(RESERVED) as usize);
+    from.take(len).read_to_end(&mut bytes)?;
+    match bytes.len() as u64 == len {
+        true => Ok(bytes),
+        false => Err(io::ErrorKind::UnexpectedEof.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn what_is_sent_is_what_is_received() {
+        let mut bytes = Vec::new();
+        send(&mut bytes, &Message::State, b"numbers").unwrap();
+        send(&mut bytes, &Message::Go { step: 7 }, b"").unwrap();
+        let mut from = &bytes[..];
+        assert_eq!(
+            receive(&mut from, Payload::State).unwrap(),
+            (Message::State, b"numbers".to_vec())
+        );
+        assert_eq!(
+            receive(&mut from, Payload::None).unwrap(),
+            (Message::Go { step: 7 }, Vec::new())
+        );
+        // Whoever has not said who it is sends no state.
+        assert!(receive(&mut &bytes[..], Payload::None).is_err());
+    }
+
+    #[test]
+    fn lengths_that_are_stated_and_never_come_take_no_memory() {
+        let mut bytes = Vec::new();
+        send(&mut bytes, &Message::State, b"x").unwrap();
+        bytes[8..16].copy_from_slice(&(MOST_PAYLOAD).to_le_bytes());
+        let error = receive(&mut &bytes[..], Payload::State).unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::UnexpectedEof);
+        bytes[8..16].copy_from_slice(&(MOST_PAYLOAD + 1).to_le_bytes());
+        assert!(receive(&mut &bytes[..], Payload::State).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_a_message_or_an_error(bytes in prop::collection::vec(any::<u8>(), 0..200), head in any::<bool>()) {
+            let mut all = if head { MAGIC.to_vec() } else { Vec::new() };
+            all.extend(bytes);
+            let _ = receive(&mut &all[..], Payload::State);
+        }
+    }
+}
