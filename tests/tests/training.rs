@@ -158,6 +158,100 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     models_can_be_looked_after(&calm);
 }
 
+/// A training of one stage, by so many processes.
+fn together(store: &Path, processes: u32) -> String {
+    format!(
+        r#"
+name = "together"
+[limits]
+max_crashes = 1000
+[[stage]]
+name = "rooms"
+scenes = {{ kind = "primitive", count = 16, seed = 3, spots = 4 }}
+render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
+output = {{ store = {store:?}, dataset = "rooms" }}
+[[stage]]
+kind = "split"
+source = "rooms"
+split = {{ counts = [12, 2, 2] }}
+[[stage]]
+name = "tof"
+kind = "train"
+source = "rooms"
+[stage.train]
+target = "tof"
+model = "tof"
+net = {{ width = 8, levels = 3 }}
+optimise = {{ epochs = 900, batch = 12, accumulate = 4 }}
+processes = {processes}
+checkpoint_minutes = 0.02
+"#
+    )
+}
+
+#[test]
+fn processes_of_one_training_that_are_killed_and_come_again_leave_the_bits_of_one() {
+    let wanted = kills_wanted();
+    let submitted = |farm: &Farm, processes: u32| {
+        let file = farm.store().with_file_name("together.toml");
+        fs::write(&file, together(&farm.store(), processes)).unwrap();
+        let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
+        answer["job"].as_str().unwrap().to_owned()
+    };
+    let calm = Farm::with_lease("together-calm", 2.0);
+    let id = submitted(&calm, 1);
+    let _worker = calm.worker("calm");
+    assert_eq!(calm.until_ended(&id)["state"], "done");
+
+    let farm = Farm::with_lease("together-killed", 2.0);
+    let id = submitted(&farm, 3);
+    let mut rng = Rng::new(23);
+    let start = |n: u64| farm.worker(&format!("worker-{n}"));
+    let mut workers = vec![start(0), start(1), start(2)];
+    let (mut kills, mut said) = (0, String::new());
+    while kills < wanted {
+        // Into the training, all of them.
+        let begun = std::time::Instant::now();
+        while farm.status(&id)["state"] == "active"
+            && !workers
+                .iter_mut()
+                .any(|w| w.stderr().contains("processes train together"))
+            && begun.elapsed() < Duration::from_secs(60)
+        {
+            sleep(Duration::from_millis(50));
+        }
+        sleep(Duration::from_millis(300 + rng.number() % 700));
+        if farm.status(&id)["state"] != "active" {
+            break;
+        }
+        // Whoever it is: one that leads, or another.
+        let which = (rng.number() % 3) as usize;
+        let victim = std::mem::replace(&mut workers[which], start(3 + kills));
+        said.push_str(&victim.stderr());
+        victim.kill();
+        kills += 1;
+    }
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    for worker in &mut workers {
+        said.push_str(&worker.stderr());
+    }
+    assert!(said.contains("processes train together"), "{said}");
+    assert!(said.contains("trains together with the process"), "{said}");
+    let made = |farm: &Farm| {
+        let mut hashes = store::hashes(&farm.store().join("models"));
+        hashes.retain(|key, _| !key.contains("checkpoints") && !key.ends_with("speed.json"));
+        hashes
+    };
+    let there = made(&farm);
+    assert!(
+        there.keys().any(|key| key.contains("weights.safetensors")),
+        "{there:?}"
+    );
+    // Neither other weights nor calls.
+    assert_eq!(there, made(&calm), "after {kills} kills");
+    eprintln!("{kills} kills");
+}
+
 fn flip(file: &Path) {
     let mut bytes = fs::read(file).unwrap();
     let middle = bytes.len() / 2;
