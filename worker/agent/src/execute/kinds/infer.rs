@@ -151,9 +151,7 @@ impl Panel {
             let depth = match &self.times {
                 None | Some(Times::Truth) => None,
                 Some(Times::Own) => Some(predicted.depth_m.clone()),
-                Some(Times::Kept(depths, _)) => {
-                    Some(stores.wait(control, depths.read_depth(index))?)
-                }
+                Some(Times::Kept(kept)) => Some(stores.wait(control, kept.0.read_depth(index))?),
             };
             predicted.lit = asked.masks(shadow, depth, 0.3..0.8)?;
         }

@@ -42,6 +42,7 @@ use super::{Control, Executor, Output, Submission, Task, TaskError, output::Stor
 pub(in crate::execute) const STORE_PATIENCE: Duration = Duration::from_secs(120);
 
 /// Where workers of this machine alone reach one another.
+#[cfg(feature = "networks")]
 const LOOPBACK: &str = "127.0.0.1";
 
 /// How tasks of a kind run.
@@ -78,6 +79,7 @@ pub(in crate::execute) struct Context {
     /// What opens scene files and imports.
     pub files: Opener,
     /// Where other workers reach this one.
+    #[cfg(feature = "networks")]
     pub peers: String,
     /// The networks that were asked last.
     #[cfg(feature = "networks")]
@@ -190,19 +192,23 @@ impl TaskExecutor {
             libraries: scenes::find_libraries(asset_dirs),
             stores: Stores::new(runtime, STORE_PATIENCE),
             sources: import::Sources::default(),
+            #[cfg(feature = "networks")]
             peers: LOOPBACK.to_owned(),
             #[cfg(feature = "networks")]
             models: infer::ModelCache::default(),
         })
     }
 
-    /// The same where other workers reach it at an address of this machine: host, or host and port.
+    /// The same where other workers reach it at an address of this machine: host, or host and port. Without networks nobody
+    /// wants to.
     #[must_use]
-    pub fn reached_at(self, peers: &str) -> Self {
-        Self(Context {
-            peers: peers.to_owned(),
-            ..self.0
-        })
+    #[cfg_attr(not(feature = "networks"), expect(unused_mut, unused_variables))]
+    pub fn reached_at(mut self, peers: &str) -> Self {
+        #[cfg(feature = "networks")]
+        {
+            peers.clone_into(&mut self.0.peers);
+        }
+        self
     }
 
     /// The same for tasks that may take so much memory, MiB; 0 = not known.

@@ -53,7 +53,7 @@ pub(super) enum Times {
     /// The stage's own ToF model.
     Own,
     /// Predictions of the scene that are kept, as the shadow network was trained with.
-    Kept(Predictions, PinnedDepths),
+    Kept(Box<(Predictions, PinnedDepths)>),
 }
 
 impl Panel {
@@ -116,7 +116,7 @@ impl Panel {
                 times
                     .predictions
                     .zip(pinned)
-                    .map(|(p, d)| Times::Kept(p, d))
+                    .map(|kept| Times::Kept(Box::new(kept)))
             }
         };
         Ok(Self {
@@ -170,7 +170,7 @@ impl Panel {
             None => None,
             Some(Times::Truth) => Some(TimesUsed::Truth),
             Some(Times::Own) => self.tof.as_ref().map(|tof| TimesUsed::Model(tof.used())),
-            Some(Times::Kept(_, pinned)) => pinned.model.clone().map(TimesUsed::Model),
+            Some(Times::Kept(kept)) => kept.1.model.clone().map(TimesUsed::Model),
         };
         let source = SceneUsed {
             dataset: task.source.dataset.clone(),
@@ -185,7 +185,7 @@ impl Panel {
             )
         });
         let times_of = match (&self.times, &times) {
-            (Some(Times::Kept(_, pinned)), _) => &*pinned.id,
+            (Some(Times::Kept(kept)), _) => &*kept.1.id,
             (_, None) => "",
             (_, Some(TimesUsed::Truth)) => TRUTH,
             (_, Some(TimesUsed::Model(model))) => &model.manifest_sha256,
