@@ -23,6 +23,9 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
         Command::Status(which) => status(&read(&which).await?, output),
         Command::Best(which) => best(&which, &read(&which).await?, output)?,
         Command::Report { which, out } => report(&read(&which).await?, &out, output)?,
+        Command::Export { which, out, curves } => {
+            export(&read(&which).await?, &out, curves, output)?;
+        }
     }
     Ok(())
 }
@@ -93,6 +96,90 @@ fn report(sweep: &Sweep, out: &Path, output: Output) -> Result<()> {
         )
     });
     Ok(())
+}
+
+fn export(sweep: &Sweep, out: &Path, curves: bool, output: Output) -> Result<()> {
+    let rows = match curves {
+        true => epochs(sweep),
+        false => trials(sweep),
+    };
+    let text: String = rows.iter().map(|row| csv(row)).collect();
+    fs::write(out, text).map_err(|e| io(out.display(), &e))?;
+    let facts = json!({"csv": out, "rows": rows.len() - 1});
+    output.result(&facts, || {
+        format!("{} rows in {}\n", rows.len() - 1, out.display())
+    });
+    Ok(())
+}
+
+/// A row for each trial.
+fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
+    let parameters = sweep.parameters();
+    let mut header = ["trial", "model", "end", "epochs", &sweep.error]
+        .map(str::to_owned)
+        .to_vec();
+    header.extend(parameters.iter().map(|name| (*name).to_owned()));
+    let row = |trial: &Tried| {
+        let mut row = vec![
+            trial.index.to_string(),
+            trial.model.clone(),
+            trial.end.name().to_owned(),
+            trial.epochs.to_string(),
+            number(trial.loss),
+        ];
+        for name in &parameters {
+            let value = trial.values.iter().find(|(other, _)| other == name);
+            row.push(value.map_or_else(String::new, |(_, value)| match value {
+                Value::Number(value) => value.to_string(),
+                Value::Text(text) => text.clone(),
+            }));
+        }
+        row
+    };
+    std::iter::once(header)
+        .chain(sweep.trials.iter().map(row))
+        .collect()
+}
+
+/// A row for each epoch of each trial that ended.
+fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
+    let header = [
+        "trial",
+        "epoch",
+        "step",
+        "loss",
+        "learning_rate",
+        &sweep.error,
+    ];
+    let mut rows = vec![header.map(str::to_owned).to_vec()];
+    for trial in &sweep.trials {
+        rows.extend(trial.history.iter().map(|line| {
+            vec![
+                trial.index.to_string(),
+                line.epoch.to_string(),
+                line.step.to_string(),
+                line.loss.to_string(),
+                line.learning_rate.to_string(),
+                number(line.validation.map(|found| found.loss())),
+            ]
+        }));
+    }
+    rows
+}
+
+/// A number with all its digits; empty where there is none.
+fn number(value: Option<f64>) -> String {
+    value.map_or_else(String::new, |value| value.to_string())
+}
+
+/// A line of CSV (RFC 4180).
+fn csv(row: &[String]) -> String {
+    let cell = |text: &String| match text.contains([',', '"', '\n', '\r']) {
+        true => format!("\"{}\"", text.replace('"', "\"\"")),
+        false => text.clone(),
+    };
+    let cells: Vec<String> = row.iter().map(cell).collect();
+    format!("{}\r\n", cells.join(","))
 }
 
 /// The records of a sweep's trials.
@@ -192,4 +279,15 @@ fn loss(trial: &Tried) -> String {
     trial
         .loss
         .map_or_else(|| "-".into(), |loss| format!("{loss:.4}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::csv;
+
+    #[test]
+    fn cells_of_csv_are_quoted_where_they_must_be() {
+        let row = ["a", "b, c", "say \"d\"", ""].map(str::to_owned);
+        assert_eq!(csv(&row), "a,\"b, c\",\"say \"\"d\"\"\",\r\n");
+    }
 }

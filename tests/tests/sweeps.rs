@@ -88,6 +88,22 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     assert_eq!(promoted["model"], model);
     assert_eq!(promoted["begun"], 6);
     assert_eq!(named["evaluations"].as_array().unwrap().len(), 1);
+    let table = farm.store().with_file_name("sweep.csv");
+    let out = table.to_str().unwrap();
+    farm.run(&["sweep", "export", store, "depth", "--out", out])
+        .ok();
+    let text = std::fs::read_to_string(&table).unwrap();
+    let rows: Vec<&str> = text.split_terminator("\r\n").collect();
+    assert_eq!(rows.len(), 7, "{text}");
+    assert!(rows[0].starts_with("trial,model,end,epochs,"), "{text}");
+    farm.run(&["sweep", "export", store, "depth", "--curves", "--out", out])
+        .ok();
+    let text = std::fs::read_to_string(&table).unwrap();
+    let epochs: usize = trials
+        .iter()
+        .map(|t| t["history"].as_array().unwrap().len())
+        .sum();
+    assert_eq!(text.split_terminator("\r\n").count(), 1 + epochs, "{text}");
     let page = farm.store().with_file_name("sweep.html");
     farm.json(&[
         "sweep",

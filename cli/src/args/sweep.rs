@@ -18,6 +18,17 @@ pub enum Sweep {
         #[arg(long, value_name = "FILE", default_value = "sweep.html")]
         out: PathBuf,
     },
+    /// Write the trials as CSV: a row for each, or for each epoch of each
+    Export {
+        #[command(flatten)]
+        which: WhichSweep,
+        /// The file to write
+        #[arg(long, value_name = "FILE", default_value = "sweep.csv")]
+        out: PathBuf,
+        /// A row for each epoch of trials that ended: loss, rate and validation along the training
+        #[arg(long)]
+        curves: bool,
+    },
 }
 
 #[derive(Args)]

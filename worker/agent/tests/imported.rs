@@ -125,6 +125,17 @@ async fn what_does_not_fit_is_named() {
         let refused = rooms.import(&weights, settings(more.clone())).unwrap_err();
         assert!(refused.contains(said), "{more}: {refused}");
     }
+    let (mut named, _) = weights::read(&weights).unwrap();
+    let (name, (_, values)) = named.iter_mut().next().unwrap();
+    let name = name.clone();
+    values[0] = f32::NAN;
+    let odd = weights::write(&named, &BTreeMap::new());
+    let refused = rooms.import(&odd, settings(json!({}))).unwrap_err();
+    let part = name.trim_start_matches("module.");
+    assert!(
+        refused.contains("holds NaN") && refused.contains(part),
+        "{refused}"
+    );
     for torn in [
         &weights[..weights.len() - 1],
         &weights[..20],

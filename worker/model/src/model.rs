@@ -51,12 +51,20 @@ impl Model {
     /// Of a file that holds a depth and a shadow network together, the one that the plan asks for.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where the bytes are damaged, or a tensor is missing or has another shape.
+    /// [`ModelError::Weights`] where the bytes are damaged, or a tensor is missing, has another shape or holds what is no finite
+    /// number.
     pub fn import(bytes: &[u8], plan: &Plan, device: &Device) -> Result<Vec<u8>, ModelError> {
         let net = Net::new(plan.net.clone())?;
         let declared = net.declared();
         let (named, _) = weights::read(bytes)?;
         let named = weights::from_torch(named, declared, plan.question.part())?;
+        let odd = |values: &[f32]| values.iter().copied().find(|value| !value.is_finite());
+        if let Some((name, value)) = named.iter().find_map(|(n, (_, v))| Some((n, odd(v)?))) {
+            let what = format!(
+                "{name:?} holds {value}; expected finite numbers: convert the weights again"
+            );
+            return Err(ModelError::weights(what));
+        }
         let parameters = Parameters::from_named(declared.to_vec(), named, device)?;
         let named = weights::to_torch(parameters.to_named());
         Ok(weights::write(
