@@ -14,10 +14,11 @@ fn kills_wanted() -> u64 {
     })
 }
 
-fn job(store: &Path) -> String {
+/// A job that renders rooms and splits them; stages that learn from them follow.
+fn rooms(name: &str, store: &Path) -> String {
     format!(
         r#"
-name = "learning"
+name = {name:?}
 [limits]
 max_crashes = 1000
 [[stage]]
@@ -29,7 +30,15 @@ output = {{ store = {store:?}, dataset = "rooms" }}
 kind = "split"
 source = "rooms"
 split = {{ counts = [12, 2, 2] }}
-[[stage]]
+"#
+    )
+}
+
+fn job(store: &Path) -> String {
+    let rooms = rooms("learning", store);
+    format!(
+        r#"
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"
@@ -160,21 +169,10 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
 
 /// A training of one stage, by so many processes.
 fn together(store: &Path, processes: u32) -> String {
+    let rooms = rooms("together", store);
     format!(
         r#"
-name = "together"
-[limits]
-max_crashes = 1000
-[[stage]]
-name = "rooms"
-scenes = {{ kind = "primitive", count = 16, seed = 3, spots = 4 }}
-render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
-output = {{ store = {store:?}, dataset = "rooms" }}
-[[stage]]
-kind = "split"
-source = "rooms"
-split = {{ counts = [12, 2, 2] }}
-[[stage]]
+{rooms}[[stage]]
 name = "tof"
 kind = "train"
 source = "rooms"
