@@ -21,7 +21,7 @@ use crate::message::{Address, Message, Payload, Wish, receive, send};
 /// How long a connection may take to say who it is, and to be answered.
 const INTRODUCTION: Duration = Duration::from_secs(10);
 /// Connections that may say who they are at a time.
-const MOST_STRANGERS: usize = 64;
+const MOST_UNIDENTIFIED: usize = 64;
 
 /// Whoever came.
 pub struct Arrived {
@@ -63,17 +63,17 @@ impl Endpoint {
         let (outbox, arrived) = channel();
         let closed = Arc::new(AtomicBool::new(false));
         let leads = Arc::new(AtomicBool::new(false));
-        let door = Arc::new(Door {
+        let acceptor = Arc::new(Acceptor {
             secret: address.secret.clone(),
             training: training.to_owned(),
             leads: leads.clone(),
             closed: closed.clone(),
-            strangers: AtomicUsize::new(0),
+            unidentified: AtomicUsize::new(0),
             outbox,
         });
         thread::Builder::new()
             .name("members".into())
-            .spawn(move || door.serve(&listener))?;
+            .spawn(move || acceptor.serve(&listener))?;
         Ok(Self {
             address,
             leads,
@@ -107,16 +107,16 @@ impl Drop for Endpoint {
     }
 }
 
-struct Door {
+struct Acceptor {
     secret: String,
     training: String,
     leads: Arc<AtomicBool>,
     closed: Arc<AtomicBool>,
-    strangers: AtomicUsize,
+    unidentified: AtomicUsize,
     outbox: Sender<Arrived>,
 }
 
-impl Door {
+impl Acceptor {
     fn serve(self: &Arc<Self>, listener: &TcpListener) {
         for stream in listener.incoming() {
             if self.closed.load(Ordering::SeqCst) {
@@ -130,20 +130,20 @@ impl Door {
                     continue;
                 }
             };
-            if self.strangers.fetch_add(1, Ordering::SeqCst) >= MOST_STRANGERS {
-                self.strangers.fetch_sub(1, Ordering::SeqCst);
+            if self.unidentified.fetch_add(1, Ordering::SeqCst) >= MOST_UNIDENTIFIED {
+                self.unidentified.fetch_sub(1, Ordering::SeqCst);
                 let _ = stream.shutdown(Shutdown::Both);
                 continue;
             }
-            let door = self.clone();
+            let acceptor = self.clone();
             let begun = thread::Builder::new().spawn(move || {
-                if let Err(error) = door.ask(stream) {
+                if let Err(error) = acceptor.ask(stream) {
                     debug!(%error, "a connection is closed before it says what it wants");
                 }
-                door.strangers.fetch_sub(1, Ordering::SeqCst);
+                acceptor.unidentified.fetch_sub(1, Ordering::SeqCst);
             });
             if begun.is_err() {
-                self.strangers.fetch_sub(1, Ordering::SeqCst);
+                self.unidentified.fetch_sub(1, Ordering::SeqCst);
             }
         }
     }

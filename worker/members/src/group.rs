@@ -576,7 +576,7 @@ impl Group for Members<'_> {
         match &self.role {
             Role::None => Ok(false),
             Role::Follows { .. } => match self.said() {
-                Waited::Said(Message::Go { .. }, _) => Ok(true),
+                Waited::Said(Message::Go, _) => Ok(true),
                 Waited::Said(message, payload) => {
                     self.put_back(message, payload);
                     Ok(false)
@@ -604,8 +604,10 @@ impl Group for Members<'_> {
                         Err(_) => Ok(true),
                     };
                 }
-                let go = Message::Go { step: 0 };
-                Ok(leads.others.iter().all(|other| other.link.say(&go, &[])))
+                Ok(leads
+                    .others
+                    .iter()
+                    .all(|other| other.link.say(&Message::Go, &[])))
             }
         }
     }

@@ -188,18 +188,18 @@ impl Mesh {
                         breaker.break_off();
                     }
                 };
-                let told = done.clone();
+                let over = done.clone();
                 writers.push(scope.spawn(move || {
                     let result = write(&mut io::BufWriter::new(stream), rank);
                     end(result.is_err());
-                    let _ = told.send(());
+                    let _ = over.send(());
                     result
                 }));
-                let told = done.clone();
+                let over = done.clone();
                 readers.push(scope.spawn(move || {
                     let result = read(&mut &*stream, rank);
                     end(result.is_err());
-                    let _ = told.send(());
+                    let _ = over.send(());
                     result
                 }));
             }

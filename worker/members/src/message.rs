@@ -52,10 +52,7 @@ pub enum Message {
         members: Vec<Address>,
     },
     /// By the leading process: go on.
-    Go {
-        /// From this step.
-        step: u64,
-    },
+    Go,
     /// By the leading process: an epoch is over.
     Epoch {
         /// How it ended.
@@ -172,7 +169,7 @@ mod tests {
     fn what_is_sent_is_what_is_received() {
         let mut bytes = Vec::new();
         send(&mut bytes, &Message::State, b"numbers").unwrap();
-        send(&mut bytes, &Message::Go { step: 7 }, b"").unwrap();
+        send(&mut bytes, &Message::Go, b"").unwrap();
         let mut from = &bytes[..];
         assert_eq!(
             receive(&mut from, Payload::State).unwrap(),
@@ -180,7 +177,7 @@ mod tests {
         );
         assert_eq!(
             receive(&mut from, Payload::None).unwrap(),
-            (Message::Go { step: 7 }, Vec::new())
+            (Message::Go, Vec::new())
         );
         // Whoever has not said who it is sends no state.
         assert!(receive(&mut &bytes[..], Payload::None).is_err());

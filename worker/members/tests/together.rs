@@ -223,7 +223,7 @@ fn an_early_end_is_the_same_for_all_and_keeps_the_same_epoch() {
 }
 
 #[test]
-fn strangers_at_the_door_disturb_nothing() {
+fn connections_without_the_secret_disturb_nothing() {
     let plan = Plan {
         epochs: 10,
         ..of_steps(2)
