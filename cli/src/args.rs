@@ -16,6 +16,7 @@ use std::{ffi::OsString, net::SocketAddr, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use picofarm_database::CatalogPlace;
+use picofarm_settings::Gpus;
 
 pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
@@ -237,6 +238,9 @@ pub struct Up {
     /// Workers to start; they share the cores
     #[arg(long, default_value_t = 1, value_parser = ranges::workers)]
     pub workers: usize,
+    /// Graphics processors, dealt to the workers in turn: how many, or which, as `picofarm model devices` names them
+    #[arg(long, default_value = "0", value_name = "N|NAMES")]
+    pub gpus: Gpus,
     #[command(flatten)]
     pub http: Http,
     #[command(flatten)]
@@ -335,9 +339,10 @@ pub struct Worker {
     /// group, the Slurm job and ulimit -v leave]
     #[arg(long, value_name = "GIB", value_parser = ranges::gib)]
     pub memory_gib: Option<f64>,
-    /// Graphics processors it may use
-    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=1024))]
-    pub gpus: u32,
+    /// Graphics processors it may use: how many, or which, as `picofarm model devices` names them (cuda:0,cuda:1). Each is tried
+    /// before it is used
+    #[arg(long, default_value = "0", value_name = "N|NAMES")]
+    pub gpus: Gpus,
     /// Address of this machine at which other workers reach this one, to train a network together (`train.processes`);
     /// whoever reaches it and can read the store can join
     #[arg(long, value_name = "HOST[:PORT]", default_value = "127.0.0.1")]

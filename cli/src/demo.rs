@@ -13,6 +13,7 @@ use picofarm_proto::{
     },
     show,
 };
+use picofarm_settings::Gpus;
 use serde_json::json;
 
 use rooms::Rooms;
@@ -21,7 +22,7 @@ use crate::{
     args::{Demo, Up},
     client::{Client, Submitted},
     dataset,
-    error::{Code, Result, io},
+    error::{CliError, Code, Result, io},
     follow::{Show, follow, verdict},
     jobfile,
     local::Local,
@@ -156,7 +157,7 @@ pub async fn demo(args: Demo, settings: &Settings, output: Output) -> Result<()>
     let mut farm = Local::start(
         &dir.join("catalog.sqlite"),
         any,
-        workers,
+        (workers, &[]),
         settings,
         Guarded::default(),
         None,
@@ -272,6 +273,18 @@ async fn tell(
     Ok(())
 }
 
+/// The names of graphics processors, which workers open.
+fn gpu_names(gpus: &Gpus) -> Result<Vec<String>> {
+    #[cfg(feature = "networks")]
+    let names = picofarm_model::device::names(gpus).map_err(|e| CliError::input(e.to_string()));
+    #[cfg(not(feature = "networks"))]
+    let names = match gpus == &Gpus::default() {
+        true => Ok(Vec::new()),
+        false => Err(crate::error::not_built("networks", "graphics processors")),
+    };
+    names
+}
+
 /// Runs a coordinator and workers until a signal.
 ///
 /// # Errors
@@ -279,13 +292,14 @@ async fn tell(
 pub async fn up(args: Up, settings: &Settings, output: Output) -> Result<()> {
     let guarded = Guarded::of(&args.guard);
     roles::refuse_unguarded(args.listen, &args.guard, true)?;
+    let gpus = gpu_names(&args.gpus)?;
     std::fs::create_dir_all(&args.dir).map_err(|e| io(args.dir.display(), &e))?;
     let stop = signals::stop_on_signal()?;
     let catalog = args.dir.join("catalog.sqlite");
     let mut farm = Local::start(
         &catalog,
         args.listen,
-        args.workers,
+        (args.workers, &gpus),
         settings,
         guarded,
         args.http.http,

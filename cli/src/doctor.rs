@@ -36,6 +36,7 @@ pub async fn run(args: Doctor, settings: &Settings, output: Output) -> Result<()
         store(&args.store).await,
         disk(&args.store),
         furniture(settings),
+        gpus(),
         coordinator(settings).await,
     ];
     output.result(&checks, || {
@@ -97,6 +98,52 @@ fn vector_kernel() -> &'static str {
 #[cfg(not(target_arch = "x86_64"))]
 fn vector_kernel() -> &'static str {
     "portable ray kernel (same results, slower)"
+}
+
+/// Those that networks may be computed on; each is opened and tried.
+#[cfg(feature = "networks")]
+fn gpus() -> Check {
+    use picofarm_model::device;
+    let tried: Vec<_> = device::gpus()
+        .iter()
+        .filter(|gpu| !gpu.is_software())
+        .map(device::Gpu::open)
+        .collect();
+    let (verdict, detail) = match &*tried {
+        _ if device::RUNTIMES.is_empty() => (
+            Verdict::Note,
+            "none: built without --features wgpu or cuda; networks are computed on the CPU".into(),
+        ),
+        [] => (
+            Verdict::Note,
+            "none: no driver lists one; networks are computed on the CPU".into(),
+        ),
+        tried => {
+            let each = tried.iter().map(|opened| match opened {
+                Ok(gpu) => gpu.to_string(),
+                Err(error) => error.to_string(),
+            });
+            let verdict = match tried.iter().all(Result::is_ok) {
+                true => Verdict::Ok,
+                false => Verdict::Bad,
+            };
+            (verdict, each.collect::<Vec<_>>().join("; "))
+        }
+    };
+    Check {
+        what: "graphics processors",
+        verdict,
+        detail,
+    }
+}
+
+#[cfg(not(feature = "networks"))]
+fn gpus() -> Check {
+    Check {
+        what: "graphics processors",
+        verdict: Verdict::Note,
+        detail: "none: built without networks, which alone are computed there".into(),
+    }
 }
 
 /// A store must give exactly one winner when several writers create the same object.

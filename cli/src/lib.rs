@@ -213,7 +213,12 @@ fn show_settings(resolved: &Resolved, output: Output) {
 
 /// Log lines go to stderr, those of tasks also to their coordinator, and spans to a collector, if one is named.
 fn log(filter: &str, traces: Option<&Traces>) -> Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(filter).map_err(|e| {
+    // A driver that has nothing to list is no error.
+    let filter = match filter.contains("wgpu") {
+        true => filter.to_owned(),
+        false => format!("{filter},wgpu_hal=off"),
+    };
+    let filter = tracing_subscriber::EnvFilter::try_new(&filter).map_err(|e| {
         error::CliError::input(format!("log filter {filter:?}: {e}"))
             .hint("e.g. --log info, or --log picofarm_agent=debug")
     })?;

@@ -2,6 +2,8 @@
 
 mod care;
 #[cfg(feature = "networks")]
+mod devices;
+#[cfg(feature = "networks")]
 mod import;
 #[cfg(feature = "networks")]
 mod report;
@@ -30,6 +32,10 @@ pub(crate) const WEIGHTS: &str = "weights.safetensors";
 pub async fn run(command: Command, output: Output) -> Result<()> {
     match command {
         Command::List { store } => list(&store, output).await,
+        #[cfg(not(feature = "networks"))]
+        Command::Devices => Err(not_built("networks", "graphics processors")),
+        #[cfg(feature = "networks")]
+        Command::Devices => devices::run(output),
         Command::Show { store, name } => show(&store, &name, output).await,
         Command::Export { store, name, out } => {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());

@@ -74,10 +74,11 @@ pub fn may_run(stage: &StageSpec, known: &Known, worker: &Abilities) -> Result<(
             gib(there)
         ));
     }
-    if needs.gpus > worker.gpus {
+    if needs.gpus as usize > worker.gpus.len() {
         return Err(format!(
             "the stage needs {} GPUs, the worker has {}",
-            needs.gpus, worker.gpus
+            needs.gpus,
+            worker.gpus.len()
         ));
     }
     if let Some(label) = needs.labels.iter().find(|l| !worker.labels.contains(l)) {

@@ -186,7 +186,7 @@ fn hello(id: String) -> wire::Hello {
         kinds: [("render".to_owned(), "r1".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 64 << 10,
-        gpus: 0,
+        gpus: Vec::new(),
         labels: Vec::new(),
     }
 }

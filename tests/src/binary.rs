@@ -4,7 +4,7 @@
 //! So it is asked for it: `cargo build --bin picofarm`, once a test process. That costs a third of a second when
 //! nothing changed, can never test a stale program, and is safe in parallel, because Cargo locks its target folder.
 //! Three arguments keep it from compiling the dependencies a second time with other features: `--workspace` and
-//! `--features picofarm/full`, as the tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
+//! `--features picofarm/full,picofarm/wgpu`, as the tests are run with, and `--test`, which makes Cargo count the features of development dependencies too.
 
 use std::{
     env,
@@ -49,7 +49,7 @@ fn build() -> PathBuf {
             "build",
             "--workspace",
             "--features",
-            "picofarm/full",
+            "picofarm/full,picofarm/wgpu",
             "--bin",
             "picofarm",
             "--test",

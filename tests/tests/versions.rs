@@ -33,7 +33,7 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
         kinds: [("render".to_owned(), "transient-0".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 0,
-        gpus: 0,
+        gpus: Vec::new(),
         labels: Vec::new(),
     }
 }

@@ -10,6 +10,7 @@ use std::{
 
 use picofarm_model::{
     ModelError,
+    device::{self, Gpus},
     input::{Batch, Target},
     net::{Architecture, NetSpec, Precision, StemForm, TimeProjection},
     train::Learner,
@@ -35,8 +36,8 @@ struct Report {
     /// Multiply-adds of a pass forward, a sample; the one-hot channels counted as if they were dense.
     multiply_adds: Option<f64>,
     threads: usize,
-    /// On a graphics processor; threads do not count then.
-    gpu: bool,
+    /// On this graphics processor; threads do not count then.
+    gpu: Option<String>,
     forms: Vec<Form>,
     /// The largest difference between the outputs of the gather and the dense form.
     forms_differ: Option<f64>,
@@ -57,9 +58,16 @@ struct Form {
 
 pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Result<()> {
     let trial = trial(args);
-    let device = match args.gpu {
-        true => picofarm_model::gpu().map_err(of_model)?,
-        false => picofarm_model::cpu(),
+    let opened = match &args.gpu {
+        Some(name) => {
+            let named = Gpus::Named(vec![name.clone()]);
+            device::open(&named).map_err(of_model)?.pop()
+        }
+        None => None,
+    };
+    let device = match &opened {
+        Some(gpu) => gpu.device.clone(),
+        None => picofarm_model::cpu(),
     };
     if let Some(path) = &args.record {
         let record = trial.record(RECORDED, &device).map_err(of_model)?;
@@ -139,7 +147,7 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         parameters,
         multiply_adds: trial.net.multiply_adds(trial.side),
         threads: rayon::current_num_threads(),
-        gpu: args.gpu,
+        gpu: opened.map(|gpu| gpu.to_string()),
         forms: names
             .into_iter()
             .enumerate()
@@ -247,9 +255,9 @@ fn text(report: &Report) -> String {
             macs / 1e9
         );
     }
-    let on = match report.gpu {
-        true => "graphics processor".to_owned(),
-        false => format!("{} threads", report.threads),
+    let on = match &report.gpu {
+        Some(gpu) => gpu.clone(),
+        None => format!("{} threads", report.threads),
     };
     out += &format!(", {on}\n\n{}", table(&rows));
     if let Some(differ) = report.forms_differ {

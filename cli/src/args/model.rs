@@ -27,6 +27,8 @@ pub enum Model {
         #[arg(value_parser = crate::paths::place)]
         store: String,
     },
+    /// List this machine's graphics processors, and try each: a product, a convolution and its gradients beside the CPU's
+    Devices,
     /// Say what a model is, where it comes from and how good it is
     Show {
         /// Folder or URL of the store

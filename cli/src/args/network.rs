@@ -33,9 +33,9 @@ pub struct BenchModel {
     /// A projection of time for each stream instead of one for both (unet2.5d)
     #[arg(long)]
     pub separate_streams: bool,
-    /// On the graphics processor (a build with --features cuda)
-    #[arg(long)]
-    pub gpu: bool,
+    /// On a graphics processor, as `picofarm model devices` names it (a build with --features wgpu or cuda)
+    #[arg(long, value_name = "NAME")]
+    pub gpu: Option<String>,
     /// Numbers in which convolutions are computed
     #[arg(long, value_enum, default_value_t = Numbers::F32)]
     pub precision: Numbers,

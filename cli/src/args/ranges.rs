@@ -103,7 +103,7 @@ mod tests {
     use clap::error::ErrorKind;
 
     /// A command line, and what its refusal says.
-    const REFUSED: [(&str, &str); 31] = [
+    const REFUSED: [(&str, &str); 33] = [
         ("up --workers 0", "expected 1 to 1024 workers"),
         ("demo --workers 0", "expected 1 to 1024 workers"),
         ("demo --samples 0", "2..=1048576"),
@@ -121,7 +121,9 @@ mod tests {
         ("worker --threads 0", "expected 1 to 1024 threads"),
         ("worker --memory-gib 0", "expected 0.05 to 1000000 GiB"),
         ("worker --memory-gib nan", "GiB"),
-        ("worker --gpus 5000", "0..=1024"),
+        ("worker --gpus 5000", "0..=256"),
+        ("worker --gpus cuda", "e.g. cuda:0"),
+        ("up --gpus cuda:0,cuda:0", "cuda:0 is named twice"),
         ("scene generate --spots 9", "1, 4, 16, 25 and 100"),
         ("scene generate --resolution 99999", "1..=4096"),
         (

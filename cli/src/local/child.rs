@@ -5,6 +5,7 @@ use std::io::{BufRead, Write};
 
 use picofarm_agent::{Access, AgentConfig};
 use picofarm_proto::ids::WorkerId;
+use picofarm_settings::Gpus;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use serde::{Deserialize, Serialize};
 use tokio::signal::unix::{SignalKind, signal};
@@ -43,6 +44,8 @@ pub struct Order {
     pub memory_mib: u64,
     /// Where that number comes from.
     pub memory_from: String,
+    /// Graphics processors, by name.
+    pub gpus: Vec<String>,
     /// Where traces go.
     pub otlp: Option<String>,
     /// How the process before this one ended; empty for the first.
@@ -131,7 +134,7 @@ async fn work(order: Order) -> Result<()> {
         threads: order.threads,
         memory_mib: order.memory_mib,
         memory_from: order.memory_from,
-        gpus: 0,
+        gpus: Gpus::named(order.gpus),
         peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,

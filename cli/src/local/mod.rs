@@ -34,7 +34,7 @@ pub struct Local {
 }
 
 impl Local {
-    /// Starts a coordinator on `catalog` and `workers` workers that share the cores, each in a process of its own: what
+    /// Starts a coordinator on `catalog` and `workers` workers that share the cores and graphics processors, each in a process of its own: what
     /// ends one of them, ends neither the coordinator nor the others.
     ///
     /// # Errors
@@ -42,7 +42,7 @@ impl Local {
     pub async fn start(
         catalog: &Path,
         listen: SocketAddr,
-        workers: usize,
+        (workers, gpus): (usize, &[String]),
         settings: &Settings,
         guarded: roles::Guarded,
         http: Option<SocketAddr>,
@@ -88,6 +88,7 @@ impl Local {
                     Some(memory) => format!("{memory}, shared by {workers} worker(s)"),
                     None => String::new(),
                 },
+                gpus: gpus.iter().skip(i).step_by(workers).cloned().collect(),
                 otlp: otlp.clone(),
                 ended: String::new(),
             };

@@ -2,12 +2,14 @@
 //! other crate uses this one type. Nothing here computes, reads or sends anything.
 
 mod gate;
+mod gpus;
 mod network;
 mod reconstruct;
 mod render;
 pub mod sensor;
 
 pub use gate::Gate;
+pub use gpus::Gpus;
 pub use network::{
     Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
 };

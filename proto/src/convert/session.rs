@@ -85,7 +85,10 @@ impl TryFrom<wire::Hello> for WorkerHello {
                     .collect::<Result<_, _>>()?,
                 cores: w.cores,
                 memory_mib: w.memory_mib,
-                gpus: w.gpus,
+                gpus: at_most(w.gpus, bounds::LIST, "hello.gpus")?
+                    .into_iter()
+                    .map(|gpu| named(gpu, "hello.gpus"))
+                    .collect::<Result<_, _>>()?,
                 labels: at_most(w.labels, bounds::LIST, "hello.labels")?
                     .into_iter()
                     .map(|label| {

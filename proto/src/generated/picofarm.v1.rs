@@ -548,8 +548,9 @@ pub struct Hello {
     /// 0 = not known.
     #[prost(uint64, tag = "10")]
     pub memory_mib: u64,
-    #[prost(uint32, tag = "11")]
-    pub gpus: u32,
+    /// Graphics processors that it has opened, as they call themselves.
+    #[prost(string, repeated, tag = "11")]
+    pub gpus: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     #[prost(string, repeated, tag = "12")]
     pub labels: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// How the process of this worker before this one ended, where its parent knows; at most 256 bytes, empty = not known.

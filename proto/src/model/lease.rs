@@ -42,8 +42,8 @@ pub struct Abilities {
     pub cores: u32,
     /// Memory in MiB; 0 = not known.
     pub memory_mib: u64,
-    /// Graphics processors.
-    pub gpus: u32,
+    /// Graphics processors that it has opened, as they call themselves.
+    pub gpus: Vec<String>,
     /// Labels it was given.
     pub labels: Vec<String>,
 }

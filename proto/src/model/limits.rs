@@ -94,7 +94,7 @@ pub struct Resources {
     pub cores: u32,
     /// Memory in GiB (2^30 bytes).
     pub memory_gib: f64,
-    /// Graphics processors.
+    /// Graphics processors: 1 for networks that are to be trained or asked on one.
     pub gpus: u32,
     /// Labels, each of which the worker must have been given.
     pub labels: Vec<String>,
@@ -118,8 +118,8 @@ impl Resources {
         within(
             "resources.gpus",
             self.gpus,
-            (0, 1024),
-            "graphics processors of one worker",
+            (0, 1),
+            "graphics processors: a task computes on one, a training on several by train.processes",
         )?;
         if self.labels.len() > bounds::LIST {
             let what = format!(

@@ -188,7 +188,7 @@ async fn changed_records_of_models_are_refused() {
         samples_per_s: 2.5,
         data_wait_share: 0.1,
         threads: 2,
-        gpu: false,
+        gpu: None,
     };
     models.put_speed("m", &speed).await.unwrap();
     let trial = TrialRecord {

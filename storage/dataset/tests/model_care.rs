@@ -77,7 +77,7 @@ async fn whole(models: &Models) -> ModelManifest {
         samples_per_s: 2.0,
         data_wait_share: 0.5,
         threads: 2,
-        gpu: false,
+        gpu: None,
     };
     models.put_speed("m", &speed).await.unwrap();
     made

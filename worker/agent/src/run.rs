@@ -18,6 +18,7 @@ pub async fn run(config: AgentConfig, shutdown: CancellationToken) -> Result<Sum
     let files = opener(&StorePrefixes::new(&config.store_prefixes)?);
     let executor = TaskExecutor::new(&config.asset_dirs, Handle::current(), files)
         .with_memory(config.memory_mib)
-        .reached_at(&config.peers);
+        .reached_at(&config.peers)
+        .with_gpus(&config.gpus)?;
     run_with(config, Arc::new(executor), shutdown).await
 }

@@ -36,6 +36,14 @@ pub enum ModelError {
         /// Which quantity, and where it was first seen.
         what: String,
     },
+    /// A graphics processor that failed.
+    #[error("graphics processor {id}: {what}")]
+    Gpu {
+        /// Which, e.g. `cuda:0`.
+        id: String,
+        /// What it did, in its driver's words where it has some.
+        what: String,
+    },
     /// What keeps a process from training together with others.
     #[error("{0}")]
     Group(String),

@@ -4,6 +4,7 @@ use burn::tensor::Device;
 
 use crate::{
     ModelError,
+    device::computes,
     input::{Batch, DEPTH_SCALE_M, Question, Target, Visit, example},
     net::Net,
     parameters::Parameters,
@@ -37,6 +38,7 @@ impl Model {
         })?;
         let plan: Plan = serde_json::from_str(plan)
             .map_err(|e| ModelError::weights(format!("the weights' plan: {e}")))?;
+        computes(&plan.net, device)?;
         let net = Net::new(plan.net.clone())?;
         let named = weights::from_torch(named, net.declared(), plan.question.part())?;
         let parameters = Parameters::from_named(net.declared().to_vec(), named, device)?;

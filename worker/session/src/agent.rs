@@ -85,7 +85,7 @@ async fn work(
             assets: executor.assets(),
             cores: u32::try_from(config.threads).unwrap_or(u32::MAX),
             memory_mib: config.memory_mib,
-            gpus: config.gpus,
+            gpus: executor.gpus(),
             labels: config.labels,
         },
     };

@@ -3,6 +3,7 @@
 use std::{path::PathBuf, time::Duration};
 
 use picofarm_proto::{ids::WorkerId, model::check_label};
+use picofarm_settings::Gpus;
 
 use crate::{Access, AccessError};
 
@@ -24,8 +25,8 @@ pub struct AgentConfig {
     pub memory_mib: u64,
     /// Where that number comes from, for the log.
     pub memory_from: String,
-    /// Graphics processors.
-    pub gpus: u32,
+    /// Graphics processors that tasks may use.
+    pub gpus: Gpus,
     /// Where other workers reach this one, which train a network together with it: an address of this machine, and a port
     /// where it must be a certain one.
     pub peers: String,

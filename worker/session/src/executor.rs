@@ -76,6 +76,11 @@ pub trait Executor: Send + Sync + 'static {
     /// Fingerprints of the furniture at hand.
     fn assets(&self) -> Vec<String>;
 
+    /// The graphics processors that it has opened, as they call themselves.
+    fn gpus(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Runs `task` to its end, reporting its progress to `control`, and stops when asked to.
     ///
     /// # Errors

@@ -87,7 +87,16 @@ async fn render(
 ) -> Result<()> {
     let any = SocketAddr::from(([127, 0, 0, 1], 0));
     let catalog = dir.join("catalog.sqlite");
-    let mut farm = Local::start(&catalog, any, 1, settings, Guarded::default(), None, None).await?;
+    let mut farm = Local::start(
+        &catalog,
+        any,
+        (1, &[]),
+        settings,
+        Guarded::default(),
+        None,
+        None,
+    )
+    .await?;
     // This process's own coordinator asks nobody who they are.
     let mut client = Client::connect(&farm.url, &Access::default()).await?;
     let job = client.submit(spec, false).await?.job;

@@ -21,8 +21,9 @@ pub struct TrainingSpeed {
     pub data_wait_share: f64,
     /// Threads of the worker.
     pub threads: usize,
-    /// Whether it was computed on a graphics processor.
-    pub gpu: bool,
+    /// The graphics processor that it was computed on, as it calls itself; none for the CPU.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<String>,
 }
 
 impl TrainingSpeed {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use picofarm_dataset::Evaluation;
 use picofarm_model::{
-    Model,
+    Device, Model,
     report::{Picture, pictures},
 };
 use picofarm_proto::model::Histogram;
@@ -29,7 +29,7 @@ pub(super) struct Shown {
     pub(super) pictures: Vec<Picture>,
 }
 
-/// What a model says of the first `count` scenes that it was evaluated on.
+/// What a model, computed on `device`, says of the first `count` scenes that it was evaluated on.
 ///
 /// # Errors
 /// [`TaskError::User`] where the model, its data set or its split is not there any more.
@@ -37,7 +37,7 @@ pub(super) fn show(
     stores: &Stores,
     store: &str,
     evaluation: &Evaluation,
-    count: usize,
+    (count, device): (usize, &Device),
     control: &Control,
 ) -> Result<Shown, TaskError> {
     let dataset = stores.open_source(store, &evaluation.dataset, control)?;
@@ -47,7 +47,7 @@ pub(super) fn show(
     let [mut scenes] = found.scenes;
     scenes.truncate(count);
     let model = ("report", &*evaluation.model);
-    let known = Known::read(stores, &models, model, dataset.spec(), control)?;
+    let known = Known::read(stores, &models, model, (dataset.spec(), device), control)?;
     let settings = trained(&known.manifest.settings)
         .map_err(|what| TaskError::User(format!("{}: its settings: {what}", evaluation.model)))?;
     let pinned = pin(stores, &dataset, &scenes, control)?;

@@ -393,7 +393,7 @@ pub fn config(address: SocketAddr) -> AgentConfig {
         threads: 1,
         memory_mib: 4096,
         memory_from: String::new(),
-        gpus: 0,
+        gpus: Default::default(),
         peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,

@@ -18,6 +18,7 @@ use picofarm_proto::{
     },
     split::{Parts, SplitSettings},
 };
+use picofarm_settings::Gpus;
 use serde_json::json;
 use tempfile::TempDir;
 use tokio::runtime::Handle;
@@ -328,6 +329,16 @@ pub async fn run_at(
     index: u64,
     control: Arc<Control>,
 ) -> Result<Output, TaskError> {
+    run_on(Gpus::default(), stage, index, control).await
+}
+
+/// The same on a worker with graphics processors.
+pub async fn run_on(
+    gpus: Gpus,
+    stage: StageSpec,
+    index: u64,
+    control: Arc<Control>,
+) -> Result<Output, TaskError> {
     let task = Task {
         job: JobId::from_uuid(Uuid::nil()),
         stage: stage_key(&stage),
@@ -337,6 +348,7 @@ pub async fn run_at(
     let runtime = Handle::current();
     let work = move || {
         let executor = TaskExecutor::new(&[], runtime, Opener::anywhere());
+        let executor = executor.with_gpus(&gpus).unwrap();
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(2)
             .build()

@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, sha256_hex};
-use picofarm_model::{Answered, Evaluated, answered, baseline::Baseline};
+use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline};
 use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
@@ -34,8 +34,8 @@ impl RunTask for EvaluateTask {
     }
 
     /// Evaluates the models that `task` names; joins their shards where they have some.
-    fn run(&self, context: &Context, _task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let evaluation = EvaluationRun::new(context, self, control)?;
+    fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let evaluation = EvaluationRun::new((context, context.device(task)?), self, control)?;
         let (mut documents, mut computed) = (Vec::new(), false);
         for which in 0..self.evaluate.models.len() {
             let (found, new) = evaluation.of(which, control)?;
@@ -58,7 +58,8 @@ impl RunTask for EvaluateShardTask {
 
     /// Asks the models of the scenes of shard `task.index`, but those whose evaluation or shard is there.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
-        let evaluation = EvaluationRun::new(context, &self.whole, control)?;
+        let evaluation =
+            EvaluationRun::new((context, context.device(task)?), &self.whole, control)?;
         let (mut bytes, mut computed) = (0, false);
         let mut names = Sha256::new();
         for which in 0..self.whole.evaluate.models.len() {
@@ -96,6 +97,8 @@ impl RunTask for EvaluateShardTask {
 struct EvaluationRun<'a> {
     stores: &'a Stores,
     task: &'a EvaluateTask,
+    /// Where models are asked.
+    device: Device,
     dataset: Dataset,
     models: Models,
     split: SplitUsed,
@@ -134,7 +137,7 @@ struct Asked {
 
 impl<'a> EvaluationRun<'a> {
     fn new(
-        context: &'a Context,
+        (context, device): (&'a Context, Device),
         task: &'a EvaluateTask,
         control: &Control,
     ) -> Result<Self, TaskError> {
@@ -158,6 +161,7 @@ impl<'a> EvaluationRun<'a> {
             known,
             stores,
             task,
+            device,
             dataset,
             models,
             split: sides.split,
@@ -171,7 +175,13 @@ impl<'a> EvaluationRun<'a> {
         let name = &settings.models[which];
         let field = format!("evaluate.models[{which}]");
         let spec = self.dataset.spec();
-        let model = Known::read(stores, models, (&field, name), spec, control)?;
+        let model = Known::read(
+            stores,
+            models,
+            (&field, name),
+            (spec, &self.device),
+            control,
+        )?;
         let trained = trained(&model.manifest.settings).map_err(|what| {
             TaskError::User(format!(
                 "{field}: the settings of {name:?} are not known: {what}"

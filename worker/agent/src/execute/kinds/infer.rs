@@ -12,7 +12,7 @@ use picofarm_dataset::{
     Dataset, DatasetError, ENCODER_VERSION, Models, Predicted, PredictionManifest, Predictions,
 };
 use picofarm_model::{
-    Model, ModelError, masks,
+    Device, Model, ModelError, masks,
     scene::{Scene, Scenes},
 };
 use picofarm_proto::model::{InferTask, TaskSpec};
@@ -38,9 +38,12 @@ pub fn infer_version() -> String {
     format!("{}/{ENCODER_VERSION}", model_version())
 }
 
-/// Models that are kept from task to task: those of the latest one, by the SHA-256 of their manifests.
+/// Models that are kept from task to task: those of the latest one.
 #[derive(Default)]
-pub(in crate::execute) struct ModelCache(Mutex<BTreeMap<String, Arc<Model>>>);
+pub(in crate::execute) struct ModelCache(Mutex<Kept>);
+
+/// Models by the SHA-256 of their manifests, and whether they are on a graphics processor.
+type Kept = BTreeMap<(String, bool), Arc<Model>>;
 
 impl RunTask for InferTask {
     fn code_version() -> String {
@@ -50,6 +53,7 @@ impl RunTask for InferTask {
     /// Lets models see scene `index`; with `force` although what they see is there.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let (stores, cache) = (&context.stores, &context.models);
+        let (device, on_gpu) = (context.device(task)?, context.gpu(task).is_some());
         let (force, index) = (task.spec.force, task.index);
         let task = self;
         let place = &task.source;
@@ -82,7 +86,13 @@ impl RunTask for InferTask {
         if let Some(there) = finished {
             return Ok(output(&there, true));
         }
-        let predicted = panel.ask(stores, (&models, cache), &dataset, index, control)?;
+        let predicted = panel.ask(
+            stores,
+            (&models, cache),
+            (device, on_gpu),
+            (&dataset, index),
+            control,
+        )?;
         let encoded = predictions
             .encode(manifest, &predicted)
             .map_err(of_dataset)?;
@@ -128,13 +138,15 @@ impl Panel {
         &self,
         stores: &Stores,
         (models, cache): (&Models, &ModelCache),
-        dataset: &Dataset,
-        index: u64,
+        (device, on_gpu): (Device, bool),
+        (dataset, index): (&Dataset, u64),
         control: &Control,
     ) -> Result<Predicted, TaskError> {
         let mut asked = Asked {
             stores,
             models,
+            device,
+            on_gpu,
             dataset,
             index,
             control,
@@ -167,28 +179,33 @@ impl Panel {
 struct Asked<'a> {
     stores: &'a Stores,
     models: &'a Models,
+    device: Device,
+    on_gpu: bool,
     dataset: &'a Dataset,
     index: u64,
     control: &'a Control,
     /// Models at hand, and those that were asked.
-    cache: BTreeMap<String, Arc<Model>>,
-    used: BTreeMap<String, Arc<Model>>,
+    cache: Kept,
+    used: Kept,
     /// The scene with each histogram that was read.
     seen: Vec<(Shown, Arc<Scene>)>,
 }
 
 impl Asked<'_> {
     fn model(&mut self, member: &Member) -> Result<Arc<Model>, TaskError> {
-        let sha256 = member.checked.manifest.sha256();
-        let model = match self.cache.get(&sha256) {
+        let which = (member.checked.manifest.sha256(), self.on_gpu);
+        let model = match self.cache.get(&which) {
             Some(model) => model.clone(),
             None => {
                 let (stores, models, control) = (self.stores, self.models, self.control);
-                let read = member.checked.model(stores, models, &member.field, control);
+                let read =
+                    member
+                        .checked
+                        .model(stores, models, (&member.field, &self.device), control);
                 Arc::new(read?)
             }
         };
-        self.used.insert(sha256, model.clone());
+        self.used.insert(which, model.clone());
         Ok(model)
     }
 

@@ -2,6 +2,8 @@
 //! [`picofarm_proto::model::kinds`].
 
 #[cfg(feature = "networks")]
+pub(in crate::execute) mod device;
+#[cfg(feature = "networks")]
 pub(super) mod evaluate;
 pub mod export;
 mod generate;
@@ -28,12 +30,16 @@ mod without_networks;
 use std::{collections::BTreeMap, path::PathBuf, time::Duration};
 
 use picofarm_files::Opener;
+#[cfg(feature = "networks")]
+use picofarm_model::device::OpenGpu;
 use picofarm_proto::model::{
     EvaluateShardTask, EvaluateTask, ExportTask, GenerateTask, ImportTask, InferTask, PartTask,
     PromoteTask, RenderTask, ReportTask, ReprocessTask, SpecError, SplitTask, TaskSpec, TrainTask,
     kinds::{Declared, ReconstructTask, VerifyTask, export::FORMATS, reconstruct::MLP},
 };
 use picofarm_scene::AssetLibrary;
+use picofarm_session::AgentError;
+use picofarm_settings::Gpus;
 use tokio::runtime::Handle;
 
 use super::{Control, Executor, Output, Submission, Task, TaskError, output::Stores, scenes};
@@ -81,6 +87,9 @@ pub(in crate::execute) struct Context {
     /// Where other workers reach this one.
     #[cfg(feature = "networks")]
     pub peers: String,
+    /// Graphics processors that tasks may use.
+    #[cfg(feature = "networks")]
+    pub gpus: Vec<OpenGpu>,
     /// The networks that were asked last.
     #[cfg(feature = "networks")]
     pub models: infer::ModelCache,
@@ -195,6 +204,8 @@ impl TaskExecutor {
             #[cfg(feature = "networks")]
             peers: LOOPBACK.to_owned(),
             #[cfg(feature = "networks")]
+            gpus: Vec::new(),
+            #[cfg(feature = "networks")]
             models: infer::ModelCache::default(),
         })
     }
@@ -209,6 +220,32 @@ impl TaskExecutor {
             peers.clone_into(&mut self.0.peers);
         }
         self
+    }
+
+    /// The same with graphics processors, which are opened and tried.
+    ///
+    /// # Errors
+    /// [`AgentError::Config`] where there are none such, or one computes wrongly; in a program without networks, for any.
+    #[cfg_attr(not(feature = "networks"), expect(unused_mut))]
+    pub fn with_gpus(mut self, gpus: &Gpus) -> Result<Self, AgentError> {
+        let refused = |what: String| AgentError::Config {
+            field: "gpus",
+            what,
+        };
+        #[cfg(feature = "networks")]
+        {
+            let opened = picofarm_model::device::open(gpus);
+            self.0.gpus = opened.map_err(|e| refused(device::plain(e)))?;
+            for gpu in &self.0.gpus {
+                tracing::info!(%gpu, "computes as the CPU does");
+            }
+        }
+        #[cfg(not(feature = "networks"))]
+        if *gpus != Gpus::default() {
+            let what = "are for networks, which this program was built without; build it with --features wgpu or cuda";
+            return Err(refused(what.into()));
+        }
+        Ok(self)
     }
 
     /// The same for tasks that may take so much memory, MiB; 0 = not known.
@@ -232,6 +269,13 @@ impl Executor for TaskExecutor {
             .map(|(kind, version)| (kind.to_owned(), version))
             .chain(parts)
             .collect()
+    }
+
+    fn gpus(&self) -> Vec<String> {
+        #[cfg(feature = "networks")]
+        return self.0.gpus.iter().map(ToString::to_string).collect();
+        #[cfg(not(feature = "networks"))]
+        Vec::new()
     }
 
     fn assets(&self) -> Vec<String> {
@@ -259,6 +303,10 @@ impl Executor for TaskExecutor {
             // Others say it when they have seen what they read.
             self.0.stores.fits(spec.clone(), None)?;
         }
-        runner(spec).run(&self.0, task, control)
+        let run = || runner(spec).run(&self.0, task, control);
+        #[cfg(feature = "networks")]
+        return device::on_gpu(self.0.gpu(task), run);
+        #[cfg(not(feature = "networks"))]
+        run()
     }
 }

@@ -10,7 +10,7 @@ use picofarm_dataset::{
     TrainingSpeed,
 };
 use picofarm_model::{
-    Evaluated, Model,
+    Device, Evaluated, Model, cpu,
     metric::Metrics,
     report::{Data, Entry, Report, Speed, html, json},
     train::Line,
@@ -55,7 +55,7 @@ impl Collector {
     ) -> Result<Entry, TaskError> {
         let models = self.stores.source_models(store)?;
         let subject = Subject::find(&self.stores, &models, name, control)?;
-        subject.entry(&self.stores, (store, &models), pictures, control)
+        subject.entry(&self.stores, (store, &models), (pictures, &cpu()), control)
     }
 }
 
@@ -67,7 +67,7 @@ impl RunTask for ReportTask {
     /// Makes the report that `task` names and keeps it; with `force` although it is there.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let stores = &context.stores;
-        let force = task.spec.force;
+        let (force, device) = (task.spec.force, context.device(task)?);
         let task = self;
         let settings = &task.report;
         let (store, prefix) = stores
@@ -107,7 +107,7 @@ impl RunTask for ReportTask {
             let entry = subject.entry(
                 stores,
                 (place, &models),
-                settings.pictures as usize,
+                (settings.pictures as usize, &device),
                 control,
             )?;
             report.models.push(entry);
@@ -202,7 +202,7 @@ impl Subject {
         &self,
         stores: &Stores,
         (store, models): (&str, &Models),
-        pictures: usize,
+        (pictures, device): (usize, &Device),
         control: &Control,
     ) -> Result<Entry, TaskError> {
         let (manifest, name) = (&self.manifest, &*self.manifest.name);
@@ -210,7 +210,7 @@ impl Subject {
         let broken = |what: String| TaskError::Crash(format!("model {name:?}: {what}"));
         let mut entry = match &self.evaluation {
             Some(evaluation) => {
-                let shown = gallery::show(stores, store, evaluation, pictures, control)?;
+                let shown = gallery::show(stores, store, evaluation, (pictures, device), control)?;
                 Entry {
                     pictures: shown.pictures,
                     ..Entry::new(name, &shown.model, shown.side)
@@ -218,7 +218,7 @@ impl Subject {
             }
             None => {
                 let weights = stores.wait(control, models.read(manifest, WEIGHTS))?;
-                let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
+                let model = Model::read(&weights, device).map_err(of_model)?;
                 let mut entry = Entry::new(name, &model, 0);
                 entry.multiply_adds = None;
                 entry

@@ -15,7 +15,7 @@ use picofarm_dataset::{
 };
 use picofarm_members::Members;
 use picofarm_model::{
-    Device, ModelError,
+    Device, ModelError, cpu,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
@@ -67,14 +67,14 @@ impl RunTask for TrainTask {
     /// Trains what `task` names; with `force` although it is there, and on a graphics processor where the job asks for `gpus`.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
         let stores = &context.stores;
-        let (force, gpus) = (task.spec.force, task.spec.resources.gpus);
-        let task = self;
+        let force = task.spec.force;
         let training = TrainingRun {
-            gpus,
+            device: context.device(task)?,
+            gpu: context.gpu(task).map(ToString::to_string),
             peers: &context.peers,
-            ..TrainingRun::of(stores, task, control)?
+            ..TrainingRun::of(stores, self, control)?
         };
-        let Some(trial) = &task.train.trial else {
+        let Some(trial) = &self.train.trial else {
             let published = match training.learn(stores, force, None, control)? {
                 Ok(published) => published,
                 Err(_) => unreachable!("only trials are left before their end"),
@@ -103,8 +103,10 @@ struct TrainingRun<'a> {
     built: BTreeMap<&'static str, Known>,
     lineage: Lineage,
     key: String,
-    /// Graphics processors that the job asks for.
-    gpus: u32,
+    /// Where it is computed.
+    device: Device,
+    /// The graphics processor that this is, as it calls itself.
+    gpu: Option<String>,
     /// Where other workers reach this one.
     peers: &'a str,
 }
@@ -189,26 +191,10 @@ impl<'a> TrainingRun<'a> {
             built,
             lineage,
             key,
-            gpus: 0,
+            device: cpu(),
+            gpu: None,
             peers: "",
         })
-    }
-
-    /// Where it is computed. A program without graphics processors trains on its processor, and says so.
-    fn device(&self) -> Result<Device, TaskError> {
-        if self.gpus == 0 {
-            return Ok(picofarm_model::cpu());
-        }
-        match picofarm_model::gpu() {
-            Err(error) if picofarm_model::HAS_GPUS => {
-                Err(TaskError::Interrupted(error.to_string()))
-            }
-            Err(error) => {
-                warn!(%error, "trains on the processor");
-                Ok(picofarm_model::cpu())
-            }
-            Ok(device) => Ok(device),
-        }
     }
 
     /// What the model runtime is asked.
@@ -317,7 +303,7 @@ impl<'a> TrainingRun<'a> {
             samples_per_s,
             data_wait_share,
             threads: rayon::current_num_threads(),
-            gpu: self.gpus > 0 && picofarm_model::HAS_GPUS,
+            gpu: self.gpu.clone(),
         };
         let put = self.models.put_speed(&self.task.train.model, &speed);
         if let Err(error) = stores.wait(control, put) {
@@ -334,7 +320,6 @@ impl<'a> TrainingRun<'a> {
         control: &Control,
     ) -> Result<Came, TaskError> {
         let (name, key) = (&self.task.train.model, &*self.key);
-        let device = self.device()?;
         let sources = Sources {
             train: self.training.clone(),
             validation: self.validation.clone(),
@@ -344,10 +329,10 @@ impl<'a> TrainingRun<'a> {
         let from = from.map(|known| &known.weights[..]);
         let newest = stores.wait(control, self.models.newest_checkpoint(name, key))?;
         let mut training = match newest {
-            None => Training::start(plan, from, sources, &device),
+            None => Training::start(plan, from, sources, &self.device),
             Some((step, content)) => {
                 info!("goes on from the checkpoint after {step} steps");
-                Training::resume(plan, &content, sources, &device)
+                Training::resume(plan, &content, sources, &self.device)
             }
         }
         .map_err(of_model)?
@@ -472,7 +457,7 @@ fn read_models(
 ) -> Result<BTreeMap<&'static str, Known>, TaskError> {
     let mut built = BTreeMap::new();
     for (field, name) in settings.models() {
-        let known = Known::read(stores, models, (field, name), spec, control)?;
+        let known = Known::read(stores, models, (field, name), (spec, &cpu()), control)?;
         let wanted = match field {
             "train.from" => settings.target.name(),
             _ => Target::Tof.name(),
@@ -509,6 +494,7 @@ pub(in crate::execute) fn of_model(error: ModelError) -> TaskError {
         // What is in the store has its checksum: this program made it, and does not know it again.
         ModelError::Weights { what } => TaskError::Crash(what),
         ModelError::Group(what) => TaskError::Interrupted(what),
+        error @ ModelError::Gpu { .. } => TaskError::Crash(error.to_string()),
         other => TaskError::User(other.to_string()),
     }
 }

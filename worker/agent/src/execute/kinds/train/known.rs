@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use picofarm_dataset::{DatasetSpec, Gate, ModelManifest, Models};
-use picofarm_model::{Model, train::Plan};
+use picofarm_model::{Device, Model, train::Plan};
 use serde::{Deserialize, Serialize};
 
 use super::{WEIGHTS, at, of_model};
@@ -112,21 +112,21 @@ impl CheckedModel {
         weights.map_err(|e| at(field, e))
     }
 
-    /// The model, ready to be asked.
+    /// The model, ready to be asked on a device.
     pub(in crate::execute) fn model(
         &self,
         stores: &Stores,
         models: &Models,
-        field: &str,
+        (field, device): (&str, &Device),
         control: &Control,
     ) -> Result<Model, TaskError> {
         let weights = self.weights(stores, models, field, control)?;
-        Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)
+        Model::read(&weights, device).map_err(of_model)
     }
 }
 
 impl Known {
-    /// Reads a model; see [`CheckedModel::look`].
+    /// Reads a model that is asked on a device; see [`CheckedModel::look`].
     ///
     /// # Errors
     /// [`TaskError::User`] at `field` where there is none of this name, or it does not fit.
@@ -134,12 +134,12 @@ impl Known {
         stores: &Stores,
         models: &Models,
         (field, name): (&str, &str),
-        spec: &DatasetSpec,
+        (spec, device): (&DatasetSpec, &Device),
         control: &Control,
     ) -> Result<Self, TaskError> {
         let checked = CheckedModel::look(stores, models, (field, name), spec, control)?;
         let weights = checked.weights(stores, models, field, control)?;
-        let model = Model::read(&weights, &picofarm_model::cpu()).map_err(of_model)?;
+        let model = Model::read(&weights, device).map_err(of_model)?;
         Ok(Self {
             model: Arc::new(model),
             weights,

@@ -1,0 +1,176 @@
+//! Networks on graphics processors beside the kernels of the CPU. Every device that drivers list is tried, software devices
+//! too: Debian's mesa-vulkan-drivers have one, so that this runs on machines without a card.
+#![cfg(any(feature = "cuda", feature = "wgpu"))]
+
+mod common;
+
+use std::collections::BTreeMap;
+
+use common::{plan, scene, sources};
+use picofarm_model::{
+    Model, answers, cpu,
+    device::{OpenGpu, gpus},
+    input::{ShadowVariant, Target},
+    net::{Architecture, NetSpec, Precision, StemForm, TimeProjection},
+    train::{Control, Ended, Event, Plan, Trained, Training},
+    trial::Trial,
+    weights,
+};
+
+/// Steps of AdamW that are compared.
+const STEPS: usize = 20;
+
+/// All that can be opened. Says so where there are none.
+fn opened() -> Vec<OpenGpu> {
+    let listed = gpus();
+    if listed.is_empty() {
+        eprintln!("SKIPPED graphics processors: no driver lists any (Debian: mesa-vulkan-drivers)");
+    }
+    listed.iter().map(|gpu| gpu.open().unwrap()).collect()
+}
+
+/// The six networks: what each learns, as U-Net over bins as channels and over time as a dimension.
+fn six() -> impl Iterator<Item = Trial> {
+    let targets = [Target::Tof, Target::Shadow, Target::Specular];
+    targets.into_iter().flat_map(|target| {
+        [Architecture::Unet2d, Architecture::Unet25d].map(|architecture| Trial {
+            target,
+            net: NetSpec {
+                architecture,
+                dense: 24,
+                one_hot: if target == Target::Shadow { 24 } else { 0 },
+                outputs: 1,
+                width: 8,
+                levels: 3,
+                stem: 0,
+                stem_form: StemForm::Block,
+                time: 8,
+                time_projection: TimeProjection::Shared,
+                frozen: false,
+                precision: Precision::F32,
+            },
+            batch: 3,
+            side: 16,
+            learning_rate: 2e-4,
+            decay: 1e-3,
+            seed: 1,
+        })
+    })
+}
+
+type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+/// The greatest difference of tensors whose names begin with `part`, over the greatest value of each.
+fn apart(a: &Tensors, b: &Tensors, part: &str) -> f64 {
+    let named = a.iter().filter(|(name, _)| name.starts_with(part));
+    let mut worst = 0.0;
+    for (name, (shape, values)) in named {
+        let (other, others) = &b[name];
+        assert_eq!(shape, other, "{name}");
+        let scale = values.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+        for (x, y) in values.iter().zip(others) {
+            assert!(x.is_finite() && y.is_finite(), "{name}: {x} and {y}");
+            worst = f64::max(worst, f64::from((x - y).abs() / scale.max(1e-6)));
+        }
+    }
+    worst
+}
+
+#[test]
+fn the_six_networks_answer_and_learn_as_on_the_cpu() {
+    for gpu in opened() {
+        for trial in six() {
+            let record = |device| {
+                weights::read(&trial.record(STEPS, device).unwrap())
+                    .unwrap()
+                    .0
+            };
+            let (ours, theirs) = (record(&cpu()), record(&gpu.device));
+            let part = |name: &str| {
+                let worst = apart(&ours, &theirs, name);
+                println!(
+                    "{gpu} {:?} {:?} {name}: {worst:.1e}",
+                    trial.target, trial.net.architecture
+                );
+                worst
+            };
+            assert_eq!(part("weights"), 0.0);
+            assert!(part("evaluated") < 1e-4);
+            assert!(part("output") < 1e-4);
+            assert!(part("gradient") < 2e-3);
+            assert!(part("after") < 1e-4);
+            assert!(part("losses") < 1e-3);
+            let losses = &theirs["losses"].1;
+            assert!(
+                losses[STEPS - 1] < losses[0],
+                "{gpu} learns nothing: {losses:?}"
+            );
+        }
+    }
+}
+
+fn trained(plan: &Plan, gpu: &OpenGpu, stop: Option<u64>) -> Trained {
+    let device = &gpu.device;
+    let mut training = Training::start(plan.clone(), None, sources(), device).unwrap();
+    if let Some(stop) = stop {
+        let ended = training.run(&mut |_, event| match event {
+            Event::Step { step, .. } if *step >= stop => Control::Stop,
+            _ => Control::Continue,
+        });
+        assert_eq!(ended.unwrap(), Ended::Stopped);
+        let checkpoint = training.checkpoint();
+        training = Training::resume(plan.clone(), &checkpoint, sources(), device).unwrap();
+    }
+    training.run(&mut |_, _| Control::Continue).unwrap();
+    training.finish()
+}
+
+#[test]
+fn a_training_that_was_cut_off_comes_to_the_same_bits_on_the_same_device() {
+    let plan = plan(Target::Shadow, ShadowVariant::Concat);
+    for gpu in opened() {
+        let (whole, cut) = (trained(&plan, &gpu, None), trained(&plan, &gpu, Some(3)));
+        assert_eq!(whole.weights, cut.weights, "{gpu}");
+        assert_eq!(whole.history, cut.history, "{gpu}");
+    }
+}
+
+#[test]
+fn a_network_says_on_any_device_what_it_says_on_the_cpu() {
+    let plan = plan(Target::Shadow, ShadowVariant::Concat);
+    for gpu in opened() {
+        let weights = trained(&plan, &gpu, None).weights;
+        let [ours, theirs] = [&cpu(), &gpu.device].map(|device| {
+            let model = Model::read(&weights, device).unwrap();
+            let mut said = Vec::new();
+            answers(&model, &scene(100), &mut |logits, _| {
+                said.extend_from_slice(logits)
+            })
+            .unwrap();
+            said
+        });
+        let scale = ours.iter().fold(0f32, |m, x| m.max(x.abs()));
+        assert!(ours.len() == 128 && scale > 0.0);
+        for (a, b) in ours.iter().zip(&theirs) {
+            assert!((a - b).abs() <= 1e-4 * scale, "{gpu}: {a} and {b}");
+        }
+    }
+}
+
+#[test]
+fn numbers_of_16_bits_are_refused_where_a_device_has_none() {
+    for gpu in opened() {
+        let mut plan = plan(Target::Tof, ShadowVariant::Concat);
+        plan.net.precision = Precision::Bf16;
+        match Training::start(plan, None, sources(), &gpu.device) {
+            Ok(_) => println!("{gpu} has bfloat16"),
+            Err(error) => {
+                let text = error.to_string();
+                assert!(
+                    text.contains("net.precision") && text.contains("\"f32\""),
+                    "{text}"
+                );
+            }
+        }
+    }
+}
