@@ -117,6 +117,9 @@ pub enum Schedule {
     OnecyclePaper,
     /// From the rate to zero on half a cosine.
     Cosine,
+    /// From the rate to zero on half a cosine, again and again in cycles that become longer (SGDR, Loshchilov and Hutter, ICLR
+    /// 2017; PyTorch's `CosineAnnealingWarmRestarts`).
+    Restarts,
     /// The same all the time.
     Constant,
 }

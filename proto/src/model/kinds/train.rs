@@ -25,8 +25,8 @@ pub use super::names::check_model;
 pub(super) use check::check_spots;
 pub(super) use settings::is_zero;
 pub use settings::{
-    InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, SpecularSettings,
-    TRUTH, TrainSettings,
+    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
+    SpecularSettings, TRUTH, TrainSettings,
 };
 
 /// The field of [`ShadowSettings::times`].
@@ -107,7 +107,8 @@ impl TaskKind for TrainTask {
         // Sums of blocks of 2, 4, … parts of a batch wait for one another; and what others have comes beside.
         let waiting = self.train.optimise.accumulate.max(2).ilog2() - 1;
         let exchanged = if self.train.processes > 1 { 3 } else { 0 };
-        let sums = f64::from(waiting + exchanged) * ours.weights();
+        let average = if self.train.optimise.ema > 0.0 { 1 } else { 0 };
+        let sums = f64::from(waiting + exchanged + average) * ours.weights();
         Some(BASE + source.two() + learns + sums + others.fold(0.0, f64::max))
     }
 

@@ -17,10 +17,11 @@ use crate::{
     weights,
 };
 
-const FORMAT: &str = "picofarm-checkpoint-2";
+const FORMAT: &str = "picofarm-checkpoint-3";
 
-/// Before the names of kept values.
+/// Before the names of kept values, and of averages.
 const KEPT: &str = "kept/";
+const AVERAGE: &str = "average/";
 
 /// What a checkpoint holds beside tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -45,6 +46,10 @@ pub(super) fn write(
     }
     for (name, value) in kept.into_iter().flat_map(Parameters::to_named) {
         named.insert(format!("{KEPT}{name}"), value);
+    }
+    let average = learner.average.iter().flat_map(|a| a.values.to_named());
+    for (name, value) in average {
+        named.insert(format!("{AVERAGE}{name}"), value);
     }
     for (d, moments) in learner.net.declared().iter().zip(&learner.moments) {
         if d.learned {
@@ -96,18 +101,23 @@ pub(super) fn read(
             learner.moments[i][k] = upload(value, device);
         }
     }
-    let (mut weights, mut kept) = (Named::new(), Named::new());
+    let [mut weights, mut kept, mut averaged] = [(); 3].map(|()| Named::new());
     for (name, value) in named {
-        match name.strip_prefix(KEPT) {
-            Some(name) => kept.insert(name.to_owned(), value),
-            None => weights.insert(name.trim_start_matches("weights/").to_owned(), value),
+        let (to, name) = match (name.strip_prefix(KEPT), name.strip_prefix(AVERAGE)) {
+            (Some(name), _) => (&mut kept, name),
+            (_, Some(name)) => (&mut averaged, name),
+            _ => (&mut weights, name.trim_start_matches("weights/")),
         };
+        to.insert(name.to_owned(), value);
     }
     let declared = || learner.net.declared().to_vec();
     let kept = match kept.is_empty() {
         true => None,
         false => Some(Parameters::from_named(declared(), kept, device)?),
     };
+    if let Some(average) = &mut learner.average {
+        average.values = Parameters::from_named(declared(), averaged, device)?;
+    }
     learner.parameters = Parameters::from_named(declared(), weights, device)?;
     learner.steps = header.steps;
     Ok((header, kept))
@@ -123,10 +133,11 @@ pub fn left_by(bytes: &[u8]) -> Result<(Vec<u8>, Vec<Line>), ModelError> {
     let header = metadata.get("checkpoint").ok_or_else(none)?;
     let header: Header = serde_json::from_str(header)
         .map_err(|e| ModelError::weights(format!("the checkpoint's header: {e}")))?;
-    let part = match named.keys().any(|name| name.starts_with(KEPT)) {
-        true => KEPT,
-        false => "weights/",
-    };
+    let there = |part: &&str| named.keys().any(|name| name.starts_with(part));
+    let part = [KEPT, AVERAGE]
+        .into_iter()
+        .find(there)
+        .unwrap_or("weights/");
     let of_part = named.into_iter();
     let of_part = of_part.filter_map(|(name, v)| Some((name.strip_prefix(part)?.to_owned(), v)));
     let named = weights::to_torch(of_part.collect());

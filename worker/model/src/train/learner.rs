@@ -1,6 +1,7 @@
 //! A network with its numbers and the optimiser's, one step at a time.
 
 use burn::tensor::{Device, Tensor};
+use rayon::{iter::ParallelIterator, slice::ParallelSlice};
 
 use super::{
     group::{Block, Blocks, Part},
@@ -29,10 +30,23 @@ pub struct Learner {
     pub(super) moments: Vec<[Tensor<1>; 2]>,
     /// Steps taken.
     pub(super) steps: u64,
+    /// The average of its numbers, where one is wanted.
+    pub(super) average: Option<Average>,
+    /// Greatest norm of a step's gradient.
+    clip_norm: Option<f64>,
     target: Target,
     decay: f64,
     device: Device,
 }
+
+/// An exponential moving average of all numbers of a network, running statistics too.
+pub struct Average {
+    decay: f64,
+    pub(super) values: Parameters,
+}
+
+/// Values whose squares are summed at a time.
+const SQUARED: usize = 1 << 16;
 
 /// What follows from a batch: gradients and loss, and running statistics after it.
 struct OfBatch {
@@ -78,9 +92,40 @@ impl Learner {
             parameters,
             moments,
             steps: 0,
+            average: None,
+            clip_norm: None,
             target,
             decay,
             device,
+        }
+    }
+
+    /// The same whose gradients are at most so long.
+    #[must_use]
+    pub fn clipped(self, norm: Option<f64>) -> Self {
+        Self {
+            clip_norm: norm,
+            ..self
+        }
+    }
+
+    /// The same that keeps an average of its numbers, which begins with those it has. After step t an average is d times what it was
+    /// plus (1 − d) times the numbers, with d the lesser of `decay` and (1 + t)/(10 + t).
+    #[must_use]
+    pub fn averaging(self, decay: Option<f64>) -> Self {
+        let values = || self.parameters.clone();
+        let average = decay.map(|decay| Average {
+            decay,
+            values: values(),
+        });
+        Self { average, ..self }
+    }
+
+    /// The numbers that are validated and kept: their average where there is one.
+    pub fn kept(&self) -> &Parameters {
+        match &self.average {
+            Some(average) => &average.values,
+            None => &self.parameters,
         }
     }
 
@@ -187,6 +232,7 @@ impl Learner {
             .expect("a step has a batch");
         self.move_statistics(sum.moved);
         let share = 1.0 / batches as f32;
+        let scale = share * self.shortened(&summed.gradients, share);
         self.steps += 1;
         let settings = AdamW {
             learning_rate: pace.learning_rate,
@@ -200,8 +246,8 @@ impl Learner {
             let Some(mut gradient) = gradient else {
                 continue;
             };
-            if batches > 1 {
-                gradient = gradient.mul_scalar(share);
+            if scale != 1.0 {
+                gradient = gradient.mul_scalar(scale);
             }
             let value = self.parameters.take(Id(i));
             let empty = [(); 2].map(|()| Tensor::empty([0], &self.device));
@@ -210,7 +256,36 @@ impl Learner {
             self.parameters.set(Id(i), value);
             self.moments[i] = moments;
         }
+        self.follow();
         summed.losses * share
+    }
+
+    /// What a step's gradient, `share` times `summed`, is to be multiplied by so that it is not too long.
+    fn shortened(&self, summed: &[Option<Tensor<1>>], share: f32) -> f32 {
+        let Some(most) = self.clip_norm else {
+            return 1.0;
+        };
+        let squares: f64 = summed.iter().flatten().map(squares).sum();
+        // PyTorch's constant.
+        let scale = most / (squares.sqrt() * f64::from(share) + 1e-6);
+        match scale < 1.0 {
+            true => scale as f32,
+            false => 1.0,
+        }
+    }
+
+    /// Moves the average after a step.
+    fn follow(&mut self) {
+        let Some(average) = &mut self.average else {
+            return;
+        };
+        let step = self.steps as f64;
+        let decay = average.decay.min((1.0 + step) / (10.0 + step));
+        for (i, value) in self.parameters.values().iter().enumerate() {
+            let before = average.values.take(Id(i));
+            let moved = before.mul_scalar(decay) + value.clone().mul_scalar(1.0 - decay);
+            average.values.set(Id(i), moved);
+        }
     }
 
     /// What a process has of a step, in numbers.
@@ -298,7 +373,7 @@ impl Learner {
 
     /// What the network says in evaluation: (N, outputs, H, W), row by row.
     pub fn predict(&self, batch: &Batch) -> Vec<f32> {
-        predict(&self.net, &self.parameters, batch)
+        predict(&self.net, self.kept(), batch)
     }
 
     /// The name of the first parameter that is not finite.
@@ -323,6 +398,16 @@ impl Learner {
             what: format!("the loss is {loss}; {first}"),
         }
     }
+}
+
+/// The sum of squares, in one order whatever the threads.
+fn squares(values: &Tensor<1>) -> f64 {
+    let values = download(values);
+    let parts: Vec<f64> = values
+        .par_chunks(SQUARED)
+        .map(|part| part.iter().map(|x| f64::from(*x) * f64::from(*x)).sum())
+        .collect();
+    parts.iter().sum()
 }
 
 /// What a network says in evaluation: (N, outputs, H, W), row by row.

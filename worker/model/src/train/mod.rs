@@ -42,6 +42,15 @@ pub struct Plan {
     pub decay: f64,
     /// How the rate moves.
     pub schedule: Schedule,
+    /// Epochs of the first cycle, and how many times as long each further one is: for [`Schedule::Restarts`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub restarts: Option<(u64, u64)>,
+    /// Greatest norm of a step's gradient; none without it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clip_norm: Option<f64>,
+    /// Decay of an average of the weights that is validated and kept in their place.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ema: Option<f64>,
     /// Mirrored scenes are shown too, where the target allows it.
     pub augment: bool,
     /// Validations without improvement after which it ends; 0 = never.
@@ -85,7 +94,19 @@ impl Plan {
             let what = "learning_rate must be positive, weight_decay in 0..1";
             return Err(ModelError::invalid("optimise", what));
         }
-        schedule::check(self.schedule, self.steps(scenes))
+        if self
+            .clip_norm
+            .is_some_and(|norm| !(norm > 0.0 && norm.is_finite()))
+        {
+            return Err(ModelError::invalid(
+                "optimise.clip_norm",
+                "must be positive",
+            ));
+        }
+        if self.ema.is_some_and(|decay| !(0.0..1.0).contains(&decay)) {
+            return Err(ModelError::invalid("optimise.ema", "must lie in 0..1"));
+        }
+        schedule::check(self, scenes)
     }
 
     pub(crate) fn text(&self) -> String {

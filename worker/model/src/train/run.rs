@@ -18,6 +18,7 @@ use super::{
 };
 use crate::{
     ModelError,
+    device::computes,
     input::Visit,
     metric::{Metrics, Tally},
     model::PLAN,
@@ -126,6 +127,7 @@ impl Training {
         device: &Device,
     ) -> Result<Self, ModelError> {
         plan.check(sources.train.len())?;
+        computes(&plan.net, device)?;
         let net = Net::new(plan.net.clone())?;
         let mut parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
         if plan.net.frozen && from.is_none() {
@@ -140,7 +142,7 @@ impl Training {
                 true => parameters.with_encoder_of(named, device)?,
             };
         }
-        let learner = Learner::new(net, parameters, plan.question.target, plan.decay);
+        let learner = learner(&plan, net, parameters);
         Ok(Self {
             plan,
             learner,
@@ -164,9 +166,10 @@ impl Training {
         device: &Device,
     ) -> Result<Self, ModelError> {
         plan.check(sources.train.len())?;
+        computes(&plan.net, device)?;
         let net = Net::new(plan.net.clone())?;
         let parameters = Parameters::begin(net.declared().to_vec(), plan.seed, device);
-        let mut learner = Learner::new(net, parameters, plan.question.target, plan.decay);
+        let mut learner = learner(&plan, net, parameters);
         let (position, kept) = restored(&plan, checkpoint, &mut learner, device)?;
         Ok(Self {
             plan,
@@ -355,8 +358,7 @@ impl Training {
 
     /// The optimiser's pace at a step.
     fn pace(&self, step: u64) -> schedule::Pace {
-        let plan = &self.plan;
-        schedule::pace(plan.schedule, step, self.steps(), plan.learning_rate)
+        schedule::pace(&self.plan, step, self.sources.train.len())
     }
 
     fn is_over(&self) -> bool {
@@ -396,7 +398,7 @@ impl Training {
                 position.since_best = 0;
                 if self.plan.early_stop > 0 {
                     position.kept_epoch = position.epoch;
-                    self.kept = Some(self.learner.parameters().clone());
+                    self.kept = Some(self.learner.kept().clone());
                 }
             } else {
                 position.since_best += 1;
@@ -465,7 +467,7 @@ impl Training {
 
     /// What came out.
     pub fn finish(self) -> Trained {
-        let parameters = self.kept.as_ref().unwrap_or(self.learner.parameters());
+        let parameters = self.kept.as_ref().unwrap_or(self.learner.kept());
         let named = weights::to_torch(parameters.to_named());
         let kept_epoch = match self.kept {
             Some(_) => self.position.kept_epoch,
@@ -478,6 +480,13 @@ impl Training {
             stopped_early: self.position.stopped_early,
         }
     }
+}
+
+/// What takes a plan's steps.
+fn learner(plan: &Plan, net: Net, parameters: Parameters) -> Learner {
+    Learner::new(net, parameters, plan.question.target, plan.decay)
+        .clipped(plan.clip_norm)
+        .averaging(plan.ema)
 }
 
 impl Member for Training {

@@ -1,9 +1,10 @@
 //! What a training's settings may be.
 
-use picofarm_settings::{Architecture, StemForm, Target, TimeProjection};
+use picofarm_settings::{Architecture, Schedule, StemForm, Target, TimeProjection};
 
 use super::settings::{
-    InputSettings, NetSettings, Normalise, OptimiseSettings, ShadowSettings, TrainSettings,
+    InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
+    TrainSettings,
 };
 use crate::model::{
     kinds::{
@@ -211,7 +212,21 @@ impl OptimiseSettings {
             self.weight_decay,
             (0.0, 0.999),
             unit,
-        )
+        )?;
+        let unit = "(the greatest norm of a step's gradient; 0 is no limit); 1 is usual";
+        within("train.optimise.clip_norm", self.clip_norm, (0.0, 1e6), unit)?;
+        let unit = "(the decay of an average of the weights; 0 is none); 0.999 is usual";
+        within("train.optimise.ema", self.ema, (0.0, 0.999_999), unit)?;
+        let RestartSettings { first, factor } = self.restarts;
+        let unit = "epochs of the first cycle";
+        within("train.optimise.restarts.first", first, (1, 1_000_000), unit)?;
+        let unit = "times the length of the cycle before";
+        within("train.optimise.restarts.factor", factor, (1, 1000), unit)?;
+        if self.restarts != RestartSettings::default() && self.schedule != Schedule::Restarts {
+            let what = "is for schedule = \"restarts\"; set that, or remove it".into();
+            return fail("restarts", what);
+        }
+        Ok(())
     }
 }
 

@@ -159,8 +159,37 @@ pub struct OptimiseSettings {
     pub schedule: Schedule,
     /// Numbers in which the network is computed.
     pub precision: Precision,
+    /// For `schedule = "restarts"`: the cycles.
+    #[serde(skip_serializing_if = "is_default")]
+    pub restarts: RestartSettings,
+    /// Gradients whose norm, of all parameters together, is greater are shortened to it (PyTorch's `clip_grad_norm_`); 0 = never.
+    #[serde(skip_serializing_if = "is_zero_f64")]
+    pub clip_norm: f64,
+    /// Decay of an exponential moving average of all weights and statistics, e.g. 0.999, which is validated and kept in their place;
+    /// at step t no more than (1 + t)/(10 + t). 0 = none.
+    #[serde(skip_serializing_if = "is_zero_f64")]
+    pub ema: f64,
     /// Stop after so many validations (one an epoch) without improvement; 0 = never.
     pub early_stop: u32,
+}
+
+/// The cycles of `schedule = "restarts"`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RestartSettings {
+    /// Epochs of the first cycle.
+    pub first: u32,
+    /// Each further cycle is so many times as long.
+    pub factor: u32,
+}
+
+impl Default for RestartSettings {
+    fn default() -> Self {
+        Self {
+            first: 10,
+            factor: 2,
+        }
+    }
 }
 
 impl Default for NetSettings {
@@ -196,6 +225,9 @@ impl Default for OptimiseSettings {
             weight_decay: 1e-3,
             schedule: Schedule::Onecycle,
             precision: Precision::F32,
+            restarts: RestartSettings::default(),
+            clip_norm: 0.0,
+            ema: 0.0,
             early_stop: 0,
         }
     }

@@ -10,7 +10,7 @@ use picofarm_model::{
 };
 use picofarm_proto::model::{
     TrainSettings,
-    train::{Normalise, Target},
+    train::{Normalise, Schedule, Target},
 };
 
 use super::{known::Known, of_model};
@@ -28,6 +28,7 @@ pub(super) fn plan(
     greatest: f32,
 ) -> Result<Plan, TaskError> {
     let (input, optimise) = (&settings.input, &settings.optimise);
+    let some = |value: f64| (value > 0.0).then_some(value);
     let user = |field: &str, what: String| TaskError::User(format!("train.{field}: {what}"));
     let bins = match input.bins {
         0 => spec.gate.bins,
@@ -85,6 +86,12 @@ pub(super) fn plan(
         learning_rate: optimise.learning_rate,
         decay: optimise.weight_decay,
         schedule: optimise.schedule,
+        restarts: (optimise.schedule == Schedule::Restarts).then_some((
+            optimise.restarts.first.into(),
+            optimise.restarts.factor.into(),
+        )),
+        clip_norm: some(optimise.clip_norm),
+        ema: some(optimise.ema),
         augment: settings.augment,
         early_stop: optimise.early_stop.into(),
         seed: settings.seed,
