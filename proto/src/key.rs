@@ -61,13 +61,13 @@ pub fn training_key(
 
 /// Names what an evaluation of one model finds: the model by the SHA-256 of its manifest, what pins the bytes of the scenes
 /// and of those that plain answers are fitted to, in order, the histogram, what two-bounce times follow from (`truth`, or what
-/// pins predictions; empty where none are given) and the code.
+/// pins predictions; empty where none are given), whether the model's sensor is between, and the code.
 pub fn evaluation_key(
     model_sha256: &str,
     data: [&str; 2],
     times: &str,
-    histogram: Histogram,
-    spots: &[u32],
+    (histogram, spots): (Histogram, &[u32]),
+    sensor: bool,
     version: &str,
 ) -> TaskKey {
     let description = serde_json::json!({
@@ -77,6 +77,7 @@ pub fn evaluation_key(
         "histogram": histogram,
         "spots": spots,
         "times": times,
+        "sensor": sensor,
         "version": version,
     });
     TaskKey(Sha256::digest(canonical(description).as_bytes()).into())

@@ -178,6 +178,7 @@ async fn changed_records_of_models_are_refused() {
         side: "test".into(),
         scenes: 4,
         histogram: "transient".into(),
+        sensor: false,
         times: String::new(),
         code: "c".into(),
         metrics: json!({"l1_m": 0.25}),

@@ -54,6 +54,7 @@ async fn put_evaluation(models: &Models, model: &ModelManifest) {
         side: "test".into(),
         scenes: 3,
         histogram: "transient".into(),
+        sensor: false,
         times: String::new(),
         code: "model".into(),
         metrics: json!({"mae_m": 0.25}),

@@ -290,6 +290,7 @@ async fn an_evaluation_stands_beside_its_model() {
         side: "test".into(),
         scenes: 3,
         histogram: "transient".into(),
+        sensor: false,
         times: String::new(),
         code: "v".into(),
         metrics: json!({"mae_m": 0.5}),

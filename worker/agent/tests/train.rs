@@ -461,3 +461,94 @@ async fn processes_train_together_to_the_bits_of_one_and_leave_nothing_behind() 
         );
     }
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_sensor_draws_anew_at_each_visit_and_the_same_on_any_machine() {
+    let sensor = json!({"scale": {"kind": "peak", "photons": 40.0}, "pulse": {"kind": "none"}, "jitter": {"kind": "gaussian", "fwhm_ps": 0.0}});
+    let with = |more: serde_json::Value| {
+        let mut settings =
+            json!({"sensor": sensor, "augment": false, "optimise": {"epochs": 6, "batch": 5}});
+        for (name, value) in more.as_object().unwrap() {
+            settings[name] = value.clone();
+        }
+        settings
+    };
+    let (place, again, calm) = (Place::new().await, Place::new().await, Place::new().await);
+    run(place.training(with(json!({})))).await.unwrap();
+    // Stopped half-way and gone on with elsewhere.
+    assert!(run_until(again.training(with(json!({}))), 0.4).await);
+    run(again.training(with(json!({})))).await.unwrap();
+    assert_eq!(place.files("models"), again.files("models"));
+    let manifest = place.models().manifest("m").await.unwrap();
+    assert!(manifest.lineage.measurement.photon_noise);
+    run(calm.training(json!({"augment": false, "optimise": {"epochs": 6, "batch": 5}})))
+        .await
+        .unwrap();
+    assert_ne!(
+        place.files("models").keys().collect::<Vec<_>>(),
+        calm.files("models").keys().collect::<Vec<_>>(),
+        "photons change what is learnt"
+    );
+    // A step sees all five scenes; at a rate of almost zero its loss differs by the noise alone.
+    let still = json!({"model": "still", "optimise": {"epochs": 6, "batch": 5, "learning_rate": 1e-8, "weight_decay": 0.0, "schedule": "constant"}});
+    let losses = |place: &Place| {
+        let path = place.files("models/still");
+        let (_, history) = path
+            .iter()
+            .find(|(name, _)| name.ends_with("history.jsonl"))
+            .unwrap();
+        let lines = String::from_utf8_lossy(history).into_owned();
+        lines
+            .lines()
+            .map(|line| {
+                serde_json::from_str::<serde_json::Value>(line).unwrap()["loss"]
+                    .as_f64()
+                    .unwrap()
+            })
+            .collect::<Vec<_>>()
+    };
+    run(place.training(with(still.clone()))).await.unwrap();
+    let mut settings = still;
+    settings["augment"] = json!(false);
+    run(calm.training(settings)).await.unwrap();
+    let spread = |losses: &[f64]| {
+        let most = losses
+            .iter()
+            .fold(0.0, |a: f64, b| a.max((b - losses[0]).abs()));
+        most / losses[0]
+    };
+    let (noisy, quiet) = (losses(&place), losses(&calm));
+    assert!(spread(&quiet) < 1e-6, "{quiet:?}");
+    assert!(spread(&noisy) > 1e-5, "{noisy:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_evaluation_goes_through_the_sensor_that_a_model_was_trained_with_unless_told_otherwise()
+{
+    let place = Place::new().await;
+    let sensor = json!({"scale": {"kind": "peak", "photons": 10.0}});
+    run(place.training(json!({"sensor": sensor, "optimise": {"epochs": 6, "batch": 2}})))
+        .await
+        .unwrap();
+    for more in [
+        json!({}),
+        json!({"sensor": false}),
+        json!({"shards": 2, "sensor": true}),
+    ] {
+        run(place.evaluation(more)).await.unwrap();
+    }
+    let found = place.models().evaluations("m").await.unwrap();
+    let mut through: Vec<bool> = found.iter().map(|e| e.sensor).collect();
+    through.sort_unstable();
+    assert_eq!(through, [false, true], "shards change nothing");
+    assert_ne!(found[0].metrics["mae_m"], found[1].metrics["mae_m"]);
+    run(place.report(json!({"pictures": 1}))).await.unwrap();
+    let said = refused(place.training(json!({"model": "n", "sensor": {"rebin": 2}}))).await;
+    assert!(
+        said.contains("train.sensor.rebin") && said.contains("input.bins"),
+        "{said}"
+    );
+    let said =
+        refused(place.training(json!({"model": "n", "sensor": {"dark_per_bin": -1.0}}))).await;
+    assert!(said.contains("train.sensor.dark_per_bin"), "{said}");
+}

@@ -1,10 +1,6 @@
 //! What training reads: a scene's histogram and what is known about it.
 
-use std::{
-    collections::HashMap,
-    error::Error,
-    sync::{Arc, Mutex, PoisonError},
-};
+use std::{error::Error, sync::Arc};
 
 /// A scene. Images are row by row, from the top left.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -38,6 +34,23 @@ pub struct Scene {
     pub intrinsics: [f64; 4],
 }
 
+impl Scene {
+    /// The same with another histogram of as many bins.
+    #[must_use]
+    pub fn showing(&self, histogram: Vec<f32>) -> Self {
+        Self {
+            histogram,
+            depth_m: self.depth_m.clone(),
+            seen_depth_m: self.seen_depth_m.clone(),
+            specular: self.specular.clone(),
+            spots: self.spots.clone(),
+            lit: self.lit.clone(),
+            beams_m: self.beams_m.clone(),
+            ..*self
+        }
+    }
+}
+
 /// Scenes that are read one by one, in any order, from several threads.
 pub trait Scenes: Send + Sync {
     /// How many.
@@ -53,6 +66,15 @@ pub trait Scenes: Send + Sync {
     /// # Errors
     /// Whatever keeps it from being read.
     fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable>;
+
+    /// One of them as the `visit`th visit of a training sees it, counted over all epochs: what is drawn at random is drawn anew
+    /// at each. Always the same where nothing is.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    fn visited(&self, index: usize, _visit: u64) -> Result<Arc<Scene>, Unreadable> {
+        self.load(index)
+    }
 }
 
 /// Why a scene could not be read.
@@ -65,44 +87,6 @@ impl Scenes for Vec<Arc<Scene>> {
 
     fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
         Ok(Arc::clone(&self[index]))
-    }
-}
-
-/// Scenes that are kept in memory once they were read, as far as there is room.
-pub struct Kept {
-    scenes: Arc<dyn Scenes>,
-    kept: Mutex<(HashMap<usize, Arc<Scene>>, usize)>,
-    room: usize,
-}
-
-impl Kept {
-    /// With room for so many bytes.
-    pub fn new(scenes: Arc<dyn Scenes>, room: usize) -> Self {
-        Self {
-            scenes,
-            kept: Mutex::default(),
-            room,
-        }
-    }
-}
-
-impl Scenes for Kept {
-    fn len(&self) -> usize {
-        self.scenes.len()
-    }
-
-    fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
-        let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(scene) = lock().0.get(&index) {
-            return Ok(Arc::clone(scene));
-        }
-        let scene = self.scenes.load(index)?;
-        let (kept, used) = &mut *lock();
-        if *used + scene.bytes() <= self.room && !kept.contains_key(&index) {
-            *used += scene.bytes();
-            kept.insert(index, Arc::clone(&scene));
-        }
-        Ok(scene)
     }
 }
 

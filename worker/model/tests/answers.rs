@@ -13,7 +13,7 @@ use picofarm_model::{
     input::{ShadowVariant, Target},
     metric::Metrics,
     net::{Architecture, Net, NetSpec, StemForm, TimeProjection},
-    scene::{Kept, Scene, Scenes},
+    scene::{Scene, Scenes},
     train::{Control, Plan, Sources, Trained, Training},
     trial::Trial,
     weights,
@@ -36,7 +36,7 @@ fn evaluated(model: &Model, scenes_before: &Vec<Arc<Scene>>) -> Evaluated {
 fn a_depth_network_beats_the_best_constant_and_its_shadow_network_the_mask_of_all() {
     let device = Device::flex();
     let many = || Sources {
-        train: Arc::new(Kept::new(Arc::new(scenes(0, 40)), usize::MAX)),
+        train: Arc::new(scenes(0, 40)),
         ..sources()
     };
     let depth = Plan {

@@ -66,6 +66,10 @@ pub struct EvaluateSettings {
     /// model what it was trained with.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub times: String,
+    /// Histograms go through the sensor that a model was trained with, if it was; with false they are seen as stored. Default
+    /// true.
+    #[serde(default = "yes", skip_serializing_if = "is_yes")]
+    pub sensor: bool,
     /// The scenes are asked of in so many tasks, 1 to 10,000, whose sums one more task joins: the figures are the same to
     /// the bit. Default 1: one task for all.
     #[serde(default = "one", skip_serializing_if = "is_one")]
@@ -77,6 +81,15 @@ pub struct EvaluateSettings {
 
 fn one() -> u32 {
     1
+}
+
+fn yes() -> bool {
+    true
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_yes(sensor: &bool) -> bool {
+    *sensor
 }
 
 fn is_one(shards: &u32) -> bool {

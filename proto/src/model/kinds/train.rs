@@ -109,7 +109,9 @@ impl TaskKind for TrainTask {
         let exchanged = if self.train.processes > 1 { 3 } else { 0 };
         let average = if self.train.optimise.ema > 0.0 { 1 } else { 0 };
         let sums = f64::from(waiting + exchanged + average) * ours.weights();
-        Some(BASE + source.two() + learns + sums + others.fold(0.0, f64::max))
+        // What a sensor makes of a scene lies beside it.
+        let sensed = self.train.sensor.as_ref().map_or(0.0, |_| source.two());
+        Some(BASE + source.two() + sensed + learns + sums + others.fold(0.0, f64::max))
     }
 
     fn tasks(&self) -> u64 {

@@ -33,6 +33,9 @@ pub struct Evaluation {
     /// For a shadow network that is given two-bounce times: `truth`, or the folder of the predictions that they follow from.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub times: String,
+    /// Whether histograms went through the sensor that the model was trained with.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sensor: bool,
     /// Version of networks and metrics.
     pub code: String,
     /// The figures.

@@ -6,22 +6,34 @@ use std::{
 };
 
 use picofarm_dataset::{Dataset, DatasetError, Predictions, Quantity, SplitUsed, sha256_hex};
-use picofarm_model::scene::{Scene, Scenes};
+use picofarm_model::{
+    Random,
+    scene::{Scene, Scenes, Unreadable},
+};
 use picofarm_proto::{
     model::Histogram,
     split::{Rank, SplitRecord},
 };
-use picofarm_transient::sensor::Multiplex;
+use picofarm_transient::sensor::{Histograms, Multiplex, PS_PER_M, Sensor, SensorError, sense};
 use tokio::runtime::Handle;
 
 #[cfg(test)]
 mod folded;
 
-use super::{Control, TaskError, output::Stores, reprocess::quantity};
+use super::{
+    Control, TaskError,
+    output::Stores,
+    reprocess::{as_radiance, quantity},
+};
 use picofarm_session::memory_mib;
 
 /// One part of so many of the memory holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
+
+/// What draws of sensors are, among all random numbers of a training.
+const SENSED: u64 = 5;
+/// The draw of scenes that look the same whenever they are met. No training has so many visits.
+const ALWAYS: u64 = u64::MAX;
 
 /// Scenes of a data set, in an order.
 pub(super) struct Examples {
@@ -31,6 +43,8 @@ pub(super) struct Examples {
     /// The spots whose light the histogram holds; `None` = all.
     spots: Option<Vec<u32>>,
     scenes: Vec<u64>,
+    /// What histograms go through, and the seed of its noise.
+    sensor: Option<(Sensor, u64)>,
     /// Depths that two-bounce times follow from; the truth's where there are none.
     depths: Option<Predictions>,
     kept: Mutex<Kept>,
@@ -103,6 +117,7 @@ impl Examples {
                 _ => Some(quantity.spots_of_100().to_vec()),
             },
             scenes,
+            sensor: None,
             depths: None,
             kept: Mutex::new(Kept {
                 scenes: HashMap::new(),
@@ -117,6 +132,12 @@ impl Examples {
         Self { depths, ..self }
     }
 
+    /// The same through a sensor.
+    #[must_use]
+    pub(super) fn through(self, sensor: Option<(Sensor, u64)>) -> Self {
+        Self { sensor, ..self }
+    }
+
     /// Spots whose light the histogram holds.
     pub(super) fn spots(&self) -> usize {
         let all = self.dataset.spec().spots as usize;
@@ -127,6 +148,39 @@ impl Examples {
     pub(super) fn spot_numbers(&self) -> Vec<u32> {
         let all = || (0..self.dataset.spec().spots).collect();
         self.spots.clone().unwrap_or_else(all)
+    }
+
+    /// A scene as it is stored.
+    fn stored(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
+        let kept = || self.kept.lock().expect("no panic while locked");
+        if let Some(scene) = kept().scenes.get(&index) {
+            return Ok(scene.clone());
+        }
+        let scene = Arc::new(self.runtime.block_on(self.scene(self.scenes[index]))?);
+        kept().keep(index, &scene);
+        Ok(scene)
+    }
+
+    /// A scene through the sensor, if there is one; `draw` tells one draw of its noise from another.
+    fn sensed(&self, index: usize, draw: u64) -> Result<Arc<Scene>, Unreadable> {
+        let stored = self.stored(index)?;
+        let Some((sensor, seed)) = &self.sensor else {
+            return Ok(stored);
+        };
+        let input = Histograms {
+            transient: &stored.histogram,
+            two_bounce: None,
+            bins: stored.bins,
+            bin_width_ps: stored.bin_width_m * PS_PER_M,
+        };
+        let seed = Random::new(*seed, &[SENSED, draw]).bits();
+        let sensed = sense(sensor, &input, seed, self.scenes[index]).map_err(
+            |SensorError::Invalid { field, what }| DatasetError::Invalid {
+                field: format!("train.{field}"),
+                what: format!("scene {}: {what}", self.scenes[index]),
+            },
+        )?;
+        Ok(Arc::new(stored.showing(as_radiance(&sensed).0)))
     }
 
     async fn histogram(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
@@ -208,14 +262,12 @@ impl Scenes for Examples {
         self.scenes.len()
     }
 
-    fn load(&self, index: usize) -> Result<Arc<Scene>, Box<dyn std::error::Error + Send + Sync>> {
-        let kept = || self.kept.lock().expect("no panic while locked");
-        if let Some(scene) = kept().scenes.get(&index) {
-            return Ok(scene.clone());
-        }
-        let scene = Arc::new(self.runtime.block_on(self.scene(self.scenes[index]))?);
-        kept().keep(index, &scene);
-        Ok(scene)
+    fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
+        self.sensed(index, ALWAYS)
+    }
+
+    fn visited(&self, index: usize, visit: u64) -> Result<Arc<Scene>, Unreadable> {
+        self.sensed(index, visit)
     }
 }
 

@@ -70,7 +70,10 @@ pub(super) fn show(
     let histogram = Histogram::parse(&evaluation.histogram).map_err(TaskError::User)?;
     let indices: Vec<usize> = (0..scenes.len()).collect();
     let histogram = (histogram, &*settings.spots);
-    let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?.timed_by(depths);
+    let sensor = settings.sensor.filter(|_| evaluation.sensor);
+    let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?
+        .through(sensor.map(|sensor| (sensor, settings.seed)))
+        .timed_by(depths);
     let pictures = pictures(&known.model, &examples, &indices, 2).map_err(of_model)?;
     Ok(Shown {
         side: dataset.spec().height as usize,

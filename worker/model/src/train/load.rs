@@ -86,8 +86,8 @@ impl<'a> Course<'a> {
         (self.plan.epochs * self.each - self.first) / all * ours
     }
 
-    /// One of them: the scene's index, and how it is visited.
-    pub(super) fn visit(&self, which: u64) -> (usize, Visit) {
+    /// One of them: the scene's index, how it is visited, and its number among all visits of the training.
+    pub(super) fn visit(&self, which: u64) -> (usize, Visit, Option<u64>) {
         let (all, ours) = self.of_step();
         let before = self.share.start as u64 * self.plan.batch as u64;
         let which = which / ours * all + before + which % ours;
@@ -102,7 +102,7 @@ impl<'a> Course<'a> {
             orders.pop_first();
         }
         let visit = order::visit(plan.seed, epoch, at, &plan.question, plan.augment);
-        (scene, visit)
+        (scene, visit, Some(which))
     }
 }
 
@@ -110,8 +110,8 @@ impl<'a> Course<'a> {
 pub(super) struct Making<'a> {
     pub(super) plan: &'a Plan,
     pub(super) scenes: &'a dyn Scenes,
-    /// The visits, in order: which scene, and how.
-    pub(super) visit: &'a (dyn Fn(u64) -> (usize, Visit) + Sync),
+    /// The visits, in order: which scene, how, and the number of a visit where scenes look different at each.
+    pub(super) visit: &'a (dyn Fn(u64) -> (usize, Visit, Option<u64>) + Sync),
     /// How many visits.
     pub(super) count: u64,
     pub(super) loading: Loading,
@@ -159,8 +159,11 @@ impl Making<'_> {
 
     /// The example of a visit alone; `bytes` becomes what it took to make it.
     fn example(&self, which: u64, bytes: &mut usize) -> Result<Batch, ModelError> {
-        let (index, visit) = (self.visit)(which);
-        let scene = self.scenes.load(index);
+        let (index, visit, number) = (self.visit)(which);
+        let scene = match number {
+            Some(number) => self.scenes.visited(index, number),
+            None => self.scenes.load(index),
+        };
         let scene = scene.map_err(|source| ModelError::Scene {
             scene: index,
             source,

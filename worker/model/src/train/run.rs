@@ -440,7 +440,7 @@ impl Training {
                 spot,
                 ..Visit::default()
             };
-            (index, visit)
+            (index, visit, None)
         };
         let making = Making {
             plan: &self.plan,

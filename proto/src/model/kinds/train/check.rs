@@ -1,6 +1,6 @@
 //! What a training's settings may be.
 
-use picofarm_settings::{Architecture, Schedule, StemForm, Target, TimeProjection};
+use picofarm_settings::{Architecture, Schedule, SensorError, StemForm, Target, TimeProjection};
 
 use super::settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
@@ -79,6 +79,20 @@ impl TrainSettings {
         }
         self.input.check()?;
         self.net.check()?;
+        if let Some(sensor) = &self.sensor {
+            let fail =
+                |field: &str, what: String| Err(SpecError::new(format!("train.{field}"), what));
+            if sensor.rebin != 1 {
+                let what = format!(
+                    "is {}; bins are summed by train.input.bins: leave it out",
+                    sensor.rebin
+                );
+                return fail("sensor.rebin", what);
+            }
+            sensor
+                .check()
+                .or_else(|SensorError::Invalid { field, what }| fail(&field, what))?;
+        }
         self.optimise.check()?;
         let minutes = self.checkpoint_minutes;
         within(

@@ -1,7 +1,7 @@
 //! What is learnt, and how: the settings of trainings, and the network that follows from them.
 
 use picofarm_settings::{
-    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
+    Architecture, Precision, Schedule, Sensor, ShadowVariant, StemForm, Target, TimeProjection,
 };
 use serde::{Deserialize, Serialize};
 
@@ -31,6 +31,10 @@ pub struct TrainSettings {
     /// Only these spots, summed: with `histogram = "transient_spots"`, which needs it; ascending.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub spots: Vec<u32>,
+    /// A sensor through which histograms go when they are read, with noise that is drawn anew at each visit; for validation and
+    /// evaluation once for each scene. Without it they are seen as stored.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<Sensor>,
     /// What the network sees of a histogram.
     #[serde(default)]
     pub input: InputSettings,

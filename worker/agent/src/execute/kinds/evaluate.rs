@@ -11,6 +11,7 @@ use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
 };
+use picofarm_transient::sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -130,6 +131,8 @@ struct Asked {
     times: Option<Times>,
     histogram: Histogram,
     spots: Vec<u32>,
+    /// What the histograms go through, and the seed of its noise.
+    sensor: Option<(Sensor, u64)>,
     sha256: String,
     /// Key of what is found.
     key: String,
@@ -221,15 +224,26 @@ impl<'a> EvaluationRun<'a> {
                 .pin(stores, at_times.0, &self.scenes, &self.data, control)?
                 .map_or_else(|| times.name.clone(), |depths| depths.id),
         };
+        let sensor = trained.sensor.filter(|_| settings.sensor);
+        let sensor = sensor.map(|sensor| (sensor, trained.seed));
         let (sha256, version) = (model.manifest.sha256(), &settings.version);
         let data = [&*self.data.id, &self.known_data.id];
         Ok(Asked {
-            key: evaluation_key(&sha256, data, &pinned, histogram, &spots, version).to_string(),
+            key: evaluation_key(
+                &sha256,
+                data,
+                &pinned,
+                (histogram, &spots),
+                sensor.is_some(),
+                version,
+            )
+            .to_string(),
             which,
             model,
             times,
             histogram,
             spots,
+            sensor,
             sha256,
         })
     }
@@ -277,6 +291,7 @@ impl<'a> EvaluationRun<'a> {
             side: settings.side.clone(),
             scenes: self.scenes.len() as u64,
             histogram: asked.histogram.name().to_owned(),
+            sensor: asked.sensor.is_some(),
             times: asked
                 .times
                 .as_ref()
@@ -364,6 +379,7 @@ impl<'a> EvaluationRun<'a> {
                 scenes.to_vec(),
                 "evaluate",
             )
+            .map(|examples| examples.through(asked.sensor.clone()))
         };
         let depths = asked.times.as_ref();
         let depths = depths.and_then(|times| times.predictions.clone());

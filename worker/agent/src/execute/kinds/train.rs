@@ -26,6 +26,7 @@ use picofarm_proto::{
         train::{Normalise, Target},
     },
 };
+use picofarm_transient::sensor::SENSOR_VERSION;
 use tracing::{info, warn};
 
 mod along;
@@ -54,9 +55,9 @@ use crate::execute::{
     truth,
 };
 
-/// Version of networks, training and metrics.
+/// Version of networks, training and metrics, and of the sensor that may stand before them.
 pub fn model_version() -> String {
-    picofarm_model::VERSION.to_owned()
+    format!("{}/{SENSOR_VERSION}", picofarm_model::VERSION)
 }
 
 impl RunTask for TrainTask {
@@ -147,7 +148,12 @@ impl<'a> TrainingRun<'a> {
         let depths = times.pin(stores, named.0, &used, &data, control)?;
         let histogram = (settings.histogram, &*settings.spots);
         let examples = |scenes| {
-            let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?;
+            let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?.through(
+                settings
+                    .sensor
+                    .clone()
+                    .map(|sensor| (sensor, settings.seed)),
+            );
             Ok(Arc::new(scenes.timed_by(times.predictions.clone())))
         };
         let shown = training.first().copied();
@@ -156,7 +162,9 @@ impl<'a> TrainingRun<'a> {
         let measurement = match shown {
             Some(scene) => {
                 let manifest = stores.wait(control, dataset.manifest(scene))?;
-                results::measurement(&spec, training.spots() as u32, &manifest)
+                let mut found = results::measurement(&spec, training.spots() as u32, &manifest);
+                found.photon_noise |= settings.sensor.as_ref().is_some_and(|s| s.poisson);
+                found
             }
             None => Measurement::default(),
         };
