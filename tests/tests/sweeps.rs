@@ -28,7 +28,7 @@ source = "rooms"
 trials = {trials}
 seed = 2
 promote = {promote:?}
-halving = {{ first = 4, factor = 3 }}
+stop = {{ halving = {{ first = 4, factor = 3 }} }}
 over = {{ lr = {{ log = [1e-5, 3e-2] }}, width = {{ int = [2, 6] }} }}
 [stage.train]
 target = "tof"
