@@ -233,21 +233,31 @@ mod tests {
         let trials = vec![values(1e-2, 3, "b", 0.5); 8];
         let mixture = Mixture::of(&space, trials.iter());
         let draws: Vec<Values> = (0..2000).map(|i| mixture.draw(7, 1, i)).collect();
-        for (name, wanted) in [("width", json!(3)), ("kind", json!("b"))] {
+        // The density of one parameter, whatever the others are.
+        let density = |name: &str, value: Value| {
             let one = Space::from([(name.to_owned(), space[name].clone())]);
             let alone = Mixture {
-                space: &one,
                 kernels: Mixture::of(&one, trials.iter()).kernels,
+                space: &one,
                 width: mixture.width,
             };
-            let density =
-                libm::exp(alone.log_density(&Values::from([(name.to_owned(), wanted.clone())])));
-            let found = draws.iter().filter(|d| d[name] == wanted).count() as f64 / 2000.0;
-            assert!((found - density).abs() < 0.04, "{name}: {found} {density}");
-        }
-        let near = |d: &&Values| (0.3..0.7).contains(&d["x"].as_f64().unwrap());
-        let near = draws.iter().filter(near).count();
-        assert!((500..1200).contains(&near), "{near}");
+            libm::exp(alone.log_density(&Values::from([(name.to_owned(), value)])))
+        };
+        let share = |of: &dyn Fn(&Values) -> bool| {
+            draws.iter().filter(|d| of(d)).count() as f64 / draws.len() as f64
+        };
+        let width = density("width", json!(3));
+        assert!(
+            (share(&|d| d["width"] == 3) - width).abs() < 0.03,
+            "{width}"
+        );
+        let kind = density("kind", json!("b"));
+        assert!((share(&|d| d["kind"] == "b") - kind).abs() < 0.03, "{kind}");
+        // Of x, a tenth of its interval: 0.1 times the mean density there.
+        let near = (0..100).map(|i| density("x", json!(0.3 + 0.004 * (f64::from(i) + 0.5))));
+        let near = near.sum::<f64>() / 100.0 * 0.1;
+        let found = share(&|d| (0.3..0.7).contains(&d["x"].as_f64().unwrap()));
+        assert!((found - near).abs() < 0.03, "{found} {near}");
     }
 
     proptest! {

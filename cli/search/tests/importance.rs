@@ -54,6 +54,27 @@ fn what_weighs_more_has_the_greater_share_and_what_weighs_nothing_is_chance() {
 }
 
 #[test]
+fn shares_are_those_of_optuna() {
+    // PedAnovaImportanceEvaluator of Optuna 5.0.0 on the same trials (tests/peers/search_optuna.py).
+    for (trials, seed, shares) in [
+        (300, 1, [0.8623, 0.1337, 0.0040]),
+        (300, 2, [0.9211, 0.0747, 0.0042]),
+        (100, 1, [0.7705, 0.2212, 0.0083]),
+        (50, 3, [0.8572, 0.0510, 0.0918]),
+    ] {
+        let found = importance(&space(), &tried(trials, seed)).unwrap();
+        for (name, share) in ["x", "y", "z"].iter().zip(shares) {
+            let ours = of(&found, name).0;
+            println!("{trials} trials, seed {seed}: {name} {ours:.4}, Optuna {share}");
+            assert!(
+                (ours - share).abs() < 0.01,
+                "{trials} {seed} {name}: {ours} {share}"
+            );
+        }
+    }
+}
+
+#[test]
 fn a_list_that_decides_all_has_the_greatest_share() {
     let space: Space =
         serde_json::from_value(json!({"kind": ["a", "b", "c", "d"], "x": {"range": [0, 1]}}))
