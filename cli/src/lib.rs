@@ -40,6 +40,7 @@ mod stored;
 mod sweep;
 mod tail;
 mod template;
+#[cfg(feature = "networks")]
 mod tensorboard;
 mod token;
 #[cfg(feature = "traces")]

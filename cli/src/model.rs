@@ -2,6 +2,8 @@
 
 mod care;
 #[cfg(feature = "networks")]
+mod epochs;
+#[cfg(feature = "networks")]
 mod import;
 #[cfg(feature = "networks")]
 mod report;
@@ -20,16 +22,12 @@ use crate::error::not_built;
 use crate::{
     args::{Model as Command, ModelFormat},
     dataset::failed,
-    error::{CliError, Code, Result, io},
+    error::{CliError, Result, io},
     output::{Output, bytes, table},
-    tensorboard::Run,
 };
 
 /// The object of a model that holds its weights.
 pub(crate) const WEIGHTS: &str = "weights.safetensors";
-
-/// The object that holds its epochs.
-const HISTORY: &str = "history.jsonl";
 
 pub async fn run(command: Command, output: Output) -> Result<()> {
     match command {
@@ -44,6 +42,9 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             let out = out.unwrap_or_else(|| format!("{name}.safetensors").into());
             export(&store, &name, &out, output).await
         }
+        #[cfg(not(feature = "networks"))]
+        Command::Export { .. } => Err(not_built("networks", "event files of TensorBoard")),
+        #[cfg(feature = "networks")]
         Command::Export {
             store,
             name,
@@ -51,7 +52,7 @@ pub async fn run(command: Command, output: Output) -> Result<()> {
             out,
         } => {
             let out = out.unwrap_or_else(|| "tensorboard".into());
-            epochs(&store, &name, &out, output).await
+            epochs::run(&store, &name, &out, output).await
         }
         #[cfg(not(feature = "networks"))]
         Command::Import { .. } => Err(not_built("networks", "imports of models")),
@@ -265,38 +266,6 @@ async fn export(store: &str, name: &str, out: &Path, output: Output) -> Result<(
                        "sha256": manifest.object(WEIGHTS).map(|o| &o.sha256)});
     output.result(&facts, || {
         format!("{}: {}", out.display(), bytes(weights.len() as u64))
-    });
-    Ok(())
-}
-
-/// Writes what the model's epochs found as a run of TensorBoard's, into a folder of its name.
-async fn epochs(store: &str, name: &str, out: &Path, output: Output) -> Result<()> {
-    let models = open(store)?;
-    let manifest = models.manifest(name).await.map_err(failed)?;
-    if manifest.object(HISTORY).is_none() {
-        let what = format!("{name:?} has no epochs: it was trained elsewhere");
-        return Err(
-            CliError::input(what).hint("`picofarm model list` says which were trained here")
-        );
-    }
-    let history = models.read(&manifest, HISTORY).await.map_err(failed)?;
-    let mut run = Run::default();
-    let mut count = 0;
-    for line in String::from_utf8_lossy(&history).lines() {
-        let line = serde_json::from_str(line);
-        let broken = |e| CliError::new(Code::Damaged, format!("{name}: {HISTORY}: {e}"));
-        run.epoch(&line.map_err(broken)?);
-        count += 1;
-    }
-    let folder = out.join(name);
-    run.write(&folder)?;
-    let facts = json!({"model": name, "tensorboard": folder, "epochs": count});
-    output.result(&facts, || {
-        format!(
-            "{count} epochs in {}\nlook at them with: tensorboard --logdir {}\n",
-            folder.display(),
-            show::argument(&out.display().to_string())
-        )
     });
     Ok(())
 }
