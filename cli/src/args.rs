@@ -25,12 +25,12 @@ pub use data::{
 pub use guard::{Audit, Guard, Token};
 pub use integrity::{BenchDataset, DatasetGc, DatasetRepair, DatasetShow, DatasetVerify, Snapshot};
 pub use job::{Job, JobKind, ListedState};
-pub use model::Model;
+pub use model::{Model, ModelFormat};
 pub use network::{BenchModel, Kind, Learns, Numbers};
 pub use reconstruct::{FieldArg, Reconstruct, ShadowLossArg, SpotsFrom, ViewsArg};
 pub use render::{BenchRender, RenderArgs, ScenePlan, SceneRender, SceneRoot};
 pub use secrets::without_secrets;
-pub use sweep::{Sweep, WhichSweep};
+pub use sweep::{Extend, MoreTrials, Sampler, Sweep, SweepFormat, SweepRun, WhichSweep};
 
 /// Render farm for time-resolved lidar histograms.
 #[derive(Parser)]
@@ -164,7 +164,7 @@ pub enum Command {
     /// Look at trained models, and take their weights out
     #[command(subcommand)]
     Model(Model),
-    /// Look at sweeps: how their trials fare, which is the best
+    /// Look at sweeps: how their trials fare, which is the best, which values to try next
     #[command(subcommand)]
     Sweep(Sweep),
     /// Make, inspect and render single scenes

@@ -40,6 +40,8 @@ mod stored;
 mod sweep;
 mod tail;
 mod template;
+#[cfg(feature = "networks")]
+mod tensorboard;
 mod token;
 #[cfg(feature = "traces")]
 mod traces;
@@ -154,7 +156,7 @@ async fn run(
         Command::Dataset(command) => dataset::run(command, settings, output).await,
         Command::Model(command) => model::run(command, output).await,
         #[cfg(feature = "networks")]
-        Command::Sweep(command) => sweep::run(command, output).await,
+        Command::Sweep(command) => sweep::run(command, settings, output).await,
         #[cfg(not(feature = "networks"))]
         Command::Sweep(_) => Err(error::not_built("networks", "sweeps")),
         Command::Scene(command) => scene::run(command, settings, output).await,

@@ -193,7 +193,7 @@ fn sweep() -> String {
      [stage.sweep]\n\
      trials = 27               # drawn at random; left away: each combination, where all parameters are lists\n\
      seed = 1                  # of the draws; more trials later are further ones\n\
-     halving = { first = 2, factor = 3 }   # after 2, 6, 18 epochs only the best third goes on; left away: all do\n\
+     stop = { halving = { first = 2, factor = 3 } }   # after 2, 6, 18 epochs only the best third goes on; also: median, hyperband\n\
      [stage.sweep.over]        # a parameter stands anywhere in the stage as \"{name}\"\n\
      lr = { log = [1e-4, 1e-1] }           # or: range = [a, b], int = [a, b], or a list of values\n\
      decay = { log = [1e-5, 1e-1] }\n\

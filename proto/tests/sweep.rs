@@ -2,7 +2,7 @@
 
 use picofarm_proto::{
     key::stage_key,
-    model::{Halving, JobSpec, StageSpec, TaskSpec, TrainSettings, Trial},
+    model::{Domain, Halving, JobSpec, Median, StageSpec, Stop, TaskSpec, TrainSettings, Trial},
     wire,
 };
 use proptest::prelude::*;
@@ -52,7 +52,8 @@ fn trials(spec: &JobSpec) -> Vec<&StageSpec> {
 
 #[test]
 fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
-    let sweep = "over = { lr = [0.01, 0.001], width = [8, 16, 32] }, halving = { first = 3 }";
+    let sweep =
+        "over = { lr = [0.01, 0.001], width = [8, 16, 32] }, stop = { halving = { first = 3 } }";
     let evaluate =
         "[[stage]]\nkind = \"evaluate\"\nsource = \"render\"\nevaluate = { models = [\"tof\"] }\n";
     let spec = job(sweep, TRAIN, evaluate).unwrap();
@@ -80,7 +81,13 @@ fn a_grid_is_every_combination_and_then_the_choice_of_the_best() {
         serde_json::to_string(&of.values).unwrap(),
         r#"{"lr":0.001,"width":16}"#
     );
-    assert_eq!(of.halving.unwrap().factor, 3);
+    assert_eq!(
+        of.stop,
+        Some(Stop::Halving(Halving {
+            first: 3,
+            factor: 3
+        }))
+    );
     let TaskSpec::Promote(best) = &spec.stages[8].task else {
         panic!("{:?}", spec.stages[8]);
     };
@@ -148,7 +155,7 @@ fn draws_lie_where_they_shall_and_more_trials_are_further_ones() {
 
 #[test]
 fn what_a_trial_computes_does_not_depend_on_the_sweep_but_its_task_does() {
-    let spec = good("over = { lr = [0.01], width = [8] }, halving = { first = 3 }");
+    let spec = good("over = { lr = [0.01], width = [8] }, stop = { halving = { first = 3 } }");
     let stage = trials(&spec)[0];
     let mut plain = stage.clone();
     let TaskSpec::Train(task) = &mut plain.task else {
@@ -214,14 +221,64 @@ fn a_sweep_that_cannot_be_says_why() {
             "stage.sweep.over.depth: nothing in the stage says \"{depth}\"",
         ),
         (
-            &format!("over = {{ {over} }}, halving = {{ first = 0 }}"),
+            &format!("over = {{ {over} }}, stop = {{ halving = {{ first = 0 }} }}"),
             TRAIN,
-            "stage.sweep.halving.first: must be at least 1 epoch",
+            "stage.sweep.stop.halving.first: must be at least 1 epoch",
         ),
         (
-            &format!("over = {{ {over} }}, halving = {{ first = 1, factor = 1 }}"),
+            &format!("over = {{ {over} }}, stop = {{ halving = {{ first = 1, factor = 1 }} }}"),
             TRAIN,
-            "stage.sweep.halving.factor: must be at least 2",
+            "stage.sweep.stop.halving.factor: must be at least 2",
+        ),
+        (
+            &format!("over = {{ {over} }}, stop = {{ median = {{ first = 2, every = 0 }} }}"),
+            TRAIN,
+            "stage.sweep.stop.median.every: must be at least 1 epoch",
+        ),
+        (
+            &format!("over = {{ {over} }}, stop = {{ median = {{ first = 2, least = 0 }} }}"),
+            TRAIN,
+            "stage.sweep.stop.median.least: must be at least 1 trial",
+        ),
+        (
+            &format!("over = {{ {over} }}, stop = {{ hyperband = {{ first = 2, factor = 1 }} }}"),
+            TRAIN,
+            "stage.sweep.stop.hyperband.factor: must be at least 2",
+        ),
+        (
+            &format!("over = {{ {over} }}, stop = {{ average = {{ first = 2 }} }}"),
+            TRAIN,
+            "unknown variant `average`",
+        ),
+        (
+            &format!("over = {{ {over} }}, values = [{{ lr = 0.1, width = 9 }}]"),
+            TRAIN,
+            "stage.sweep.values[0].width: 9 is not in [8]; change it, or widen sweep.over.width",
+        ),
+        (
+            &format!("over = {{ {over} }}, values = [{{ lr = 0.1 }}]"),
+            TRAIN,
+            "stage.sweep.values[0].width: is missing",
+        ),
+        (
+            "values = [{ lr = 0.1, width = 8 }, { lr = 0.1, width = 8, decay = 0 }]",
+            TRAIN,
+            "stage.sweep.values[1].decay: is no parameter of the others",
+        ),
+        (
+            "values = [{ lr = 0.1, width = 8 }, { lr = 0.2, width = 8 }], trials = 1",
+            TRAIN,
+            "stage.sweep.trials: 1 are fewer than the 2 that sweep.values lists",
+        ),
+        (
+            "values = [{ lr = 0.1, width = 8 }], trials = 3",
+            TRAIN,
+            "stage.sweep.over: names no parameter to draw trials 1 to 2 from",
+        ),
+        (
+            "values = [{ lr = 0.1, width = 8, depth = 3 }]",
+            TRAIN,
+            "stage.sweep.values[0].depth: nothing in the stage says \"{depth}\"",
         ),
         (
             &format!("trials = 1000, over = {{ {over} }}"),
@@ -246,6 +303,95 @@ fn a_sweep_that_cannot_be_says_why() {
     );
 }
 
+#[test]
+fn listed_values_are_the_first_trials_and_change_neither_the_sweep_nor_the_tasks() {
+    let over = "seed = 4, over = { lr = { log = [1e-4, 1e-1] }, width = { int = [4, 7] } }";
+    let drawn = good(&format!("trials = 3, {over}"));
+    let list: Vec<String> = trials(&drawn)
+        .iter()
+        .map(|s| {
+            let values = &trial(s).values;
+            format!("{{ lr = {}, width = {} }}", values["lr"], values["width"])
+        })
+        .collect();
+    let list = list.join(", ");
+    let listed = good(&format!("values = [{list}], {over}"));
+    let keys = |spec: &JobSpec| -> Vec<_> { trials(spec).iter().map(|s| stage_key(s)).collect() };
+    assert_eq!(keys(&listed), keys(&drawn));
+    // What is appended is further trials of the same sweep; what is drawn beyond them is what would be drawn anyway.
+    let more = good(&format!(
+        "values = [{list}, {{ lr = 0.02, width = 5 }}], trials = 6, {over}"
+    ));
+    assert_eq!(keys(&more)[..3], keys(&drawn)[..]);
+    assert_eq!(trials(&more).len(), 6);
+    let id = |spec: &JobSpec| trial(trials(spec)[0]).id.clone();
+    assert_eq!(id(&more), id(&drawn));
+    assert_eq!(
+        keys(&more)[4..],
+        keys(&good(&format!("trials = 6, {over}")))[4..]
+    );
+    assert_eq!(
+        serde_json::to_string(&trial(trials(&more)[3]).values).unwrap(),
+        r#"{"lr":0.02,"width":5}"#
+    );
+    // By hand, without saying where else they might lie.
+    let by_hand = good("values = [{ lr = 0.1, width = 8 }, { lr = 5, width = 9 }]");
+    assert_eq!(trials(&by_hand).len(), 2);
+    assert_eq!(
+        trial(trials(&by_hand)[1]).over,
+        std::collections::BTreeMap::new()
+    );
+    let further =
+        good("values = [{ lr = 0.1, width = 8 }, { lr = 5, width = 9 }, { lr = 1, width = 1 }]");
+    assert_eq!(keys(&further)[..2], keys(&by_hand)[..]);
+    // Of other rules, it is another sweep.
+    let other = good(&format!(
+        "trials = 3, {over}, stop = {{ median = {{ first = 3 }} }}"
+    ));
+    assert_ne!(id(&other), id(&drawn));
+    assert_eq!(
+        trial(trials(&other)[0]).stop,
+        Some(Stop::Median(Median {
+            first: 3,
+            every: 1,
+            least: 5
+        }))
+    );
+}
+
+#[test]
+fn hyperband_deals_trials_to_brackets_as_published() {
+    // Li et al., JMLR 2018, table 1: R = 81, factor 3: 81, 34, 15, 8 and 5 trials; here 1, 3, 9, 27 are rungs before the end.
+    let stop = Stop::Hyperband(Halving {
+        first: 1,
+        factor: 3,
+    });
+    let mut counts = [0; 5];
+    for index in 0..143 {
+        counts[stop.bracket(index, 81) as usize] += 1;
+    }
+    assert_eq!(counts, [81, 34, 15, 8, 5]);
+    let asked = |bracket: u32| -> Vec<u64> {
+        let index = (0..143).find(|i| stop.bracket(*i, 81) == bracket).unwrap();
+        (0..100).filter(|e| stop.asks(index, *e, 81)).collect()
+    };
+    assert_eq!(asked(0), [1, 3, 9, 27]);
+    assert_eq!(asked(2), [9, 27]);
+    assert_eq!(asked(4), [0; 0]);
+}
+
+/// A domain of any kind.
+fn domain() -> impl Strategy<Value = Domain> {
+    let ends = (-50i64..50, 1i64..60);
+    prop_oneof![
+        (-9.0..9.0f64, 0.1..9.0f64).prop_map(|(a, w)| serde_json::json!({"range": [a, a + w]})),
+        (1e-6..1.0f64, 1.5..1e4f64).prop_map(|(a, w)| serde_json::json!({"log": [a, a * w]})),
+        ends.prop_map(|(a, w)| serde_json::json!({"int": [a, a + w]})),
+        (1usize..5).prop_map(|n| serde_json::json!(vec![0.5, 1.0, 8.0, 9.0][..n.min(4)])),
+    ]
+    .prop_map(|domain| serde_json::from_value(domain).unwrap())
+}
+
 proptest! {
     #[test]
     fn rungs_lie_at_powers_of_the_factor_before_the_end(first in 1u32..6, factor in 2u32..5, of in 1u64..200) {
@@ -258,5 +404,48 @@ proptest! {
         }
         let found: Vec<u64> = (0..=of + 1).filter(|e| halving.is_rung(*e, of)).collect();
         prop_assert_eq!(found, rungs);
+    }
+
+    #[test]
+    fn draws_lie_in_their_domain_and_domains_come_back_from_json(domain in domain(), seed: u64, number in 0u64..2000) {
+        let over = [("x".to_owned(), domain.clone())].into();
+        let value = picofarm_proto::model::domain::draw(&over, seed, number)["x"].clone();
+        prop_assert!(domain.contains(&value), "{value} of {domain:?}");
+        let text = serde_json::to_string(&domain).unwrap();
+        prop_assert_eq!(&serde_json::from_str::<Domain>(&text).unwrap(), &domain);
+        // A value's share of the interval leads back to it.
+        if let Domain::Within(interval) = domain {
+            prop_assert_eq!(interval.at(interval.share(&value).unwrap()), value);
+        }
+    }
+
+    #[test]
+    fn each_bracket_of_hyperband_has_its_share_of_the_first_trials_however_many(first in 1u32..4, factor in 2u32..5, of in 2u64..90, trials in 1u64..90) {
+        let stop = Stop::Hyperband(Halving { first, factor });
+        let dealt: Vec<u32> = (0..trials).map(|i| stop.bracket(i, of)).collect();
+        let brackets = (0..=of).filter(|e| Halving { first, factor }.is_rung(*e, of)).count() + 1;
+        let weight = |b: usize| (brackets as f64 * f64::from(factor).powi((brackets - 1 - b) as i32) / (brackets - b) as f64).ceil();
+        let total: f64 = (0..brackets).map(weight).sum();
+        for bracket in 0..brackets {
+            let count = dealt.iter().filter(|b| **b as usize == bracket).count() as f64;
+            let due = trials as f64 * weight(bracket) / total;
+            prop_assert!((count - due).abs() <= brackets as f64 / 2.0 + 1.0, "bracket {bracket}: {count} of {due}");
+        }
+        // Later brackets are asked at fewer of the same rungs, and none at its end.
+        for index in (0..trials).step_by(7) {
+            let asked: Vec<u64> = (0..=of).filter(|e| stop.asks(index, *e, of)).collect();
+            prop_assert_eq!(asked.len(), brackets - 1 - dealt[index as usize] as usize);
+            let rungs = Halving { first, factor };
+            prop_assert!(asked.iter().all(|e| *e < of && rungs.is_rung(*e, of)));
+        }
+    }
+
+    #[test]
+    fn by_the_median_trials_are_asked_every_so_often_before_the_end(first in 1u32..9, every in 1u32..9, of in 1u64..60, index in 0u64..9) {
+        let stop = Stop::Median(Median { first, every, least: 1 });
+        let asked: Vec<u64> = (0..=of + 1).filter(|e| stop.asks(index, *e, of)).collect();
+        let due: Vec<u64> = (u64::from(first)..of).step_by(every as usize).collect();
+        prop_assert_eq!(asked, due);
+        prop_assert_eq!(stop.bracket(index, of), 0);
     }
 }

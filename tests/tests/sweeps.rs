@@ -1,9 +1,11 @@
 //! A sweep over real workers: trials that fall behind leave them to others, one worker is killed, the best model gets its
-//! name, and more trials later are further ones.
+//! name, and more trials later are further ones: drawn, or chosen by what was found. TensorBoard shows what came out, where
+//! `PICOFARM_PYTHON` names a Python that has it.
 
-use std::{fs, path::Path, thread::sleep, time::Duration};
+use std::{ffi::OsStr, fs, path::Path, thread::sleep, time::Duration};
 
 use picofarm_tests::{Farm, store};
+use serde_json::{Value, json};
 
 fn job(store: &Path, trials: u64, promote: &str) -> String {
     format!(
@@ -28,7 +30,7 @@ source = "rooms"
 trials = {trials}
 seed = 2
 promote = {promote:?}
-halving = {{ first = 4, factor = 3 }}
+stop = {{ halving = {{ first = 4, factor = 3 }} }}
 over = {{ lr = {{ log = [1e-5, 3e-2] }}, width = {{ int = [2, 6] }} }}
 [stage.train]
 target = "tof"
@@ -137,4 +139,240 @@ fn a_sweep_stops_what_falls_behind_and_names_the_best_although_a_worker_is_kille
     assert_eq!(hashes(), before);
     let sweep = farm.json(&["sweep", "status", store, "depth"]);
     assert_eq!(sweep["trials"].as_array().unwrap().len(), 7);
+}
+
+/// A sweep of one stage that is extended, and one of values chosen by hand.
+fn learning(store: &Path) -> String {
+    format!(
+        r#"# What follows keeps its comments.
+name = "search"
+[limits]
+max_crashes = 1000
+[[stage]]
+name = "rooms"
+scenes = {{ kind = "primitive", count = 8, seed = 3, spots = 4 }}
+render = {{ resolution = 16, samples = 2, bins = 32, bin_width_m = 0.768 }}
+output = {{ store = {store:?}, dataset = "rooms" }}
+[[stage]]
+kind = "split"
+source = "rooms"
+split = {{ counts = [5, 2, 1] }}
+[[stage]]
+name = "tof"
+kind = "train"
+source = "rooms"
+[stage.sweep]
+trials = 10        # drawn
+seed = 2
+stop = {{ median = {{ first = 2, least = 4 }} }}
+[stage.sweep.over] # learning rate and width
+lr = {{ log = [1e-5, 3e-2] }}
+width = {{ int = [2, 6] }}
+precision = ["f32", "bf16"]
+[stage.train]
+target = "tof"
+model = "depth"
+net = {{ width = "{{width}}", levels = 2 }}
+optimise = {{ learning_rate = "{{lr}}", precision = "{{precision}}", epochs = 6, batch = 2 }}
+[[stage]]
+name = "hand"
+kind = "train"
+source = "rooms"
+sweep = {{ values = [{{ lr = 1e-2 }}, {{ lr = 1e-3 }}], stop = {{ hyperband = {{ first = 2 }} }} }}
+train = {{ target = "tof", model = "by-hand", net = {{ width = 3, levels = 2 }}, optimise = {{ learning_rate = "{{lr}}", epochs = 4, batch = 2 }} }}
+[[stage]]
+kind = "evaluate"
+source = "rooms"
+evaluate = {{ models = ["tof"] }}
+"#
+    )
+}
+
+#[test]
+fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() {
+    let farm = Farm::start("extend");
+    let (place, text) = (farm.store(), farm.store().display().to_string());
+    let store = text.as_str();
+    let file = place.with_file_name("search.toml");
+    fs::write(&file, learning(&place)).unwrap();
+    let path = |name: &str| place.with_file_name(name).display().to_string();
+    let first = path("search.toml");
+    let submitted = farm.json(&["job", "submit", &first]);
+    let _one = farm.worker("one");
+    let _other = farm.worker("other");
+    let ended = farm.until_ended(submitted["job"].as_str().unwrap());
+    assert_eq!(ended["state"], "done", "{ended}");
+
+    // The same records give the same file; a random sampler gives another.
+    let extended = farm.json(&["sweep", "extend", &first, "--trials", "3", "--stage", "tof"]);
+    let next = path("search-13.toml");
+    assert_eq!(extended["file"], next.as_str());
+    assert_eq!(extended["ended"], 10);
+    let proposed = extended["trials"].as_array().unwrap();
+    let numbers: Vec<u64> = proposed
+        .iter()
+        .map(|t| t["trial"].as_u64().unwrap())
+        .collect();
+    assert_eq!(numbers, [10, 11, 12]);
+    let again = path("again.toml");
+    let extend = [
+        "sweep", "extend", &first, "--trials", "3", "--stage", "tof", "--out", &again,
+    ];
+    farm.json(&extend);
+    assert_eq!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
+    farm.json(&[&extend[..], &["--sampler", "random"]].concat());
+    assert_ne!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
+    let written = fs::read_to_string(&next).unwrap();
+    assert!(
+        written.starts_with("# What follows keeps its comments.\n")
+            && written.contains("# learning rate and width"),
+        "{written}"
+    );
+    farm.run(&["sweep", "extend", &first, "--trials", "3"])
+        .fails(3, &["several sweeps", "--stage tof | hand"]);
+    farm.run(&[
+        "sweep", "extend", &first, "--trials", "3", "--stage", "hand",
+    ])
+    .fails(3, &["sweep.over", "is missing"]);
+    let elsewhere = std::env::temp_dir().join("x.toml").display().to_string();
+    farm.run(&[
+        "sweep", "extend", &first, "--trials", "1", "--stage", "tof", "--out", &elsewhere,
+    ])
+    .fails(3, &["another folder"]);
+
+    // Those that ended are reused: 8 rooms, the split, ten and two trials, and what was chosen by hand.
+    let hashes = || {
+        let mut hashes = store::hashes(&place.join("models"));
+        hashes.retain(|key, _| key.contains("/trials/"));
+        hashes
+    };
+    let before = hashes();
+    assert_eq!(before.len(), 12);
+    let plan = farm.json(&["job", "plan", &next]);
+    assert_eq!(
+        (&plan["reuse"], &plan["run"]),
+        (&22.into(), &5.into()),
+        "{plan}"
+    );
+    // Submits that file, and then one of a trial more.
+    let run = [
+        "sweep", "run", &next, "--trials", "1", "--rounds", "1", "--stage", "tof",
+    ];
+    let rounds = farm.json(&run);
+    assert_eq!(rounds["rounds"][1]["file"], path("search-14.toml").as_str());
+    let after = hashes();
+    assert_eq!(after.len(), 16);
+    assert!(
+        before
+            .iter()
+            .all(|(key, hash)| after.get(key) == Some(hash))
+    );
+    let sweep = farm.json(&["sweep", "status", store, "depth"]);
+    let trials = sweep["trials"].as_array().unwrap();
+    assert_eq!(trials.len(), 14);
+    for (trial, proposed) in trials[10..13].iter().zip(proposed) {
+        let values = trial["values"].as_array().unwrap();
+        for pair in values {
+            assert_eq!(
+                pair[1].as_f64(),
+                proposed["values"][pair[0].as_str().unwrap()].as_f64()
+            );
+        }
+    }
+    for name in ["depth", "depth-13", "depth-14"] {
+        farm.json(&["model", "show", store, name]);
+    }
+    // Given again, it finds everything done.
+    assert_eq!(farm.json(&run)["rounds"], rounds["rounds"]);
+
+    let importance = farm.json(&["sweep", "importance", store, "depth"]);
+    let shares = importance["parameters"].as_array().unwrap();
+    let sum: f64 = shares.iter().map(|p| p["share"].as_f64().unwrap()).sum();
+    assert!(
+        shares.len() == 3 && (sum - 1.0).abs() < 1e-9,
+        "{importance}"
+    );
+    farm.run(&["sweep", "importance", store, "by-hand"])
+        .fails(1, &["2 trials of \"by-hand\" have ended, and it takes 10"]);
+    let compared = farm.json(&["sweep", "compare", store, "depth", "by-hand"]);
+    let epochs: u64 = trials.iter().map(|t| t["epochs"].as_u64().unwrap()).sum();
+    let one = &compared[0];
+    assert_eq!(one["epochs"], epochs);
+    let count = ["finished", "stopped", "diverged"].map(|end| one[end].as_u64().unwrap());
+    assert_eq!(count.iter().sum::<u64>(), 14, "{one}");
+    let best = farm.json(&["sweep", "best", store, "depth"]);
+    assert_eq!(
+        (&one["best"]["model"], &one["best"]["loss"]),
+        (&best["model"], &best["loss"])
+    );
+    assert_eq!(compared[1]["best"]["values"].as_object().unwrap().len(), 1);
+    farm.run(&["sweep", "compare", store, "depth"])
+        .fails(3, &["nothing to compare it with"]);
+
+    let runs = path("runs");
+    farm.json(&[
+        "sweep",
+        "export",
+        store,
+        "depth",
+        "--format",
+        "tensorboard",
+        "--out",
+        &runs,
+    ]);
+    let model = [
+        "model",
+        "export",
+        store,
+        "depth-14",
+        "--format",
+        "tensorboard",
+    ];
+    farm.json(&[&model[..], &["--out", &runs]].concat());
+    let Some(python) = std::env::var_os("PICOFARM_PYTHON") else {
+        eprintln!(
+            "SKIPPED reading event files: tests/run installs a Python with tensorboard, PICOFARM_PYTHON names it"
+        );
+        return;
+    };
+    shown_by_tensorboard(&farm, &python, &runs, trials);
+}
+
+/// What TensorBoard shows of the runs is what the trials found.
+fn shown_by_tensorboard(farm: &Farm, python: &OsStr, runs: &str, trials: &[Value]) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("interop/read_tensorboard.py");
+    let script = script.display().to_string();
+    let shown = farm
+        .cli()
+        .run_other(python, &["-B", &script, runs])
+        .ok()
+        .json();
+    assert_eq!(shown["metrics"], json!(["error"]));
+    assert_eq!(shown["scalars"].as_object().unwrap().len(), 15);
+    let near = |a: &Value, b: &Value| {
+        let (a, b) = (a.as_f64().unwrap(), b.as_f64().unwrap());
+        assert!((a - b).abs() <= 1e-6 * b.abs(), "{a} {b}");
+    };
+    for trial in trials {
+        let model = trial["model"].as_str().unwrap();
+        let (run, session) = (&shown["scalars"][model], &shown["sessions"][model]);
+        near(&session["metrics"]["error"], &trial["loss"]);
+        for pair in trial["values"].as_array().unwrap() {
+            assert_eq!(
+                session["parameters"][pair[0].as_str().unwrap()],
+                pair[1],
+                "{session}"
+            );
+        }
+        assert_eq!(session["status"], "STATUS_SUCCESS");
+        let history = trial["history"].as_array().unwrap();
+        for (tag, field) in [("loss", "/loss"), ("validation/mae_m", "/validation/mae_m")] {
+            let points = run[tag].as_array().unwrap();
+            assert_eq!(points.len(), history.len());
+            for (point, line) in points.iter().zip(history) {
+                assert_eq!(point[0], line["epoch"]);
+                near(&point[1], line.pointer(field).unwrap());
+            }
+        }
+    }
 }

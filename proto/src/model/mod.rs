@@ -2,6 +2,7 @@
 
 pub mod audit;
 pub mod bounds;
+pub mod domain;
 pub mod explain;
 pub mod file;
 pub mod job;
@@ -17,12 +18,14 @@ mod scale;
 mod spec_error;
 pub mod stage;
 pub mod status;
+pub mod stop;
 mod substitute;
 pub mod sweep;
 mod texts;
 pub mod trial;
 
 pub use audit::{Act, AuditEntry, Outcome};
+pub use domain::{Domain, Interval};
 // What jobs share with data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};
 pub use job::JobSpec;
@@ -54,4 +57,5 @@ pub use status::{
     Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
     StageStatus, TaskCounts,
 };
-pub use trial::{Halving, Trial};
+pub use stop::{Halving, Median, Stop};
+pub use trial::Trial;

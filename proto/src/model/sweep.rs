@@ -4,7 +4,7 @@
 //! ```toml
 //! [stage.sweep]
 //! trials = 27                                   # drawn at random; without it, the whole grid
-//! halving = { first = 3, factor = 3 }           # after 3, 9, 27, … epochs only the best third goes on
+//! stop = { halving = { first = 3, factor = 3 } }    # after 3, 9, 27, … epochs only the best third goes on
 //! over = { lr = { log = [1e-4, 1e-1] }, width = [8, 16], levels = { int = [2, 4] } }
 //! [stage.train]
 //! model = "depth"                               # trials are depth.0, depth.1, …; the best of them becomes depth
@@ -16,10 +16,13 @@
 //! reused and looked at as any other. Its draws follow from the seed, its number and the parameters' names alone, so more
 //! trials later are further ones. `tof` itself becomes a stage of kind `promote` which needs all of them.
 //!
-//! Halving is ASHA's rule (Li et al., "A System for Massively Parallel Hyperparameter Tuning", MLSys 2020) in the form that
-//! stops: a trial that reaches a rung goes on if it is among the best 1/factor of those that have reached it by then. No
-//! trial waits for another, and one that stops leaves its worker to the next. Which trials come to their end thus depends
-//! on which came first; what each of them computes does not.
+//! `values = [{ lr = 0.01, width = 8, levels = 3 }, …]` lists the values of the first trials by hand; `trials` counts them
+//! in, and those beyond are drawn. `picofarm sweep extend` writes such a list. The sweep's id follows from what is trained,
+//! `over`, `seed` and `stop`, neither from the number of trials nor from who chose their values: a sweep that is extended
+//! stays the same one, and what its trials have found is compared with.
+//!
+//! When trials stop that fall behind: [`super::stop`]. No trial waits for another, and one that stops leaves its worker to
+//! the next. Which trials come to their end thus depends on which came first; what each of them computes does not.
 
 use std::collections::BTreeMap;
 
@@ -28,52 +31,40 @@ use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{
+    domain::{Domain, draw},
     limits::MAX_STAGES,
     spec_error::SpecError,
+    stop::Stop,
     substitute::substitute,
-    trial::{Halving, Trial},
+    trial::Trial,
 };
 
 /// `[stage.sweep]`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SweepText {
-    /// Trials drawn at random; 0 = each combination of values, which must be lists.
+    /// Trials in all; those that `values` does not list are drawn at random. 0 = those listed or, where none is, each
+    /// combination of values, which must be lists.
     #[serde(default)]
     trials: u64,
     /// Seed of the draws.
     #[serde(default)]
     seed: u64,
     /// By the parameters' names: the values that each may have.
-    over: BTreeMap<String, Values>,
+    #[serde(default)]
+    over: BTreeMap<String, Domain>,
+    /// The values of the first trials.
+    #[serde(default)]
+    values: Vec<Values>,
     /// When trials stop that fall behind; never without it.
-    halving: Option<Halving>,
+    stop: Option<Stop>,
     /// The name that the best model gets; that of the stage's model without it.
     #[serde(default)]
     promote: String,
 }
 
-/// The values that a parameter may have.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(untagged)]
-enum Values {
-    /// One of these.
-    OneOf(Vec<Value>),
-    /// An interval.
-    Within(Interval),
-}
-
-/// An interval: `{ range = [a, b] }`, `{ log = [a, b] }` or `{ int = [a, b] }`, ends among it.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-enum Interval {
-    /// Every number alike.
-    Range([f64; 2]),
-    /// Every order of magnitude alike.
-    Log([f64; 2]),
-    /// Every whole number alike.
-    Int([i64; 2]),
-}
+/// A trial's values, by the parameters' names.
+type Values = BTreeMap<String, Value>;
 
 /// The stages that a stage with a sweep stands for, its trials and what chooses among them; one without stands for itself.
 pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
@@ -88,7 +79,7 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
         stage["train"],
         sweep["over"],
         sweep["seed"],
-        sweep["halving"]
+        sweep["stop"]
     ]);
     let sweep: SweepText =
         serde_json::from_value(sweep).map_err(|e| SpecError::new("stage.sweep", e.to_string()))?;
@@ -100,9 +91,8 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
     let Some(model) = stage.get("train").and_then(|train| of(train, "model")) else {
         return fail("train.model", "is missing; name the model".into());
     };
-    if let Some(halving) = sweep.halving {
-        halving
-            .check()
+    if let Some(stop) = sweep.stop {
+        stop.check()
             .map_err(|e| SpecError::new(format!("stage.{}", e.field), e.what))?;
     }
     let chosen = sweep.choose()?;
@@ -119,7 +109,11 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
                 let what = format!(
                     "nothing in the stage says \"{mark}\"; write it where the value belongs"
                 );
-                return fail(&format!("sweep.over.{parameter}"), what);
+                let field = match sweep.over.contains_key(parameter) {
+                    true => format!("sweep.over.{parameter}"),
+                    false => format!("sweep.values[0].{parameter}"),
+                };
+                return fail(&field, what);
             }
         }
         trial["name"] = json!(format!("{name}.{index}"));
@@ -130,7 +124,9 @@ pub(super) fn trials(mut stage: Value) -> Result<Vec<Value>, SpecError> {
             id: id.clone(),
             index: index as u64,
             values,
-            halving: sweep.halving,
+            over: sweep.over.clone(),
+            seed: sweep.seed,
+            stop: sweep.stop,
         })
         .expect("plain data");
         models.push(called);
@@ -167,32 +163,98 @@ fn id(mut described: Value) -> String {
 
 impl SweepText {
     /// The values of every trial.
-    fn choose(&self) -> Result<Vec<BTreeMap<String, Value>>, SpecError> {
+    fn choose(&self) -> Result<Vec<Values>, SpecError> {
         let fail = |field: String, what: String| Err(SpecError::new(field, what));
-        if self.over.is_empty() {
+        if self.over.is_empty() && self.values.is_empty() {
             let what = "names no parameter, e.g. over = { lr = { log = [1e-4, 1e-1] } }";
             return fail("stage.sweep.over".into(), what.into());
         }
-        for (parameter, values) in &self.over {
-            if let Some(what) = values.fault() {
+        for (parameter, domain) in &self.over {
+            if let Some(what) = domain.fault() {
                 return fail(format!("stage.sweep.over.{parameter}"), what);
             }
         }
-        if self.trials > MAX_STAGES as u64 - 1 {
-            let what = format!("{} are more than {}", self.trials, MAX_STAGES - 1);
+        let (trials, listed) = (self.trials, self.values.len() as u64);
+        if trials.max(listed) > MAX_STAGES as u64 - 1 {
+            let field = if trials >= listed { "trials" } else { "values" };
+            let what = format!("{} are more than {}", trials.max(listed), MAX_STAGES - 1);
+            return fail(format!("stage.sweep.{field}"), what);
+        }
+        self.check_values()?;
+        if trials == 0 && listed == 0 {
+            return self.grid();
+        }
+        if trials > 0 && trials < listed {
+            let what = format!(
+                "{trials} are fewer than the {listed} that sweep.values lists; say how many there are in all, or leave it away"
+            );
             return fail("stage.sweep.trials".into(), what);
         }
-        match self.trials {
-            0 => self.grid(),
-            n => Ok((0..n).map(|trial| self.draw(trial)).collect()),
+        if self.over.is_empty() && trials > listed {
+            let what = format!(
+                "names no parameter to draw trials {listed} to {} from; give it, or leave sweep.trials away",
+                trials - 1
+            );
+            return fail("stage.sweep.over".into(), what);
         }
+        let drawn = (listed..trials).map(|trial| draw(&self.over, self.seed, trial));
+        Ok(self.values.iter().cloned().chain(drawn).collect())
+    }
+
+    /// Whether listed values name every parameter, and no other, and lie where they shall.
+    fn check_values(&self) -> Result<(), SpecError> {
+        let fail = |i: usize, parameter: &str, what: String| {
+            let field = format!("stage.sweep.values[{i}].{parameter}");
+            Err(SpecError::new(field, what))
+        };
+        let parameters: Vec<&String> = match self.over.is_empty() {
+            true => self
+                .values
+                .iter()
+                .take(1)
+                .flat_map(BTreeMap::keys)
+                .collect(),
+            false => self.over.keys().collect(),
+        };
+        if parameters.is_empty() {
+            let what = "names no parameter, e.g. values = [{ lr = 0.01 }]";
+            return Err(SpecError::new("stage.sweep.values[0]", what));
+        }
+        for (i, values) in self.values.iter().enumerate() {
+            for parameter in &parameters {
+                if !values.contains_key(*parameter) {
+                    return fail(
+                        i,
+                        parameter,
+                        "is missing; each trial needs a value of it".into(),
+                    );
+                }
+            }
+            for (parameter, value) in values {
+                match self.over.get(parameter) {
+                    Some(domain) if !domain.contains(value) => {
+                        let domain = serde_json::to_string(domain).expect("plain data");
+                        let what = format!(
+                            "{value} is not in {domain}; change it, or widen sweep.over.{parameter}"
+                        );
+                        return fail(i, parameter, what);
+                    }
+                    None if !parameters.contains(&parameter) => {
+                        let what = "is no parameter of the others; name the same in each trial, or give it in sweep.over";
+                        return fail(i, parameter, what.into());
+                    }
+                    _ => {}
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Each combination.
-    fn grid(&self) -> Result<Vec<BTreeMap<String, Value>>, SpecError> {
+    fn grid(&self) -> Result<Vec<Values>, SpecError> {
         let mut grid = vec![BTreeMap::new()];
         for (parameter, values) in &self.over {
-            let Values::OneOf(values) = values else {
+            let Domain::OneOf(values) = values else {
                 let what =
                     "is an interval: say how many trials are drawn (sweep.trials), or list values";
                 return Err(SpecError::new(
@@ -206,7 +268,7 @@ impl SweepText {
                 );
                 return Err(SpecError::new("stage.sweep.over", what));
             }
-            let with = |chosen: &BTreeMap<String, Value>, value: &Value| {
+            let with = |chosen: &Values, value: &Value| {
                 let mut chosen = chosen.clone();
                 chosen.insert(parameter.clone(), value.clone());
                 chosen
@@ -217,61 +279,5 @@ impl SweepText {
                 .collect();
         }
         Ok(grid)
-    }
-
-    /// One combination at random.
-    fn draw(&self, trial: u64) -> BTreeMap<String, Value> {
-        let over = self.over.iter();
-        over.map(|(parameter, values)| {
-            let mut hash = Sha256::new();
-            hash.update(b"trial");
-            hash.update(self.seed.to_le_bytes());
-            hash.update(trial.to_le_bytes());
-            hash.update(parameter.as_bytes());
-            let digest = hash.finalize();
-            let bits = u64::from_le_bytes(digest[..8].try_into().expect("a digest has 32 bytes"));
-            (parameter.clone(), values.at(bits))
-        })
-        .collect()
-    }
-}
-
-impl Values {
-    /// What is wrong with them.
-    fn fault(&self) -> Option<String> {
-        let ordered = |a: f64, b: f64| a.is_finite() && b.is_finite() && a < b;
-        match self {
-            Self::OneOf(values) => values.is_empty().then(|| "lists no value".into()),
-            Self::Within(Interval::Range([a, b])) => {
-                (!ordered(*a, *b)).then(|| format!("{a} must lie below {b}"))
-            }
-            Self::Within(Interval::Log([a, b])) => (!ordered(*a, *b) || *a <= 0.0)
-                .then(|| format!("{a} must lie above 0 and below {b}")),
-            Self::Within(Interval::Int([a, b])) => {
-                (a >= b || b.checked_sub(*a).is_none()).then(|| format!("{a} must lie below {b}"))
-            }
-        }
-    }
-
-    /// The value that random bits choose. Numbers of an interval have four digits, which are readable and the same on
-    /// every machine.
-    fn at(&self, bits: u64) -> Value {
-        let share = (bits >> 11) as f64 / (1u64 << 53) as f64;
-        let whole = |n: u64| ((u128::from(bits) * u128::from(n)) >> 64) as u64;
-        let four = |x: f64, [a, b]: [f64; 2]| {
-            let rounded: f64 = format!("{x:.3e}").parse().expect("a number");
-            json!(rounded.clamp(a, b))
-        };
-        match self {
-            Self::OneOf(values) => values[whole(values.len() as u64) as usize].clone(),
-            Self::Within(Interval::Range(ends)) => {
-                four(ends[0] + share * (ends[1] - ends[0]), *ends)
-            }
-            Self::Within(Interval::Log(ends)) => {
-                let [a, b] = ends.map(libm::log);
-                four(libm::exp(a + share * (b - a)), *ends)
-            }
-            Self::Within(Interval::Int([a, b])) => json!(a + whole((b - a) as u64 + 1) as i64),
-        }
     }
 }

@@ -197,6 +197,7 @@ async fn changed_records_of_models_are_refused() {
         id: "i".into(),
         index: 0,
         values: BTreeMap::new(),
+        over: BTreeMap::new(),
         model: "m".into(),
         kind: "tof".into(),
         training_key: "t".into(),

@@ -55,8 +55,7 @@ async fn all_trials(place: &Place) -> Vec<TrialRecord> {
 async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
     let place = Place::new().await;
     // Far too small a rate learns nothing: whoever comes after the others and is no better stops.
-    let over =
-        json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-2]}, "halving": {"first": 3, "factor": 3}});
+    let over = json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-2]}, "stop": {"halving": {"first": 3, "factor": 3}}});
     let stages = sweep(&place, &over, &json!({}));
     let mut outputs = Vec::new();
     for stage in stages.clone() {
@@ -130,6 +129,58 @@ async fn trials_that_fall_behind_stop_and_the_best_gets_the_name() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn who_is_worse_than_the_median_of_the_others_stops() {
+    let place = Place::new().await;
+    let stop = json!({"median": {"first": 3, "every": 2, "least": 2}});
+    let over = json!({"over": {"lr": [1e-2, 3e-2, 1e-8, 2e-8]}, "stop": stop});
+    for stage in sweep(&place, &over, &json!({})) {
+        run(stage).await.unwrap();
+    }
+    let trials = all_trials(&place).await;
+    let ends: Vec<(&TrialEnd, u64)> = trials.iter().map(|t| (&t.end, t.epochs)).collect();
+    // The second has one other to compare with, which is too few; the third learns nothing and has two.
+    let (finished, pruned) = ((&TrialEnd::Finished, 9), (&TrialEnd::Pruned, 3));
+    assert_eq!(ends, [finished, finished, pruned, pruned]);
+    // Where they were asked, and what the sweep's domain was, is on record.
+    let id = place.models().sweeps("m").await.unwrap();
+    let (_, rungs) = place
+        .models()
+        .trials("m", id.first().unwrap())
+        .await
+        .unwrap();
+    let asked: Vec<(u64, u64)> = rungs.iter().map(|r| (r.epochs, r.index)).collect();
+    assert_eq!(
+        asked,
+        [
+            (3, 0),
+            (3, 1),
+            (3, 2),
+            (3, 3),
+            (5, 0),
+            (5, 1),
+            (7, 0),
+            (7, 1)
+        ]
+    );
+    assert_eq!(trials[2].over["lr"], json!([1e-2, 3e-2, 1e-8, 2e-8]));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn trials_of_a_bracket_are_compared_with_one_another_alone() {
+    let place = Place::new().await;
+    // Of 9 epochs, with the only rung after 3: trials 0, 2 and 4 are asked there, 1 and 3 never.
+    let stop = json!({"hyperband": {"first": 3, "factor": 3}});
+    let over = json!({"over": {"lr": [1e-2, 1e-8, 2e-8, 3e-8]}, "stop": stop});
+    for stage in sweep(&place, &over, &json!({})) {
+        run(stage).await.unwrap();
+    }
+    let trials = all_trials(&place).await;
+    let ends: Vec<(&TrialEnd, u64)> = trials.iter().map(|t| (&t.end, t.epochs)).collect();
+    let (finished, pruned) = ((&TrialEnd::Finished, 9), (&TrialEnd::Pruned, 3));
+    assert_eq!(ends, [finished, finished, pruned, finished]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_trial_computes_what_the_training_computes_without_a_sweep() {
     let place = Place::new().await;
     let stages = sweep(&place, &json!({"over": {"lr": [1e-2]}}), &json!({}));
@@ -149,7 +200,8 @@ async fn a_trial_computes_what_the_training_computes_without_a_sweep() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn trials_that_are_stopped_again_and_again_end_as_those_that_never_were() {
-    let over = json!({"over": {"lr": [1e-2, 1e-8, 3e-2]}, "halving": {"first": 4, "factor": 2}});
+    let over =
+        json!({"over": {"lr": [1e-2, 1e-8, 3e-2]}, "stop": {"halving": {"first": 4, "factor": 2}}});
     let train = json!({"optimise": {"epochs": 40, "batch": 2, "learning_rate": "{lr}"}, "checkpoint_minutes": 0.01});
     let (calm, place) = (Place::new().await, Place::new().await);
     for stage in sweep(&calm, &over, &train) {

@@ -31,6 +31,8 @@ pub struct TrialRecord {
     pub index: u64,
     /// Its values, by the parameters' names.
     pub values: BTreeMap<String, Value>,
+    /// By the parameters' names: the values that each may have, as in the job file. Empty where it does not say.
+    pub over: BTreeMap<String, Value>,
     /// The name of its model; there is one only where it came to its end.
     pub model: String,
     /// What it predicts: `tof`, `shadow` or `specular`.
@@ -53,7 +55,7 @@ pub struct TrialRecord {
 pub enum TrialEnd {
     /// It came to its end.
     Finished,
-    /// It fell behind others at a rung.
+    /// It fell behind others.
     Pruned,
     /// Its numbers became infinite or none: what did.
     Diverged(String),
@@ -76,6 +78,7 @@ impl TrialRecord {
         let mut sorted = self.clone();
         let values = sorted.values.values_mut();
         values
+            .chain(sorted.over.values_mut())
             .chain(&mut sorted.history)
             .for_each(Value::sort_all_objects);
         json(&sorted)

@@ -36,6 +36,7 @@ mod known;
 mod plan;
 mod results;
 mod trial;
+mod verdict;
 
 use super::saver::Saver;
 use along::{Reporter, loading};
@@ -353,20 +354,22 @@ impl<'a> TrainingRun<'a> {
         let mut teller = Reporter::new(control, epochs);
         // The answer to the trial at its latest rung.
         let mut answer = Ok(true);
-        let mut ask = |line: &Line| {
-            answer = course.map_or(Ok(true), |course| course.goes_on(line, epochs, control));
+        let mut ask = |line: &Line, best: Option<f64>| {
+            let goes_on = |course: &Course<'_>| course.goes_on(line, best, epochs, control);
+            answer = course.map_or(Ok(true), goes_on);
             matches!(answer, Ok(true))
         };
         // It may have been stopped right at a rung.
         let position = training.position();
+        let best = position.best;
         let at_rung = position.history.last().filter(|_| position.batches == 0);
-        let ended = match at_rung.copied().is_none_or(|line| ask(&line)) {
+        let ended = match at_rung.copied().is_none_or(|line| ask(&line, best)) {
             false => Ok(Ended::Stopped),
             true => {
                 let mut hear = |training: &Training, event: &Event| {
                     teller.hear(event);
                     if let Event::Epoch(line) = event
-                        && !ask(line)
+                        && !ask(line, training.position().best)
                     {
                         return picofarm_model::train::Control::Stop;
                     }

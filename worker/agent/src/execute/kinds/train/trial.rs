@@ -1,13 +1,17 @@
-//! A training that is one of a sweep's trials: at rungs it compares itself with those that have been there, and stops if it
-//! has fallen behind; however it ends, it tells so under the sweep's name, and that is the task's result.
+//! A training that is one of a sweep's trials: after some epochs it compares itself with those that have come as far, and
+//! stops if it has fallen behind; however it ends, it tells so under the sweep's name, and that is the task's result.
 
 use picofarm_dataset::{ModelManifest, Models, Rung, TrialEnd, TrialRecord};
 use picofarm_model::{metric::Metrics, train::Line};
-use picofarm_proto::model::Trial;
+use picofarm_proto::model::{Domain, Trial};
 use serde_json::Value;
 use tracing::info;
 
-use super::{TrainingRun, results::lines_of};
+use super::{
+    TrainingRun,
+    results::lines_of,
+    verdict::{Verdict, verdict},
+};
 use crate::execute::{Control, Output, TaskError, output::Stores};
 
 /// Name of the object that holds a model's epochs.
@@ -63,7 +67,7 @@ impl<'a> Course<'a> {
             && found.training_key != self.training.key
         {
             let what = format!(
-                "sweep: trial {} of {:?} is another training by now (key {}, this one's is {}): the data set has changed; \
+                "sweep: trial {} of {:?} is another training by now (key {}, this one's is {}): its values or the data set have changed; \
                  choose another name for the model",
                 trial.index, trial.sweep, found.training_key, self.training.key
             );
@@ -80,10 +84,11 @@ impl<'a> Course<'a> {
         Ok(found)
     }
 
-    /// Whether it goes on after an epoch of `of`.
+    /// Whether it goes on after an epoch of `of`; `best` is the least loss that it has had so far.
     pub(super) fn goes_on(
         &self,
         line: &Line,
+        best: Option<f64>,
         of: u32,
         control: &Control,
     ) -> Result<bool, TaskError> {
@@ -91,10 +96,11 @@ impl<'a> Course<'a> {
             return Ok(again.end != TrialEnd::Pruned || again.epochs != line.epoch);
         }
         let trial = self.trial;
-        let rung = trial
-            .halving
-            .filter(|halving| halving.is_rung(line.epoch, u64::from(of)));
-        let (Some(halving), Some(found)) = (rung, line.validation) else {
+        let of = u64::from(of);
+        let asked = trial
+            .stop
+            .filter(|stop| stop.asks(trial.index, line.epoch, of));
+        let (Some(stop), Some(found)) = (asked, line.validation) else {
             return Ok(true);
         };
         let ours = Rung {
@@ -105,13 +111,15 @@ impl<'a> Course<'a> {
         let (models, sweep, id) = (self.models(), &*trial.sweep, &*trial.id);
         let written = async || models.put_rung(sweep, id, &ours).await;
         self.stores.patiently(control, written)?;
-        let there = self
+        let mut there = self
             .stores
             .wait(control, models.rung(sweep, id, line.epoch))?;
-        let (place, goes_on) = judged(&ours, &there, halving.factor);
-        let (count, then) = (there.len(), if goes_on { "goes on" } else { "stops" });
+        let bracket = stop.bracket(trial.index, of);
+        there.retain(|other| stop.bracket(other.index, of) == bracket);
+        let Verdict { goes_on, why } = verdict(&stop, &ours, best.unwrap_or(ours.loss), &there);
+        let then = if goes_on { "goes on" } else { "stops" };
         info!(
-            "trial {} after {} epochs is number {place} of {count}: it {then}",
+            "trial {} after {} epochs {why}: it {then}",
             trial.index, line.epoch
         );
         Ok(goes_on)
@@ -183,6 +191,7 @@ impl<'a> Course<'a> {
             id: trial.id.clone(),
             index: trial.index,
             values: trial.values.clone(),
+            over: trial.over.iter().map(of_domain).collect(),
             model: settings.model.clone(),
             kind: settings.target.name().to_owned(),
             training_key: self.training.key.clone(),
@@ -207,52 +216,11 @@ pub(super) fn adopted(record: &TrialRecord) -> Output {
     }
 }
 
+fn of_domain((name, domain): (&String, &Domain)) -> (String, Value) {
+    let domain = serde_json::to_value(domain).expect("a domain is plain data");
+    (name.clone(), domain)
+}
+
 fn of_line(line: &Line) -> Value {
     serde_json::to_value(line).expect("figures are plain data")
-}
-
-/// The place of a trial among those that have reached a rung, from 1, and whether it goes on: the best 1/factor of them do,
-/// and at least one.
-fn judged(ours: &Rung, there: &[Rung], factor: u32) -> (usize, bool) {
-    let better = |other: &&Rung| {
-        other.index != ours.index
-            && (other.loss, other.index).partial_cmp(&(ours.loss, ours.index))
-                == Some(std::cmp::Ordering::Less)
-    };
-    let place = 1 + there.iter().filter(better).count();
-    (place, place <= (there.len() / factor as usize).max(1))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn rungs(losses: &[f64]) -> Vec<Rung> {
-        let rung = |(index, loss): (usize, &f64)| Rung {
-            index: index as u64,
-            epochs: 3,
-            loss: *loss,
-        };
-        losses.iter().enumerate().map(rung).collect()
-    }
-
-    #[test]
-    fn the_first_goes_on_and_then_the_best_of_so_many() {
-        let there = rungs(&[0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.1]);
-        let on: Vec<bool> = (0..7)
-            .map(|i| judged(&there[i], &there[..=i], 3).1)
-            .collect();
-        assert_eq!(on, [true, true, false, true, false, true, true]);
-        // Of seven, the two best.
-        let late: Vec<bool> = there.iter().map(|r| judged(r, &there, 3).1).collect();
-        assert_eq!(late, [false, false, false, false, false, true, true]);
-        assert_eq!(judged(&there[0], &there, 3).0, 5);
-    }
-
-    #[test]
-    fn equals_are_told_apart_by_their_number() {
-        let there = rungs(&[0.5; 6]);
-        let on = there.iter().filter(|r| judged(r, &there, 3).1).count();
-        assert_eq!(on, 2);
-    }
 }

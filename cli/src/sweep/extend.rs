@@ -1,0 +1,362 @@
+//! `picofarm sweep extend` and `sweep run`: further trials, by what those that have ended found.
+//!
+//! Trials are stages of a job with settings of their own, and a job does not change once it is submitted: leases, plans, reuse
+//! and keys follow from that. So a search that learns goes in rounds. A round reads what the store holds, proposes values,
+//! and writes them into a job file beside the first one, which lists the values of all trials. Whoever submits it has the
+//! trials that ended reused and only the new ones trained; whoever does not likes a proposal changes it in the file. The
+//! file alone says what is run, as any other, and the same records give the same file.
+
+use std::path::{Path, PathBuf};
+
+use picofarm_dataset::TrialRecord;
+use picofarm_proto::{
+    model::{TaskSpec, Trial},
+    show,
+};
+use picofarm_search::{Outcome, Tried, Values, tpe};
+use serde_json::{Value, json};
+
+use super::{
+    file::with_values,
+    records::{Records, listed, outcome, text},
+};
+use crate::{
+    args::{Extend, MoreTrials, Sampler, SweepRun},
+    client::Client,
+    error::{CliError, Result, io},
+    follow::{Show, follow, verdict},
+    jobfile,
+    model::open,
+    output::{Output, table},
+    settings::Settings,
+};
+
+/// A sweep of a job file.
+struct Sweep {
+    store: String,
+    stage: String,
+    /// Its trials as the file has them, by number.
+    trials: Vec<Trial>,
+}
+
+/// A file that was written.
+struct Extended {
+    file: PathBuf,
+    sweep: String,
+    id: String,
+    /// How many trials have ended.
+    ended: usize,
+    /// The number of the first new trial.
+    first: u64,
+    proposed: Vec<Values>,
+}
+
+/// Writes a job file with further trials.
+pub async fn run(args: Extend, settings: &Settings, output: Output) -> Result<()> {
+    let Extend { more, promote, out } = &args;
+    let extended = extend(more, promote.as_deref(), out.as_deref(), settings).await?;
+    let Extended { file, proposed, .. } = &extended;
+    let trials: Vec<Value> = (extended.first..)
+        .zip(proposed)
+        .map(|(trial, values)| json!({"trial": trial, "values": values}))
+        .collect();
+    let facts = json!({
+        "file": file, "sweep": extended.sweep, "id": extended.id, "ended": extended.ended, "trials": trials,
+    });
+    output.result(&facts, || described(&extended, more));
+    Ok(())
+}
+
+/// Submits a job file, waits for its end, extends it, and so on.
+pub async fn rounds(args: SweepRun, settings: &Settings, output: Output) -> Result<()> {
+    let SweepRun { mut more, rounds } = args;
+    let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
+    let mut files = Vec::new();
+    for round in 0..=rounds {
+        let (file, scale) = (&more.file, more.scale.as_deref());
+        let spec = jobfile::read_counted(file, scale, &settings.assets).await?;
+        let job = client.submit(spec, false).await?.job;
+        output.say(format!("round {round}: {}, job {job}", file.display()));
+        let status = follow(&mut client, job, output, Show::Progress).await?;
+        verdict(&status)?;
+        files.push(json!({"file": file, "job": job}));
+        if round < rounds {
+            more.file = extend_or_find(&more, settings).await?;
+        }
+    }
+    output.result(&json!({ "rounds": files }), || {
+        let last = show::path(&more.file);
+        format!("{rounds} rounds after the first; the last file is {last}\n")
+    });
+    Ok(())
+}
+
+/// The next round's file: the one that an earlier run has written, or a new one.
+async fn extend_or_find(more: &MoreTrials, settings: &Settings) -> Result<PathBuf> {
+    let spec = jobfile::read_counted(&more.file, more.scale.as_deref(), &settings.assets).await?;
+    let sweep = find(&spec.stages, more.stage.as_deref())?;
+    let trials = sweep.trials.len() as u64;
+    let next = beside(&more.file, trials, trials + more.trials);
+    match next.exists() {
+        true => Ok(next),
+        false => Ok(extend(more, None, None, settings).await?.file),
+    }
+}
+
+async fn extend(
+    more: &MoreTrials,
+    promote: Option<&str>,
+    out: Option<&Path>,
+    settings: &Settings,
+) -> Result<Extended> {
+    let MoreTrials { file, scale, .. } = more;
+    let spec = jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?;
+    let named = |what: String| CliError::input(format!("{}: {what}", file.display()));
+    let Sweep {
+        store,
+        stage,
+        trials,
+    } = find(&spec.stages, more.stage.as_deref())?;
+    let (first, name) = (&trials[0], trials[0].sweep.clone());
+    if first.over.is_empty() {
+        let what = format!(
+            "stage {stage:?}: sweep.over: is missing, so nothing says where further values may lie"
+        );
+        return Err(
+            named(what).hint("name each parameter's, e.g. over = { lr = { log = [1e-4, 1e-1] } }")
+        );
+    }
+    let records = Records::of(&open(&store)?, &name, first.id.clone()).await?;
+    let tried = all(&trials, &records.ended).map_err(named)?;
+    let (begin, count) = (tried.len() as u64, more.trials);
+    let search = match more.sampler {
+        Sampler::Tpe => tpe::propose,
+        Sampler::Random => tpe::random,
+    };
+    let proposed = search(&first.over, &tried, first.seed, begin, count);
+    if proposed.is_empty() {
+        let what = format!("all values of the sweep {name:?} have been tried");
+        return Err(CliError::input(what).hint("widen sweep.over: that makes another sweep of it"));
+    }
+    let total = begin + proposed.len() as u64;
+    let values: Vec<Values> = tried.into_iter().map(|t| t.values).collect();
+    let values: Vec<Values> = values.into_iter().chain(proposed.iter().cloned()).collect();
+    let promote = promote.map_or_else(|| format!("{name}-{total}"), str::to_owned);
+    let before = std::fs::read_to_string(file).map_err(|e| io(file.display(), &e))?;
+    let after = with_values(&before, &stage, &values, &promote).map_err(named)?;
+    let out = match out {
+        Some(out) => same_folder(file, out)?,
+        None => beside(file, trials.len() as u64, total),
+    };
+    std::fs::write(&out, after).map_err(|e| io(out.display(), &e))?;
+    // What was written must mean the same sweep, with these trials.
+    let spec = jobfile::read_counted(&out, scale.as_deref(), &settings.assets).await?;
+    let written = find(&spec.stages, Some(&stage))?;
+    let same =
+        written.trials[0].id == first.id && written.trials.iter().map(|t| &t.values).eq(&values);
+    if !same {
+        let what = "came out as another sweep; please report it, with the job file";
+        return Err(CliError::input(format!("{}: {what}", out.display())));
+    }
+    Ok(Extended {
+        file: out,
+        sweep: name,
+        id: first.id.clone(),
+        ended: records.ended.len(),
+        first: begin,
+        proposed,
+    })
+}
+
+/// The sweep of a job's stages that is meant.
+fn find(stages: &[picofarm_proto::model::StageSpec], stage: Option<&str>) -> Result<Sweep> {
+    let mut sweeps: Vec<Sweep> = Vec::new();
+    for spec in stages {
+        let TaskSpec::Train(task) = &spec.task else {
+            continue;
+        };
+        let Some(trial) = &task.train.trial else {
+            continue;
+        };
+        let end = format!(".{}", trial.index);
+        let name = spec.name.strip_suffix(&end).unwrap_or(&spec.name);
+        match sweeps.last_mut() {
+            Some(sweep) if sweep.stage == name => sweep.trials.push(trial.clone()),
+            _ => sweeps.push(Sweep {
+                store: task.source.store.clone(),
+                stage: name.to_owned(),
+                trials: vec![trial.clone()],
+            }),
+        }
+    }
+    let names: Vec<String> = sweeps.iter().map(|s| s.stage.clone()).collect();
+    if let Some(stage) = stage {
+        sweeps.retain(|sweep| sweep.stage == stage);
+    }
+    match (sweeps.pop(), sweeps.is_empty(), names.is_empty()) {
+        (Some(sweep), true, _) => Ok(sweep),
+        (_, _, true) => Err(CliError::input("the job has no stage with a sweep")
+            .hint("write one: `picofarm job init --kind sweep`")),
+        _ => {
+            let what = match stage {
+                Some(stage) => format!("no stage with a sweep is called {stage:?}"),
+                None => "the job has several sweeps".to_owned(),
+            };
+            Err(CliError::input(what).hint(format!("choose one: --stage {}", names.join(" | "))))
+        }
+    }
+}
+
+/// All trials so far: those of the file, and those beyond it that have ended.
+///
+/// # Errors
+/// The file and the store have other values for one of them, or one between them is not known.
+fn all(trials: &[Trial], ended: &[TrialRecord]) -> Result<Vec<Tried>, String> {
+    let mut all: Vec<Tried> = trials
+        .iter()
+        .map(|trial| Tried {
+            values: trial.values.clone(),
+            outcome: Outcome::Open,
+        })
+        .collect();
+    for record in ended {
+        let index = record.index as usize;
+        let known = all.len();
+        match all.get_mut(index) {
+            Some(tried) if tried.values != record.values => {
+                let shown = |values: &Values| listed(values.iter().map(|(n, v)| (n, text(v))));
+                return Err(format!(
+                    "trial {index} has {} here, and had {} when it was trained; list the latter (sweep.values)",
+                    shown(&tried.values),
+                    shown(&record.values)
+                ));
+            }
+            Some(tried) => tried.outcome = outcome(record),
+            None if index == known => all.push(Tried {
+                values: record.values.clone(),
+                outcome: outcome(record),
+            }),
+            None => {
+                return Err(format!(
+                    "trial {known} is not in it and has not ended, but trial {index} has; extend the file that lists both"
+                ));
+            }
+        }
+    }
+    Ok(all)
+}
+
+/// `job-40.toml` beside `job.toml` or `job-32.toml`, for a file of 32 trials that gets 40.
+fn beside(file: &Path, trials: u64, total: u64) -> PathBuf {
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+    let stem = stem.strip_suffix(&format!("-{trials}")).unwrap_or(&stem);
+    file.with_file_name(format!("{stem}-{total}.toml"))
+}
+
+/// A job file's places are relative to its folder, so a copy belongs there.
+fn same_folder(file: &Path, out: &Path) -> Result<PathBuf> {
+    let folder = |path: &Path| {
+        let parent = path.parent().filter(|p| !p.as_os_str().is_empty());
+        parent.unwrap_or(Path::new(".")).canonicalize()
+    };
+    let (here, there) = (
+        folder(file).map_err(|e| io(file.display(), &e))?,
+        folder(out).map_err(|e| io(out.display(), &e))?,
+    );
+    if here != there {
+        let what = format!(
+            "--out: {} lies in another folder than the job file, whose paths are relative to it",
+            out.display()
+        );
+        return Err(CliError::input(what).hint(format!("write it into {}", here.display())));
+    }
+    Ok(out.to_owned())
+}
+
+fn described(extended: &Extended, more: &MoreTrials) -> String {
+    let names: Vec<String> = extended
+        .proposed
+        .iter()
+        .take(1)
+        .flat_map(|v| v.keys().cloned())
+        .collect();
+    let mut rows = vec![
+        std::iter::once("trial".to_owned())
+            .chain(names)
+            .collect::<Vec<_>>(),
+    ];
+    for (trial, values) in (extended.first..).zip(&extended.proposed) {
+        let values = values.values().map(text);
+        rows.push(std::iter::once(trial.to_string()).chain(values).collect());
+    }
+    let few = match more.sampler {
+        Sampler::Tpe if extended.ended < tpe::STARTUP => format!(
+            "{} trials have ended; values are drawn at random until {} have\n",
+            extended.ended,
+            tpe::STARTUP
+        ),
+        _ => String::new(),
+    };
+    let scale = more.scale.as_ref();
+    let scale = scale.map_or_else(String::new, |scale| {
+        format!(" --scale {}", show::argument(scale))
+    });
+    format!(
+        "{}{few}train them with `picofarm job submit {}{scale}`: the trials that have ended are reused\n",
+        table(&rows),
+        show::argument(&extended.file.display().to_string())
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use picofarm_dataset::TrialEnd;
+
+    use super::{super::records::tests::record, *};
+
+    fn trial(index: u64, lr: f64) -> Trial {
+        Trial {
+            sweep: "m".into(),
+            id: "0123456789abcdef".into(),
+            index,
+            values: [("lr".to_owned(), json!(lr))].into(),
+            over: std::collections::BTreeMap::new(),
+            seed: 0,
+            stop: None,
+        }
+    }
+
+    #[test]
+    fn trials_of_the_file_and_of_the_store_are_joined_by_number() {
+        let file = [trial(0, 0.1), trial(1, 0.2)];
+        let ended = |index, lr| record(index, lr, TrialEnd::Finished, &[0.5]);
+        let found = all(&file, &[ended(1, 0.2), ended(2, 0.3)]).unwrap();
+        let outcomes: Vec<Outcome> = found.iter().map(|t| t.outcome).collect();
+        assert_eq!(
+            outcomes,
+            [
+                Outcome::Open,
+                Outcome::Finished(0.5),
+                Outcome::Finished(0.5)
+            ]
+        );
+        assert_eq!(found[2].values["lr"], 0.3);
+        let error = all(&file, &[ended(1, 0.25)]).unwrap_err();
+        assert_eq!(
+            error,
+            "trial 1 has lr = 0.2 here, and had lr = 0.25 when it was trained; list the latter (sweep.values)"
+        );
+        let error = all(&file, &[ended(3, 0.3)]).unwrap_err();
+        assert!(error.contains("trial 2 is not in it"), "{error}");
+    }
+
+    #[test]
+    fn files_of_rounds_are_called_by_their_number_of_trials() {
+        let name = |file: &str, trials, total| {
+            beside(Path::new(file), trials, total).display().to_string()
+        };
+        assert_eq!(name("a/job.toml", 32, 40), "a/job-40.toml");
+        assert_eq!(name("a/job-32.toml", 32, 40), "a/job-40.toml");
+        assert_eq!(name("job-8.toml", 32, 40), "job-8-40.toml");
+    }
+}

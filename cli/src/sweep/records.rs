@@ -1,0 +1,331 @@
+//! What the trials of a sweep have recorded, and the same for tables, pages and searches.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use picofarm_dataset::{Models, Rung, TrialEnd, TrialRecord};
+use picofarm_model::{
+    report::trials::{End, Sweep, Tried as Row, Value as Shown, error_name},
+    train::Line,
+};
+use picofarm_proto::model::{Domain, Interval};
+use picofarm_search::{Outcome, Space, Tried};
+use serde_json::Value;
+
+use crate::{
+    args::WhichSweep,
+    dataset::failed,
+    error::{CliError, Code, Result},
+    model::open,
+};
+
+/// What the trials of a sweep have recorded.
+pub struct Records {
+    pub name: String,
+    pub id: String,
+    /// Of those that have ended, in order.
+    pub ended: Vec<TrialRecord>,
+    /// How good those were that came to any rung, in order.
+    pub rungs: Vec<Rung>,
+}
+
+/// The records of the sweep that is meant.
+///
+/// # Errors
+/// There is none, or several are called so.
+pub async fn read(which: &WhichSweep) -> Result<Records> {
+    let models = open(&which.store)?;
+    let mut ids = ids(&models, &which.name, &which.id).await?;
+    match (ids.pop(), ids.is_empty()) {
+        (Some(id), true) => Records::of(&models, &which.name, id).await,
+        (Some(id), false) => {
+            ids.push(id);
+            let what = format!("there are {} sweeps called {:?}", ids.len(), which.name);
+            Err(CliError::input(what).hint(format!("choose one: --id {}", ids.join(" | "))))
+        }
+        (None, _) => Err(nothing(&which.name)),
+    }
+}
+
+/// The sweeps of a name whose ids begin so.
+pub async fn ids(models: &Models, name: &str, begin: &str) -> Result<Vec<String>> {
+    let ids: BTreeSet<String> = models.sweeps(name).await.map_err(failed)?;
+    Ok(ids.into_iter().filter(|id| id.starts_with(begin)).collect())
+}
+
+/// A sweep of which nothing is there.
+pub fn nothing(name: &str) -> CliError {
+    let what = format!("no trial of a sweep called {name:?} has reported anything yet");
+    CliError::input(what).hint(
+        "a sweep is called as the model of its stage; `picofarm job status` shows trials that run",
+    )
+}
+
+impl Records {
+    /// All of a sweep.
+    pub async fn of(models: &Models, name: &str, id: String) -> Result<Self> {
+        let (ended, rungs) = models.trials(name, &id).await.map_err(failed)?;
+        Ok(Self {
+            name: name.to_owned(),
+            id,
+            ended,
+            rungs,
+        })
+    }
+
+    /// What is less for a better trial.
+    pub fn error(&self) -> &'static str {
+        let kind = self.ended.first().map(|trial| &*trial.kind);
+        kind.map_or("validation loss", error_name)
+    }
+
+    /// For tables and pages.
+    ///
+    /// # Errors
+    /// A line of a history that cannot be read.
+    pub fn sweep(&self) -> Result<Sweep> {
+        let mut all: BTreeMap<u64, Row> = BTreeMap::new();
+        // Rungs come in order: the last that a trial has reached counts.
+        for rung in &self.rungs {
+            all.insert(rung.index, open_trial(&self.name, rung));
+        }
+        for trial in &self.ended {
+            all.insert(trial.index, ended_trial(trial)?);
+        }
+        Ok(Sweep {
+            name: self.name.clone(),
+            error: self.error().to_owned(),
+            trials: all.into_values().collect(),
+            ..Sweep::default()
+        })
+    }
+
+    /// For searches: those that have ended.
+    pub fn tried(&self) -> Vec<Tried> {
+        let tried = |trial: &TrialRecord| Tried {
+            values: trial.values.clone(),
+            outcome: outcome(trial),
+        };
+        self.ended.iter().map(tried).collect()
+    }
+
+    /// The values that parameters may have: as the job file says, or where it lists values alone, those that were tried.
+    ///
+    /// # Errors
+    /// A record that holds no such thing.
+    pub fn space(&self) -> Result<Space> {
+        let Some(first) = self.ended.first() else {
+            return Ok(Space::new());
+        };
+        let damaged = |name: &str, e| {
+            let what = format!("trial {}: over.{name}: {e}", first.index);
+            CliError::new(Code::Damaged, what)
+        };
+        if first.over.is_empty() {
+            let names = first.values.keys();
+            return Ok(names
+                .map(|name| (name.clone(), self.tried_of(name)))
+                .collect());
+        }
+        first
+            .over
+            .iter()
+            .map(
+                |(name, domain)| match serde_json::from_value(domain.clone()) {
+                    Ok(domain) => Ok((name.clone(), domain)),
+                    Err(e) => Err(damaged(name, e)),
+                },
+            )
+            .collect()
+    }
+
+    /// A parameter's values that were tried: numbers as an interval, anything else as a list.
+    fn tried_of(&self, name: &str) -> Domain {
+        let values: Vec<&Value> = self
+            .ended
+            .iter()
+            .filter_map(|t| t.values.get(name))
+            .collect();
+        let numbers: Option<Vec<f64>> = values.iter().map(|value| value.as_f64()).collect();
+        if let Some(numbers) = numbers {
+            let low = numbers.iter().copied().fold(f64::INFINITY, f64::min);
+            let high = numbers.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            if low < high {
+                // Over more than a decade, magnitudes count.
+                return Domain::Within(match low > 0.0 && high > 10.0 * low {
+                    true => Interval::Log([low, high]),
+                    false => Interval::Range([low, high]),
+                });
+            }
+        }
+        let mut list: Vec<Value> = Vec::new();
+        for value in values {
+            if !list.contains(value) {
+                list.push(value.clone());
+            }
+        }
+        Domain::OneOf(list)
+    }
+}
+
+/// How a trial ended, for searches.
+pub fn outcome(trial: &TrialRecord) -> Outcome {
+    match (&trial.end, trial.loss) {
+        (TrialEnd::Finished, Some(loss)) if loss.is_finite() => Outcome::Finished(loss),
+        (TrialEnd::Pruned, Some(loss)) if loss.is_finite() => Outcome::Stopped {
+            epochs: trial.epochs,
+            loss,
+        },
+        _ => Outcome::Failed,
+    }
+}
+
+fn open_trial(sweep: &str, rung: &Rung) -> Row {
+    Row {
+        index: rung.index,
+        model: format!("{sweep}.{}", rung.index),
+        values: Vec::new(),
+        end: End::Open,
+        why: String::new(),
+        epochs: rung.epochs,
+        loss: Some(rung.loss),
+        history: Vec::new(),
+    }
+}
+
+fn ended_trial(trial: &TrialRecord) -> Result<Row> {
+    let (end, why) = match &trial.end {
+        TrialEnd::Finished => (End::Finished, String::new()),
+        TrialEnd::Pruned => (End::Pruned, String::new()),
+        TrialEnd::Diverged(why) => (End::Diverged, why.clone()),
+    };
+    let lines = trial.history.iter().cloned().map(serde_json::from_value);
+    let history: serde_json::Result<Vec<Line>> = lines.collect();
+    let broken = |e| CliError::new(Code::Damaged, format!("trial {}: {e}", trial.index));
+    Ok(Row {
+        index: trial.index,
+        model: trial.model.clone(),
+        values: trial
+            .values
+            .iter()
+            .map(|(n, v)| (n.clone(), shown(v)))
+            .collect(),
+        end,
+        why,
+        epochs: trial.epochs,
+        loss: trial.loss,
+        history: history.map_err(broken)?,
+    })
+}
+
+fn shown(value: &Value) -> Shown {
+    match value {
+        Value::String(text) => Shown::Text(text.clone()),
+        other => other
+            .as_f64()
+            .map_or_else(|| Shown::Text(other.to_string()), Shown::Number),
+    }
+}
+
+/// A loss for people.
+pub fn loss(loss: Option<f64>) -> String {
+    loss.map_or_else(|| "-".into(), |loss| format!("{loss:.4}"))
+}
+
+/// Values for people, by name.
+pub fn listed<'a>(values: impl Iterator<Item = (&'a String, String)>) -> String {
+    let values: Vec<String> = values
+        .map(|(name, value)| format!("{name} = {value}"))
+        .collect();
+    values.join(", ")
+}
+
+/// A value as text: without quotes.
+pub fn text(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+pub mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// A trial of one parameter, of a sweep called `m`.
+    pub fn record(index: u64, lr: f64, end: TrialEnd, losses: &[f64]) -> TrialRecord {
+        let line = |(i, mae): (usize, &f64)| json!({"epoch": i + 1, "step": i + 1, "loss": mae, "learning_rate": lr, "validation": {"mae_m": mae, "rmse_m": mae}});
+        TrialRecord {
+            sweep: "m".into(),
+            id: "0123456789abcdef".into(),
+            index,
+            values: [("lr".to_owned(), json!(lr))].into(),
+            over: [("lr".to_owned(), json!({"log": [1e-4, 1e-1]}))].into(),
+            model: format!("m.{index}"),
+            kind: "tof".into(),
+            training_key: "k".into(),
+            end,
+            epochs: losses.len() as u64,
+            loss: losses.last().copied(),
+            history: losses.iter().enumerate().map(line).collect(),
+        }
+    }
+
+    pub fn records(ended: Vec<TrialRecord>) -> Records {
+        Records {
+            name: "m".into(),
+            id: "0123456789abcdef".into(),
+            ended,
+            rungs: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_space_that_no_job_file_says_is_that_of_the_values_tried() {
+        let mut records = records(vec![
+            record(0, 1e-3, TrialEnd::Finished, &[0.5]),
+            record(1, 1e-1, TrialEnd::Pruned, &[0.6]),
+        ]);
+        assert_eq!(
+            records.space().unwrap()["lr"],
+            Domain::Within(Interval::Log([1e-4, 1e-1]))
+        );
+        for (trial, (width, kind)) in records.ended.iter_mut().zip([(8, "a"), (16, "b")]) {
+            trial.over.clear();
+            trial.values.insert("width".into(), json!(width));
+            trial.values.insert("kind".into(), json!(kind));
+            trial.values.insert("same".into(), json!(2));
+        }
+        let space = records.space().unwrap();
+        assert_eq!(space["lr"], Domain::Within(Interval::Log([1e-3, 1e-1])));
+        assert_eq!(space["width"], Domain::Within(Interval::Range([8.0, 16.0])));
+        assert_eq!(space["kind"], Domain::OneOf(vec![json!("a"), json!("b")]));
+        assert_eq!(space["same"], Domain::OneOf(vec![json!(2)]));
+    }
+
+    #[test]
+    fn a_trial_that_broke_has_failed_for_a_search() {
+        let outcomes: Vec<Outcome> = [
+            record(0, 1e-3, TrialEnd::Finished, &[0.5]),
+            record(1, 1e-3, TrialEnd::Pruned, &[0.7, 0.6]),
+            record(2, 1e-3, TrialEnd::Diverged("x".into()), &[0.4]),
+            record(3, 1e-3, TrialEnd::Pruned, &[]),
+        ]
+        .iter()
+        .map(outcome)
+        .collect();
+        assert_eq!(
+            outcomes,
+            [
+                Outcome::Finished(0.5),
+                Outcome::Stopped {
+                    epochs: 2,
+                    loss: 0.6
+                },
+                Outcome::Failed,
+                Outcome::Failed
+            ]
+        );
+    }
+}
