@@ -172,7 +172,8 @@ fn training() -> String {
 
 fn sweep() -> String {
     "# A picofarm job that looks for the settings with which a network learns best: half an hour on two cores.\n\
-     # `picofarm sweep status STORE depth` says how trials fare, `sweep report` makes a page of it.\n\
+     # `picofarm sweep status STORE depth` says how trials fare, `sweep report` makes a page of it, and\n\
+     # `picofarm sweep extend FILE --trials 8` adds trials by what was found.\n\
      name = \"sweep\"\n\n\
      [limits]\n\
      max_crashes = 100         # a trial goes on from its last checkpoint, however often its worker is lost\n\n\

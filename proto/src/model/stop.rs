@@ -11,7 +11,7 @@
 //! - **Hyperband** (Li et al., JMLR 2018), asynchronous as in the first paper: trials are dealt to brackets by their number,
 //!   and each bracket is a halving of its own, compared within itself. Bracket 0 has all rungs, each further one lacks one
 //!   more of the first, the last has none. A bracket gets about the share of trials that Hyperband gives it, so that each
-//!   may use as many epochs. Who cannot say how early errors tell trials apart hedges so.
+//!   may use as many epochs. It is for sweeps whose early errors may mislead.
 
 use serde::{Deserialize, Serialize};
 
