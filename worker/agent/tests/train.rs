@@ -518,8 +518,8 @@ async fn a_sensor_draws_anew_at_each_visit_and_the_same_on_any_machine() {
         most / losses[0]
     };
     let (noisy, quiet) = (losses(&place), losses(&calm));
-    assert!(spread(&quiet) < 1e-6, "{quiet:?}");
-    assert!(spread(&noisy) > 1e-5, "{noisy:?}");
+    assert!(spread(&quiet) < 1e-5, "{quiet:?}");
+    assert!(spread(&noisy) > 1e-4, "{noisy:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

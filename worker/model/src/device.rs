@@ -282,12 +282,15 @@ fn faults(
     found.iter().zip(expected).find_map(|((what, a), (_, b))| {
         let greatest = |values: &mut dyn Iterator<Item = f32>| values.fold(0.0, f32::max);
         let scale = greatest(&mut b.iter().map(|x| x.abs()));
-        // NaN is larger than any number here.
+        if a.len() != b.len() {
+            return Some(format!("{what} has {} values, not {}", a.len(), b.len()));
+        }
         let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs());
-        let worst = apart.fold(0.0, |worst: f32, x| if x <= worst { worst } else { x });
-        let same = a.len() == b.len() && worst <= 1e-4 * scale;
-        (!same)
-            .then(|| format!("{what} is {worst:.1e} off where the greatest value is {scale:.1e}"))
+        let off = |x: &f32| x.is_nan() || *x > 1e-4 * scale;
+        let worst = apart.filter(off).max_by(f32::total_cmp)?;
+        Some(format!(
+            "{what} is {worst:.1e} off where the greatest value is {scale:.1e}"
+        ))
     })
 }
 
