@@ -28,14 +28,12 @@ use crate::{
     bvh::Stack,
     emitter::Emitters,
     film::Film,
-    light_vertices::{LightVertex, LightVertices},
+    light_vertices::{ALONE, LightVertex, LightVertices},
     mirror_images::Mirrors,
     rng::{Rng, Stream},
     world::{Hit, World, lift},
 };
 
-/// Density of a light vertex that nothing else finds: its share in MIS is 1 to the last bit.
-const ALONE: f32 = 1e30;
 /// Entries of the table of near-mirror triangles by spot; beyond that all spots share one row.
 const TABLE: usize = 1 << 22;
 /// Events before Russian roulette sets in.
@@ -82,6 +80,8 @@ pub(crate) struct Splat {
     pub spot: u16,
     /// Radiance averaged over the pixel, render units.
     pub value: f32,
+    /// Bounces of the whole path.
+    pub bounces: u32,
 }
 
 /// How many of a batch of light paths begin which way.
@@ -290,7 +290,7 @@ impl Caustics {
         }
     }
 
-    /// Draws light vertices beyond near-mirrors anew, from `count` light paths.
+    /// Adds light vertices beyond near-mirrors, from `count` light paths.
     pub fn fill(
         &self,
         vertices: &mut LightVertices,
@@ -299,7 +299,6 @@ impl Caustics {
         rng: &mut Rng,
         stack: &mut Stack,
     ) {
-        vertices.clear();
         for l in 0..count {
             self.trace(within, (l, count), rng, stack, |z| vertices.push(z));
         }
@@ -406,5 +405,6 @@ pub(crate) fn splat(
         slot: film.slot(z.path_m + world.metres(d)) as u32,
         spot: z.spot as u16,
         value,
+        bounces: z.bounces,
     })
 }

@@ -6,6 +6,7 @@ use crate::{
     api::{RenderError, Stop, Unstopped},
     bsdf::Surface,
     bvh::Stack,
+    contact,
     world::{World, lift},
 };
 
@@ -81,6 +82,7 @@ impl Emitter {
     fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, material: u32) -> Self {
         let surface = world.surfaces[material as usize];
         let p = world.inward(spot.point);
+        let p = contact::clear(world, stack, p, spot.normal, -spot.arriving);
         // The spot does not say whether its side is the facet's front: look at the facet beneath it.
         let beneath = world.closest(stack, lift(p, spot.normal), -spot.normal);
         // It also knows the texture there.

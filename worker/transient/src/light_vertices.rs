@@ -10,6 +10,7 @@ use picofarm_scene::Vec3;
 use crate::{
     bsdf::Surface,
     bvh::Stack,
+    contact::Contacts,
     emitter::{Columns, Emitters},
     rng::Rng,
     world::{Hit, World, lift},
@@ -33,6 +34,9 @@ pub(crate) struct LightVertex {
     pub bounces: u32,
 }
 
+/// Density of a light vertex that nothing else finds: its share in MIS is 1 to the last bit.
+pub(crate) const ALONE: f32 = 1e30;
+
 /// The light vertices of one batch.
 #[derive(Debug, Default)]
 pub(crate) struct LightVertices {
@@ -44,10 +48,10 @@ pub(crate) struct LightVertices {
 
 impl LightVertices {
     /// Draws `count` vertices anew, spread evenly over the spots. Vertices on mirrors are left out: a
-    /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them).
+    /// camera vertex meets their lobe with no chance to speak of (aimed paths reach them); so are those in a spot's own zone.
     pub fn fill(
         &mut self,
-        (world, emitters): (&World, &Emitters),
+        (world, emitters, contacts): (&World, &Emitters, Option<&Contacts>),
         count: u32,
         rng: &mut Rng,
         stack: &mut Stack,
@@ -70,6 +74,9 @@ impl LightVertices {
             let Some(mut hit) = world.closest(stack, lift(e.p, e.n), w) else {
                 continue;
             };
+            if contacts.is_some_and(|c| c.own(world, spot, &hit)) {
+                continue;
+            }
             hit.choose_lobe(rng);
             if weight == 0.0 || hit.surface.specular || hit.surface.is_black() {
                 continue;

@@ -53,6 +53,11 @@ pub(crate) struct Effort {
 const MIRROR_PATHS: u32 = 16;
 /// Light vertices beyond near-mirrors that a gather point is connected to at most.
 const BEYOND: u32 = 2;
+/// Light paths of a pass in all zones beside spots, and at least and at most in one.
+const ALL_ZONES: u32 = 64;
+const ZONE_PATHS: (u32, u32) = (4, 16);
+/// Light vertices in zones that a near-mirror is connected to at most.
+const BESIDE: u32 = 2;
 /// Glossy light vertices that a gather point is connected to at most.
 const GLOSSY: u32 = 2;
 
@@ -166,6 +171,7 @@ impl Sharing {
         a.spot.clear();
         a.bounces.clear();
         let size = film.pixel();
+        Self::draw_lights((walk, effort), pixels.len() / size, &mut rng, scratch);
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {
             let (row, col) = (
                 tile.row + k as u32 / tile.cols,
@@ -204,9 +210,10 @@ impl Sharing {
             let Scratch {
                 vertices, stack, ..
             } = scratch;
-            vertices.fill((walk.world, walk.emitters), few, &mut rng, stack);
+            let of = (walk.world, walk.emitters, walk.contacts);
+            vertices.fill(of, few, &mut rng, stack);
         }
-        self.beyond_mirrors((walk, film, effort), &mut rng, scratch, pixels);
+        self.connect_lights((walk, film), &mut rng, scratch, pixels);
         let camera = (count * effort.camera).round().max(1.0) as u32;
         let light = (count * effort.light).round().max(1.0) as u32;
         self.draw_from_camera((walk, film), camera, &mut rng, scratch, pixels);

@@ -25,6 +25,12 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
             ));
         }
     }
+    if let Some(contacts) = walk.contacts {
+        strategies.push(format!(
+            "light paths: {} spots close beside other surfaces",
+            contacts.count()
+        ));
+    }
     if longest >= 3 {
         strategies.push(
             "three and more: camera paths, connected to spots and to light vertices by contribution"

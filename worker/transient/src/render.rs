@@ -16,7 +16,7 @@ use self::{
     error::{Stat, estimate, passes_for},
     image::{Image, Watch},
     ready::{Ready, prepare},
-    splat::Splats,
+    splat::{Sources, Splats},
 };
 pub use self::{
     forecast::Forecast,
@@ -101,10 +101,7 @@ fn whole(
     let (frame, stop) = (&ready.frame, Stop(progress));
     // Before anything that takes long: where there is no room, it is known at once.
     let mut image = Image::new(frame)?;
-    let mut splats = match frame.walk.caustics {
-        Some(caustics) => Some((caustics, Splats::new(frame)?)),
-        None => None,
-    };
+    let mut splats = Sources::of(frame).map(|sources| (sources, Splats::new(frame)));
     let seen = ready.seen(stop)?;
     let walks = ready.walks();
     let passes = match left {
@@ -127,9 +124,12 @@ fn whole(
         done = until;
         let error = match &mut splats {
             None => estimate(&image.stats, image.total_spread, image.mean_passes()),
-            Some((caustics, splats)) => {
-                let wave = image.mean_passes() - before;
-                rays += splats.round((frame, caustics), wave, &watch)?;
+            Some((sources, splats)) => {
+                let wave = match walks {
+                    true => image.mean_passes() - before,
+                    false => ready.splat_passes(0),
+                };
+                rays += splats.round((frame, sources), wave, &watch)?;
                 splats.estimate(frame, &image, stop)?
             }
         };

@@ -21,6 +21,8 @@ pub(crate) enum Stream {
     Grid = 4,
     /// Light paths by way of near-mirrors.
     Caustic = 5,
+    /// Light paths in the zones of spots beside other surfaces.
+    Contact = 7,
     /// How far camera and light reach.
     Extent = 6,
 }

@@ -138,6 +138,7 @@ impl Strata {
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
                 emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
+                walk.leave_to_zones(&h, weights);
                 walk.keep_in_window(h.p, world.metres(range), weights);
                 (lift(h.p, h.n), range)
             });

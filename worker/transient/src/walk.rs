@@ -10,6 +10,7 @@ use crate::{
     api::Gate,
     bvh::Stack,
     caustic::{Caustics, Surroundings},
+    contact::Contacts,
     ellipsoid::{Patches, Window},
     emitter::Emitters,
     light_vertices::LightVertices,
@@ -17,7 +18,7 @@ use crate::{
     rng::Rng,
     sink::Sink,
     vertex::Vertex,
-    world::{World, lift},
+    world::{Hit, World, lift},
 };
 
 /// What paths are traced in.
@@ -33,6 +34,8 @@ pub(crate) struct Walk<'a> {
     pub lights: bool,
     /// Light paths by way of near-mirrors, where they pay.
     pub caustics: Option<&'a Caustics>,
+    /// Zones around spots beside other surfaces, where there are any.
+    pub contacts: Option<&'a Contacts>,
     /// Shortest path from the laser to a spot, metres.
     pub shortest_m: f64,
     /// With a narrow gate: the path lengths that count; whatever else is found is not looked at.
@@ -61,6 +64,8 @@ pub(crate) enum Lights {
     Glossy,
     /// Those beyond near-mirrors.
     Beyond,
+    /// Those in the zones of spots beside other surfaces.
+    Contact,
 }
 
 /// Buffers of one thread's walks.
@@ -77,6 +82,8 @@ pub(crate) struct Scratch {
     pub vertices: LightVertices,
     /// Light vertices beyond near-mirrors.
     pub caustics: LightVertices,
+    /// Light vertices in the zones of spots beside other surfaces.
+    pub contacts: LightVertices,
 }
 
 impl Scratch {
@@ -88,6 +95,7 @@ impl Scratch {
             lights: vec![],
             vertices: LightVertices::default(),
             caustics: LightVertices::default(),
+            contacts: LightVertices::default(),
         }
     }
 }
@@ -165,6 +173,20 @@ impl Walk<'_> {
         self.window.is_none_or(|w| w.holds(path))
     }
 
+    /// Whether a vertex that a spot lights belongs to its zone.
+    #[inline]
+    pub fn is_own(&self, spot: usize, h: &Hit) -> bool {
+        self.contacts.is_some_and(|c| c.own(self.world, spot, h))
+    }
+
+    /// Drops the weights of spots whose light at `h` is the zones'.
+    #[inline]
+    pub fn leave_to_zones(&self, h: &Hit, weights: &mut [f32]) {
+        if let Some(contacts) = self.contacts {
+            contacts.leave_out(self.world, h, weights);
+        }
+    }
+
     /// Walks on from a vertex: everything beyond it except its own connection to the spots.
     pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
         let mut vertex = from;
@@ -176,6 +198,7 @@ impl Walk<'_> {
                 self.light(rng, &vertex, Lights::All, LIGHTS, scratch, sink);
                 self.light(rng, &vertex, Lights::Beyond, LIGHTS, scratch, sink);
             }
+            self.light(rng, &vertex, Lights::Contact, LIGHTS, scratch, sink);
             let Some((step, next)) = self.step(rng, &vertex, aims, true, &mut scratch.stack) else {
                 return;
             };

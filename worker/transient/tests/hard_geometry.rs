@@ -175,7 +175,7 @@ fn three_bounces_from_a_spot_1_cm_from_a_corner_match_the_integral_over_the_othe
     let (_, _, to_spot) = Brute::new(&s).spot(0);
     let f = f64::from(rho) / PI;
     let mut expected = vec![0.0f64; 637];
-    let (n, mut rng) = (48, Noise(1));
+    let (n, mut rng) = (160, Noise(1));
     for k in 0..n * n {
         let x = 0.2 + 0.75 * ((k % n) as f64 + rng.next()) / n as f64;
         let y = 0.5 - 0.8 * ((k / n) as f64 + rng.next()) / n as f64;

@@ -76,6 +76,7 @@ impl Sharing {
                 walk_on(&mut sink, scratch);
             }
             emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
+            walk.leave_to_zones(h, &mut scratch.weights);
             if sink.list.bins.len() == y.first
                 && !walk.any_in_window(h.p, nearest, &scratch.weights)
             {

@@ -1,48 +1,119 @@
 //! Drawing: gather points, and the vertices that they share.
 
-use std::f32::consts::PI;
-
 use picofarm_scene::Vec3;
 
-use super::{BEYOND, Effort, GLOSSY, Shared, Sharing};
+use super::{ALL_ZONES, BESIDE, BEYOND, Effort, GLOSSY, Shared, Sharing, ZONE_PATHS};
 use crate::{
-    bsdf::{Surface, frame},
+    contact::Contacts,
     ellipsoid::Patches,
     film::Film,
     rng::Rng,
     sink::PixelSink,
+    turns::Turns,
     vertex::Vertex,
     walk::{ALL, Lights, Scratch, Walk},
     world::lift,
 };
 
 impl Sharing {
-    /// Draws light vertices beyond near-mirrors for this pass and connects the gather points to them.
-    pub(super) fn beyond_mirrors(
+    /// Draws light vertices for this pass, those beyond near-mirrors and those in the zones of spots beside other surfaces.
+    pub(super) fn draw_lights(
+        (walk, effort): (&Walk, &Effort),
+        pixels: usize,
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+    ) {
+        let Scratch {
+            caustics: beyond,
+            contacts: near,
+            stack,
+            ..
+        } = scratch;
+        beyond.clear();
+        near.clear();
+        let within = walk.surroundings();
+        if let Some(caustics) = walk.caustics {
+            let count = (effort.beyond * pixels as f32).max(8.0) as u32;
+            caustics.fill(beyond, &within, count, rng, stack);
+        }
+        if let Some(contacts) = walk.contacts {
+            let (least, most) = ZONE_PATHS;
+            let count = (ALL_ZONES / contacts.count()).clamp(least, most);
+            contacts.fill((near, beyond), &within, count, rng, stack);
+        }
+    }
+
+    /// Connects the gather points to those light vertices.
+    pub(super) fn connect_lights(
         &mut self,
-        (walk, film, effort): (&Walk, &Film, &Effort),
+        (walk, film): (&Walk, &Film),
         rng: &mut Rng,
         scratch: &mut Scratch,
         pixels: &mut [f32],
     ) {
-        let Some(caustics) = walk.caustics else {
-            return;
-        };
         let size = film.pixel();
-        let count = (effort.beyond * (pixels.len() / size) as f32).max(8.0) as u32;
+        if !scratch.caustics.list.is_empty() {
+            for (v, k) in &self.gathers {
+                let mut sink = PixelSink {
+                    film,
+                    pixel: &mut pixels[k * size..(k + 1) * size],
+                    factor: 1.0,
+                };
+                walk.light(rng, v, Lights::Beyond, BEYOND, scratch, &mut sink);
+            }
+        }
+        if let Some(contacts) = walk.contacts {
+            self.connect_near((walk, film, contacts), scratch, pixels);
+        }
+    }
+
+    /// Connects every gather point that is not near to every light vertex in a zone: one narrow sheaf of rays each.
+    fn connect_near(
+        &mut self,
+        (walk, film, contacts): (&Walk, &Film, &Contacts),
+        scratch: &mut Scratch,
+        pixels: &mut [f32],
+    ) {
+        let size = film.pixel();
         let Scratch {
-            caustics: vertices,
+            contacts: near,
             stack,
             ..
         } = scratch;
-        caustics.fill(vertices, &walk.surroundings(), count, rng, stack);
-        for (v, k) in &self.gathers {
-            let mut sink = PixelSink {
-                film,
-                pixel: &mut pixels[k * size..(k + 1) * size],
-                factor: 1.0,
-            };
-            walk.light(rng, v, Lights::Beyond, BEYOND, scratch, &mut sink);
+        let far = |v: &Vertex| !contacts.near(walk.world, &v.hit);
+        let far: Vec<bool> = self.gathers.iter().map(|(v, _)| far(v)).collect();
+        self.weight.clear();
+        self.weight.resize(self.gathers.len(), 0.0);
+        for y in &near.list {
+            self.ends.clear();
+            self.ends_of.clear();
+            for (i, (v, _)) in self.gathers.iter().enumerate().filter(|&(i, _)| far[i]) {
+                let bounces = v.bounce + y.bounces;
+                let to = y.hit.p - v.hit.p;
+                let d2 = to.dot(to);
+                let w = to / d2.sqrt();
+                let value = v.hit.surface.scatter(v.hit.n, v.wo, w)
+                    * y.hit.surface.scatter(y.hit.n, y.back, -w);
+                if value > 0.0 && bounces <= walk.max_bounces {
+                    self.weight[i] = v.beta * y.flux * value / d2;
+                    self.ends.push(lift(v.hit.p, v.hit.n));
+                    self.ends_of.push(i);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            let from = lift(y.hit.p, y.hit.n);
+            walk.world
+                .bvh
+                .occluded_bundle(stack, from, &self.ends, &mut self.blocked);
+            for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                let (v, k) = &self.gathers[i];
+                let leg = walk.world.metres((y.hit.p - v.hit.p).length());
+                let path = v.length_m + leg + y.path_m;
+                if !blocked && walk.window.is_none_or(|w| w.holds(path)) {
+                    let pixel = &mut pixels[k * size..(k + 1) * size];
+                    film.add(pixel, film.slot(path), self.weight[i], y.spot);
+                }
+            }
         }
     }
 
@@ -109,7 +180,8 @@ impl Sharing {
         let spots = &walk.emitters.list;
         let turns = Turns::new(count, rng);
         for j in 0..count {
-            let e = &spots[turns.choice(j, spots.len())];
+            let spot = turns.choice(j, spots.len());
+            let e = &spots[spot];
             let Some((w, weight, _)) = turns.direction(j, &e.surface, e.n, e.back, rng) else {
                 continue;
             };
@@ -118,6 +190,10 @@ impl Sharing {
                 .closest(&mut scratch.stack, lift(e.p, e.n), w)
                 .filter(|_| weight > 0.0);
             let Some(mut hit) = hit else { continue };
+            // Its light is the zones', and no density of it is counted there.
+            if walk.is_own(spot, &hit) {
+                continue;
+            }
             hit.choose_lobe(rng);
             if !hit.surface.is_black() && hit.surface.diffuse() {
                 self.shared.push(Shared {
@@ -159,62 +235,6 @@ impl Sharing {
     }
 }
 
-/// Evenly spread draws: choices in strict turn, directions by the R₂ sequence (Roberts 2018), both from
-/// a random start. What neighbours have in common then varies less from pass to pass.
-struct Turns {
-    count: f32,
-    start: f32,
-    u: f32,
-    v: f32,
-}
-
-impl Turns {
-    fn new(count: u32, rng: &mut Rng) -> Self {
-        Self {
-            count: count as f32,
-            start: rng.uniform(),
-            u: rng.uniform(),
-            v: rng.uniform(),
-        }
-    }
-
-    /// Which of `among` draw `j` is for.
-    fn choice(&self, j: u32, among: usize) -> usize {
-        let at = j as f32 / self.count + self.start;
-        (((at - at.floor()) * among as f32) as usize).min(among - 1)
-    }
-
-    /// The direction of draw `j`, as [`Surface::sample`] gives it.
-    fn direction(
-        &self,
-        j: u32,
-        surface: &Surface,
-        n: Vec3,
-        wo: Vec3,
-        rng: &mut Rng,
-    ) -> Option<(Vec3, f32, f32)> {
-        if !surface.diffuse() {
-            return surface.sample(n, wo, rng);
-        }
-        let turn = |start: f32, step: f64| {
-            let at = f64::from(start) + f64::from(j) * step;
-            (at - at.floor()) as f32
-        };
-        let (u, v) = (
-            turn(self.u, 0.754_877_666_246_69),
-            turn(self.v, 0.569_840_290_998_05),
-        );
-        // Cosine-distributed: uniform on the disc beneath (Malley's method).
-        let angle = std::f32::consts::TAU * v;
-        let (r, z) = (u.sqrt(), (1.0 - u).max(0.0).sqrt());
-        let (t, b) = frame(n);
-        let w = t * (r * libm::cosf(angle)) + b * (r * libm::sinf(angle)) + n * z;
-        let w = w.normalized();
-        let c = n.dot(w);
-        (c > 0.0).then_some((w, surface.lambertian() * PI, c / PI))
-    }
-}
-
 /// Follows a camera ray through near-mirrors to the first other surface. What the spots send to vertices
 /// past the first goes to `sink`; to near-mirrors this path finds `share` of it.
 pub(super) fn gather_point(
@@ -242,6 +262,8 @@ pub(super) fn gather_point(
         if !vertex.hit.surface.specular {
             return Some(vertex);
         }
+        sink.factor = share;
+        walk.light(rng, &vertex, Lights::Contact, BESIDE, scratch, sink);
         let roulette = vertex.bounce > 1;
         (_, vertex) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack)?;
     }
@@ -272,6 +294,7 @@ pub(super) fn only_mirrors(
         if !walk.goes_on(&vertex) {
             return;
         }
+        walk.light(rng, &vertex, Lights::Contact, BESIDE, scratch, sink);
         let roulette = vertex.bounce > 1;
         let Some((_, next)) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack) else {
             return;

@@ -15,7 +15,7 @@ use super::{
     error::estimate,
     image::{Image, Slice, Watch},
     ready::{Ready, prepare},
-    splat::Splats,
+    splat::{Sources, Splats},
 };
 use crate::api::{Budget, Progress, RenderError, Rendered, Settings, Stop};
 
@@ -146,9 +146,10 @@ pub fn render_part(
             let waves = vec![shape.passes; image.tiles()];
             let rays = image.round(frame, range.clone(), &waves, &watch)?;
             (Found::Tiles(image.take(range)), rays)
-        } else if let Some(caustics) = frame.walk.caustics {
-            let mut splats = Splats::new(frame)?;
-            let rays = splats.round((frame, caustics), shape.passes, &watch)?;
+        } else if let Some(sources) = Sources::of(frame) {
+            let mut splats = Splats::new(frame);
+            let passes = ready.splat_passes(shape.passes);
+            let rays = splats.round((frame, &sources), passes, &watch)?;
             (Found::Paths(Some(splats)), rays)
         } else {
             (Found::Paths(None), 0)
@@ -200,9 +201,9 @@ pub fn join_parts(
                 Found::Tiles(slice) if index < of => {
                     image.put(part.which.range(image.tiles()), &slice)
                 }
-                Found::Paths(None) if index == of => frame.walk.caustics.is_none(),
+                Found::Paths(None) if index == of => Sources::of(frame).is_none(),
                 Found::Paths(Some(found)) if index == of => {
-                    let fits = frame.walk.caustics.is_some() && found.fits(frame);
+                    let fits = Sources::of(frame).is_some() && found.fits(frame);
                     splats = Some(found);
                     fits
                 }

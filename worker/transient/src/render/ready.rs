@@ -10,6 +10,7 @@ use crate::{
         Stop,
     },
     caustic::Caustics,
+    contact::Contacts,
     ellipsoid::{self, Patches, Window},
     emitter::{Emitters, find_spots},
     film::Film,
@@ -26,6 +27,8 @@ use crate::{
 
 /// Side in pixels of the tiles that share vertices.
 const REUSE: u32 = 8;
+/// Passes of light paths where no other passes are made.
+const TWO_PASSES: u32 = 64;
 /// Rows from which the rays of the ground truth are forecast.
 const ROWS: usize = 128;
 
@@ -74,6 +77,7 @@ pub(super) fn prepare<R>(
         max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
+        contacts: None,
         window: narrow.then(|| Window::new(&settings.gate)),
         patches: patches.as_ref(),
         shortest_m: emitters
@@ -90,6 +94,11 @@ pub(super) fn prepare<R>(
     };
     stop.check()?;
     walk.caustics = caustics.as_ref();
+    let contacts = match walk.max_bounces {
+        0 | 1 => None,
+        _ => Contacts::find(&world, &emitters),
+    };
+    walk.contacts = contacts.as_ref();
     let frame = Frame {
         walk,
         film: &film,
@@ -123,6 +132,11 @@ impl Ready<'_> {
             Budget::Samples(n) => n,
             Budget::Error(_) => FIRST_PASSES,
         }
+    }
+
+    /// Passes of light paths that go with so many passes of the image: two bounces alone take some as well.
+    pub fn splat_passes(&self, passes: u32) -> u32 {
+        if self.walks() { passes } else { TWO_PASSES }
     }
 
     /// What the renderer decides to do, beginning with so many passes.

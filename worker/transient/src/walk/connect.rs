@@ -4,6 +4,7 @@ use std::f32::consts::PI;
 
 use super::{ALL, Lights, Scratch, Step, Walk};
 use crate::{
+    contact::Contacts,
     light_vertices,
     rng::Rng,
     sink::Sink,
@@ -43,6 +44,7 @@ impl Walk<'_> {
                 weights[spot] = 0.0;
             }
         }
+        self.leave_to_zones(h, weights);
         if !self.keep_in_window(h.p, v.length_m, weights) {
             return;
         }
@@ -175,8 +177,8 @@ impl Walk<'_> {
         sink.add(path, value, aim.spot, v.bounce + 2);
     }
 
-    /// Connects a vertex that is not a near-mirror's to `count` light vertices of some kind, drawn by
-    /// unshadowed contribution.
+    /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
+    /// those in zones.
     pub fn light(
         &self,
         rng: &mut Rng,
@@ -192,16 +194,26 @@ impl Walk<'_> {
             lights,
             vertices,
             caustics,
+            contacts,
             ..
         } = scratch;
         let vertices = match which {
             Lights::Beyond => caustics,
+            Lights::Contact => contacts,
             _ => vertices,
         };
         let wanted = match which {
             Lights::All => self.lights,
             Lights::Glossy => self.lights && vertices.has_gloss(),
-            Lights::Beyond => self.caustics.is_some() && !vertices.list.is_empty(),
+            Lights::Beyond => !vertices.list.is_empty(),
+            Lights::Contact => {
+                // Near vertices are walked to within the zones, and light paths go on by way of near-mirrors.
+                let theirs = |c: &Contacts| match h.surface.specular {
+                    true => v.open(),
+                    false => c.near(self.world, h),
+                };
+                !vertices.list.is_empty() && !self.contacts.is_some_and(theirs)
+            }
         };
         if !wanted {
             return;

@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 pub mod brute;
+pub mod light;
 pub mod npz;
 pub mod reference;
 

@@ -1,0 +1,325 @@
+//! Spots beside another surface: light that a spot throws on a surface very close to it.
+//!
+//! A spot at a small distance d from a wall sends up to half of its light to a strip of that wall some d wide, from which
+//! it goes on. No camera path finds the strip, and with d the variance grows without bound, although the energy stays finite.
+//! So around such a spot two balls are set, its *zone*, and paths are parted in two classes, by geometry alone. Call a vertex
+//! *near* where it lies within a zone's outer radius, on a material without a near-mirror. A path belongs to the zones where the first vertex
+//! after its spot is near and within the inner radius of that spot's own zone. Let v be the last vertex of the run of near ones that begins there.
+//!
+//! Light paths from the spots cover that class. They walk within the zones, and each of their vertices may be v: it is
+//! drawn into the image where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for camera vertices that
+//! are not near. Where the run ends on a near-mirror, they go on as [`crate::caustic`] says, to a point z behind it that is
+//! drawn or connected likewise; what such paths do not cover (no point as in condition 3 there, so that
+//! [`crate::vertex::Vertex::open`] is false) is found by connecting v to the near-mirror itself. [`crate::walk`] and the
+//! strata of two bounces leave out the light that comes from a spot to its own zone. Energy is carried from vertex to vertex
+//! and never divided by a distance within a zone: it is kept at any d.
+//!
+//! Where a beam meets an edge exactly, rounding decides on which side of the other wall the spot lies. Such a spot is moved
+//! along its own surface ([`clear`]) until it is [`CLEARANCE`] away from the other one.
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    bsdf::frame,
+    bvh::Stack,
+    caustic::Surroundings,
+    emitter::{Emitter, Emitters},
+    light_vertices::{ALONE, LightVertex, LightVertices},
+    rng::Rng,
+    turns::Turns,
+    world::{Hit, World, lift},
+};
+
+/// Least distance of a spot from other surfaces, render units: a lift at the far end of a scene, which is 4 to 8 units wide
+/// (about 0.1 mm in a room).
+const CLEARANCE: f32 = 1.0 / 8192.0;
+/// How much of a beam must be free before a spot, in units of the distance that it is moved by.
+const BEAM: f32 = 64.0;
+/// How often the distance is doubled to get clear.
+const DOUBLINGS: u32 = 8;
+/// Directions along the surface in which neighbours are looked for, and directions above it.
+const ROUND: u32 = 24;
+const ABOVE: u32 = 128;
+/// Share of a spot's light that must stay in its zone.
+const MUCH: f32 = 1.0 / 32.0;
+/// A spot has a zone where a surface is nearer than this share of its distance from the camera.
+const NEAR: f32 = 1.0 / 64.0;
+/// A zone's inner radius in units of the distance to the other surface, and the least one, render units.
+const RADIUS: f32 = 8.0;
+const LEAST: f32 = 1.0 / 256.0;
+/// Outer radius in units of the inner one: connections from vertices near the middle to others have at least some length.
+const OUTER: f32 = 2.5;
+/// Vertices of a light path before Russian roulette sets in.
+const SURE: u32 = 4;
+
+/// A spot with a zone.
+#[derive(Debug, Clone, Copy)]
+struct Zone {
+    /// Emitter.
+    spot: usize,
+    centre: Vec3,
+    /// Squares of its inner and outer radius.
+    inner2: f32,
+    outer2: f32,
+}
+
+impl Zone {
+    #[inline]
+    fn distance2(&self, p: Vec3) -> f32 {
+        let to = p - self.centre;
+        to.dot(to)
+    }
+}
+
+/// All zones of a scene.
+#[derive(Debug)]
+pub(crate) struct Contacts {
+    zones: Vec<Zone>,
+    /// By surface index: has no near-mirror.
+    plain: Vec<bool>,
+}
+
+impl Contacts {
+    /// The zones of a scene's spots; `None` where no spot is near another surface. Spots on near-mirrors have none.
+    pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
+        let mut stack = world.bvh.stack();
+        let mut zones = vec![];
+        for (spot, e) in emitters.list.iter().enumerate() {
+            if e.surface.has_mirror() || e.surface.is_black() {
+                continue;
+            }
+            let near = NEAR * e.p.length();
+            if let Some(radius) = radius(world, &mut stack, (e.p, e.n), near) {
+                zones.push(Zone {
+                    spot,
+                    centre: e.p,
+                    inner2: radius * radius,
+                    outer2: (OUTER * radius).powi(2),
+                });
+            }
+        }
+        (!zones.is_empty()).then(|| Self {
+            zones,
+            plain: world.surfaces.iter().map(|s| !s.has_mirror()).collect(),
+        })
+    }
+
+    /// How many spots have a zone.
+    pub fn count(&self) -> u32 {
+        self.zones.len() as u32
+    }
+
+    fn plain(&self, world: &World, h: &Hit) -> bool {
+        self.plain[world.surface[h.triangle as usize] as usize]
+    }
+
+    /// True for near vertices.
+    #[inline]
+    pub fn near(&self, world: &World, h: &Hit) -> bool {
+        let inside = |z: &Zone| z.distance2(h.p) < z.outer2;
+        self.zones.iter().any(inside) && self.plain(world, h)
+    }
+
+    /// True for near vertices within the inner radius of a spot's own zone: where they are lit by it, the path belongs to
+    /// the zones.
+    #[inline]
+    pub fn own(&self, world: &World, spot: usize, h: &Hit) -> bool {
+        let inside = |z: &Zone| z.spot == spot && z.distance2(h.p) < z.inner2;
+        self.zones.iter().any(inside) && self.plain(world, h)
+    }
+
+    /// Drops the weights of spots whose own zone has a near vertex within its inner radius.
+    #[inline]
+    pub fn leave_out(&self, world: &World, h: &Hit, weights: &mut [f32]) {
+        for z in &self.zones {
+            if z.distance2(h.p) < z.inner2 && self.plain(world, h) {
+                weights[z.spot] = 0.0;
+            }
+        }
+    }
+
+    /// Light path `l` of as many as `turns` has, in a zone: calls `each` with every vertex that it may end on.
+    pub fn trace(
+        &self,
+        within: &Surroundings<'_>,
+        (zone, l, turns): (usize, u32, &Turns),
+        rng: &mut Rng,
+        stack: &mut Stack,
+        mut each: impl FnMut(End, LightVertex),
+    ) {
+        let world = within.world;
+        let spot = self.zones[zone].spot;
+        let e: &Emitter = &within.emitters.list[spot];
+        let Some((mut w, mut flux, _)) = turns.direction(l, &e.surface, e.n, e.back, rng) else {
+            return;
+        };
+        flux /= turns.count();
+        let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
+        // Within the zones, and what the vertex before was.
+        let (mut inside, mut specular) = (true, false);
+        for bounces in 2..=within.max_bounces {
+            let Some(mut hit) = world.closest(stack, at, w) else {
+                return;
+            };
+            let near = match bounces {
+                2 if !self.own(world, spot, &hit) => return,
+                _ => inside && self.near(world, &hit),
+            };
+            hit.choose_lobe(rng);
+            path_m += world.metres((hit.p - from).length());
+            if flux == 0.0 || hit.surface.is_black() || path_m > within.gate.end_m() {
+                return;
+            }
+            let end = match near {
+                true => Some(End::Near),
+                false if hit.surface.specular => None,
+                // Behind a near-mirror, or found from the camera's side.
+                false if specular => Some(End::Beyond),
+                false => return,
+            };
+            inside = near;
+            if let Some(end) = end {
+                let vertex = LightVertex {
+                    hit,
+                    back: -w,
+                    flux,
+                    density: ALONE,
+                    path_m,
+                    spot,
+                    bounces,
+                };
+                each(end, vertex);
+            }
+            let Some((next, mut weight, _)) = hit.surface.sample(hit.n, -w, rng) else {
+                return;
+            };
+            if bounces > SURE {
+                let survive = weight.min(0.95);
+                if rng.uniform() >= survive {
+                    return;
+                }
+                weight /= survive;
+            }
+            flux *= weight;
+            specular = hit.surface.specular;
+            (from, at, w) = (hit.p, lift(hit.p, hit.n), next);
+        }
+    }
+
+    /// Draws light vertices anew, from `count` light paths for every zone: near ones, and adds those beyond near-mirrors.
+    pub fn fill(
+        &self,
+        (near, beyond): (&mut LightVertices, &mut LightVertices),
+        within: &Surroundings<'_>,
+        count: u32,
+        rng: &mut Rng,
+        stack: &mut Stack,
+    ) {
+        near.clear();
+        for zone in 0..self.zones.len() {
+            let turns = Turns::new(count, rng);
+            for l in 0..count {
+                self.trace(within, (zone, l, &turns), rng, stack, |end, z| match end {
+                    End::Near => near.push(z),
+                    End::Beyond => beyond.push(z),
+                });
+            }
+        }
+    }
+}
+
+/// Where a light path from a zone may end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum End {
+    /// On a near vertex.
+    Near,
+    /// On the first surface behind near-mirrors.
+    Beyond,
+}
+
+/// Unit directions around and above a surface with normal `n`.
+fn looks(n: Vec3) -> impl Iterator<Item = Vec3> {
+    let (t, b) = frame(n);
+    let round = (0..ROUND).map(move |k| {
+        let angle = std::f32::consts::TAU * k as f32 / ROUND as f32;
+        t * libm::cosf(angle) + b * libm::sinf(angle)
+    });
+    // Golden-angle spiral, cosine-distributed.
+    let above = (0..ABOVE).map(move |k| {
+        let r2 = (k as f32 + 0.5) / ABOVE as f32;
+        let (angle, r) = (2.399_963_2 * k as f32, r2.sqrt());
+        t * (r * libm::cosf(angle)) + b * (r * libm::sinf(angle)) + n * (1.0 - r2).sqrt()
+    });
+    round.chain(above)
+}
+
+/// Distances to what a surface point sees in directions around it and above it, up to `reach`.
+fn distances(
+    world: &World,
+    stack: &mut Stack,
+    (p, n): (Vec3, Vec3),
+    reach: f32,
+) -> Vec<Option<f32>> {
+    let from = lift(p, n);
+    let closest = |w| world.bvh.closest(stack, from, w, reach).map(|(t, _)| t);
+    looks(n).map(closest).collect()
+}
+
+/// Radius of the zone of a spot, if it needs one: if other surfaces nearer than `reach` receive much of its light.
+fn radius(world: &World, stack: &mut Stack, place: (Vec3, Vec3), reach: f32) -> Option<f32> {
+    let all = distances(world, stack, place, RADIUS * reach);
+    let nearest = all.iter().flatten().copied().fold(f32::INFINITY, f32::min);
+    if nearest >= reach {
+        return None;
+    }
+    let radius = (RADIUS * nearest).max(reach).max(LEAST);
+    let above = all[ROUND as usize..].iter().flatten();
+    let inside = above.filter(|&&t| t < radius).count();
+    (inside as f32 >= MUCH * ABOVE as f32).then_some(radius)
+}
+
+/// The place of a spot, moved along its surface where it lies on an edge: where another surface comes within
+/// [`CLEARANCE`], or cuts the spot off by rounding. It stays where light from `back` reaches it. Spots that are clear stay
+/// where they are, to the bit; one that finds no clear place stays as well.
+pub(crate) fn clear(world: &World, stack: &mut Stack, p: Vec3, n: Vec3, back: Vec3) -> Vec3 {
+    // A wall through the spot itself is met from either side of it.
+    let crossed = |stack: &mut Stack, w: Vec3| {
+        let (a, b) = (
+            lift(p - w * (0.5 * CLEARANCE), n),
+            lift(p + w * CLEARANCE, n),
+        );
+        world.bvh.occluded(stack, a, b - a, 1.0)
+    };
+    let round: Vec<Vec3> = looks(n).take(ROUND as usize).collect();
+    // Beneath a wall that leans over the spot, the place that rays start from may be behind it.
+    let lit = |stack: &mut Stack, q: Vec3, far: f32| {
+        let start = lift(q, n);
+        !world.bvh.occluded(stack, start, back * far, 1.0)
+    };
+    if lit(stack, p, BEAM * CLEARANCE) && !round.iter().any(|&w| crossed(stack, w)) {
+        return p;
+    }
+    for k in 0..=DOUBLINGS {
+        let step = CLEARANCE * (1u32 << k) as f32;
+        let mut best: Option<(f32, Vec3)> = None;
+        for &w in &round {
+            let q = p + w * step;
+            let from = lift(q, n);
+            let beneath = world
+                .bvh
+                .closest(stack, from, -n, 2.0 * (from - q).length());
+            if beneath.is_none() || !lit(stack, q, BEAM * step) {
+                continue;
+            }
+            let nearest = distances(world, stack, (q, n), 2.0 * step);
+            let room = nearest.iter().flatten().fold(2.0 * step, |a, &t| a.min(t));
+            if room > 0.5 * CLEARANCE && best.is_none_or(|(most, _)| room > most) {
+                best = Some((room, q));
+            }
+        }
+        if let Some((_, q)) = best {
+            return q;
+        }
+    }
+    p
+}
