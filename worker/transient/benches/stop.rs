@@ -1,6 +1,8 @@
 //! Whether the error that a render states, and stops by, is its true one, on scenes that are hard to sample:
 //! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
-//! ERROR 0 renders numbers of passes instead.
+//! ERROR 0 renders numbers of passes instead: error by pixel and of the whole image, CPU seconds, slope and merit. With a
+//! A negative ERROR prints which class of paths carries the variance. With a
+//! folder in `STOP_TRUTHS`, truths are kept there and used again, so that two versions are compared with the same one.
 
 #[path = "../tests/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
@@ -10,7 +12,7 @@ mod scenes;
 
 use common::{Quiet, settings};
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Rendered, Settings, render};
+use picofarm_transient::{Budget, Rendered, Settings, render, variance};
 
 const BINS: usize = 637;
 
@@ -53,8 +55,8 @@ fn truth(scene: &Scene, passes: u32) -> Truth {
     Truth { mean, noise }
 }
 
-/// Median over pixels of ‖h − r‖ / ‖r‖, the truth's own noise taken off.
-fn deviation(h: &[f32], t: &Truth) -> f64 {
+/// Median and 95th percentile over pixels of ‖h − r‖ / ‖r‖, the truth's own noise taken off.
+fn deviation(h: &[f32], t: &Truth) -> [f64; 2] {
     let mut all: Vec<f64> = h
         .chunks(BINS)
         .zip(t.mean.chunks(BINS))
@@ -67,7 +69,7 @@ fn deviation(h: &[f32], t: &Truth) -> f64 {
         })
         .collect();
     all.sort_by(f64::total_cmp);
-    all[all.len() / 2]
+    [all[all.len() / 2], all[all.len() * 19 / 20]]
 }
 
 fn main() {
@@ -105,7 +107,12 @@ fn main() {
         for line in &first.warnings {
             println!("    warning: {line}");
         }
-        let truth = truth(&scene, (16 * first.error.samples).clamp(768, 32768));
+        if asked[0] < 0.0 {
+            classes(&scene);
+            continue;
+        }
+        let passes = (16 * first.error.samples).clamp(768, 32768);
+        let truth = kept(&format!("{name}-{pixels}"), || truth(&scene, passes));
         let noise = truth.noise.iter().zip(truth.mean.chunks(BINS));
         let mut noise: Vec<f64> = noise
             .map(|(n, r)| (n / r.iter().map(|r| r * r).sum::<f64>()).sqrt())
@@ -116,9 +123,8 @@ fn main() {
             100.0 * noise[noise.len() / 2]
         );
         if asked[0] == 0.0 {
-            for passes in [8, 16, 32, 64] {
-                fixed(&scene, passes, &truth);
-            }
+            let rungs = [8, 32, 128].map(|passes| fixed(&scene, (passes, seeds), &truth));
+            merit(&rungs);
         }
         for &asked in asked.iter().filter(|&&a| a > 0.0) {
             stopped(&scene, asked, seeds, &truth);
@@ -126,27 +132,94 @@ fn main() {
     }
 }
 
+/// Variance by class of paths.
+fn classes(scene: &Scene) {
+    let set = settings(Budget::Samples(64));
+    let all = variance(scene, &set, 64).expect("the scene is sound");
+    println!("    energy %  variance %  of the middle half %");
+    for c in all {
+        let of = [c.energy, c.variance, c.middle].map(|x| 100.0 * x);
+        println!(
+            "    {:8.2}  {:8.2}  {:8.2}  {}",
+            of[0], of[1], of[2], c.class
+        );
+    }
+}
+
+/// A truth from its file, or made and kept there.
+fn kept(name: &str, make: impl Fn() -> Truth) -> Truth {
+    let Ok(folder) = std::env::var("STOP_TRUTHS") else {
+        return make();
+    };
+    let path = std::path::Path::new(&folder).join(format!("{name}.json"));
+    if let Some((mean, noise)) = std::fs::read(&path)
+        .ok()
+        .and_then(|bytes| serde_json::from_slice(&bytes).ok())
+    {
+        return Truth { mean, noise };
+    }
+    let truth = make();
+    let bytes = serde_json::to_vec(&(&truth.mean, &truth.noise)).expect("numbers");
+    std::fs::write(path, bytes).expect("the folder of truths can be written to");
+    truth
+}
+
+/// What renders of so many passes came to: CPU seconds, and the median error of a pixel.
+struct Rung {
+    cpu_s: f64,
+    error: f64,
+}
+
 /// Renders of so many passes: what they say and what is true, per pixel and of the whole image.
-fn fixed(scene: &Scene, passes: u32, truth: &Truth) {
-    const SEEDS: u32 = 8;
-    let (mut says, mut is, mut total) = (0.0, 0.0, 0.0);
+fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
+    let (mut says, mut is, mut p95, mut total, mut cpu_s) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let mut sums = vec![];
-    for seed in 0..SEEDS {
+    let n = f64::from(seeds);
+    for seed in 0..seeds {
+        let before = cpu_seconds();
         let r = run(scene, Budget::Samples(passes), u64::from(seed));
-        says += f64::from(r.error.median_relative) / f64::from(SEEDS);
-        is += deviation(&r.transient, truth) / f64::from(SEEDS);
-        total += f64::from(r.error.total_relative).powi(2) / f64::from(SEEDS);
+        cpu_s += (cpu_seconds() - before) / n;
+        says += f64::from(r.error.median_relative) / n;
+        let [median, high] = deviation(&r.transient, truth);
+        is += median / n;
+        p95 += high / n;
+        total += f64::from(r.error.total_relative).powi(2) / n;
         sums.push(r.transient.iter().map(|&x| f64::from(x)).sum::<f64>());
     }
     let whole = truth.mean.iter().sum::<f64>();
-    let spread = sums.iter().map(|s| (s / whole - 1.0).powi(2)).sum::<f64>() / f64::from(SEEDS);
+    let spread = sums.iter().map(|s| (s / whole - 1.0).powi(2)).sum::<f64>() / n;
     println!(
-        "    {passes} paths: says {:.2} %, is {:.2} % ({:.2}); whole image says {:.3} %, is {:.3} %",
+        "    {passes} paths: {cpu_s:.2} CPU s; says {:.2} %, is {:.2} % ({:.2}), 95th {:.1} %; whole image says {:.3} %, is {:.3} %",
         100.0 * says,
         100.0 * is,
         is / says,
+        100.0 * p95,
         100.0 * total.sqrt(),
         100.0 * spread.sqrt()
+    );
+    Rung { cpu_s, error: is }
+}
+
+/// Slope of error over time between the last rungs, and CPU seconds to 10 and to 5 %.
+fn merit(rungs: &[Rung]) {
+    let [.., a, b] = rungs else { return };
+    let slope = (b.error / a.error).ln() / (b.cpu_s / a.cpu_s).ln();
+    let to = |error: f64| {
+        let below = rungs.iter().position(|r| r.error <= error);
+        let (from, slope) = match below {
+            Some(k) if k > 0 => {
+                let (a, b) = (&rungs[k - 1], &rungs[k]);
+                (b, (b.error / a.error).ln() / (b.cpu_s / a.cpu_s).ln())
+            }
+            Some(_) => (&rungs[0], -0.5),
+            None => (b, slope.clamp(-0.5, -0.2)),
+        };
+        from.cpu_s * (error / from.error).powf(1.0 / slope)
+    };
+    println!(
+        "    merit: slope {slope:.2}; {:.2} CPU s to 10 %, {:.2} to 5 %",
+        to(0.1),
+        to(0.05)
     );
 }
 
@@ -157,7 +230,7 @@ fn stopped(scene: &Scene, asked: f64, seeds: u32, truth: &Truth) {
         let before = cpu_seconds();
         let r = run(scene, Budget::Error(asked), u64::from(seed));
         found.push((
-            deviation(&r.transient, truth),
+            deviation(&r.transient, truth)[0],
             f64::from(r.error.median_relative),
             r.error.samples,
             cpu_seconds() - before,

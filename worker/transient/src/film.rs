@@ -1,6 +1,9 @@
 //! The gate as an array of slots, and what pixels collect in it.
 
-use crate::api::{Gate, Overflow};
+use crate::{
+    api::{Gate, Overflow},
+    sink::{CLASSES, Place, Way, class},
+};
 
 /// How histograms are laid out while they are filled. A *channel* is one histogram: channel 0 holds all
 /// spots, each further one a group of spots. A channel has one *slot* a bin, with one more in front for
@@ -14,6 +17,8 @@ pub(crate) struct Film {
     pub channels: usize,
     /// Channels beyond 0 that a spot counts in, by emitter.
     pub of_spot: Vec<Vec<u16>>,
+    /// Channels beyond 0 are classes of paths in place of groups of spots.
+    by_class: bool,
 }
 
 impl Film {
@@ -24,6 +29,25 @@ impl Film {
             slots: gate.bins as usize + 2,
             channels: 1 + groups,
             of_spot,
+            by_class: false,
+        }
+    }
+
+    /// A film that has a channel for each class of paths.
+    pub fn by_class(gate: &Gate) -> Self {
+        let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
+        Self {
+            by_class: true,
+            ..Self::new(gate, CLASSES, of_class)
+        }
+    }
+
+    /// What a contribution is filed under: its spot, or its class.
+    #[inline]
+    pub fn tag(&self, spot: usize, place: Place, way: Way) -> usize {
+        match self.by_class {
+            false => spot,
+            true => class(place, way),
         }
     }
 

@@ -30,4 +30,7 @@ mod world;
 pub use api::*;
 pub use bvh::{Bvh, Kernel, Stack};
 pub use emitter::trace_spots;
-pub use render::{Forecast, Part, PartOf, join_parts, plan, render, render_part, render_within};
+pub use render::{
+    ClassVariance, Forecast, Part, PartOf, join_parts, plan, render, render_part, render_within,
+    variance,
+};

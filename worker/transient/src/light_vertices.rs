@@ -8,7 +8,6 @@ use std::f32::consts::PI;
 use picofarm_scene::Vec3;
 
 use crate::{
-    bsdf::Surface,
     bvh::Stack,
     contact::Contacts,
     emitter::{Columns, Emitters},
@@ -143,29 +142,22 @@ impl LightVertices {
 
     /// True where [`LightVertices::glossy_weights`] has something to give.
     pub fn has_gloss(&self) -> bool {
-        let gloss = |&i: &usize| self.list[i].hit.surface.is_rough();
+        let gloss = |&i: &usize| !self.list[i].hit.surface.is_shared();
         self.glossy.iter().any(gloss)
     }
 
-    /// As [`LightVertices::weights`], of conductors alone (of a mix its conductor) that are too rough for mirrors:
-    /// what vertices shared by a tile leave out.
+    /// As [`LightVertices::weights`], of conductors alone whose vertices a tile does not share.
     pub fn glossy_weights(&self, x: &Hit, wo: Vec3, out: &mut Vec<f32>) {
         out.clear();
         out.resize(self.list.len(), 0.0);
         for &i in &self.glossy {
-            let surface = self.list[i].hit.surface;
-            if surface.is_rough() {
-                out[i] = self.weight_by(i, &surface.gloss(), x, wo);
+            if !self.list[i].hit.surface.is_shared() {
+                out[i] = self.weight(i, x, wo);
             }
         }
     }
 
     fn weight(&self, i: usize, x: &Hit, wo: Vec3) -> f32 {
-        self.weight_by(i, &self.list[i].hit.surface, x, wo)
-    }
-
-    /// The weight of a vertex that scatters as `surface`.
-    fn weight_by(&self, i: usize, surface: &Surface, x: &Hit, wo: Vec3) -> f32 {
         let y = &self.list[i];
         let to = y.hit.p - x.p;
         let d2 = to.dot(to);
@@ -174,7 +166,7 @@ impl LightVertices {
         if !(cos > 0.0 && x.n.dot(w) > 0.0) {
             return 0.0;
         }
-        let value = x.surface.scatter(x.n, wo, w) * surface.scatter(y.hit.n, y.back, -w);
+        let value = x.surface.scatter(x.n, wo, w) * y.hit.surface.scatter(y.hit.n, y.back, -w);
         let plain = x.surface.pdf(x.n, wo, w) * cos / d2;
         value * y.flux / d2 * y.density / (y.density + plain)
     }

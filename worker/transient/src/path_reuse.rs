@@ -19,11 +19,12 @@ use self::draw::{gather_point, only_mirrors};
 use picofarm_scene::Vec3;
 
 use crate::{
+    bsdf::Surface,
     ellipsoid::Shells,
     emitter::Columns,
     film::Film,
     rng::{Rng, Stream},
-    sink::{PixelSink, Sink},
+    sink::{PixelSink, Place, Sink, Way},
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::Hit,
@@ -36,6 +37,8 @@ pub(crate) struct Effort {
     pub side: u32,
     /// Shared vertices drawn from gather points, for each pixel.
     pub camera: f32,
+    /// How many more vertices are drawn from gather points, for each of those, for what cannot be shared.
+    pub extra: u32,
     /// Shared vertices drawn from spots, for each pixel.
     pub light: f32,
     /// Shared vertices drawn in a narrow gate's shells, for each pixel.
@@ -58,16 +61,23 @@ const ALL_ZONES: u32 = 64;
 const ZONE_PATHS: (u32, u32) = (4, 16);
 /// Light vertices in zones that a near-mirror is connected to at most.
 const BESIDE: u32 = 2;
-/// Glossy light vertices that a gather point is connected to at most.
+/// Light vertices on conductors that are not shared that a gather point is connected to at most.
 const GLOSSY: u32 = 2;
+/// Spots whose light at a rough vertex is carried to the pixels, at most: drawn by contribution.
+const ROUGH_SPOTS: usize = 6;
+
+/// How many more vertices are drawn where some cannot be shared (0, 1, 3 and 7 tried on rooms with such surfaces).
+const EXTRA: u32 = 3;
 
 impl Effort {
     /// The effort for tiles of `side` pixels. The numbers minimise error² × CPU time on furnished rooms
-    /// with 1 and 25 spots, where the optimum is flat: twice as many vertices or walks cost within 10 %.
-    pub fn new(side: u32, narrow: bool) -> Self {
+    /// with 1 and 25 spots, where the optimum is flat: twice as many vertices or walks cost within 10 %. `narrow` is the
+    /// gate; `narrow_lobes`: the scene has surfaces whose vertices are not shared.
+    pub fn new(side: u32, narrow: bool, narrow_lobes: bool) -> Self {
         Self {
             side,
             camera: 1.0,
+            extra: if narrow_lobes { EXTRA } else { 0 },
             light: 0.5,
             shell: if narrow { 1.0 } else { 0.0 },
             walks: 1,
@@ -86,6 +96,28 @@ struct Shared {
     /// Its arrivals.
     first: usize,
     end: usize,
+    /// How a rough surface scatters; its arrivals are those of a white Lambertian in its place.
+    rough: Option<Surface>,
+}
+
+impl Shared {
+    /// A vertex, if it can be shared.
+    fn new(mut hit: Hit) -> Option<Self> {
+        if !hit.surface.is_shared() || hit.surface.is_black() {
+            return None;
+        }
+        let rough = (!hit.surface.diffuse()).then_some(hit.surface);
+        if rough.is_some() {
+            hit.surface = hit.surface.white();
+        }
+        Some(Self {
+            hit,
+            light: 0.0,
+            first: 0,
+            end: 0,
+            rough,
+        })
+    }
 }
 
 /// What arrives at a shared vertex and goes on, per unit solid angle, to every side.
@@ -97,6 +129,8 @@ struct Arrivals {
     spot: Vec<u16>,
     /// Bounces of the whole path where the gather point is the first.
     bounces: Vec<u8>,
+    /// Unit direction from which it arrives at a rough vertex; of others anything.
+    from: Vec<Vec3>,
 }
 
 /// Adds arrivals; lengths counted from `base_m`.
@@ -105,17 +139,42 @@ struct ArrivalSink<'a> {
     base_m: f64,
     per_metre: f64,
     factor: f32,
+    film: &'a Film,
+    place: Place,
+    from: Vec3,
+    /// `from` is that of a walk's first step and stays.
+    left: bool,
 }
 
 impl Sink for ArrivalSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32) {
+    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way) {
+        let spot = self.film.tag(spot, self.place, way);
         let list = &mut *self.list;
         list.bins
             .push(((path_m - self.base_m) * self.per_metre) as f32);
         list.value.push(self.factor * value);
         list.spot.push(spot as u16);
         list.bounces.push(bounces.min(255) as u8);
+        list.from.push(self.from);
+    }
+
+    #[inline]
+    fn toward(&mut self, w: Vec3) {
+        if !self.left {
+            self.from = w;
+        }
+    }
+
+    #[inline]
+    fn leave(&mut self, w: Vec3) {
+        self.toward(w);
+        self.left = true;
+    }
+
+    #[inline]
+    fn at(&mut self, place: Place) {
+        self.place = place;
     }
 }
 
@@ -170,6 +229,7 @@ impl Sharing {
         a.value.clear();
         a.spot.clear();
         a.bounces.clear();
+        a.from.clear();
         let size = film.pixel();
         Self::draw_lights((walk, effort), pixels.len() / size, &mut rng, scratch);
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {
@@ -181,6 +241,7 @@ impl Sharing {
                 film,
                 pixel,
                 factor: 1.0,
+                place: Place::Mirror,
             };
             let (x, y) = (rng.uniform(), rng.uniform());
             let paths = match tile.mirrors[row as usize * tile.width as usize + col as usize] {
@@ -216,7 +277,8 @@ impl Sharing {
         self.connect_lights((walk, film), &mut rng, scratch, pixels);
         let camera = (count * effort.camera).round().max(1.0) as u32;
         let light = (count * effort.light).round().max(1.0) as u32;
-        self.draw_from_camera((walk, film), camera, &mut rng, scratch, pixels);
+        let extra = camera * effort.extra;
+        self.draw_from_camera((walk, film), (camera, extra), &mut rng, scratch, pixels);
         self.draw_from_spots(walk, light, &mut rng, scratch);
         if let Some(patches) = walk.patches {
             let count = (count * effort.shell).round().max(1.0) as u32;

@@ -8,6 +8,7 @@ mod ready;
 mod region;
 mod splat;
 mod tile;
+mod variance;
 mod warn;
 
 use picofarm_scene::Scene;
@@ -21,6 +22,7 @@ use self::{
 pub use self::{
     forecast::Forecast,
     part::{Part, PartOf, join_parts, render_part},
+    variance::{ClassVariance, variance},
 };
 use crate::{
     api::{Budget, Progress, RenderError, Rendered, Settings, Stop, Unstopped},

@@ -60,7 +60,7 @@ pub(crate) struct Step {
 pub(crate) enum Lights {
     /// All that spots light directly.
     All,
-    /// The glossy ones among those, for vertices that a tile's shared vertices serve as well.
+    /// Those among them on conductors that are not shared, for vertices that a tile's shared vertices serve as well.
     Glossy,
     /// Those beyond near-mirrors.
     Beyond,
@@ -202,6 +202,7 @@ impl Walk<'_> {
             let Some((step, next)) = self.step(rng, &vertex, aims, true, &mut scratch.stack) else {
                 return;
             };
+            sink.leave(-next.wo);
             vertex = next;
             self.connect(rng, &vertex, helped.then_some(&step), SPOTS, scratch, sink);
         }

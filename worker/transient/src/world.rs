@@ -210,6 +210,12 @@ impl World {
         near.length() <= self.horizon
     }
 
+    /// Whether there are surfaces with a lobe too narrow for pixels to share their vertices.
+    pub fn has_narrow_lobes(&self) -> bool {
+        let narrow = |s: &Surface| !s.is_black() && !s.gloss().is_shared();
+        self.surfaces.iter().any(narrow)
+    }
+
     /// World metres → render units.
     pub fn inward(&self, p: Vec3) -> Vec3 {
         (p - self.camera.origin) * self.scale

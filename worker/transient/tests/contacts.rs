@@ -14,34 +14,24 @@ use common::{
 use picofarm_scene::{Bsdf, Distribution, Material, Object, Scene, Vec3};
 use picofarm_transient::{Budget, Gate, Part, PartOf, Settings, join_parts, render_part};
 
-const SEEDS: u64 = 2;
 /// Light paths of a reference.
-const PATHS: usize = 200_000;
+const PATHS: usize = 120_000;
 
-/// Energies of exactly two bounces and of three and more, over some seeds, and the standard error that is stated for both
-/// together.
+/// Energies of exactly two bounces and of three and more, and the standard error that is stated for both together.
 fn energies(s: &Scene) -> ([f64; 2], f64) {
-    let (mut sums, mut variance) = ([0.0; 2], 0.0);
-    for seed in 1..=SEEDS {
-        let gate = Gate {
-            start_m: 0.0,
-            bin_width_m: 4.0,
-            bins: 100,
-        };
-        let set = Settings {
-            seed,
-            gate,
-            ..settings(Budget::Samples(128))
-        };
-        let r = ok(s, &set);
-        let split = r.split.as_ref().unwrap();
-        let n = SEEDS as f64;
-        sums[0] += energy(&split.two) / n;
-        sums[1] += energy(&split.multi) / n;
-        let se = f64::from(r.error.total_relative) * energy(&r.transient);
-        variance += (se / n).powi(2);
-    }
-    (sums, variance.sqrt())
+    let gate = Gate {
+        start_m: 0.0,
+        bin_width_m: 4.0,
+        bins: 100,
+    };
+    let set = Settings {
+        gate,
+        ..settings(Budget::Samples(128))
+    };
+    let r = ok(s, &set);
+    let split = r.split.as_ref().unwrap();
+    let se = f64::from(r.error.total_relative) * energy(&r.transient);
+    ([energy(&split.two), energy(&split.multi)], se)
 }
 
 /// Renders with the spot stated in f32 and traces light from it in f64; both must agree.
@@ -53,7 +43,7 @@ fn agrees(what: &str, s: &Scene, start: Start, paths: usize) {
         let se = stated.hypot(expected.se);
         near(&format!("{what}, {part}"), got, expected.mean, 0.002, se);
         assert!(
-            se < 0.01 * (got + reference[0].mean + reference[1].mean),
+            se < 0.012 * (got + reference[0].mean + reference[1].mean),
             "{what}, {part}: {se}"
         );
     }
@@ -78,7 +68,7 @@ fn beside_wall(objects: Vec<Object>, d: f64) -> (Scene, Start) {
 
 #[test]
 fn a_spot_beside_a_wall_has_the_energy_of_an_independent_tracer_at_any_distance() {
-    for d in [1e-9, 1e-6, 1e-4, 1e-3, 1e-2, 6e-2] {
+    for d in [1e-9, 1e-4, 1e-2, 6e-2] {
         let (s, start) = beside_wall(grey_room(), d);
         agrees(&format!("{d:e} m from the wall"), &s, start, PATHS);
     }

@@ -2,15 +2,51 @@
 
 use std::f32::consts::PI;
 
-use super::{ArrivalSink, Effort, Sharing};
+use super::{ArrivalSink, Effort, ROUGH_SPOTS, Sharing};
 use crate::{
     film::Film,
     rng::Rng,
-    sink::Sink,
+    sink::{Place, Sink, Way},
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::lift,
 };
+
+/// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
+/// some are drawn by contribution (systematic sampling), each with its share of the sum.
+struct Carry {
+    /// Weight between two draws; 0 where all are carried as they are.
+    step: f32,
+    sum: f32,
+    next: f32,
+}
+
+impl Carry {
+    fn new(rough: bool, lit: &[usize], weights: &[f32], rng: &mut Rng) -> Self {
+        let total: f32 = lit.iter().map(|&spot| weights[spot]).sum();
+        let step = total / ROUGH_SPOTS as f32;
+        let drawn = rough && lit.len() > ROUGH_SPOTS && step > 1e-30 && step.is_finite();
+        Self {
+            step: if drawn { step } else { 0.0 },
+            sum: 0.0,
+            next: if drawn { rng.uniform() * step } else { 0.0 },
+        }
+    }
+
+    /// What is carried of the next spot, whose weight is `w`.
+    fn share(&mut self, w: f32) -> f32 {
+        if self.step == 0.0 {
+            return w;
+        }
+        self.sum += w;
+        let mut share = 0.0;
+        while self.next < self.sum {
+            share += self.step;
+            self.next += self.step;
+        }
+        share
+    }
+}
 
 impl Sharing {
     /// Optical path to the nearest gather point, metres: where arrivals' lengths are counted from.
@@ -54,6 +90,10 @@ impl Sharing {
                 base_m: nearest,
                 per_metre,
                 factor: 1.0,
+                film,
+                place: Place::Shared,
+                from: h.n,
+                left: false,
             };
             let mut density = 0.0;
             let vertex = Vertex {
@@ -65,15 +105,19 @@ impl Sharing {
                 after_mirror: false,
                 open_before: false,
             };
-            let mut walk_on = |sink: &mut ArrivalSink, scratch: &mut Scratch| {
+            let walk_on = |rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
                 sink.factor = 1.0 / effort.walks.max(1) as f32;
+                sink.at(Place::Walk);
                 for _ in 0..effort.walks {
+                    sink.left = false;
                     walk.run(rng, vertex, scratch, sink);
                 }
                 sink.factor = 1.0;
+                sink.at(Place::Shared);
+                sink.left = false;
             };
             if walk.window.is_some() {
-                walk_on(&mut sink, scratch);
+                walk_on(rng, &mut sink, scratch);
             }
             emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
             walk.leave_to_zones(h, &mut scratch.weights);
@@ -97,9 +141,13 @@ impl Sharing {
                 &self.ends,
                 &mut self.blocked,
             );
-            for (&spot, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+            let mut lit = self.ends_of.iter().zip(&self.blocked);
+            let lit = lit.by_ref().filter(|(_, blocked)| !**blocked);
+            let lit: Vec<usize> = lit.map(|(&spot, _)| spot).collect();
+            let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
+            for &spot in &lit {
                 let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
-                if !blocked {
+                {
                     let to = h.p - e.p;
                     let d2 = to.dot(to);
                     let d = d2.sqrt();
@@ -111,8 +159,10 @@ impl Sharing {
                         e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
                     };
                     let path = nearest + walk.world.metres(d) + e.path_m;
-                    if walk.window.is_none_or(|w| w.holds(path)) {
-                        sink.add(path, w, spot, bounce + 1);
+                    let carried = carry.share(w);
+                    if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
+                        sink.toward(to * (-1.0 / d));
+                        sink.add(path, carried, spot, bounce + 1, Way::Spot);
                     }
                 }
             }
@@ -121,7 +171,7 @@ impl Sharing {
                 y.light += self.shells.density((walk.world, patches), h);
             }
             if walk.window.is_none() {
-                walk_on(&mut sink, scratch);
+                walk_on(rng, &mut sink, scratch);
             }
             y.end = sink.list.bins.len();
         }
@@ -228,6 +278,23 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
+                if let Some(surface) = &y.rough {
+                    let n = y.hit.n;
+                    let to = (v.hit.p - y.hit.p).normalized();
+                    for k in range {
+                        if u32::from(a.bounces[k]) + deeper > walk.max_bounces {
+                            continue;
+                        }
+                        // In place of the white Lambertian's 1/π.
+                        let from = a.from[k];
+                        let value = a.value[k] * PI * surface.scatter(n, to, from) / n.dot(from);
+                        if value > 0.0 {
+                            let slot = floor(a.bins[k] + offset, last) as usize;
+                            film.add(pixel, slot, weight * value, usize::from(a.spot[k]));
+                        }
+                    }
+                    continue;
+                }
                 let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
                 if film.channels == 1 && !bounded {
                     let pixel = &mut pixel[..film.slots];
@@ -266,7 +333,30 @@ fn floor(x: f32, last: f32) -> u32 {
 
 #[cfg(test)]
 mod tests {
-    use super::floor;
+    use super::{Carry, floor};
+    use crate::rng::{Rng, Stream};
+
+    #[test]
+    fn each_spot_is_carried_with_its_own_weight_on_average() {
+        let weights: Vec<f32> = (0..25).map(|k| (1 + k * k % 17) as f32).collect();
+        let lit: Vec<usize> = (0..25).filter(|k| k % 4 != 1).collect();
+        let mut rng = Rng::new(1, Stream::Paths, 2, 3);
+        let (mut sums, n) = ([0.0f64; 25], 20_000);
+        for _ in 0..n {
+            let mut carry = Carry::new(true, &lit, &weights, &mut rng);
+            let mut carried = 0;
+            for &spot in &lit {
+                let share = carry.share(weights[spot]);
+                carried += u32::from(share > 0.0);
+                sums[spot] += f64::from(share) / f64::from(n);
+            }
+            assert!(carried <= super::ROUGH_SPOTS as u32 + 1);
+        }
+        for &spot in &lit {
+            let miss = sums[spot] / f64::from(weights[spot]) - 1.0;
+            assert!(miss.abs() < 0.06, "spot {spot}: {miss}");
+        }
+    }
 
     #[test]
     fn slots_are_whole_parts_within_their_range() {

@@ -8,7 +8,7 @@ use crate::{
     ellipsoid::Patches,
     film::Film,
     rng::Rng,
-    sink::PixelSink,
+    sink::{PixelSink, Place, Sink, Way},
     turns::Turns,
     vertex::Vertex,
     walk::{ALL, Lights, Scratch, Walk},
@@ -58,6 +58,7 @@ impl Sharing {
                     film,
                     pixel: &mut pixels[k * size..(k + 1) * size],
                     factor: 1.0,
+                    place: Place::Gather,
                 };
                 walk.light(rng, v, Lights::Beyond, BEYOND, scratch, &mut sink);
             }
@@ -111,26 +112,33 @@ impl Sharing {
                 let path = v.length_m + leg + y.path_m;
                 if !blocked && walk.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
-                    film.add(pixel, film.slot(path), self.weight[i], y.spot);
+                    let spot = film.tag(y.spot, Place::Gather, Way::Zone);
+                    film.add(pixel, film.slot(path), self.weight[i], spot);
                 }
             }
         }
     }
 
-    /// Draws shared vertices by the scattering of gather points in turn. A vertex that cannot be shared is
-    /// walked on for its own pixel.
+    /// Draws vertices by the scattering of gather points in turn: `count` of which those that can be shared are, and `extra`
+    /// more for those that cannot. They are walked on for their own pixel, which is where most of the variance is, and
+    /// costs little beside what is shared.
     pub(super) fn draw_from_camera(
         &mut self,
         (walk, film): (&Walk, &Film),
-        count: u32,
+        (count, extra): (u32, u32),
         rng: &mut Rng,
         scratch: &mut Scratch,
         pixels: &mut [f32],
     ) {
         let size = film.pixel();
         let points = self.gathers.len();
-        let turns = Turns::new(count, rng);
-        for j in 0..count {
+        let all = [Turns::new(count, rng), Turns::new(extra.max(1), rng)];
+        for j in 0..count + extra {
+            let shares = j < count;
+            let (turns, j) = match shares {
+                true => (&all[0], j),
+                false => (&all[1], j - count),
+            };
             let at = turns.choice(j, points);
             let (vertex, k) = self.gathers[at];
             if !walk.goes_on(&vertex) {
@@ -139,7 +147,8 @@ impl Sharing {
             let mut sink = PixelSink {
                 film,
                 pixel: &mut pixels[k * size..(k + 1) * size],
-                factor: points as f32 / count as f32,
+                factor: points as f32 / (count + extra) as f32,
+                place: Place::Gather,
             };
             let aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
             walk.light(rng, &vertex, Lights::Glossy, GLOSSY, scratch, &mut sink);
@@ -155,16 +164,13 @@ impl Sharing {
             if next.hit.surface.is_black() {
                 continue;
             }
-            if next.hit.surface.diffuse() {
-                self.shared.push(Shared {
-                    hit: next.hit,
-                    light: 0.0,
-                    first: 0,
-                    end: 0,
-                });
-            } else {
+            if !next.hit.surface.is_shared() {
+                sink.at(Place::Alone);
                 walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
+                sink.at(Place::AloneWalk);
                 walk.run(rng, next, scratch, &mut sink);
+            } else if shares {
+                self.shared.extend(Shared::new(next.hit));
             }
         }
     }
@@ -195,14 +201,7 @@ impl Sharing {
                 continue;
             }
             hit.choose_lobe(rng);
-            if !hit.surface.is_black() && hit.surface.diffuse() {
-                self.shared.push(Shared {
-                    hit,
-                    light: 0.0,
-                    first: 0,
-                    end: 0,
-                });
-            }
+            self.shared.extend(Shared::new(hit));
         }
     }
 
@@ -223,14 +222,7 @@ impl Sharing {
                 continue;
             };
             hit.choose_lobe(rng);
-            if hit.surface.diffuse() {
-                self.shared.push(Shared {
-                    hit,
-                    light: 0.0,
-                    first: 0,
-                    end: 0,
-                });
-            }
+            self.shared.extend(Shared::new(hit));
         }
     }
 }

@@ -89,7 +89,8 @@ struct Found {
     rays: f64,
 }
 
-fn look(frame: &Frame, passes: u32) -> Found {
+/// The tiles looked at.
+pub(super) fn regions(frame: &Frame) -> Vec<Region> {
     let starts = |length: u32| -> Vec<u32> {
         let side = SIDE.min(length);
         let count = TILES.min(length / side);
@@ -99,7 +100,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
             .collect()
     };
     let columns = starts(frame.width);
-    let regions: Vec<Region> = starts(frame.height)
+    starts(frame.height)
         .into_iter()
         .flat_map(|row| {
             columns.iter().map(move |&col| Region {
@@ -109,7 +110,11 @@ fn look(frame: &Frame, passes: u32) -> Found {
                 cols: SIDE.min(frame.width),
             })
         })
-        .collect();
+        .collect()
+}
+
+fn look(frame: &Frame, passes: u32) -> Found {
+    let regions = regions(frame);
     let pixels: usize = regions.iter().map(Region::pixels).sum();
     // Passes from the far end of the range: the render's own would be no forecast.
     let order = Order {

@@ -103,7 +103,11 @@ pub(super) fn prepare<R>(
         walk,
         film: &film,
         sampling: &sampling,
-        effort: Effort::new(strategy.path_reuse.unwrap_or(REUSE), narrow),
+        effort: Effort::new(
+            strategy.path_reuse.unwrap_or(REUSE),
+            narrow,
+            world.has_narrow_lobes(),
+        ),
         seed: settings.seed,
         width: scene.camera.intrinsics.width,
         height: scene.camera.intrinsics.height,

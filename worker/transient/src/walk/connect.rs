@@ -7,7 +7,7 @@ use crate::{
     contact::Contacts,
     light_vertices,
     rng::Rng,
-    sink::Sink,
+    sink::{Sink, Way},
     vertex::Vertex,
     world::{Hit, lift},
 };
@@ -55,7 +55,7 @@ impl Walk<'_> {
             let e = &self.emitters.list[spot];
             if self.world.free(stack, h.p, h.n, e.p, e.n) {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-                sink.add(path, v.beta * value, spot, v.bounce + 1);
+                sink.add(path, v.beta * value, spot, v.bounce + 1, Way::Spot);
             }
         };
         if count == ALL {
@@ -174,7 +174,8 @@ impl Walk<'_> {
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
         let value = v.beta * value / (aimed + plain);
-        sink.add(path, value, aim.spot, v.bounce + 2);
+        sink.toward(w);
+        sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
     }
 
     /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
@@ -229,12 +230,19 @@ impl Walk<'_> {
                 *w = if window.holds(path) { *w } else { 0.0 };
             }
         }
+        let way = match which {
+            Lights::All | Lights::Glossy => Way::Lit,
+            Lights::Beyond => Way::Beyond,
+            Lights::Contact => Way::Zone,
+        };
         draw(lights, count, rng.uniform(), |i, value| {
             let y = &vertices.list[i];
             let (there, bounces) = (&y.hit, v.bounce + y.bounces);
             if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
-                let path = v.length_m + self.world.metres((there.p - h.p).length()) + y.path_m;
-                sink.add(path, v.beta * value, y.spot, bounces);
+                let leg = there.p - h.p;
+                let path = v.length_m + self.world.metres(leg.length()) + y.path_m;
+                sink.toward(leg.normalized());
+                sink.add(path, v.beta * value, y.spot, bounces, way);
             }
         });
     }

@@ -1,0 +1,184 @@
+//! Which class of paths carries the variance, from a few tiles of the image.
+
+use picofarm_scene::Scene;
+use rayon::prelude::*;
+
+use super::{
+    forecast::regions,
+    ready::prepare,
+    region::Region,
+    tile::{Bench, Frame, Order},
+};
+use crate::{
+    api::{RenderError, Settings, Stop, Unstopped},
+    film::Film,
+    path_reuse::{Sharing, Tile},
+    sink::{CLASSES, class_name},
+    walk::Scratch,
+};
+
+/// What one class of paths brings to the part of three bounces and more.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClassVariance {
+    /// Where on the path, and how it was found.
+    pub class: String,
+    /// Share of the energy.
+    pub energy: f64,
+    /// Sum over the pixels of its squared error relative to the pixel, as a share of that of all classes.
+    pub variance: f64,
+    /// The same over the middle half of the pixels, ordered by their error: what the median follows.
+    pub middle: f64,
+}
+
+/// Sums of one tile's pixels.
+struct Found {
+    /// ‖h‖² by pixel.
+    norm2: Vec<f64>,
+    /// Energy and variance by pixel and class.
+    classes: Vec<[(f64, f64); CLASSES]>,
+}
+
+/// Shares of the classes in energy and variance of three bounces and more, after so many passes over a few tiles; the
+/// largest variance first, classes without light left out. Runs on the caller's rayon pool.
+///
+/// # Errors
+/// Those of [`crate::render`].
+pub fn variance(
+    scene: &Scene,
+    settings: &Settings,
+    passes: u32,
+) -> Result<Vec<ClassVariance>, RenderError> {
+    prepare(scene, settings, Stop(&Unstopped), |ready| {
+        if !ready.walks() {
+            return Ok(vec![]);
+        }
+        let film = Film::by_class(&settings.gate);
+        let by_class = Frame {
+            film: &film,
+            ..ready.frame
+        };
+        let found: Vec<Found> = regions(&ready.frame)
+            .into_par_iter()
+            .map(|region| look((&ready.frame, &by_class), &region, passes.max(2)))
+            .collect();
+        Ok(shares(&found))
+    })
+}
+
+fn look((frame, by_class): (&Frame, &Frame), region: &Region, passes: u32) -> Found {
+    let first = u32::MAX - passes;
+    let order = Order {
+        first,
+        count: passes,
+    };
+    let mut bench = Bench::new(frame);
+    bench
+        .render(frame, region, &order, &|_| true)
+        .expect("nobody stops it");
+    let pixels = region.pixels();
+    let norm2 = |k| {
+        let slots = 1..frame.film.slots - 1;
+        let h = |slot| bench.done.value(frame.film, k, 0, slot);
+        slots.map(|slot| h(slot).powi(2)).sum()
+    };
+    let norm2 = (0..pixels).map(norm2).collect();
+    let (walk, film, side) = (&by_class.walk, by_class.film, by_class.effort.side);
+    let size = film.pixel();
+    let (mut sum, mut square) = (vec![0.0f32; pixels * size], vec![0.0f32; pixels * size]);
+    let mut scratch = Scratch::new(walk.world, walk.emitters, walk.mirrors);
+    let (mut sharing, mut found) = (Sharing::default(), vec![]);
+    for pass in 0..passes {
+        for row in (0..region.rows).step_by(side as usize) {
+            for col in (0..region.cols).step_by(side as usize) {
+                let (rows, cols) = (side.min(region.rows - row), side.min(region.cols - col));
+                found.clear();
+                found.resize((rows * cols) as usize * size, 0.0);
+                let tile = Tile {
+                    row: region.row + row,
+                    col: region.col + col,
+                    cols,
+                    width: by_class.width,
+                    seed: by_class.seed,
+                    pass: u64::from(first + pass),
+                    mirrors: &by_class.sampling.refined,
+                };
+                sharing.pass(
+                    (walk, film, &by_class.effort),
+                    &tile,
+                    &mut scratch,
+                    &mut found,
+                );
+                for (k, from) in found.chunks(size).enumerate() {
+                    let (r, c) = (row + k as u32 / cols, col + k as u32 % cols);
+                    let at = (r * region.cols + c) as usize * size;
+                    for (i, &x) in from.iter().enumerate().filter(|(_, x)| **x != 0.0) {
+                        sum[at + i] += x;
+                        square[at + i] += x * x;
+                    }
+                }
+            }
+        }
+    }
+    let n = f64::from(passes);
+    let pixel = |k: usize| {
+        std::array::from_fn(|class| {
+            let first = k * size + (class + 1) * film.slots;
+            let slots = first + 1..first + film.slots - 1;
+            let mut of = (0.0, 0.0);
+            for (&x, &x2) in sum[slots.clone()].iter().zip(&square[slots]) {
+                let (x, x2) = (f64::from(x), f64::from(x2));
+                of.0 += x / n;
+                of.1 += (x2 - x * x / n).max(0.0) / (n - 1.0) / n;
+            }
+            of
+        })
+    };
+    Found {
+        norm2,
+        classes: (0..pixels).map(pixel).collect(),
+    }
+}
+
+fn shares(found: &[Found]) -> Vec<ClassVariance> {
+    // Relative squared error by pixel: of all classes, and of each.
+    let mut pixels: Vec<(f64, [f64; CLASSES])> = vec![];
+    let mut energy = [0.0; CLASSES];
+    for tile in found {
+        for (&norm2, classes) in tile.norm2.iter().zip(&tile.classes) {
+            for (all, of) in energy.iter_mut().zip(classes) {
+                *all += of.0;
+            }
+            if norm2 > 0.0 {
+                let each = classes.map(|of| of.1 / norm2);
+                pixels.push((each.iter().sum(), each));
+            }
+        }
+    }
+    pixels.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let of = |range: std::ops::Range<usize>| {
+        let mut sums = [0.0; CLASSES];
+        for (_, each) in &pixels[range] {
+            for (sum, x) in sums.iter_mut().zip(each) {
+                *sum += x;
+            }
+        }
+        let all = sums.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+        sums.map(|x| x / all)
+    };
+    let (all, middle) = (
+        of(0..pixels.len()),
+        of(pixels.len() / 4..pixels.len() * 3 / 4),
+    );
+    let light = energy.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+    let mut classes: Vec<ClassVariance> = (0..CLASSES)
+        .filter(|&c| energy[c] > 0.0)
+        .map(|c| ClassVariance {
+            class: class_name(c),
+            energy: energy[c] / light,
+            variance: all[c],
+            middle: middle[c],
+        })
+        .collect();
+    classes.sort_by(|a, b| b.variance.total_cmp(&a.variance));
+    classes
+}
