@@ -34,7 +34,7 @@ pub struct TrainSettings {
     /// A sensor through which histograms go when they are read, with noise that is drawn anew at each visit; for validation and
     /// evaluation once for each scene. Without it they are seen as stored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub sensor: Option<Sensor>,
+    pub sensor: Option<Box<Sensor>>,
     /// What the network sees of a histogram.
     #[serde(default)]
     pub input: InputSettings,

@@ -225,7 +225,7 @@ impl<'a> EvaluationRun<'a> {
                 .map_or_else(|| times.name.clone(), |depths| depths.id),
         };
         let sensor = trained.sensor.filter(|_| settings.sensor);
-        let sensor = sensor.map(|sensor| (sensor, trained.seed));
+        let sensor = sensor.map(|sensor| (*sensor, trained.seed));
         let (sha256, version) = (model.manifest.sha256(), &settings.version);
         let data = [&*self.data.id, &self.known_data.id];
         Ok(Asked {

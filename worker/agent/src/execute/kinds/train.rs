@@ -153,7 +153,7 @@ impl<'a> TrainingRun<'a> {
                 settings
                     .sensor
                     .clone()
-                    .map(|sensor| (sensor, settings.seed)),
+                    .map(|sensor| (*sensor, settings.seed)),
             );
             Ok(Arc::new(scenes.timed_by(times.predictions.clone())))
         };
