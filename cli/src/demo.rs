@@ -22,7 +22,7 @@ use crate::{
     args::{Demo, Up},
     client::{Client, Submitted},
     dataset,
-    error::{CliError, Code, Result, io},
+    error::{Code, Result, io},
     follow::{Show, follow, verdict},
     jobfile,
     local::Local,
@@ -276,7 +276,8 @@ async fn tell(
 /// The names of graphics processors, which workers open.
 fn gpu_names(gpus: &Gpus) -> Result<Vec<String>> {
     #[cfg(feature = "networks")]
-    let names = picofarm_model::device::names(gpus).map_err(|e| CliError::input(e.to_string()));
+    let names = picofarm_model::device::names(gpus)
+        .map_err(|e| crate::error::CliError::input(e.to_string()));
     #[cfg(not(feature = "networks"))]
     let names = match gpus == &Gpus::default() {
         true => Ok(Vec::new()),
