@@ -220,7 +220,14 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
     ];
     farm.json(&extend);
     assert_eq!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
-    farm.json(&[&extend[..], &["--sampler", "random"]].concat());
+    farm.json(&extend);
+    // Another proposal never replaces a file: somebody may have changed it by hand.
+    let other = [&extend[..], &["--sampler", "random"]].concat();
+    farm.run(&other)
+        .fails(3, &["again.toml", "is there", "--out"]);
+    assert_eq!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
+    fs::remove_file(&again).unwrap();
+    farm.json(&other);
     assert_ne!(fs::read(&again).unwrap(), fs::read(&next).unwrap());
     let written = fs::read_to_string(&next).unwrap();
     assert!(

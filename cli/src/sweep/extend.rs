@@ -6,7 +6,10 @@
 //! trials that ended reused and only the new ones trained; whoever does not likes a proposal changes it in the file. The
 //! file alone says what is run, as any other, and the same records give the same file.
 
-use std::path::{Path, PathBuf};
+use std::{
+    io::Write,
+    path::{Path, PathBuf},
+};
 
 use picofarm_dataset::TrialRecord;
 use picofarm_proto::{
@@ -98,7 +101,20 @@ async fn extend_or_find(more: &MoreTrials, settings: &Settings) -> Result<PathBu
     let trials = sweep.trials.len() as u64;
     let next = beside(&more.file, trials, trials + more.trials);
     match next.exists() {
-        true => Ok(next),
+        true => {
+            let spec =
+                jobfile::read_counted(&next, more.scale.as_deref(), &settings.assets).await?;
+            let found = find(&spec.stages, Some(&sweep.stage))?;
+            if found.trials[0].id != sweep.trials[0].id || found.trials.len() as u64 <= trials {
+                let what = format!(
+                    "{}: is no extension of {}",
+                    next.display(),
+                    more.file.display()
+                );
+                return Err(CliError::input(what).hint("move it away, and give the command again"));
+            }
+            Ok(next)
+        }
         false => Ok(extend(more, None, None, settings).await?.file),
     }
 }
@@ -148,15 +164,19 @@ async fn extend(
         Some(out) => same_folder(file, out)?,
         None => beside(file, trials.len() as u64, total),
     };
-    std::fs::write(&out, after).map_err(|e| io(out.display(), &e))?;
+    let failed = |e: std::io::Error| io(out.display(), &e);
+    let written = NewFile::beside(&out, &after).map_err(failed)?;
     // What was written must mean the same sweep, with these trials.
-    let spec = jobfile::read_counted(&out, scale.as_deref(), &settings.assets).await?;
-    let written = find(&spec.stages, Some(&stage))?;
-    let same =
-        written.trials[0].id == first.id && written.trials.iter().map(|t| &t.values).eq(&values);
+    let spec = jobfile::read_counted(written.path(), scale.as_deref(), &settings.assets).await?;
+    let found = find(&spec.stages, Some(&stage))?;
+    let same = found.trials[0].id == first.id && found.trials.iter().map(|t| &t.values).eq(&values);
     if !same {
         let what = "came out as another sweep; please report it, with the job file";
         return Err(CliError::input(format!("{}: {what}", out.display())));
+    }
+    if !written.keep(&out).map_err(failed)? {
+        let what = format!("{}: is there and says something else", out.display());
+        return Err(CliError::input(what).hint("name another file (--out), or remove it"));
     }
     Ok(Extended {
         file: out,
@@ -166,6 +186,40 @@ async fn extend(
         first: begin,
         proposed,
     })
+}
+
+/// A file that is whole before it has its name.
+struct NewFile(tempfile::NamedTempFile);
+
+impl NewFile {
+    /// With this content, in the folder of `out`.
+    fn beside(out: &Path, content: &str) -> std::io::Result<Self> {
+        let folder = out.parent().filter(|p| !p.as_os_str().is_empty());
+        let mut file = tempfile::Builder::new()
+            .prefix(".sweep-")
+            .suffix(".toml")
+            .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))
+            .tempfile_in(folder.unwrap_or(Path::new(".")))?;
+        file.write_all(content.as_bytes())?;
+        file.as_file().sync_all()?;
+        Ok(Self(file))
+    }
+
+    fn path(&self) -> &Path {
+        self.0.path()
+    }
+
+    /// Gives it its name, if that is free or what it names is equal; says whether it was.
+    fn keep(self, out: &Path) -> std::io::Result<bool> {
+        let ours = std::fs::read(self.path())?;
+        match self.0.persist_noclobber(out) {
+            Ok(_) => Ok(true),
+            Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
+                Ok(std::fs::read(out)? == ours)
+            }
+            Err(e) => Err(e.error),
+        }
+    }
 }
 
 /// The sweep of a job's stages that is meant.
@@ -348,6 +402,19 @@ mod tests {
         );
         let error = all(&file, &[ended(3, 0.3)]).unwrap_err();
         assert!(error.contains("trial 2 is not in it"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_says_something_else_is_never_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("job-8.toml");
+        let write = |content| NewFile::beside(&out, content).unwrap().keep(&out).unwrap();
+        assert!(write("a = 1"));
+        assert!(write("a = 1"), "the same again");
+        assert!(!write("a = 2"));
+        assert_eq!(std::fs::read_to_string(&out).unwrap(), "a = 1");
+        // Nothing else is left in the folder.
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
     #[test]
