@@ -19,7 +19,7 @@ use crate::{
     ranked,
 };
 
-/// Trials that must have ended; with fewer, the best are not told from the rest.
+/// Trials that must have ended; with fewer, the best cannot be distinguished from the rest.
 pub const LEAST: usize = 10;
 /// With fewer trials than this, shares say little. Of 10 trials drawn at random of a function of three parameters that weigh
 /// 1, 0.1 and 0, the first came first in 73 % of 100 repetitions, of 20 in 89 %, of 40 in 90 %, of 80 in all; its chance

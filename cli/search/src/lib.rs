@@ -4,7 +4,7 @@
 //! SHA-256 of a seed and of what is drawn.
 //!
 //! Written here rather than taken from crates.io: the crates there (`tpe`, `optimizer`, `hyperopt`, `parzen`) have generators
-//! of random numbers of their own or a study that must be told of each trial as it goes, and use the platform's logarithm.
+//! of random numbers of their own or a study that must hear of each trial as it goes, and use the platform's logarithm.
 //! Here proposals must follow from records in a store alone, in rounds of any number, to the same digits everywhere.
 
 pub mod importance;
