@@ -278,7 +278,8 @@ async fn export(store: &str, name: &str, out: &Path, output: Output) -> Result<(
 
 /// Most steps that any training under the name has saved.
 fn furthest(checkpoints: &[Checkpoint]) -> Option<u64> {
-    checkpoints.iter().map(|c| c.step).max()
+    let finished = checkpoints.iter().filter(|c| c.finished);
+    finished.map(|c| c.step).max()
 }
 
 /// The numbers of a model's figures, in a line.

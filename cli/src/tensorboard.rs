@@ -46,13 +46,13 @@ pub struct Parameter {
 }
 
 impl Run {
-    /// Adds the numbers of an epoch's line: its `epoch` is the step, and all others are scalars by their names; those in a
+    /// Adds the numbers of a history's line: its `step` is the step, and all others are scalars by their names; those in a
     /// table of it are called `table/name`.
-    pub fn epoch(&mut self, line: &Value) {
-        let epoch = line["epoch"].as_i64().unwrap_or(0);
+    pub fn line(&mut self, line: &Value) {
+        let step = line["step"].as_i64().unwrap_or(0);
         let mut values = Vec::new();
         scalars(&mut values, "", line);
-        self.add(epoch, values);
+        self.add(step, values);
     }
 
     /// Adds a scalar at a step.
@@ -138,7 +138,7 @@ fn scalars(into: &mut Vec<SummaryValue>, path: &str, value: &Value) {
     match value {
         Value::Object(table) => {
             for (name, value) in table {
-                if name == "epoch" && path.is_empty() {
+                if name == "step" && path.is_empty() {
                     continue;
                 }
                 let path = match path {
@@ -259,10 +259,10 @@ mod tests {
     }
 
     #[test]
-    fn epochs_become_scalars_at_their_steps() {
+    fn lines_become_scalars_at_their_steps() {
         let mut run = Run::default();
-        run.epoch(&json!({"epoch": 1, "step": 4, "loss": 0.5, "learning_rate": 1e-3, "validation": {"mae_m": 0.25, "rmse_m": 0.5}}));
-        run.epoch(&json!({"epoch": 2, "step": 8, "loss": 0.25, "learning_rate": 1e-3}));
+        run.line(&json!({"epoch": 1, "step": 4, "loss": 0.5, "learning_rate": 1e-3, "validation": {"mae_m": 0.25, "rmse_m": 0.5}}));
+        run.line(&json!({"epoch": 2, "step": 8, "loss": 0.25, "learning_rate": 1e-3}));
         let events = read(&run.to_bytes());
         assert_eq!(events.len(), 3);
         assert_eq!(
@@ -288,14 +288,14 @@ mod tests {
         assert_eq!(
             sorted,
             [
+                "epoch",
                 "learning_rate",
                 "loss",
-                "step",
                 "validation/mae_m",
                 "validation/rmse_m"
             ]
         );
-        assert_eq!((found[0].0, found[1].0), (1, 2));
+        assert_eq!((found[0].0, found[1].0), (4, 8));
         assert!(found[1].1.contains(&("loss".to_owned(), 0.25)));
     }
 

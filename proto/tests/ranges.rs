@@ -155,8 +155,8 @@ fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
         ),
         (
             "stage/2/train/checkpoint_minutes",
-            json!(0),
-            ["checkpoint_minutes", "0 lies", "minutes"],
+            json!(-1),
+            ["checkpoint_minutes", "-1 lies", "minutes"],
         ),
         (
             "stage/3/report/pictures",

@@ -377,7 +377,7 @@ fn shown_by_tensorboard(farm: &Farm, python: &OsStr, runs: &str, trials: &[Value
             let points = run[tag].as_array().unwrap();
             assert_eq!(points.len(), history.len());
             for (point, line) in points.iter().zip(history) {
-                assert_eq!(point[0], line["epoch"]);
+                assert_eq!(point[0], line["step"]);
                 near(&point[1], line.pointer(field).unwrap());
             }
         }

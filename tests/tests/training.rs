@@ -5,7 +5,7 @@
 
 use std::{fs, path::Path, thread::sleep, time::Duration};
 
-use picofarm_tests::{Farm, rng::Rng, store};
+use picofarm_tests::{Farm, Signal, rng::Rng, store, wait};
 
 /// Kills of workers while they train.
 fn kills_wanted() -> u64 {
@@ -165,6 +165,112 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     eprintln!("{kills} kills, {resumed} resumptions");
     predictions_can_be_looked_at(&calm);
     models_can_be_looked_after(&calm);
+}
+
+/// A training of one stage that is saved every so many minutes.
+fn saved_every(store: &Path, minutes: f64) -> String {
+    let rooms = rooms("saved", store);
+    format!(
+        r#"
+{rooms}[[stage]]
+name = "tof"
+kind = "train"
+source = "rooms"
+[stage.train]
+target = "tof"
+model = "tof"
+net = {{ width = 8, levels = 3 }}
+optimise = {{ epochs = 900, batch = 4 }}
+checkpoint_minutes = {minutes}
+"#
+    )
+}
+
+fn submit_saved(farm: &Farm, minutes: f64) -> String {
+    let file = farm.store().with_file_name("saved.toml");
+    fs::write(&file, saved_every(&farm.store(), minutes)).unwrap();
+    let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    answer["job"].as_str().unwrap().to_owned()
+}
+
+/// Steps after which a training has a checkpoint in the store.
+fn saved(farm: &Farm) -> Vec<u64> {
+    let there = store::hashes(&farm.store().join("models/tof"));
+    let steps = there.keys().filter_map(|key| {
+        let name = Path::new(key).file_name()?.to_str()?;
+        name.strip_suffix(".ckpt")?.parse().ok()
+    });
+    steps.collect()
+}
+
+/// Steps done, as the task says of itself.
+fn step_of(farm: &Farm, id: &str) -> Option<u64> {
+    let status = farm.status(id);
+    let text = status.to_string();
+    let (_, rest) = text.split_once("\"step\":")?;
+    let digits: String = rest.chars().take_while(char::is_ascii_digit).collect();
+    digits.parse().ok()
+}
+
+#[test]
+fn a_training_told_to_end_is_saved_where_it_stands_and_another_worker_goes_on_from_there() {
+    let calm = Farm::start("saved-calm");
+    let id = submit_saved(&calm, 60.0);
+    let _worker = calm.worker("calm");
+    assert_eq!(calm.until_ended(&id)["state"], "done");
+
+    let farm = Farm::with_lease("saved-told", 4.0);
+    // Nothing is saved by the clock in this test's time.
+    let id = submit_saved(&farm, 60.0);
+    let mut leaver = farm.worker("leaver");
+    wait::until("the training to be under way", || {
+        step_of(&farm, &id).filter(|step| *step > 5)
+    });
+    assert_eq!(saved(&farm), Vec::<u64>::new());
+    let told = std::time::Instant::now();
+    leaver.signal(Signal::Terminate);
+    leaver.end().ok();
+    eprintln!("ended {:.2} s after SIGTERM", told.elapsed().as_secs_f64());
+    let steps = saved(&farm);
+    assert!(matches!(steps[..], [step] if step > 5), "{steps:?}");
+    assert_eq!(farm.events_of(&id, "released").len(), 1);
+    let heir = farm.worker("heir");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    let words = format!("goes on from the checkpoint after {} steps", steps[0]);
+    assert!(heir.stderr().contains(&words), "{}", heir.stderr());
+    for kind in ["failed", "expired", "dead"] {
+        assert_eq!(farm.events_of(&id, kind).len(), 0, "{kind}");
+    }
+    assert_eq!(weights(&farm), weights(&calm));
+}
+
+fn weights(farm: &Farm) -> Vec<u8> {
+    let objects = farm.store().join("models/tof");
+    let there = store::hashes(&objects);
+    let key = there
+        .keys()
+        .find(|key| key.ends_with("weights.safetensors"));
+    fs::read(objects.join(key.expect("the model is there"))).unwrap()
+}
+
+#[test]
+fn no_more_than_one_step_is_lost_by_a_kill_where_each_step_is_saved() {
+    let farm = Farm::with_lease("saved-each", 2.0);
+    let id = submit_saved(&farm, 0.0);
+    let killed = farm.worker("killed");
+    wait::until("some steps", || {
+        step_of(&farm, &id).filter(|step| *step > 5)
+    });
+    // What it said that it had done, before it was killed.
+    let said = step_of(&farm, &id).unwrap();
+    killed.kill();
+    let steps = saved(&farm);
+    let newest = *steps.iter().max().expect("each step is saved");
+    assert!(newest + 1 >= said, "{newest} saved, {said} done");
+    let heir = farm.worker("heir");
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    let words = format!("goes on from the checkpoint after {newest} steps");
+    assert!(heir.stderr().contains(&words), "{}", heir.stderr());
 }
 
 /// A training of one stage, by so many processes.

@@ -162,7 +162,7 @@ async fn made_again(models: &Models, manifest: &ModelManifest) -> Result<Vec<Byt
 
 /// The weights and the history that a checkpoint holds; nothing where it cannot be read.
 #[cfg(feature = "networks")]
-fn left_by(checkpoint: &[u8]) -> Result<Vec<Bytes>> {
+fn left_by(checkpoint: &[Bytes]) -> Result<Vec<Bytes>> {
     let Ok((weights, history)) = picofarm_model::train::left_by(checkpoint) else {
         return Ok(Vec::new());
     };
@@ -173,7 +173,7 @@ fn left_by(checkpoint: &[u8]) -> Result<Vec<Bytes>> {
 }
 
 #[cfg(not(feature = "networks"))]
-fn left_by(_: &[u8]) -> Result<Vec<Bytes>> {
+fn left_by(_: &[Bytes]) -> Result<Vec<Bytes>> {
     let what = "networks, which read the checkpoint that this repair begins with";
     Err(crate::error::not_built("networks", what))
 }

@@ -32,15 +32,15 @@ pub async fn run(store: &str, name: &str, out: &Path, output: Output) -> Result<
     for line in String::from_utf8_lossy(&history).lines() {
         let line = serde_json::from_str(line);
         let broken = |e| CliError::new(Code::Damaged, format!("{name}: {HISTORY}: {e}"));
-        run.epoch(&line.map_err(broken)?);
+        run.line(&line.map_err(broken)?);
         count += 1;
     }
     let folder = out.join(name);
     run.write(&folder)?;
-    let facts = json!({"model": name, "tensorboard": folder, "epochs": count});
+    let facts = json!({"model": name, "tensorboard": folder, "lines": count});
     output.result(&facts, || {
         format!(
-            "{count} epochs in {}\nlook at them with: tensorboard --logdir {}\n",
+            "{count} lines of its history in {}\nlook at them with: tensorboard --logdir {}\n",
             folder.display(),
             show::argument(&out.display().to_string())
         )

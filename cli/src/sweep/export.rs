@@ -44,9 +44,10 @@ pub fn as_tensorboard(records: &Records, out: &Path, output: Output) -> Result<(
             TrialEnd::Diverged(_) => Ended::Badly,
         };
         run.trial(&trial.model, trial.values.iter(), ended);
-        trial.history.iter().for_each(|line| run.epoch(line));
+        trial.history.iter().for_each(|line| run.line(line));
+        let last = trial.history.last().and_then(|line| line["step"].as_i64());
         if let Some(loss) = trial.loss {
-            run.scalar(trial.epochs as i64, "error", loss);
+            run.scalar(last.unwrap_or(0), "error", loss);
         }
         run.write(&out.join(&trial.model))?;
     }
@@ -104,7 +105,7 @@ fn trials(sweep: &Sweep) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// A row for each epoch of each trial that ended.
+/// A row for each line of the history of each trial that ended: its epochs, and validations within them.
 fn epochs(sweep: &Sweep) -> Vec<Vec<String>> {
     let header = [
         "trial",

@@ -1,11 +1,17 @@
 //! Checkpoints of tasks that run for long: `checkpoints/<key>/<step>.ckpt`, each with its own checksum. Whoever runs such a
 //! task finds the newest one that is whole. The newest two are kept, so that one which is damaged costs no more than the
 //! time between them; all are deleted when the result is published.
+//!
+//! A large one comes in pieces, which are written and read several at once, while the task goes on:
+//! `<step>.<piece>.part` for all but the first, and last the first as `<step>.ckpt`, with the checksums of all. So what has a
+//! `.ckpt` was written whole, and pieces of two writings are never mixed.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures::TryStreamExt;
+use futures::stream::{FuturesUnordered, StreamExt};
+use futures::{TryStreamExt, stream};
 use object_store::path::Path;
 use object_store::{
     Error, ObjectMeta, ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload,
@@ -15,14 +21,22 @@ use sha2::{Digest, Sha256};
 use crate::error::DatasetError;
 use crate::store::objects;
 
-/// First bytes of a checkpoint; its SHA-256 (32 bytes) and its content follow.
-const MAGIC: &[u8; 8] = b"pfckpt1\n";
-/// Bytes before the content.
-const HEAD: usize = MAGIC.len() + 32;
+/// First bytes of a checkpoint; the SHA-256 (32 bytes) of all that follows, the number of further pieces (4 bytes, little
+/// endian), the SHA-256 of each, and the first piece follow.
+const MAGIC: &[u8; 8] = b"pfckpt2\n";
+/// Bytes before what the checksum is of.
+const HEAD: usize = MAGIC.len() + SHA;
+/// Bytes of a SHA-256.
+const SHA: usize = 32;
 /// Checkpoints that are kept.
 const KEPT: usize = 2;
+/// Pieces that are on their way at once: each is in memory meanwhile.
+const AT_ONCE: usize = 4;
 /// Folder of checkpoints, beside what is published.
 pub(crate) const FOLDER: &str = "checkpoints";
+
+/// What a checkpoint holds, piece by piece; made while pieces before are on their way.
+pub type Pieces = Box<dyn Iterator<Item = Bytes> + Send>;
 
 /// A checkpoint as it is listed.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -33,7 +47,9 @@ pub struct Checkpoint {
     pub step: u64,
     /// Its size.
     pub bytes: u64,
-    pub(crate) object: ObjectMeta,
+    /// Whether it was written to its end. What was not is left over, or under way.
+    pub finished: bool,
+    pub(crate) objects: Vec<ObjectMeta>,
 }
 
 /// The checkpoints of one task. Cheap to clone.
@@ -55,53 +71,127 @@ impl Checkpoints {
     ///
     /// # Errors
     /// [`DatasetError::Store`].
-    pub async fn put(&self, step: u64, content: Bytes) -> Result<(), DatasetError> {
-        let path = objects::path_of(&self.folder, &format!("{step:012}.ckpt"));
-        let mut head = MAGIC.to_vec();
-        head.extend_from_slice(&Sha256::digest(&content));
-        let payload: PutPayload = [Bytes::from(head), content].into_iter().collect();
+    ///
+    /// # Panics
+    /// Where `content` has no piece.
+    pub async fn put(&self, step: u64, content: Pieces) -> Result<(), DatasetError> {
+        if self.read(step).await?.is_none() {
+            self.write(step, content).await?;
+        }
+        let mut there = self.all().await?;
+        there.retain(|checkpoint| checkpoint.step <= step);
+        let finished = there.iter().rev().filter(|c| c.finished);
+        let oldest = finished.take(KEPT).last().map_or(step, |c| c.step);
+        for old in there.iter().filter(|c| c.step < oldest) {
+            // What has no head is no checkpoint: it goes first.
+            for object in &old.objects {
+                self.remove(&object.location).await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn write(&self, step: u64, mut content: Pieces) -> Result<(), DatasetError> {
+        let mut first = None;
+        let mut sums: Vec<[u8; SHA]> = Vec::new();
+        let mut under_way = FuturesUnordered::new();
+        loop {
+            while under_way.len() >= AT_ONCE {
+                under_way.next().await.expect("some are under way")?;
+            }
+            let made = tokio::task::spawn_blocking(move || {
+                let piece = content.next();
+                let sum = piece.as_deref().map(sha);
+                (piece.zip(sum), content)
+            });
+            let broken = |e| DatasetError::codec("cannot make a checkpoint", e);
+            let (piece, rest) = made.await.map_err(broken)?;
+            content = rest;
+            let Some((piece, sum)) = piece else { break };
+            if first.is_none() {
+                first = Some(piece);
+                continue;
+            }
+            sums.push(sum);
+            let path = self.part(step, sums.len());
+            // Pieces that lie there are of a writing that was cut off, or damaged.
+            under_way.push(async move {
+                let put = self.store.put(&path, piece.into()).await;
+                put.map_err(|e| self.failed("write", &path, e))
+            });
+        }
+        while under_way.try_next().await?.is_some() {}
+        let first = first.expect("a checkpoint has a piece");
+        let mut facts = (sums.len() as u32).to_le_bytes().to_vec();
+        facts.extend(sums.concat());
+        let mut sum = Sha256::new();
+        sum.update(&facts);
+        sum.update(&first);
+        let head = [&MAGIC[..], &sum.finalize(), &facts].concat();
+        let payload: PutPayload = [Bytes::from(head), first].into_iter().collect();
+        let path = self.head(step);
         let put = |mode| {
             let options = PutOptions::from(mode);
             self.store.put_opts(&path, payload.clone(), options)
         };
         match put(PutMode::Create).await {
-            Ok(_) => {}
+            Ok(_) => Ok(()),
+            // Damaged, or another worker's, who came to the same step meanwhile: one of both stands whole.
             Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => {
-                let found = objects::get(&*self.store, &path).await?;
-                if found.and_then(whole).is_none() {
+                if self.read(step).await?.is_none() {
                     let replaced = put(PutMode::Overwrite).await;
                     replaced.map_err(|e| self.failed("replace", &path, e))?;
                 }
+                Ok(())
             }
-            Err(e) => return Err(self.failed("write", &path, e)),
+            Err(e) => Err(self.failed("write", &path, e)),
         }
-        let mut there = self.all().await?;
-        there.retain(|checkpoint| checkpoint.step <= step);
-        for old in there.iter().rev().skip(KEPT) {
-            self.remove(&old.object.location).await?;
-        }
-        Ok(())
     }
 
-    /// The newest whole checkpoint: its step and content. Damaged ones are passed over.
+    /// The newest whole checkpoint: its step and its pieces. Damaged ones are passed over.
     ///
     /// # Errors
     /// [`DatasetError::Store`].
-    pub async fn newest(&self) -> Result<Option<(u64, Bytes)>, DatasetError> {
-        for checkpoint in self.all().await?.iter().rev() {
-            let path = &checkpoint.object.location;
-            // Another worker may have written a newer one and deleted this one meanwhile.
-            let Some(bytes) = objects::get(&*self.store, path).await? else {
-                continue;
-            };
-            match whole(bytes) {
-                Some(content) => return Ok(Some((checkpoint.step, content))),
+    pub async fn newest(&self) -> Result<Option<(u64, Vec<Bytes>)>, DatasetError> {
+        let all = self.all().await?;
+        for checkpoint in all.iter().rev().filter(|c| c.finished) {
+            match self.read(checkpoint.step).await? {
+                Some(pieces) => return Ok(Some((checkpoint.step, pieces))),
+                // Another worker may have written a newer one and deleted this one meanwhile.
                 None => {
-                    tracing::warn!(object = %path, "a checkpoint is damaged; the one before is used");
+                    let object = self.head(checkpoint.step);
+                    tracing::warn!(%object, "a checkpoint is damaged or gone; the one before is used");
                 }
             }
         }
         Ok(None)
+    }
+
+    /// The pieces of a checkpoint if all are whole.
+    pub(crate) async fn read(&self, step: u64) -> Result<Option<Vec<Bytes>>, DatasetError> {
+        let bytes = objects::get(&*self.store, &self.head(step)).await?;
+        let Some((first, sums)) = bytes.and_then(whole) else {
+            return Ok(None);
+        };
+        let parts = sums.into_iter().enumerate().map(|(i, sum)| async move {
+            let path = self.part(step, i + 1);
+            let Some(bytes) = objects::get(&*self.store, &path).await? else {
+                return Ok(None);
+            };
+            let checked =
+                tokio::task::spawn_blocking(move || (sha(&bytes) == sum).then_some(bytes));
+            let broken = |e| DatasetError::codec("cannot check a checkpoint", e);
+            checked.await.map_err(broken)
+        });
+        let mut parts = stream::iter(parts).buffered(AT_ONCE);
+        let mut pieces = vec![first];
+        while let Some(part) = parts.next().await {
+            match part? {
+                Some(part) => pieces.push(part),
+                None => return Ok(None),
+            }
+        }
+        Ok(Some(pieces))
     }
 
     /// Deletes all.
@@ -110,9 +200,19 @@ impl Checkpoints {
     /// [`DatasetError::Store`].
     pub async fn delete(&self) -> Result<(), DatasetError> {
         for checkpoint in self.all().await? {
-            self.remove(&checkpoint.object.location).await?;
+            for object in &checkpoint.objects {
+                self.remove(&object.location).await?;
+            }
         }
         Ok(())
+    }
+
+    pub(crate) fn head(&self, step: u64) -> Path {
+        objects::path_of(&self.folder, &format!("{step:012}.ckpt"))
+    }
+
+    fn part(&self, step: u64, piece: usize) -> Path {
+        objects::path_of(&self.folder, &format!("{step:012}.{piece:04}.part"))
     }
 
     async fn all(&self) -> Result<Vec<Checkpoint>, DatasetError> {
@@ -134,37 +234,63 @@ impl Checkpoints {
     }
 }
 
-/// The checkpoints among objects, by task and step, ascending.
+/// The checkpoints among objects, by task and step, ascending. The head of each is the first of its objects.
 pub(crate) fn found(objects: Vec<ObjectMeta>) -> Vec<Checkpoint> {
-    let mut found: Vec<Checkpoint> = objects.into_iter().filter_map(checkpoint).collect();
-    found.sort_by(|a, b| (&a.training_key, a.step).cmp(&(&b.training_key, b.step)));
-    found
+    let mut found: BTreeMap<(String, u64), Vec<(bool, ObjectMeta)>> = BTreeMap::new();
+    for object in objects {
+        if let Some((key, step, head)) = place(&object) {
+            found.entry((key, step)).or_default().push((head, object));
+        }
+    }
+    let checkpoint =
+        |((training_key, step), mut objects): ((String, u64), Vec<(bool, ObjectMeta)>)| {
+            objects.sort_by(|a, b| (!a.0, &a.1.location).cmp(&(!b.0, &b.1.location)));
+            Checkpoint {
+                training_key,
+                step,
+                bytes: objects.iter().map(|(_, object)| object.size).sum(),
+                finished: objects[0].0,
+                objects: objects.into_iter().map(|(_, object)| object).collect(),
+            }
+        };
+    found.into_iter().map(checkpoint).collect()
 }
 
-/// The checkpoint in an object, if it is named like one.
-fn checkpoint(object: ObjectMeta) -> Option<Checkpoint> {
+/// Task and step of an object of a checkpoint, and whether it is the head.
+pub(crate) fn place(object: &ObjectMeta) -> Option<(String, u64, bool)> {
     let parts: Vec<_> = object.location.parts().collect();
     let [.., folder, training_key, file] = &parts[..] else {
         return None;
     };
-    let digits = file.as_ref().strip_suffix(".ckpt")?;
+    let file = file.as_ref();
+    let (digits, head) = match file.strip_suffix(".ckpt") {
+        Some(digits) => (digits, true),
+        None => (file.strip_suffix(PART)?.split_once('.')?.0, false),
+    };
     if folder.as_ref() != FOLDER || digits.len() < 12 {
         return None;
     }
-    Some(Checkpoint {
-        training_key: training_key.as_ref().to_owned(),
-        step: digits.parse().ok()?,
-        bytes: object.size,
-        object: object.clone(),
-    })
+    Some((training_key.as_ref().to_owned(), digits.parse().ok()?, head))
 }
 
-/// The content of a checkpoint that has its checksum.
-pub(crate) fn whole(bytes: Bytes) -> Option<Bytes> {
-    if bytes.len() < HEAD || bytes[..MAGIC.len()] != *MAGIC {
+/// End of the names of all pieces but the first.
+pub(crate) const PART: &str = ".part";
+
+fn sha(bytes: &[u8]) -> [u8; SHA] {
+    Sha256::digest(bytes).into()
+}
+
+/// The first piece of a checkpoint whose head has its checksum, and the checksums of the others.
+fn whole(bytes: Bytes) -> Option<(Bytes, Vec<[u8; SHA]>)> {
+    if bytes.len() < HEAD + 4 || bytes[..MAGIC.len()] != *MAGIC {
         return None;
     }
-    let content = bytes.slice(HEAD..);
     let stated = &bytes[MAGIC.len()..HEAD];
-    (Sha256::digest(&content)[..] == *stated).then_some(content)
+    if sha(&bytes[HEAD..]) != *stated {
+        return None;
+    }
+    let count = u32::from_le_bytes(bytes[HEAD..HEAD + 4].try_into().ok()?) as usize;
+    let first = HEAD + 4 + count.checked_mul(SHA)?;
+    let sums = bytes.get(HEAD + 4..first)?.as_chunks::<SHA>().0.to_vec();
+    Some((bytes.slice(first..), sums))
 }

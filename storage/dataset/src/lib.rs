@@ -26,7 +26,7 @@ const WITHOUT_FORMATS: &str = "this picofarm was built without OpenEXR and HDF5"
 #[cfg(not(feature = "formats"))]
 const BUILD_WITH_FORMATS: &str = "build it with `cargo build --release --features formats`, or with `--features full` for everything";
 
-pub use checkpoints::{Checkpoint, Checkpoints};
+pub use checkpoints::{Checkpoint, Checkpoints, Pieces};
 pub use coding::squareroot::{EncodeError, SATURATED, SquareRoot, photon_scale};
 pub use coding::transient::{CodedImage, TransientCodec};
 pub use error::DatasetError;

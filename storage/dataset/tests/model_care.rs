@@ -13,7 +13,10 @@ use std::{
 };
 
 use bytes::Bytes;
-use common::tricky::{Moment, Tricky};
+use common::{
+    pieces,
+    tricky::{Moment, Tricky},
+};
 use futures::{FutureExt, TryStreamExt};
 use object_store::{ObjectStore, ObjectStoreExt, memory::InMemory, path::Path};
 use picofarm_dataset::*;
@@ -71,7 +74,7 @@ async fn whole(models: &Models) -> ModelManifest {
         .unwrap()
         .manifest;
     put_evaluation(models, &made).await;
-    let content = Bytes::from_static(b"a checkpoint");
+    let content = pieces(&[b"a checkpoint"]);
     models.put_checkpoint("m", "k", 5, content).await.unwrap();
     let speed = TrainingSpeed {
         training_key: "k".into(),
@@ -332,7 +335,7 @@ async fn a_removal_killed_anywhere_goes_on_to_the_same_end() {
             .unwrap();
         // Of another training under the name, which goes on.
         models
-            .put_checkpoint("m", "later", 1, Bytes::from_static(b"c"))
+            .put_checkpoint("m", "later", 1, pieces(&[b"c"]))
             .await
             .unwrap();
         let seen = Arc::new(AtomicUsize::new(0));
@@ -405,7 +408,7 @@ async fn a_model_that_is_trained_again_while_it_is_removed_keeps_its_objects() {
 async fn a_model_that_is_still_trained_or_cannot_be_read_goes_only_by_force() {
     let (store, models) = in_memory();
     models
-        .put_checkpoint("m", "k", 1, Bytes::from_static(b"c"))
+        .put_checkpoint("m", "k", 1, pieces(&[b"c"]))
         .await
         .unwrap();
     let said = models.remove("m", false).await.unwrap_err().to_string();

@@ -6,7 +6,7 @@ mod common;
 use std::{path::PathBuf, sync::Arc, time::Duration};
 
 use bytes::Bytes;
-use futures::executor::block_on;
+use common::pieces;
 use object_store::{ObjectStore, memory::InMemory, path::Path};
 use picofarm_dataset::*;
 use proptest::prelude::*;
@@ -117,7 +117,7 @@ async fn what_a_killed_training_left_is_in_nobodys_way() {
         std::fs::remove_file(dir.path().join(format!("models/{name}/manifest.json"))).unwrap();
     }
     models
-        .put_checkpoint("m", "other", 5, Bytes::from_static(b"5"))
+        .put_checkpoint("m", "other", 5, pieces(&[b"5"]))
         .await
         .unwrap();
     std::fs::write(dir.path().join("models/m/manifest.json#1"), b"{").unwrap();
@@ -162,7 +162,7 @@ async fn who_asks_for_a_model_that_is_not_there_hears_which_are() {
     assert!(said.contains("there are: none"), "{said}");
     models.publish(model("a", "k", b"w"), false).await.unwrap();
     models
-        .put_checkpoint("m", "k", 5, Bytes::from_static(b"5"))
+        .put_checkpoint("m", "k", 5, pieces(&[b"5"]))
         .await
         .unwrap();
     let said = models.manifest("x").await.unwrap_err().to_string();
@@ -176,14 +176,14 @@ async fn who_asks_for_a_model_that_is_not_there_hears_which_are() {
 async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
     let (dir, models) = local();
     for step in [10, 20, 30, 1_000_000_000_000] {
-        let content = Bytes::from(format!("at {step}"));
+        let content = pieces(&[format!("at {step}").as_bytes()]);
         models
             .put_checkpoint("m", "k", step, content)
             .await
             .unwrap();
     }
     models
-        .put_checkpoint("m", "other", 1, Bytes::new())
+        .put_checkpoint("m", "other", 1, pieces(&[b""]))
         .await
         .unwrap();
     let steps: Vec<u64> = models
@@ -196,14 +196,12 @@ async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
     assert_eq!(steps, [30, 1_000_000_000_000, 1]);
     // A worker that was slow takes nothing away from one that is further.
     models
-        .put_checkpoint("m", "k", 25, Bytes::new())
+        .put_checkpoint("m", "k", 25, pieces(&[b""]))
         .await
         .unwrap();
     let newest = models.newest_checkpoint("m", "k").await.unwrap().unwrap();
-    assert_eq!(
-        (newest.0, &newest.1[..]),
-        (1_000_000_000_000, &b"at 1000000000000"[..])
-    );
+    assert_eq!((newest.0, newest.1.len()), (1_000_000_000_000, 1));
+    assert_eq!(newest.1[0], "at 1000000000000");
     models.delete_checkpoints("m", "k").await.unwrap();
     assert_eq!(models.newest_checkpoint("m", "k").await.unwrap(), None);
     let left = files(dir.path());
@@ -213,21 +211,77 @@ async fn the_newest_two_checkpoints_are_kept_and_none_after_the_end() {
 #[tokio::test]
 async fn a_damaged_checkpoint_is_replaced_and_a_whole_one_stands() {
     let (dir, models) = local();
-    let put =
-        |content: &'static [u8]| models.put_checkpoint("m", "k", 7, Bytes::from_static(content));
+    let put = |content: &'static [u8]| models.put_checkpoint("m", "k", 7, pieces(&[content]));
     put(b"first").await.unwrap();
     put(b"other").await.unwrap();
     assert_eq!(
         models.newest_checkpoint("m", "k").await.unwrap().unwrap().1,
-        "first"
+        ["first"]
     );
     let path = files(dir.path()).pop().unwrap();
     std::fs::write(path, b"torn").unwrap();
     put(b"other").await.unwrap();
     assert_eq!(
         models.newest_checkpoint("m", "k").await.unwrap().unwrap().1,
-        "other"
+        ["other"]
     );
+}
+
+#[tokio::test]
+async fn a_checkpoint_in_pieces_counts_when_its_head_lies_there_and_each_piece_is_whole() {
+    let (dir, models) = local();
+    let many: Vec<Vec<u8>> = (0..9u8).map(|i| vec![i; 100 + usize::from(i)]).collect();
+    let many: Vec<&[u8]> = many.iter().map(Vec::as_slice).collect();
+    let newest = async || models.newest_checkpoint("m", "k").await.unwrap();
+    let put = async |step| {
+        let put = models.put_checkpoint("m", "k", step, pieces(&many));
+        put.await.unwrap();
+    };
+    put(3).await;
+    put(7).await;
+    let (step, found) = newest().await.unwrap();
+    assert!(step == 7 && found == many);
+    assert_eq!(files(dir.path()).len(), 18);
+    assert_eq!(models.verify("m").await.unwrap().checkpoints, 2);
+    // Each of its objects, damaged or gone: the one before counts, a check says so, and writing it again mends it.
+    let of_7 = |path: &&PathBuf| path.to_str().unwrap().contains("/000000000007.");
+    for path in files(dir.path()).iter().filter(of_7) {
+        for gone in [false, true] {
+            let was = std::fs::read(path).unwrap();
+            match gone {
+                true => std::fs::remove_file(path).unwrap(),
+                false => std::fs::write(path, [&was[1..], b"x"].concat()).unwrap(),
+            }
+            assert_eq!(newest().await.unwrap().0, 3, "{path:?}");
+            let check = models.verify("m").await.unwrap();
+            let head_gone = gone && path.extension().unwrap() == "ckpt";
+            assert_eq!(check.problems.len(), usize::from(!head_gone), "{path:?}");
+            assert_eq!(
+                check.unused.len(),
+                if head_gone { 8 } else { 0 },
+                "{path:?}"
+            );
+            put(7).await;
+            let (step, found) = newest().await.unwrap();
+            assert!(step == 7 && found == many, "{path:?}");
+        }
+    }
+    // Cut off before its head: nobody takes it for a checkpoint, and the next one clears it away.
+    put(9).await;
+    let head = files(dir.path())
+        .into_iter()
+        .find(|path| path.ends_with("000000000009.ckpt"));
+    std::fs::remove_file(head.unwrap()).unwrap();
+    assert_eq!(newest().await.unwrap().0, 7);
+    let listed = models.checkpoints("m").await.unwrap();
+    let listed: Vec<(u64, bool)> = listed.iter().map(|c| (c.step, c.finished)).collect();
+    assert_eq!(listed, [(7, true), (9, false)]);
+    put(11).await;
+    put(12).await;
+    let left = models.checkpoints("m").await.unwrap();
+    assert_eq!(left.iter().map(|c| c.step).collect::<Vec<_>>(), [11, 12]);
+    models.delete_checkpoints("m", "k").await.unwrap();
+    assert_eq!(files(dir.path()), Vec::<PathBuf>::new());
 }
 
 #[tokio::test]
@@ -246,21 +300,21 @@ async fn collection_takes_what_nobody_needs_and_leaves_the_rest() {
         .unwrap();
     std::fs::remove_file(dir.path().join("models/gone/manifest.json")).unwrap();
     models
-        .put_checkpoint("m", "old", 7, Bytes::new())
+        .put_checkpoint("m", "old", 7, pieces(&[b"a", b"b"]))
         .await
         .unwrap();
     std::fs::write(dir.path().join("models/m/notes.txt"), b"mine").unwrap();
     let young = dataset.collect(MIN_GRACE, true).await.unwrap();
     assert_eq!(young.orphans, []);
     let found = dataset.collect(NOW, false).await.unwrap();
-    assert_eq!(found.orphans.len(), 3);
+    assert_eq!(found.orphans.len(), 4);
     assert_eq!(
         found
             .orphans
             .iter()
             .filter(|o| o.why().starts_with("checkpoint"))
             .count(),
-        1
+        2
     );
     assert_eq!(
         found
@@ -341,23 +395,24 @@ proptest! {
     fn the_newest_checkpoint_that_is_whole_is_found_whatever_became_of_the_others(
         steps in prop::collection::btree_map(0u64..1000, (prop::collection::vec(any::<u8>(), 0..40), harm()), 1..5),
     ) {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let store: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
         // Written by workers that did not know of each other: each into a store of its own, so that none tidies up.
         let mut expected = None;
         for (step, (content, harm)) in &steps {
             let own: Arc<dyn ObjectStore> = Arc::new(InMemory::new());
             let models = Models::new(own.clone(), &Path::from("s"));
-            block_on(models.put_checkpoint("m", "k", *step, content.clone().into())).unwrap();
+            runtime.block_on(models.put_checkpoint("m", "k", *step, pieces(&[content]))).unwrap();
             let path = Path::from(format!("s/models/m/checkpoints/k/{step:012}.ckpt"));
-            let mut bytes = block_on(async { own.get_opts(&path, Default::default()).await.unwrap().bytes().await }).unwrap().to_vec();
+            let mut bytes = runtime.block_on(async { own.get_opts(&path, Default::default()).await.unwrap().bytes().await }).unwrap().to_vec();
             match harm {
-                Harm::None => expected = Some((*step, Bytes::from(content.clone()))),
+                Harm::None => expected = Some((*step, vec![Bytes::from(content.clone())])),
                 Harm::Cut(at) => { let at = at.index(bytes.len()); bytes.truncate(at); }
                 Harm::Flip(at, bits) => { let at = at.index(bytes.len()); bytes[at] ^= bits; }
             }
-            block_on(store.put_opts(&path, bytes.into(), Default::default())).unwrap();
+            runtime.block_on(store.put_opts(&path, bytes.into(), Default::default())).unwrap();
         }
         let models = Models::new(store, &Path::from("s"));
-        prop_assert_eq!(block_on(models.newest_checkpoint("m", "k")).unwrap(), expected);
+        prop_assert_eq!(runtime.block_on(models.newest_checkpoint("m", "k")).unwrap(), expected);
     }
 }

@@ -208,17 +208,27 @@ fn an_early_end_is_the_same_for_all_and_keeps_the_same_epoch() {
         learning_rate: 0.3,
         ..of_steps(2)
     };
-    let expected = alone(&plan);
+    ends_early(&plan);
+    // Within epochs, too.
+    ends_early(&Plan {
+        validate_every: 1,
+        early_stop: 3,
+        ..plan
+    });
+}
+
+fn ends_early(plan: &Plan) {
+    let expected = alone(plan);
     assert!(expected.stopped_early, "{:?}", expected.history);
     let board = Board::default();
     let found: Vec<(Ended, Option<Trained>)> = thread::scope(|scope| {
-        let go = || process(&board, &plan, &|| false, &mut |_, _| Control::Continue);
+        let go = || process(&board, plan, &|| false, &mut |_, _| Control::Continue);
         let running = [scope.spawn(go), scope.spawn(go)];
         running.map(|r| r.join().unwrap()).into()
     });
     for kept in found.iter().filter_map(|(_, kept)| kept.as_ref()) {
         assert_same(kept, &expected);
-        assert_eq!(kept.kept_epoch, expected.kept_epoch);
+        assert_eq!(kept.kept_step, expected.kept_step);
     }
 }
 

@@ -166,6 +166,11 @@ impl Parameters {
             .collect()
     }
 
+    /// Each value beside its declaration.
+    pub(crate) fn named_values(&self) -> impl Iterator<Item = (&Declared, &Tensor<1>)> {
+        self.declared.iter().zip(&self.values)
+    }
+
     /// The declarations, in order.
     pub fn declared(&self) -> &[Declared] {
         &self.declared

@@ -133,10 +133,16 @@ fn an_average_follows_the_weights_is_judged_and_kept_and_goes_on_to_the_same_bit
     assert!((found - said).abs() < 1e-6, "{found} {said}");
     // Stopped in the middle.
     let checkpoint = stopped_after(&averaged, 3).checkpoint();
-    let mut again = Training::resume(averaged, &checkpoint, sources(), &Device::flex()).unwrap();
+    let mut again = Training::resume(
+        averaged,
+        &[checkpoint.as_slice()],
+        sources(),
+        &Device::flex(),
+    )
+    .unwrap();
     assert_eq!(again.checkpoint(), checkpoint);
     again.run(&mut |_, _| Control::Continue).unwrap();
-    let (left, _) = left_by(&again.checkpoint()).unwrap();
+    let (left, _) = left_by(&[again.checkpoint()]).unwrap();
     let again = again.finish();
     assert!(again.weights == trained.weights && left == trained.weights);
     assert_eq!(again.history, trained.history);

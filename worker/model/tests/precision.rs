@@ -82,7 +82,8 @@ fn trained(plan: &Plan, stop: Option<u64>) -> Trained {
         });
         assert_eq!(ended.unwrap(), Ended::Stopped);
         let checkpoint = training.checkpoint();
-        training = Training::resume(plan.clone(), &checkpoint, sources(), &device).unwrap();
+        training =
+            Training::resume(plan.clone(), &[checkpoint.as_slice()], sources(), &device).unwrap();
     }
     training.run(&mut |_, _| Control::Continue).unwrap();
     training.finish()

@@ -11,7 +11,7 @@ use picofarm_model::{
     baseline::Baseline,
     input::{ShadowVariant, Target},
     scene::Scene,
-    train::{Control, Ended, Event, Plan, Sources, Trained, Training},
+    train::{Control, Ended, Event, Plan, Sources, Trained, Training, epochs_at},
 };
 use proptest::prelude::*;
 
@@ -44,7 +44,8 @@ fn stopped(plan: &Plan, stops: &[u64]) -> Trained {
             break;
         }
         let checkpoint = training.checkpoint();
-        training = Training::resume(plan.clone(), &checkpoint, sources(), &device).unwrap();
+        training =
+            Training::resume(plan.clone(), &[checkpoint.as_slice()], sources(), &device).unwrap();
         assert_eq!(
             training.checkpoint(),
             checkpoint,
@@ -53,6 +54,17 @@ fn stopped(plan: &Plan, stops: &[u64]) -> Trained {
     }
     training.run(&mut |_, _| Control::Continue).unwrap();
     training.finish()
+}
+
+/// Weights without the plan that stands beside them.
+fn plain(weights: &[u8]) -> Vec<(String, Vec<u8>)> {
+    let tensors = safetensors::SafeTensors::deserialize(weights).unwrap();
+    let named = tensors
+        .iter()
+        .map(|(name, view)| (name.to_owned(), view.data().to_vec()));
+    let mut named: Vec<_> = named.collect();
+    named.sort();
+    named
 }
 
 proptest! {
@@ -115,7 +127,7 @@ fn after(plan: &Plan, epochs: u64) -> (Vec<u8>, Vec<picofarm_model::train::Line>
                     Control::Continue
                 }
             }
-            Event::Step { .. } => Control::Continue,
+            Event::Step { .. } | Event::Validated(_) => Control::Continue,
         })
         .unwrap();
     (training.finish().weights, history)
@@ -171,13 +183,14 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     });
     assert_eq!(stopped.unwrap(), Ended::Stopped);
     let checkpoint = training.checkpoint();
-    let mut training = Training::resume(plan.clone(), &checkpoint, sources(), &device).unwrap();
+    let mut training =
+        Training::resume(plan.clone(), &[checkpoint.as_slice()], sources(), &device).unwrap();
     assert_eq!(training.checkpoint(), checkpoint);
     training.run(&mut |_, _| Control::Continue).unwrap();
-    let (left, history) = picofarm_model::train::left_by(&training.checkpoint()).unwrap();
+    let (left, history) = picofarm_model::train::left_by(&[training.checkpoint()]).unwrap();
     let again = training.finish();
     assert!(left == again.weights && history == again.history);
-    assert!(again.weights == trained.weights && again.kept_epoch == trained.kept_epoch);
+    assert!(again.weights == trained.weights && again.kept_step == trained.kept_step);
     // Without early_stop, the last ones count.
     let (last, history) = after(
         &Plan {
@@ -188,6 +201,75 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     );
     assert_eq!(history[..], trained.history[..past as usize]);
     assert!(last != trained.weights);
+}
+
+#[test]
+fn a_validation_within_an_epoch_is_a_line_and_moves_no_bit() {
+    let every = |validate_every| Plan {
+        epochs: 4,
+        batch: 1,
+        validate_every,
+        ..plan(Target::Tof, ShadowVariant::Concat)
+    };
+    let often = whole(&every(3), sources());
+    let seldom = whole(&every(0), sources());
+    assert!(plain(&often.weights) == plain(&seldom.weights));
+    let per_epoch = seldom.history[0].step;
+    assert!(!per_epoch.is_multiple_of(3), "{per_epoch}");
+    // Each third step, and the end of each epoch.
+    let due = |step: &u64| step.is_multiple_of(3) || step.is_multiple_of(per_epoch);
+    let due: Vec<u64> = (1..=4 * per_epoch).filter(due).collect();
+    let steps: Vec<u64> = often.history.iter().map(|line| line.step).collect();
+    assert_eq!(steps, due);
+    let (mut sums, mut last) = (0.0, 0);
+    for line in &often.history {
+        assert_eq!(line.epoch, (line.step - 1) / per_epoch + 1);
+        assert_eq!(line.within, !line.step.is_multiple_of(per_epoch));
+        assert!(line.validation.is_some());
+        sums += line.loss * (line.step - last) as f64;
+        last = line.step;
+        if !line.within {
+            // A whole epoch's loss is the mean over its parts, and its validation the same.
+            let whole = &seldom.history[line.epoch as usize - 1];
+            assert!((sums / per_epoch as f64 - whole.loss).abs() < 1e-9);
+            assert_eq!(line.validation, whole.validation);
+            sums = 0.0;
+        }
+    }
+    // Cut off anywhere, before and after a line, it comes to the same.
+    let cut = stopped(&every(3), &(1..4 * per_epoch).collect::<Vec<_>>());
+    assert!(cut.history == often.history && cut.weights == often.weights);
+    let at: Vec<f64> = epochs_at(&often.history).map(|(at, _)| at).collect();
+    assert!(at.is_sorted() && at.last() == Some(&4.0), "{at:?}");
+}
+
+#[test]
+fn early_stop_counts_validations_within_epochs() {
+    let plan = Plan {
+        epochs: 1_000,
+        batch: 1,
+        validate_every: 1,
+        early_stop: 3,
+        learning_rate: 0.2,
+        schedule: picofarm_model::train::Schedule::Constant,
+        ..plan(Target::Tof, ShadowVariant::Concat)
+    };
+    let trained = whole(&plan, sources());
+    assert!(trained.stopped_early);
+    let kept = trained.kept().unwrap();
+    let last = trained.history.last().unwrap();
+    assert_eq!(last.step, kept.step + 3);
+    let best = trained
+        .history
+        .iter()
+        .map(|line| line.validation.unwrap().loss());
+    assert_eq!(
+        kept.validation.unwrap().loss(),
+        best.fold(f64::INFINITY, f64::min)
+    );
+    let cut = stopped(&plan, &(1..last.step).collect::<Vec<_>>());
+    assert!(cut.history == trained.history && cut.weights == trained.weights);
+    assert_eq!(cut.kept_step, trained.kept_step);
 }
 
 #[test]
@@ -389,7 +471,7 @@ fn checkpoints_of_another_plan_or_cut_short_are_refused() {
     let training = Training::start(plan_a.clone(), None, sources(), &device).unwrap();
     let checkpoint = training.checkpoint();
     let refused = |plan: Plan, bytes: &[u8]| {
-        let training = Training::resume(plan, bytes, sources(), &device);
+        let training = Training::resume(plan, &[bytes], sources(), &device);
         training.map(|_| ()).unwrap_err().to_string()
     };
     let other = Plan {
@@ -401,6 +483,48 @@ fn checkpoints_of_another_plan_or_cut_short_are_refused() {
     assert!(refused(plan_a.clone(), cut).contains("no whole safetensors"));
     let weights = training.finish().weights;
     assert!(refused(plan_a, &weights).contains("only weights"));
+}
+
+#[test]
+fn pieces_of_a_checkpoint_are_as_small_as_asked_and_give_the_bits_of_the_whole() {
+    let device = Device::flex();
+    let plan = Plan {
+        early_stop: 2,
+        ema: Some(0.9),
+        ..plan(Target::Shadow, ShadowVariant::Concat)
+    };
+    let mut training = Training::start(plan.clone(), None, sources(), &device).unwrap();
+    let stop_at = |training: &mut Training, at: u64| {
+        training.run(&mut |_, event| match event {
+            Event::Step { step, .. } if *step >= at => Control::Stop,
+            _ => Control::Continue,
+        })
+    };
+    stop_at(&mut training, 2).unwrap();
+    let whole = training.checkpoint();
+    let snapshot = training.snapshot();
+    // The training goes on before the snapshot is written: in place, where nothing shares its numbers.
+    stop_at(&mut training, 3).unwrap();
+    assert!(training.checkpoint() != whole);
+    let pieces: Vec<Vec<u8>> = snapshot.pieces(4_000).collect();
+    assert!(pieces.len() > 3, "{}", pieces.len());
+    let largest = training
+        .learner()
+        .net()
+        .declared()
+        .iter()
+        .map(|d| 4 * d.len())
+        .max();
+    for piece in &pieces {
+        let tensors = safetensors::SafeTensors::deserialize(piece).unwrap();
+        let bytes: usize = tensors.iter().map(|(_, view)| view.data().len()).sum();
+        assert!(bytes <= 4_000 || (tensors.len() == 1 && Some(bytes) <= largest));
+    }
+    let of_pieces = Training::resume(plan.clone(), &pieces, sources(), &device).unwrap();
+    assert!(of_pieces.checkpoint() == whole);
+    let without = Training::resume(plan, &pieces[..pieces.len() - 1], sources(), &device);
+    let said = without.map(|_| ()).unwrap_err().to_string();
+    assert!(said.contains("no \"") || said.contains("missing"), "{said}");
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use bytes::Bytes;
 
 use super::{Models, check_name};
-use crate::checkpoints::{Checkpoint, Checkpoints, FOLDER, found};
+use crate::checkpoints::{Checkpoint, Checkpoints, FOLDER, Pieces, found};
 use crate::error::DatasetError;
 
 impl Models {
@@ -30,7 +30,7 @@ impl Models {
         name: &str,
         training_key: &str,
         step: u64,
-        content: Bytes,
+        content: Pieces,
     ) -> Result<(), DatasetError> {
         self.checkpoints_of(name, training_key)?
             .put(step, content)
@@ -45,7 +45,7 @@ impl Models {
         &self,
         name: &str,
         training_key: &str,
-    ) -> Result<Option<(u64, Bytes)>, DatasetError> {
+    ) -> Result<Option<(u64, Vec<Bytes>)>, DatasetError> {
         self.checkpoints_of(name, training_key)?.newest().await
     }
 

@@ -34,7 +34,7 @@ impl Models {
             let mut trainings: BTreeMap<String, Vec<ObjectMeta>> = BTreeMap::new();
             for checkpoint in self.checkpoints(&name).await? {
                 let training = trainings.entry(checkpoint.training_key).or_default();
-                training.push(checkpoint.object);
+                training.extend(checkpoint.objects);
             }
             for objects in trainings.into_values().filter(|all| all.iter().all(old)) {
                 for object in objects {

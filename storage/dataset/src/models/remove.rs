@@ -261,8 +261,9 @@ impl Models {
         }
         for checkpoint in self.checkpoints(name).await? {
             if all || checkpoint.training_key == note.training_key {
-                self.remove_one(&checkpoint.object.location, removed)
-                    .await?;
+                for object in &checkpoint.objects {
+                    self.remove_one(&object.location, removed).await?;
+                }
             }
         }
         let path = self.path(name, speed::FILE);

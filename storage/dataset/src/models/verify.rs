@@ -1,6 +1,9 @@
 //! Checking a model: manifest, each object's size and SHA-256, evaluations, checkpoints, and records of trials.
 
+use std::collections::BTreeSet;
+
 use object_store::ObjectMeta;
+use object_store::path::Path;
 
 use super::{
     Evaluation, MANIFEST, ModelManifest, Models, Rung, TrainingSpeed, TrialRecord, check_name,
@@ -88,9 +91,11 @@ impl Models {
                 fault,
             });
         }
-        for object in there {
+        let all: BTreeSet<Path> = there.iter().map(|object| object.location.clone()).collect();
+        for object in &there {
             if let Some(key) = key_below(&folder, &object.location) {
-                self.check_other(name, &key, &object, &mut check).await?;
+                self.check_other(name, &key, (object, &all), &mut check)
+                    .await?;
             }
         }
         check.problems.sort_by(|a, b| a.object.cmp(&b.object));
@@ -102,7 +107,7 @@ impl Models {
         &self,
         name: &str,
         key: &str,
-        object: &ObjectMeta,
+        (object, all): (&ObjectMeta, &BTreeSet<Path>),
         check: &mut ModelCheck,
     ) -> Result<(), DatasetError> {
         let at = self.shown(&object.location);
@@ -129,14 +134,24 @@ impl Models {
                     Err(error) => return Err(error),
                 }
             }
-            Some((checkpoints::FOLDER, _)) => {
-                check.checkpoints += 1;
-                let bytes = objects::require(&*self.store, &object.location).await?;
-                match checkpoints::whole(bytes) {
-                    Some(_) => None,
-                    None => bad("its content has not the checkpoint's checksum"),
+            Some((checkpoints::FOLDER, _)) => match checkpoints::place(object) {
+                None => Some(Fault::Foreign),
+                Some((key, step, true)) => {
+                    check.checkpoints += 1;
+                    match self.checkpoints_of(name, &key)?.read(step).await? {
+                        Some(_) => None,
+                        None => bad("its content has not the checkpoint's checksums"),
+                    }
                 }
-            }
+                // Checked with its head; without one, it is left over.
+                Some((key, step, false)) => {
+                    let head = self.checkpoints_of(name, &key)?.head(step);
+                    if !all.contains(&head) {
+                        check.unused.push(at.clone());
+                    }
+                    None
+                }
+            },
             // Of an evaluation or a training that goes on or was given up; who reads a damaged one makes it again.
             Some((super::shard::FOLDER | super::call::FOLDER, _)) => {
                 check.unused.push(at.clone());

@@ -23,6 +23,7 @@ use futures::{StreamExt, TryStreamExt, stream};
 use object_store::path::Path;
 use object_store::{Error, ObjectMeta, ObjectStoreExt};
 
+use crate::checkpoints;
 use crate::error::DatasetError;
 use crate::layout::manifest::Manifest;
 use crate::models::Models;
@@ -57,7 +58,9 @@ impl Orphan {
             Some(_) => "its scene has no manifest: left by a killed worker",
             None if name.starts_with(PROBE) => "left by a killed probe of the store",
             None if name.contains('#') => "unfinished file of a killed write",
-            None if name.ends_with(".ckpt") => "checkpoint of a training that nobody goes on with",
+            None if name.ends_with(".ckpt") || name.ends_with(checkpoints::PART) => {
+                "checkpoint of a training that nobody goes on with"
+            }
             None if !name.ends_with(".zst") => {
                 "its model has no manifest that names it: left by a killed worker"
             }

@@ -12,3 +12,9 @@ mod scene;
 pub mod tricky;
 
 pub use scene::*;
+
+/// A checkpoint of these pieces.
+pub fn pieces(all: &[&[u8]]) -> picofarm_dataset::Pieces {
+    let all: Vec<bytes::Bytes> = all.iter().map(|piece| piece.to_vec().into()).collect();
+    Box::new(all.into_iter())
+}

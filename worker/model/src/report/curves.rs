@@ -10,7 +10,7 @@ use super::{
 use crate::{
     input::{DEPTH_SCALE_M, Target},
     metric::Metrics,
-    train::Line,
+    train::{Line, epochs_at},
 };
 
 /// Charts of all tasks.
@@ -94,10 +94,7 @@ fn series(report: &Report, groups: &[&Group], value: &dyn Fn(&Line) -> f64) -> V
     for (style, group) in groups.iter().enumerate() {
         for model in &group.models {
             let entry = &report.models[*model];
-            let points = entry
-                .history
-                .iter()
-                .map(|line| (line.epoch as f64, value(line), 0.0));
+            let points = epochs_at(&entry.history).map(|(at, line)| (at, value(line), 0.0));
             out.push(Series {
                 label: entry.name.clone(),
                 style,

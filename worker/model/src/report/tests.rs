@@ -75,6 +75,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         multiply_adds: net.multiply_adds(32),
         history: vec![Line {
             epoch: 1,
+            within: false,
             step: 12,
             loss: 0.5,
             learning_rate: 1e-2,
@@ -114,6 +115,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
             ema: None,
             augment: true,
             early_stop: 0,
+            validate_every: 0,
             seed,
         },
     }

@@ -11,7 +11,7 @@ use super::{
     number::{digits, short},
     text::Safe,
 };
-use crate::train::Line;
+use crate::train::{Line, epochs_at};
 
 /// A sweep.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -253,10 +253,8 @@ fn curves(sweep: &Sweep) -> String {
     let lines = sweep.trials.iter().map(|trial| Series {
         label: format!("{} ({})", trial.model, trial.end.name()),
         style: trial.end.style(),
-        points: trial
-            .history
-            .iter()
-            .filter_map(|line| Some((line.epoch as f64, line.validation.as_ref()?.loss(), 0.0)))
+        points: epochs_at(&trial.history)
+            .filter_map(|(at, line)| Some((at, line.validation.as_ref()?.loss(), 0.0)))
             .collect(),
         joined: true,
         marks: trial.history.len() == 1,
@@ -371,6 +369,7 @@ mod tests {
     fn tried(index: u64, lr: f64, end: End, losses: &[f64]) -> Tried {
         let line = |(i, mae_m): (usize, &f64)| Line {
             epoch: i as u64 + 1,
+            within: false,
             step: i as u64 + 1,
             loss: *mae_m,
             learning_rate: lr,

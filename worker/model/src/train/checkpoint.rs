@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -17,7 +17,7 @@ use crate::{
     weights,
 };
 
-const FORMAT: &str = "picofarm-checkpoint-3";
+const FORMAT: &str = "picofarm-checkpoint-4";
 
 /// Before the names of kept values, and of averages.
 const KEPT: &str = "kept/";
@@ -33,53 +33,102 @@ pub(super) struct Header {
     pub(super) plan: String,
 }
 
-/// `kept` are the values after the epoch whose validation was the best, where those count at the end.
-pub(super) fn write(
-    learner: &Learner,
-    position: &Position,
-    kept: Option<&Parameters>,
-    plan: &str,
-) -> Vec<u8> {
-    let mut named = Named::new();
-    for (name, value) in learner.parameters.to_named() {
-        named.insert(format!("weights/{name}"), value);
-    }
-    for (name, value) in kept.into_iter().flat_map(Parameters::to_named) {
-        named.insert(format!("{KEPT}{name}"), value);
-    }
-    let average = learner.average.iter().flat_map(|a| a.values.to_named());
-    for (name, value) in average {
-        named.insert(format!("{AVERAGE}{name}"), value);
-    }
-    for (d, moments) in learner.net.declared().iter().zip(&learner.moments) {
-        if d.learned {
-            for (part, moment) in ["m", "v"].iter().zip(moments) {
-                let value = (d.shape.clone(), download(moment));
-                named.insert(format!("adamw.{part}/{}", d.name), value);
+/// What a training is between two steps. It shares its numbers with the training, which goes on meanwhile: whatever changes
+/// them in place makes a copy first.
+pub struct Snapshot {
+    header: String,
+    /// In the order of their names.
+    tensors: BTreeMap<String, (Vec<usize>, Tensor<1>)>,
+}
+
+impl Snapshot {
+    /// `kept` are the values at the best validation, where those count at the end.
+    pub(super) fn of(
+        learner: &Learner,
+        position: &Position,
+        kept: Option<&Parameters>,
+        plan: &str,
+    ) -> Self {
+        let mut tensors = BTreeMap::new();
+        let average = learner.average.as_ref().map(|average| &average.values);
+        let all = [
+            ("weights/", Some(&learner.parameters)),
+            (KEPT, kept),
+            (AVERAGE, average),
+        ];
+        for (part, values) in all {
+            let values = values.into_iter().flat_map(Parameters::named_values);
+            for (d, value) in values {
+                tensors.insert(
+                    format!("{part}{}", d.name),
+                    (d.shape.clone(), value.clone()),
+                );
             }
         }
+        for (d, moments) in learner.net.declared().iter().zip(&learner.moments) {
+            if d.learned {
+                for (part, moment) in ["m", "v"].iter().zip(moments) {
+                    let name = format!("adamw.{part}/{}", d.name);
+                    tensors.insert(name, (d.shape.clone(), moment.clone()));
+                }
+            }
+        }
+        let header = Header {
+            format: FORMAT.into(),
+            steps: learner.steps,
+            position: position.clone(),
+            plan: plan.into(),
+        };
+        let header = serde_json::to_string(&header).expect("plain data");
+        Self { header, tensors }
     }
-    let header = Header {
-        format: FORMAT.into(),
-        steps: learner.steps,
-        position: position.clone(),
-        plan: plan.into(),
-    };
-    let header = serde_json::to_string(&header).expect("plain data");
-    weights::write(&named, &BTreeMap::from([("checkpoint".into(), header)]))
+
+    /// The checkpoint as safetensors of at most `most` bytes each, but for a tensor that is larger, and their headers. The first
+    /// says where the training stands.
+    pub fn pieces(self, most: usize) -> impl Iterator<Item = Vec<u8>> + Send {
+        let mut tensors = self.tensors.into_iter().peekable();
+        let mut header = Some(self.header);
+        std::iter::from_fn(move || {
+            if header.is_none() && tensors.peek().is_none() {
+                return None;
+            }
+            let (mut named, mut bytes) = (Named::new(), 0_usize);
+            let size = |shape: &[usize]| 4 * shape.iter().product::<usize>();
+            while let Some((name, (shape, value))) = tensors
+                .next_if(|(_, (shape, _))| bytes == 0 || bytes.saturating_add(size(shape)) <= most)
+            {
+                bytes += size(&shape);
+                named.insert(name, (shape, download(&value)));
+            }
+            let metadata = header
+                .take()
+                .map(|header| ("checkpoint".to_owned(), header));
+            Some(weights::write(&named, &metadata.into_iter().collect()))
+        })
+    }
+}
+
+/// All tensors of a checkpoint's pieces, and its header.
+fn gathered(pieces: &[impl AsRef<[u8]>]) -> Result<(Named, Header), ModelError> {
+    let none = || ModelError::weights("these are no checkpoint of a training, only weights");
+    let (mut named, mut header) = (Named::new(), None);
+    for piece in pieces {
+        let (part, metadata) = weights::read(piece.as_ref())?;
+        named.extend(part);
+        header = header.or_else(|| metadata.get("checkpoint").cloned());
+    }
+    let header: Header = serde_json::from_str(&header.ok_or_else(none)?)
+        .map_err(|e| ModelError::weights(format!("the checkpoint's header: {e}")))?;
+    Ok((named, header))
 }
 
 /// Puts a learner where a checkpoint was made, and gives the values that were kept.
 pub(super) fn read(
-    bytes: &[u8],
+    pieces: &[impl AsRef<[u8]>],
     learner: &mut Learner,
     device: &Device,
 ) -> Result<(Header, Option<Parameters>), ModelError> {
-    let (mut named, metadata) = weights::read(bytes)?;
-    let none = || ModelError::weights("these are no checkpoint of a training, only weights");
-    let header = metadata.get("checkpoint").ok_or_else(none)?;
-    let header: Header = serde_json::from_str(header)
-        .map_err(|e| ModelError::weights(format!("the checkpoint's header: {e}")))?;
+    let (mut named, header) = gathered(pieces)?;
     if header.format != FORMAT {
         let what = format!(
             "the checkpoint has format {:?}, this program reads {FORMAT:?}",
@@ -127,12 +176,8 @@ pub(super) fn read(
 ///
 /// # Errors
 /// [`ModelError::Weights`] where it is no checkpoint.
-pub fn left_by(bytes: &[u8]) -> Result<(Vec<u8>, Vec<Line>), ModelError> {
-    let (named, metadata) = weights::read(bytes)?;
-    let none = || ModelError::weights("these are no checkpoint of a training, only weights");
-    let header = metadata.get("checkpoint").ok_or_else(none)?;
-    let header: Header = serde_json::from_str(header)
-        .map_err(|e| ModelError::weights(format!("the checkpoint's header: {e}")))?;
+pub fn left_by(pieces: &[impl AsRef<[u8]>]) -> Result<(Vec<u8>, Vec<Line>), ModelError> {
+    let (named, header) = gathered(pieces)?;
     let there = |part: &&str| named.keys().any(|name| name.starts_with(part));
     let part = [KEPT, AVERAGE]
         .into_iter()

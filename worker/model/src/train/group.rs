@@ -14,7 +14,7 @@ use std::ops::Range;
 use super::position::Line;
 use crate::ModelError;
 
-/// Where a training stands: steps done, epochs done. Two processes that stand at the same place have the same numbers.
+/// Where a training stands: steps done, lines of its history written. Two processes that stand at the same place have the same numbers.
 #[derive(
     Debug,
     Clone,
@@ -30,8 +30,8 @@ use crate::ModelError;
 pub struct Standing {
     /// Steps of the optimiser.
     pub step: u64,
-    /// Whole epochs: the last of an epoch's steps is done before the epoch is.
-    pub epoch: u64,
+    /// Lines of the history: a step that ends an epoch, or that a validation follows, is done before its line is.
+    pub lines: u64,
 }
 
 /// A training as a group sees it.
@@ -103,10 +103,10 @@ pub trait Group {
     /// As [`Self::agree`].
     fn sum(&mut self, step: u64, part: Part) -> Result<Option<Part>, ModelError>;
 
-    /// Tells the others how an epoch ended, by whoever leads; `digest` is of its numbers.
+    /// Tells the others the line of an epoch's end or of a validation, by whoever leads; `digest` is of its numbers.
     fn tell(&mut self, line: &Line, digest: u64);
 
-    /// How the leading process says that an epoch ended; `None` where it was lost.
+    /// The line that the leading process wrote; `None` where it was lost.
     ///
     /// # Errors
     /// [`ModelError::Group`] where the leading process has other numbers than those of `digest`; as [`Self::agree`].

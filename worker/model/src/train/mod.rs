@@ -12,11 +12,11 @@ mod schedule;
 
 use serde::{Deserialize, Serialize};
 
-pub use checkpoint::left_by;
+pub use checkpoint::{Snapshot, left_by};
 pub use learner::{Gradients, Learner, predict};
 pub use load::Loading;
 pub use picofarm_settings::Schedule;
-pub use position::{Line, Position};
+pub use position::{Line, Position, epochs_at};
 pub use run::{Control, Ended, Event, Sources, Trained, Training};
 pub use schedule::Pace;
 
@@ -55,8 +55,16 @@ pub struct Plan {
     pub augment: bool,
     /// Validations without improvement after which it ends; 0 = never.
     pub early_stop: u64,
+    /// Steps after which it is validated within an epoch too; 0 = at the end of each only.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub validate_every: u64,
     /// Of weights, order, spots and mirroring.
     pub seed: u64,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_zero(n: &u64) -> bool {
+    *n == 0
 }
 
 impl Plan {

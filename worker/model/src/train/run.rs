@@ -9,7 +9,8 @@ use std::{
 use burn::tensor::Device;
 
 use super::{
-    Plan, checkpoint,
+    Plan,
+    checkpoint::{self, Snapshot},
     group::{Group, Member, Next, Standing},
     learner::{Gradients, Learner},
     load::{Course, Loading, Making, Ready},
@@ -46,6 +47,8 @@ pub enum Event {
         /// Share of that time in which the network waited for data.
         data_wait_share: f64,
     },
+    /// It was validated within an epoch.
+    Validated(Line),
     /// An epoch is over.
     Epoch(Line),
 }
@@ -83,7 +86,7 @@ pub struct Training {
     plan: Plan,
     learner: Learner,
     position: Position,
-    /// With `early_stop`: the values after the epoch whose validation was the best.
+    /// With `early_stop`: the values at the best validation.
     kept: Option<Parameters>,
     sources: Sources,
     loading: Loading,
@@ -96,21 +99,24 @@ pub struct Training {
 pub struct Trained {
     /// Safetensors by PyTorch's names.
     pub weights: Vec<u8>,
-    /// A line for each epoch.
+    /// A line for each epoch, and for each validation within one.
     pub history: Vec<Line>,
-    /// It ended before its last epoch.
+    /// It ended before its last epoch did.
     pub stopped_early: bool,
-    /// The epoch, from 1, after which the network had these weights: with `early_stop` the one whose validation was the best,
-    /// else the last.
-    pub kept_epoch: u64,
+    /// The step after which the network had these weights: with `early_stop` the one whose validation was the best, else the
+    /// last.
+    pub kept_step: u64,
 }
 
 impl Trained {
-    /// The line of the epoch whose weights these are.
+    /// The line that says how good these weights are.
     pub fn kept(&self) -> Option<&Line> {
-        self.history
-            .iter()
-            .find(|line| line.epoch == self.kept_epoch)
+        self.history.iter().find(|line| line.step == self.kept_step)
+    }
+
+    /// Whole epochs.
+    pub fn epochs(&self) -> usize {
+        self.history.iter().filter(|line| !line.within).count()
     }
 }
 
@@ -155,13 +161,13 @@ impl Training {
         })
     }
 
-    /// A training where a checkpoint of the same plan was made.
+    /// A training where a checkpoint of the same plan was made, from its pieces in any order.
     ///
     /// # Errors
     /// [`ModelError::Weights`] for a checkpoint that is damaged or of another plan; those of [`Self::start`].
     pub fn resume(
         plan: Plan,
-        checkpoint: &[u8],
+        checkpoint: &[impl AsRef<[u8]>],
         sources: Sources,
         device: &Device,
     ) -> Result<Self, ModelError> {
@@ -191,14 +197,20 @@ impl Training {
         self
     }
 
-    /// The training as bytes, to go on from.
-    pub fn checkpoint(&self) -> Vec<u8> {
-        checkpoint::write(
+    /// The training as it is now, to be written while it goes on.
+    pub fn snapshot(&self) -> Snapshot {
+        Snapshot::of(
             &self.learner,
             &self.position,
             self.kept.as_ref(),
             &self.plan.text(),
         )
+    }
+
+    /// The training as bytes, to go on from.
+    pub fn checkpoint(&self) -> Vec<u8> {
+        let mut pieces = self.snapshot().pieces(usize::MAX);
+        pieces.next().expect("there is a first piece")
     }
 
     /// Where it stands.
@@ -297,11 +309,11 @@ impl Training {
         say: &mut dyn FnMut(&Self, &Event) -> Control,
     ) -> Result<Option<Ended>, ModelError> {
         let mut clock = Clock::new();
-        let (of, per_epoch) = (self.steps(), self.plan.batches(self.sources.train.len()));
+        let of = self.steps();
         let batches = self.plan.accumulate;
         while !self.is_over() {
             let mut events = Vec::new();
-            if self.position.batches < per_epoch {
+            if !self.line_is_due() {
                 if let Some(group) = group.as_deref_mut()
                     && !group.go_on()?
                 {
@@ -339,12 +351,15 @@ impl Training {
                     data_wait_share: clock.share(),
                 });
             }
-            if self.position.batches == per_epoch {
+            if self.line_is_due() {
                 let since = Instant::now();
-                let Some(line) = self.end_epoch(group.as_deref_mut())? else {
+                let Some(line) = self.write_line(group.as_deref_mut())? else {
                     return Ok(None);
                 };
-                events.push(Event::Epoch(line));
+                events.push(match line.within {
+                    true => Event::Validated(line),
+                    false => Event::Epoch(line),
+                });
                 clock.began += since.elapsed();
             }
             for event in &events {
@@ -365,8 +380,20 @@ impl Training {
         self.position.epoch == self.plan.epochs || self.position.stopped_early
     }
 
+    fn ends_epoch(&self) -> bool {
+        self.position.batches == self.plan.batches(self.sources.train.len())
+    }
+
+    /// Whether an epoch has just ended, or a validation within it is due.
+    fn line_is_due(&self) -> bool {
+        let (step, every) = (self.learner.steps(), self.plan.validate_every);
+        let validate =
+            every > 0 && step.is_multiple_of(every) && !self.sources.validation.is_empty();
+        self.ends_epoch() || (validate && self.position.steps > 0)
+    }
+
     /// Validates where this process leads, and hears it from the one that does where not; `None` where that was lost.
-    fn end_epoch(
+    fn write_line(
         &mut self,
         group: Option<&mut (dyn Group + '_)>,
     ) -> Result<Option<Line>, ModelError> {
@@ -389,15 +416,17 @@ impl Training {
         let position = &mut self.position;
         position.history.push(line);
         (position.losses, position.steps) = (0.0, 0);
-        position.epoch += 1;
-        position.batches = 0;
+        if !line.within {
+            position.epoch += 1;
+            position.batches = 0;
+        }
         if let Some(loss) = validation.map(|m| m.loss()) {
             // A loss that is no number is never the best.
             if loss.is_finite() && position.best.is_none_or(|best| loss < best) {
                 position.best = Some(loss);
                 position.since_best = 0;
                 if self.plan.early_stop > 0 {
-                    position.kept_epoch = position.epoch;
+                    position.kept_step = line.step;
                     self.kept = Some(self.learner.kept().clone());
                 }
             } else {
@@ -409,7 +438,7 @@ impl Training {
         Ok(Some(line))
     }
 
-    /// The epoch whose steps are done, with figures on the validation scenes.
+    /// The line of where it stands, with figures on the validation scenes.
     fn line(&self) -> Result<Line, ModelError> {
         let validation = match self.sources.validation.is_empty() {
             true => None,
@@ -418,6 +447,7 @@ impl Training {
         let (position, step) = (&self.position, self.learner.steps());
         Ok(Line {
             epoch: position.epoch + 1,
+            within: !self.ends_epoch(),
             step,
             loss: position.losses / position.steps as f64,
             learning_rate: self.pace(step - 1).learning_rate,
@@ -469,12 +499,12 @@ impl Training {
     pub fn finish(self) -> Trained {
         let parameters = self.kept.as_ref().unwrap_or(self.learner.kept());
         let named = weights::to_torch(parameters.to_named());
-        let kept_epoch = match self.kept {
-            Some(_) => self.position.kept_epoch,
-            None => self.position.epoch,
+        let kept_step = match self.kept {
+            Some(_) => self.position.kept_step,
+            None => self.learner.steps(),
         };
         Trained {
-            kept_epoch,
+            kept_step,
             weights: weights::write(&named, &[(PLAN.to_owned(), self.plan.text())].into()),
             history: self.position.history,
             stopped_early: self.position.stopped_early,
@@ -493,7 +523,7 @@ impl Member for Training {
     fn standing(&self) -> Standing {
         Standing {
             step: self.learner.steps(),
-            epoch: self.position.epoch,
+            lines: self.position.history.len() as u64,
         }
     }
 
@@ -506,7 +536,7 @@ impl Member for Training {
     }
 
     fn become_state(&mut self, state: &[u8]) -> Result<(), ModelError> {
-        let (position, kept) = restored(&self.plan, state, &mut self.learner, &self.device)?;
+        let (position, kept) = restored(&self.plan, &[state], &mut self.learner, &self.device)?;
         (self.position, self.kept) = (position, kept);
         Ok(())
     }
@@ -515,7 +545,7 @@ impl Member for Training {
 /// Puts a learner where a checkpoint of the same plan was made; its position, and what is kept.
 fn restored(
     plan: &Plan,
-    checkpoint: &[u8],
+    checkpoint: &[impl AsRef<[u8]>],
     learner: &mut Learner,
     device: &Device,
 ) -> Result<(Position, Option<Parameters>), ModelError> {

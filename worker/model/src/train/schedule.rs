@@ -137,6 +137,7 @@ mod tests {
             ema: None,
             augment: false,
             early_stop: 0,
+            validate_every: 0,
             seed: 0,
         }
     }

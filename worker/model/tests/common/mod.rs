@@ -95,6 +95,7 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
         ema: None,
         augment: true,
         early_stop: 0,
+        validate_every: 0,
         seed: 5,
     }
 }

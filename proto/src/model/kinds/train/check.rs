@@ -98,8 +98,8 @@ impl TrainSettings {
         within(
             "train.checkpoint_minutes",
             minutes,
-            (0.01, 10_000.0),
-            "minutes",
+            (0.0, 10_000.0),
+            "minutes; 0 is after each step",
         )
     }
 }
@@ -201,6 +201,13 @@ impl OptimiseSettings {
                 0,
                 1_000_000,
                 "validations; 0 is never",
+            ),
+            (
+                "validate_every",
+                self.validate_every,
+                0,
+                1_000_000_000,
+                "steps; 0 is at the end of each epoch only",
             ),
         ];
         for (field, value, low, high, unit) in limits {

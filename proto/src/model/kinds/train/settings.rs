@@ -64,7 +64,8 @@ pub struct TrainSettings {
     /// batch. They come and go as workers do, and the result is the same to the bit however many there are. Default 1.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub processes: u32,
-    /// Minutes between checkpoints: as much is lost at most when a worker dies. Changes no result.
+    /// Minutes between checkpoints: as much is lost at most when a worker dies, and what one takes to be written. 0 = after each
+    /// step, and the next waits for it: no more than one step is lost. Changes no result.
     #[serde(default = "ten")]
     pub checkpoint_minutes: f64,
     /// What makes it a trial of a sweep; written by `[stage.sweep]`, not by hand.
@@ -173,8 +174,11 @@ pub struct OptimiseSettings {
     /// at step t no more than (1 + t)/(10 + t). 0 = none.
     #[serde(skip_serializing_if = "is_zero_f64")]
     pub ema: f64,
-    /// Stop after so many validations (one an epoch) without improvement; 0 = never.
+    /// Stop after so many validations without improvement; 0 = never.
     pub early_stop: u32,
+    /// Steps after which it is validated within an epoch too, counted from the beginning; 0 = at the end of each epoch only.
+    #[serde(skip_serializing_if = "is_zero_u32")]
+    pub validate_every: u32,
 }
 
 /// The cycles of `schedule = "restarts"`.
@@ -233,6 +237,7 @@ impl Default for OptimiseSettings {
             clip_norm: 0.0,
             ema: 0.0,
             early_stop: 0,
+            validate_every: 0,
         }
     }
 }

@@ -1,16 +1,19 @@
 //! Saves what long tasks have reached.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use bytes::Bytes;
-use picofarm_dataset::{Checkpoints, DatasetError};
+use picofarm_dataset::{Checkpoints, DatasetError, Pieces};
 use tokio::task::JoinHandle;
-use tracing::warn;
+use tracing::{debug, warn};
 
 use crate::execute::output::Stores;
 
 /// How long a task that shall stop may take to save what it has reached.
 const LAST_SAVE: Duration = Duration::from_secs(240);
+
+/// Bytes of a piece of a checkpoint: a few are written and read at once, and one is a request.
+#[cfg(feature = "networks")]
+pub(super) const PIECE: usize = 64 << 20;
 
 /// Saves checkpoints while the task goes on, one at a time.
 pub(super) struct Saver<'a> {
@@ -28,10 +31,26 @@ impl<'a> Saver<'a> {
         }
     }
 
-    pub(super) fn save(&mut self, step: u64, content: Bytes) {
+    /// Whether the checkpoint before is still on its way.
+    pub(super) fn is_busy(&self) -> bool {
+        self.under_way
+            .as_ref()
+            .is_some_and(|task| !task.is_finished())
+    }
+
+    /// Begins to save, after the checkpoint before.
+    pub(super) fn save(&mut self, step: u64, content: Pieces) {
         self.last();
         let checkpoints = self.checkpoints.clone();
-        let put = async move { checkpoints.put(step, content).await };
+        let put = async move {
+            let begun = Instant::now();
+            checkpoints.put(step, content).await?;
+            debug!(
+                "the checkpoint after {step} steps was written in {:.2} s",
+                begun.elapsed().as_secs_f64()
+            );
+            Ok(())
+        };
         self.under_way = Some(self.stores.runtime().spawn(put));
     }
 

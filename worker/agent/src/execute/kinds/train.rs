@@ -9,6 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use bytes::Bytes;
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Lineage, Measurement, ModelManifest, Models, NewModel,
     Pinned, Published, TrainingSpeed, TrialEnd,
@@ -27,7 +28,7 @@ use picofarm_proto::{
     },
 };
 use picofarm_transient::sensor::SENSOR_VERSION;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 
 mod along;
 mod board;
@@ -38,7 +39,7 @@ mod results;
 mod trial;
 mod verdict;
 
-use super::saver::Saver;
+use super::saver::{PIECE, Saver};
 use along::{Reporter, loading};
 use board::Board;
 pub use imported::{ImportFor, imported};
@@ -376,9 +377,14 @@ impl<'a> TrainingRun<'a> {
                     if control.stopped() {
                         return picofarm_model::train::Control::Stop;
                     }
-                    if saved.elapsed() >= every && training.leads() {
-                        saver.save(training.learner().steps(), training.checkpoint().into());
+                    if training.leads() && saved.elapsed() >= every && !saver.is_busy() {
                         saved = Instant::now();
+                        save(&mut saver, training);
+                        if every.is_zero() {
+                            // Not a step more than this one may be lost.
+                            saver.last();
+                        }
+                        debug!("a checkpoint held the training for {:?}", saved.elapsed());
                     }
                     picofarm_model::train::Control::Continue
                 };
@@ -418,7 +424,7 @@ impl<'a> TrainingRun<'a> {
             }
             Ok(Ended::Stopped) => {
                 if training.leads() {
-                    saver.save(training.learner().steps(), training.checkpoint().into());
+                    save(&mut saver, &training);
                 }
                 saver.last();
                 // Where the store was away at a rung, the trial goes on from there.
@@ -426,6 +432,12 @@ impl<'a> TrainingRun<'a> {
             }
         }
     }
+}
+
+/// Saves what a training is now, while it goes on.
+fn save(saver: &mut Saver<'_>, training: &Training) {
+    let pieces = training.snapshot().pieces(PIECE).map(Bytes::from);
+    saver.save(training.learner().steps(), Box::new(pieces));
 }
 
 /// How a training came to its end here.

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use picofarm_dataset::{Checkpoints, ReconstructionManifest, Reconstructions};
+use picofarm_dataset::{Checkpoints, Pieces, ReconstructionManifest, Reconstructions};
 use picofarm_platonerf::{MlpSettings, Settings as Networks, Training, grid};
 use picofarm_proto::model::kinds::{ReconstructTask, TaskKind};
 use picofarm_reconstruct::{Measured, Reconstructed, Reconstruction, Settings};
@@ -29,7 +29,7 @@ pub fn fit(
     let networks = Networks::of(asked, &start, settings.seed);
     let newest = stores.wait(watch.0, checkpoints.newest())?;
     let resumed = newest.and_then(|(step, content)| {
-        match Training::resume(measured.clone(), networks, &content) {
+        match Training::resume(measured.clone(), networks, &content.concat()) {
             Ok(training) => {
                 info!("goes on from the checkpoint after {step} steps");
                 Some(training)
@@ -48,17 +48,22 @@ pub fn fit(
     let mut saved = Instant::now();
     let finished = training.run_with(watch, &mut |training| {
         if saved.elapsed() >= EVERY {
-            saver.save(training.step(), training.checkpoint().into());
+            saver.save(training.step(), whole(training));
             saved = Instant::now();
         }
     });
     if !finished.map_err(of_reconstruction)? {
-        saver.save(training.step(), training.checkpoint().into());
+        saver.save(training.step(), whole(&training));
         saver.last();
         return Err(TaskError::Stopped);
     }
     saver.last();
     Ok(training.finish(start))
+}
+
+/// A checkpoint, which is small, in one piece.
+fn whole(training: &Training) -> Pieces {
+    Box::new(std::iter::once(training.checkpoint().into()))
 }
 
 /// Deletes the checkpoints of a task that has published its reconstruction.

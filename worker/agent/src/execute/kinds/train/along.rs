@@ -55,6 +55,12 @@ impl<'a> Reporter<'a> {
         self.pace
     }
 
+    fn validated(&mut self, line: &Line) {
+        self.validation = line
+            .validation
+            .map(|found| ("validation_loss", found.loss()));
+    }
+
     pub(super) fn hear(&mut self, event: &Event) {
         match event {
             Event::Step {
@@ -84,10 +90,9 @@ impl<'a> Reporter<'a> {
                     figures.into_iter().chain(self.validation).collect();
                 self.control.say(text, &figures);
             }
+            Event::Validated(line) => self.validated(line),
             Event::Epoch(line) => {
-                self.validation = line
-                    .validation
-                    .map(|found| ("validation_loss", found.loss()));
+                self.validated(line);
                 // All of few epochs, every so many of many, and the last.
                 let between = u64::from(self.epochs.div_ceil(LINES));
                 if line.epoch >= self.reported + between || line.epoch == u64::from(self.epochs) {

@@ -94,6 +94,7 @@ pub(super) fn plan(
         ema: some(optimise.ema),
         augment: settings.augment,
         early_stop: optimise.early_stop.into(),
+        validate_every: optimise.validate_every.into(),
         seed: settings.seed,
     })
 }

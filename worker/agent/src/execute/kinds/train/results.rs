@@ -8,14 +8,15 @@ use crate::execute::Output;
 
 /// Name of the object that holds a model's weights.
 pub(in crate::execute) const WEIGHTS: &str = "weights.safetensors";
-/// How good a trained network is, and how it came to that: figures of the epoch whose weights are kept.
+/// How good a trained network is, and how it came to that: figures of when its weights were kept.
 pub(super) fn metrics(trained: &Trained) -> Value {
     let (last, kept) = (trained.history.last(), trained.kept());
     let mut metrics = json!({
-        "epochs": trained.history.len(),
+        "epochs": trained.epochs(),
         "steps": last.map(|line| line.step),
         "stopped_early": trained.stopped_early,
-        "kept_epoch": trained.kept_epoch,
+        "kept_step": trained.kept_step,
+        "kept_epoch": kept.map(|line| line.epoch),
         "loss": kept.map(|line| line.loss),
     });
     metrics["validation"] = json!(kept.and_then(|line| line.validation));
@@ -35,13 +36,13 @@ pub(super) fn measurement(spec: &DatasetSpec, spots: u32, scene: &Manifest) -> M
     }
 }
 
-/// A line of JSON for each epoch.
+/// A line of JSON for each epoch, and for each validation within one.
 pub(super) fn lines(history: &[Line]) -> Vec<u8> {
     let line = |line: &Line| serde_json::to_string(line).expect("figures are plain data") + "\n";
     history.iter().map(line).collect::<String>().into_bytes()
 }
 
-/// The epochs of `history.jsonl`.
+/// The lines of `history.jsonl`.
 pub(super) fn lines_of(history: &[u8]) -> Result<Vec<Line>, String> {
     let text = String::from_utf8_lossy(history);
     let lines = text.lines().map(serde_json::from_str);
