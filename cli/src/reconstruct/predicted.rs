@@ -221,6 +221,7 @@ fn seen(scene: &Scene, rendered: &Rendered) -> scene::Scene {
         first_m: rendered.gate.start_m,
         bin_width_m: rendered.gate.bin_width_m,
         histogram: rendered.transient.clone(),
+        order: scene::Order::Pixels,
         depth_m: vec![f32::INFINITY; pixels],
         specular: vec![0; pixels],
         lit: vec![0; pixels * rendered.spots.len()],

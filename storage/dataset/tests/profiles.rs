@@ -131,6 +131,17 @@ async fn any_part_equals_the_same_part_of_the_whole() {
             .await
             .unwrap();
         assert_eq!(again, whole);
+        let mut planes = vec![f32::NAN; 3];
+        dataset
+            .read_planes_into(0, Quantity::Transient, &mut planes)
+            .await
+            .unwrap();
+        let pixels = 36 * 40;
+        let of_pixel = |i: usize| planes[i % 300 * pixels + i / 300];
+        assert!(
+            (0..whole.len()).map(of_pixel).eq(whole.iter().copied()),
+            "{profile}"
+        );
         let error = dataset.read_transient_part(0, 0..1, 0..1, 300..301).await;
         assert!(error.unwrap_err().to_string().starts_with("bins: expected"));
     }

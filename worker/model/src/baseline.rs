@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     ModelError,
     input::{DEPTH_SCALE_M, Target},
-    scene::{Scene, Scenes},
+    scene::{Order, Scene, Scenes},
 };
 
 /// Answers without a network, fitted to training scenes.
@@ -218,19 +218,38 @@ fn known(z: f32) -> f32 {
 /// Path length of each pixel's greatest bin times the cosine of its angle to the optical axis, metres.
 fn peaks(scene: &Scene) -> Vec<f64> {
     let [fx, fy, cx, cy] = scene.intrinsics;
-    let pixels = scene.histogram.chunks_exact(scene.bins).enumerate();
-    pixels
-        .map(|(i, h)| {
-            let mut peak = 0;
-            for (b, value) in h.iter().enumerate() {
-                if *value > h[peak] {
-                    peak = b;
-                }
-            }
+    brightest(scene)
+        .into_iter()
+        .enumerate()
+        .map(|(i, peak)| {
             let path = scene.first_m + (peak as f64 + 0.5) * scene.bin_width_m;
             let x = ((i % scene.width) as f64 + 0.5 - cx) / fx;
             let y = ((i / scene.width) as f64 + 0.5 - cy) / fy;
             path / (x * x + y * y + 1.0).sqrt()
         })
         .collect()
+}
+
+/// Each pixel's greatest bin, the first of several.
+fn brightest(scene: &Scene) -> Vec<usize> {
+    match scene.order {
+        Order::Pixels => {
+            let of =
+                |h: &[f32]| (1..h.len()).fold(0, |peak, b| if h[b] > h[peak] { b } else { peak });
+            scene.histogram.chunks_exact(scene.bins).map(of).collect()
+        }
+        Order::Bins => {
+            let mut planes = scene.histogram.chunks_exact(scene.pixels());
+            let mut most = planes.next().map_or_else(Vec::new, <[f32]>::to_vec);
+            let mut peaks = vec![0; most.len()];
+            for (b, plane) in planes.enumerate() {
+                for ((h, most), peak) in plane.iter().zip(&mut most).zip(&mut peaks) {
+                    if *h > *most {
+                        (*most, *peak) = (*h, b + 1);
+                    }
+                }
+            }
+            peaks
+        }
+    }
 }

@@ -2,6 +2,16 @@
 
 use std::{error::Error, sync::Arc};
 
+/// How a histogram's values follow each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Order {
+    /// `[row][column][bin]`: histogram by histogram.
+    #[default]
+    Pixels,
+    /// `[bin][row][column]`: an image for each bin, as networks take them.
+    Bins,
+}
+
 /// A scene. Images are row by row, from the top left.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Scene {
@@ -15,8 +25,10 @@ pub struct Scene {
     pub first_m: f64,
     /// Width of a bin, metres of path.
     pub bin_width_m: f64,
-    /// h: `[row][column][bin]`.
+    /// h, in [`Self::order`].
     pub histogram: Vec<f32>,
+    /// How its values follow each other.
+    pub order: Order,
     /// z-depth, metres: `[row][column]`.
     pub depth_m: Vec<f32>,
     /// z-depth that two-bounce times follow from where that is not the truth but a network's, metres: `[row][column]`.
@@ -35,11 +47,12 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The same with another histogram of as many bins.
+    /// The same with another histogram of as many bins, in [`Order::Pixels`].
     #[must_use]
     pub fn showing(&self, histogram: Vec<f32>) -> Self {
         Self {
             histogram,
+            order: Order::Pixels,
             depth_m: self.depth_m.clone(),
             seen_depth_m: self.seen_depth_m.clone(),
             specular: self.specular.clone(),
@@ -66,6 +79,9 @@ pub trait Scenes: Send + Sync {
     /// # Errors
     /// Whatever keeps it from being read.
     fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable>;
+
+    /// Takes back what nobody needs any more: the room of its histogram may serve for the next.
+    fn take_back(&self, _scene: Arc<Scene>) {}
 
     /// One of them as the `visit`th visit of a training sees it, counted over all epochs: what is drawn at random is drawn anew
     /// at each. Always the same where nothing is.

@@ -323,6 +323,67 @@ fn an_empty_scene_gives_nothing_but_dark_counts() {
 }
 
 #[test]
+fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
+    use picofarm_transient::sensor::{sense, sense_again};
+    let h = |p: usize, b: usize| {
+        if b > 3 {
+            1.0 / (1.0 + (p * 7 + b * 3) as f32 % 13.0)
+        } else {
+            0.0
+        }
+    };
+    let values: Vec<f32> = (0..40 * 24).map(|i| h(i / 24, i % 24)).collect();
+    let seen = Histograms {
+        transient: &values,
+        two_bounce: None,
+        bins: 24,
+        bin_width_ps: 128.0,
+    };
+    let compat = Jitter::Sb3dCompat { sigma_bins: 1.5 };
+    let range = Scale::PeakRange {
+        low: 100.0,
+        high: 900.0,
+    };
+    for (sensor, known) in [
+        (Sensor::default(), true),
+        (
+            Sensor {
+                scale: range,
+                ..Sensor::default()
+            },
+            true,
+        ),
+        // The pulse is shifted by another draw each time.
+        (
+            Sensor {
+                jitter: compat,
+                scale: range,
+                ..Sensor::default()
+            },
+            false,
+        ),
+        (
+            Sensor {
+                scale: Scale::Fixed {
+                    photons_per_unit: 50.0,
+                },
+                ..Sensor::default()
+            },
+            false,
+        ),
+    ] {
+        let first = sense(&sensor, &seen, 1, 4).unwrap();
+        assert_eq!(first.peak.is_some(), known, "{sensor:?}");
+        for seed in 2..6 {
+            let plain = sense(&sensor, &seen, seed, 4).unwrap();
+            let again = sense_again(&sensor, &seen, seed, 4, first.peak).unwrap();
+            assert_eq!(plain, again, "{sensor:?}");
+            assert_ne!(plain.values, first.values);
+        }
+    }
+}
+
+#[test]
 fn the_peak_of_the_median_pixel_is_what_was_asked_for() {
     let bins = 100;
     let h = transients(51, bins);

@@ -12,6 +12,10 @@ use std::{
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, open_store,
 };
+use picofarm_model::{
+    input::{Normalise, planes},
+    scene::{Order, Scene},
+};
 use serde::Serialize;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -65,9 +69,21 @@ pub struct Fetched {
     pub requests: f64,
 }
 
+/// What a loader makes of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Into {
+    /// Its histogram, in a buffer of the thread.
+    Histogram,
+    /// Its share of a network's batch: bins as images, scaled, in fresh memory.
+    Input,
+}
+
 /// Several readers at once, as in a training's loader: each with a thread of its own.
 #[derive(Debug, Serialize)]
 pub struct Loader {
+    /// What a scene is made into.
+    pub into: Into,
     pub threads: usize,
     pub scenes_per_s: f64,
     pub cpu_s_a_scene: f64,
@@ -119,7 +135,9 @@ pub fn measure(
     let mut loaders = Vec::new();
     for threads in threads {
         stopped(stop)?;
-        loaders.push(loader(&dataset, samples.len(), *threads, runtime)?);
+        for into in [Into::Histogram, Into::Input] {
+            loaders.push(loader(&dataset, samples.len(), (*threads, into), runtime)?);
+        }
     }
     Ok(Reading {
         profile: Profile::default().to_string(),
@@ -246,22 +264,35 @@ async fn fetched(spec: &DatasetSpec, folder: &Path) -> Result<(Crop, Fetched), D
 fn loader(
     dataset: &Dataset,
     scenes: usize,
-    threads: usize,
+    (threads, into): (usize, Into),
     runtime: &tokio::runtime::Handle,
 ) -> Result<Loader> {
     let pools = (0..threads).map(|_| pool(1)).collect::<Result<Vec<_>>>()?;
     let next = AtomicUsize::new(0);
     let total = READS * threads;
     let one = |pool: &rayon::ThreadPool| -> Result<(), DatasetError> {
-        let mut buffer = Vec::new();
+        let (mut buffer, mut scaled) = (Vec::new(), Vec::new());
         loop {
             let i = next.fetch_add(1, Ordering::Relaxed);
             if i >= total {
                 return Ok(());
             }
             let scene = (i % scenes) as u64;
-            let read = dataset.read_histogram_into(scene, Quantity::Transient, &mut buffer);
-            pool.install(|| runtime.block_on(read))?;
+            match into {
+                Into::Histogram => {
+                    let read = dataset.read_histogram_into(scene, Quantity::Transient, &mut buffer);
+                    pool.install(|| runtime.block_on(read))?;
+                }
+                Into::Input => {
+                    let read = dataset.read_planes_into(scene, Quantity::Transient, &mut buffer);
+                    pool.install(|| runtime.block_on(read))?;
+                    let seen = seen(dataset.spec(), std::mem::take(&mut buffer));
+                    scaled.resize(seen.histogram.len(), 0.0);
+                    planes(&seen, seen.bins, Normalise::MinMax, &mut scaled);
+                    buffer = seen.histogram;
+                    drop(std::hint::black_box(scaled.clone()));
+                }
+            }
         }
     };
     let start = Instant::now();
@@ -280,9 +311,22 @@ fn loader(
     }
     let cpu_s_a_scene = cpu_s / total as f64;
     Ok(Loader {
+        into,
         threads,
         scenes_per_s: total as f64 / seconds,
         cpu_s_a_scene,
         cores_for_training: TRAINING * cpu_s_a_scene,
     })
+}
+
+/// A scene of which a network sees h, `[bin][row][column]`, and nothing else.
+fn seen(spec: &DatasetSpec, h: Vec<f32>) -> Scene {
+    Scene {
+        height: spec.height as usize,
+        width: spec.width as usize,
+        bins: spec.gate.bins as usize,
+        histogram: h,
+        order: Order::Bins,
+        ..Scene::default()
+    }
 }

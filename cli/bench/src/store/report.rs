@@ -3,7 +3,7 @@
 use super::{
     Report, Row,
     method::Kind,
-    reading::{Fetched, Reading, TRAINING},
+    reading::{Fetched, Into, Reading, TRAINING},
 };
 use picofarm_cli::output::table;
 
@@ -121,7 +121,11 @@ fn read(reading: &Reading) -> String {
     for l in &reading.loaders {
         rows.push(vec![
             format!(
-                "loader, {} thread{}",
+                "loader of {}, {} thread{}",
+                match l.into {
+                    Into::Histogram => "histograms",
+                    Into::Input => "a network's input",
+                },
                 l.threads,
                 if l.threads == 1 { "" } else { "s" }
             ),

@@ -99,6 +99,11 @@ impl Tiles {
         self.side[2]
     }
 
+    /// The tiles of one range of bins.
+    pub fn of_slab(&self, slab: usize) -> impl Iterator<Item = usize> + use<> {
+        (slab..self.count()).step_by(self.grid[2])
+    }
+
     /// Whether the tile has values of the part.
     pub fn touches(&self, tile: usize, part: &Part) -> bool {
         let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
@@ -158,6 +163,25 @@ impl Tiles {
         };
         matrix.transpose(0..pixels, 0..self.side[2], &mut stored, pixels);
         stored
+    }
+
+    /// What a tile stores of a run at one of its bins, from the tile's first: pixel by pixel. `scratch` holds it where it lies
+    /// otherwise.
+    pub fn of_bin<'a, T: bytemuck::Pod>(
+        &self,
+        stored: &'a [T],
+        run: &Run,
+        bin: usize,
+        scratch: &'a mut Vec<T>,
+    ) -> &'a [T] {
+        if self.bins_first {
+            let at = bin * self.side[0] * self.side[1] + run.tile;
+            return &stored[at..at + run.columns];
+        }
+        let of_pixel = |k| stored[(run.tile + k) * self.side[2] + bin];
+        scratch.clear();
+        scratch.extend((0..run.columns).map(of_pixel));
+        scratch
     }
 
     /// Some bins of some columns of a run, histogram by histogram, out of a tile as it is stored.

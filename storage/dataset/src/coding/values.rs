@@ -212,6 +212,64 @@ impl<'a> Decoder<'a> {
         }
     }
 
+    /// The same as images of `pixels` pixels, one for each of the tile's bins, of which `target` holds all.
+    pub fn decode_planes(
+        &mut self,
+        tile: usize,
+        raw: &[u8],
+        pixels: usize,
+        target: &mut [f32],
+    ) -> bool {
+        match self.profile {
+            Profile::SqrtU16 { delta } => {
+                let code = SquareRoot::new(delta, self.scale);
+                let mut codes = std::mem::take(&mut self.codes);
+                let decode = |q: &[u16], h: &mut [f32]| code.decode_run(q, h);
+                let saturated = self.planes(tile, &values(raw), &mut codes, pixels, target, decode);
+                self.codes = codes;
+                saturated
+            }
+            Profile::CountsU16 => {
+                let scale = self.scale;
+                let mut codes = std::mem::take(&mut self.codes);
+                let decode = |q: &[u16], h: &mut [f32]| counts::decode_run(scale, q, h);
+                let saturated = self.planes(tile, &values(raw), &mut codes, pixels, target, decode);
+                self.codes = codes;
+                saturated
+            }
+            Profile::PlainF32 { .. } => {
+                let mut floats = std::mem::take(&mut self.floats);
+                let copy = |from: &[f32], h: &mut [f32]| {
+                    h.copy_from_slice(from);
+                    false
+                };
+                self.planes(tile, &values(raw), &mut floats, pixels, target, copy);
+                self.floats = floats;
+                false
+            }
+        }
+    }
+
+    fn planes<T: bytemuck::Pod>(
+        &self,
+        tile: usize,
+        stored: &[T],
+        scratch: &mut Vec<T>,
+        pixels: usize,
+        target: &mut [f32],
+        decode: impl Fn(&[T], &mut [f32]) -> bool,
+    ) -> bool {
+        let mut saturated = false;
+        let runs: Vec<Run> = self.tiles.runs(tile).collect();
+        for (bin, plane) in target.chunks_exact_mut(pixels).enumerate() {
+            for run in &runs {
+                let from = self.tiles.of_bin(stored, run, bin, scratch);
+                saturated |= decode(from, &mut plane[run.pixel..run.pixel + run.columns]);
+            }
+        }
+        saturated
+    }
+
     fn runs<T: bytemuck::Pod>(
         &self,
         tile: usize,

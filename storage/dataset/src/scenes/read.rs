@@ -112,6 +112,34 @@ impl Dataset {
             .map_err(|e| e.in_object(|| self.shown(&path)))
     }
 
+    /// h of a scene as images, one for each bin: `[bin][row][column]`, as networks take it. Bins lie so in what is stored, too:
+    /// nothing changes places on the way. `target` is treated as in [`Self::read_histogram_into`].
+    ///
+    /// # Errors
+    /// Those of [`Self::read_histogram`]; [`DatasetError::Invalid`] for a transient of several images, such as
+    /// [`Quantity::TransientSpots`].
+    pub async fn read_planes_into(
+        &self,
+        scene: u64,
+        quantity: Quantity,
+        target: &mut Vec<f32>,
+    ) -> Result<(), DatasetError> {
+        let array = self.array_of(quantity)?;
+        if !quantity.is_transient() || array.layout.planes() != 1 {
+            let what = format!("{} is no single transient", quantity.name());
+            return Err(DatasetError::invalid("quantity", what));
+        }
+        let manifest = self.manifest(scene).await?;
+        let path = self.path(&array.layout.key(scene));
+        let bytes = objects::require(&*self.store, &path).await?;
+        let len = self.spec.transient_len();
+        if target.len() != len {
+            *target = vec![0.0; len];
+        }
+        self.decode_planes_into(&manifest, array, &bytes, target)
+            .map_err(|e| e.in_object(|| self.shown(&path)))
+    }
+
     /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
     /// training loops; a scene that cannot be read gives its error and the next one follows.
     ///

@@ -117,6 +117,18 @@ impl Dataset {
         self.complete(manifest, whole)
     }
 
+    /// The same as images, one for each bin: `[bin][row][column]`.
+    pub(crate) fn decode_planes_into(
+        &self,
+        manifest: &Manifest,
+        array: &ArrayCodec,
+        bytes: &Bytes,
+        target: &mut [f32],
+    ) -> Result<(), DatasetError> {
+        let whole = self.decoding(manifest, array).planes(bytes, target)?;
+        self.complete(manifest, whole)
+    }
+
     fn decoding<'a>(&'a self, manifest: &'a Manifest, array: &'a ArrayCodec) -> Decoding<'a> {
         Decoding {
             spec: &self.spec,
@@ -153,20 +165,56 @@ impl Decoding<'_> {
     /// A whole transient from the bytes of its shard, into a target of its size, which is overwritten.
     pub fn shard(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
         let tiles = Tiles::new(self.spec, &self.array.layout);
+        let chunks = Self::chunks(&tiles, bytes)?;
+        if chunks.iter().any(Option::is_none) {
+            target.fill(0.0);
+        }
+        let chunks = chunks.into_iter().enumerate().collect();
+        self.part(&tiles, chunks, &tiles.whole(), target)
+    }
+
+    /// The same as images, one for each bin. What tiles of the same bins hold lies side by side there: these are decoded at once,
+    /// those of other bins beside them.
+    pub fn planes(&self, bytes: &Bytes, target: &mut [f32]) -> Result<Complete, DatasetError> {
+        let tiles = Tiles::new(self.spec, &self.array.layout);
+        let chunks = Self::chunks(&tiles, bytes)?;
+        if chunks.iter().any(Option::is_none) {
+            target.fill(0.0);
+        }
+        let pixels = self.spec.pixels();
+        let slabs = target.par_chunks_mut(tiles.slab_len() * pixels).enumerate();
+        let saturated = slabs
+            .map(|(slab, values)| {
+                let mut decoder = Decoder::new(self.spec.profile, self.scale, &tiles);
+                let mut saturated = false;
+                for tile in tiles.of_slab(slab) {
+                    let Some(bytes) = &chunks[tile] else { continue };
+                    let raw = self.array.codec.decode(bytes)?;
+                    saturated |= decoder.decode_planes(tile, &raw, pixels, values);
+                }
+                Ok(saturated)
+            })
+            .collect::<Result<Vec<bool>, DatasetError>>()?;
+        let bins = self.spec.gate.bins as usize;
+        for (index, value) in self.overflow {
+            let (pixel, bin) = (*index as usize / bins, *index as usize % bins);
+            if pixel < pixels {
+                target[bin * pixels + pixel] = *value;
+            }
+        }
+        let complete = !saturated.contains(&true) || target.iter().all(|h| h.is_finite());
+        Ok(Complete(complete))
+    }
+
+    /// The coded bytes of each tile of a shard; `None` = all fill value.
+    fn chunks(tiles: &Tiles, bytes: &Bytes) -> Result<Vec<Option<Bytes>>, DatasetError> {
         let Some(start) = bytes.len().checked_sub(shard::index_len(tiles.count())) else {
             let what = format!("{} bytes are too few", bytes.len());
             return Err(DatasetError::codec("cannot read a shard's index", what));
         };
         let index = shard::parse_index(&bytes[start..], tiles.count(), bytes.len() as u64)?;
-        if index.iter().any(Option::is_none) {
-            target.fill(0.0);
-        }
-        let chunks = index
-            .into_iter()
-            .map(|entry| entry.map(|r| bytes.slice(r.start as usize..r.end as usize)))
-            .enumerate()
-            .collect();
-        self.part(&tiles, chunks, &tiles.whole(), target)
+        let bytes_of = |r: Range<u64>| bytes.slice(r.start as usize..r.end as usize);
+        Ok(index.into_iter().map(|entry| entry.map(bytes_of)).collect())
     }
 
     /// Decodes tiles into a part's values and applies the overflow list. Bands of tiles are decoded at once, each

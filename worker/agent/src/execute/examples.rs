@@ -8,13 +8,15 @@ use std::{
 use picofarm_dataset::{Dataset, DatasetError, Predictions, Quantity, SplitUsed, sha256_hex};
 use picofarm_model::{
     Random,
-    scene::{Scene, Scenes, Unreadable},
+    scene::{Order, Scene, Scenes, Unreadable},
 };
 use picofarm_proto::{
     model::Histogram,
     split::{Rank, SplitRecord},
 };
-use picofarm_transient::sensor::{Histograms, Multiplex, PS_PER_M, Sensor, SensorError, sense};
+use picofarm_transient::sensor::{
+    Histograms, Multiplex, PS_PER_M, Sensor, SensorError, sense_again,
+};
 use tokio::runtime::Handle;
 
 #[cfg(test)]
@@ -29,6 +31,9 @@ use picofarm_session::memory_mib;
 
 /// One part of so many of the memory holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
+
+/// Histograms whose room is kept for others, at most.
+const SPARE: usize = 4;
 
 /// What draws of sensors are, among all random numbers of a training.
 const SENSED: u64 = 5;
@@ -48,6 +53,10 @@ pub(super) struct Examples {
     /// Depths that two-bounce times follow from; the truth's where there are none.
     depths: Option<Predictions>,
     kept: Mutex<Kept>,
+    /// Room of histograms that nobody looks at any more: fresh memory for each would cost as much as decoding it.
+    spare: Mutex<Vec<Vec<f32>>>,
+    /// What the sensor's scale follows from, by scene: the same at each visit.
+    peaks: Mutex<HashMap<usize, f64>>,
 }
 
 /// Scenes that stay in memory, as many as there is room for. The order in which a training visits them is random, so that
@@ -123,6 +132,8 @@ impl Examples {
                 scenes: HashMap::new(),
                 room: (memory_mib() / KEPT_SHARE) as usize * (1 << 20),
             }),
+            spare: Mutex::default(),
+            peaks: Mutex::default(),
         })
     }
 
@@ -174,29 +185,48 @@ impl Examples {
             bin_width_ps: stored.bin_width_m * PS_PER_M,
         };
         let seed = Random::new(*seed, &[SENSED, draw]).bits();
-        let sensed = sense(sensor, &input, seed, self.scenes[index]).map_err(
+        let peaks = || self.peaks.lock().expect("no panic while locked");
+        let peak = peaks().get(&index).copied();
+        let sensed = sense_again(sensor, &input, seed, self.scenes[index], peak).map_err(
             |SensorError::Invalid { field, what }| DatasetError::Invalid {
                 field: format!("train.{field}"),
                 what: format!("scene {}: {what}", self.scenes[index]),
             },
         )?;
+        if let Some(found) = sensed.peak.filter(|_| peak.is_none()) {
+            peaks().insert(index, found);
+        }
         Ok(Arc::new(stored.showing(as_radiance(&sensed).0)))
     }
 
-    async fn histogram(&self, scene: u64) -> Result<Vec<f32>, DatasetError> {
+    /// What is seen of a scene, and in which order: as networks take it where no sensor stands before them.
+    async fn histogram(&self, scene: u64) -> Result<(Vec<f32>, Order), DatasetError> {
         let Some(spots) = self
             .spots
             .as_ref()
             .filter(|_| self.quantity == Quantity::TransientSpots)
         else {
-            return self.dataset.read_histogram(scene, self.quantity).await;
+            let spare = || self.spare.lock().expect("no panic while locked").pop();
+            let mut h = spare().unwrap_or_default();
+            let (dataset, quantity) = (&self.dataset, self.quantity);
+            let order = match self.sensor {
+                None => {
+                    dataset.read_planes_into(scene, quantity, &mut h).await?;
+                    Order::Bins
+                }
+                Some(_) => {
+                    dataset.read_histogram_into(scene, quantity, &mut h).await?;
+                    Order::Pixels
+                }
+            };
+            return Ok((h, order));
         };
         let mut sum = Multiplex::new(self.dataset.spec().transient_len());
         for spot in spots {
             let h = self.dataset.read_spot(scene, *spot).await?;
             sum.add(&h).expect("each spot's histogram has that length");
         }
-        Ok(sum.finish())
+        Ok((sum.finish(), Order::Pixels))
     }
 
     async fn scene(&self, scene: u64) -> Result<Scene, DatasetError> {
@@ -208,7 +238,7 @@ impl Examples {
                 None => Ok(None),
             }
         };
-        let (histogram, seen_depth_m, depth, specular, lit, spots, intrinsics) = futures::try_join!(
+        let ((histogram, order), seen_depth_m, depth, specular, lit, spots, intrinsics) = futures::try_join!(
             self.histogram(scene),
             seen,
             dataset.read::<f32>(scene, Quantity::Depth),
@@ -238,6 +268,7 @@ impl Examples {
             width: spec.width as usize,
             bins: spec.gate.bins as usize,
             histogram,
+            order,
             first_m: spec.gate.start_m,
             bin_width_m: spec.gate.bin_width_m,
             depth_m,
@@ -264,6 +295,15 @@ impl Scenes for Examples {
 
     fn load(&self, index: usize) -> Result<Arc<Scene>, Unreadable> {
         self.sensed(index, ALWAYS)
+    }
+
+    fn take_back(&self, scene: Arc<Scene>) {
+        if let Some(scene) = Arc::into_inner(scene) {
+            let mut spare = self.spare.lock().expect("no panic while locked");
+            if spare.len() < SPARE {
+                spare.push(scene.histogram);
+            }
+        }
     }
 
     fn visited(&self, index: usize, visit: u64) -> Result<Arc<Scene>, Unreadable> {

@@ -33,7 +33,7 @@ pub struct Batch {
     pub target: Vec<f32>,
 }
 
-/// Adds a visit to a batch.
+/// Adds a visit to a batch. What an empty batch still holds of another one is overwritten.
 ///
 /// # Errors
 /// [`ModelError::Invalid`] where the scene has another size than the batch, or not what the question needs.
@@ -45,10 +45,14 @@ pub fn example(
 ) -> Result<(), ModelError> {
     check(batch, question, scene)?;
     (batch.height, batch.width) = (scene.height, scene.width);
-    batch.images += 1;
+    if batch.images == 0 {
+        batch.one_hot.clear();
+        batch.target.clear();
+    }
     let pixels = scene.pixels();
     let (channels, _, _) = question.channels();
-    let at = batch.dense.len();
+    let at = batch.images * channels * pixels;
+    batch.images += 1;
     batch.dense.resize(at + channels * pixels, 0.0);
     let dense = &mut batch.dense[at..];
     let seen = if question.intensity_only {
@@ -78,6 +82,7 @@ pub fn example(
                 }
             }
             ShadowVariant::Index => {
+                dense[seen * pixels..].fill(0.0);
                 let from = (seen + visit.spot) * pixels;
                 dense[from..from + pixels].fill(1.0);
             }
@@ -196,28 +201,28 @@ impl Batch {
         4 * (self.dense.len() + self.one_hot.len() + self.target.len())
     }
 
-    /// Appends another one, of `of` that will be joined in all.
+    /// Appends another one, of `of` that will be joined in all, and gives back its room, empty, to be used again.
     ///
     /// # Errors
     /// [`ModelError::Invalid`] where it has another size.
-    pub(crate) fn join(&mut self, mut other: Self, of: usize) -> Result<(), ModelError> {
+    pub(crate) fn join(&mut self, mut other: Self, of: usize) -> Result<Self, ModelError> {
         if self.images == 0 {
-            // The first one's room is the whole's.
-            let more = of.saturating_sub(other.images);
-            if more > 0 {
-                other.dense.reserve_exact(more * other.dense.len());
-                other.one_hot.reserve_exact(more * other.one_hot.len());
-                other.target.reserve_exact(more * other.target.len());
+            if of == other.images {
+                return Ok(std::mem::replace(self, other));
             }
-            *self = other;
-            return Ok(());
+            let room = |values: usize| values / other.images * of;
+            self.dense.reserve_exact(room(other.dense.len()));
+            self.one_hot.reserve_exact(room(other.one_hot.len()));
+            self.target.reserve_exact(room(other.target.len()));
+            (self.height, self.width) = (other.height, other.width);
         }
         check_size((self.height, self.width), (other.height, other.width))?;
         self.images += other.images;
-        self.dense.append(&mut other.dense);
-        self.one_hot.append(&mut other.one_hot);
-        self.target.append(&mut other.target);
-        Ok(())
+        self.dense.extend_from_slice(&other.dense);
+        self.one_hot.extend_from_slice(&other.one_hot);
+        self.target.extend_from_slice(&other.target);
+        other.images = 0;
+        Ok(other)
     }
 
     /// On a device: what the network sees, and what it should say.

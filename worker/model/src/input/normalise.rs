@@ -1,10 +1,12 @@
 //! Histograms as planes: rebinned, scaled, bin by bin.
 
 use super::Normalise;
-use crate::scene::Scene;
+use crate::scene::{Order, Scene};
 
 /// Pixels that change from pixel by pixel to bin by bin together: they fill a cache line of each bin's plane.
 const BLOCK: usize = 16;
+/// Pixels whose planes are scaled together: their least and greatest values stay in the first cache.
+const STRIP: usize = 1024;
 
 /// How many adjacent bins of `stored` are summed for one of `bins`. What is left over at the end, and dropped, must be fewer
 /// than are summed: otherwise most of a gate could go without a word.
@@ -41,6 +43,9 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
     assert!(bins <= scene.bins, "bins are summed, not divided");
     assert_eq!(out.len(), bins * pixels, "room for each bin of each pixel");
     let merged = scene.bins / bins;
+    if scene.order == Order::Bins {
+        return strips(scene, bins, normalise, out);
+    }
     let mut block = vec![0.0f32; BLOCK * bins];
     for (k, stored) in scene.histogram.chunks(BLOCK * scene.bins).enumerate() {
         let here = stored.len() / scene.bins;
@@ -57,6 +62,56 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
             let row = &mut out[b * pixels + k * BLOCK..][..here];
             for (i, value) in row.iter_mut().enumerate() {
                 *value = block[i * bins + b];
+            }
+        }
+    }
+}
+
+/// [`planes`] of what lies so already: to the same bits.
+fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
+    let (pixels, merged) = (scene.pixels(), scene.bins / bins);
+    for (plane, stored) in out
+        .chunks_exact_mut(pixels)
+        .zip(scene.histogram.chunks_exact(pixels * merged))
+    {
+        let mut stored = stored.chunks_exact(pixels);
+        plane.copy_from_slice(stored.next().expect("at least one is merged"));
+        for stored in stored {
+            plane.iter_mut().zip(stored).for_each(|(sum, h)| *sum += h);
+        }
+    }
+    if let Normalise::Log { .. } = normalise {
+        return scale(out, normalise);
+    }
+    let (mut least, mut most) = ([0.0f32; STRIP], [0.0f32; STRIP]);
+    for from in (0..pixels).step_by(STRIP) {
+        let of = from..(from + STRIP).min(pixels);
+        let (least, most) = (&mut least[..of.len()], &mut most[..of.len()]);
+        least.fill(f32::INFINITY);
+        most.fill(f32::NEG_INFINITY);
+        for plane in out.chunks_exact(pixels) {
+            let bounds = least.iter_mut().zip(most.iter_mut());
+            for (h, (least, most)) in plane[of.clone()].iter().zip(bounds) {
+                *least = least.min(*h);
+                *most = most.max(*h);
+            }
+        }
+        for (least, most) in least.iter_mut().zip(most.iter_mut()) {
+            // A range of infinity makes zeros of all.
+            let range = *most - *least;
+            *most = match range > 0.0 && range.is_finite() {
+                true => range,
+                false => f32::INFINITY,
+            };
+            if !least.is_finite() {
+                *least = 0.0;
+            }
+        }
+        for plane in out.chunks_exact_mut(pixels) {
+            let bounds = least.iter().zip(most.iter());
+            for (h, (least, range)) in plane[of.clone()].iter_mut().zip(bounds) {
+                let scaled = (*h - least) / range;
+                *h = if scaled.is_finite() { scaled } else { 0.0 };
             }
         }
     }
@@ -94,8 +149,19 @@ fn min_max(values: &mut [f32]) {
 
 /// Σ_b h, scaled to 0..1 over the image.
 pub fn intensity(scene: &Scene, out: &mut [f32]) {
-    for (sum, h) in out.iter_mut().zip(scene.histogram.chunks_exact(scene.bins)) {
-        *sum = h.iter().sum();
+    match scene.order {
+        Order::Pixels => {
+            for (sum, h) in out.iter_mut().zip(scene.histogram.chunks_exact(scene.bins)) {
+                *sum = h.iter().sum();
+            }
+        }
+        Order::Bins => {
+            // From where sums begin, so that they have the same bits.
+            out.fill(std::iter::empty::<f32>().sum());
+            for plane in scene.histogram.chunks_exact(out.len()) {
+                out.iter_mut().zip(plane).for_each(|(sum, h)| *sum += h);
+            }
+        }
     }
     min_max(out);
 }
@@ -118,6 +184,44 @@ mod tests {
         let mut out = vec![f32::NAN; bins];
         planes(&one(histogram), bins, Normalise::MinMax, &mut out);
         out
+    }
+
+    #[test]
+    fn bin_by_bin_gives_the_bits_of_pixel_by_pixel() {
+        let odd = [f32::INFINITY, f32::MAX, 0.0, 1e-30];
+        let value = |i: usize| match i % 37 {
+            0 => odd[i / 37 % 4],
+            k => (k as f32).sin().powi(4) * 1e3,
+        };
+        // More pixels than a strip has, and one pixel that is dark.
+        let (height, width, bins) = (50, 41, 13);
+        let pixels = height * width;
+        let mut pixel_by_pixel: Vec<f32> = (0..pixels * bins).map(value).collect();
+        pixel_by_pixel[7 * bins..8 * bins].fill(0.0);
+        let bin_by_bin = (0..pixels * bins).map(|i| pixel_by_pixel[i % pixels * bins + i / pixels]);
+        let scene = |order, histogram| Scene {
+            height,
+            width,
+            bins,
+            histogram,
+            order,
+            ..Scene::default()
+        };
+        let other = scene(Order::Bins, bin_by_bin.collect());
+        let one = scene(Order::Pixels, pixel_by_pixel);
+        let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        for normalise in [Normalise::MinMax, Normalise::Log { greatest: 50.0 }] {
+            for bins in [13, 6, 4, 1] {
+                let mut out = [(); 2].map(|()| vec![f32::NAN; bins * pixels]);
+                planes(&one, bins, normalise, &mut out[0]);
+                planes(&other, bins, normalise, &mut out[1]);
+                assert_eq!(bits(&out[0]), bits(&out[1]), "{normalise:?} {bins}");
+            }
+        }
+        let mut out = [(); 2].map(|()| vec![f32::NAN; pixels]);
+        intensity(&one, &mut out[0]);
+        intensity(&other, &mut out[1]);
+        assert_eq!(bits(&out[0]), bits(&out[1]));
     }
 
     #[test]

@@ -152,13 +152,13 @@ impl Making<'_> {
     fn work(&self, shelf: &Shelf) {
         while let Some(which) = shelf.take(self) {
             let mut bytes = 0;
-            let made = self.example(which, &mut bytes);
+            let made = self.example(which, shelf.spare(), &mut bytes);
             shelf.put(which, made, bytes);
         }
     }
 
     /// The example of a visit alone; `bytes` becomes what it took to make it.
-    fn example(&self, which: u64, bytes: &mut usize) -> Result<Batch, ModelError> {
+    fn example(&self, which: u64, mut made: Batch, bytes: &mut usize) -> Result<Batch, ModelError> {
         let (index, visit, number) = (self.visit)(which);
         let scene = match number {
             Some(number) => self.scenes.visited(index, number),
@@ -168,9 +168,9 @@ impl Making<'_> {
             scene: index,
             source,
         })?;
-        let mut made = Batch::default();
         example(&mut made, &self.plan.question, &scene, visit)?;
         *bytes = scene.bytes() + made.bytes();
+        self.scenes.take_back(scene);
         Ok(made)
     }
 }
@@ -192,6 +192,8 @@ struct State {
     /// Examples that are made, and their bytes.
     made: BTreeMap<u64, Result<Batch, ModelError>>,
     waiting: usize,
+    /// Room of examples that have joined their batch: fresh memory takes as long as what is written there.
+    spare: Vec<Batch>,
     /// The most bytes that it took to make one; 0 = none is made yet.
     largest: usize,
     closed: bool,
@@ -236,6 +238,11 @@ impl Shelf {
             }
             state = self.wait(state);
         }
+    }
+
+    /// An empty example, with the room of one before if there is any.
+    fn spare(&self) -> Batch {
+        self.lock().spare.pop().unwrap_or_default()
     }
 
     fn put(&self, which: u64, made: Result<Batch, ModelError>, bytes: usize) {
@@ -293,7 +300,12 @@ impl Ready<'_> {
         let mut batch = Batch::default();
         for which in begun..begun + size {
             let example = self.example(which)?;
-            batch.join(example, size as usize)?;
+            let empty = batch.join(example, size as usize)?;
+            let mut state = self.shelf.lock();
+            // No more than are made at once.
+            if state.spare.len() <= state.in_hand {
+                state.spare.push(empty);
+            }
         }
         Ok(batch)
     }

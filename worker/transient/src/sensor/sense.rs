@@ -65,6 +65,9 @@ pub struct Sensed {
     pub scale: f64,
     /// The peak that set the scale, photons; `None` for a fixed scale and for scenes without light.
     pub peak_photons: Option<f64>,
+    /// The brightest bin of the median pixel, in units of h, where the scale follows from it and it is the same in every draw: what
+    /// [`sense_again`] is spared.
+    pub peak: Option<f64>,
     /// Bins by which the pulse was shifted (`sb3d_compat` jitter; otherwise 0).
     pub shift_bins: i64,
     /// What is not in the image.
@@ -113,16 +116,31 @@ pub fn sense(
     seed: u64,
     scene: u64,
 ) -> Result<Sensed, SensorError> {
+    sense_again(sensor, h, seed, scene, None)
+}
+
+/// The same with the [`Sensed::peak`] that was found before, with the same sensor and histograms and whatever seed. To the same
+/// bits, without looking at all histograms twice.
+///
+/// # Errors
+/// Those of [`sense`].
+pub fn sense_again(
+    sensor: &Sensor,
+    h: &Histograms<'_>,
+    seed: u64,
+    scene: u64,
+    peak: Option<f64>,
+) -> Result<Sensed, SensorError> {
     let count = check(sensor, h)?;
     let kernel = Kernel::new(sensor, h.bin_width_ps)?;
     let shift_bins = shift(sensor, seed, scene);
     let convolver = Convolver::new(&kernel.shifted(shift_bins), h.bins);
-    let (scale, peak_photons) = scale_of(sensor, h, &convolver, seed, scene)?;
+    let scale = scale_of(sensor, h, (&convolver, peak), seed, scene)?;
     let chain = Chain {
         sensor,
         h,
         convolver,
-        scale,
+        scale: scale.per_unit,
         factor: sensor.rebin as usize,
         out_bins: h.bins / sensor.rebin as usize,
         seed,
@@ -142,8 +160,11 @@ pub fn sense(
         values,
         bins: chain.out_bins,
         bin_width_ps: h.bin_width_ps * f64::from(sensor.rebin),
-        scale,
-        peak_photons,
+        scale: scale.per_unit,
+        peak_photons: scale.photons,
+        peak: scale
+            .peak
+            .filter(|_| matches!(sensor.jitter, Jitter::Gaussian { .. })),
         shift_bins,
         dropped: total(&facts, h.bins % chain.factor)?,
     })
@@ -159,16 +180,28 @@ fn shift(sensor: &Sensor, seed: u64, scene: u64) -> i64 {
     }
 }
 
-/// Photons for a unit of h, and the peak that set it.
+/// Photons for a unit of h, and what that follows from.
+struct Scaled {
+    per_unit: f64,
+    /// Photons of the peak, and the peak in units of h.
+    photons: Option<f64>,
+    peak: Option<f64>,
+}
+
 fn scale_of(
     sensor: &Sensor,
     h: &Histograms<'_>,
-    convolver: &Convolver,
+    (convolver, known): (&Convolver, Option<f64>),
     seed: u64,
     scene: u64,
-) -> Result<(f64, Option<f64>), SensorError> {
+) -> Result<Scaled, SensorError> {
+    let alone = |per_unit| Scaled {
+        per_unit,
+        photons: None,
+        peak: None,
+    };
     let photons = match sensor.scale {
-        Scale::Fixed { photons_per_unit } => return Ok((photons_per_unit, None)),
+        Scale::Fixed { photons_per_unit } => return Ok(alone(photons_per_unit)),
         Scale::Peak { photons } => photons,
         Scale::PeakRange { low, high } => {
             let u = PixelKey::new(seed, Purpose::Peak, scene, 0)
@@ -178,10 +211,14 @@ fn scale_of(
         }
     };
     let part = h.two_bounce.unwrap_or(h.transient);
-    match median_peak(part, h.bins, convolver) {
-        Some(peak) => Ok((photons / peak, Some(photons))),
+    match known.or_else(|| median_peak(part, h.bins, convolver)) {
+        Some(peak) => Ok(Scaled {
+            per_unit: photons / peak,
+            photons: Some(photons),
+            peak: Some(peak),
+        }),
         // Nothing to see: any scale gives the same image.
-        None if h.transient.iter().all(|h| *h == 0.0) => Ok((1.0, None)),
+        None if h.transient.iter().all(|h| *h == 0.0) => Ok(alone(1.0)),
         None => Err(SensorError::new(
             "sensor.scale",
             "the two-bounce part has no light although the transient has; \

@@ -164,8 +164,9 @@ fn two_bounce_times_from_any_depth_begin_with_the_folded_beams_length() {
         ..scene.as_ref().clone()
     };
     let (mut pixels, bins) = (0, scene.bins);
+    let image = scene.pixels();
     for (p, tof) in predicted.tof(0).into_iter().enumerate() {
-        let h = &scene.histogram[p * bins..][..bins];
+        let h: Vec<f32> = (0..bins).map(|b| scene.histogram[b * image + p]).collect();
         let Some(onset) = h.iter().position(|h| *h > 0.0) else {
             continue;
         };
