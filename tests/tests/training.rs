@@ -298,7 +298,7 @@ checkpoint_minutes = 0.02
 }
 
 #[test]
-fn processes_of_one_training_that_are_killed_and_come_again_leave_the_bits_of_one() {
+fn processes_of_one_training_that_are_killed_or_frozen_and_come_again_leave_the_bits_of_one() {
     let wanted = kills_wanted();
     let submitted = |farm: &Farm, processes: u32| {
         let file = farm.store().with_file_name("together.toml");
@@ -358,6 +358,30 @@ fn processes_of_one_training_that_are_killed_and_come_again_leave_the_bits_of_on
     // Neither other weights nor calls.
     assert_eq!(there, made(&calm), "after {kills} kills");
     eprintln!("{kills} kills");
+
+    // Frozen for longer than a lease, one after the other, and awake again: the others go on meanwhile, and whoever wakes does
+    // no harm.
+    let farm = Farm::with_lease("together-frozen", 2.0);
+    let id = submitted(&farm, 3);
+    let mut workers: Vec<_> = (0..3).map(|n| farm.worker(&format!("cold-{n}"))).collect();
+    wait::until("the processes to train together", || {
+        let mut said = workers.iter_mut().map(|worker| worker.stderr());
+        said.any(|said| said.contains("processes train together"))
+            .then_some(())
+    });
+    let mut frozen = 0;
+    for worker in &mut workers {
+        if farm.status(&id)["state"] != "active" {
+            break;
+        }
+        worker.signal(Signal::Stop);
+        frozen += 1;
+        sleep(Duration::from_secs(4));
+        worker.signal(Signal::Continue);
+    }
+    assert_eq!(farm.until_ended(&id)["state"], "done");
+    assert_eq!(made(&farm), made(&calm), "after {frozen} freezes");
+    eprintln!("{frozen} freezes");
 }
 
 fn flip(file: &Path) {
