@@ -1,7 +1,7 @@
 """The networks of picofarm in PyTorch: the same numbers, and how long they take.
 
 usage: model_torch.py parity FILE...
-       model_torch.py bench FILE [--channels-last]
+       model_torch.py bench [--channels-last] FILE
 
 FILE comes from `picofarm bench model --record FILE`: weights, a batch, and what picofarm made of them. `parity` computes
 the same and fails where outputs differ by more than 1e-4, a gradient by more than 1e-3 of its norm, or the losses of the
@@ -282,7 +282,7 @@ if __name__ == "__main__":
             sys.exit(0 if all([parity(path) for path in paths]) else 1)
         case ["bench", path]:
             bench(path)
-        case ["bench", path, "--channels-last"]:
+        case ["bench", "--channels-last", path]:
             bench(path, channels_last=True)
         case _:
             sys.exit(__doc__)
