@@ -247,6 +247,46 @@ fn an_unusable_field_is_named() {
             "multiple of 8",
         ),
         (
+            "target = \"tof\", model = \"m\", net = { swin = { groups = 2 } }",
+            "train.net.swin",
+            "swinir",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"swinir\", width = 100 }",
+            "train.net.width",
+            "no multiple of the 6 heads",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"swinir\", width = 60, swin = { window = 1 } }",
+            "train.net.swin.window",
+            "2..=64",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"swinir\", width = 60, levels = 3 }",
+            "train.net.levels",
+            "is for U-Nets",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"swinir\", width = 60, stem = 8 }",
+            "train.net.stem",
+            "unet2d",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"embeddings\", time_features = 8 }",
+            "train.net.time_features",
+            "unet25d",
+        ),
+        (
+            "target = \"specular\", model = \"m\", specular = { on = \"x\" }, net = { architecture = \"embeddings\" }",
+            "train.specular.on",
+            "from scratch",
+        ),
+        (
+            "target = \"shadow\", model = \"m\", shadow = { variant = \"index\" }, net = { architecture = \"embeddings\" }",
+            "train.shadow.variant",
+            "concat",
+        ),
+        (
             "target = \"tof\", model = \"m\", optimise = { batch = 32, accumulate = 5 }",
             "train.optimise.accumulate",
             "does not divide",

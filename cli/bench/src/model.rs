@@ -12,7 +12,7 @@ use picofarm_model::{
     ModelError,
     device::{self, Gpus},
     input::{Batch, Target},
-    net::{Architecture, NetSpec, Precision, StemForm, TimeProjection},
+    net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
     train::Learner,
     trial::Trial,
 };
@@ -34,7 +34,7 @@ struct Report {
     trial: Trial,
     parameters: usize,
     /// Multiply-adds of a pass forward, a sample; the one-hot channels counted as if they were dense.
-    multiply_adds: Option<f64>,
+    multiply_adds: f64,
     threads: usize,
     /// On this graphics processor; threads do not count then.
     gpu: Option<String>,
@@ -187,6 +187,8 @@ fn trial(args: &BenchModel) -> Trial {
             architecture: match args.net {
                 Kind::Unet2d => Architecture::Unet2d,
                 Kind::Unet25d => Architecture::Unet25d,
+                Kind::Swinir => Architecture::Swinir,
+                Kind::Embeddings => Architecture::Embeddings,
             },
             dense,
             one_hot: if target == Target::Shadow { dense } else { 0 },
@@ -202,6 +204,12 @@ fn trial(args: &BenchModel) -> Trial {
             time_projection: match args.separate_streams {
                 false => TimeProjection::Shared,
                 true => TimeProjection::Each,
+            },
+            swin: Swin {
+                groups: args.groups,
+                depth: args.depth,
+                heads: args.heads,
+                window: args.window,
             },
             frozen: false,
             precision: match args.precision {
@@ -248,13 +256,12 @@ fn text(report: &Report) -> String {
         ]);
     }
     let mut out = format!("{} parameters", report.parameters);
-    if let Some(macs) = report.multiply_adds {
-        let rate = 3.0 * macs * report.forms[0].samples_per_s / 1e9;
-        out += &format!(
-            ", {:.2} G multiply-adds a sample forward; ours: {rate:.0} G a second with both gradients",
-            macs / 1e9
-        );
-    }
+    let macs = report.multiply_adds;
+    let rate = 3.0 * macs * report.forms[0].samples_per_s / 1e9;
+    out += &format!(
+        ", {:.2} G multiply-adds a sample forward; ours: {rate:.0} G a second with both gradients",
+        macs / 1e9
+    );
     let on = match &report.gpu {
         Some(gpu) => gpu.clone(),
         None => format!("{} threads", report.threads),

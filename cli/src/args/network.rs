@@ -15,7 +15,7 @@ pub struct BenchModel {
     /// Bins of the histograms
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u64).range(1..=4096))]
     pub bins: u64,
-    /// Channels of the first level
+    /// Channels of the first level; of all features (swinir)
     #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub width: u64,
     /// Levels, the bottleneck among them
@@ -33,6 +33,18 @@ pub struct BenchModel {
     /// A projection of time for each stream instead of one for both (unet2.5d)
     #[arg(long)]
     pub separate_streams: bool,
+    /// Groups of blocks (swinir)
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub groups: u32,
+    /// Blocks of a group (swinir)
+    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub depth: u32,
+    /// Heads of attention; they share the width (swinir)
+    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub heads: u32,
+    /// Rows and columns of a window of attention (swinir)
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=64))]
+    pub window: u32,
     /// On a graphics processor, as `picofarm model devices` names it (a build with --features wgpu or cuda)
     #[arg(long, value_name = "NAME")]
     pub gpu: Option<String>,
@@ -89,4 +101,8 @@ pub enum Kind {
     /// Time is a dimension of the encoder
     #[value(name = "unet2.5d")]
     Unet25d,
+    /// Bins are channels, attention within windows
+    Swinir,
+    /// A volume of features, flattened over time, and a network over those images
+    Embeddings,
 }

@@ -11,7 +11,7 @@ pub mod sensor;
 pub use gate::Gate;
 pub use gpus::Gpus;
 pub use network::{
-    Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
+    Architecture, Precision, Schedule, ShadowVariant, StemForm, Swin, Target, TimeProjection,
 };
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{Budget, Choice, Strategy};

@@ -68,6 +68,75 @@ pub enum Architecture {
     Unet2d,
     /// Time is a dimension of the encoder; the decoder has none (appendix B).
     Unet25d,
+    /// SwinIR: bins are channels, attention within windows (Liang et al., ICCVW 2021).
+    Swinir,
+    /// Learned feature embeddings: a volume of features, its greatest values over time and their moments, and a network over those
+    /// images (Chen et al., SIGGRAPH Asia 2020).
+    Embeddings,
+}
+
+impl Architecture {
+    /// Its name, as in a job file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unet2d => "unet2d",
+            Self::Unet25d => "unet25d",
+            Self::Swinir => "swinir",
+            Self::Embeddings => "embeddings",
+        }
+    }
+}
+
+/// The transformer blocks of a SwinIR.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Swin {
+    /// Residual groups: blocks, a convolution, and what went in. The lightweight SwinIR has 4, the others 6.
+    pub groups: u32,
+    /// Blocks of a group; every second one's windows are shifted by half a window.
+    pub depth: u32,
+    /// Heads of attention; must divide the width.
+    pub heads: u32,
+    /// Rows and columns of a window; must divide those of the images.
+    pub window: u32,
+}
+
+impl Default for Swin {
+    fn default() -> Self {
+        Self {
+            groups: 4,
+            depth: 6,
+            heads: 6,
+            window: 8,
+        }
+    }
+}
+
+impl Swin {
+    /// Whether a network of `width` channels can be built of them.
+    ///
+    /// # Errors
+    /// The field, below `net`, and what is wrong with it.
+    pub fn check(&self, width: usize) -> Result<(), (&'static str, String)> {
+        for (field, value, least, most) in [
+            ("swin.groups", self.groups, 1, 64),
+            ("swin.depth", self.depth, 1, 64),
+            ("swin.heads", self.heads, 1, 64),
+            ("swin.window", self.window, 2, 64),
+        ] {
+            if !(least..=most).contains(&value) {
+                return Err((field, format!("{value} lies outside {least}..={most}")));
+            }
+        }
+        if !width.is_multiple_of(self.heads as usize) {
+            let what = format!(
+                "{width} is no multiple of the {} heads (swin.heads), which share it; 60 and 180 are usual",
+                self.heads
+            );
+            return Err(("width", what));
+        }
+        Ok(())
+    }
 }
 
 /// What the projection before the first level is (appendix B names a convolution to 128 channels and nothing more).

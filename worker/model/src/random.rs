@@ -31,6 +31,14 @@ impl Random {
         (self.bits() >> 40) as f32 / (1u64 << 24) as f32
     }
 
+    /// Normal with mean 0 and variance 1 (Box and Muller 1958), the same bits on every machine.
+    pub fn normal(&mut self) -> f32 {
+        // In (0, 1], so that its logarithm is finite.
+        let open = 1.0 - f64::from(self.unit());
+        let angle = std::f64::consts::TAU * f64::from(self.unit());
+        (libm::sqrt(-2.0 * libm::log(open)) * libm::cos(angle)) as f32
+    }
+
     /// A permutation of 0..n (Fisher and Yates).
     pub fn permutation(&mut self, n: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..n).collect();

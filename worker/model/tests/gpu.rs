@@ -11,7 +11,7 @@ use picofarm_model::{
     Model, answers, cpu,
     device::{OpenGpu, gpus},
     input::{ShadowVariant, Target},
-    net::{Architecture, NetSpec, Precision, StemForm, TimeProjection},
+    net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
     train::{Control, Ended, Event, Plan, Trained, Training},
     trial::Trial,
     weights,
@@ -29,11 +29,17 @@ fn opened() -> Vec<OpenGpu> {
     listed.iter().map(|gpu| gpu.open().unwrap()).collect()
 }
 
-/// The six networks: what each learns, as U-Net over bins as channels and over time as a dimension.
-fn six() -> impl Iterator<Item = Trial> {
+/// What each network learns, in each architecture.
+fn networks() -> impl Iterator<Item = Trial> {
     let targets = [Target::Tof, Target::Shadow, Target::Specular];
     targets.into_iter().flat_map(|target| {
-        [Architecture::Unet2d, Architecture::Unet25d].map(|architecture| Trial {
+        [
+            Architecture::Unet2d,
+            Architecture::Unet25d,
+            Architecture::Swinir,
+            Architecture::Embeddings,
+        ]
+        .map(|architecture| Trial {
             target,
             net: NetSpec {
                 architecture,
@@ -46,6 +52,12 @@ fn six() -> impl Iterator<Item = Trial> {
                 stem_form: StemForm::Block,
                 time: 8,
                 time_projection: TimeProjection::Shared,
+                swin: Swin {
+                    groups: 2,
+                    depth: 2,
+                    heads: 2,
+                    window: 8,
+                },
                 frozen: false,
                 precision: Precision::F32,
             },
@@ -77,9 +89,9 @@ fn apart(a: &Tensors, b: &Tensors, part: &str) -> f64 {
 }
 
 #[test]
-fn the_six_networks_answer_and_learn_as_on_the_cpu() {
+fn networks_answer_and_learn_as_on_the_cpu() {
     for gpu in opened() {
-        for trial in six() {
+        for trial in networks() {
             let record = |device| {
                 weights::read(&trial.record(STEPS, device).unwrap())
                     .unwrap()

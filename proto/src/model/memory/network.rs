@@ -1,5 +1,7 @@
 //! What networks take: weights, what passes keep, and what the optimiser keeps.
 
+use picofarm_settings::{Architecture, Swin};
+
 use super::shape::{BIN, Shape};
 
 /// Copies of the weights in a training: their values, the optimiser's two moments, gradients, and a checkpoint of the
@@ -31,7 +33,16 @@ pub struct Network {
     pub stem: f64,
     /// Weights of that projection for each pair of channels.
     pub stem_taps: f64,
+    /// Its kind.
+    pub architecture: Architecture,
+    /// Groups and blocks of a SwinIR.
+    pub swin: Swin,
 }
+
+/// Feature maps that a transformer block keeps for its way back: norms, queries, keys, values, sums and the perceptron.
+const BLOCK: f64 = 24.0;
+/// Forms in which scores of attention are kept.
+const SCORES: f64 = 5.0;
 
 impl Network {
     /// Inputs, middle and outputs of each level's encoder, from the finest.
@@ -51,6 +62,15 @@ impl Network {
 
     /// Bytes of its weights: 3×3 convolutions (3×3×3 in the encoder of a 2.5D network).
     pub fn weights(&self) -> f64 {
+        match self.architecture {
+            Architecture::Unet2d | Architecture::Unet25d => {}
+            Architecture::Swinir => return BIN * self.swin_weights(),
+            Architecture::Embeddings => {
+                let [width, streams, flat] = self.embedded();
+                let volume = 27.0 * (streams * width + 4.0 * width * width);
+                return BIN * (volume + 9.0 * (5.0 + 2.0 + 16.0) * flat * flat);
+            }
+        }
         let taps = if self.time > 1.0 { 27.0 } else { 9.0 };
         let encoders: f64 = self
             .encoders()
@@ -68,6 +88,20 @@ impl Network {
     /// Values that a pass over one image keeps for its way back: of each convolution what goes in, what comes out, and
     /// what the norm makes of it.
     fn kept(&self, source: &Shape) -> f64 {
+        if self.architecture == Architecture::Swinir {
+            let blocks = f64::from(self.swin.groups * self.swin.depth);
+            let convolutions = 3.0 * f64::from(self.swin.groups + 3);
+            let values = self.width * convolutions + blocks * self.of_block();
+            return source.pixels() * (self.dense + values);
+        }
+        if self.architecture == Architecture::Embeddings {
+            let [width, streams, flat] = self.embedded();
+            // An eighth of the voxels: what the first convolutions see, and four others with what lies around them.
+            let voxels = source.pixels() * self.dense / 8.0;
+            let volume = voxels * (2.0 * 27.0 * streams + 4.0 * 10.0 * width + 8.0 * flat);
+            return volume
+                + source.pixels() * (self.dense + flat * (5.0 * 6.0 / 4.0 + 2.0 * 5.0 * 6.0));
+        }
         let mut sum = source.pixels() * (self.dense + 2.0 * self.stem);
         for (level, [inputs, between, outputs]) in self.encoders().enumerate() {
             // A quarter of the pixels a level, and half of the moments.
@@ -89,6 +123,27 @@ impl Network {
         sum
     }
 
+    /// Channels of the volume, streams, and channels of the images that it becomes.
+    fn embedded(&self) -> [f64; 3] {
+        let streams = (self.inputs / self.dense.max(1.0)).ceil();
+        [self.width, streams, 2.0 * (self.width + streams)]
+    }
+
+    /// Numbers of a SwinIR's weights.
+    fn swin_weights(&self) -> f64 {
+        let (e, swin) = (self.width, &self.swin);
+        let places = f64::from(2 * swin.window - 1).powi(2);
+        let block = 8.0 * e * e + 11.0 * e + places * f64::from(swin.heads);
+        let convolutions = self.inputs + e * f64::from(swin.groups + 1) + 1.0;
+        9.0 * e * convolutions + f64::from(swin.groups * swin.depth) * block
+    }
+
+    /// Values of a pixel that a transformer block keeps: its scores are as many as a window has pixels, for each head.
+    fn of_block(&self) -> f64 {
+        let tokens = f64::from(self.swin.window).powi(2);
+        BLOCK * self.width + SCORES * tokens * f64::from(self.swin.heads)
+    }
+
     /// Bytes that a training takes, `images` at a time.
     pub(in crate::model) fn learn(&self, source: &Shape, images: u32) -> f64 {
         let images = f64::from(images);
@@ -99,6 +154,16 @@ impl Network {
 
     /// Bytes that asking it about one image takes, its weights included.
     pub(in crate::model) fn ask(&self, source: &Shape) -> f64 {
+        match self.architecture {
+            Architecture::Unet2d | Architecture::Unet25d => {}
+            Architecture::Swinir => {
+                let values = self.dense + LIVE * self.width + self.of_block();
+                return self.weights() + BIN * source.pixels() * values;
+            }
+            Architecture::Embeddings => {
+                return self.weights() + BIN * self.kept(source);
+            }
+        }
         let widest = self
             .encoders()
             .next()

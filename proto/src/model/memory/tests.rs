@@ -79,3 +79,25 @@ fn the_released_network_takes_what_is_known_of_it() {
     assert!(learns > 50e9, "{learns}");
     assert!(net.ask(&source) < 0.1 * learns);
 }
+
+/// 262,530 values a block, 36 blocks; 11,504,163 with three channels in and out (11.5 M as published).
+#[test]
+fn a_swinir_takes_what_is_known_of_it() {
+    let settings = r#"{"target": "tof", "model": "m", "net":
+        {"architecture": "swinir", "width": 180, "swin": {"groups": 6}}}"#;
+    let settings: crate::model::TrainSettings = serde_json::from_str(settings).unwrap();
+    settings.check().unwrap();
+    let source = Shape {
+        height: 256,
+        width: 256,
+        bins: 3,
+        spots: 25,
+    };
+    let net = settings.network(&source);
+    let share = net.weights() / (4.0 * 11_504_163.0);
+    assert!((0.99..1.01).contains(&share), "{share}");
+    // Features of 36 blocks, of 65,536 pixels.
+    let learns = net.learn(&source, 1);
+    assert!(learns > 36.0 * 65_536.0 * 180.0 * 4.0 * 10.0, "{learns}");
+    assert!(net.ask(&source) < 0.1 * learns);
+}

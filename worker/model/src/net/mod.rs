@@ -1,8 +1,13 @@
 //! The networks: what they are made of, and passes through them.
 
 mod block;
+mod cost;
+mod embeddings;
+mod layer;
 mod pass;
+mod residual;
 mod spec;
+mod swinir;
 mod unet25d;
 mod unet2d;
 
@@ -10,12 +15,14 @@ use burn::tensor::Tensor;
 
 pub use block::ONE_HOT;
 pub use pass::{Input, MOMENTUM, Pass};
-pub use spec::{Architecture, NetSpec, Precision, StemForm, TimeProjection};
+pub use spec::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection};
 
 use crate::{
     ModelError,
     parameters::{Declarations, Declared},
 };
+use embeddings::Embeddings;
+use swinir::Swinir;
 use unet2d::Unet2d;
 use unet25d::Unet25d;
 
@@ -31,6 +38,8 @@ pub struct Net {
 enum Body {
     Unet2d(Unet2d),
     Unet25d(Unet25d),
+    Swinir(Swinir),
+    Embeddings(Box<Embeddings>),
 }
 
 impl Net {
@@ -44,6 +53,11 @@ impl Net {
         let body = match spec.architecture {
             Architecture::Unet2d => Body::Unet2d(Unet2d::declare(&mut declarations, &spec)),
             Architecture::Unet25d => Body::Unet25d(Unet25d::declare(&mut declarations, &spec)),
+            Architecture::Swinir => Body::Swinir(Swinir::declare(&mut declarations, &spec)),
+            Architecture::Embeddings => {
+                let net = Embeddings::declare(&mut declarations, &spec);
+                Body::Embeddings(Box::new(net))
+            }
         };
         Ok(Self {
             spec,
@@ -79,6 +93,8 @@ impl Net {
         match &self.body {
             Body::Unet2d(net) => net.forward(pass, input),
             Body::Unet25d(net) => net.forward(pass, input, self.spec.frozen),
+            Body::Swinir(net) => net.forward(pass, input),
+            Body::Embeddings(net) => net.forward(pass, input),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! What a network looks like: everything that decides its parameters, and nothing else.
 
-pub use picofarm_settings::{Architecture, Precision, StemForm, TimeProjection};
+pub use picofarm_settings::{Architecture, Precision, StemForm, Swin, TimeProjection};
 use serde::{Deserialize, Serialize};
 
 use crate::ModelError;
@@ -17,9 +17,10 @@ pub struct NetSpec {
     pub one_hot: usize,
     /// Channels of the output.
     pub outputs: usize,
-    /// Channels of the first level; each further one has twice as many.
+    /// Channels of a U-Net's first level; each further one has twice as many. Of the others the channels of all features, or of the
+    /// volume's.
     pub width: usize,
-    /// Levels of encoder and decoder, the bottleneck among them.
+    /// Levels of a U-Net's encoder and decoder, the bottleneck among them.
     pub levels: usize,
     /// Channels of a convolution before the first level (the appendix's form: 128); 0 = none (the released code's).
     pub stem: usize,
@@ -31,6 +32,9 @@ pub struct NetSpec {
     /// Whether two streams share that projection, `Unet25d` only.
     #[serde(default, skip_serializing_if = "is_default")]
     pub time_projection: TimeProjection,
+    /// Groups, blocks, heads and windows, `Swinir` only.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub swin: Swin,
     /// The encoder stays as it is, its batch norms too: a decoder learns on another network's features.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub frozen: bool,
@@ -57,6 +61,7 @@ impl NetSpec {
             stem_form: StemForm::Block,
             time: 160,
             time_projection: TimeProjection::Shared,
+            swin: Swin::default(),
             frozen: false,
             precision: Precision::F32,
         }
@@ -69,38 +74,31 @@ impl NetSpec {
 
     /// Width and height must be multiples of this.
     pub fn multiple(&self) -> usize {
-        1 << (self.levels - 1)
+        match self.architecture {
+            Architecture::Unet2d | Architecture::Unet25d => 1 << (self.levels - 1),
+            Architecture::Swinir => self.swin.window as usize,
+            Architecture::Embeddings => 2,
+        }
     }
 
-    /// Multiply-adds of a pass forward over an image of `side`² pixels, one-hot channels counted as dense ones; of the 2D
-    /// network.
-    pub fn multiply_adds(&self, side: usize) -> Option<f64> {
-        if self.architecture != Architecture::Unet2d {
-            return None;
+    /// Why, and the setting that says so.
+    pub fn why_multiple(&self) -> (&'static str, String) {
+        match self.architecture {
+            Architecture::Unet2d | Architecture::Unet25d => {
+                let what = format!("{} halve the image {} times", self.levels, self.levels - 1);
+                ("net.levels", what)
+            }
+            Architecture::Swinir => {
+                let what = format!("windows have {0}×{0} pixels", self.swin.window);
+                ("net.swin.window", what)
+            }
+            Architecture::Embeddings => ("net.architecture", "embeddings halve the image".into()),
         }
-        let of = |inputs: usize, outputs: usize, level: usize| {
-            let pixels = (side >> level).pow(2);
-            (9 * inputs * outputs * pixels) as f64
-        };
-        let mut inputs = self.dense + self.one_hot;
-        let mut sum = 0.0;
-        if self.stem > 0 {
-            sum += match self.stem_form {
-                StemForm::Block => of(inputs, self.stem, 0),
-                StemForm::Linear => of(inputs, self.stem, 0) / 9.0,
-            };
-            inputs = self.stem;
-        }
-        let widths = self.widths();
-        for (level, width) in widths.iter().enumerate() {
-            let between = inputs.max(width / 2);
-            sum += of(inputs, between, level) + of(between, *width, level);
-            inputs = *width;
-        }
-        for (level, pair) in widths.windows(2).enumerate() {
-            sum += of(pair[0] + pair[1], pair[0], level) + of(pair[0], pair[0], level);
-        }
-        Some(sum + (self.width * self.outputs * side * side) as f64)
+    }
+
+    /// Measurement, and shadow transient where there is one, of networks in which time is a dimension.
+    pub(super) fn streams(&self) -> usize {
+        if self.one_hot > 0 { 2 } else { 1 }
     }
 
     /// Checks what can be built.
@@ -132,13 +130,40 @@ impl NetSpec {
                 );
                 return Err(ModelError::invalid("net.time_features", what));
             }
-            if self.one_hot != 0 && self.one_hot != self.dense {
-                let what = "the two streams of a 2.5D U-Net must have the same bins";
-                return Err(ModelError::invalid("net.one_hot", what));
-            }
             if self.stem != 0 {
                 return Err(ModelError::invalid("net.stem", "is for unet2d; remove it"));
             }
+        }
+        let timed = matches!(
+            self.architecture,
+            Architecture::Unet25d | Architecture::Embeddings
+        );
+        if timed && self.one_hot != 0 && self.one_hot != self.dense {
+            let what = "the two streams of a network over time must have the same bins";
+            return Err(ModelError::invalid("net.one_hot", what));
+        }
+        self.check_other()
+    }
+
+    /// What networks that are no U-Nets lack or need.
+    fn check_other(&self) -> Result<(), ModelError> {
+        if matches!(
+            self.architecture,
+            Architecture::Unet2d | Architecture::Unet25d
+        ) {
+            return Ok(());
+        }
+        if self.stem != 0 {
+            return Err(ModelError::invalid("net.stem", "is for unet2d; remove it"));
+        }
+        if self.frozen {
+            let what = "a frozen encoder with a decoder of its own is for unet2d and unet25d";
+            return Err(ModelError::invalid("net.frozen", what));
+        }
+        if self.architecture == Architecture::Swinir {
+            self.swin
+                .check(self.width)
+                .map_err(|(field, what)| ModelError::invalid(format!("net.{field}"), what))?;
         }
         Ok(())
     }
@@ -150,12 +175,7 @@ mod tests {
 
     #[test]
     fn the_released_networks_take_half_and_one_and_a_quarter_million_million_multiply_adds() {
-        let tera = |one_hot| {
-            NetSpec::released(637, one_hot, 1)
-                .multiply_adds(256)
-                .unwrap()
-                / 1e12
-        };
+        let tera = |one_hot| NetSpec::released(637, one_hot, 1).multiply_adds(256) / 1e12;
         assert!((tera(0) - 0.517).abs() < 1e-3, "{}", tera(0));
         assert!((tera(637) - 1.283).abs() < 1e-3, "{}", tera(637));
     }

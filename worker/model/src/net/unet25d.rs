@@ -37,7 +37,7 @@ struct Cbr {
 
 impl Unet25d {
     pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
-        let streams = if spec.one_hot > 0 { 2 } else { 1 };
+        let streams = spec.streams();
         d.frozen = spec.frozen;
         let shape = [spec.time, spec.dense, 1, 1];
         let projections = match spec.time_projection {
@@ -146,7 +146,7 @@ fn project(pass: &Pass, x: Tensor<4>, time: usize, layers: &[Linear]) -> Tensor<
 
 /// Sizes from a level's moments to one: 160-128-32-1, 80-64-32-1, 40-32-1, 20-16-1 (the appendix), others alike: the
 /// greatest power of two below, 32 if that is greater, one.
-fn steps(time: usize) -> Vec<usize> {
+pub(super) fn steps(time: usize) -> Vec<usize> {
     let mut sizes = vec![time];
     if time > 2 {
         let power = (time - 1).ilog2();

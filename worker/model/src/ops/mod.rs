@@ -6,6 +6,7 @@ mod cpu;
 mod differentiate;
 mod gradient;
 pub mod plain;
+mod window;
 
 use burn::{
     backend::{Dispatch, DispatchDevice},
@@ -14,6 +15,10 @@ use burn::{
 
 use crate::kernel::AdamW;
 use cpu::NetOps;
+pub use window::{
+    APART, from_windows, layer_norm, linear, position_bias, relative_positions, shifted,
+    shifted_back, window_attention, window_mask, windows,
+};
 
 /// Added to variances: PyTorch's default.
 pub const EPSILON: f64 = 1e-5;

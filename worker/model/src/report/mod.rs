@@ -122,7 +122,7 @@ impl Entry {
             data: Data::default(),
             conditions: Vec::new(),
             parameters: model.learned() as u64,
-            multiply_adds: plan.net.multiply_adds(side),
+            multiply_adds: Some(plan.net.multiply_adds(side)),
             history: Vec::new(),
             evaluated: None,
             speed: None,

@@ -282,8 +282,13 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         words.push("photon noise".to_owned());
     }
     let architecture = match net.architecture {
-        Architecture::Unet2d => "2D U-Net",
-        Architecture::Unet25d => "2.5D U-Net",
+        Architecture::Unet2d => format!("2D U-Net, width {}, {} levels", net.width, net.levels),
+        Architecture::Unet25d => format!("2.5D U-Net, width {}, {} levels", net.width, net.levels),
+        Architecture::Swinir => format!(
+            "SwinIR, width {}, {} groups of {} blocks, {} heads, windows {4}×{4}",
+            net.width, net.swin.groups, net.swin.depth, net.swin.heads, net.swin.window
+        ),
+        Architecture::Embeddings => format!("learned feature embeddings, width {}", net.width),
     };
     let stem = match (net.stem, net.stem_form) {
         (0, _) => String::new(),
@@ -295,10 +300,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
         TimeProjection::Each => ", a projection of time for each stream",
     };
     let frozen = if net.frozen { ", frozen encoder" } else { "" };
-    words.push(format!(
-        "{architecture}, width {}, {} levels{stem}{projection}{frozen}",
-        net.width, net.levels
-    ));
+    words.push(format!("{architecture}{stem}{projection}{frozen}"));
     words.extend(
         entry
             .data

@@ -9,7 +9,7 @@ use crate::{
     Evaluated,
     input::{Normalise, Question, ShadowVariant, Target},
     metric::{Metrics, Released},
-    net::{Architecture, NetSpec, StemForm, TimeProjection},
+    net::{Architecture, NetSpec, StemForm, Swin, TimeProjection},
     train::{Line, Plan, Schedule},
 };
 
@@ -34,6 +34,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         stem_form: StemForm::Block,
         time: 0,
         time_projection: TimeProjection::Shared,
+        swin: Swin::default(),
         frozen: false,
         precision: crate::net::Precision::F32,
     };
@@ -72,7 +73,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         },
         conditions: Vec::new(),
         parameters: 12_345,
-        multiply_adds: net.multiply_adds(32),
+        multiply_adds: Some(net.multiply_adds(32)),
         history: vec![Line {
             epoch: 1,
             within: false,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use picofarm_model::{
     Random,
     input::{Normalise, Question, ShadowVariant, Target},
-    net::{Architecture, NetSpec, StemForm, TimeProjection},
+    net::{Architecture, NetSpec, StemForm, Swin, TimeProjection},
     scene::Scene,
     train::{Plan, Schedule, Sources},
 };
@@ -81,6 +81,7 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
             stem_form: StemForm::Block,
             time: 0,
             time_projection: TimeProjection::Shared,
+            swin: Swin::default(),
             frozen: false,
             precision: picofarm_model::net::Precision::F32,
         },

@@ -1,6 +1,8 @@
 //! What a training's settings may be.
 
-use picofarm_settings::{Architecture, Schedule, SensorError, StemForm, Target, TimeProjection};
+use picofarm_settings::{
+    Architecture, Schedule, SensorError, ShadowVariant, StemForm, Swin, Target, TimeProjection,
+};
 
 use super::settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
@@ -45,6 +47,25 @@ impl TrainSettings {
                 "specular",
                 format!("is not for target = {:?}; remove it", self.target.name()),
             );
+        }
+        let unet = matches!(
+            self.net.architecture,
+            Architecture::Unet2d | Architecture::Unet25d
+        );
+        if !self.specular.on.is_empty() && !unet {
+            let what = format!(
+                "is for U-Nets, whose decoder learns on the features of a frozen encoder; architecture = {:?} has no such parts: \
+                 remove it to learn mirrors from scratch",
+                self.net.architecture.name()
+            );
+            return fail("specular.on", what);
+        }
+        if self.net.architecture == Architecture::Embeddings
+            && self.shadow.variant == ShadowVariant::Index
+        {
+            let what = "\"index\" adds planes that are no moments of time, which architecture = \"embeddings\" cannot see; \
+                        take variant = \"concat\", or another architecture";
+            return fail("shadow.variant", what.into());
         }
         if !self.specular.on.is_empty() && !self.from.is_empty() {
             let what = "is not for a network on the features of another (train.specular.on); remove one of them";
@@ -153,23 +174,68 @@ impl NetSettings {
             let what = "is for a net with a stem; give net.stem (128 in the paper), or remove it";
             return fail("stem_form", what.into());
         }
-        match (self.architecture, self.time_features) {
-            (Architecture::Unet2d, 1..) => fail(
-                "time_features",
-                "is for architecture = \"unet25d\"; remove it".into(),
-            ),
-            (Architecture::Unet25d, t) if t == 0 || t % (1 << (self.levels - 1)) != 0 => fail(
-                "time_features",
-                format!(
-                    "{t} must be a multiple of {}, so that each of {} levels can halve it (160 in the paper)",
-                    1 << (self.levels - 1),
-                    self.levels
-                ),
-            ),
-            (Architecture::Unet25d, _) if self.stem > 0 => {
-                fail("stem", "is for architecture = \"unet2d\"; remove it".into())
+        if self.architecture != Architecture::Swinir && self.swin != Swin::default() {
+            return fail("swin", "is for architecture = \"swinir\"; remove it".into());
+        }
+        match self.architecture {
+            Architecture::Unet2d => self.check_timeless(),
+            Architecture::Unet25d => {
+                let (time, halved) = (self.time_features, 1 << (self.levels - 1));
+                if time == 0 || time % halved != 0 {
+                    let what = format!(
+                        "{time} must be a multiple of {halved}, so that each of {} levels can halve it (160 in the paper)",
+                        self.levels
+                    );
+                    return fail("time_features", what);
+                }
+                self.check_stemless()
             }
-            _ => Ok(()),
+            Architecture::Embeddings => {
+                self.check_timeless()?;
+                self.check_stemless()?;
+                self.check_flat()
+            }
+            Architecture::Swinir => {
+                self.check_timeless()?;
+                self.check_stemless()?;
+                self.check_flat()?;
+                self.swin
+                    .check(self.width as usize)
+                    .or_else(|(field, what)| fail(field, what))
+            }
+        }
+    }
+
+    fn check_timeless(&self) -> Result<(), SpecError> {
+        match self.time_features {
+            0 => Ok(()),
+            _ => Err(SpecError::new(
+                "train.net.time_features",
+                "is for architecture = \"unet25d\"; remove it",
+            )),
+        }
+    }
+
+    fn check_stemless(&self) -> Result<(), SpecError> {
+        match self.stem {
+            0 => Ok(()),
+            _ => Err(SpecError::new(
+                "train.net.stem",
+                "is for architecture = \"unet2d\"; remove it",
+            )),
+        }
+    }
+
+    fn check_flat(&self) -> Result<(), SpecError> {
+        match self.levels == Self::default().levels {
+            true => Ok(()),
+            false => Err(SpecError::new(
+                "train.net.levels",
+                format!(
+                    "is for U-Nets; remove it, or set architecture = \"unet2d\" in place of {:?}",
+                    self.architecture.name()
+                ),
+            )),
         }
     }
 }

@@ -1,7 +1,8 @@
 //! What is learnt, and how: the settings of trainings, and the network that follows from them.
 
 use picofarm_settings::{
-    Architecture, Precision, Schedule, Sensor, ShadowVariant, StemForm, Target, TimeProjection,
+    Architecture, Precision, Schedule, Sensor, ShadowVariant, StemForm, Swin, Target,
+    TimeProjection,
 };
 use serde::{Deserialize, Serialize};
 
@@ -109,9 +110,10 @@ pub enum Normalise {
 pub struct NetSettings {
     /// Its kind.
     pub architecture: Architecture,
-    /// Channels of the first level; each further one has twice as many.
+    /// Channels of the first level of a U-Net; each further one has twice as many. Of `swinir` the channels of all its
+    /// features, of `embeddings` those of the volume's.
     pub width: u32,
-    /// Levels of the encoder; between two of them the image is halved.
+    /// Levels of a U-Net's encoder; between two of them the image is halved.
     pub levels: u32,
     /// Channels of a projection before the first level, as in the paper's appendix (128); 0 = none, as in the released code.
     pub stem: u32,
@@ -124,6 +126,9 @@ pub struct NetSettings {
     /// For `unet25d`: whether both streams share that projection, as in the released code.
     #[serde(skip_serializing_if = "is_default")]
     pub time_projection: TimeProjection,
+    /// For `swinir`: its groups, blocks, heads and windows.
+    #[serde(skip_serializing_if = "is_default")]
+    pub swin: Swin,
 }
 
 /// How shadows are predicted (appendix A.1 of the paper).
@@ -210,6 +215,7 @@ impl Default for NetSettings {
             stem_form: StemForm::Block,
             time_features: 0,
             time_projection: TimeProjection::Shared,
+            swin: Swin::default(),
         }
     }
 }
@@ -311,9 +317,11 @@ impl TrainSettings {
             width: f64::from(net.width),
             levels: net.levels,
             time: match net.architecture {
-                Architecture::Unet2d => 1.0,
                 Architecture::Unet25d => f64::from(net.time_features.max(1)),
+                Architecture::Unet2d | Architecture::Swinir | Architecture::Embeddings => 1.0,
             },
+            architecture: net.architecture,
+            swin: net.swin,
             stem: f64::from(net.stem),
             stem_taps: if linear { 1.0 } else { 9.0 },
         }

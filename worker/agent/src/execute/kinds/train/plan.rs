@@ -63,19 +63,18 @@ pub(super) fn plan(
         stem_form: wanted.stem_form,
         time: wanted.time_features as usize,
         time_projection: wanted.time_projection,
+        swin: wanted.swin,
         frozen: !settings.specular.on.is_empty(),
         precision: optimise.precision,
     };
     let multiple = net.multiple() as u32;
     if !spec.height.is_multiple_of(multiple) || !spec.width.is_multiple_of(multiple) {
+        let (field, why) = net.why_multiple();
         let what = format!(
-            "{} halve the image {} times, so that its sides must be multiples of {multiple}; the data set has {}x{} pixels",
-            wanted.levels,
-            wanted.levels - 1,
-            spec.width,
-            spec.height
+            "{why}, so that the sides of images must be multiples of {multiple}; the data set has {}x{} pixels",
+            spec.width, spec.height
         );
-        return Err(user("net.levels", what));
+        return Err(user(field, what));
     }
     Ok(Plan {
         question,
@@ -135,6 +134,7 @@ pub(super) fn check_on(plan: &Plan, on: &Known) -> Result<(), TaskError> {
             text(&net.time_projection),
             text(&under.time_projection),
         ),
+        ("net.swin", text(&net.swin), text(&under.swin)),
     ] {
         if ours != theirs {
             return Err(TaskError::User(format!(

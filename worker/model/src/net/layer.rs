@@ -1,0 +1,113 @@
+//! Layers of the networks that are no U-Nets: convolutions with a bias, linear layers and norms over channels.
+
+use burn::tensor::{Int, Tensor};
+
+use super::{block::ONE_HOT, pass::Pass};
+use crate::{
+    ops,
+    parameters::{Begin, Declarations, Id},
+};
+
+/// Deviation of the normal distribution that weights of transformers begin with (SwinIR's released code).
+const DEVIATION: f32 = 0.02;
+
+/// 3×3 convolution with a bias.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Conv {
+    weight: Id,
+    /// Of one-hot channels after the dense ones, in the first layer only.
+    one_hot: Option<Id>,
+    bias: Id,
+}
+
+impl Conv {
+    /// Of `inputs` dense channels and `one_hot` others.
+    pub(super) fn declare(
+        d: &mut Declarations,
+        at: &str,
+        [inputs, one_hot]: [usize; 2],
+        outputs: usize,
+    ) -> Self {
+        let begin = Begin::FanIn((inputs + one_hot) * 9);
+        let weight = format!("{at}.weight");
+        Self {
+            weight: d.add(weight.clone(), &[outputs, inputs, 3, 3], begin, true),
+            one_hot: (one_hot > 0).then(|| {
+                let shape = [outputs, one_hot, 3, 3];
+                d.add(format!("{weight}{ONE_HOT}"), &shape, begin, true)
+            }),
+            bias: d.add(format!("{at}.bias"), &[outputs], begin, true),
+        }
+    }
+
+    /// With zeros around the image.
+    pub(super) fn forward(
+        &self,
+        pass: &Pass,
+        x: Tensor<4>,
+        one_hot: Option<Tensor<3, Int>>,
+    ) -> Tensor<4> {
+        let mut y = ops::conv3x3(pass.lower(x), pass.lower(pass.get(self.weight)));
+        if let (Some(id), Some(bins)) = (self.one_hot, one_hot) {
+            y = y + ops::one_hot_conv3x3(bins, pass.lower(pass.get(id)));
+        }
+        let bias: Tensor<1> = pass.get(self.bias);
+        let channels = bias.dims()[0];
+        pass.raise(y) + bias.reshape([1, channels, 1, 1])
+    }
+}
+
+/// A linear layer with a bias over the last dimension.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Dense {
+    weight: Id,
+    bias: Id,
+}
+
+impl Dense {
+    pub(super) fn declare(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
+        let begin = Begin::Normal(DEVIATION);
+        Self {
+            weight: d.add(format!("{at}.weight"), &[outputs, inputs], begin, true),
+            bias: d.add(format!("{at}.bias"), &[outputs], Begin::Constant(0.0), true),
+        }
+    }
+
+    pub(super) fn forward<const D: usize>(&self, pass: &Pass, x: Tensor<D>) -> Tensor<D> {
+        let (weight, bias) = (pass.get(self.weight), pass.get(self.bias));
+        pass.raise(ops::linear(
+            pass.lower(x),
+            pass.lower(weight),
+            pass.lower(bias),
+        ))
+    }
+}
+
+/// Layer norm over the last dimension.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LayerNorm {
+    gamma: Id,
+    beta: Id,
+}
+
+impl LayerNorm {
+    pub(super) fn declare(d: &mut Declarations, at: &str, channels: usize) -> Self {
+        let mut of = |name: &str, value: f32| {
+            let begin = Begin::Constant(value);
+            d.add(format!("{at}.{name}"), &[channels], begin, true)
+        };
+        Self {
+            gamma: of("weight", 1.0),
+            beta: of("bias", 0.0),
+        }
+    }
+
+    pub(super) fn forward<const D: usize>(&self, pass: &Pass, x: Tensor<D>) -> Tensor<D> {
+        ops::layer_norm(x, pass.get(self.gamma), pass.get(self.beta))
+    }
+}
+
+/// A learnt table of rows, each as a transformer's weights begin.
+pub(super) fn table(d: &mut Declarations, name: String, rows: usize, columns: usize) -> Id {
+    d.add(name, &[rows, columns], Begin::Normal(DEVIATION), true)
+}

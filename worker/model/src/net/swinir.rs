@@ -1,0 +1,168 @@
+//! SwinIR (Liang et al., ICCVW 2021): attention within windows, without any change of the image's size. Names and order of its
+//! parameters are the released code's.
+//!
+//! The network for images of noise adds what it finds to its input; here output and input are different things, so nothing is
+//! added. Stochastic depth is left out.
+
+use burn::tensor::{Tensor, TensorData, activation::gelu};
+
+use super::{
+    layer::{Conv, Dense, LayerNorm, table},
+    pass::{Input, Pass},
+    spec::{NetSpec, Swin},
+};
+use crate::{
+    ops,
+    parameters::{Declarations, Id},
+};
+
+/// Channels between the two layers of a block's perceptron, over those of the features.
+pub(super) const BETWEEN: usize = 2;
+
+#[derive(Debug, Clone)]
+pub(super) struct Swinir {
+    first: Conv,
+    /// Norm of the first features, before the groups.
+    embedded: LayerNorm,
+    groups: Vec<Group>,
+    norm: LayerNorm,
+    after: Conv,
+    last: Conv,
+    window: usize,
+}
+
+/// Blocks, a convolution, and what went in added to it.
+#[derive(Debug, Clone)]
+struct Group {
+    blocks: Vec<Block>,
+    conv: Conv,
+}
+
+/// x + attention(norm(x)), then x + perceptron(norm(x)).
+#[derive(Debug, Clone)]
+struct Block {
+    norms: [LayerNorm; 2],
+    positions: Id,
+    qkv: Dense,
+    project: Dense,
+    perceptron: [Dense; 2],
+    /// Whether its windows lie half a window further.
+    shifted: bool,
+}
+
+impl Swinir {
+    pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        let (width, swin) = (spec.width, &spec.swin);
+        let conv =
+            |d: &mut Declarations, at: &str, outputs| Conv::declare(d, at, [width, 0], outputs);
+        let first = Conv::declare(d, "conv_first", [spec.dense, spec.one_hot], width);
+        let embedded = LayerNorm::declare(d, "patch_embed.norm", width);
+        let groups = (0..swin.groups).map(|g| {
+            let at = format!("layers.{g}");
+            let blocks = (0..swin.depth).map(|b| {
+                let at = format!("{at}.residual_group.blocks.{b}");
+                Block::declare(d, &at, width, swin, b % 2 == 1)
+            });
+            let blocks = blocks.collect();
+            let conv = conv(d, &format!("{at}.conv"), width);
+            Group { blocks, conv }
+        });
+        Self {
+            first,
+            embedded,
+            groups: groups.collect(),
+            norm: LayerNorm::declare(d, "norm", width),
+            after: conv(d, "conv_after_body", width),
+            last: conv(d, "conv_last", spec.outputs),
+            window: swin.window as usize,
+        }
+    }
+
+    pub(super) fn forward(&self, pass: &Pass, input: Input) -> Tensor<4> {
+        let first = self.first.forward(pass, input.dense, input.one_hot);
+        let [_, _, h, w] = first.dims();
+        // An image of one window has nothing to shift to (released code).
+        let shift = match h.min(w) > self.window {
+            true => self.window / 2,
+            false => 0,
+        };
+        let mask = (shift > 0).then(|| {
+            let tokens = self.window * self.window;
+            let windows = h * w / tokens;
+            let mask = ops::window_mask([h, w], self.window, shift);
+            let mask = TensorData::new(mask, [windows, tokens, tokens]);
+            Tensor::<3>::from_data(mask, &first.device())
+        });
+        let mut x = self.embedded.forward(pass, tokens_last(first.clone()));
+        for group in &self.groups {
+            let before = x.clone();
+            for block in &group.blocks {
+                let shift = if block.shifted { shift } else { 0 };
+                x = block.forward(pass, x, self.window, shift, mask.as_ref());
+            }
+            let y = group.conv.forward(pass, channels_first(x), None);
+            x = tokens_last(y) + before;
+        }
+        let x = channels_first(self.norm.forward(pass, x));
+        let x = self.after.forward(pass, x, None) + first;
+        self.last.forward(pass, x, None)
+    }
+}
+
+impl Block {
+    fn declare(d: &mut Declarations, at: &str, width: usize, swin: &Swin, shifted: bool) -> Self {
+        let places = (2 * swin.window as usize - 1).pow(2);
+        let dense = |d: &mut Declarations, name: &str, inputs, outputs| {
+            Dense::declare(d, &format!("{at}.{name}"), inputs, outputs)
+        };
+        let norm = |d: &mut Declarations, name: &str| {
+            LayerNorm::declare(d, &format!("{at}.{name}"), width)
+        };
+        let first = norm(d, "norm1");
+        let name = format!("{at}.attn.relative_position_bias_table");
+        Self {
+            positions: table(d, name, places, swin.heads as usize),
+            qkv: dense(d, "attn.qkv", width, 3 * width),
+            project: dense(d, "attn.proj", width, width),
+            norms: [first, norm(d, "norm2")],
+            perceptron: [
+                dense(d, "mlp.fc1", width, BETWEEN * width),
+                dense(d, "mlp.fc2", BETWEEN * width, width),
+            ],
+            shifted,
+        }
+    }
+
+    /// (N, H, W, C) to the same.
+    fn forward(
+        &self,
+        pass: &Pass,
+        x: Tensor<4>,
+        window: usize,
+        shift: usize,
+        mask: Option<&Tensor<3>>,
+    ) -> Tensor<4> {
+        let [_, h, w, _] = x.dims();
+        let seen = ops::shifted(self.norms[0].forward(pass, x.clone()), shift);
+        let qkv = self.qkv.forward(pass, ops::windows(seen, window));
+        let bias = ops::position_bias(pass.get(self.positions), window);
+        let mask = mask.filter(|_| shift > 0).cloned();
+        let said = ops::window_attention(qkv, bias, mask);
+        let said = self.project.forward(pass, said);
+        let said = ops::from_windows(said, window, [h, w]);
+        let x = x + ops::shifted_back(said, shift);
+        let [first, second] = &self.perceptron;
+        let between = gelu(first.forward(pass, self.norms[1].forward(pass, x.clone())));
+        x + second.forward(pass, between)
+    }
+}
+
+/// (N, C, H, W) to (N, H, W, C).
+fn tokens_last(x: Tensor<4>) -> Tensor<4> {
+    x.permute([0, 2, 3, 1])
+}
+
+/// (N, H, W, C) to (N, C, H, W).
+fn channels_first(x: Tensor<4>) -> Tensor<4> {
+    x.permute([0, 3, 1, 2])
+}

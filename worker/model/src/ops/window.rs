@@ -1,0 +1,166 @@
+//! Attention within windows, as in Swin transformers (Liu et al., ICCV 2021, sections 3.2 and 3.3) and SwinIR (Liang et al.,
+//! ICCVW 2021): compositions of burn's operations, the same on every device.
+//!
+//! A *token* is a pixel's row of features. Feature maps lie with their channels last here, (N, H, W, C), and windows of
+//! w×w tokens as (N·H/w·W/w, w², C), windows row by row within an image, tokens row by row within a window.
+
+use burn::tensor::{Int, Tensor, TensorData, activation::softmax, module};
+
+use super::EPSILON;
+
+/// What keeps tokens apart that a shift brought into one window: added to their scores, as in the released code.
+pub const APART: f64 = -100.0;
+
+/// Layer norm over the last dimension, with PyTorch's epsilon: (…, C), scale (C) and shift (C) to (…, C).
+pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<D> {
+    module::layer_norm(x, gamma, Some(beta), EPSILON)
+}
+
+/// (…, I), weights (O, I) and a bias (O) to (…, O), as PyTorch's `Linear`.
+pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, bias: Tensor<1>) -> Tensor<D> {
+    let mut shape = x.dims();
+    let inputs = shape[D - 1];
+    let tokens = shape.iter().product::<usize>() / inputs;
+    let [outputs, _] = w.dims();
+    let y = x.reshape([tokens, inputs]).matmul(w.transpose()) + bias.reshape([1, outputs]);
+    shape[D - 1] = outputs;
+    y.reshape(shape)
+}
+
+/// (N, H, W, C) to its windows.
+///
+/// # Panics
+/// Where H or W is no multiple of `window`.
+pub fn windows(x: Tensor<4>, window: usize) -> Tensor<3> {
+    let [n, h, w, c] = x.dims();
+    let (rows, columns) = (h / window, w / window);
+    x.reshape([n, rows, window, columns, window, c])
+        .permute([0, 1, 3, 2, 4, 5])
+        .reshape([n * rows * columns, window * window, c])
+}
+
+/// Windows to (N, H, W, C).
+pub fn from_windows(x: Tensor<3>, window: usize, [h, w]: [usize; 2]) -> Tensor<4> {
+    let [all, _, c] = x.dims();
+    let (rows, columns) = (h / window, w / window);
+    let n = all / (rows * columns);
+    x.reshape([n, rows, columns, window, window, c])
+        .permute([0, 1, 3, 2, 4, 5])
+        .reshape([n, h, w, c])
+}
+
+/// Rows and columns moved by `shift` towards the origin; what leaves comes in at the other end. `shift` lies in 0..H and 0..W.
+pub fn shifted(x: Tensor<4>, shift: usize) -> Tensor<4> {
+    let turn = |x: Tensor<4>, dim: usize| {
+        let len = x.dims()[dim];
+        let first = x.clone().narrow(dim, 0, shift);
+        Tensor::cat(vec![x.narrow(dim, shift, len - shift), first], dim)
+    };
+    match shift {
+        0 => x,
+        _ => turn(turn(x, 1), 2),
+    }
+}
+
+/// The inverse of [`shifted`] by the same `shift`.
+pub fn shifted_back(x: Tensor<4>, shift: usize) -> Tensor<4> {
+    let turn = |x: Tensor<4>, dim: usize| {
+        let len = x.dims()[dim];
+        let last = x.clone().narrow(dim, len - shift, shift);
+        Tensor::cat(vec![last, x.narrow(dim, 0, len - shift)], dim)
+    };
+    match shift {
+        0 => x,
+        _ => turn(turn(x, 1), 2),
+    }
+}
+
+/// For each pair of tokens of a window, (w², w²) row by row, the entry of a table of (2w − 1)² differences of places, those of
+/// rows first: (row of a − row of b + w − 1)·(2w − 1) + column of a − column of b + w − 1.
+pub fn relative_positions(window: usize) -> Vec<usize> {
+    let tokens = window * window;
+    let place = |token: usize| (token / window, token % window);
+    let entry = |at: usize| {
+        let ((row, column), (of_row, of_column)) = (place(at / tokens), place(at % tokens));
+        let (down, right) = (row + window - 1 - of_row, column + window - 1 - of_column);
+        down * (2 * window - 1) + right
+    };
+    (0..tokens * tokens).map(entry).collect()
+}
+
+/// What is added to scores in each window of an image of (H, W) tokens that was [`shifted`], (H/w·W/w, w², w²) row by row:
+/// [`APART`] where a shift brought two tokens together from different ends of the image, else 0.
+pub fn window_mask([h, w]: [usize; 2], window: usize, shift: usize) -> Vec<f32> {
+    // Three bands: whole windows, what was in the last window before the shift, what came from the other end.
+    let band = |at: usize, len: usize| match (at < len - window, at < len - shift) {
+        (true, _) => 0,
+        (false, true) => 1,
+        (false, false) => 2,
+    };
+    let (columns, tokens) = (w / window, window * window);
+    let mut mask = Vec::with_capacity(h / window * columns * tokens * tokens);
+    for which in 0..h / window * columns {
+        let region = |token: usize| {
+            let row = which / columns * window + token / window;
+            let column = which % columns * window + token % window;
+            (band(row, h), band(column, w))
+        };
+        for a in 0..tokens {
+            let apart = |b| {
+                if region(a) == region(b) {
+                    0.0
+                } else {
+                    APART as f32
+                }
+            };
+            mask.extend((0..tokens).map(apart));
+        }
+    }
+    mask
+}
+
+/// Multi-head attention within windows.
+///
+/// `qkv` (windows, w², 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩
+/// times (C/heads)^−½, plus `bias` (heads, w², w²), plus `mask` (windows of an image, w², w²), the same for every image. Gives
+/// (windows, w², C), head after head.
+pub fn window_attention(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>) -> Tensor<3> {
+    let [all, tokens, channels] = qkv.dims();
+    let [heads, ..] = bias.dims();
+    let size = channels / 3 / heads;
+    let apart = qkv
+        .reshape([all, tokens, 3, heads, size])
+        .permute([2, 0, 3, 1, 4]);
+    let part = |which| {
+        apart
+            .clone()
+            .narrow(0, which, 1)
+            .reshape([all, heads, tokens, size])
+    };
+    let [q, k, v] = [0, 1, 2].map(part);
+    let q = q.mul_scalar((size as f64).powf(-0.5));
+    let mut scores = q.matmul(k.swap_dims(2, 3)) + bias.reshape([1, heads, tokens, tokens]);
+    if let Some(mask) = mask {
+        let [of_image, ..] = mask.dims();
+        let images = all / of_image;
+        let by_image = scores.reshape([images, of_image, heads, tokens, tokens]);
+        let mask = mask.reshape([1, of_image, 1, tokens, tokens]);
+        scores = (by_image + mask).reshape([all, heads, tokens, tokens]);
+    }
+    softmax(scores, 3)
+        .matmul(v)
+        .swap_dims(1, 2)
+        .reshape([all, tokens, heads * size])
+}
+
+/// Rows of a table ((2w − 1)², heads) for each pair of tokens: (heads, w², w²).
+pub fn position_bias(table: Tensor<2>, window: usize) -> Tensor<3> {
+    let (tokens, [_, heads]) = (window * window, table.dims());
+    let entries = relative_positions(window).into_iter().map(|at| at as i64);
+    let entries = TensorData::new(entries.collect::<Vec<i64>>(), [tokens * tokens]);
+    let entries = Tensor::<1, Int>::from_data(entries, &table.device());
+    table
+        .select(0, entries)
+        .transpose()
+        .reshape([heads, tokens, tokens])
+}
