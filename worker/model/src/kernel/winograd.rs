@@ -6,8 +6,6 @@
 //! the tiles' columns, so that lanes are neighbouring tiles, transforms them, multiplies, and transforms back. The
 //! products are chains over input channels; the transforms are sums of a fixed order.
 
-use std::ops::Range;
-
 use rayon::prelude::*;
 
 use super::conv_shape::{BLOCK, ConvShape};
@@ -17,10 +15,8 @@ use super::simd::{Kernels, LANES, Lanes, Op, shifted};
 
 /// Values of a tile, and so the number of products.
 const TILE: usize = 16;
-/// Bytes of a task's transformed input and products, about: what a second-level cache holds beside the weights.
-const BYTES: usize = 1280 << 10;
-/// Input channels that are transformed and multiplied at a time.
-const CHUNK: usize = 64;
+/// Bytes of a task's transformed input, about: half of a second-level cache.
+const BYTES: usize = 512 << 10;
 
 /// True where this form is faster than the direct one.
 pub(super) fn pays(s: &ConvShape) -> bool {
@@ -36,8 +32,7 @@ impl Kernels {
             width: s.width.div_ceil(2),
             pad: 1,
         };
-        let chunk = CHUNK.min(s.inputs);
-        let units = (BYTES / (TILE * LANES * 4 * (chunk + s.outputs))).clamp(6, 12);
+        let units = (BYTES / (TILE * LANES * 4 * s.inputs)).clamp(8, 12);
         let bands = tiles.bands(units * LANES);
         if bands.is_empty() {
             return;
@@ -64,40 +59,35 @@ impl Kernels {
                 let units = tiles.units_unpadded(band);
                 let len = units.len() * LANES;
                 // One line more than the data keeps the sixteen streams out of one cache set.
-                let step = chunk * len + LANES;
+                let step = s.inputs * len + LANES;
                 let blocks = channels.div_ceil(BLOCK);
                 let mut v = Scratch::take(TILE * step);
                 let mut m = Scratch::take(TILE * blocks * BLOCK * len);
                 let plane = tiles.packed_len(band) + 2 * LANES;
                 let mut columns = Scratch::take(8 * plane);
-                // A product goes on over the chunks: its chain is the same however long they are.
-                for from in (0..s.inputs).step_by(chunk) {
-                    let channels = from..(from + chunk).min(s.inputs);
-                    for c in channels.clone() {
-                        self.run(Input {
-                            s,
-                            tiles,
-                            band,
-                            units: &units,
-                            x,
-                            channel: c,
-                            plane,
-                            columns: &mut columns,
-                            to: &mut v[(c - from) * len..],
-                            step,
-                        });
-                    }
-                    self.run(Multiply {
-                        v: &v,
+                for c in 0..s.inputs {
+                    self.run(Input {
+                        s,
+                        tiles,
+                        band,
+                        units: &units,
+                        x,
+                        channel: c,
+                        plane,
+                        columns: &mut columns,
+                        to: &mut v[c * len..],
                         step,
-                        channels,
-                        inputs: s.inputs,
-                        len,
-                        weights: &weights[first * TILE * s.inputs..],
-                        blocks,
-                        m: &mut m,
                     });
                 }
+                self.run(Multiply {
+                    v: &v,
+                    step,
+                    inputs: s.inputs,
+                    len,
+                    weights: &weights[first * TILE * s.inputs..],
+                    blocks,
+                    m: &mut m,
+                });
                 self.run(Output {
                     m: &m,
                     len,
@@ -268,13 +258,10 @@ fn columns_of<L: Lanes>(row: &[f32], at: usize, width: usize, columns: &mut [f32
     columns[d + width - 1] = 0.0;
 }
 
-/// The sixteen products over some input channels: `m[block][channel][tile value][tile]`, begun with the first channel.
+/// The sixteen products: `m[block][channel][tile value][tile]`.
 struct Multiply<'a> {
     v: &'a [f32],
     step: usize,
-    /// Those that `v` has.
-    channels: Range<usize>,
-    /// Of all.
     inputs: usize,
     len: usize,
     weights: &'a [f32],
@@ -327,28 +314,19 @@ impl Multiply<'_> {
         for (v, start) in starts.iter_mut().enumerate() {
             *start = at + v * LANES;
         }
-        let row = |m: usize| ((b * BLOCK + half + m) * TILE + f) * self.len + at;
-        let mut acc = [[L::splat(0.0); V]; M];
-        if self.channels.start > 0 {
-            for (m, acc) in acc.iter_mut().enumerate() {
-                for (v, acc) in acc.iter_mut().enumerate() {
-                    *acc = L::load(&self.m[row(m) + v * LANES..]);
-                }
-            }
-        }
         // Without inputs there are no weights.
-        let weights = ((b * TILE + f) * self.inputs + self.channels.start) * BLOCK + half;
+        let weights = ((b * TILE + f) * self.inputs * BLOCK + half).min(self.weights.len());
         let acc = shifted::<L, M, V, 1>(
             &self.v[f * self.step..],
             starts,
-            (self.channels.len(), self.len, 0),
-            &self.weights[weights.min(self.weights.len())..],
-            acc,
+            (self.inputs, self.len, 0),
+            &self.weights[weights..],
+            [[L::splat(0.0); V]; M],
         );
         for (m, acc) in acc.iter().enumerate() {
-            let row = row(m);
+            let row = ((b * BLOCK + half + m) * TILE + f) * self.len;
             for (v, acc) in acc.iter().enumerate() {
-                acc.store(&mut self.m[row + v * LANES..]);
+                acc.store(&mut self.m[row + at + v * LANES..]);
             }
         }
     }
