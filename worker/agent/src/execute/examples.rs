@@ -1,7 +1,7 @@
 //! The scenes of a data set as networks meet them: a histogram, and the truth of the spots that made it.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, HashSet},
     sync::{Arc, Mutex},
 };
 
@@ -53,6 +53,8 @@ pub(super) struct Examples {
     /// Depths that two-bounce times follow from; the truth's where there are none.
     depths: Option<Predictions>,
     kept: Mutex<Kept>,
+    /// Scenes whose histograms hold light, and nothing but finite numbers.
+    sound: Mutex<HashSet<u64>>,
     /// Room of histograms that nobody looks at any more: fresh memory for each would cost as much as decoding it.
     spare: Mutex<Vec<Vec<f32>>>,
     /// What the sensor's scale follows from, by scene: the same at each visit.
@@ -132,6 +134,7 @@ impl Examples {
                 scenes: HashMap::new(),
                 room: (memory_mib() / KEPT_SHARE) as usize * (1 << 20),
             }),
+            sound: Mutex::default(),
             spare: Mutex::default(),
             peaks: Mutex::default(),
         })
@@ -247,7 +250,12 @@ impl Examples {
             dataset.read_spots(scene),
             dataset.read_intrinsics(scene),
         )?;
-        check_light(&dataset.place(), scene, &histogram)?;
+        // What was sound once is not looked through again at each visit.
+        let sound = || self.sound.lock().expect("no panic while locked");
+        if !sound().contains(&scene) {
+            check_light(&dataset.place(), scene, &histogram)?;
+            sound().insert(scene);
+        }
         // Nothing is seen there: infinitely far, not at the camera.
         let depth_m: Vec<f32> = depth
             .into_iter()

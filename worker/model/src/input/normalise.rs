@@ -5,8 +5,8 @@ use crate::scene::{Order, Scene};
 
 /// Pixels that change from pixel by pixel to bin by bin together: they fill a cache line of each bin's plane.
 const BLOCK: usize = 16;
-/// Pixels whose planes are scaled together: their least and greatest values stay in the first cache.
-const STRIP: usize = 1024;
+/// Pixels whose planes are scaled together: 1.3 MB of 637 bins.
+const STRIP: usize = 512;
 
 /// How many adjacent bins of `stored` are summed for one of `bins`. What is left over at the end, and dropped, must be fewer
 /// than are summed: otherwise most of a gate could go without a word.
@@ -67,34 +67,48 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
     }
 }
 
-/// [`planes`] of what lies so already: to the same bits.
+/// [`planes`] of what lies so already: to the same bits. What a strip of pixels holds is looked at twice, and stays in the
+/// second-level cache meanwhile.
 fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
     let (pixels, merged) = (scene.pixels(), scene.bins / bins);
-    for (plane, stored) in out
-        .chunks_exact_mut(pixels)
-        .zip(scene.histogram.chunks_exact(pixels * merged))
-    {
-        let mut stored = stored.chunks_exact(pixels);
-        plane.copy_from_slice(stored.next().expect("at least one is merged"));
-        for stored in stored {
-            plane.iter_mut().zip(stored).for_each(|(sum, h)| *sum += h);
-        }
-    }
-    if let Normalise::Log { .. } = normalise {
-        return scale(out, normalise);
-    }
     let (mut least, mut most) = ([0.0f32; STRIP], [0.0f32; STRIP]);
+    let mut sums = [0.0f32; STRIP];
     for from in (0..pixels).step_by(STRIP) {
         let of = from..(from + STRIP).min(pixels);
-        let (least, most) = (&mut least[..of.len()], &mut most[..of.len()]);
+        let len = of.len();
+        let stored = |plane: usize| &scene.histogram[plane * pixels..][of.clone()];
+        let (least, most) = (&mut least[..len], &mut most[..len]);
         least.fill(f32::INFINITY);
         most.fill(f32::NEG_INFINITY);
-        for plane in out.chunks_exact(pixels) {
-            let bounds = least.iter_mut().zip(most.iter_mut());
-            for (h, (least, most)) in plane[of.clone()].iter().zip(bounds) {
-                *least = least.min(*h);
-                *most = most.max(*h);
+        for (b, plane) in out.chunks_exact_mut(pixels).enumerate() {
+            let sum = match merged {
+                1 => stored(b),
+                _ => {
+                    let sums = &mut sums[..len];
+                    sums.copy_from_slice(stored(b * merged));
+                    for k in 1..merged {
+                        let more = stored(b * merged + k);
+                        sums.iter_mut().zip(more).for_each(|(sum, h)| *sum += h);
+                    }
+                    plane[of.clone()].copy_from_slice(sums);
+                    &*sums
+                }
+            };
+            for ((h, least), most) in sum.iter().zip(least.iter_mut()).zip(most.iter_mut()) {
+                // As `f32::min` and `max` do, which compilers do not make one instruction of.
+                *least = if *h < *least { *h } else { *least };
+                *most = if *h > *most { *h } else { *most };
             }
+        }
+        if let Normalise::Log { .. } = normalise {
+            for (b, plane) in out.chunks_exact_mut(pixels).enumerate() {
+                let plane = &mut plane[of.clone()];
+                if merged == 1 {
+                    plane.copy_from_slice(stored(b));
+                }
+                scale(plane, normalise);
+            }
+            continue;
         }
         for (least, most) in least.iter_mut().zip(most.iter_mut()) {
             // A range of infinity makes zeros of all.
@@ -107,13 +121,30 @@ fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
                 *least = 0.0;
             }
         }
-        for plane in out.chunks_exact_mut(pixels) {
-            let bounds = least.iter().zip(most.iter());
-            for (h, (least, range)) in plane[of.clone()].iter_mut().zip(bounds) {
-                let scaled = (*h - least) / range;
-                *h = if scaled.is_finite() { scaled } else { 0.0 };
+        for (b, plane) in out.chunks_exact_mut(pixels).enumerate() {
+            let plane = &mut plane[of.clone()];
+            if merged == 1 {
+                let of_bin = plane.iter_mut().zip(stored(b));
+                for ((to, h), (least, range)) in of_bin.zip(least.iter().zip(most.iter())) {
+                    *to = within(*h, *least, *range);
+                }
+            } else {
+                for (h, (least, range)) in plane.iter_mut().zip(least.iter().zip(most.iter())) {
+                    *h = within(*h, *least, *range);
+                }
             }
         }
+    }
+}
+
+/// (h − least)/range; 0 where that is not finite.
+#[inline]
+fn within(h: f32, least: f32, range: f32) -> f32 {
+    let scaled = (h - least) / range;
+    if scaled.abs() <= f32::MAX {
+        scaled
+    } else {
+        0.0
     }
 }
 
