@@ -167,30 +167,10 @@ fn a_training_whose_workers_are_killed_again_and_again_gives_the_weights_of_one_
     models_can_be_looked_after(&calm);
 }
 
-/// A training of one stage that is saved every so many minutes.
-fn saved_every(store: &Path, minutes: f64, epochs: u32) -> String {
-    let rooms = rooms("saved", store);
-    format!(
-        r#"
-{rooms}[[stage]]
-name = "tof"
-kind = "train"
-source = "rooms"
-[stage.train]
-target = "tof"
-model = "tof"
-net = {{ width = 8, levels = 3 }}
-optimise = {{ epochs = {epochs}, batch = 4 }}
-checkpoint_minutes = {minutes}
-"#
-    )
-}
-
+/// A training that is saved every so many minutes.
 fn submit_saved(farm: &Farm, minutes: f64, epochs: u32) -> String {
-    let file = farm.store().with_file_name("saved.toml");
-    fs::write(&file, saved_every(&farm.store(), minutes, epochs)).unwrap();
-    let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
-    answer["job"].as_str().unwrap().to_owned()
+    let optimise = format!("epochs = {epochs}, batch = 4");
+    submit_training(farm, &optimise, (1, minutes))
 }
 
 /// Steps after which a training has a checkpoint in the store.
@@ -277,10 +257,10 @@ fn no_more_than_one_step_is_lost_by_a_kill_where_each_step_is_saved() {
     assert!(heir.stderr().contains(&words), "{}", heir.stderr());
 }
 
-/// A training of one stage, by so many processes.
-fn together(store: &Path, processes: u32) -> String {
-    let rooms = rooms("together", store);
-    format!(
+/// Submits a training of one stage, by so many processes, with so many minutes between checkpoints.
+fn submit_training(farm: &Farm, optimise: &str, (processes, minutes): (u32, f64)) -> String {
+    let rooms = rooms("training", &farm.store());
+    let job = format!(
         r#"
 {rooms}[[stage]]
 name = "tof"
@@ -290,21 +270,23 @@ source = "rooms"
 target = "tof"
 model = "tof"
 net = {{ width = 8, levels = 3 }}
-optimise = {{ epochs = 900, batch = 12, accumulate = 4 }}
+optimise = {{ {optimise} }}
 processes = {processes}
-checkpoint_minutes = 0.02
+checkpoint_minutes = {minutes}
 "#
-    )
+    );
+    let file = farm.store().with_file_name("training.toml");
+    fs::write(&file, job).unwrap();
+    let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
+    answer["job"].as_str().unwrap().to_owned()
 }
 
 #[test]
 fn processes_of_one_training_that_are_killed_or_frozen_and_come_again_leave_the_bits_of_one() {
     let wanted = kills_wanted();
     let submitted = |farm: &Farm, processes: u32| {
-        let file = farm.store().with_file_name("together.toml");
-        fs::write(&file, together(&farm.store(), processes)).unwrap();
-        let answer = farm.json(&["job", "submit", file.to_str().unwrap()]);
-        answer["job"].as_str().unwrap().to_owned()
+        let optimise = "epochs = 900, batch = 12, accumulate = 4";
+        submit_training(farm, optimise, (processes, 0.02))
     };
     let calm = Farm::with_lease("together-calm", 2.0);
     let id = submitted(&calm, 1);

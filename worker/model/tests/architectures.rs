@@ -392,7 +392,8 @@ fn trained(plan: &Plan, stop: Option<u64>) -> Trained {
         };
         training.run(&mut |t, e| at(t, e)).unwrap();
         let checkpoint = training.checkpoint();
-        training = Training::resume(plan.clone(), &checkpoint, sources(), &device).unwrap();
+        training =
+            Training::resume(plan.clone(), &[checkpoint.as_slice()], sources(), &device).unwrap();
     }
     training.run(&mut |_, _| Control::Continue).unwrap();
     training.finish()

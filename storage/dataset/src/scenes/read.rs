@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use bytes::Bytes;
 use futures::{Stream, StreamExt, stream};
 
 use crate::coding::tiles::Part;
@@ -10,7 +11,7 @@ use crate::layout::manifest::Manifest;
 use crate::layout::published::scenes_in;
 use crate::layout::quantity::{Element, Quantity};
 use crate::layout::record::{Intrinsics, Spot};
-use crate::scenes::dataset::Dataset;
+use crate::scenes::dataset::{ArrayCodec, Dataset};
 use crate::store::objects;
 
 /// A type in which an array may be stored.
@@ -100,6 +101,18 @@ impl Dataset {
             let what = format!("{} is no transient; use read", quantity.name());
             return Err(DatasetError::invalid("quantity", what));
         }
+        self.decode_into(scene, array, target, Self::decode_shard_into)
+            .await
+    }
+
+    /// Fetches a scene's shard and decodes it into `target`, which becomes as long as needed.
+    async fn decode_into(
+        &self,
+        scene: u64,
+        array: &ArrayCodec,
+        target: &mut Vec<f32>,
+        decode: impl Fn(&Self, &Manifest, &ArrayCodec, &Bytes, &mut [f32]) -> Result<(), DatasetError>,
+    ) -> Result<(), DatasetError> {
         let manifest = self.manifest(scene).await?;
         let path = self.path(&array.layout.key(scene));
         let bytes = objects::require(&*self.store, &path).await?;
@@ -108,7 +121,7 @@ impl Dataset {
             // Fresh pages come zeroed from the system; growing would touch them twice.
             *target = vec![0.0; len];
         }
-        self.decode_shard_into(&manifest, array, &bytes, target)
+        decode(self, &manifest, array, &bytes, target)
             .map_err(|e| e.in_object(|| self.shown(&path)))
     }
 
@@ -129,15 +142,8 @@ impl Dataset {
             let what = format!("{} is no single transient", quantity.name());
             return Err(DatasetError::invalid("quantity", what));
         }
-        let manifest = self.manifest(scene).await?;
-        let path = self.path(&array.layout.key(scene));
-        let bytes = objects::require(&*self.store, &path).await?;
-        let len = self.spec.transient_len();
-        if target.len() != len {
-            *target = vec![0.0; len];
-        }
-        self.decode_planes_into(&manifest, array, &bytes, target)
-            .map_err(|e| e.in_object(|| self.shown(&path)))
+        self.decode_into(scene, array, target, Self::decode_planes_into)
+            .await
     }
 
     /// h of many scenes, in the order asked for, while up to `ahead` of them are being fetched and decoded. For
