@@ -72,7 +72,10 @@ struct Kept {
 impl Kept {
     fn keep(&mut self, index: usize, scene: &Arc<Scene>) {
         let bytes = scene.bytes();
-        if bytes <= self.room && self.scenes.insert(index, scene.clone()).is_none() {
+        // Spare room has its share.
+        if bytes.saturating_mul(1 + SPARE) <= self.room
+            && self.scenes.insert(index, scene.clone()).is_none()
+        {
             self.room -= bytes;
         }
     }
@@ -307,8 +310,10 @@ impl Scenes for Examples {
 
     fn take_back(&self, scene: Arc<Scene>) {
         if let Some(scene) = Arc::into_inner(scene) {
+            let room = self.kept.lock().expect("no panic while locked").room;
             let mut spare = self.spare.lock().expect("no panic while locked");
-            if spare.len() < SPARE {
+            let bytes = 4 * scene.histogram.len();
+            if spare.len() < SPARE && bytes.saturating_mul(spare.len() + 1) <= room {
                 spare.push(scene.histogram);
             }
         }

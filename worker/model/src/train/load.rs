@@ -129,6 +129,7 @@ impl Making<'_> {
                 shelf: &shelf,
                 batch: self.plan.batch as u64,
                 count: self.count,
+                room: self.loading.room,
             };
             // However it ends, the threads do.
             let _over = Closing(&shelf);
@@ -283,6 +284,8 @@ pub(super) struct Ready<'a> {
     shelf: &'a Shelf,
     batch: u64,
     count: u64,
+    /// Bytes, as in [`Loading::room`].
+    room: usize,
 }
 
 impl Ready<'_> {
@@ -302,8 +305,11 @@ impl Ready<'_> {
             let example = self.example(which)?;
             let empty = batch.join(example, size as usize)?;
             let mut state = self.shelf.lock();
-            // No more than are made at once.
-            if state.spare.len() <= state.in_hand {
+            let held = state.in_hand + state.spare.len() + 1;
+            let held = held.saturating_mul(state.largest);
+            // No more than are made at once, and no more than there is room for.
+            if state.spare.len() <= state.in_hand && state.waiting.saturating_add(held) <= self.room
+            {
                 state.spare.push(empty);
             }
         }
