@@ -6,7 +6,7 @@ use crate::model::{JobSpec, StageSpec, TaskSpec};
 /// Bytes that a task takes at most, in a process of its own; `None` where that depends on a data set of which nothing is
 /// known here.
 ///
-/// | kind | beside the program (70 MB) and the store (20 MB); H = 4·pixels·bins |
+/// | kind | beside the program (70 MB) and the store (60 MB); H = 4·pixels·bins |
 /// | --- | --- |
 /// | render | H a histogram, truth (260 + spots a pixel), tiles of each thread; and what is more: .6 of the light paths' sums, or the coded result (.45·H) |
 /// | render of parts | the same, and all parts (as much as the image) |
