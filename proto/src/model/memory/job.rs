@@ -13,11 +13,12 @@ use crate::model::{JobSpec, StageSpec, TaskSpec};
 /// | part | the image's and truth's, of the range of tiles; the sums over light paths, and both once more as a message |
 /// | generate | nothing that grows with pixels: its scene is counted with the program |
 /// | import | 3.2·H |
-/// | reprocess | 2.6·H; from single spots 4.6·H |
+/// | reprocess | 3.4·H; from single spots 5·H |
 /// | split | nothing that grows with pixels |
 /// | promote | twice the weights |
 /// | reconstruct | 28 bytes a node of the grid, 40 a pixel and spot; from single spots 2·H |
 /// | export | 3.5·H |
+/// | verify | 2.6·H |
 /// | train, evaluate, infer, report | see [`Network`]; and two scenes |
 pub fn peak_bytes(task: &TaskSpec, known: &Known, threads: u32) -> Option<u64> {
     let estimate = task.memory(known, threads)?;
