@@ -141,11 +141,11 @@ fn a_task_that_gets_no_memory_fails_alone() {
         maximum: None,
     };
     prlimit(Some(pid(worker)), Resource::As, limit).unwrap();
-    // Histograms of 500 MB.
+    // Histograms of 2 GB: more than that, and than the addresses that the allocator has set aside.
     let big = Job {
         name: "big".into(),
         dataset: "big".into(),
-        resolution: 1400,
+        resolution: 2800,
         max_failures: 1,
         max_crashes: 1,
         count: Some(1),
