@@ -138,10 +138,10 @@ async fn list(store: &str, output: Output) -> Result<()> {
                 "-".into(),
                 "-".into(),
                 "-".into(),
-                format!(
-                    "not finished: a checkpoint after {} steps",
-                    step.unwrap_or(0)
-                ),
+                match step {
+                    Some(step) => format!("not finished: a checkpoint after {step} steps"),
+                    None => "not finished, and no whole checkpoint".into(),
+                },
             ],
         });
         table(&[header].into_iter().chain(rows).collect::<Vec<_>>())
