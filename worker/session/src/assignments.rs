@@ -93,8 +93,8 @@ pub(crate) struct Assignments {
     beats: VecDeque<Beat>,
     /// A lease has been asked for on this connection and not received yet.
     asked: bool,
-    /// How long the last finished task took.
-    pace: Option<Duration>,
+    /// How long the last finished task took, and its stage: it tells nothing of another stage's tasks.
+    pace: Option<(StageKey, Duration)>,
     /// No new work before this time.
     paused_until: Option<Instant>,
     draining: bool,
@@ -301,7 +301,7 @@ impl Assignments {
             .expect("only the task in hand can end: the runner runs one at a time");
         let held = self.leases.iter().any(|h| h.lease == hand.lease);
         if result.is_ok() {
-            self.pace = Some(now - hand.since);
+            self.pace = Some((hand.task.stage, now - hand.since));
         }
         match result {
             Ok(output) => self.outbox.push(Report::Done(Finished {
@@ -391,11 +391,18 @@ impl Assignments {
         });
     }
 
-    /// Whether to ask for a lease: none is on its way, and the work at hand is over or soon will be.
+    /// Whether to ask for a lease: none is on its way, and the work at hand is over or soon will be. After a stage of short
+    /// tasks, one of another stage may take days: while any is held, no more is asked for.
     fn wants(&self) -> bool {
         let waiting: u64 = self.leases.iter().map(|h| h.hi - h.next).sum();
         let left = waiting + u64::from(self.in_hand.is_some());
-        let soon_over = self.pace.is_some_and(|pace| {
+        let ahead = self.leases.iter().filter(|h| h.next < h.hi);
+        let in_hand = self.in_hand.iter().map(|hand| hand.task.stage);
+        let mut stages = ahead.map(|h| h.stage).chain(in_hand);
+        let soon_over = self.pace.is_some_and(|(stage, pace)| {
+            if stages.any(|other| other != stage) {
+                return false;
+            }
             let left = u32::try_from(left).unwrap_or(u32::MAX);
             pace.saturating_mul(left) <= AHEAD
         });

@@ -107,6 +107,40 @@ fn result(kind: u8) -> Result<Output, TaskError> {
     }
 }
 
+/// Whether the worker asks for another lease now.
+fn asks(assignments: &mut Assignments, now: Instant) -> bool {
+    let sent = assignments.outgoing(now);
+    sent.iter().any(|m| matches!(m, Outgoing::Credit(1)))
+}
+
+#[test]
+fn after_a_stage_of_short_tasks_one_task_of_another_is_enough() {
+    let (mut assignments, start) = (Assignments::new(), Instant::now());
+    let of = |epoch, stage| Lease {
+        key: StageKey([stage; 32]),
+        ..lease(epoch, 1, Vec::new())
+    };
+    assert!(asks(&mut assignments, start), "nothing to do");
+    assert!(assignments.granted(start, of(1, 0)));
+    assignments.begin(start).expect("a task is there");
+    assignments.ended(start, &result(2));
+    // The next of the same stage is soon over: another is asked for, and that is of a second stage.
+    assert!(asks(&mut assignments, start), "nothing to do");
+    assert!(assignments.granted(start, of(2, 0)));
+    assert!(asks(&mut assignments, start), "it is soon over");
+    assert!(assignments.granted(start, of(3, 1)));
+    assert!(
+        !asks(&mut assignments, start),
+        "nobody knows how long the second stage's task takes"
+    );
+    assignments.begin(start).expect("a task is there");
+    assignments.ended(start, &result(2));
+    assignments.begin(start).expect("a task is there");
+    assert!(!asks(&mut assignments, start), "it is in hand");
+    assignments.ended(start, &result(2));
+    assert!(asks(&mut assignments, start), "nothing to do");
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(256))]
 
