@@ -19,17 +19,15 @@ use picofarm_transient::sensor::{
 };
 use tokio::runtime::Handle;
 
-#[cfg(test)]
-mod folded;
-
 use super::{
     Control, TaskError,
     output::Stores,
     reprocess::{as_radiance, quantity},
 };
-use picofarm_session::memory_mib;
 
-/// One part of so many of the memory holds scenes; training and validation have one each.
+#[cfg(test)]
+mod folded;
+/// One part of so many of the memory that the worker's tasks may take holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
 
 /// Histograms whose room is kept for others, at most.
@@ -135,7 +133,8 @@ impl Examples {
             depths: None,
             kept: Mutex::new(Kept {
                 scenes: HashMap::new(),
-                room: (memory_mib() / KEPT_SHARE) as usize * (1 << 20),
+                room: usize::try_from((stores.memory_mib() << 20) / KEPT_SHARE)
+                    .unwrap_or(usize::MAX),
             }),
             sound: Mutex::default(),
             spare: Mutex::default(),

@@ -61,6 +61,12 @@ impl Stores {
         Self { memory_mib, ..self }
     }
 
+    /// Memory that tasks may take, MiB; 0 = not known. One of several workers on a machine has its part of it.
+    #[cfg(feature = "networks")]
+    pub(super) fn memory_mib(&self) -> u64 {
+        self.memory_mib
+    }
+
     /// Refuses a task that takes more memory than tasks may take here. `source` is the data set that it reads, where its
     /// size depends on one.
     pub(super) fn fits(

@@ -346,7 +346,7 @@ impl<'a> TrainingRun<'a> {
             }
         }
         .map_err(of_model)?
-        .loading(loading());
+        .loading(loading(stores.memory_mib()));
         let checkpoints = self.models.checkpoints_of(name, key).map_err(of_dataset)?;
         let mut saver = Saver::new(stores, checkpoints);
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);
