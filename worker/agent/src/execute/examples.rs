@@ -27,6 +27,7 @@ use super::{
 
 #[cfg(test)]
 mod folded;
+
 /// One part of so many of the memory that the worker's tasks may take holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
 
