@@ -16,7 +16,7 @@ use std::{ffi::OsString, net::SocketAddr, path::PathBuf};
 
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use picofarm_database::CatalogPlace;
-use picofarm_settings::Gpus;
+use picofarm_settings::{Gpus, Spots};
 
 pub use data::{
     BenchStore, DatasetExport, DatasetImport, DatasetReport, DatasetReprocess, DatasetSplit,
@@ -205,9 +205,9 @@ pub struct Demo {
     /// Image width and height in pixels
     #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: u32,
-    /// Laser spots: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25, value_parser = ranges::spots)]
-    pub spots: u32,
+    /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1, right and down)
+    #[arg(long, default_value = "25", value_parser = ranges::spots)]
+    pub spots: Spots,
     /// Seed of the data set
     #[arg(long, default_value_t = 1, value_parser = ranges::whole)]
     pub seed: u64,
@@ -409,7 +409,7 @@ pub enum Dataset {
 pub enum Scene {
     /// Generate a scene from a seed and write it as .glb
     Generate {
-        /// Kind of scene; plato is the room that reconstructions are measured in
+        /// Kind of scene; desktop is a box on a desk as laboratories have it, plato the room that reconstructions are measured in
         #[arg(long, value_enum, default_value_t = GeneratorArg::Furnished)]
         kind: GeneratorArg,
         /// Seed
@@ -418,9 +418,10 @@ pub enum Scene {
         /// Where to write it
         #[arg(long, default_value = "scene.glb", value_name = "FILE")]
         out: PathBuf,
-        /// Laser spots: 1, 4, 16, 25 or 100 [default: 25; 16 in plato rooms, which have no more]
+        /// Laser spots: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to 1, right and down) [default: 25; 16 in
+        /// desktop and plato rooms; plato rooms take a number up to 16]
         #[arg(long, value_parser = ranges::spots)]
-        spots: Option<u32>,
+        spots: Option<Spots>,
         /// Image width and height in pixels
         #[arg(long, default_value_t = 256, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
         resolution: u32,
@@ -460,9 +461,10 @@ pub struct SceneExport {
     /// Format [default: by the extension of --out]
     #[arg(long, value_enum)]
     pub format: Option<FormatArg>,
-    /// Aim this many laser spots over the camera's view, in place of the file's laser: 1, 4, 16, 25 or 100
+    /// Laser spots in the camera's view, in place of the file's: a grid of 1, 4, 16, 25 or 100; random:N; or places as X,Y/X,Y (0 to
+    /// 1, right and down)
     #[arg(long, value_parser = ranges::spots)]
-    pub spots: Option<u32>,
+    pub spots: Option<Spots>,
     /// Put a camera in front of a file without one (.ply), and 25 spots if --spots does not say otherwise
     #[arg(long)]
     pub frame: bool,
@@ -479,6 +481,7 @@ pub enum FormatArg {
 pub enum GeneratorArg {
     Furnished,
     Primitive,
+    Desktop,
     Plato,
 }
 

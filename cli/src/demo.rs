@@ -43,7 +43,8 @@ fn task(args: &Demo) -> RenderTask {
             count: args.scenes,
             seed: args.seed,
             fov_deg: 90.0,
-            spots: args.spots,
+            spots: args.spots.clone(),
+            laser_m: [0.0; 3],
         },
         render: RenderSettings {
             resolution: args.resolution,

@@ -145,6 +145,7 @@ mod tests {
         for kind in [
             JobKind::Furnished,
             JobKind::Primitive,
+            JobKind::Desktop,
             JobKind::Files,
             JobKind::Graph,
             JobKind::Train,
@@ -235,6 +236,22 @@ mod tests {
             "{}",
             error.message
         );
+    }
+
+    #[test]
+    fn what_the_desktop_template_leaves_out_is_what_it_says() {
+        let dir = tempfile::tempdir().unwrap();
+        let left_out = template(JobKind::Desktop);
+        let rooms = left_out.find("# [scenes.rooms]").unwrap();
+        let end = left_out.find("\n[render]").unwrap();
+        let said = left_out[rooms..end]
+            .replace("# [", "[")
+            .replace("\n# ", "\n");
+        let said = format!("{}{said}{}", &left_out[..rooms], &left_out[end..]);
+        let read = |text: &str| read(&written(dir.path(), text), dir.path()).unwrap();
+        assert_eq!(read(&said), read(&left_out));
+        let wider = said.replace("scale = [0.22, 0.34]", "scale = [0.22, 0.4]");
+        assert_ne!(read(&wider), read(&left_out));
     }
 
     #[test]

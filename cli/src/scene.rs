@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 
 use picofarm_proto::show;
 use picofarm_scene::{
-    AssetLibrary, LaserGrid, Scene, export,
+    Aim, AssetLibrary, Scene, export,
     furnished::{self, FurnishedSettings},
     import::{self, ImportOptions},
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
 };
+use picofarm_settings::Spots;
 use serde_json::json;
 
 use crate::{
@@ -58,13 +59,13 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
 
 /// `scene export`.
 fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
-    let spots = args.spots.or(args.frame.then_some(25));
-    let grid = |n: u32| {
-        let what = format!("--spots {n}: there are grids of 1, 4, 16, 25 and 100 spots");
-        LaserGrid::new(n).ok_or_else(|| CliError::input(what))
+    let spots = args.spots.clone();
+    let spots = spots.or(args.frame.then_some(Spots::Grid(25)));
+    let aim = |spots: Spots| {
+        Aim::of(&spots, 0).map_err(|what| CliError::input(format!("--spots {spots}: {what}")))
     };
     let options = ImportOptions {
-        laser: spots.map(grid).transpose()?,
+        laser: spots.map(aim).transpose()?,
         frame: args.frame,
         ..ImportOptions::default()
     };
@@ -112,32 +113,35 @@ fn export_scene(args: &SceneExport, output: Output) -> Result<()> {
 fn generate(
     kind: GeneratorArg,
     seed: u64,
-    spots: Option<u32>,
+    spots: Option<Spots>,
     resolution: u32,
     object: PlatoArg,
     assets: &str,
     settings: &Settings,
 ) -> Result<Scene> {
-    let grid = spots.unwrap_or(25);
     match kind {
         GeneratorArg::Furnished => {
             let library = AssetLibrary::named(assets, std::slice::from_ref(&settings.assets))?;
             let settings = FurnishedSettings {
                 assets: library.name().to_owned(),
                 specular_at_least: 1,
-                spots: grid,
+                spots: spots.unwrap_or(Spots::Grid(25)),
                 width: resolution,
                 height: resolution,
                 ..Default::default()
             };
             Ok(furnished::generate(seed, &settings, &library)?)
         }
-        GeneratorArg::Primitive => {
+        GeneratorArg::Primitive | GeneratorArg::Desktop => {
+            let preset = match kind {
+                GeneratorArg::Desktop => PrimitiveSettings::desktop(),
+                _ => PrimitiveSettings::default(),
+            };
             let settings = PrimitiveSettings {
-                spots: grid,
+                spots: spots.unwrap_or(preset.spots),
                 width: resolution,
                 height: resolution,
-                ..Default::default()
+                ..preset
             };
             Ok(primitive::generate(seed, &settings)?)
         }
@@ -148,7 +152,14 @@ fn generate(
                 PlatoArg::HiddenBox => PlatoObject::HiddenBox,
                 PlatoArg::Empty => PlatoObject::Empty,
             };
-            let spots = spots.unwrap_or(16) as usize;
+            let spots = spots.unwrap_or(Spots::Grid(16));
+            if !spots.is_grid() {
+                let what = format!(
+                    "--spots {spots}: plato rooms have spots of their own; give a number of them, up to 16"
+                );
+                return Err(CliError::input(what));
+            }
+            let spots = spots.count() as usize;
             Ok(plato::generate(&PlatoSettings {
                 object,
                 spots,

@@ -9,10 +9,10 @@ pub fn template(kind: JobKind) -> String {
         JobKind::Train => return training(),
         JobKind::Sweep => return sweep(),
         JobKind::Furnished => {
-            "kind = \"furnished\"        # furnished rooms; also: primitive, files\n\
+            "kind = \"furnished\"        # furnished rooms; also: primitive, desktop, files\n\
              count = 8\n\
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
-             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             spots = 25                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
              fov_deg = 90.0            # horizontal field of view\n\
              assets = \"auto\"           # sweethome3d where installed, else parametric\n\
              min_specular = 1          # mirrors a room at least\n"
@@ -21,8 +21,25 @@ pub fn template(kind: JobKind) -> String {
             "kind = \"primitive\"        # a cube, a cylinder and a mirror in a room\n\
              count = 8\n\
              seed = 1                  # scene i derives its own seed from (seed, i)\n\
-             spots = 25                # laser spots: 1, 4, 16, 25 or 100\n\
+             spots = 25                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
              fov_deg = 90.0            # horizontal field of view; jittered by scene\n"
+        }
+        JobKind::Desktop => {
+            "kind = \"desktop\"          # a box on a desk, as in the paper's laboratory: a cube, a cylinder of one inch, a mirror\n\
+             count = 8\n\
+             seed = 1                  # scene i derives its own seed from (seed, i)\n\
+             spots = 16                # laser spots: a grid of 1, 4, 16, 25 or 100; or { random = 16 } or { at = [[0.5, 0.5]] }\n\
+             fov_deg = 46.0            # horizontal field of view; jittered by scene\n\
+             # laser_m = [0.05, 0.0, 0.0]   # the laser beside the camera: x right, y down, z forward\n\
+             # [scenes.rooms]          # ranges; what is left out is as here. kind = \"primitive\" has them too, for living rooms\n\
+             # scale = [0.22, 0.34]    # of 1, a room is 3.6 m wide and deep, each ± 10 %, and 2.6 m high\n\
+             # depth_m = [0.3, 1.4]    # of the view; other views are drawn again\n\
+             # fov_jitter_deg = 3.0\n\
+             # cube = { width_m = [0.06, 0.16], height_m = [0.06, 0.2] }\n\
+             # cylinder = { width_m = [0.0254, 0.0254], height_m = [0.1, 0.3] }\n\
+             # mirror = { width_m = [0.12, 0.3], height_m = [0.12, 0.3] }\n\
+             # mirror_wall = \"back\"    # or: any, none\n\
+             # mirror_from_m = [0.05, 0.2]   # its lower edge over the floor\n"
         }
         JobKind::Files => {
             "kind = \"files\"            # .glb, .gltf or .json scenes, one a task\n\

@@ -93,6 +93,36 @@ fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
             ["scenes.spots", "9", "1, 4, 16, 25 and 100"],
         ),
         (
+            "stage/0/scenes/spots",
+            json!({"random": 0}),
+            ["scenes.spots", "random = 0", "1 to 100 spots"],
+        ),
+        (
+            "stage/0/scenes/spots",
+            json!({"at": [[0.5, 1.0]]}),
+            ["scenes.spots", "[0.5, 1]", "from 0 up to 1"],
+        ),
+        (
+            "stage/0/scenes/spots",
+            json!("many"),
+            ["scenes.spots", "many", "{ random = N }"],
+        ),
+        (
+            "stage/0/scenes/laser_m",
+            json!([0.0, 9.0, 0.0]),
+            ["scenes.laser_m", "9 lies", "metres"],
+        ),
+        (
+            "stage/0/scenes/rooms",
+            json!({"scale": [1.0, 2.0]}),
+            ["scenes.rooms", "furnished", "desktop"],
+        ),
+        (
+            "stage/2/train/depth_scale_m",
+            json!(0),
+            ["train.depth_scale_m", "0 lies", "metres"],
+        ),
+        (
             "stage/0/scenes/min_specular",
             json!(1000),
             ["scenes.min_specular", "1000", "0..=16"],
@@ -190,6 +220,10 @@ fn what_cannot_be_meant_is_refused_with_the_field_the_value_and_the_range() {
         ("stage/0/render/samples", json!(2)),
         ("stage/0/render/resolution", json!(4096)),
         ("stage/0/scenes/fov_deg", json!(120)),
+        ("stage/0/scenes/spots", json!({"random": 100})),
+        ("stage/0/scenes/spots", json!({"at": [[0.0, 0.999]]})),
+        ("stage/0/scenes/laser_m", json!([5.0, -5.0, 0.0])),
+        ("stage/2/train/depth_scale_m", json!(1.27)),
         ("stage/2/train/optimise", json!({"learning_rate": 10})),
         ("limits", json!({"max_crashes": 1_000_000})),
     ] {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use picofarm_scene::{
-    AssetLibrary, LaserGrid, Scene,
+    Aim, AssetLibrary, Scene,
     furnished::{self, FurnishedSettings},
     import,
     primitive::{self, PrimitiveSettings},
@@ -49,12 +49,12 @@ pub fn resize(scene: &mut Scene, pixels: u32) {
 /// # Errors
 /// There is no such grid.
 pub fn with_spots(scene: &mut Scene, spots: u32) -> Result<()> {
-    let grid = LaserGrid::new(spots).ok_or_else(|| {
+    let aim = Aim::grid(spots).ok_or_else(|| {
         CliError::input(format!(
             "{spots} spots: there are grids of 1, 4, 16, 25 and 100 spots"
         ))
     })?;
-    scene.laser = grid.laser(&scene.camera);
+    scene.laser = aim.laser(&scene.camera);
     Ok(())
 }
 

@@ -146,6 +146,8 @@ pub enum JobKind {
     Furnished,
     /// Render primitive rooms
     Primitive,
+    /// Render boxes on a desk, as in the paper's laboratory
+    Desktop,
     /// Render scene files
     Files,
     /// Stages that need each other: render, two sensors, split, export

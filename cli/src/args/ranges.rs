@@ -2,7 +2,7 @@
 
 use std::{fmt::Display, ops::RangeInclusive, str::FromStr};
 
-use picofarm_proto::model::SceneSource;
+use picofarm_settings::Spots;
 
 fn within<T: FromStr + PartialOrd + Display>(
     text: &str,
@@ -91,11 +91,9 @@ pub fn at_least_one(text: &str) -> Result<usize, String> {
     within(text, 1..=1_000_000_000, "").map_err(|said| said.trim_end().to_owned())
 }
 
-/// Laser spots of a grid.
-pub fn spots(text: &str) -> Result<u32, String> {
-    let number = text.trim().parse();
-    let number = number.map_err(|_| "expected 1, 4, 16, 25 or 100".to_owned())?;
-    SceneSource::check_spots(number).map(|()| number)
+/// Laser spots: a grid, random ones, or places.
+pub fn spots(text: &str) -> Result<Spots, String> {
+    text.parse()
 }
 
 #[cfg(test)]

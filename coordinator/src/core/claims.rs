@@ -196,9 +196,14 @@ impl Core {
         for job in over {
             self.drop_job(job, "the job was stopped");
         }
+        let mut held = std::collections::BTreeSet::new();
         for (id, entry) in &mut self.stages {
             entry.free = Some(news.free.get(id).copied().unwrap_or(0));
-            entry.job.paused = news.active.get(&id.job).copied().unwrap_or(false);
+            let paused = news.active.get(&id.job).copied().unwrap_or(false);
+            if paused && !entry.job.paused {
+                held.insert(id.job);
+            }
+            entry.job.paused = paused;
         }
         self.load.hear_elsewhere(news.busy);
         if let Some(leased) = &news.leased {
@@ -220,6 +225,10 @@ impl Core {
             }
         }
         self.receive(news.taken, now_ms);
+        // Held by way of another instance.
+        for job in held {
+            self.paused(job, true);
+        }
         let active = news.active.into_keys();
         let unknown = active.filter(|job| !self.knows(*job));
         unknown.collect()

@@ -6,7 +6,7 @@ use picofarm_catalog::{
     Job, JobRecord, NewEvent, Owner, Range, ResultSet, Run, Sight, StageRecord, Timing,
 };
 use picofarm_proto::{
-    ids::{JobId, RangeId, StageRef},
+    ids::{JobId, RangeId, StageRef, WorkerId},
     model::{
         EventKind, JobSpec, JobState, JobStatus, RunningTask, SpecError, StageSpec, StageState,
         StageStatus,
@@ -19,6 +19,7 @@ use crate::{
     auth::{Caller, not_yours},
     plan,
     submission::Draft,
+    transition::RangeEvent,
 };
 
 /// A job ready to be recorded.
@@ -233,13 +234,52 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
 }
 
 impl Core {
-    /// A job is held, or goes on: what is pending goes back, what runs goes on.
+    /// A job is held, or goes on: what no worker has begun goes back, what runs goes on.
     pub(crate) fn paused(&mut self, job: JobId, paused: bool) {
+        if paused {
+            self.free_what_waits(job);
+        }
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
             entry.job.paused = paused;
             entry.free = None;
             if paused {
                 entry.stage.give_pending(&mut self.changes);
+            }
+        }
+    }
+
+    /// Takes from the leases of a job what their workers have not begun, as far as is known: a worker has one task in hand, and
+    /// works off a lease in order.
+    fn free_what_waits(&mut self, job: JobId) {
+        let stages = self.stages.iter().filter(|(id, _)| id.job == job);
+        let leases = stages.flat_map(|(_, entry)| entry.stage.leased());
+        let leases: Vec<(Range, WorkerId)> = leases
+            .map(|(range, lease)| (range.clone(), lease.worker))
+            .collect();
+        for (range, worker) in leases {
+            let Some(entry) = self.workers.get(&worker) else {
+                continue;
+            };
+            let session = entry.session;
+            let busy = |id: &RangeId| self.progress.get(id).is_some_and(|tasks| !tasks.is_empty());
+            let elsewhere = entry.leases.iter().any(|id| *id != range.id && busy(id));
+            if elsewhere && !busy(&range.id) {
+                let revoke = Say::Revoke {
+                    lease: range.lease(),
+                    reason: "the job is held".into(),
+                };
+                self.say.push((session, revoke));
+                self.close(&range, false);
+                continue;
+            }
+            let Some(last) = self.in_hand(&range).into_iter().max() else {
+                continue;
+            };
+            let at = last + 1;
+            if at < range.hi && (at..range.hi).all(|task| range.has_to_do(task)) {
+                let lease = range.lease();
+                self.say.push((session, Say::Trim { lease, hi: at }));
+                self.mark(&range, &RangeEvent::Trim { at });
             }
         }
     }

@@ -198,7 +198,7 @@ impl Core {
     }
 
     /// The tasks of a lease that its worker works on, as far as is known; of one that has reported nothing, the first to do.
-    fn in_hand(&self, range: &Range) -> Vec<u64> {
+    pub(super) fn in_hand(&self, range: &Range) -> Vec<u64> {
         let todo = |task: &u64| range.has_to_do(*task);
         let reported = self.progress.get(&range.id).into_iter();
         let reported = reported.flat_map(|tasks| tasks.keys().copied());

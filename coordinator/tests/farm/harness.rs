@@ -40,7 +40,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// A store as a test wants it: it holds what is reported, but for the exceptions.
 #[derive(Debug, Default)]
-pub struct Shelf {
+pub struct FakeStore {
     /// What it holds instead, by task; `None`: nothing.
     pub instead: Mutex<BTreeMap<u64, Option<[u8; 32]>>>,
     /// Why it cannot be read.
@@ -51,7 +51,7 @@ pub struct Shelf {
     pub asked: AtomicUsize,
 }
 
-impl Shelf {
+impl FakeStore {
     /// From now on it holds this of a task.
     pub fn put(&self, task: u64, manifest: Option<[u8; 32]>) {
         self.instead.lock().unwrap().insert(task, manifest);
@@ -62,7 +62,7 @@ impl Shelf {
     }
 }
 
-impl Stored for Shelf {
+impl Stored for FakeStore {
     fn look<'a>(
         &'a self,
         _: &'a StageSpec,
@@ -90,7 +90,7 @@ impl Stored for Shelf {
 pub struct Farm {
     _folder: tempfile::TempDir,
     /// What the coordinator takes for the store.
-    pub shelf: Arc<Shelf>,
+    pub stored: Arc<FakeStore>,
     pub clock: Arc<AtomicI64>,
     /// How long the coordinator was suspended.
     slept: Arc<AtomicI64>,
@@ -122,7 +122,7 @@ impl Farm {
         let slept = Arc::new(AtomicI64::new(0));
         let (time, more) = (Arc::clone(&clock), Arc::clone(&slept));
         let passed = Arc::clone(&slept);
-        let shelf = Arc::new(Shelf::default());
+        let stored = Arc::new(FakeStore::default());
         let config = CoordinatorConfig {
             lease_ms: LEASE_MS,
             tick: Duration::from_millis(10),
@@ -135,13 +135,13 @@ impl Farm {
                 move || passed.load(Ordering::SeqCst),
             ),
             http: Some("127.0.0.1:0".parse().unwrap()),
-            stored: Some(Arc::clone(&shelf) as Arc<dyn Stored>),
+            stored: Some(Arc::clone(&stored) as Arc<dyn Stored>),
             ..CoordinatorConfig::new(catalog.clone(), "127.0.0.1:0".parse().unwrap())
         };
         let (running, stop, jobs) = run(&config).await.unwrap();
         Self {
             _folder: folder,
-            shelf,
+            stored,
             clock,
             slept,
             config,

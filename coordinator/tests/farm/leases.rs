@@ -167,7 +167,7 @@ async fn two_different_results_of_a_task_are_an_alarm() {
     let lease = worker.lease().await;
     assert!(worker.done(&lease, lease.lo).await.accepted);
     // The store cannot tell who is right.
-    farm.shelf.close("it is on another machine");
+    farm.stored.close("it is on another machine");
     let answer = worker.report(&lease, lease.lo, &manifest(99)).await;
     assert!(!answer.accepted);
     assert!(answer.reason.contains("different"), "{}", answer.reason);

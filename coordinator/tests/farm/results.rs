@@ -36,7 +36,7 @@ async fn a_done_job_whose_results_are_gone_runs_again_without_being_asked() {
         let (job, mut worker) = done(&mut farm, 8).await;
         assert!(farm.submit(&spec(8)).await.existed, "all is there");
         for task in [2, 3, 6] {
-            farm.shelf.put(task, None);
+            farm.stored.put(task, None);
         }
         let plan = farm.plan(&spec(8)).await;
         assert_eq!((plan.reuse, plan.run), (5, 3));
@@ -53,7 +53,7 @@ async fn a_done_job_whose_results_are_gone_runs_again_without_being_asked() {
         assert_eq!((status.tasks.reused, status.tasks.pending), (5, 3));
         // Not yet made, the scenes stay missing for everyone: a twin follows the one that makes them.
         assert!(farm.submit(&spec(8)).await.existed);
-        farm.shelf.instead.lock().unwrap().clear();
+        farm.stored.instead.lock().unwrap().clear();
         let status = worker.work(&mut farm, &again.job_id).await;
         assert_eq!((status.state, status.tasks.done), (JobState::Done, 8));
         assert!(farm.submit(&spec(8)).await.existed);
@@ -66,7 +66,7 @@ async fn a_deleted_store_leaves_nothing_done() {
     for mut farm in Farm::start_on_each().await {
         let (_, mut worker) = done(&mut farm, 5).await;
         for task in 0..5 {
-            farm.shelf.put(task, None);
+            farm.stored.put(task, None);
         }
         let grown = farm.plan(&spec(9)).await;
         assert_eq!((grown.reuse, grown.run), (0, 9));
@@ -83,18 +83,18 @@ async fn of_many_results_a_sample_is_looked_at_and_all_once_one_of_them_is_gone(
     let mut farm = Farm::start().await;
     let (_, _worker) = done(&mut farm, 1_500).await;
     farm.plan(&spec(1_500)).await;
-    let shelf = farm.shelf.clone();
-    let first = shelf.asked.swap(0, Ordering::SeqCst);
+    let stored = farm.stored.clone();
+    let first = stored.asked.swap(0, Ordering::SeqCst);
     assert_eq!(first, 1_500, "what nobody has seen is all looked at");
     farm.plan(&spec(1_500)).await;
-    let sampled = shelf.asked.swap(0, Ordering::SeqCst);
+    let sampled = stored.asked.swap(0, Ordering::SeqCst);
     assert!((1..200).contains(&sampled), "{sampled}");
     for task in 0..1_400 {
-        shelf.put(task, None);
+        stored.put(task, None);
     }
     let plan = farm.plan(&spec(1_500)).await;
     assert_eq!((plan.reuse, plan.run), (100, 1_400));
-    assert_eq!(shelf.asked.load(Ordering::SeqCst), 1_500);
+    assert_eq!(stored.asked.load(Ordering::SeqCst), 1_500);
 }
 
 #[tokio::test]
@@ -113,11 +113,11 @@ async fn a_result_that_a_worker_made_up_does_not_count_for_the_next_job() {
         farm.until_ended(&job).await;
         // The store holds nothing: nothing was ever rendered.
         for task in 0..2 {
-            farm.shelf.put(task, None);
+            farm.stored.put(task, None);
         }
         let next = farm.submit(&renamed(2)).await;
         assert_eq!(next.plan.unwrap().run, 2);
-        farm.shelf.instead.lock().unwrap().clear();
+        farm.stored.instead.lock().unwrap().clear();
         let status = liar.work(&mut farm, &next.job_id).await;
         assert_eq!((status.tasks.done, status.tasks.reused), (2, 0));
         farm.stop().await;
@@ -127,7 +127,7 @@ async fn a_result_that_a_worker_made_up_does_not_count_for_the_next_job() {
 #[tokio::test]
 async fn what_nobody_could_look_at_is_looked_for_by_a_worker() {
     for mut farm in Farm::start_on_each().await {
-        farm.shelf.close("it is on another machine");
+        farm.stored.close("it is on another machine");
         let (_, mut worker) = done(&mut farm, 3).await;
         let plan = farm.plan(&renamed(3)).await;
         assert_eq!((plan.reuse, plan.run), (0, 3));
@@ -153,10 +153,10 @@ async fn between_two_manifests_the_store_decides_and_not_who_came_first() {
         let lease = liar.lease().await;
         assert!(liar.report(&lease, 0, &"f".repeat(64)).await.accepted);
         farm.until_ended(&job).await;
-        farm.shelf.close("it is far away");
+        farm.stored.close("it is far away");
         let next = farm.submit(&renamed(1)).await.job_id;
-        *farm.shelf.closed.lock().unwrap() = None;
-        farm.shelf.put(0, Some(bytes(7)));
+        *farm.stored.closed.lock().unwrap() = None;
+        farm.stored.put(0, Some(bytes(7)));
         // An honest worker reports what it published.
         let lease = liar.lease().await;
         assert!(liar.report(&lease, 0, &manifest(7)).await.accepted);
@@ -180,7 +180,7 @@ async fn between_two_manifests_the_store_decides_and_not_who_came_first() {
 async fn a_store_that_hangs_holds_up_nobody_else() {
     let mut farm = Farm::start().await;
     let (_, mut worker) = done(&mut farm, 3).await;
-    farm.shelf.hangs.store(true, Ordering::SeqCst);
+    farm.stored.hangs.store(true, Ordering::SeqCst);
     let mut other = farm.jobs.clone();
     let held = tokio::spawn(async move {
         let request = wire::PlanJobRequest {

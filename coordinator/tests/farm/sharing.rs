@@ -205,6 +205,40 @@ async fn busy(farm: &mut Farm) -> (Worker, Vec<Lease>) {
 }
 
 #[tokio::test]
+async fn of_a_held_job_a_worker_keeps_the_task_in_hand_alone() {
+    let mut farm = Farm::start().await;
+    let job = farm.submit(&spec(20)).await.job_id;
+    let (mut worker, held) = busy(&mut farm).await;
+    assert!(held.len() > 1 && held[0].hi > held[0].lo + 1, "{held:?}");
+    let leases: Vec<&Lease> = held.iter().collect();
+    worker.beat(&leases, Some(held[0].lo)).await;
+    let pause = wire::PauseJobRequest {
+        job_id: job.clone(),
+    };
+    farm.jobs.pause_job(pause).await.unwrap();
+    let (mut trimmed, mut revoked) = (Vec::new(), Vec::new());
+    for _ in &held {
+        match worker.hear().await.unwrap() {
+            Heard::Trim(trim) => trimmed.push((trim.lease, trim.hi)),
+            Heard::Revoke(revoke) => revoked.push(revoke.lease),
+            other => panic!("expected to lose what is not begun, heard {other:?}"),
+        }
+    }
+    assert_eq!(trimmed, [(Some(held[0].lease.into()), held[0].lo + 1)]);
+    let others = held[1..].iter().map(|l| Some(l.lease.into()));
+    assert_eq!(revoked, others.collect::<Vec<_>>());
+    let tasks = farm.status(&job).await.tasks;
+    assert_eq!((tasks.done, tasks.leased, tasks.pending), (1, 1, 18));
+    assert!(worker.done(&held[0], held[0].lo).await.accepted);
+    let resume = wire::ResumeJobRequest {
+        job_id: job.clone(),
+    };
+    farm.jobs.resume_job(resume).await.unwrap();
+    let status = worker.work(&mut farm, &job).await;
+    assert_eq!((status.state, status.tasks.done), (JobState::Done, 20));
+}
+
+#[tokio::test]
 async fn an_idle_worker_takes_half_of_what_a_busy_one_has_not_begun() {
     let mut farm = Farm::start().await;
     let job = farm.submit(&spec(20)).await.job_id;

@@ -6,7 +6,9 @@ mod gpus;
 mod network;
 mod reconstruct;
 mod render;
+mod rooms;
 pub mod sensor;
+mod spots;
 
 pub use gate::Gate;
 pub use gpus::Gpus;
@@ -15,4 +17,6 @@ pub use network::{
 };
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
 pub use render::{Budget, Choice, Strategy};
+pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
+pub use spots::Spots;

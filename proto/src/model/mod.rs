@@ -48,7 +48,7 @@ pub use lease::{
 };
 pub use limits::{Limits, Resources, check_label, check_project};
 pub use log::{LogAllowance, LogLevel, LogLine, TaskLog};
-pub use picofarm_settings::{Budget, Choice, Sensor, Strategy};
+pub use picofarm_settings::{Budget, Choice, PrimitiveRooms, Sensor, Spots, Strategy};
 pub use places::{OutputSettings, SourceSettings};
 pub use scale::scaled;
 pub use spec_error::SpecError;

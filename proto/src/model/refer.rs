@@ -67,18 +67,18 @@ pub(super) fn resolve(stages: &mut [StageSpec]) -> Result<(), SpecError> {
 /// # Errors
 /// A name that stands for several models where one is wanted, or for a stage that trains none.
 fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
-    if stage.task.shelf().is_some_and(String::is_empty) {
+    if stage.task.models_store().is_some_and(String::is_empty) {
         let models = stage
             .task
             .models()
             .into_iter()
             .map(|(_, name)| name.clone());
-        let found = shelf(&models.collect::<Vec<_>>(), before);
-        if let Some(store) = stage.task.shelf_mut() {
+        let found = store_of(&models.collect::<Vec<_>>(), before);
+        if let Some(store) = stage.task.models_store_mut() {
             *store = found;
         }
     }
-    let Some(store) = stage.task.shelf().cloned() else {
+    let Some(store) = stage.task.models_store().cloned() else {
         return Ok(());
     };
     let source = stage.task.reads().cloned();
@@ -120,7 +120,7 @@ fn link(stage: &mut StageSpec, before: &[StageSpec]) -> Result<(), SpecError> {
         });
         // A report tells what evaluations of its models found.
         let evaluates = task.reports().is_some()
-            && s.task.shelf() == Some(&store)
+            && s.task.models_store() == Some(&store)
             && s.task.evaluates().iter().any(read);
         let trains = s
             .task
@@ -183,7 +183,7 @@ fn all(names: &mut Vec<String>, before: &[StageSpec], store: &str) -> Result<(),
 }
 
 /// The store in which the first stage that trains one of `names` keeps it; empty where none does.
-fn shelf(names: &[String], before: &[StageSpec]) -> String {
+fn store_of(names: &[String], before: &[StageSpec]) -> String {
     let meant = |stage: &&StageSpec| {
         stage.task.trains().is_some_and(|(_, model)| {
             let base = stage.name.split('[').next();
@@ -193,7 +193,7 @@ fn shelf(names: &[String], before: &[StageSpec]) -> String {
     };
     let found = before.iter().find(meant);
     found
-        .and_then(|stage| stage.task.shelf())
+        .and_then(|stage| stage.task.models_store())
         .cloned()
         .unwrap_or_default()
 }

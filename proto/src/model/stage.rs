@@ -165,7 +165,7 @@ impl StageSpec {
             );
             return Err(SpecError::new("report.name", what));
         }
-        let Some(store) = self.task.shelf() else {
+        let Some(store) = self.task.models_store() else {
             return Ok(());
         };
         for (field, model) in self.task.models() {

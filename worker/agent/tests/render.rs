@@ -20,6 +20,7 @@ use picofarm_proto::{
     model::{RenderTask, SceneFile, SceneKind},
 };
 use picofarm_scene::{export, primitive};
+use picofarm_settings::Spots;
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;
 use tokio::runtime::Handle;
@@ -207,7 +208,7 @@ fn of_file(name: &str, content: &[u8]) -> Place {
 
 fn primitive_glb(spots: u32) -> Vec<u8> {
     let settings = primitive::PrimitiveSettings {
-        spots,
+        spots: Spots::Grid(spots),
         width: 32,
         height: 32,
         ..Default::default()
@@ -218,7 +219,7 @@ fn primitive_glb(spots: u32) -> Vec<u8> {
 #[tokio::test]
 async fn a_scene_file_is_rendered_at_the_jobs_resolution_with_its_own_laser() {
     let mut place = of_file("room.glb", &primitive_glb(4));
-    place.spec.scenes.spots = 4;
+    place.spec.scenes.spots = Spots::Grid(4);
     place.run(0).await.unwrap();
     let (store, prefix) = open_store(&place.spec.output.store).unwrap();
     let dataset = Dataset::open(store, prefix.join("tiny")).await.unwrap();
@@ -229,7 +230,7 @@ async fn a_scene_file_is_rendered_at_the_jobs_resolution_with_its_own_laser() {
 #[tokio::test]
 async fn a_scene_file_without_a_laser_gets_the_jobs_grid() {
     let mut place = of_file("wall.gltf", include_bytes!("common/wall.gltf"));
-    place.spec.scenes.spots = 4;
+    place.spec.scenes.spots = Spots::Grid(4);
     place.run(0).await.unwrap();
 }
 

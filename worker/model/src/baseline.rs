@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     ModelError,
-    input::{DEPTH_SCALE_M, Target},
+    input::{Question, Target},
     scene::{Order, Scene, Scenes},
 };
 
@@ -25,9 +25,10 @@ impl Baseline {
     ///
     /// # Errors
     /// [`ModelError::Scene`]; [`ModelError::Invalid`] where there is none or where they are of several sizes.
-    pub fn fit(target: Target, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
+    pub fn fit(question: &Question, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
+        let target = question.target;
         Ok(match target {
-            Target::Tof => Self::Depth(DepthBaseline::fit(scenes, most)?),
+            Target::Tof => Self::Depth(DepthBaseline::fit(question.depth_scale_m, scenes, most)?),
             Target::Shadow | Target::Specular => {
                 Self::Mask(MaskBaseline::fit(target, scenes, most)?)
             }
@@ -42,11 +43,17 @@ impl Baseline {
         }
     }
 
-    /// What they say of a scene in the place of a network: depth over 4.5 m, or logits of the masks from `plane` on.
-    pub(crate) fn answers(&self, scene: &Scene, plane: usize, len: usize) -> Vec<Vec<f32>> {
+    /// What they say of a scene in the place of a network: depth over its scale, or logits of the masks from `plane` on.
+    pub(crate) fn answers(
+        &self,
+        question: &Question,
+        scene: &Scene,
+        plane: usize,
+        len: usize,
+    ) -> Vec<Vec<f32>> {
         match self {
             Self::Depth(fit) => {
-                let scaled = |z: f32| (z / DEPTH_SCALE_M).clamp(0.0, 1.0);
+                let scaled = |z: f32| (z / question.depth_scale_m).clamp(0.0, 1.0);
                 let peaks = fit.of_peaks(scene).into_iter().map(scaled).collect();
                 let median = fit.median_m.iter().copied().map(scaled).collect();
                 vec![vec![scaled(fit.constant_m as f32); len], peaks, median]
@@ -125,11 +132,11 @@ pub struct DepthBaseline {
 }
 
 impl DepthBaseline {
-    /// Fitted to at most `most` scenes, the first ones.
+    /// Fitted to at most `most` scenes, the first ones; depths end at `scale_m`, as those that networks learn.
     ///
     /// # Errors
     /// [`ModelError::Scene`]; [`ModelError::Invalid`] where they are of several sizes.
-    pub fn fit(scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
+    pub fn fit(scale_m: f32, scenes: &dyn Scenes, most: usize) -> Result<Self, ModelError> {
         let mut depths = Vec::new();
         // Σ1, Σx, Σx², Σz, Σxz
         let mut sums = [0.0f64; 5];
@@ -141,8 +148,9 @@ impl DepthBaseline {
             }
             same_size(pixels, scene.pixels(), index)?;
             for (x, z) in peaks(&scene).iter().zip(&scene.depth_m) {
-                let (x, z) = (*x, f64::from(known(*z)));
-                depths.push(known(z as f32));
+                let (x, z) = (*x, known(*z, scale_m));
+                depths.push(z);
+                let z = f64::from(z);
                 for (sum, term) in sums.iter_mut().zip([1.0, x, x * x, z, x * z]) {
                     *sum += term;
                 }
@@ -207,11 +215,11 @@ fn median(values: &mut [f32]) -> f32 {
 }
 
 /// Depth as networks learn it: within what they can say.
-fn known(z: f32) -> f32 {
+fn known(z: f32, scale_m: f32) -> f32 {
     if z.is_finite() {
-        z.clamp(0.0, DEPTH_SCALE_M)
+        z.clamp(0.0, scale_m)
     } else {
-        DEPTH_SCALE_M
+        scale_m
     }
 }
 

@@ -104,7 +104,7 @@ pub fn answered(
 }
 
 fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answered, ModelError> {
-    let target = model.question().target;
+    let question = model.question();
     let names = baseline.names().iter();
     let mut found = Answered {
         examples: 0,
@@ -117,11 +117,11 @@ fn of_scene(model: &Model, baseline: &Baseline, scene: &Scene) -> Result<Answere
     answers(model, scene, &mut |said, batch| {
         let (side, truth) = ([batch.height, batch.width], &batch.target);
         found.examples += batch.images as u64;
-        found.model.add(target, said, truth, side);
-        let trivial = baseline.answers(scene, plane, truth.len());
+        found.model.add(question, said, truth, side);
+        let trivial = baseline.answers(question, scene, plane, truth.len());
         for ((_, tally), said) in found.trivial.iter_mut().zip(trivial) {
             fits &= said.len() == truth.len();
-            tally.add(target, &said, truth, side);
+            tally.add(question, &said, truth, side);
         }
         plane += truth.len() / scene.pixels();
     })?;

@@ -4,7 +4,7 @@ mod boundary;
 
 use serde::{Deserialize, Serialize};
 
-use crate::input::{DEPTH_SCALE_M, Target};
+use crate::input::{Question, Target};
 
 /// Masks that the released code scores together.
 const BATCH: usize = 32;
@@ -106,11 +106,11 @@ impl Released {
 }
 
 impl Tally {
-    /// Adds images: what a network said (depth over 4.5 m, or logits) and what is true, `[image][row][column]`, of `height`
-    /// rows and `width` columns.
+    /// Adds images: what a network said (depth over the question's scale, or logits) and what is true, `[image][row][column]`, of
+    /// `height` rows and `width` columns.
     pub fn add(
         &mut self,
-        target: Target,
+        question: &Question,
         said: &[f32],
         truth: &[f32],
         [height, width]: [usize; 2],
@@ -121,10 +121,11 @@ impl Tally {
             .zip(truth.chunks_exact(height * width));
         for (said, truth) in images {
             self.images += 1;
-            match target {
+            match question.target {
                 Target::Tof => {
+                    let scale_m = f64::from(question.depth_scale_m);
                     for (said, truth) in said.iter().zip(truth) {
-                        let error = f64::from(said - truth) * f64::from(DEPTH_SCALE_M);
+                        let error = f64::from(said - truth) * scale_m;
                         self.absolute += error.abs();
                         self.squared += error * error;
                     }
@@ -228,21 +229,40 @@ impl Overlap {
 mod tests {
     use super::*;
 
+    fn asked(target: Target) -> Question {
+        Question {
+            target,
+            variant: crate::input::ShadowVariant::default(),
+            normalise: crate::input::Normalise::default(),
+            bins: 1,
+            intensity_only: false,
+            spots: 1,
+            depth_scale_m: 4.5,
+        }
+    }
+
     #[test]
     fn depths_are_measured_in_metres() {
         let mut tally = Tally::default();
-        tally.add(Target::Tof, &[0.0, 1.0], &[1.0, 1.0], [1, 2]);
+        tally.add(&asked(Target::Tof), &[0.0, 1.0], &[1.0, 1.0], [1, 2]);
         let Metrics::Depth { mae_m, rmse_m } = tally.metrics(Target::Tof) else {
             panic!("a depth")
         };
         assert!((mae_m - 2.25).abs() < 1e-9 && (rmse_m - 4.5 / 2f64.sqrt()).abs() < 1e-9);
+        let desktop = Question {
+            depth_scale_m: 1.25,
+            ..asked(Target::Tof)
+        };
+        let mut tally = Tally::default();
+        tally.add(&desktop, &[0.0, 1.0], &[1.0, 1.0], [1, 2]);
+        assert!((tally.metrics(Target::Tof).loss() - 0.625).abs() < 1e-9);
     }
 
     #[test]
     fn masks_of_nothing_are_perfect_and_overlap_counts_otherwise() {
         let of = |said: &[f32], truth: &[f32]| {
             let mut tally = Tally::default();
-            tally.add(Target::Shadow, said, truth, [1, said.len()]);
+            tally.add(&asked(Target::Shadow), said, truth, [1, said.len()]);
             tally.metrics(Target::Shadow)
         };
         let perfect = Metrics::Mask {
@@ -263,10 +283,10 @@ mod tests {
     fn the_released_code_scores_masks_by_32_and_none_where_both_are_empty() {
         // 32 masks of two pixels, both right; then 16 that are empty in both; and joined in two parts.
         let mut tally = Tally::default();
-        tally.add(Target::Shadow, &[1.0; 40], &[1.0; 40], [1, 2]);
+        tally.add(&asked(Target::Shadow), &[1.0; 40], &[1.0; 40], [1, 2]);
         let mut rest = Tally::default();
-        rest.add(Target::Shadow, &[1.0; 24], &[1.0; 24], [1, 2]);
-        rest.add(Target::Shadow, &[-1.0; 32], &[0.0; 32], [1, 2]);
+        rest.add(&asked(Target::Shadow), &[1.0; 24], &[1.0; 24], [1, 2]);
+        rest.add(&asked(Target::Shadow), &[-1.0; 32], &[0.0; 32], [1, 2]);
         tally.join(&rest);
         let expected = Released::Mask {
             mae_32: 0.0,

@@ -5,7 +5,7 @@ use burn::tensor::Device;
 use crate::{
     ModelError,
     device::computes,
-    input::{Batch, DEPTH_SCALE_M, Question, Target, Visit, example},
+    input::{Batch, Question, Target, Visit, example},
     net::Net,
     parameters::Parameters,
     scene::Scene,
@@ -107,7 +107,8 @@ impl Model {
         let mut batch = Batch::default();
         example(&mut batch, self.question(), scene, Visit::default())?;
         let scaled = self.answer(&batch);
-        let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * DEPTH_SCALE_M);
+        let scale = self.question().depth_scale_m;
+        let depth = scaled.iter().map(|z| z.clamp(0.0, 1.0) * scale);
         Ok(depth.collect())
     }
 }

@@ -26,7 +26,7 @@ fn trained(plan: &Plan, sources: Sources) -> Trained {
 }
 
 fn evaluated(model: &Model, scenes_before: &Vec<Arc<Scene>>) -> Evaluated {
-    let baseline = Baseline::fit(model.question().target, &scenes(0, 40), 40).unwrap();
+    let baseline = Baseline::fit(model.question(), &scenes(0, 40), 40).unwrap();
     evaluate(model, &baseline, scenes_before, &mut |_, _| true)
         .unwrap()
         .unwrap()
@@ -100,7 +100,7 @@ fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
         };
         let model = trained(&plan, sources());
         let model = Model::read(&model.weights, &Device::flex()).unwrap();
-        let baseline = Baseline::fit(target, &scenes(0, 8), 8).unwrap();
+        let baseline = Baseline::fit(model.question(), &scenes(0, 8), 8).unwrap();
         let scenes = scenes(500, 7);
         let whole = evaluate(&model, &baseline, &scenes, &mut |_, _| true);
         let whole = whole.unwrap().unwrap();
@@ -126,7 +126,7 @@ fn figures_are_the_same_to_the_bit_in_however_many_parts_scenes_are_asked() {
 #[test]
 fn images_that_are_the_same_for_all_scenes_are_the_best_such_ones() {
     let train = scenes(0, 20);
-    let fit = DepthBaseline::fit(&train, 20).unwrap();
+    let fit = DepthBaseline::fit(4.5, &train, 20).unwrap();
     let error = |image: &dyn Fn(usize) -> f32| -> f32 {
         let each = |s: &Arc<picofarm_model::scene::Scene>| -> f32 {
             let pixels = s.depth_m.iter().enumerate();
@@ -140,8 +140,12 @@ fn images_that_are_the_same_for_all_scenes_are_the_best_such_ones() {
         assert!(best <= error(&|i| other.depth_m[i]));
     }
 
-    let Baseline::Mask(MaskBaseline { mask }) = Baseline::fit(Target::Shadow, &train, 20).unwrap()
-    else {
+    let Baseline::Mask(MaskBaseline { mask }) = Baseline::fit(
+        &plan(Target::Shadow, ShadowVariant::All).question,
+        &train,
+        20,
+    )
+    .unwrap() else {
         panic!("a mask")
     };
     let iou = |mask: &dyn Fn(usize) -> bool| {
@@ -164,7 +168,7 @@ fn images_that_are_the_same_for_all_scenes_are_the_best_such_ones() {
 #[test]
 fn the_peak_is_a_better_depth_than_a_constant_where_peaks_follow_depths() {
     let scenes = scenes(0, 20);
-    let fit = DepthBaseline::fit(&scenes, 20).unwrap();
+    let fit = DepthBaseline::fit(4.5, &scenes, 20).unwrap();
     let error = |depth: &dyn Fn(&picofarm_model::scene::Scene) -> Vec<f32>| -> f32 {
         scenes
             .iter()

@@ -126,7 +126,8 @@ fn an_average_follows_the_weights_is_judged_and_kept_and_goes_on_to_the_same_bit
     // What the last epoch validated is what the weights that are kept say.
     let scenes = scenes(100, 3);
     let model = Model::read(&trained.weights, &Device::flex()).unwrap();
-    let baseline = Baseline::fit(Target::Tof, &scenes, 3).unwrap();
+    let baseline =
+        Baseline::fit(&plan(Target::Tof, ShadowVariant::All).question, &scenes, 3).unwrap();
     let found = evaluate(&model, &baseline, &scenes, &mut |_, _| true);
     let found = found.unwrap().unwrap().metrics.loss();
     let said = trained.history[3].validation.unwrap().loss();

@@ -16,7 +16,7 @@ use picofarm_model::{
 
 fn trained(target: Target) -> Entry {
     let (plan, sources) = (plan(target, ShadowVariant::Concat), sources());
-    let baseline = Baseline::fit(plan.question.target, sources.train.as_ref(), 9).unwrap();
+    let baseline = Baseline::fit(&plan.question, sources.train.as_ref(), 9).unwrap();
     let mut training = Training::start(plan, None, sources, &cpu()).unwrap();
     training.run(&mut |_, _| Control::Continue).unwrap();
     let trained = training.finish();

@@ -169,7 +169,7 @@ fn with_early_stop_the_weights_of_the_best_epoch_are_kept_and_not_the_last() {
     // They say of the validation scenes what that epoch's did.
     let model = picofarm_model::Model::read(&trained.weights, &Device::flex()).unwrap();
     let scenes = scenes(100, 3);
-    let baseline = Baseline::fit(plan.question.target, &scenes, 3).unwrap();
+    let baseline = Baseline::fit(&plan.question, &scenes, 3).unwrap();
     let found = picofarm_model::evaluate(&model, &baseline, &scenes, &mut |_, _| true);
     let found = found.unwrap().unwrap().metrics.loss();
     assert!((found - best).abs() < 1e-6, "{found} {best}");

@@ -20,7 +20,7 @@ use picofarm_reconstruct::{
     surface,
 };
 use picofarm_scene::{
-    AssetLibrary, LaserGrid, Scene,
+    Aim, AssetLibrary, Scene,
     furnished::{self, FurnishedSettings},
     plato::{self, PlatoObject, PlatoSettings},
     primitive::{self, PrimitiveSettings},
@@ -396,8 +396,8 @@ fn peers(captures: bool) -> Vec<Row> {
 
 fn measure(row: &Row, every: usize) -> Result<(), Box<dyn Error>> {
     let mut scene = plato::generate(&row.room)?;
-    if let Some(grid) = LaserGrid::new(row.grid) {
-        scene.laser = grid.laser(&scene.camera);
+    if let Some(aim) = Aim::grid(row.grid) {
+        scene.laser = aim.laser(&scene.camera);
     }
     let measured = measured(&scene, &row.how, row.captures)?;
     judge(row.name, &scene, timed(|| row.field(measured))?, every)

@@ -7,8 +7,9 @@
 //!   parameters that other programs read.
 //!
 //! Files of other makers may state a laser in the extras of any node: `"laser_spots": 25` (a grid over the
-//! camera's view) or `"laser_directions": [[x, y, z], …]` in that node's frame.
+//! camera's view, or `{"random": 16}`, or `{"at": [[x, y], …]}`) or `"laser_directions": [[x, y, z], …]` in that node's frame.
 
+use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Camera, Laser, Material, Provenance, Vec3};
@@ -48,7 +49,7 @@ pub(crate) struct NodeExtras {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) instance: Option<u32>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) laser_spots: Option<u32>,
+    pub(crate) laser_spots: Option<Spots>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) laser_directions: Option<Vec<Vec3>>,
 }

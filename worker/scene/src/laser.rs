@@ -1,8 +1,9 @@
 //! The laser: where it stands, where its beams point, and the spots they make.
 
+use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
 
-use crate::{Camera, Vec3};
+use crate::{Camera, Vec3, rng::Rng, trace::World};
 
 /// One collimated (delta) beam of unit pulse energy.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -39,77 +40,110 @@ pub struct Laser {
     pub beams: Vec<Beam>,
 }
 
-/// The standard grids of spots over the camera's field of view.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct LaserGrid(u32);
+/// Where in the camera's view the beams of a laser are aimed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Aim(Vec<[f32; 2]>);
 
-impl LaserGrid {
-    /// The grids that exist, by number of spots.
-    pub const SIZES: [u32; 4] = [4, 16, 25, 100];
+/// Stream of the random numbers that places of spots are drawn from: no attempt at a room has its number.
+const PLACES: u64 = u64::MAX;
 
-    /// The grid of `spots` spots; `None` unless `spots` is 1 or one of [`LaserGrid::SIZES`].
-    pub fn new(spots: u32) -> Option<Self> {
-        (spots == 1 || Self::SIZES.contains(&spots)).then_some(Self(spots))
+impl Aim {
+    /// At the grid of `spots` spots; `None` unless there is one of so many.
+    pub fn grid(spots: u32) -> Option<Self> {
+        Self::of(&Spots::Grid(spots), 0).ok()
     }
 
-    /// Number of spots.
-    pub fn spots(self) -> u32 {
-        self.0
+    /// At the spots of the scene of `seed`. Random places depend on nothing but seed and number: the first of more are the fewer.
+    ///
+    /// # Errors
+    /// What is wrong with the spots.
+    pub fn of(spots: &Spots, seed: u64) -> Result<Self, String> {
+        spots.check()?;
+        Ok(Self(match spots {
+            Spots::Grid(n) => grid(*n),
+            Spots::Random(n) => {
+                let mut rng = Rng::new(seed, PLACES);
+                (0..*n).map(|_| [rng.unit(), rng.unit()]).collect()
+            }
+            Spots::At(places) => places.iter().map(|p| p.map(|x| x as f32)).collect(),
+        }))
     }
 
-    /// Film positions in `[0, 1]²` (x right, y down), row by row. 4 and 25 are subsets of the 10×10 grid
-    /// of cell centres: 25 = rows 0,2,4,6,8 × columns 1,3,5,7,9; 4 = indices 22, 27, 72, 77. 16 is a
-    /// 4×4 grid of its own; 1 is the centre.
-    pub fn film(self) -> Vec<[f32; 2]> {
-        let cell = |i: u32, n: u32| (i as f32 + 0.5) / n as f32;
-        let of_hundred = |i: u32| [cell(i % 10, 10), cell(i / 10, 10)];
-        match self.0 {
-            1 => vec![[0.5, 0.5]],
-            4 => [22, 27, 72, 77].map(of_hundred).to_vec(),
-            16 => (0..16).map(|i| [cell(i % 4, 4), cell(i / 4, 4)]).collect(),
-            25 => (0..25)
-                .map(|i| of_hundred((i / 5) * 2 * 10 + (i % 5) * 2 + 1))
-                .collect(),
-            _ => (0..100).map(of_hundred).collect(),
-        }
+    /// Film positions in `[0, 1]²` (x right, y down).
+    pub fn film(&self) -> &[[f32; 2]] {
+        &self.0
     }
 
-    /// Beams from the camera's centre through the grid's film positions.
-    pub fn laser(self, camera: &Camera) -> Laser {
-        let i = &camera.intrinsics;
-        let beams = self
-            .film()
-            .into_iter()
-            .map(|[x, y]| Beam {
-                direction: camera
-                    .ray(x * i.width as f32, y * i.height as f32)
-                    .normalized(),
-                spot: None,
-            })
-            .collect();
+    /// Beams from the camera's centre.
+    pub fn laser(&self, camera: &Camera) -> Laser {
+        let beam = |direction: Vec3| Beam {
+            direction: direction.normalized(),
+            spot: None,
+        };
         Laser {
             origin: camera.origin,
-            beams,
+            beams: self.rays(camera).map(beam).collect(),
         }
+    }
+
+    /// Beams from a laser at `place` in the camera's frame (x right, y down, z forward; metres), at the points that the camera sees
+    /// there, as a lab steers its mirrors; `None` where a ray of the camera meets nothing, or the laser stands outside of the room.
+    pub(crate) fn laser_at(&self, camera: &Camera, place: Vec3, world: &World) -> Option<Laser> {
+        if place == Vec3::default() {
+            return Some(self.laser(camera));
+        }
+        let away = camera.right * place.x + camera.down * place.y + camera.forward * place.z;
+        let distance = away.length();
+        // A wall or an object in between would be lit from behind.
+        if world
+            .closest(camera.origin, away * (1.0 / distance))
+            .is_none_or(|hit| hit.t <= distance)
+        {
+            return None;
+        }
+        let origin = camera.origin + away;
+        let beam = |ray: Vec3| {
+            let seen = camera.origin + ray * world.closest(camera.origin, ray)?.t;
+            Some(Beam {
+                direction: (seen - origin).normalized(),
+                spot: None,
+            })
+        };
+        let beams = self.rays(camera).map(beam).collect::<Option<_>>()?;
+        Some(Laser { origin, beams })
+    }
+
+    fn rays(&self, camera: &Camera) -> impl Iterator<Item = Vec3> {
+        let i = camera.intrinsics;
+        let (w, h) = (i.width as f32, i.height as f32);
+        self.0.iter().map(move |[x, y]| camera.ray(x * w, y * h))
     }
 }
 
-/// The grid of a generator's `spots` setting, or (field, what was expected).
-pub(crate) fn check_spots(spots: u32) -> Result<LaserGrid, (&'static str, String)> {
-    LaserGrid::new(spots).ok_or_else(|| {
-        (
-            "spots",
-            format!("{spots}: there are grids of 1, 4, 16, 25 and 100 spots"),
-        )
-    })
+/// Film positions of a grid, row by row. 4 and 25 are subsets of the 10×10 grid of cell centres: 25 = rows 0,2,4,6,8 × columns
+/// 1,3,5,7,9; 4 = indices 22, 27, 72, 77. 16 is a 4×4 grid of its own; 1 is the centre.
+fn grid(spots: u32) -> Vec<[f32; 2]> {
+    let cell = |i: u32, n: u32| (i as f32 + 0.5) / n as f32;
+    let of_hundred = |i: u32| [cell(i % 10, 10), cell(i / 10, 10)];
+    match spots {
+        1 => vec![[0.5, 0.5]],
+        4 => [22, 27, 72, 77].map(of_hundred).to_vec(),
+        16 => (0..16).map(|i| [cell(i % 4, 4), cell(i / 4, 4)]).collect(),
+        25 => (0..25)
+            .map(|i| of_hundred((i / 5) * 2 * 10 + (i % 5) * 2 + 1))
+            .collect(),
+        _ => (0..100).map(of_hundred).collect(),
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::LaserGrid;
+    use picofarm_settings::Spots;
+
+    use super::Aim;
 
     fn film(spots: u32) -> Vec<[f32; 2]> {
-        LaserGrid::new(spots).expect("a standard grid").film()
+        Aim::grid(spots).expect("a standard grid").film().to_vec()
     }
 
     #[test]
@@ -128,11 +162,39 @@ mod tests {
 
     #[test]
     fn every_grid_lies_on_the_film_and_has_its_number_of_spots() {
-        for n in [1, 4, 16, 25, 100] {
+        for n in Spots::GRIDS {
             let points = film(n);
             assert_eq!(points.len(), n as usize);
             assert!(points.iter().flatten().all(|x| (0.0..1.0).contains(x)));
         }
-        assert_eq!(LaserGrid::new(9), None);
+        assert_eq!(Aim::grid(9), None);
+    }
+
+    #[test]
+    fn random_places_fill_the_film_evenly_and_follow_from_the_seed_alone() {
+        let at = |n: u32, seed: u64| Aim::of(&Spots::Random(n), seed).unwrap();
+        assert_eq!(at(16, 7), at(16, 7));
+        assert_ne!(at(16, 7), at(16, 8));
+        assert_eq!(at(16, 7).film(), &at(100, 7).film()[..16]);
+        let mut quarters = [0; 4];
+        for seed in 0..200 {
+            for &[x, y] in at(20, seed).film() {
+                assert!((0.0..1.0).contains(&x) && (0.0..1.0).contains(&y));
+                quarters[usize::from(x >= 0.5) + 2 * usize::from(y >= 0.5)] += 1;
+            }
+        }
+        // 4,000 places: 1,000 ± 27.4 in each quarter.
+        assert!(
+            quarters.iter().all(|n| (863..1137).contains(n)),
+            "{quarters:?}"
+        );
+    }
+
+    #[test]
+    fn given_places_are_taken_as_they_are() {
+        let spots = Spots::At(vec![[0.25, 0.5], [0.75, 0.125]]);
+        let aim = Aim::of(&spots, 3).unwrap();
+        assert_eq!(aim.film(), [[0.25, 0.5], [0.75, 0.125]]);
+        assert!(Aim::of(&Spots::At(vec![[0.5, 1.5]]), 3).is_err());
     }
 }

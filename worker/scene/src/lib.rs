@@ -28,7 +28,7 @@ mod view;
 pub use assets::{AssetLibrary, install};
 pub use camera::{Camera, Intrinsics};
 pub use label::LABELS;
-pub use laser::{Beam, Laser, LaserGrid, Spot};
+pub use laser::{Aim, Beam, Laser, Spot};
 pub use material::{Bsdf, Distribution, Material};
 pub use mesh::Mesh;
 pub use model::{Object, Provenance, Scene, SceneError};

@@ -1,13 +1,13 @@
 //! The paper's primitive rooms: a cube, a cylinder and a mirror in a bare room of varying scale, seen by
-//! a camera whose place and field of view jitter.
+//! a camera whose place and field of view jitter. Of the size of living rooms, or of a box on a desk.
 
 use std::{collections::BTreeMap, f32::consts::TAU, sync::Arc};
 
+use picofarm_settings::{MirrorWall, PrimitiveRooms, Sizes, Spots};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Affine, Camera, Intrinsics, LaserGrid, Material, Mesh, Object, Provenance, Scene, SceneError,
-    Vec3,
+    Affine, Aim, Camera, Intrinsics, Material, Mesh, Object, Provenance, Scene, SceneError, Vec3,
     label::{label_id, vocabulary},
     layout::{Footprint, Room},
     rng::Rng,
@@ -23,34 +23,48 @@ pub const GENERATOR_VERSION: &str = "primitive-2";
 const ATTEMPTS: u32 = 64;
 /// Cameras tried for one room.
 const CAMERAS: u32 = 24;
+/// The wall that cameras look at ([`Room::against_wall`]).
+const BACK: usize = 0;
 
 /// What a primitive room is made for.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PrimitiveSettings {
-    /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
-    pub spots: u32,
+    /// Laser spots.
+    pub spots: Spots,
+    /// Where the laser stands in the camera's frame (x right, y down, z forward), metres.
+    pub laser_m: [f32; 3],
     /// Image width in pixels.
     pub width: u32,
     /// Image height in pixels.
     pub height: u32,
     /// Middle of the horizontal field of view, degrees.
     pub fov_deg: f32,
-    /// The field of view is uniform within ± this, degrees.
-    pub fov_jitter_deg: f32,
-    /// Hang or stand a mirror in the room.
-    pub mirror: bool,
+    /// Sizes of rooms and objects, bounds of depth, the mirror's wall, and how much the field of view varies.
+    pub rooms: PrimitiveRooms,
 }
 
 impl Default for PrimitiveSettings {
     fn default() -> Self {
         Self {
-            spots: 25,
+            spots: Spots::Grid(25),
+            laser_m: [0.0; 3],
             width: 256,
             height: 256,
             fov_deg: 90.0,
-            fov_jitter_deg: 5.0,
-            mirror: true,
+            rooms: PrimitiveRooms::LIVING,
+        }
+    }
+}
+
+impl PrimitiveSettings {
+    /// A box on a desk, as in the laboratory of appendix F.1: 46° wide, 16 spots.
+    pub fn desktop() -> Self {
+        Self {
+            spots: Spots::Grid(16),
+            fov_deg: 46.0,
+            rooms: PrimitiveRooms::DESKTOP,
+            ..Self::default()
         }
     }
 }
@@ -59,12 +73,12 @@ impl Default for PrimitiveSettings {
 ///
 /// # Errors
 /// [`SceneError::Invalid`] for settings out of range, [`SceneError::Exhausted`] if no camera of any
-/// sub-seed keeps the depth within [`crate::MIN_DEPTH_M`]..[`crate::MAX_DEPTH_M`].
+/// sub-seed keeps the depth within the bounds of [`PrimitiveRooms::depth_m`].
 pub fn generate(seed: u64, settings: &PrimitiveSettings) -> Result<Scene, SceneError> {
-    let grid = settings.check()?;
+    let aim = settings.check(seed)?;
     for attempt in 0..ATTEMPTS {
         let mut rng = Rng::new(seed, u64::from(attempt));
-        if let Some(scene) = attempt_room(seed, attempt, settings, grid, &mut rng) {
+        if let Some(scene) = attempt_room(seed, attempt, settings, &aim, &mut rng) {
             return Ok(scene);
         }
     }
@@ -76,21 +90,35 @@ pub fn generate(seed: u64, settings: &PrimitiveSettings) -> Result<Scene, SceneE
 }
 
 impl PrimitiveSettings {
-    fn check(&self) -> Result<LaserGrid, SceneError> {
+    fn check(&self, seed: u64) -> Result<Aim, SceneError> {
         let invalid = |field: &str, what: String| SceneError::Invalid {
             scene: GENERATOR_VERSION.into(),
             field: field.into(),
             what,
         };
+        let jitter = self.rooms.fov_jitter_deg as f32;
+        self.rooms
+            .check()
+            .map_err(|(field, what)| invalid(&format!("rooms.{field}"), what))?;
         crate::camera::check_view(self.width, self.height, self.fov_deg)
             .and_then(|()| {
-                let jitter = self.fov_jitter_deg;
-                crate::camera::check_view(self.width, self.height, self.fov_deg + jitter)?;
+                crate::camera::check_view(self.width, self.height, self.fov_deg + jitter)
+            })
+            .and_then(|()| {
                 crate::camera::check_view(self.width, self.height, self.fov_deg - jitter)
             })
-            .and_then(|()| crate::laser::check_spots(self.spots))
+            .and_then(|()| Aim::of(&self.spots, seed).map_err(|what| ("spots", what)))
             .map_err(|(field, what)| invalid(field, what))
     }
+}
+
+fn drawn(rng: &mut Rng, [lo, hi]: [f64; 2]) -> f32 {
+    rng.range(lo as f32, hi as f32)
+}
+
+/// Half a width, and a height.
+fn size(rng: &mut Rng, sizes: &Sizes) -> (f32, f32) {
+    (drawn(rng, sizes.width_m) * 0.5, drawn(rng, sizes.height_m))
 }
 
 fn grey(rng: &mut Rng, name: &str) -> Material {
@@ -100,16 +128,16 @@ fn grey(rng: &mut Rng, name: &str) -> Material {
     Material::diffuse(name, rgb)
 }
 
-fn cube(rng: &mut Rng) -> Mesh {
-    let (half, height) = (rng.range(0.15, 0.4), rng.range(0.3, 0.9));
+fn cube(rng: &mut Rng, sizes: &Sizes) -> Mesh {
+    let (half, height) = size(rng, sizes);
     let mut shape = Shape::new("cube");
     let m = shape.material(grey(rng, "cube"));
     shape.cuboid([-half, 0.0, -half], [half, height, half], m);
     shape.finish()
 }
 
-fn cylinder(rng: &mut Rng) -> Mesh {
-    let (radius, height) = (rng.range(0.12, 0.35), rng.range(0.3, 1.1));
+fn cylinder(rng: &mut Rng, sizes: &Sizes) -> Mesh {
+    let (radius, height) = size(rng, sizes);
     let mut shape = Shape::new("cylinder");
     let m = shape.material(grey(rng, "cylinder"));
     shape.cylinder([0.0; 2], [0.0, height], [radius, radius], 48, m);
@@ -117,8 +145,8 @@ fn cylinder(rng: &mut Rng) -> Mesh {
 }
 
 /// A thin planar near-mirror (α = 0.01) with its back at z = 0 and its front towards +z.
-fn mirror(rng: &mut Rng) -> Mesh {
-    let (half, height) = (rng.range(0.25, 0.6), rng.range(0.5, 1.2));
+fn mirror(rng: &mut Rng, sizes: &Sizes) -> Mesh {
+    let (half, height) = size(rng, sizes);
     let mut shape = Shape::new("mirror");
     let m = shape.material(Material::mirror("mirror", 0.01));
     shape.cuboid([-half, 0.0, -0.01], [half, height, 0.01], m);
@@ -129,10 +157,11 @@ fn attempt_room(
     seed: u64,
     attempt: u32,
     settings: &PrimitiveSettings,
-    grid: LaserGrid,
+    aim: &Aim,
     rng: &mut Rng,
 ) -> Option<Scene> {
-    let scale = rng.range(0.8, 1.15);
+    let rooms = &settings.rooms;
+    let scale = drawn(rng, rooms.scale);
     let room = Room {
         width: 3.6 * scale * rng.range(0.9, 1.1),
         depth: 3.6 * scale * rng.range(0.9, 1.1),
@@ -157,17 +186,21 @@ fn attempt_room(
     let mut taken: Vec<Footprint> = Vec::new();
     for label in ["cube", "cylinder", "mirror"] {
         let mesh = match label {
-            "cube" => cube(rng),
-            "cylinder" => cylinder(rng),
-            _ if settings.mirror => mirror(rng),
-            _ => continue,
+            "cube" => cube(rng, &rooms.cube),
+            "cylinder" => cylinder(rng, &rooms.cylinder),
+            _ if rooms.mirror_wall == MirrorWall::None => continue,
+            _ => mirror(rng, &rooms.mirror),
         };
         let (lo, hi) = mesh.bounds()?;
         let half = [(hi.x - lo.x) * 0.5, (hi.z - lo.z) * 0.5];
         let spot = (0..64).find_map(|_| {
             let (at, yaw) = if label == "mirror" {
-                let (at, yaw) = room.against_wall(rng.below(4), rng.range(-1.0, 1.0), half, 0.002);
-                ([at[0], rng.range(0.3, 0.8), at[1]], yaw)
+                let wall = match rooms.mirror_wall {
+                    MirrorWall::Back => BACK,
+                    MirrorWall::Any | MirrorWall::None => rng.below(4),
+                };
+                let (at, yaw) = room.against_wall(wall, rng.range(-1.0, 1.0), half, 0.002);
+                ([at[0], drawn(rng, rooms.mirror_from_m), at[1]], yaw)
             } else {
                 let x = rng.range(-0.5, 0.5) * room.width;
                 let z = rng.range(-0.5, 0.5) * room.depth;
@@ -182,7 +215,7 @@ fn attempt_room(
         put(mesh, label, Affine::yaw_then_move(yaw, at.into()));
     }
     for _ in 0..CAMERAS {
-        let fov = settings.fov_deg + rng.range(-1.0, 1.0) * settings.fov_jitter_deg;
+        let fov = settings.fov_deg + rng.range(-1.0, 1.0) * rooms.fov_jitter_deg as f32;
         let eye = Vec3::new(
             rng.range(-0.45, 0.45) * room.width,
             rng.range(0.35, 0.7) * room.height,
@@ -195,15 +228,18 @@ fn attempt_room(
         );
         let (width, height) = (settings.width, settings.height);
         let mut camera = Camera::look_at(eye, target, acceptance(fov, width, height));
-        let laser = grid.laser(&camera);
-        let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
+        let bounds = rooms.depth_m.map(|z| z as f32);
+        let Some(seen) = coarse_view(&world, &camera, bounds, objects.len()) else {
+            continue;
+        };
+        let Some(laser) = aim.laser_at(&camera, settings.laser_m.into(), &world) else {
             continue;
         };
         // Everything that is not the room itself must be in view.
         if seen[6..].contains(&0) || !beams_land(&world, &laser, &objects) {
             continue;
         }
-        if let Some([near, far]) = full_view(&world, &camera) {
+        if let Some([near, far]) = full_view(&world, &camera, bounds) {
             camera.intrinsics = Intrinsics::from_fov(fov, width, height);
             let notes = BTreeMap::from([
                 ("attempt".to_owned(), attempt.to_string()),

@@ -3,9 +3,9 @@
 
 use crate::{Camera, Intrinsics, Laser, Material, Object, Vec3, trace::World};
 
-/// Smallest z-depth of a generated view, metres.
+/// Smallest z-depth of a furnished room's view, metres.
 pub const MIN_DEPTH_M: f32 = 0.5;
-/// Largest z-depth of a generated view, metres.
+/// Largest z-depth of a furnished room's view, metres.
 pub const MAX_DEPTH_M: f32 = 4.5;
 
 /// Pixels along the longer side of the image by which a view is accepted. It is the same for every image
@@ -27,8 +27,13 @@ pub(crate) fn acceptance(fov_x_deg: f32, width: u32, height: u32) -> Intrinsics 
 }
 
 /// Pixels of the coarse look (of COARSE²) that see each object; `None` where any lies outside the
-/// depth bounds. The film's corners are looked at too, since extremes tend to lie there.
-pub(crate) fn coarse_view(world: &World, camera: &Camera, objects: usize) -> Option<Vec<u32>> {
+/// bounds of z-depth. The film's corners are looked at too, since extremes tend to lie there.
+pub(crate) fn coarse_view(
+    world: &World,
+    camera: &Camera,
+    bounds: [f32; 2],
+    objects: usize,
+) -> Option<Vec<u32>> {
     let i = &camera.intrinsics;
     let (w, h) = (i.width as f32, i.height as f32);
     for [x, y] in [
@@ -37,26 +42,26 @@ pub(crate) fn coarse_view(world: &World, camera: &Camera, objects: usize) -> Opt
         [0.5, h - 0.5],
         [w - 0.5, h - 0.5],
     ] {
-        bounded(world, camera, x, y)?;
+        bounded(world, camera, bounds, x, y)?;
     }
     let mut seen = vec![0; objects];
     for row in 0..COARSE {
         for column in 0..COARSE {
             let x = (column as f32 + 0.5) / COARSE as f32 * w;
             let y = (row as f32 + 0.5) / COARSE as f32 * h;
-            seen[bounded(world, camera, x, y)?.0] += 1;
+            seen[bounded(world, camera, bounds, x, y)?.0] += 1;
         }
     }
     Some(seen)
 }
 
 /// Smallest and largest z-depth over every pixel centre; `None` where one lies outside the bounds.
-pub(crate) fn full_view(world: &World, camera: &Camera) -> Option<[f32; 2]> {
+pub(crate) fn full_view(world: &World, camera: &Camera, bounds: [f32; 2]) -> Option<[f32; 2]> {
     let i = &camera.intrinsics;
     let (mut near, mut far) = (f32::INFINITY, 0.0f32);
     for v in 0..i.height {
         for u in 0..i.width {
-            let (_, depth) = bounded(world, camera, u as f32 + 0.5, v as f32 + 0.5)?;
+            let (_, depth) = bounded(world, camera, bounds, u as f32 + 0.5, v as f32 + 0.5)?;
             (near, far) = (near.min(depth), far.max(depth));
         }
     }
@@ -64,12 +69,16 @@ pub(crate) fn full_view(world: &World, camera: &Camera) -> Option<[f32; 2]> {
 }
 
 /// Object and z-depth at a film position, if within the bounds.
-fn bounded(world: &World, camera: &Camera, x: f32, y: f32) -> Option<(usize, f32)> {
+fn bounded(
+    world: &World,
+    camera: &Camera,
+    [near, far]: [f32; 2],
+    x: f32,
+    y: f32,
+) -> Option<(usize, f32)> {
     // Camera rays have z-component 1, so the ray parameter is the z-depth.
     let hit = world.closest(camera.origin, camera.ray(x, y))?;
-    (MIN_DEPTH_M..=MAX_DEPTH_M)
-        .contains(&hit.t)
-        .then_some((hit.object, hit.t))
+    (near..=far).contains(&hit.t).then_some((hit.object, hit.t))
 }
 
 /// True if every beam ends on a diffuse surface, straight or folded by mirrors.

@@ -6,7 +6,7 @@ mod common;
 use std::{path::Path, sync::OnceLock};
 
 use picofarm_scene::{
-    LaserGrid, export,
+    Aim, export,
     import::{self, Bounds, ImportOptions},
 };
 use proptest::{prelude::*, test_runner::TestRunner};
@@ -105,7 +105,7 @@ fn survives(folder: &Path, name: &str, bytes: &[u8]) -> Result<(), TestCaseError
     let path = folder.join(name);
     std::fs::write(&path, bytes).expect("writes");
     let options = ImportOptions {
-        laser: LaserGrid::new(4),
+        laser: Aim::grid(4),
         frame: true,
         ..ImportOptions::default()
     };
@@ -299,7 +299,7 @@ fn peak_kb() -> Option<u64> {
 fn the_undamaged_files_are_read() {
     let folder = folder();
     let options = ImportOptions {
-        laser: LaserGrid::new(4),
+        laser: Aim::grid(4),
         frame: true,
         ..ImportOptions::default()
     };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use common::data_uri;
 use picofarm_scene::{
-    Bsdf, Distribution, LaserGrid, Scene, SceneError, Vec3, export,
+    Aim, Bsdf, Distribution, Scene, SceneError, Vec3, export,
     import::{Bounds, ImportOptions, read_reference_json, read_scene, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
@@ -98,7 +98,7 @@ fn a_missing_camera_or_laser_is_named_and_can_be_stated() {
     let dark = folder.file("dark.gltf", gltf(&uri, r#","camera":0"#));
     assert!(refusal(&dark).contains("laser_spots"));
     let options = ImportOptions {
-        laser: LaserGrid::new(25),
+        laser: Aim::grid(25),
         ..ImportOptions::default()
     };
     let scene = read_scene_with(&dark, &options, &Bounds::default()).expect("the grid is stated");

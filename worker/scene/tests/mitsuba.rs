@@ -6,7 +6,7 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use picofarm_scene::{
-    Bsdf, Distribution, LaserGrid, Scene, SceneError, Vec3, export,
+    Aim, Bsdf, Distribution, Scene, SceneError, Vec3, export,
     import::{self, Bounds, ImportOptions, read_scene, read_scene_with},
 };
 
@@ -364,7 +364,7 @@ fn a_grid_stated_on_import_replaces_the_beams() {
     let path = folder.path().join("scene.xml");
     export::write_mitsuba(&common::textured_room(), &path).expect("writes");
     let options = ImportOptions {
-        laser: LaserGrid::new(4),
+        laser: Aim::grid(4),
         ..ImportOptions::default()
     };
     let scene = read_scene_with(&path, &options, &Bounds::default()).expect("reads");

@@ -6,7 +6,7 @@ use std::{
 };
 
 use picofarm_scene::{
-    LaserGrid, SceneError,
+    Aim, SceneError,
     import::{Bounds, ImportOptions, fingerprint, read_scene_with},
 };
 
@@ -65,7 +65,7 @@ impl Place {
 
 fn options() -> ImportOptions {
     ImportOptions {
-        laser: LaserGrid::new(1),
+        laser: Aim::grid(1),
         frame: true,
         ..ImportOptions::default()
     }

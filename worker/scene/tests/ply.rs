@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use picofarm_scene::{
-    LaserGrid, Scene, SceneError, export,
+    Aim, Scene, SceneError, export,
     import::{Bounds, ImportOptions, read_scene_with},
     primitive::{self, PrimitiveSettings},
 };
@@ -62,7 +62,7 @@ fn read(name: &str, bytes: &[u8], frame: bool) -> Result<Scene, SceneError> {
     let path: PathBuf = folder.path().join(name);
     std::fs::write(&path, bytes).expect("writes");
     let options = ImportOptions {
-        laser: LaserGrid::new(4),
+        laser: Aim::grid(4),
         frame,
         ..ImportOptions::default()
     };

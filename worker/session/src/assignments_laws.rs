@@ -13,6 +13,7 @@ use picofarm_proto::{
         TaskAt, TaskSpec,
     },
 };
+use picofarm_settings::{PrimitiveRooms, Spots};
 use proptest::prelude::*;
 use uuid::Uuid;
 
@@ -79,11 +80,14 @@ fn lease(epoch: u64, tasks: u64, skip: Vec<u64>) -> Lease {
         stage: StageSpec::new(TaskSpec::Render(RenderTask {
             parts: 1,
             scenes: SceneSource {
-                kind: SceneKind::Primitive,
+                kind: SceneKind::Primitive {
+                    rooms: PrimitiveRooms::LIVING,
+                },
                 count: 5,
                 seed: 0,
                 fov_deg: 90.0,
-                spots: 1,
+                spots: Spots::Grid(1),
+                laser_m: [0.0; 3],
             },
             render: RenderSettings::default(),
             output: OutputSettings {

@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 
 use common::{energy, ok, settings};
 use picofarm_scene::{Scene, primitive};
+use picofarm_settings::{MirrorWall, PrimitiveRooms, Spots};
 use picofarm_transient::{Budget, Gate, Rendered, Settings};
 
 const SIZE: usize = 16;
@@ -23,10 +24,13 @@ fn gate() -> Gate {
 /// A room with things in it, four spots.
 fn room() -> Scene {
     let set = primitive::PrimitiveSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: SIZE as u32,
         height: SIZE as u32,
-        mirror: false,
+        rooms: PrimitiveRooms {
+            mirror_wall: MirrorWall::None,
+            ..PrimitiveRooms::LIVING
+        },
         ..primitive::PrimitiveSettings::default()
     };
     primitive::generate(5, &set).unwrap()

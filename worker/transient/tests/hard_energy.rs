@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 use common::{
     beam_to, energy, framed, grey, multi_energy, near, ok, quad, room, scene, settings, sphere, v,
 };
-use picofarm_scene::{Camera, LaserGrid, Material, Scene, Texture, Vec3, Wrap};
+use picofarm_scene::{Aim, Camera, Material, Scene, Texture, Vec3, Wrap};
 use picofarm_transient::{Budget, Gate, Settings};
 
 fn long(bins: u32) -> Gate {
@@ -146,7 +146,7 @@ fn a_bright_corner_loses_at_least_its_absorption_at_every_bounce() {
 /// In a white sphere every path from spot to pixel counts the same: bounce k adds 1/(4π²R²).
 fn bright_sphere(spots: u32) -> Scene {
     let mut s = scene(vec![sphere(Vec3::ZERO, 2.0, 5, grey(1.0))], 2, &[]);
-    s.laser = LaserGrid::new(spots).unwrap().laser(&s.camera);
+    s.laser = Aim::grid(spots).unwrap().laser(&s.camera);
     s
 }
 

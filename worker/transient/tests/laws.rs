@@ -151,9 +151,7 @@ fn the_histogram_of_many_spots_is_the_sum_of_their_own() {
     let camera = scene(vec![], 6, &[]).camera;
     for spots in [1, 4, 25] {
         let mut all = scene(walls(), 6, &[]);
-        all.laser = picofarm_scene::LaserGrid::new(spots)
-            .unwrap()
-            .laser(&camera);
+        all.laser = picofarm_scene::Aim::grid(spots).unwrap().laser(&camera);
         let set = Settings {
             one_bounce: true,
             ..settings(Budget::Samples(256))

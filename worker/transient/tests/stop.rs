@@ -6,6 +6,7 @@ use picofarm_scene::{
     AssetLibrary,
     furnished::{self, FurnishedSettings},
 };
+use picofarm_settings::Spots;
 use picofarm_transient::{
     Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, render, render_within,
 };
@@ -61,7 +62,7 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
     let library = AssetLibrary::find("parametric", &[]).unwrap();
     let side = 48;
     let room = FurnishedSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: side,
         height: side,
         ..FurnishedSettings::default()
@@ -103,7 +104,7 @@ fn a_render_stops_within_a_few_questions_wherever_it_is() {
 fn within(seconds: u64, budget: Budget) -> Rendered {
     let library = AssetLibrary::find("parametric", &[]).unwrap();
     let room = FurnishedSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: 16,
         height: 16,
         ..FurnishedSettings::default()

@@ -4,6 +4,7 @@ mod common;
 
 use common::{beam_to, energy, grey, ok, quad, room, scene, settings, sphere, v};
 use picofarm_scene::{Beam, Material, Object, Scene, primitive};
+use picofarm_settings::{MirrorWall, PrimitiveRooms, Spots};
 use picofarm_transient::{Budget, Rendered, Settings};
 
 const SIZE: usize = 16;
@@ -15,10 +16,13 @@ const WIDE: usize = 13;
 
 fn plain() -> Scene {
     let set = primitive::PrimitiveSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: SIZE as u32,
         height: SIZE as u32,
-        mirror: false,
+        rooms: PrimitiveRooms {
+            mirror_wall: MirrorWall::None,
+            ..PrimitiveRooms::LIVING
+        },
         ..primitive::PrimitiveSettings::default()
     };
     primitive::generate(5, &set).unwrap()

@@ -5,7 +5,7 @@ use std::{net::SocketAddr, path::Path};
 use picofarm_agent::Access;
 use picofarm_dataset::{Dataset, Profile};
 use picofarm_proto::model::{
-    Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource,
+    Budget, JobSpec, OutputSettings, RenderSettings, RenderTask, SceneKind, SceneSource, Spots,
 };
 use tokio_util::sync::CancellationToken;
 
@@ -56,7 +56,8 @@ pub async fn source(
             count: args.scenes,
             seed: args.seed,
             fov_deg: 90.0,
-            spots: 25,
+            spots: Spots::Grid(25),
+            laser_m: [0.0; 3],
         },
         render: RenderSettings {
             resolution: args.resolution,

@@ -181,16 +181,16 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
     }
 
     /// The store that keeps the models which are read or trained.
-    fn shelf(&self) -> Option<&String> {
+    fn models_store(&self) -> Option<&String> {
         self.reads().map(|source| &source.store)
     }
 
     /// The same where it may be left out, to be filled in.
-    fn shelf_mut(&mut self) -> Option<&mut String> {
+    fn models_store_mut(&mut self) -> Option<&mut String> {
         None
     }
 
-    /// The models that are read, from the store of [`Self::shelf`]: field and name.
+    /// The models that are read, from the store of [`Self::models_store`]: field and name.
     fn models(&self) -> Vec<(&'static str, &String)> {
         Vec::new()
     }
@@ -288,7 +288,7 @@ pub(super) fn predicts_depth(
     task: &dyn TaskKind,
     before: &[&dyn TaskKind],
 ) -> Result<(), SpecError> {
-    let (Some((field, folder)), Some(store)) = (task.reads_beside(), task.shelf()) else {
+    let (Some((field, folder)), Some(store)) = (task.reads_beside(), task.models_store()) else {
         return Ok(());
     };
     let Some(writer) = before

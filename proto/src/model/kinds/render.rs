@@ -1,6 +1,6 @@
 //! What a render task does: which scenes, rendered how.
 
-use picofarm_settings::Budget;
+use picofarm_settings::{Budget, Spots};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -74,19 +74,15 @@ impl RenderTask {
     /// What a task keeps in memory, beside its scene.
     pub(super) fn rendering(&self, threads: u32) -> Rendering {
         let render = &self.render;
-        let spots = if render.per_spot {
-            self.scenes.spots
-        } else {
-            0
-        };
+        let spots = self.scenes.spots.count();
         Rendering {
             shape: Shape {
                 height: render.resolution,
                 width: render.resolution,
                 bins: render.bins,
-                spots: self.scenes.spots,
+                spots,
             },
-            histograms: 1 + render.subsets.len() as u32 + spots,
+            histograms: 1 + render.subsets.len() as u32 + if render.per_spot { spots } else { 0 },
             split: false,
             light_paths: render.strategy.caustics != Some(false) && render.max_bounces != 2,
             threads,
@@ -137,14 +133,14 @@ impl TaskKind for RenderTask {
             return Err(SpecError::new("parts", what));
         }
         if let [smallest, ..] = self.render.subsets[..]
-            && self.scenes.spots != 100
+            && self.scenes.spots != Spots::Grid(100)
         {
             return Err(SpecError::new(
                 "render.subsets",
                 format!(
                     "{smallest} is a subset of the 10x10 grid, which scenes.spots = {} is not; set scenes.spots = 100, \
                      or leave subsets out",
-                    self.scenes.spots
+                    json!(self.scenes.spots)
                 ),
             ));
         }
@@ -210,7 +206,7 @@ impl TaskKind for RenderTask {
             height: self.render.resolution,
             width: self.render.resolution,
             bins: self.render.bins,
-            spots: self.scenes.spots,
+            spots: self.scenes.spots.count(),
         })
     }
 }

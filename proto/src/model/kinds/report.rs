@@ -111,11 +111,11 @@ impl TaskKind for ReportTask {
         Some((&self.report.store, &self.report.name))
     }
 
-    fn shelf(&self) -> Option<&String> {
+    fn models_store(&self) -> Option<&String> {
         Some(&self.report.store)
     }
 
-    fn shelf_mut(&mut self) -> Option<&mut String> {
+    fn models_store_mut(&mut self) -> Option<&mut String> {
         Some(&mut self.report.store)
     }
 

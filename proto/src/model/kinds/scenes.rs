@@ -1,5 +1,6 @@
 //! The scenes of a stage that renders or generates: where they come from, how a job file says it, and the checks.
 
+use picofarm_settings::{MirrorWall, PrimitiveRooms, Sizes, Spots};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -14,7 +15,7 @@ use crate::{
 /// Names of furniture that stand for whatever a machine has of it.
 const LIBRARIES: [&str; 5] = ["", "auto", "parametric", "sweethome3d", "gltf"];
 /// The kinds of scenes.
-const KINDS: [&str; 3] = ["furnished", "primitive", "files"];
+const KINDS: [&str; 4] = ["furnished", "primitive", "desktop", "files"];
 
 /// The scenes of a job: one task each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -27,10 +28,18 @@ pub struct SceneSource {
     pub count: u64,
     /// Seed (default 0); scene i derives its own from (seed, i).
     pub seed: u64,
-    /// Horizontal field of view in degrees (generated scenes; default 90).
+    /// Horizontal field of view in degrees (generated scenes; default 90, of boxes on a desk 46).
     pub fov_deg: f64,
-    /// Laser spots: 1, 4, 16, 25 (default) or 100 (generated scenes, and files without a laser).
-    pub spots: u32,
+    /// Laser spots (generated scenes, and files without a laser; default a grid of 25, in boxes on a desk of 16).
+    pub spots: Spots,
+    /// Where the laser stands in the camera's frame, x right, y down, z forward, metres (generated scenes; default at the camera's
+    /// centre). Its beams go to the points that the camera sees at the spots' places.
+    #[serde(skip_serializing_if = "is_centre")]
+    pub laser_m: [f64; 3],
+}
+
+fn is_centre(place: &[f64; 3]) -> bool {
+    *place == [0.0; 3]
 }
 
 /// Where scenes come from.
@@ -45,8 +54,13 @@ pub enum SceneKind {
         /// At least this many mirrors a room (default 1).
         min_specular: u32,
     },
-    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale.
-    Primitive,
+    /// Primitive rooms: cube, cylinder and mirror in a room of varying scale. `kind = "desktop"` are those of
+    /// [`PrimitiveRooms::DESKTOP`].
+    Primitive {
+        /// Sizes of rooms and objects, bounds of depth, the mirror's wall.
+        #[serde(skip_serializing_if = "is_living")]
+        rooms: PrimitiveRooms,
+    },
     /// Scene files (.glb, .gltf, .json), one scene each.
     Files {
         /// The files; in a job file, plain paths.
@@ -58,6 +72,10 @@ pub enum SceneKind {
         #[serde(skip_serializing_if = "Option::is_none")]
         root: Option<String>,
     },
+}
+
+fn is_living(rooms: &PrimitiveRooms) -> bool {
+    *rooms == PrimitiveRooms::LIVING
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
@@ -109,12 +127,21 @@ impl From<SceneFileText> for SceneFile {
 impl SceneSource {
     /// What shapes the scenes, but for seed, field of view and spots, as keys know it.
     pub(super) fn shaping(&self) -> Value {
+        let mut value = self.kind_shaping();
+        if !is_centre(&self.laser_m) {
+            value["laser_m"] = json!(self.laser_m);
+        }
+        value
+    }
+
+    fn kind_shaping(&self) -> Value {
         match &self.kind {
             SceneKind::Furnished {
                 assets,
                 min_specular,
             } => json!({"kind": "furnished", "assets": assets, "min_specular": min_specular}),
-            SceneKind::Primitive => json!({"kind": "primitive"}),
+            SceneKind::Primitive { rooms } if is_living(rooms) => json!({"kind": "primitive"}),
+            SceneKind::Primitive { rooms } => json!({"kind": "primitive", "rooms": rooms}),
             SceneKind::Files { files, .. } => json!({
                 "kind": "files",
                 "sha256": files.iter().map(|f| f.sha256.as_str()).collect::<Vec<_>>(),
@@ -150,9 +177,6 @@ impl SceneSource {
         }
     }
 
-    /// The numbers of laser spots there are: grids of up to 10×10.
-    pub const SPOTS: [u32; 5] = [1, 4, 16, 25, 100];
-
     pub(super) fn check(&self) -> Result<(), SpecError> {
         check_count("scenes.count", self.count)?;
         if let SceneKind::Files { first: 1.., .. } = &self.kind {
@@ -176,7 +200,12 @@ impl SceneSource {
         // What the generators can furnish: beyond, walls or furniture leave the view.
         let degrees = "degrees from left to right";
         within("scenes.fov_deg", self.fov_deg, (20.0, 120.0), degrees)?;
-        Self::check_spots(self.spots).map_err(|what| SpecError::new("scenes.spots", what))?;
+        let spots = self.spots.check();
+        spots.map_err(|what| SpecError::new("scenes.spots", what))?;
+        let metres = "metres from the camera's centre";
+        for along in self.laser_m {
+            within("scenes.laser_m", along, (-5.0, 5.0), metres)?;
+        }
         match &self.kind {
             SceneKind::Furnished { min_specular, .. } => within(
                 "scenes.min_specular",
@@ -184,20 +213,20 @@ impl SceneSource {
                 (0, 16),
                 "mirrors a room at least; more find no wall",
             ),
-            _ => Ok(()),
-        }
-    }
-
-    /// Checks a number of laser spots: they lie on a square grid.
-    ///
-    /// # Errors
-    /// What numbers there are.
-    pub fn check_spots(spots: u32) -> Result<(), String> {
-        match Self::SPOTS.contains(&spots) {
-            true => Ok(()),
-            false => Err(format!(
-                "{spots} is no number of spots; there are grids of 1, 4, 16, 25 and 100"
+            SceneKind::Primitive { rooms } => {
+                let named = |(field, what)| SpecError::new(format!("scenes.rooms.{field}"), what);
+                rooms.check().map_err(named)?;
+                let (fov, jitter) = (self.fov_deg, rooms.fov_jitter_deg);
+                let degrees =
+                    "degrees less and more than scenes.fov_deg, which must stay within 1 and 170";
+                let most = (fov - 1.0).min(170.0 - fov);
+                within("scenes.rooms.fov_jitter_deg", jitter, (0.0, most), degrees)
+            }
+            SceneKind::Files { .. } if !is_centre(&self.laser_m) => Err(SpecError::new(
+                "scenes.laser_m",
+                "is of generated scenes; a file says itself where its laser stands",
             )),
+            SceneKind::Files { .. } => Ok(()),
         }
     }
 }
@@ -218,7 +247,38 @@ struct SceneSourceText {
     #[serde(default)]
     seed: u64,
     fov_deg: Option<f64>,
-    spots: Option<u32>,
+    spots: Option<Spots>,
+    laser_m: Option<[f64; 3]>,
+    rooms: Option<RoomsText>,
+}
+
+/// `scenes.rooms` as it is written: what is left out is as the kind has it.
+#[derive(Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct RoomsText {
+    scale: Option<[f64; 2]>,
+    depth_m: Option<[f64; 2]>,
+    fov_jitter_deg: Option<f64>,
+    cube: Option<Sizes>,
+    cylinder: Option<Sizes>,
+    mirror: Option<Sizes>,
+    mirror_wall: Option<MirrorWall>,
+    mirror_from_m: Option<[f64; 2]>,
+}
+
+impl RoomsText {
+    fn over(self, of: PrimitiveRooms) -> PrimitiveRooms {
+        PrimitiveRooms {
+            scale: self.scale.unwrap_or(of.scale),
+            depth_m: self.depth_m.unwrap_or(of.depth_m),
+            fov_jitter_deg: self.fov_jitter_deg.unwrap_or(of.fov_jitter_deg),
+            cube: self.cube.unwrap_or(of.cube),
+            cylinder: self.cylinder.unwrap_or(of.cylinder),
+            mirror: self.mirror.unwrap_or(of.mirror),
+            mirror_wall: self.mirror_wall.unwrap_or(of.mirror_wall),
+            mirror_from_m: self.mirror_from_m.unwrap_or(of.mirror_from_m),
+        }
+    }
 }
 
 impl TryFrom<SceneSourceText> for SceneSource {
@@ -250,13 +310,27 @@ impl TryFrom<SceneSourceText> for SceneSource {
         only("files", "files", text.files.is_some())?;
         only("root", "files", text.root.is_some())?;
         only("first", "files", text.first != 0)?;
+        if text.rooms.is_some() && !matches!(&*text.kind, "primitive" | "desktop") {
+            let what = format!(
+                "belongs to kind = \"primitive\" or \"desktop\"; remove it from kind = {:?}",
+                text.kind
+            );
+            return Err(SpecError::new("scenes.rooms", what));
+        }
+        let desktop = text.kind == "desktop";
+        let rooms = text.rooms.unwrap_or_default();
         let mut count = text.count;
         let kind = match text.kind.as_str() {
             "furnished" => SceneKind::Furnished {
                 assets: text.assets.unwrap_or_else(|| "auto".into()),
                 min_specular: text.min_specular.unwrap_or(1),
             },
-            "primitive" => SceneKind::Primitive,
+            "primitive" => SceneKind::Primitive {
+                rooms: rooms.over(PrimitiveRooms::LIVING),
+            },
+            "desktop" => SceneKind::Primitive {
+                rooms: rooms.over(PrimitiveRooms::DESKTOP),
+            },
             _ => {
                 let files = text.files.unwrap_or_default();
                 count = count.or(Some(files.len() as u64));
@@ -272,8 +346,11 @@ impl TryFrom<SceneSourceText> for SceneSource {
             count: count
                 .ok_or_else(|| SpecError::new("scenes.count", "is missing; say how many scenes"))?,
             seed: text.seed,
-            fov_deg: text.fov_deg.unwrap_or(90.0),
-            spots: text.spots.unwrap_or(25),
+            fov_deg: text.fov_deg.unwrap_or(if desktop { 46.0 } else { 90.0 }),
+            spots: text
+                .spots
+                .unwrap_or(Spots::Grid(if desktop { 16 } else { 25 })),
+            laser_m: text.laser_m.unwrap_or_default(),
         })
     }
 }

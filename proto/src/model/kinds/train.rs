@@ -1,6 +1,7 @@
 //! Training: a network learns from the scenes of a data set and is kept in its store under a name. One task. Defaults are
 //! the published experiments' (Shoot-Bounce-3D: the paper, its appendix and its released code).
 
+use picofarm_settings::Spots;
 pub use picofarm_settings::{
     Architecture, Precision, Schedule, ShadowVariant, StemForm, Target, TimeProjection,
 };
@@ -10,6 +11,7 @@ use serde_json::{Value, json};
 use super::{
     fields::Fields,
     kind::{Declared, Manifest, ModelNames, Results, TaskKind, predicts_depth},
+    scenes::SceneSource,
 };
 use crate::model::{
     limits::check_count,
@@ -155,9 +157,22 @@ impl TaskKind for TrainTask {
         Some((TIMES, &mut self.train.shadow.times))
     }
 
-    /// Depths are predicted by then.
+    /// Depths are predicted by then, and spots that are known by their number are at the same places in all scenes.
     fn check_among(&self, before: &[&dyn TaskKind]) -> Result<(), SpecError> {
-        predicts_depth(self, before)
+        predicts_depth(self, before)?;
+        let numbered = self.train.target == Target::Shadow && !self.train.shadow.variant.is_timed();
+        let spots = scenes_of(&self.source, before).map(|scenes| &scenes.spots);
+        match spots {
+            Some(Spots::Random(_)) if numbered => {
+                let what = format!(
+                    "{:?} knows spots by their number, but scenes.spots of the scenes are at other places in each; take \"concat\" \
+                     or \"difference\", or a grid",
+                    self.train.shadow.variant.name()
+                );
+                Err(SpecError::new("train.shadow.variant", what))
+            }
+            _ => Ok(()),
+        }
     }
 
     fn models(&self) -> Vec<(&'static str, &String)> {
@@ -167,4 +182,22 @@ impl TaskKind for TrainTask {
     fn models_mut(&mut self) -> ModelNames<'_> {
         ModelNames::Single(self.train.models_mut())
     }
+}
+
+/// The scenes of a data set, as far as stages before render them or measure them again.
+fn scenes_of<'a>(
+    source: &'a SourceSettings,
+    before: &'a [&dyn TaskKind],
+) -> Option<&'a SceneSource> {
+    let mut source = source;
+    for task in before.iter().rev() {
+        if task.writes() != Some((&source.store, &source.dataset)) {
+            continue;
+        }
+        if let Some(scenes) = task.scenes() {
+            return Some(scenes);
+        }
+        source = task.reads()?;
+    }
+    None
 }

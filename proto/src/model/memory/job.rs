@@ -53,7 +53,7 @@ pub(super) fn made(before: &[StageSpec], place: (&String, &String)) -> Option<Sh
 
 /// The networks that stages train of which another one reads the models.
 fn networks(before: &[StageSpec], spec: &StageSpec) -> Vec<Network> {
-    let Some(store) = spec.task.shelf() else {
+    let Some(store) = spec.task.models_store() else {
         return Vec::new();
     };
     let trained = |model: &String| {

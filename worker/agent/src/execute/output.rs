@@ -294,7 +294,7 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
         scenes: spec.scenes.count,
         height: render.resolution,
         width: render.resolution,
-        spots: spec.scenes.spots,
+        spots: spec.scenes.spots.count(),
         subsets: Subsets::of(&render.subsets)
             .map_err(|e| TaskError::User(format!("render.subsets: {e}")))?,
         per_spot: render.per_spot,

@@ -8,7 +8,7 @@ use picofarm_proto::{
     model::{SceneFile, SceneKind, SceneSource},
 };
 use picofarm_scene::{
-    AssetLibrary, LaserGrid, Scene, SceneError,
+    Aim, AssetLibrary, Scene, SceneError,
     furnished::{self, FurnishedSettings},
     import::{self, Bounds, ImportOptions},
     primitive::{self, PrimitiveSettings},
@@ -61,7 +61,8 @@ pub(super) fn scene(
         } => {
             let library = library(assets, libraries)?;
             let settings = FurnishedSettings {
-                spots: source.spots,
+                spots: source.spots.clone(),
+                laser_m: source.laser_m.map(|x| x as f32),
                 width: side,
                 height: side,
                 fov_deg: source.fov_deg as f32,
@@ -70,13 +71,14 @@ pub(super) fn scene(
             };
             furnished::generate(seed, &settings, library).map_err(of_scene)
         }
-        SceneKind::Primitive => {
+        SceneKind::Primitive { rooms } => {
             let settings = PrimitiveSettings {
-                spots: source.spots,
+                spots: source.spots.clone(),
+                laser_m: source.laser_m.map(|x| x as f32),
                 width: side,
                 height: side,
                 fov_deg: source.fov_deg as f32,
-                ..PrimitiveSettings::default()
+                rooms: *rooms,
             };
             primitive::generate(seed, &settings).map_err(of_scene)
         }
@@ -89,7 +91,9 @@ pub(super) fn scene(
             let file = source.kind.file(index).ok_or_else(|| {
                 TaskError::User(format!("{at}: the job lists no such file; submit it again"))
             })?;
-            read(file, &at, (source.spots, side), &bounds)
+            let aim = Aim::of(&source.spots, seed)
+                .map_err(|what| TaskError::User(format!("scenes.spots: {what}")))?;
+            read(file, &at, (&aim, side), &bounds)
         }
     }
 }
@@ -113,7 +117,7 @@ fn library<'a>(
 fn read(
     file: &SceneFile,
     at: &str,
-    (spots, side): (u32, u32),
+    (aim, side): (&Aim, u32),
     bounds: &Bounds,
 ) -> Result<Scene, TaskError> {
     let path = Path::new(&file.path);
@@ -125,27 +129,27 @@ fn read(
             file.path, file.sha256
         )));
     }
-    let mut scene = with_laser(path, spots, bounds).map_err(|e| named(at, e))?;
+    let mut scene = with_laser(path, aim, bounds).map_err(|e| named(at, e))?;
     scene.camera.intrinsics = scene.camera.intrinsics.resized(side, side);
-    let beams = scene.laser.beams.len();
-    if beams != spots as usize {
+    let (beams, spots) = (scene.laser.beams.len(), aim.film().len());
+    if beams != spots {
         return Err(TaskError::User(format!(
             "{at}: {} has a laser of {beams} beams, but the job says scenes.spots = {spots}; set scenes.spots to {beams}, \
-             or remove the laser from the file to use the job's grid",
+             or remove the laser from the file to use the job's spots",
             file.path
         )));
     }
     Ok(scene)
 }
 
-/// Reads a scene with its own laser, or the grid of `spots` where it has none.
-fn with_laser(path: &Path, spots: u32, bounds: &Bounds) -> Result<Scene, SceneError> {
+/// Reads a scene with its own laser, or one aimed as the job says where it has none.
+fn with_laser(path: &Path, aim: &Aim, bounds: &Bounds) -> Result<Scene, SceneError> {
     match import::read_scene_with(path, &ImportOptions::default(), bounds) {
         // The importer's word for a file without a laser; one with an unusable laser is not repaired here.
         Err(SceneError::Format { what, .. }) if what.starts_with("laser: ") => {
-            warn!(path = %path.display(), spots, "the file has no laser; the job's grid is used");
+            warn!(path = %path.display(), spots = aim.film().len(), "the file has no laser; the job's spots are used");
             let options = ImportOptions {
-                laser: LaserGrid::new(spots),
+                laser: Some(aim.clone()),
                 ..ImportOptions::default()
             };
             import::read_scene_with(path, &options, bounds)

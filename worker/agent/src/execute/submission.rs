@@ -54,7 +54,7 @@ impl Submission<'_> {
                 library.fingerprint().clone_into(assets);
                 return Ok(());
             }
-            SceneKind::Primitive => return Ok(()),
+            SceneKind::Primitive { .. } => return Ok(()),
             SceneKind::Files { files, root, .. } => (files, root),
         };
         if let Some(root) = root {

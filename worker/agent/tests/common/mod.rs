@@ -21,6 +21,7 @@ use picofarm_proto::{
         session_response::Message as Answer,
     },
 };
+use picofarm_settings::{PrimitiveRooms, Spots};
 use picofarm_tests::ports::lasting;
 use tokio::{net::TcpListener, sync::mpsc, task::JoinHandle};
 use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
@@ -256,11 +257,14 @@ pub fn spec(store: &str) -> RenderTask {
     RenderTask {
         parts: 1,
         scenes: SceneSource {
-            kind: SceneKind::Primitive,
+            kind: SceneKind::Primitive {
+                rooms: PrimitiveRooms::LIVING,
+            },
             count: 100,
             seed: 7,
             fov_deg: 90.0,
-            spots: 1,
+            spots: Spots::Grid(1),
+            laser_m: [0.0; 3],
         },
         render: RenderSettings {
             resolution: 16,

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::{DEPTH_SCALE_M, Question, ShadowVariant, Target, intensity, merged, planes};
+use super::{Question, ShadowVariant, Target, intensity, merged, planes};
 use crate::{ModelError, net::Input, scene::Scene};
 
 /// How a scene is looked at once.
@@ -94,7 +94,10 @@ pub fn example(
     }
     let at = batch.target.len();
     match question.target {
-        Target::Tof => batch.target.extend(scene.depth_m.iter().map(depth_target)),
+        Target::Tof => {
+            let scaled = |z: &f32| depth_target(*z, question.depth_scale_m);
+            batch.target.extend(scene.depth_m.iter().map(scaled));
+        }
         Target::Specular => {
             let mirrors = scene.specular.iter().map(|s| f32::from(*s));
             batch.target.extend(mirrors);
@@ -114,9 +117,9 @@ pub fn example(
     Ok(())
 }
 
-/// What a depth network should say: z over [`DEPTH_SCALE_M`], within 0..1; 1 where nothing is seen.
-fn depth_target(z: &f32) -> f32 {
-    let scaled = z / DEPTH_SCALE_M;
+/// What a depth network should say: z over the question's scale, within 0..1; 1 where nothing is seen.
+fn depth_target(z: f32, scale_m: f32) -> f32 {
+    let scaled = z / scale_m;
     if scaled.is_finite() {
         scaled.clamp(0.0, 1.0)
     } else {

@@ -26,8 +26,17 @@ pub enum Normalise {
     },
 }
 
-/// Depths are divided by this, metres.
+/// By how many metres depths of furnished rooms are divided.
 pub const DEPTH_SCALE_M: f32 = 4.5;
+
+fn of_rooms() -> f32 {
+    DEPTH_SCALE_M
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_of_rooms(scale: &f32) -> bool {
+    *scale == DEPTH_SCALE_M
+}
 
 /// What is asked of a network, and how.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -49,6 +58,9 @@ pub struct Question {
     /// Spots of each scene; for shadows.
     #[serde(default)]
     pub spots: usize,
+    /// By how many metres depths are divided, so that they lie within 0 to 1; for depths.
+    #[serde(default = "of_rooms", skip_serializing_if = "is_of_rooms")]
+    pub depth_scale_m: f32,
 }
 
 impl Question {

@@ -6,7 +6,7 @@ const FROM: f64 = 1.05;
 const TO: f64 = 1.25;
 const STEPS: usize = 10;
 
-/// Depths count as no less: 1e-6 m over 4.5 m.
+/// Depths count as no less: 1e-6 m over 4.5 m, of what networks say.
 const NEAREST: f32 = 1e-6 / 4.5;
 
 /// The figure of one image, 0 to 1; depths in any unit, `[row][column]`.

@@ -1,14 +1,14 @@
 //! Curves: training loss and validation figure over epochs.
 
 use super::{
-    Group, Report, Summary,
+    Entry, Group, Report, Summary,
     chart::{Axis, Series, chart, legend},
     number::short,
     summary::TARGETS,
     table::{error_name, target_name},
 };
 use crate::{
-    input::{DEPTH_SCALE_M, Target},
+    input::Target,
     metric::Metrics,
     train::{Line, epochs_at},
 };
@@ -25,15 +25,19 @@ pub(super) fn curves(report: &Report, summary: &Summary) -> String {
         if groups.is_empty() {
             continue;
         }
-        let of = |value: &dyn Fn(&Line) -> f64| series(report, &groups, value);
-        let scale = f64::from(DEPTH_SCALE_M);
+        let of = |value: &dyn Fn(&Entry, &Line) -> f64| series(report, &groups, value);
         let (loss, label) = match target {
-            Target::Tof => (of(&|line| line.loss * scale), "training L1 (m)"),
+            Target::Tof => {
+                let metres = |entry: &Entry, line: &Line| {
+                    line.loss * f64::from(entry.plan.question.depth_scale_m)
+                };
+                (of(&metres), "training L1 (m)")
+            }
             Target::Shadow | Target::Specular => {
-                (of(&|line| line.loss), "training cross-entropy (nats)")
+                (of(&|_, line| line.loss), "training cross-entropy (nats)")
             }
         };
-        let seen = of(&|line| line.validation.as_ref().map_or(f64::NAN, Metrics::loss));
+        let seen = of(&|_, line| line.validation.as_ref().map_or(f64::NAN, Metrics::loss));
         let name = target_name(target);
         let validation = format!("validation {}", error_name(target));
         out.push_str("<div class=\"charts\">");
@@ -89,12 +93,12 @@ fn wide(values: impl Iterator<Item = f64>) -> bool {
 }
 
 /// A line for each model, in its experiment's colour.
-fn series(report: &Report, groups: &[&Group], value: &dyn Fn(&Line) -> f64) -> Vec<Series> {
+fn series(report: &Report, groups: &[&Group], value: &dyn Fn(&Entry, &Line) -> f64) -> Vec<Series> {
     let mut out = Vec::new();
     for (style, group) in groups.iter().enumerate() {
         for model in &group.models {
             let entry = &report.models[*model];
-            let points = epochs_at(&entry.history).map(|(at, line)| (at, value(line), 0.0));
+            let points = epochs_at(&entry.history).map(|(at, line)| (at, value(entry, line), 0.0));
             out.push(Series {
                 label: entry.name.clone(),
                 style,

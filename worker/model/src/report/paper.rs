@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::Entry;
 use crate::{
-    input::{ShadowVariant, Target},
+    input::{DEPTH_SCALE_M, ShadowVariant, Target},
     net::Architecture,
 };
 
@@ -61,6 +61,11 @@ pub fn unlike(entry: &Entry) -> Vec<String> {
         .scenes
         .map_or_else(|| unknown("scenes"), |n| format!("{n} scenes"));
     compare(data.scenes == Some(SCENES), scenes);
+    let of_rooms = question.target != Target::Tof || question.depth_scale_m == DEPTH_SCALE_M;
+    compare(
+        of_rooms,
+        format!("depths over {} m", question.depth_scale_m),
+    );
     let size = format!("width {}, {} levels", net.width, net.levels);
     compare([net.width, net.levels] == NET, size);
     differs

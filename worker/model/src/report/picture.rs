@@ -5,7 +5,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
 use crate::{
     ModelError, answers,
-    input::{DEPTH_SCALE_M, Target, intensity},
+    input::{Target, intensity},
     metric::{Metrics, Tally},
     model::Model,
     scene::Scenes,
@@ -116,7 +116,8 @@ pub fn pictures(
     indices: &[usize],
     spots: usize,
 ) -> Result<Vec<Picture>, ModelError> {
-    let target = model.question().target;
+    let question = model.question();
+    let (target, scale) = (question.target, question.depth_scale_m);
     let mut out = Vec::new();
     for index in indices.iter().copied() {
         if index >= scenes.len() {
@@ -143,13 +144,13 @@ pub fn pictures(
         })?;
         for (spot, (said, truth)) in planes.into_iter().enumerate() {
             let mut tally = Tally::default();
-            tally.add(target, &said, &truth, [scene.height, scene.width]);
+            tally.add(question, &said, &truth, [scene.height, scene.width]);
             let label = match target {
                 Target::Shadow => format!("scene {index}, spot {spot}"),
                 Target::Tof | Target::Specular => format!("scene {index}"),
             };
             let (said, truth) = match target {
-                Target::Tof => (metres(&said), metres(&truth)),
+                Target::Tof => (metres(&said, scale), metres(&truth, scale)),
                 Target::Shadow | Target::Specular => {
                     (said.iter().map(probability).collect(), truth)
                 }
@@ -166,8 +167,8 @@ pub fn pictures(
     Ok(out)
 }
 
-fn metres(scaled: &[f32]) -> Vec<f32> {
-    scaled.iter().map(|z| z * DEPTH_SCALE_M).collect()
+fn metres(scaled: &[f32], scale_m: f32) -> Vec<f32> {
+    scaled.iter().map(|z| z * scale_m).collect()
 }
 
 fn probability(logit: &f32) -> f32 {

@@ -21,6 +21,7 @@ fn entry(name: &str, target: Target, variant: ShadowVariant, seed: u64, metrics:
         bins: 64,
         intensity_only: false,
         spots: 4,
+        depth_scale_m: 4.5,
     };
     let (dense, one_hot, outputs) = question.channels();
     let net = NetSpec {

@@ -120,41 +120,41 @@ pub(super) struct Making<'a> {
 impl Making<'_> {
     /// Makes examples ready while `use_them` runs, and ends with it.
     pub(super) fn ahead<R>(&self, use_them: impl FnOnce(&Ready<'_>) -> R) -> R {
-        let shelf = Shelf::default();
+        let exchange = Exchange::default();
         thread::scope(|scope| {
             for _ in 0..self.loading.threads.max(1) {
-                scope.spawn(|| self.serve(&shelf));
+                scope.spawn(|| self.serve(&exchange));
             }
             let ready = Ready {
-                shelf: &shelf,
+                exchange: &exchange,
                 batch: self.plan.batch as u64,
                 count: self.count,
                 room: self.loading.room,
             };
             // However it ends, the threads do.
-            let _over = Closing(&shelf);
+            let _over = Closing(&exchange);
             use_them(&ready)
         })
     }
 
     /// A thread's work. Its own pool has one thread, so that a scene is decoded where it was taken up: in a pool of more,
     /// whoever waits for a part would begin with another scene in the middle of this one.
-    fn serve(&self, shelf: &Shelf) {
-        let broken = Broken(shelf);
+    fn serve(&self, exchange: &Exchange) {
+        let broken = Broken(exchange);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
         match pool {
-            Ok(pool) => pool.install(|| self.work(shelf)),
+            Ok(pool) => pool.install(|| self.work(exchange)),
             // Without one, the process's own pool decodes.
-            Err(_) => self.work(shelf),
+            Err(_) => self.work(exchange),
         }
         drop(broken);
     }
 
-    fn work(&self, shelf: &Shelf) {
-        while let Some(which) = shelf.take(self) {
+    fn work(&self, exchange: &Exchange) {
+        while let Some(which) = exchange.take(self) {
             let mut bytes = 0;
-            let made = self.example(which, shelf.spare(), &mut bytes);
-            shelf.put(which, made, bytes);
+            let made = self.example(which, exchange.spare(), &mut bytes);
+            exchange.put(which, made, bytes);
         }
     }
 
@@ -178,7 +178,7 @@ impl Making<'_> {
 
 /// Examples between the threads that make them and the network.
 #[derive(Default)]
-struct Shelf {
+struct Exchange {
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -215,7 +215,7 @@ impl State {
     }
 }
 
-impl Shelf {
+impl Exchange {
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -258,7 +258,7 @@ impl Shelf {
 }
 
 /// Nobody wants examples any more.
-struct Closing<'a>(&'a Shelf);
+struct Closing<'a>(&'a Exchange);
 
 impl Drop for Closing<'_> {
     fn drop(&mut self) {
@@ -268,7 +268,7 @@ impl Drop for Closing<'_> {
 }
 
 /// Tells the network where a thread panicked; it would wait for ever for what that thread had in hand.
-struct Broken<'a>(&'a Shelf);
+struct Broken<'a>(&'a Exchange);
 
 impl Drop for Broken<'_> {
     fn drop(&mut self) {
@@ -281,7 +281,7 @@ impl Drop for Broken<'_> {
 
 /// Where the network gets its examples.
 pub(super) struct Ready<'a> {
-    shelf: &'a Shelf,
+    exchange: &'a Exchange,
     batch: u64,
     count: u64,
     /// Bytes, as in [`Loading::room`].
@@ -297,14 +297,14 @@ impl Ready<'_> {
     /// # Panics
     /// Where a thread that makes examples did, and where there are no more.
     pub(super) fn next(&self) -> Result<Batch, ModelError> {
-        let begun = self.shelf.lock().taken;
+        let begun = self.exchange.lock().taken;
         let size = self.batch.min(self.count - begun);
         assert!(size > 0, "a batch is asked for each step and no more");
         let mut batch = Batch::default();
         for which in begun..begun + size {
             let example = self.example(which)?;
             let empty = batch.join(example, size as usize)?;
-            let mut state = self.shelf.lock();
+            let mut state = self.exchange.lock();
             let held = state.in_hand + state.spare.len() + 1;
             let held = held.saturating_mul(state.largest);
             // No more than are made at once, and no more than there is room for.
@@ -317,18 +317,18 @@ impl Ready<'_> {
     }
 
     fn example(&self, which: u64) -> Result<Batch, ModelError> {
-        let mut state = self.shelf.lock();
+        let mut state = self.exchange.lock();
         let made = loop {
             if let Some(made) = state.made.remove(&which) {
                 break made;
             }
             assert!(!state.broken, "a thread that prepares scenes panicked");
-            state = self.shelf.wait(state);
+            state = self.exchange.wait(state);
         };
         state.taken += 1;
         state.waiting -= made.as_ref().map_or(0, Batch::bytes);
         drop(state);
-        self.shelf.changed.notify_all();
+        self.exchange.changed.notify_all();
         made
     }
 }

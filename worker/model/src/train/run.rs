@@ -483,12 +483,7 @@ impl Training {
             for _ in 0..scenes.len().div_ceil(self.plan.batch) {
                 let batch = ready.next()?;
                 let said = self.learner.predict(&batch);
-                tally.add(
-                    question.target,
-                    &said,
-                    &batch.target,
-                    [batch.height, batch.width],
-                );
+                tally.add(question, &said, &batch.target, [batch.height, batch.width]);
             }
             Ok::<(), ModelError>(())
         })?;

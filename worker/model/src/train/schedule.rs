@@ -124,6 +124,7 @@ mod tests {
                 bins: 8,
                 intensity_only: false,
                 spots: 0,
+                depth_scale_m: 4.5,
             },
             net: NetSpec::released(8, 0, 1),
             epochs,

@@ -66,6 +66,7 @@ pub fn plan(target: Target, variant: ShadowVariant) -> Plan {
         bins: 16,
         intensity_only: false,
         spots: 2,
+        depth_scale_m: 4.5,
     };
     let (dense, one_hot, outputs) = question.channels();
     Plan {

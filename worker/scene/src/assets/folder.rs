@@ -308,9 +308,7 @@ mod tests {
 
     /// A model of 10 × 30 × 20 units, up along z and its front along −y, as a .glb with textures.
     fn model(path: &Path) {
-        use crate::{
-            Camera, Intrinsics, LaserGrid, Material, Object, Provenance, Scene, shape::Shape,
-        };
+        use crate::{Aim, Camera, Intrinsics, Material, Object, Provenance, Scene, shape::Shape};
         let mut shape = Shape::new("crate");
         let m = shape.material(Material::diffuse("wood", [0.6, 0.4, 0.2]));
         // The front bulges: 15 units towards −y, 5 towards +y.
@@ -329,7 +327,7 @@ mod tests {
                 name: "crate".into(),
             }],
             labels: vec!["box".into()],
-            laser: LaserGrid::new(1).unwrap().laser(&camera),
+            laser: Aim::grid(1).unwrap().laser(&camera),
             camera,
             provenance: Provenance::default(),
         };

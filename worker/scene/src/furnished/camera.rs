@@ -1,7 +1,7 @@
 //! Choosing the camera: random places near the walls, rejected until the view is acceptable.
 
 use crate::{
-    Camera, Intrinsics, Laser, LaserGrid, Vec3,
+    Aim, Camera, Intrinsics, Laser, MAX_DEPTH_M, MIN_DEPTH_M, Vec3,
     rng::Rng,
     view::{acceptance, beams_land, coarse_view, full_view, is_specular},
 };
@@ -18,6 +18,8 @@ const SEEN_PIXELS: u32 = 2;
 const MIRROR_PIXELS: u32 = 5;
 /// Coarse pixels that one piece of furniture may fill: no view of nothing but a wardrobe.
 const FILL_PIXELS: u32 = 200;
+/// Bounds of z-depth, metres.
+const DEPTH_M: [f32; 2] = [MIN_DEPTH_M, MAX_DEPTH_M];
 /// The camera keeps this distance from every box, metres.
 const CLEARANCE: f32 = 0.12;
 
@@ -34,7 +36,7 @@ pub(super) struct View {
 pub(super) fn choose(
     rng: &mut Rng,
     settings: &FurnishedSettings,
-    grid: LaserGrid,
+    aim: &Aim,
     plan: &Plan<'_>,
 ) -> Option<View> {
     let (world, objects) = (plan.world(), plan.objects());
@@ -61,7 +63,7 @@ pub(super) fn choose(
             continue;
         }
         let mut camera = Camera::look_at(eye, target, accepted);
-        let Some(seen) = coarse_view(&world, &camera, objects.len()) else {
+        let Some(seen) = coarse_view(&world, &camera, DEPTH_M, objects.len()) else {
             continue;
         };
         let furniture = plan
@@ -83,11 +85,13 @@ pub(super) fn choose(
         if crowded || furniture < MIN_SEEN || specular < settings.specular_at_least as usize {
             continue;
         }
-        let laser = grid.laser(&camera);
+        let Some(laser) = aim.laser_at(&camera, settings.laser_m.into(), &world) else {
+            continue;
+        };
         if !beams_land(&world, &laser, &objects) {
             continue;
         }
-        if let Some(depth) = full_view(&world, &camera) {
+        if let Some(depth) = full_view(&world, &camera, DEPTH_M) {
             camera.intrinsics = Intrinsics::from_fov(fov, width, height);
             return Some(View {
                 camera,

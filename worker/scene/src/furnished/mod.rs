@@ -11,11 +11,12 @@ mod tops;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    AssetLibrary, LaserGrid, Material, Provenance, Scene, SceneError, label::vocabulary,
-    layout::Room, rng::Rng,
+    Aim, AssetLibrary, Material, Provenance, Scene, SceneError, label::vocabulary, layout::Room,
+    rng::Rng,
 };
 use plan::Plan;
 
@@ -29,8 +30,10 @@ const ATTEMPTS: u32 = 64;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FurnishedSettings {
-    /// Laser spots: 1, 4, 16, 25 or 100 ([`LaserGrid`]).
-    pub spots: u32,
+    /// Laser spots.
+    pub spots: Spots,
+    /// Where the laser stands in the camera's frame (x right, y down, z forward), metres.
+    pub laser_m: [f32; 3],
     /// Image width in pixels.
     pub width: u32,
     /// Image height in pixels.
@@ -46,7 +49,8 @@ pub struct FurnishedSettings {
 impl Default for FurnishedSettings {
     fn default() -> Self {
         Self {
-            spots: 25,
+            spots: Spots::Grid(25),
+            laser_m: [0.0; 3],
             width: 256,
             height: 256,
             fov_deg: 90.0,
@@ -88,11 +92,11 @@ pub fn generate(
     settings: &FurnishedSettings,
     assets: &AssetLibrary,
 ) -> Result<Scene, SceneError> {
-    let grid = settings.check(assets)?;
+    let aim = settings.check(seed, assets)?;
     for attempt in 0..ATTEMPTS {
         let mut rng = Rng::new(seed, u64::from(attempt));
         let (plan, kind) = furnish(&mut rng, settings, assets);
-        if let Some(view) = camera::choose(&mut rng, settings, grid, &plan) {
+        if let Some(view) = camera::choose(&mut rng, settings, &aim, &plan) {
             let scene = finish(seed, attempt, kind, plan, view, assets);
             tracing::debug!(
                 seed,
@@ -111,7 +115,7 @@ pub fn generate(
 }
 
 impl FurnishedSettings {
-    fn check(&self, assets: &AssetLibrary) -> Result<LaserGrid, SceneError> {
+    fn check(&self, seed: u64, assets: &AssetLibrary) -> Result<Aim, SceneError> {
         if self.assets != assets.name() {
             return Err(SceneError::Assets {
                 name: self.assets.clone(),
@@ -129,7 +133,7 @@ impl FurnishedSettings {
         };
         specular
             .and_then(|()| crate::camera::check_view(self.width, self.height, self.fov_deg))
-            .and_then(|()| crate::laser::check_spots(self.spots))
+            .and_then(|()| Aim::of(&self.spots, seed).map_err(|what| ("spots", what)))
             .map_err(|(field, what)| SceneError::Invalid {
                 scene: GENERATOR_VERSION.into(),
                 field: field.into(),

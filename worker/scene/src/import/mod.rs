@@ -13,18 +13,18 @@ use std::path::{Path, PathBuf};
 
 use picofarm_files::{FileError, Opener};
 
-use crate::{Affine, Camera, LaserGrid, Scene, SceneError, Vec3};
+use crate::{Affine, Aim, Camera, Scene, SceneError, Vec3};
 
 pub use fingerprint::fingerprint;
 pub use reference::read_reference_json;
 
 /// What the caller states where a file does not, or wants otherwise.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct ImportOptions {
     /// Use this camera in place of the file's.
     pub camera: Option<Camera>,
-    /// Use this grid over the camera's view in place of the file's laser.
-    pub laser: Option<LaserGrid>,
+    /// Beams aimed so over the camera's view, in place of the file's laser.
+    pub laser: Option<Aim>,
     /// Put a camera in front of a lone mesh (PLY) where no camera is stated: 60°, on its +z side, seeing all of it.
     pub frame: bool,
 }
@@ -102,8 +102,8 @@ pub fn read_scene_with(
     if let Some(camera) = options.camera {
         scene.camera = camera;
     }
-    if let Some(grid) = options.laser {
-        scene.laser = grid.laser(&scene.camera);
+    if let Some(aim) = &options.laser {
+        scene.laser = aim.laser(&scene.camera);
     }
     validated(path, scene)
 }

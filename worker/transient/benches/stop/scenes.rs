@@ -6,6 +6,8 @@ use picofarm_scene::{
     primitive,
 };
 
+use picofarm_settings::Spots;
+
 use crate::common::{grey, object, quad, room, scene, sphere, v};
 
 fn mixed(alpha: f32, weight: f32) -> Material {
@@ -112,10 +114,9 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     let glossy = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &rough(0.3));
 
     let plain = primitive::PrimitiveSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: pixels,
         height: pixels,
-        mirror: true,
         ..primitive::PrimitiveSettings::default()
     };
     let plain = primitive::generate(3, &plain).expect("the settings are sound");
@@ -147,7 +148,7 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
 
     let library = AssetLibrary::find("parametric", &[]).expect("it is built in");
     let furniture = FurnishedSettings {
-        spots: 4,
+        spots: Spots::Grid(4),
         width: pixels,
         height: pixels,
         specular_at_least: 0,

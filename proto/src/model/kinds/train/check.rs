@@ -6,7 +6,7 @@ use picofarm_settings::{
 
 use super::settings::{
     InputSettings, NetSettings, Normalise, OptimiseSettings, RestartSettings, ShadowSettings,
-    TrainSettings,
+    TrainSettings, is_of_rooms,
 };
 use crate::model::{
     kinds::{
@@ -45,6 +45,19 @@ impl TrainSettings {
         if self.target != Target::Specular && !self.specular.on.is_empty() {
             return fail(
                 "specular",
+                format!("is not for target = {:?}; remove it", self.target.name()),
+            );
+        }
+        let metres = "metres; 4.5 for furnished rooms";
+        within(
+            "train.depth_scale_m",
+            self.depth_scale_m,
+            (0.01, 1000.0),
+            metres,
+        )?;
+        if self.target != Target::Tof && !is_of_rooms(&self.depth_scale_m) {
+            return fail(
+                "depth_scale_m",
                 format!("is not for target = {:?}; remove it", self.target.name()),
             );
         }

@@ -39,6 +39,10 @@ pub struct TrainSettings {
     /// What the network sees of a histogram.
     #[serde(default)]
     pub input: InputSettings,
+    /// By how many metres depths are divided, which a network predicts within 0 to 1: about the greatest of the data set; for
+    /// `target = "tof"` only.
+    #[serde(default = "of_rooms", skip_serializing_if = "is_of_rooms")]
+    pub depth_scale_m: f64,
     /// The network.
     #[serde(default)]
     pub net: NetSettings,
@@ -250,6 +254,18 @@ impl Default for OptimiseSettings {
 
 /// [`ShadowSettings::times`] where two-bounce times are the ground truth's.
 pub const TRUTH: &str = "truth";
+
+/// [`TrainSettings::depth_scale_m`] of furnished rooms.
+const OF_ROOMS_M: f64 = 4.5;
+
+fn of_rooms() -> f64 {
+    OF_ROOMS_M
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+pub(super) fn is_of_rooms(scale: &f64) -> bool {
+    *scale == OF_ROOMS_M
+}
 
 fn default_split() -> String {
     "default".into()

@@ -392,9 +392,9 @@ impl<'a> EvaluationRun<'a> {
                 scenes.spots()
             )));
         }
-        let target = model.model.question().target;
+        let question = model.model.question();
         let baseline =
-            Baseline::fit(target, &examples(&self.known)?, BASELINE).map_err(of_model)?;
+            Baseline::fit(question, &examples(&self.known)?, BASELINE).map_err(of_model)?;
         let (name, count) = (&model.manifest.name, self.task.evaluate.models.len());
         let mut tell = |scene: usize, of: usize| {
             let share = (which as f32 + scene as f32 / of as f32) / count as f32;

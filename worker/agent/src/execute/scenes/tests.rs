@@ -17,7 +17,7 @@ const SPOTS: u32 = 4;
 fn named_in_the_suite(kind: &SceneKind) -> &'static str {
     match kind {
         SceneKind::Furnished { .. } => "furnished",
-        SceneKind::Primitive => "primitive",
+        SceneKind::Primitive { .. } => "primitive",
         SceneKind::Files { .. } => "files",
     }
 }
@@ -64,6 +64,8 @@ impl Place {
             self.resolved(text).unwrap()
         };
         let primitive = made("primitive", json!({}));
+        let desktop = json!({"spots": {"random": SPOTS}, "laser_m": [0.04, -0.02, 0.0]});
+        let desktop = made("desktop", desktop);
         let names: Vec<String> = (0..COUNT).map(|i| format!("room {i}.glb")).collect();
         for (i, name) in names.iter().enumerate() {
             let bytes = self.glb(&primitive, 640, i as u64);
@@ -74,10 +76,11 @@ impl Place {
             json!({"assets": "parametric", "min_specular": 2}),
         );
         let files = made("files", json!({"files": names}));
-        let all = vec![furnished, primitive, files];
+        let mut all = vec![furnished, primitive, files];
         let mut named: Vec<_> = all.iter().map(|s| named_in_the_suite(&s.kind)).collect();
         named.dedup();
         assert_eq!(named.len(), all.len());
+        all.push(desktop);
         all
     }
 }
@@ -178,7 +181,7 @@ fn resolving_twice_changes_nothing_and_pins_what_may_change() {
             .unwrap();
         assert_eq!(again, source);
         match &source.kind {
-            SceneKind::Primitive => {}
+            SceneKind::Primitive { .. } => {}
             SceneKind::Furnished { assets, .. } => {
                 assert!(assets.starts_with("parametric") && assets.len() > "parametric".len());
                 let mut elsewhere = source.clone();

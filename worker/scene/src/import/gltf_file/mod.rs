@@ -345,8 +345,8 @@ impl<'a> Walk<'a> {
                         "camera: no node has one; add a perspective camera, or state one on import",
                     )
                 })?;
-                let laser = match (options.laser, &self.laser) {
-                    (Some(grid), _) => grid.laser(&camera),
+                let laser = match (&options.laser, &self.laser) {
+                    (Some(aim), _) => aim.laser(&camera),
                     (None, Some((to_world, extras))) => laser_of(path, to_world, extras, &camera)?,
                     (None, None) => {
                         return Err(format_error(

@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use gltf::camera::Projection;
+use picofarm_settings::Spots;
 
 use crate::{
-    Affine, Beam, Camera, Intrinsics, Laser, LaserGrid, SceneError, Vec3, extras::NodeExtras,
+    Affine, Aim, Beam, Camera, Intrinsics, Laser, SceneError, Vec3, extras::NodeExtras,
     import::format_error,
 };
 
@@ -83,13 +84,10 @@ pub(super) fn laser_of(
             beams,
         });
     }
-    let spots = extras.laser_spots.unwrap_or_default();
-    LaserGrid::new(spots)
-        .map(|grid| grid.laser(camera))
-        .ok_or_else(|| {
-            format_error(
-                path,
-                format!("laser_spots: {spots} is no grid; use 1, 4, 16, 25 or 100"),
-            )
-        })
+    // The caller saw one of the two.
+    let spots = extras.laser_spots.clone().unwrap_or(Spots::Grid(0));
+    // A file has no seed: random places are the same in each.
+    Aim::of(&spots, 0)
+        .map(|aim| aim.laser(camera))
+        .map_err(|what| format_error(path, format!("laser_spots: {what}")))
 }

@@ -222,8 +222,8 @@ impl<'a> Reader<'a> {
                 );
             }
         };
-        let laser = match options.laser {
-            Some(grid) => grid.laser(&camera),
+        let laser = match &options.laser {
+            Some(aim) => aim.laser(&camera),
             None => {
                 let emitters = self.children(&root, "emitter")?;
                 self.laser(&emitters)?.ok_or(

@@ -56,7 +56,7 @@ pub(super) fn read(
     let camera = options
         .camera
         .or_else(|| options.frame.then(|| frame(&mesh))?);
-    let (Some(camera), Some(grid)) = (camera, options.laser) else {
+    let (Some(camera), Some(aim)) = (camera, &options.laser) else {
         return Err(format_error(
             path,
             "is a mesh without camera and laser: place it in a glTF or Mitsuba scene, or let \
@@ -74,7 +74,7 @@ pub(super) fn read(
         }],
         labels: vec!["unlabelled".into()],
         camera,
-        laser: grid.laser(&camera),
+        laser: aim.laser(&camera),
         provenance: Provenance {
             source: "ply".into(),
             notes,

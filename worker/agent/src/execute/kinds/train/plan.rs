@@ -49,6 +49,7 @@ pub(super) fn plan(
             Target::Shadow => spots,
             _ => 0,
         },
+        depth_scale_m: settings.depth_scale_m as f32,
     };
     let (dense, one_hot, outputs) = question.channels();
     let wanted = &settings.net;

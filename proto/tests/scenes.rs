@@ -1,0 +1,137 @@
+//! Scenes as jobs say them: spots in three ways, rooms of two sizes, and what keys depend on.
+
+use std::collections::BTreeSet;
+
+use picofarm_proto::{
+    key::{StageKey, stage_key},
+    model::{JobSpec, PrimitiveRooms, SceneKind, SceneSource, Spots, TaskSpec},
+    wire,
+};
+
+fn read(scenes: &str) -> Result<JobSpec, String> {
+    let text = format!(
+        "name = \"test\"\n[scenes]\ncount = 3\n{scenes}\n[render]\nresolution = 16\nsamples = 4\nrenderer = \"r\"\n\
+         [output]\nstore = \"/store\"\ndataset = \"rooms\"\n"
+    );
+    let spec: JobSpec = toml::from_str(&text).map_err(|e| e.to_string())?;
+    spec.check().map_err(|e| e.to_string())?;
+    Ok(spec)
+}
+
+fn scenes(text: &str) -> SceneSource {
+    let spec = read(text).unwrap_or_else(|e| panic!("{text}: {e}"));
+    let TaskSpec::Render(task) = &spec.stages[0].task else {
+        unreachable!("the job renders");
+    };
+    task.scenes.clone()
+}
+
+fn key(text: &str) -> StageKey {
+    stage_key(&read(text).unwrap().stages[0])
+}
+
+/// Scenes that all differ.
+const ALL: [&str; 9] = [
+    "kind = \"primitive\"",
+    "kind = \"primitive\"\nspots = 16",
+    "kind = \"primitive\"\nspots = { random = 16 }",
+    "kind = \"primitive\"\nspots = { at = [[0.5, 0.5], [0.25, 0.75]] }",
+    "kind = \"primitive\"\nspots = { at = [[0.25, 0.75], [0.5, 0.5]] }",
+    "kind = \"primitive\"\nlaser_m = [0.1, 0.0, 0.0]",
+    "kind = \"primitive\"\nrooms = { mirror_wall = \"back\" }",
+    "kind = \"desktop\"",
+    "kind = \"desktop\"\nrooms = { cube = { width_m = [0.1, 0.1], height_m = [0.1, 0.1] } }",
+];
+
+#[test]
+fn what_is_said_of_scenes_comes_back_from_wire_and_catalog_and_each_has_a_key_of_its_own() {
+    let mut keys = BTreeSet::new();
+    for text in ALL {
+        let spec = read(text).unwrap_or_else(|e| panic!("{text}: {e}"));
+        let back = JobSpec::try_from(wire::JobSpec::from(spec.clone())).unwrap();
+        assert_eq!(back, spec, "{text}");
+        let stored = serde_json::to_string(&spec).unwrap();
+        assert_eq!(serde_json::from_str::<JobSpec>(&stored).unwrap(), spec);
+        keys.insert(key(text).to_string());
+    }
+    assert_eq!(keys.len(), ALL.len());
+}
+
+#[test]
+fn what_is_left_out_is_what_the_kind_has() {
+    let desktop = scenes("kind = \"desktop\"");
+    assert_eq!((desktop.fov_deg, desktop.spots), (46.0, Spots::Grid(16)));
+    let rooms = PrimitiveRooms::DESKTOP;
+    assert_eq!(desktop.kind, SceneKind::Primitive { rooms });
+    let some = scenes("kind = \"desktop\"\nspots = 4\nrooms = { depth_m = [0.2, 1.2] }");
+    let rooms = PrimitiveRooms {
+        depth_m: [0.2, 1.2],
+        ..PrimitiveRooms::DESKTOP
+    };
+    assert_eq!(some.kind, SceneKind::Primitive { rooms });
+    // The same said in full is the same.
+    let full = "kind = \"primitive\"\nspots = 25\nfov_deg = 90\nlaser_m = [0, 0, 0]\nrooms = { scale = [0.8, 1.15] }";
+    assert_eq!(key(full), key("kind = \"primitive\""));
+}
+
+#[test]
+fn what_cannot_be_used_is_named() {
+    for (text, parts) in [
+        (
+            "kind = \"files\"\nfiles = [\"/a.glb\", \"/b.glb\", \"/c.glb\"]\nlaser_m = [0.1, 0, 0]",
+            ["scenes.laser_m", "generated"],
+        ),
+        (
+            "kind = \"primitive\"\nrooms = { walls = 3 }",
+            ["walls", "mirror_wall"],
+        ),
+        (
+            "kind = \"desktop\"\nrooms = { depth_m = [2.0, 1.0] }",
+            ["scenes.rooms.depth_m", "the lesser first"],
+        ),
+        (
+            "kind = \"desktop\"\nrooms = { fov_jitter_deg = 46 }",
+            ["scenes.rooms.fov_jitter_deg", "46"],
+        ),
+        (
+            "kind = \"desktop\"\nrooms = { mirror_wall = \"front\" }",
+            ["front", "`back`"],
+        ),
+        (
+            "kind = \"primitive\"\nspots = { random = 4, at = [[0.5, 0.5]] }",
+            ["\"at\"", "one of random and at"],
+        ),
+    ] {
+        let said = read(text).expect_err(text);
+        for part in parts {
+            assert!(said.contains(part), "{text}: {part:?} is not in {said}");
+        }
+    }
+}
+
+#[test]
+fn networks_that_know_spots_by_number_are_refused_where_spots_are_at_random() {
+    let job = |spots: &str, variant: &str| {
+        let text = format!(
+            "name = \"n\"\n[[stage]]\nname = \"rooms\"\nscenes = {{ kind = \"desktop\", count = 3, spots = {spots} }}\n\
+             output = {{ store = \"/s\", dataset = \"rooms\" }}\n\
+             [[stage]]\nname = \"noisy\"\nkind = \"reprocess\"\nsource = \"rooms\"\nreprocess = {{ seed = 1 }}\n\
+             output = {{ store = \"/s\", dataset = \"noisy\", profile = \"counts-u16\" }}\n\
+             [[stage]]\nname = \"split\"\nkind = \"split\"\nsource = \"noisy\"\nsplit = {{ counts = [1, 1, 1] }}\n\
+             [[stage]]\nname = \"train\"\nkind = \"train\"\nsource = \"noisy\"\n\
+             train = {{ target = \"shadow\", model = \"m\", shadow = {{ variant = \"{variant}\" }} }}\n"
+        );
+        let spec: JobSpec = toml::from_str(&text).unwrap();
+        spec.check().map_err(|e| e.to_string())
+    };
+    for variant in ["index", "all"] {
+        let said = job("{ random = 4 }", variant).unwrap_err();
+        assert!(
+            said.contains("train.shadow.variant") && said.contains("other places"),
+            "{said}"
+        );
+        job("4", variant).unwrap();
+        job("{ at = [[0.5, 0.5], [0.1, 0.2]] }", variant).unwrap();
+    }
+    job("{ random = 4 }", "concat").unwrap();
+}
