@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use picofarm_tests::{Cli, Ended, Farm, Job, s3::Server, store};
+use picofarm_tests::{Cli, Ended, Farm, Job, Scratch, s3::Server, store};
 use serde_json::Value;
 
 /// Scenes.
@@ -160,4 +160,39 @@ fn the_example_reads_what_the_program_reads_and_learns_from_s3() {
     let bucket = server.bucket();
     let place = |profile: &str| format!("s3://{bucket}/deep/{profile}");
     everything(&python, &farm, &source, &place);
+}
+
+/// Where `PICOFARM_BLENDER_PYTHON` names a Python with bpy too, which is 374 MB and for one version of Python alone.
+#[test]
+fn blender_sees_each_pixel_at_the_depth_that_the_renderer_states() {
+    let Some(readers) = python("blender") else {
+        return;
+    };
+    let Some(blender) = std::env::var_os("PICOFARM_BLENDER_PYTHON") else {
+        eprintln!("SKIPPED blender: PICOFARM_BLENDER_PYTHON names no Python with bpy");
+        return;
+    };
+    let scratch = Scratch::new("blender");
+    let cli = Cli::new(scratch.path());
+    for kind in ["primitive", "desktop"] {
+        let name = format!("{kind}.glb");
+        let generate = ["scene", "generate", "--kind", kind, "--resolution", "64"];
+        cli.run(&[&generate[..], &["--out", &name]].concat()).ok();
+        let render = ["scene", "render", &name, "--samples", "2", "--out", kind];
+        cli.run(&render).ok();
+        let images = ["--out", "rgb", "--samples", "2"];
+        run(
+            &blender,
+            &cli,
+            "docs/python/blender.py",
+            &[&[&*name][..], &images].concat(),
+        );
+        let compare = format!(
+            "import OpenEXR, zarr, numpy as n\n\
+             seen = OpenEXR.File('rgb/{kind}.exr', separate_channels=True).channels()['ViewLayer.Depth.Z'].pixels\n\
+             apart = n.abs(seen - zarr.open_group('{kind}', mode='r')['depth'][:])\n\
+             assert n.mean(apart < 1e-4) > 0.98, n.percentile(apart, [50, 90, 99])"
+        );
+        cli.run_other(&readers, &["-c", &compare]).ok();
+    }
 }

@@ -52,7 +52,9 @@ pub(super) fn about(quantity: Quantity) -> &'static str {
         Quantity::TwoBouncePath => {
             "[spot][row][column]: measured optical path of the spot's two-bounce light, metres; 0 = not measured"
         }
-        Quantity::Rgb => "colour, sRGB",
+        Quantity::Rgb => {
+            "colour, sRGB: of rendered scenes a preview under a lamp at the ceiling, shadows and mirrors but no indirect light; not radiometric"
+        }
         Quantity::Spots => {
             "[spot]: position and normal (camera frame, metres), path from the laser; NaN = the beam meets nothing"
         }
