@@ -18,7 +18,9 @@ use picofarm_scene::{
     Scene,
     import::{self, ImportOptions},
 };
-use picofarm_transient::{Budget, Forecast, Progress, RenderError, Rendered, Settings};
+use picofarm_transient::{
+    Budget, ClassVariance, Forecast, Progress, RenderError, Rendered, Settings,
+};
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
@@ -216,14 +218,22 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
         return too_large(&order, memory, &what, output);
     }
     let pool = order.pool()?;
-    let (order, forecast) = tokio::task::spawn_blocking(move || {
-        let run = || picofarm_transient::plan(&order.scene, &order.settings);
-        let forecast = pool.install(run);
-        (order, forecast)
+    let by_class = args.variance;
+    let (order, found) = tokio::task::spawn_blocking(move || {
+        let run = || {
+            let forecast = picofarm_transient::plan(&order.scene, &order.settings)?;
+            let classes = match by_class {
+                true => picofarm_transient::variance(&order.scene, &order.settings, PASSES)?,
+                false => Vec::new(),
+            };
+            Ok((forecast, classes))
+        };
+        let found: std::result::Result<_, RenderError> = pool.install(run);
+        (order, found)
     })
     .await
     .map_err(|e| CliError::new(Code::Failed, format!("the renderer broke: {e}")))?;
-    let forecast = forecast.map_err(CliError::input)?;
+    let (forecast, classes) = found.map_err(CliError::input)?;
     let Forecast {
         plan,
         passes,
@@ -232,14 +242,21 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
         warnings,
     } = &forecast;
     let i = &order.scene.camera.intrinsics;
+    let mut facts = json!({
+        "scene": order.scene.name, "width": i.width, "height": i.height,
+        "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
+        "strategies": plan.strategies, "approximations": plan.approximations,
+        "samples": passes, "error": error, "rays": rays, "memory_bytes": memory, "fits": true,
+        "warnings": warnings,
+    });
+    if by_class {
+        let share = |c: &ClassVariance| {
+            json!({"paths": c.class, "energy": c.energy, "variance": c.variance, "of_the_middle_half": c.middle})
+        };
+        facts["variance"] = classes.iter().map(share).collect();
+    }
     output.result(
-        &json!({
-            "scene": order.scene.name, "width": i.width, "height": i.height,
-            "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
-            "strategies": plan.strategies, "approximations": plan.approximations,
-            "samples": passes, "error": error, "rays": rays, "memory_bytes": memory, "fits": true,
-            "warnings": warnings,
-        }),
+        &facts,
         || {
             let head = format!(
                 "{}: {}x{} pixels x {} bins, {} spots\n\
@@ -253,10 +270,30 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
                 *rays as f64 / 1e6,
                 gib(memory),
             );
-            head + &decided(plan) + &warned(warnings)
+            head + &decided(plan) + &carried(by_class, &classes) + &warned(warnings)
         },
     );
     Ok(())
+}
+
+/// Passes that classes of paths are judged by.
+const PASSES: u32 = 64;
+
+/// Which paths carry the variance, as a table.
+fn carried(asked: bool, classes: &[ClassVariance]) -> String {
+    if !asked {
+        return String::new();
+    }
+    if classes.is_empty() {
+        return "no paths of three bounces and more\n".to_owned();
+    }
+    let mut text = "paths of three bounces and more, % of energy, of variance, and of the variance of the middle half of the pixels:\n"
+        .to_owned();
+    for c in classes {
+        let [energy, variance, middle] = [c.energy, c.variance, c.middle].map(|x| 100.0 * x);
+        text += &format!("  {energy:6.2}  {variance:6.2}  {middle:6.2}  {}\n", c.class);
+    }
+    text
 }
 
 /// The plan of a render that the size alone decides: it does not fit, so nothing is measured for it.

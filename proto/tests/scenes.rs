@@ -99,7 +99,7 @@ fn what_cannot_be_used_is_named() {
         ),
         (
             "kind = \"primitive\"\nspots = { random = 4, at = [[0.5, 0.5]] }",
-            ["\"at\"", "one of random and at"],
+            ["spots", "one of random and at"],
         ),
     ] {
         let said = read(text).expect_err(text);

@@ -166,6 +166,26 @@ fn a_cancelled_job_submitted_again_is_not_said_to_run() {
 }
 
 #[test]
+fn a_plan_says_which_paths_carry_the_variance_where_it_is_asked() {
+    let farm = Farm::start("variance");
+    let cli = farm.cli();
+    room(&cli);
+    let plan = ["scene", "plan", "room.glb", "--resolution", "8"];
+    let plan = [&plan[..], &["--samples", "2"]].concat();
+    let plain = cli.run(&plan).ok().stdout;
+    assert!(!plain.contains("of variance"), "{plain}");
+    let asked = [&plan[..], &["--variance"]].concat();
+    let table = cli.run(&asked).ok().stdout;
+    assert!(table.contains("% of energy, of variance"), "{table}");
+    let classes = cli.json(&asked)["variance"].clone();
+    for share in ["energy", "variance"] {
+        let all = classes.as_array().unwrap().iter();
+        let sum: f64 = all.map(|c| c[share].as_f64().unwrap()).sum();
+        assert!((sum - 1.0).abs() < 1e-6, "{share}: {classes}");
+    }
+}
+
+#[test]
 fn scenes_without_light_say_why() {
     let farm = Farm::start("dark");
     let cli = farm.cli();

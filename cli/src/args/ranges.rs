@@ -96,18 +96,29 @@ pub fn spots(text: &str) -> Result<Spots, String> {
     text.parse()
 }
 
+/// Laser spots of a grid.
+pub fn grid(text: &str) -> Result<u32, String> {
+    match text.parse()? {
+        Spots::Grid(spots) => Ok(spots),
+        _ => Err("expected a grid of 1, 4, 16, 25 or 100 spots".to_owned()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use clap::error::ErrorKind;
 
     /// A command line, and what its refusal says.
-    const REFUSED: [(&str, &str); 33] = [
+    const REFUSED: [(&str, &str); 36] = [
         ("up --workers 0", "expected 1 to 1024 workers"),
         ("demo --workers 0", "expected 1 to 1024 workers"),
         ("demo --samples 0", "2..=1048576"),
         ("demo --samples 1", "2..=1048576"),
         ("demo --resolution 0", "1..=4096"),
         ("demo --spots 9", "1, 4, 16, 25 and 100"),
+        ("demo --spots random:0", "1 to 100 spots"),
+        ("demo --spots 0.5,1.5", "from 0 up to 1"),
+        ("bench render --spots random:4", "a grid of 1, 4, 16"),
         ("demo --scenes 0", "expected 1 to 100000000 scenes"),
         ("demo --scenes -5", "expected 1 to 100000000 scenes"),
         ("demo --seed -1", "expected 0 to 18446744073709551615"),

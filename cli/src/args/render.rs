@@ -88,6 +88,9 @@ pub struct SceneRender {
 pub struct ScenePlan {
     #[command(flatten)]
     pub render: RenderArgs,
+    /// Say which paths of three bounces and more carry energy and variance, from 64 passes over a few tiles
+    #[arg(long)]
+    pub variance: bool,
 }
 
 #[derive(Args)]
@@ -99,7 +102,7 @@ pub struct BenchRender {
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub resolution: Option<u32>,
     /// Laser spots of the presets: 1, 4, 16, 25 or 100
-    #[arg(long, default_value_t = 25, value_parser = super::ranges::spots)]
+    #[arg(long, default_value_t = 25, value_parser = super::ranges::grid)]
     pub spots: u32,
     /// Split triangles into four until the scene has at least this many
     #[arg(long, value_name = "N")]

@@ -225,8 +225,10 @@ async fn of_a_held_job_a_worker_keeps_the_task_in_hand_alone() {
         }
     }
     assert_eq!(trimmed, [(Some(held[0].lease.into()), held[0].lo + 1)]);
-    let others = held[1..].iter().map(|l| Some(l.lease.into()));
-    assert_eq!(revoked, others.collect::<Vec<_>>());
+    assert_eq!(revoked.len(), held.len() - 1);
+    for other in &held[1..] {
+        assert!(revoked.contains(&Some(other.lease.into())), "{other:?}");
+    }
     let tasks = farm.status(&job).await.tasks;
     assert_eq!((tasks.done, tasks.leased, tasks.pending), (1, 1, 18));
     assert!(worker.done(&held[0], held[0].lo).await.accepted);
