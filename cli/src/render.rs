@@ -251,7 +251,9 @@ pub async fn plan(args: ScenePlan, output: Output) -> Result<()> {
     });
     if by_class {
         let share = |c: &ClassVariance| {
-            json!({"paths": c.class, "energy": c.energy, "variance": c.variance, "of_the_middle_half": c.middle})
+            json!({
+                "paths": c.class, "energy": c.energy, "variance": c.variance, "of_the_middle_half": c.middle,
+            })
         };
         facts["variance"] = classes.iter().map(share).collect();
     }
@@ -291,7 +293,10 @@ fn carried(asked: bool, classes: &[ClassVariance]) -> String {
         .to_owned();
     for c in classes {
         let [energy, variance, middle] = [c.energy, c.variance, c.middle].map(|x| 100.0 * x);
-        text += &format!("  {energy:6.2}  {variance:6.2}  {middle:6.2}  {}\n", c.class);
+        text += &format!(
+            "  {energy:6.2}  {variance:6.2}  {middle:6.2}  {}\n",
+            c.class
+        );
     }
     text
 }
