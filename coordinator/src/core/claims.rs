@@ -159,10 +159,11 @@ impl Core {
             return;
         };
         let mut ended = entry.stage.outdated_by(range);
-        if matches!(range.state, RangeState::Pending { .. }) {
-            // The same one, without its worker.
-            ended.extend(entry.stage.leased_range(range.id).map(|old| old.id));
-        }
+        // The same one, without its worker, or another worker's by now.
+        let pending = matches!(range.state, RangeState::Pending { .. });
+        let same = entry.stage.leased_range(range.id);
+        let same = same.filter(|old| pending || old.epoch != range.epoch);
+        ended.extend(same.map(|old| old.id));
         for id in ended {
             tracing::info!(range = %id, "this lease ended at another coordinator");
             if let Some(entry) = self.stages.get_mut(&range.stage) {
