@@ -60,6 +60,8 @@ pub struct JobFacts {
     pub holdups: Holdups,
     /// The workers connected to the coordinator that answers.
     pub candidates: Vec<Candidate>,
+    /// Tasks that workers have in hand for other jobs with the same outputs.
+    pub shared: u64,
     /// Jobs that go first and have tasks waiting for the same workers.
     pub ahead: Vec<JobId>,
     /// How many more of these there are that the asker may not see.
@@ -213,8 +215,16 @@ fn waiting(facts: &JobFacts, reasons: &mut Vec<Reason>) {
         reasons.push(reason("paused", facts.counts.pending, words));
         return;
     }
-    if *ready > 0 {
-        reasons.push(unleased(facts, *ready));
+    let shared = facts.shared.min(*ready);
+    if shared > 0 {
+        let words = format!(
+            "{} under way for another job with the same outputs, whose results count here too",
+            n(shared, "task")
+        );
+        reasons.push(reason("shared", shared, words));
+    }
+    if *ready > shared {
+        reasons.push(unleased(facts, *ready - shared));
     }
     if *waiting > 0 {
         let soon = next_ms.map_or_else(String::new, |at| {

@@ -77,12 +77,21 @@ proptest! {
             let lease = (!leased.is_empty()).then(|| leased[a as usize % leased.len()].clone());
             let (range, event) = match (op, lease) {
                 (0, _) => {
-                    let Some(front) = stage.front(i64::MAX, flag).cloned() else { continue };
-                    let count = 1 + b % front.len();
-                    for t in front.lo..front.lo + count {
+                    // Some tasks are under way for another stage.
+                    let lo = a % (2 * total);
+                    let except = [Run { lo, hi: lo + b % 5 }];
+                    let among = (lo..except[0].hi.min(total)).filter(|t| table[*t as usize] == Task::Pending);
+                    prop_assert_eq!(stage.pending_among(&except), among.count() as u64);
+                    let Some((front, run)) = stage.front(i64::MAX, flag, &except) else { continue };
+                    let front = front.clone();
+                    prop_assert!(front.lo <= run.lo && run.lo < run.hi && run.hi <= front.hi);
+                    prop_assert!(run.hi <= lo || except[0].hi <= run.lo);
+                    let count = 1 + b % (run.hi - run.lo);
+                    for t in run.lo..run.lo + count {
                         table[t as usize] = Task::Leased;
                     }
                     let event = RangeEvent::Grant {
+                        at: run.lo,
                         count,
                         worker: WorkerId::from_uuid(Uuid::nil()),
                         incarnation: Incarnation::from_uuid(Uuid::nil()),
@@ -177,9 +186,10 @@ proptest! {
         let mut stage = in_hand(4, &[], &mut ids);
         let mut last = Epoch(0);
         for halve in grants {
-            let front = stage.front(i64::MAX, true).unwrap().clone();
+            let front = stage.front(i64::MAX, true, &[]).unwrap().0.clone();
             prop_assume!(front.lo == 0);
             let event = RangeEvent::Grant {
+                at: 0,
                 count: 1,
                 worker: WorkerId::from_uuid(Uuid::nil()),
                 incarnation: Incarnation::from_uuid(Uuid::nil()),

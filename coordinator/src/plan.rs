@@ -100,11 +100,19 @@ fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<Str
         reasons.push(format!("{run} run: their outputs do not exist yet"));
     } else if run > 0 {
         reasons.push(match kin(stage, recent) {
-            Some((job, changes)) if changes.is_empty() => format!(
-                "{run} run: the settings are those of job {job}, but it put its results elsewhere"
-            ),
-            Some((job, changes)) => {
-                format!("{run} run: since job {job}, {}", changes.join(", "))
+            Some(kin) if kin.changes.is_empty() => {
+                let what = match kin.same_place {
+                    true => "whose outputs are not there (not made yet, or removed)",
+                    false => "but it put its results elsewhere",
+                };
+                format!(
+                    "{run} run: the settings are those of job {}, {what}",
+                    kin.job
+                )
+            }
+            Some(kin) => {
+                let changes = kin.changes.join(", ");
+                format!("{run} run: since job {}, {changes}", kin.job)
             }
             None => format!("{run} run: no job has done the like of it"),
         });
@@ -112,17 +120,34 @@ fn reasons(stage: &StageSpec, total: u64, there: u64, recent: &[Job]) -> Vec<Str
     reasons
 }
 
-/// The job with the stage most like this one (of equals the latest), and what has changed since. Stages are alike that
-/// have the same name, or come from the same matrix.
-fn kin(stage: &StageSpec, recent: &[Job]) -> Option<(JobId, Vec<String>)> {
+/// A stage of an earlier job, beside the one that is submitted.
+struct Kin {
+    job: JobId,
+    /// The settings that have changed since, each in words.
+    changes: Vec<String>,
+    /// Its results are kept where those of the new one will be.
+    same_place: bool,
+}
+
+/// The stage most like this one; of equals the one with the same place, then the latest. Stages are alike that have the
+/// same name, or come from the same matrix.
+fn kin(stage: &StageSpec, recent: &[Job]) -> Option<Kin> {
     let base = |stage: &StageSpec| stage.name.split('[').next().map(str::to_owned);
+    let place = |stage: &StageSpec| {
+        let results = stage.task.results();
+        (results.store.to_owned(), results.folder)
+    };
     let stages = recent
         .iter()
         .flat_map(|job| job.spec.stages.iter().map(|other| (job.id, other)));
     stages
         .filter(|(_, other)| other.task.kind() == stage.task.kind() && base(other) == base(stage))
-        .map(|(job, other)| (job, changes(other, stage)))
-        .min_by_key(|(_, changes)| changes.len())
+        .map(|(job, other)| Kin {
+            job,
+            changes: changes(other, stage),
+            same_place: place(other) == place(stage),
+        })
+        .min_by_key(|kin| (kin.changes.len(), !kin.same_place))
 }
 
 /// The settings that shape results and differ between two stages of one kind, each in words:

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_catalog::{Changes, LeaseState, Mark, Range, RangeState};
+use picofarm_catalog::{Changes, LeaseState, Mark, Range, RangeState, Run};
 use picofarm_proto::ids::{LeaseRef, RangeId};
 
 use crate::transition::{self, Illegal, RangeEvent};
@@ -141,13 +141,27 @@ impl Stage {
         Some(range.clone())
     }
 
-    /// The pending range that should go next at this time: fresh ones by index, then the earliest retry.
-    pub fn front(&self, now_ms: i64, suspects: bool) -> Option<&Range> {
+    /// The pending range that should go next at this time, and the first run of its tasks outside `except` (ascending,
+    /// disjoint): fresh ones by index, then the earliest retry.
+    pub fn front(&self, now_ms: i64, suspects: bool, except: &[Run]) -> Option<(&Range, Run)> {
         self.queue
             .iter()
             .take_while(|(not_before, _)| *not_before <= now_ms)
             .filter_map(|(_, lo)| self.pending.get(lo))
-            .find(|range| suspects || range.crashes == 0)
+            .filter(|range| suspects || range.crashes == 0)
+            .find_map(|range| Some((range, first_outside(range, except)?)))
+    }
+
+    /// Pending tasks in hand that are among `runs` (disjoint).
+    pub fn pending_among(&self, runs: &[Run]) -> u64 {
+        let both = |run: &Run| {
+            let up_to = self.pending.range(..run.hi).rev();
+            up_to
+                .take_while(|(_, range)| range.hi > run.lo)
+                .map(|(_, range)| range.hi.min(run.hi) - range.lo.max(run.lo))
+                .sum::<u64>()
+        };
+        runs.iter().map(both).sum()
     }
 
     /// The pending range that holds a task.
@@ -244,4 +258,23 @@ impl Stage {
             RangeState::Done { .. } | RangeState::Dead => {}
         }
     }
+}
+
+/// The first run of a range's tasks outside `except` (ascending, disjoint).
+fn first_outside(range: &Range, except: &[Run]) -> Option<Run> {
+    let mut lo = range.lo;
+    for run in except {
+        if run.hi <= lo {
+            continue;
+        }
+        if run.lo > lo {
+            let hi = run.lo.min(range.hi);
+            return Some(Run { lo, hi });
+        }
+        lo = run.hi;
+        if lo >= range.hi {
+            return None;
+        }
+    }
+    Some(Run { lo, hi: range.hi })
 }

@@ -7,9 +7,11 @@ use picofarm_proto::ids::{Incarnation, RangeId, WorkerId};
 /// Something that happens to a range.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RangeEvent {
-    /// The first `count` tasks go to a worker; the rest stays pending.
+    /// `count` tasks from `at` on go to a worker; the rest stays pending.
     Grant {
-        /// Tasks granted, at least 1 and at most the range's.
+        /// The first task granted, one of the range's.
+        at: u64,
+        /// Tasks granted, at least 1 and at most those of the range from `at` on.
         count: u64,
         /// To whom.
         worker: WorkerId,
@@ -83,31 +85,34 @@ pub fn next(
         (
             RangeState::Pending { .. },
             RangeEvent::Grant {
+                at,
                 count,
                 worker,
                 incarnation,
                 until_ms,
             },
-        ) if (1..=range.len()).contains(count) => {
-            let cut = range.lo + count;
-            let mut front = range.clone();
-            front.hi = cut;
-            front.epoch.0 += 1;
-            front.state = RangeState::Leased(LeaseState {
+        ) if (range.lo..range.hi).contains(at) && (1..=range.hi - at).contains(count) => {
+            let leased = RangeState::Leased(LeaseState {
                 worker: *worker,
                 incarnation: *incarnation,
                 until_ms: *until_ms,
                 marks: vec![Mark::Todo; usize::try_from(*count).expect("a lease is small")],
             });
-            if cut == range.hi {
-                return Ok(vec![front]);
+            let end = at + count;
+            let mut pieces = Vec::with_capacity(3);
+            // What stays pending keeps the range's id.
+            for (lo, hi) in [(range.lo, *at), (end, range.hi)] {
+                if lo < hi {
+                    let state = range.state.clone();
+                    let n = pieces.len();
+                    pieces.push(piece(range, lo, hi, range.crashes, state, n, ids));
+                }
             }
-            front.id = ids();
-            let rest = Range {
-                lo: cut,
-                ..range.clone()
-            };
-            Ok(vec![front, rest])
+            let n = pieces.len();
+            let mut granted = piece(range, *at, end, range.crashes, leased, n, ids);
+            granted.epoch.0 += 1;
+            pieces.push(granted);
+            Ok(pieces)
         }
         (RangeState::Leased(lease), RangeEvent::Finish { task, reused }) => {
             let mark = if *reused { Mark::Reused } else { Mark::Done };

@@ -45,9 +45,11 @@ impl Core {
             for (id, appetite) in hungry.into_iter().take(sharing as usize) {
                 let entry = &self.stages[&id];
                 let leases = (appetite.leases - covered).div_ceil(sharing);
-                let have = entry.stage.pending_tasks();
+                let others = self.done_for_others(id);
+                let have = entry.stage.pending_tasks() - entry.stage.pending_among(&others);
                 let size = self.lease_size(entry, appetite.able, u64::MAX);
-                let short = have < leases * size || entry.stage.front(now_ms, true).is_none();
+                let none = entry.stage.front(now_ms, true, &others).is_none();
+                let short = have < leases * size || none;
                 if short && entry.free != Some(0) && entry.ask_at_ms <= now_ms {
                     wants.push(Want {
                         stage: id,

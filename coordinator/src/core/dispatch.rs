@@ -116,15 +116,18 @@ impl Core {
             return false;
         }
         // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
-        let Some(range) = entry.stage.front(now_ms, who.leases.is_empty()).cloned() else {
+        let others = self.done_for_others(id);
+        let suspects = who.leases.is_empty();
+        let Some((range, run)) = entry.stage.front(now_ms, suspects, &others) else {
             return false;
         };
+        let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
         // A task that may run for days holds up no other.
         let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
         let count = match alone {
             true => 1,
-            false => self.lease_size(entry, able, range.len()),
+            false => self.lease_size(entry, able, run.hi - run.lo),
         };
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");
@@ -133,6 +136,7 @@ impl Core {
             .apply(
                 &range,
                 &RangeEvent::Grant {
+                    at: run.lo,
                     count,
                     worker,
                     incarnation: who.incarnation,

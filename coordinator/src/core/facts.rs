@@ -29,6 +29,8 @@ pub(crate) struct Look {
 pub(crate) struct JobLook {
     /// Whether the workers here may run its tasks, and what they do.
     pub candidates: Vec<Candidate>,
+    /// Tasks that wait only because workers have them in hand for other jobs with the same outputs.
+    pub shared: u64,
     /// Jobs that go first and have tasks waiting that one of these workers may run.
     pub ahead: Vec<JobId>,
     /// Workers connected to other instances.
@@ -157,6 +159,7 @@ impl Core {
         ahead.dedup();
         JobLook {
             candidates,
+            shared: self.waits_for_others(here),
             ahead,
             elsewhere: self.elsewhere,
             running: task.and_then(|task| self.runs(entry, task)),

@@ -319,6 +319,7 @@ impl Core {
                 self.close(&range, false);
             }
             if let Some(mut entry) = self.stages.remove(&id) {
+                self.sets[entry.set].stages.remove(&id);
                 entry.stage.give_pending(&mut self.changes);
             }
         }

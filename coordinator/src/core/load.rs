@@ -25,9 +25,9 @@ struct JobLoad {
 impl Load {
     /// A lease has begun.
     pub(super) fn begun(&mut self, lease: RangeId, job: &Job, worker: WorkerId) {
-        if self.leases.insert(lease, (job.id, worker)).is_some() {
-            return;
-        }
+        // One that is known may be another worker's by now.
+        self.over(lease);
+        self.leases.insert(lease, (job.id, worker));
         let load = self.jobs.entry(job.id).or_default();
         load.user.clone_from(&job.user);
         load.leases += 1;
@@ -80,5 +80,44 @@ impl Load {
             (load.workers.contains_key(&worker), load.workers.len())
         });
         known || here as u64 + u64::from(elsewhere) < u64::from(most)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use picofarm_proto::model::{JobSpec, JobState};
+    use uuid::Uuid;
+
+    use super::*;
+
+    #[test]
+    fn a_lease_that_begins_again_at_another_worker_is_that_workers_alone() {
+        let spec: JobSpec = serde_json::from_str(
+            r#"{"name": "j", "scenes": {"kind": "primitive", "count": 1}, "output": {"store": "s", "dataset": "d"}}"#,
+        )
+        .unwrap();
+        let id = JobId::from_uuid(Uuid::from_u128(1));
+        let job = Job {
+            id,
+            spec_hash: String::new(),
+            spec: Arc::new(spec),
+            state: JobState::Active,
+            submitted_ms: 0,
+            ended_ms: None,
+            paused: false,
+            user: "ada".into(),
+        };
+        let lease = RangeId::from_uuid(Uuid::from_u128(2));
+        let worker = |n| WorkerId::from_uuid(Uuid::from_u128(n));
+        let mut load = Load::default();
+        load.begun(lease, &job, worker(3));
+        load.begun(lease, &job, worker(4));
+        assert_eq!((load.of_job(id), load.of_user("ada")), (1, 1));
+        assert!(load.may_join(id, worker(4), 1) && !load.may_join(id, worker(3), 1));
+        load.over(lease);
+        assert_eq!((load.of_job(id), load.of_user("ada")), (0, 0));
+        assert!(load.jobs.is_empty() && load.users.is_empty());
     }
 }

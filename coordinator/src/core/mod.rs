@@ -15,6 +15,7 @@ mod load;
 mod log;
 mod refused;
 mod sessions;
+mod shared;
 mod stores;
 mod tail;
 #[cfg(test)]
@@ -135,10 +136,12 @@ impl StageEntry {
     }
 }
 
-/// Jobs that share outputs.
+/// Outputs that stages of one job or of several share.
 struct SetEntry {
     key: StageKey,
     timing: Timing,
+    /// The stages of active jobs that have them.
+    stages: BTreeSet<StageRef>,
 }
 
 struct WorkerEntry {
@@ -288,8 +291,14 @@ impl Core {
             let timing = timing.get(&record.set).copied().unwrap_or_default();
             let set = *self.set_ids.entry(record.set).or_insert(next);
             if set == next {
-                self.sets.push(SetEntry { key, timing });
+                let stages = BTreeSet::new();
+                self.sets.push(SetEntry {
+                    key,
+                    timing,
+                    stages,
+                });
             }
+            self.sets[set].stages.insert(record.id);
             self.stages.insert(
                 record.id,
                 StageEntry {
@@ -318,7 +327,10 @@ impl Core {
         }
         for end in &settled.ends {
             tracing::info!(job = %end.job, state = ?end.state, "job ended");
-            self.stages.retain(|id, _| id.job != end.job);
+            let ended = self.stages.extract_if(.., |id, _| id.job == end.job);
+            for (id, entry) in ended {
+                self.sets[entry.set].stages.remove(&id);
+            }
         }
     }
 

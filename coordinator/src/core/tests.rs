@@ -535,6 +535,22 @@ impl World {
         }
         let known: BTreeSet<(u32, u64)> = self.committed.keys().copied().collect();
         assert_eq!(outputs, known, "outputs are exactly what was accepted");
+        self.check_shared();
+    }
+
+    /// Of outputs that jobs share, an instance has none in hand for two of them. (It does not know what others have in hand.)
+    fn check_shared(&self) {
+        if let [instance] = &*self.instances {
+            for set in &instance.core.sets {
+                let mut seen = BTreeSet::new();
+                for stage in &set.stages {
+                    for (range, _) in instance.core.stages[stage].stage.leased() {
+                        let mut to_do = (range.lo..range.hi).filter(|task| range.has_to_do(*task));
+                        assert!(to_do.all(|task| seen.insert(task)), "under way twice");
+                    }
+                }
+            }
+        }
     }
 
     /// An honest worker finishes what is left.
@@ -650,6 +666,37 @@ fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
             world.trims,
             world.doubles
         );
+    });
+}
+
+#[test]
+fn jobs_that_want_the_same_outputs_share_the_work() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
+            .await
+            .unwrap();
+        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        world.act(&Op::Grow).await;
+        let (first, second) = (world.jobs[0], world.jobs[1]);
+        for w in 0..2 {
+            world.connect(w, 0).await;
+            world.act(&Op::Credit(w)).await;
+        }
+        let lease = |w: usize| world.workers[w].leases[0].clone();
+        let (a, b) = (lease(0), lease(1));
+        assert_eq!((a.job, b.job), (first, second), "either job has a worker");
+        assert_eq!((a.lo, b.lo), (0, a.hi), "the second begins after the first");
+        let look = |job| world.instances[0].core.look_at(job, None, None, world.now);
+        assert_eq!(look(first).shared, b.hi - b.lo);
+        assert_eq!(look(second).shared, a.hi - a.lo);
+        world.check_shared();
+        // What the second job made counts for the first, and the other way round.
+        world.finish_all().await;
+        world.check().await;
+        for instance in &world.instances {
+            instance.catalog.close().await;
+        }
     });
 }
 

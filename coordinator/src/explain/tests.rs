@@ -31,6 +31,7 @@ fn facts() -> JobFacts {
             ..Holdups::default()
         },
         candidates: vec![able("a")],
+        shared: 0,
         ahead: vec![],
         unseen: 0,
         elsewhere: 0,
@@ -162,6 +163,26 @@ fn a_waiting_job_says_what_it_waits_for() {
         ..behind
     };
     assert_eq!(first(&starting).0, "starting");
+}
+
+#[test]
+fn tasks_under_way_for_another_job_are_told_from_those_that_wait_for_a_worker() {
+    let some = JobFacts {
+        shared: 4,
+        ..facts()
+    };
+    let reasons = job(&some);
+    let found: Vec<(&str, u64)> = reasons.iter().map(|r| (&*r.code, r.tasks)).collect();
+    assert_eq!(found, [("shared", 4), ("busy", 6)]);
+    assert!(reasons[0].words.starts_with("4 tasks under way"));
+
+    // What other jobs have in hand may be more than what waits here.
+    let all = JobFacts {
+        shared: 40,
+        ..facts()
+    };
+    let reasons = job(&all);
+    assert_eq!((reasons.len(), reasons[0].tasks), (1, 10));
 }
 
 #[test]

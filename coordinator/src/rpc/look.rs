@@ -58,6 +58,7 @@ pub(super) async fn explain(
     let now_ms = link.clock.now_ms();
     let JobLook {
         candidates,
+        shared,
         ahead,
         elsewhere,
         running,
@@ -73,6 +74,7 @@ pub(super) async fn explain(
             .read(move |catalog| async move { catalog.holdups(job, now_ms).await })
             .await?,
         candidates,
+        shared,
         ahead,
         unseen,
         elsewhere,

@@ -1,0 +1,53 @@
+//! Outputs that several jobs want. What a worker has in hand for one of them is not begun for another: its result counts for
+//! both. So jobs over the same data set that are submitted at once share the work instead of doing it twice.
+//!
+//! This instance knows what its own workers have in hand. Workers of other instances may do the same at the same time;
+//! what they have finished is found, as ever, when tasks are claimed and once more by the worker that begins them.
+
+use picofarm_catalog::{Mark, Run};
+use picofarm_proto::ids::StageRef;
+
+use super::Core;
+
+impl Core {
+    /// Tasks of a stage that workers have in hand for other stages with the same outputs: ascending, disjoint. None for a
+    /// stage whose outputs do not count where they exist.
+    pub(super) fn done_for_others(&self, id: StageRef) -> Vec<Run> {
+        let entry = &self.stages[&id];
+        let sharing = &self.sets[entry.set].stages;
+        if sharing.len() < 2 || entry.spec(id).force {
+            return Vec::new();
+        }
+        let mut runs: Vec<Run> = sharing
+            .iter()
+            .filter(|other| **other != id)
+            .flat_map(|other| self.stages[other].stage.leased())
+            .filter_map(|(range, lease)| {
+                // Leases are worked off in order.
+                let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
+                Some(Run {
+                    lo: range.lo + first as u64,
+                    hi: range.hi,
+                })
+            })
+            .collect();
+        runs.sort_unstable_by_key(|run| run.lo);
+        runs.dedup_by(|next, run| {
+            let joins = next.lo <= run.hi;
+            if joins {
+                run.hi = run.hi.max(next.hi);
+            }
+            joins
+        });
+        runs
+    }
+
+    /// How many tasks of a stage wait only because they are in hand for other stages.
+    pub(super) fn waits_for_others(&self, id: StageRef) -> u64 {
+        let own = &self.stages[&id].stage;
+        let in_hand = |task: u64| own.leased().any(|(range, _)| range.has_to_do(task));
+        let runs = self.done_for_others(id);
+        let tasks = runs.iter().flat_map(|run| run.lo..run.hi);
+        tasks.filter(|task| !in_hand(*task)).count() as u64
+    }
+}
