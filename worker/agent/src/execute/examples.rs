@@ -28,7 +28,7 @@ use super::{
 #[cfg(test)]
 mod folded;
 
-/// One part of so many of the memory that the worker's tasks may take holds scenes; training and validation have one each.
+/// One part of so many of the memory that is left beside a task holds scenes; training and validation have one each.
 const KEPT_SHARE: u64 = 6;
 
 /// Histograms whose room is kept for others, at most.
@@ -62,6 +62,7 @@ pub(super) struct Examples {
 
 /// Scenes that stay in memory, as many as there is room for. The order in which a training visits them is random, so that
 /// no choice would be better than the first ones.
+#[derive(Default)]
 struct Kept {
     scenes: HashMap<usize, Arc<Scene>>,
     /// Bytes left.
@@ -132,15 +133,23 @@ impl Examples {
             scenes,
             sensor: None,
             depths: None,
-            kept: Mutex::new(Kept {
-                scenes: HashMap::new(),
-                room: usize::try_from((stores.memory_mib() << 20) / KEPT_SHARE)
-                    .unwrap_or(usize::MAX),
-            }),
+            kept: Mutex::default(),
             sound: Mutex::default(),
             spare: Mutex::default(),
             peaks: Mutex::default(),
         })
+    }
+
+    /// The same, of which scenes stay in a share of the memory that is left beside their task, MiB; none where that is not
+    /// known.
+    #[must_use]
+    pub(super) fn staying(self, left_mib: Option<u64>) -> Self {
+        let bytes = (left_mib.unwrap_or(0) << 20) / KEPT_SHARE;
+        let kept = Mutex::new(Kept {
+            scenes: HashMap::new(),
+            room: usize::try_from(bytes).unwrap_or(usize::MAX),
+        });
+        Self { kept, ..self }
     }
 
     /// The same with two-bounce times that follow from these depths; from the truth's where there are none.

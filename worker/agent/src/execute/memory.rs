@@ -21,18 +21,26 @@ pub(super) fn shape(spec: &DatasetSpec) -> Shape {
     }
 }
 
-/// Refuses a task that takes more than `limit_mib`; 0 = not known, which refuses nothing.
+/// Refuses a task that takes more than `limit_mib`; 0 = not known, which refuses nothing. Returns what is left beside the
+/// task, MiB; `None` = not known.
 ///
 /// # Errors
 /// [`TaskError::User`] with what it takes, what there is, and what to do.
-pub(super) fn check(task: &TaskSpec, known: &Known, limit_mib: u64) -> Result<(), TaskError> {
+pub(super) fn check(
+    task: &TaskSpec,
+    known: &Known,
+    limit_mib: u64,
+) -> Result<Option<u64>, TaskError> {
     let threads = rayon::current_num_threads() as u32;
     let Some(needed) = peak_bytes(task, known, threads) else {
-        return Ok(());
+        return Ok(None);
     };
     let limit = limit_mib << 20;
-    if limit == 0 || needed <= limit {
-        return Ok(());
+    if limit == 0 {
+        return Ok(None);
+    }
+    if needed <= limit {
+        return Ok(Some((limit - needed) >> 20));
     }
     Err(TaskError::User(format!(
         "a {} task like this takes about {} of memory, but tasks of this worker may take {}; run it on a larger machine, \
@@ -129,7 +137,11 @@ mod tests {
         let refused = of(1024).unwrap_err().to_string();
         assert!(refused.contains("GiB of memory"), "{refused}");
         assert!(refused.contains("may take 1.0 GiB"), "{refused}");
-        assert_eq!(of(1 << 20), Ok(()));
-        assert_eq!(of(0), Ok(()));
+        let left = of(1 << 20).unwrap().unwrap();
+        assert!(left < 1 << 20);
+        // A worker that it takes all of the memory of has none left, and does it.
+        assert_eq!(of((1 << 20) - left), Ok(Some(0)));
+        assert!(of((1 << 20) - left - 1).is_err());
+        assert_eq!(of(0), Ok(None), "not known");
     }
 }

@@ -61,19 +61,14 @@ impl Stores {
         Self { memory_mib, ..self }
     }
 
-    /// Memory that tasks may take, MiB; 0 = not known. One of several workers on a machine has its part of it.
-    #[cfg(feature = "networks")]
-    pub(super) fn memory_mib(&self) -> u64 {
-        self.memory_mib
-    }
-
-    /// Refuses a task that takes more memory than tasks may take here. `source` is the data set that it reads, where its
-    /// size depends on one.
+    /// Refuses a task that takes more memory than tasks may take here; one of several workers on a machine has its part of
+    /// it. `source` is the data set that it reads, where its size depends on one. Returns what is left beside the task, MiB;
+    /// `None` = not known.
     pub(super) fn fits(
         &self,
         task: TaskSpec,
         source: Option<&DatasetSpec>,
-    ) -> Result<(), TaskError> {
+    ) -> Result<Option<u64>, TaskError> {
         let known = Known {
             source: source.map(memory::shape),
             networks: Vec::new(),

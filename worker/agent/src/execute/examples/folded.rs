@@ -86,8 +86,8 @@ fn room() -> Scene {
     }
 }
 
-/// The rendered room as a stage reads it from a data set, twice, where tasks may take so much memory, MiB.
-fn seen_twice(memory_mib: u64) -> [Arc<Seen>; 2] {
+/// The rendered room as a stage reads it from a data set, twice, where so much memory is left beside the task, MiB.
+fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
     let (folder, runtime) = (tempfile::tempdir().unwrap(), Runtime::new().unwrap());
     let gate = Gate {
         start_m: 4.0,
@@ -140,26 +140,31 @@ fn seen_twice(memory_mib: u64) -> [Arc<Seen>; 2] {
         dataset
     });
     let stores = Stores::new(runtime.handle().clone(), std::time::Duration::ZERO);
-    let stores = stores.with_memory(memory_mib);
     let shown = (Histogram::Transient, &[][..]);
     let Ok(examples) = Examples::new(&stores, &dataset, shown, vec![0], "test") else {
         panic!("the data set has that histogram")
     };
+    let examples = examples.staying(left_mib);
     [(); 2].map(|()| examples.load(0).unwrap())
 }
 
 #[test]
-fn scenes_stay_in_a_share_of_the_memory_that_the_worker_was_given() {
+fn scenes_stay_in_a_share_of_the_memory_that_is_left_beside_their_task() {
     // 400 kB, and as much again for each of four spare rooms.
-    for (memory_mib, stays) in [(0, false), (10, false), (20, true)] {
-        let [first, second] = seen_twice(memory_mib);
-        assert_eq!(Arc::ptr_eq(&first, &second), stays, "{memory_mib} MiB");
+    for (left_mib, stays) in [
+        (None, false),
+        (Some(0), false),
+        (Some(10), false),
+        (Some(20), true),
+    ] {
+        let [first, second] = seen_twice(left_mib);
+        assert_eq!(Arc::ptr_eq(&first, &second), stays, "{left_mib:?} MiB");
     }
 }
 
 #[test]
 fn two_bounce_times_from_any_depth_begin_with_the_folded_beams_length() {
-    let [scene, _] = seen_twice(0);
+    let [scene, _] = seen_twice(None);
     let [x, y, z] = scene.spots[0];
     let straight = (x * x + y * y + z * z).sqrt();
     assert!(

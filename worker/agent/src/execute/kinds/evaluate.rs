@@ -109,6 +109,8 @@ struct EvaluationRun<'a> {
     /// Training scenes that the answers which need no model are fitted to, and what pins their bytes.
     known: Vec<u64>,
     known_data: Pinned,
+    /// Memory that is left beside it, MiB; `None` = not known.
+    left_mib: Option<u64>,
 }
 
 /// A shard as it lies in the store.
@@ -149,7 +151,7 @@ impl<'a> EvaluationRun<'a> {
         let dataset = stores
             .open_source(&place.store, &place.dataset, control)
             .map_err(|e| at("source", e))?;
-        stores.fits(TaskSpec::Evaluate(task.clone()), Some(dataset.spec()))?;
+        let left_mib = stores.fits(TaskSpec::Evaluate(task.clone()), Some(dataset.spec()))?;
         let models = stores
             .models(&place.store, control)
             .map_err(|e| at("source.store", e))?;
@@ -162,6 +164,7 @@ impl<'a> EvaluationRun<'a> {
             data: pin(stores, &dataset, &scenes, control)?,
             known_data: pin(stores, &dataset, &known, control)?,
             known,
+            left_mib,
             stores,
             task,
             device,
@@ -379,7 +382,10 @@ impl<'a> EvaluationRun<'a> {
                 scenes.to_vec(),
                 "evaluate",
             )
-            .map(|examples| examples.through(asked.sensor.clone()))
+            .map(|examples| {
+                let examples = examples.through(asked.sensor.clone());
+                examples.staying(self.left_mib)
+            })
         };
         let depths = asked.times.as_ref();
         let depths = depths.and_then(|times| times.predictions.clone());

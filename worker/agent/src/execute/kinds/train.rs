@@ -106,6 +106,8 @@ struct TrainingRun<'a> {
     built: BTreeMap<&'static str, Known>,
     lineage: Lineage,
     key: String,
+    /// Memory that is left beside it, MiB; `None` = not known.
+    left_mib: Option<u64>,
     /// Where it is computed.
     device: Device,
     /// The graphics processor that this is, as it calls itself.
@@ -120,7 +122,7 @@ impl<'a> TrainingRun<'a> {
         let dataset = stores
             .open_source(&place.store, &place.dataset, control)
             .map_err(|e| at("source", e))?;
-        stores.fits(TaskSpec::Train(task.clone()), Some(dataset.spec()))?;
+        let left_mib = stores.fits(TaskSpec::Train(task.clone()), Some(dataset.spec()))?;
         let models = stores
             .models(&place.store, control)
             .map_err(|e| at("source.store", e))?;
@@ -156,7 +158,8 @@ impl<'a> TrainingRun<'a> {
                     .clone()
                     .map(|sensor| (*sensor, settings.seed)),
             );
-            Ok(Arc::new(scenes.timed_by(times.predictions.clone())))
+            let scenes = scenes.timed_by(times.predictions.clone());
+            Ok(Arc::new(scenes.staying(left_mib)))
         };
         let shown = training.first().copied();
         let [training_scenes, validation_scenes] = [&training, &validation].map(|s| s.len() as u64);
@@ -201,6 +204,7 @@ impl<'a> TrainingRun<'a> {
             built,
             lineage,
             key,
+            left_mib,
             device: cpu(),
             gpu: None,
             peers: "",
@@ -346,7 +350,7 @@ impl<'a> TrainingRun<'a> {
             }
         }
         .map_err(of_model)?
-        .loading(loading(stores.memory_mib()));
+        .loading(loading(self.left_mib));
         let checkpoints = self.models.checkpoints_of(name, key).map_err(of_dataset)?;
         let mut saver = Saver::new(stores, checkpoints);
         let every = Duration::from_secs_f64(self.task.train.checkpoint_minutes * 60.0);

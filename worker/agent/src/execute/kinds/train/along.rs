@@ -13,16 +13,16 @@ const TRAINED: f32 = 0.99;
 /// Lines of an epoch that a task logs at most: its allowance holds few more.
 const LINES: u32 = 80;
 
-/// One part of so many of the memory that the worker's tasks may take holds scenes that are made ready for the network.
+/// One part of so many of the memory that is left beside the task holds scenes that are made ready for the network.
 const AHEAD_SHARE: u64 = 8;
 
-/// How scenes are made ready: by as many threads as the task has, in a part of the memory that the worker's tasks may take,
-/// MiB; 0 = not known.
-pub(super) fn loading(memory_mib: u64) -> Loading {
+/// How scenes are made ready: by as many threads as the task has, in a part of the memory that is left beside it, MiB; `None`
+/// = not known.
+pub(super) fn loading(left_mib: Option<u64>) -> Loading {
     let standard = Loading::default();
-    match memory_mib {
-        0 => standard,
-        mib => Loading {
+    match left_mib {
+        None => standard,
+        Some(mib) => Loading {
             room: usize::try_from(mib / AHEAD_SHARE).map_or(usize::MAX, |mib| mib << 20),
             ..standard
         },
