@@ -1,7 +1,13 @@
 //! Jobs, plans and events in words.
 
+use std::collections::BTreeSet;
+
 use picofarm_proto::{
-    model::{Event, JobPlan, JobSpec, JobStatus, memory::gib},
+    model::{
+        Event, JobPlan, JobSpec, JobStatus, StagePlan,
+        matrix::{same_matrix, together},
+        memory::gib,
+    },
     show,
 };
 
@@ -13,27 +19,64 @@ pub fn describe_plan(plan: &JobPlan) -> String {
         plan.total, plan.reuse, plan.run
     );
     let several = plan.stages.len() > 1;
-    for stage in &plan.stages {
+    let groups = plan
+        .stages
+        .chunk_by(|a, b| a.kind == b.kind && same_matrix(&a.name, &b.name));
+    for stages in groups {
         if several {
+            let names: Vec<&str> = stages.iter().map(|stage| &*stage.name).collect();
+            let many = match stages.len() {
+                1 => String::new(),
+                count => format!(", {count} stages"),
+            };
             text += &format!(
-                "  {} ({}): {} reuse, {} run\n",
-                show::line(&stage.name),
-                show::line(&stage.kind),
-                stage.reuse,
-                stage.run
+                "  {} ({}{many}): {} reuse, {} run\n",
+                show::line(&together(&names)),
+                show::line(&stages[0].kind),
+                stages.iter().map(|stage| stage.reuse).sum::<u64>(),
+                stages.iter().map(|stage| stage.run).sum::<u64>(),
             );
         }
         let indent = if several { "    " } else { "  " };
-        for reason in &stage.reasons {
-            text += &format!("{indent}{}\n", show::line(reason));
-        }
-        if stage.run > 0 && stage.memory_bytes > 0 {
-            let memory = gib(stage.memory_bytes);
-            text += &format!("{indent}each takes about {memory} of memory\n");
+        text += &reasons(stages, indent);
+        let running = stages.iter().filter(|stage| stage.run > 0);
+        let most = running.map(|stage| stage.memory_bytes).max().unwrap_or(0);
+        if most > 0 {
+            let (each, most) = (
+                if stages.len() > 1 { "at most" } else { "about" },
+                gib(most),
+            );
+            text += &format!("{indent}each takes {each} {most} of memory\n");
         }
     }
     if let Some(job) = plan.existing_job {
         text += &format!("  job {job} has this exact spec\n");
+    }
+    text
+}
+
+/// Why tasks of stages of one matrix, or of one stage, run or do not.
+fn reasons(stages: &[StagePlan], indent: &str) -> String {
+    const SHOWN: usize = 2;
+    let mut seen = BTreeSet::new();
+    let all = stages.iter().flat_map(|stage| {
+        let reasons = stage.reasons.iter();
+        reasons.map(move |reason| (&*stage.name, reason))
+    });
+    let different: Vec<(&str, &String)> = all.filter(|(_, reason)| seen.insert(*reason)).collect();
+    let mut text = String::new();
+    for (name, reason) in different.iter().take(SHOWN.max(stages[0].reasons.len())) {
+        let of = match (stages.len(), different.len()) {
+            (1, _) => String::new(),
+            (_, 1) => "each: ".to_owned(),
+            _ => format!("{}: ", show::line(name)),
+        };
+        text += &format!("{indent}{of}{}\n", show::line(reason));
+    }
+    let shown = text.lines().count();
+    if different.len() > shown {
+        let more = different.len() - shown;
+        text += &format!("{indent}and {more} more (--json has them all)\n");
     }
     text
 }
@@ -146,11 +189,17 @@ fn describe_stages(s: &JobStatus) -> String {
             t.leased.to_string(),
             t.pending.to_string(),
             t.dead.to_string(),
-            stage.needs.join(", "),
+            needs(&stage.needs),
         ]
     });
     let header = header.map(String::from).to_vec();
     table(&std::iter::once(header).chain(rows).collect::<Vec<_>>())
+}
+
+/// The stages that one needs, those of a matrix together.
+fn needs(needs: &[String]) -> String {
+    let groups = needs.chunk_by(|a, b| same_matrix(a, b));
+    groups.map(together).collect::<Vec<_>>().join(", ")
 }
 
 pub fn describe_event(e: &Event) -> String {
@@ -207,9 +256,58 @@ pub fn clock(ms: i64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
     #[test]
     fn clock_is_utc() {
-        assert_eq!(super::clock(0), "1970-01-01T00:00:00Z");
-        assert_eq!(super::clock(1_795_255_530_000), "2026-11-21T10:05:30Z");
+        assert_eq!(clock(0), "1970-01-01T00:00:00Z");
+        assert_eq!(clock(1_795_255_530_000), "2026-11-21T10:05:30Z");
+    }
+
+    #[test]
+    fn a_plan_tells_stages_of_one_matrix_together() {
+        let stage = |name: &str, reuse: u64, memory_bytes: u64, reasons: &[&str]| StagePlan {
+            name: name.into(),
+            kind: "train".into(),
+            total: 1,
+            reuse,
+            run: 1 - reuse,
+            memory_bytes,
+            reasons: reasons.iter().map(|r| (*r).to_owned()).collect(),
+        };
+        let stages = vec![
+            stage("split", 1, 0, &["exists"]),
+            stage("tof[1]", 1, 0, &["exists"]),
+            stage("tof[2]", 1, 0, &["exists"]),
+            stage("shadow[a]", 0, 1 << 30, &["new a"]),
+            stage("shadow[b]", 0, 2 << 30, &["new b"]),
+            stage("shadow[c]", 0, 1 << 30, &["new c"]),
+            stage("last", 0, 0, &["old", "new"]),
+        ];
+        let plan = JobPlan {
+            spec_hash: String::new(),
+            total: 7,
+            reuse: 3,
+            run: 4,
+            existing_job: None,
+            stages,
+        };
+        let text = "7 tasks: 3 reuse, 4 run
+  split (train): 1 reuse, 0 run
+    exists
+  tof[…] (train, 2 stages): 2 reuse, 0 run
+    each: exists
+  shadow[…] (train, 3 stages): 0 reuse, 3 run
+    shadow[a]: new a
+    shadow[b]: new b
+    and 1 more (--json has them all)
+    each takes at most 2.0 GiB of memory
+  last (train): 0 reuse, 1 run
+    old
+    new
+";
+        assert_eq!(describe_plan(&plan), text);
+        let names = ["rooms", "tof[1]", "tof[2]", "shadow[1]"].map(str::to_owned);
+        assert_eq!(needs(&names), "rooms, tof[…], shadow[1]");
     }
 }

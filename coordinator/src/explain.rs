@@ -5,6 +5,7 @@ use picofarm_proto::{
     ids::JobId,
     model::{
         Event, JobState, Limits, Reason, RunningTask, StageState, StageStatus, TaskCounts,
+        matrix::{same_matrix, together},
         memory::gib,
     },
 };
@@ -264,22 +265,34 @@ fn setback(event: &Event) -> String {
 
 /// Which stages wait for others.
 fn blocked(facts: &JobFacts, reasons: &mut Vec<Reason>) {
-    let stands = |need: &String| {
-        let stage = facts.stages.iter().find(|s| s.name == *need);
-        let done = stage.is_some_and(|s| s.state == StageState::Done);
-        (!done).then(|| match stage {
-            Some(s) if s.state == StageState::Failed => {
-                format!("{need:?} ({} given up)", n(s.tasks.dead, "task"))
-            }
-            Some(s) => format!("{need:?} ({} of {} done)", s.tasks.done, s.tasks.total),
-            None => format!("{need:?}"),
+    // Stages of one matrix are told together.
+    let stands = |needs: &[String]| {
+        let named = |s: &&StageStatus| needs.contains(&s.name);
+        let stages: Vec<&StageStatus> = facts.stages.iter().filter(named).collect();
+        let left = stages.iter().filter(|s| s.state != StageState::Done);
+        if left.count() == 0 && stages.len() == needs.len() {
+            return None;
+        }
+        let sum = |of: fn(&TaskCounts) -> u64| stages.iter().map(|s| of(&s.tasks)).sum::<u64>();
+        let name = together(needs);
+        Some(if stages.is_empty() {
+            format!("{name:?}")
+        } else if stages.iter().any(|s| s.state == StageState::Failed) {
+            format!("{name:?} ({} given up)", n(sum(|t| t.dead), "task"))
+        } else {
+            format!(
+                "{name:?} ({} of {} done)",
+                sum(|t| t.done),
+                sum(|t| t.total)
+            )
         })
     };
     for stage in &facts.stages {
         if stage.state != StageState::Blocked {
             continue;
         }
-        let needs: Vec<String> = stage.needs.iter().filter_map(stands).collect();
+        let groups = stage.needs.chunk_by(|a, b| same_matrix(a, b));
+        let needs: Vec<String> = groups.filter_map(stands).collect();
         let words = format!(
             "{} of stage {:?} after {}",
             n(stage.tasks.pending, "task"),

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use picofarm_catalog::{Job, Range, RangeState, Run};
 use picofarm_proto::{
     ids::{Epoch, JobId, RangeId, StageRef},
-    model::{JobPlan, JobSpec, StagePlan, StageSpec, memory::peak_bytes},
+    model::{JobPlan, JobSpec, StagePlan, StageSpec, matrix::of_matrix, memory::peak_bytes},
 };
 use serde_json::Value;
 
@@ -132,7 +132,7 @@ struct Kin {
 /// The stage most like this one; of equals the one with the same place, then the latest. Stages are alike that have the
 /// same name, or come from the same matrix.
 fn kin(stage: &StageSpec, recent: &[Job]) -> Option<Kin> {
-    let base = |stage: &StageSpec| stage.name.split('[').next().map(str::to_owned);
+    let base = |stage: &StageSpec| of_matrix(&stage.name).unwrap_or(&stage.name).to_owned();
     let place = |stage: &StageSpec| {
         let results = stage.task.results();
         (results.store.to_owned(), results.folder)

@@ -166,6 +166,37 @@ fn a_waiting_job_says_what_it_waits_for() {
 }
 
 #[test]
+fn stages_of_one_matrix_that_others_wait_for_are_told_together() {
+    let stage = |name: &str, state, done, needs: &[&str]| StageStatus {
+        name: name.into(),
+        kind: "train".into(),
+        state,
+        needs: needs.iter().map(|need| (*need).to_owned()).collect(),
+        tasks: TaskCounts {
+            total: 1,
+            done,
+            pending: 1 - done,
+            ..TaskCounts::default()
+        },
+    };
+    let needs = ["split", "tof[1]", "tof[2]", "tof[3]"];
+    let facts = JobFacts {
+        stages: vec![
+            stage("split", StageState::Done, 1, &[]),
+            stage("tof[1]", StageState::Done, 1, &[]),
+            stage("tof[2]", StageState::Open, 0, &[]),
+            stage("tof[3]", StageState::Open, 0, &[]),
+            stage("evaluate", StageState::Blocked, 0, &needs),
+        ],
+        ..facts()
+    };
+    let reasons = job(&facts);
+    let blocked = reasons.iter().find(|r| r.code == "blocked").unwrap();
+    let words = "1 task of stage \"evaluate\" after \"tof[…]\" (1 of 3 done)";
+    assert_eq!(blocked.words, words);
+}
+
+#[test]
 fn tasks_under_way_for_another_job_are_told_from_those_that_wait_for_a_worker() {
     let some = JobFacts {
         shared: 4,

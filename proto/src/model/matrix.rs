@@ -63,3 +63,37 @@ fn name_instance(stage: &mut Map<String, Value>, values: &str) {
         stage.insert("name".into(), Value::String(name));
     }
 }
+
+/// The name that a stage of a matrix was given, without its values: `tof` of `tof[125,1]`; `None` = it is of none.
+pub fn of_matrix(name: &str) -> Option<&str> {
+    name.strip_suffix(']')?.split_once('[').map(|(of, _)| of)
+}
+
+/// Whether two stages are of one matrix, by their names.
+pub fn same_matrix(a: &str, b: &str) -> bool {
+    of_matrix(a).is_some_and(|of| of_matrix(b) == Some(of))
+}
+
+/// What stages of one matrix are called together: `tof[…]`; a stage alone by its name. Empty for none.
+pub fn together(names: &[impl AsRef<str>]) -> String {
+    match names {
+        [] => String::new(),
+        [name] => name.as_ref().to_owned(),
+        [name, ..] => format!("{}[…]", of_matrix(name.as_ref()).unwrap_or(name.as_ref())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_of_one_matrix_are_told_by_their_names() {
+        assert!(same_matrix("tof[1]", "tof[125,1]"));
+        assert!(!same_matrix("tof[1]", "tof-stem[1]"));
+        assert!(!same_matrix("tof", "tof"), "of no matrix");
+        assert_eq!(together(&["tof[1]", "tof[2]"]), "tof[…]");
+        assert_eq!(together(&["tof[1]"]), "tof[1]");
+        assert_eq!(together(&["rooms"]), "rooms");
+    }
+}

@@ -10,7 +10,7 @@ pub mod kinds;
 pub mod lease;
 pub mod limits;
 pub mod log;
-mod matrix;
+pub mod matrix;
 pub mod memory;
 pub mod places;
 mod refer;
