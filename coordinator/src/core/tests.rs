@@ -4,10 +4,7 @@
 
 mod world;
 
-use std::sync::Arc;
-
 use picofarm_catalog::{EventQuery, Sight};
-use picofarm_database::SqliteCatalog;
 use picofarm_proto::model::{Failure, FailureKind, Lease};
 use proptest::prelude::*;
 
@@ -25,10 +22,7 @@ fn block_on(work: impl Future<Output = ()>) {
 fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
-        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
-            .await
-            .unwrap();
-        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        let mut world = World::on_sqlite(folder.path()).await;
         world.greedy().await;
         assert!(
             world.trims > 0 && world.doubles > 0,
@@ -43,10 +37,7 @@ fn histories_that_begin_greedily_have_leases_trimmed_and_tasks_doubled() {
 fn jobs_that_want_the_same_outputs_share_the_work() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
-        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
-            .await
-            .unwrap();
-        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        let mut world = World::on_sqlite(folder.path()).await;
         world.act(&Op::Grow).await;
         let (first, second) = (world.jobs[0], world.jobs[1]);
         for w in 0..2 {
@@ -76,10 +67,7 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
 fn only_leases_of_workers_that_were_heard_outlive_a_busy_coordinator() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
-        let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test")
-            .await
-            .unwrap();
-        let mut world = World::new(vec![Arc::new(catalog)], None).await;
+        let mut world = World::on_sqlite(folder.path()).await;
         for w in 0..2 {
             world.connect(w, 0).await;
             world.act(&Op::Credit(w)).await;
@@ -231,8 +219,7 @@ proptest! {
     fn every_task_is_committed_exactly_once_whatever_happens(greedy: bool, ops in prop::collection::vec(op(), 1..60)) {
         block_on(async {
             let folder = tempfile::tempdir().unwrap();
-            let catalog = SqliteCatalog::open(&folder.path().join("c.db"), "test").await.unwrap();
-            World::new(vec![Arc::new(catalog)], None).await.live(greedy, &ops).await;
+            World::on_sqlite(folder.path()).await.live(greedy, &ops).await;
         });
     }
 

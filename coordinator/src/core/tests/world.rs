@@ -2,11 +2,12 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    path::Path,
     sync::Arc,
 };
 
 use picofarm_catalog::{Catalog, CatalogError, Job, Outcome, Recorded, ResultSet, Run, Submission};
-use picofarm_database::{PostgresCatalog, testing};
+use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
 use picofarm_proto::{
     PROTOCOL,
     ids::{Incarnation, InstanceId, JobId, WorkerId},
@@ -146,6 +147,12 @@ pub(super) struct World {
 }
 
 impl World {
+    /// One instance on SQLite in a folder.
+    pub(super) async fn on_sqlite(folder: &Path) -> Self {
+        let catalog = SqliteCatalog::open(&folder.join("c.db"), "test").await;
+        Self::new(vec![Arc::new(catalog.unwrap())], None).await
+    }
+
     /// Two instances on one Postgres, where there is one.
     pub(super) async fn on_postgres() -> Option<Self> {
         let url = testing::postgres().await?;
@@ -156,7 +163,7 @@ impl World {
         Some(Self::new(catalogs, Some(url)).await)
     }
 
-    pub(super) async fn new(catalogs: Vec<Arc<dyn Catalog>>, postgres: Option<String>) -> Self {
+    async fn new(catalogs: Vec<Arc<dyn Catalog>>, postgres: Option<String>) -> Self {
         let mut instances = Vec::new();
         for catalog in catalogs {
             instances.push(Instance::open(catalog, 0).await);
