@@ -209,6 +209,7 @@ impl Core {
             entry.job.paused = paused;
         }
         self.load.hear_elsewhere(news.busy);
+        self.shared_elsewhere = news.shared;
         if let Some(leased) = &news.leased {
             let lost: Vec<_> = self
                 .leases

@@ -223,6 +223,8 @@ pub(crate) struct Core {
     instances: u32,
     /// Workers connected to other instances.
     elsewhere: u32,
+    /// What these workers had in hand when last heard, of stages whose outputs another stage has, too.
+    shared_elsewhere: BTreeMap<StageRef, Vec<Run>>,
     /// Outputs of `changes`, by set and task.
     fresh: HashMap<(usize, u64), [u8; 32]>,
     changes: Changes,
@@ -262,6 +264,7 @@ impl Core {
             progress: BTreeMap::new(),
             instances: 1,
             elsewhere: 0,
+            shared_elsewhere: BTreeMap::new(),
             fresh: HashMap::new(),
             changes: Changes::default(),
             say: Vec::new(),

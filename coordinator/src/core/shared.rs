@@ -1,8 +1,9 @@
 //! Outputs that several jobs want. What a worker has in hand for one of them is not begun for another: its result counts for
 //! both. So jobs over the same data set that are submitted at once share the work instead of doing it twice.
 //!
-//! This instance knows what its own workers have in hand. Workers of other instances may do the same at the same time;
-//! what they have finished is found, as ever, when tasks are claimed and once more by the worker that begins them.
+//! This instance knows what its own workers have in hand, and what those of other instances had when it last heard of them
+//! (once a second). What it does not know yet is done twice, and comes to the same bytes; what others have finished is found,
+//! as ever, when tasks are claimed, and once more by the worker that begins them.
 
 use picofarm_catalog::{Mark, Run};
 use picofarm_proto::ids::StageRef;
@@ -18,19 +19,18 @@ impl Core {
         if sharing.len() < 2 || entry.spec(id).force {
             return Vec::new();
         }
-        let mut runs: Vec<Run> = sharing
-            .iter()
-            .filter(|other| **other != id)
-            .flat_map(|other| self.stages[other].stage.leased())
-            .filter_map(|(range, lease)| {
-                // Leases are worked off in order.
-                let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
-                Some(Run {
-                    lo: range.lo + first as u64,
-                    hi: range.hi,
-                })
+        let others = || sharing.iter().filter(|other| **other != id);
+        let here = others().flat_map(|other| self.stages[other].stage.leased());
+        let here = here.filter_map(|(range, lease)| {
+            // Leases are worked off in order.
+            let first = lease.marks.iter().position(|m| *m == Mark::Todo)?;
+            Some(Run {
+                lo: range.lo + first as u64,
+                hi: range.hi,
             })
-            .collect();
+        });
+        let elsewhere = others().filter_map(|other| self.shared_elsewhere.get(other));
+        let mut runs: Vec<Run> = here.chain(elsewhere.flatten().copied()).collect();
         runs.sort_unstable_by_key(|run| run.lo);
         runs.dedup_by(|next, run| {
             let joins = next.lo <= run.hi;

@@ -61,6 +61,35 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
     });
 }
 
+#[test]
+fn what_a_worker_of_another_instance_has_in_hand_is_not_begun_for_another_job() {
+    block_on(async {
+        let Some(mut world) = World::on_postgres().await else {
+            return;
+        };
+        world.act(&Op::Grow).await;
+        world.connect(0, 0).await;
+        world.act(&Op::Credit(0)).await;
+        let there = world.workers[0].leases[0].clone();
+        assert_eq!((there.job, there.lo), (world.jobs[0], 0));
+        world.beat(1).await;
+        world.connect(1, 1).await;
+        let second = loop {
+            world.act(&Op::Credit(1)).await;
+            let mut leases = world.workers[1].leases.iter();
+            if let Some(lease) = leases.find(|lease| lease.job == world.jobs[1]) {
+                break lease.clone();
+            }
+        };
+        assert_eq!(second.lo, there.hi, "the second job's first task but those");
+        world.finish_all().await;
+        world.check().await;
+        for instance in &world.instances {
+            instance.catalog.close().await;
+        }
+    });
+}
+
 /// A worker's heartbeat waits in line while this coordinator is busy: its leases, which would run out, are prolonged; those
 /// of a silent worker are not, and the history says what it did.
 #[test]

@@ -79,6 +79,8 @@ pub struct News {
     pub active: BTreeMap<JobId, bool>,
     /// Workers of other instances that have leases, by job.
     pub busy: BTreeMap<JobId, u32>,
+    /// Leased ranges of other instances, of stages whose outputs another stage of an active job has, too.
+    pub shared: BTreeMap<StageRef, Vec<Run>>,
     /// Pending tasks that are nobody's and whose stage is open.
     pub free: BTreeMap<StageRef, u64>,
     /// Ranges of instances that were lost.

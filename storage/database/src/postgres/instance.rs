@@ -2,12 +2,15 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use picofarm_proto::ids::{InstanceId, JobId, RangeId, WorkerId};
+use picofarm_proto::ids::{InstanceId, JobId, RangeId, StageRef, WorkerId};
 use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
-use super::writer::{RANGE, Result, Sql, WriteError, Writer, ranges};
-use picofarm_catalog::Range;
+use super::{
+    query,
+    writer::{RANGE, Result, Sql, WriteError, Writer, ranges},
+};
+use picofarm_catalog::{Range, Run};
 
 /// Holds the instance's row until the transaction ends, so that nobody can find it lost meanwhile. A row whose time is over
 /// but that nobody has removed will do: what the instance owns is still its own.
@@ -121,6 +124,32 @@ pub(super) async fn busy(c: &mut PgConnection, instance: InstanceId) -> Sql<BTre
             Ok((JobId::from_uuid(row.try_get("id")?), workers))
         })
         .collect()
+}
+
+/// Leased ranges of other instances, of stages whose outputs another stage of an active job has, too.
+pub(super) async fn shared(
+    c: &mut PgConnection,
+    instance: InstanceId,
+) -> Sql<BTreeMap<StageRef, Vec<Run>>> {
+    let rows = sqlx::query(
+        "SELECT job.id AS job_id, stage.ordinal, lo, hi FROM task_range \
+         JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
+         WHERE task_range.state = 1 AND owner <> $1 AND EXISTS (SELECT 1 FROM stage AS other \
+           JOIN job AS its ON its.key = other.job \
+           WHERE other.result_set = stage.result_set AND other.key <> stage.key AND its.state = 0)",
+    )
+    .bind(instance.uuid())
+    .fetch_all(c)
+    .await?;
+    let mut shared: BTreeMap<StageRef, Vec<Run>> = BTreeMap::new();
+    for row in &rows {
+        let run = Run {
+            lo: query::uint(row, "lo")?,
+            hi: query::uint(row, "hi")?,
+        };
+        shared.entry(query::stage_of(row)?).or_default().push(run);
+    }
+    Ok(shared)
 }
 
 /// Gives everything up that is not leased, and the instance. Its leases find a new one.

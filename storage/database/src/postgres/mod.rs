@@ -210,6 +210,7 @@ impl Catalog for PostgresCatalog {
             let news = News {
                 active: job_query::active(&mut tx).await?,
                 busy: instance::busy(&mut tx, instance).await?,
+                shared: instance::shared(&mut tx, instance).await?,
                 free: job_query::free(&mut tx).await?,
                 taken: Owned {
                     exceptions: query::exceptions(&mut tx, &taken).await?,

@@ -217,6 +217,7 @@ impl Catalog for SqliteCatalog {
             Ok(News {
                 active: job_query::active(&mut c).await?,
                 busy: BTreeMap::new(),
+                shared: BTreeMap::new(),
                 free: job_query::free(&mut c).await?,
                 taken: Owned::default(),
                 leased: None,
