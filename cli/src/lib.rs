@@ -308,8 +308,8 @@ mod tests {
                 }
             }
         }
-        let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference.md");
-        let page = std::fs::read_to_string(page).unwrap();
+        let here = std::env::var("CARGO_MANIFEST_DIR").unwrap();
+        let page = std::fs::read_to_string(here + "/../docs/reference.md").unwrap();
         for command in args::command()
             .get_subcommands()
             .filter(|c| !c.is_hide_set())

@@ -79,7 +79,7 @@ fn build() -> PathBuf {
         ])
         .arg("--target-dir")
         .arg(target)
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .current_dir(crate::package())
         .stderr(Stdio::inherit())
         .output()
         .expect("cargo starts");

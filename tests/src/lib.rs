@@ -32,3 +32,12 @@ pub use job::Job;
 pub use process::{Process, Signal};
 pub use scratch::Scratch;
 pub use slurm::Slurm;
+
+/// The folder of the tests, as cargo says where it runs them. (As it was when they were built, it may be another checkout's: a
+/// target folder may be kept.)
+///
+/// # Panics
+/// Where neither cargo nor nextest runs this.
+pub fn package() -> String {
+    std::env::var("CARGO_MANIFEST_DIR").expect("cargo or nextest runs the tests")
+}

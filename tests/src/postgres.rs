@@ -13,7 +13,7 @@ pub struct Postgres {
 }
 
 fn script(args: &[&str]) -> std::process::Output {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("services/postgres.sh");
+    let script = Path::new(&crate::package()).join("services/postgres.sh");
     Command::new(script)
         .args(args)
         .output()

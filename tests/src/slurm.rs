@@ -18,7 +18,7 @@ pub struct Slurm {
 }
 
 fn here(path: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+    Path::new(&crate::package()).join(path)
 }
 
 fn said(what: &str, command: &mut Command) -> String {

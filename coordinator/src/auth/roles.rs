@@ -146,9 +146,9 @@ mod tests {
 
     #[test]
     fn every_method_of_the_schema_is_listed_with_the_role_it_needs() {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../proto");
+        let here = std::env::var("CARGO_MANIFEST_DIR").unwrap();
         let mut found = Vec::new();
-        let mut folders = vec![std::path::PathBuf::from(folder)];
+        let mut folders = vec![std::path::Path::new(&here).join("../proto")];
         while let Some(folder) = folders.pop() {
             for entry in std::fs::read_dir(folder).unwrap() {
                 let path = entry.unwrap().path();

@@ -63,7 +63,7 @@ mod tests {
             ("postgres", POSTGRES_STEPS),
         ];
         for (engine, steps) in listed {
-            let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+            let folder = std::path::Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
                 .join("migrations")
                 .join(engine);
             let mut files: Vec<String> = std::fs::read_dir(folder)

@@ -338,7 +338,8 @@ async fn files_of_scipy_and_h5py_are_read() {
     let folder = tempfile::tempdir().unwrap();
     let collection = folder.path().join("collection");
     std::fs::create_dir(&collection).unwrap();
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/interop/make_mat.py");
+    let script = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
+        .join("../../tests/interop/make_mat.py");
     let output = Command::new(&python)
         .arg(script)
         .arg(&collection)

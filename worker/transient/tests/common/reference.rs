@@ -14,7 +14,8 @@ pub struct Part {
 }
 
 fn folder() -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/reference/transients")
+    PathBuf::from(std::env::var("CARGO_MANIFEST_DIR").unwrap())
+        .join("../../../shared/reference/transients")
 }
 
 /// The scene `name`; `None`, with a message, where the references are not beside the workspace.
