@@ -98,10 +98,11 @@ pub(super) const TARGETS: [Target; 3] = [Target::Tof, Target::Shadow, Target::Sp
 impl Spread {
     /// Of values; none of no values.
     pub fn of(values: &[f64]) -> Option<Self> {
-        let n = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / n;
+        let (first, n) = (*values.first()?, values.len() as f64);
+        // From the first on: equal values have no deviation, not that of rounding.
+        let mean = first + values.iter().map(|v| v - first).sum::<f64>() / n;
         let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
-        (!values.is_empty()).then(|| Self {
+        Some(Self {
             mean,
             deviation: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()),
             runs: values.len(),

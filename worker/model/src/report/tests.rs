@@ -3,7 +3,8 @@
 use serde_json::Value;
 
 use super::{
-    Data, Entry, Picture, Plane, Report, Speed, html, json, published, summary, table::table,
+    Data, Entry, Picture, Plane, Report, Speed, Spread, html, json, published, summary,
+    table::table,
 };
 use crate::{
     Evaluated,
@@ -166,6 +167,17 @@ fn seeds_of_an_experiment_are_one_row_beside_trivial_and_published_figures() {
         .iter()
         .map(|g| table(&all, g.target, &[g]).replace("<t", "\n<t"));
     insta::assert_snapshot!(tables.collect::<Vec<_>>().join("\n"));
+}
+
+#[test]
+fn equal_figures_of_several_seeds_have_no_deviation() {
+    for value in [0.403_124_202_604_601_76, 0.1, 1.0 / 3.0] {
+        let spread = Spread::of(&[value; 3]).unwrap();
+        assert_eq!((spread.mean, spread.deviation), (value, Some(0.0)));
+    }
+    let spread = Spread::of(&[1.0, 2.0, 3.0]).unwrap();
+    assert_eq!((spread.mean, spread.deviation), (2.0, Some(1.0)));
+    assert_eq!(Spread::of(&[]), None);
 }
 
 #[test]
