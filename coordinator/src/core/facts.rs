@@ -109,10 +109,12 @@ impl Core {
         now_ms: i64,
     ) -> JobLook {
         let waits = |e: &StageEntry| e.waits() && (e.stage.pending_tasks() > 0 || e.free > Some(0));
-        let stage = stage.or_else(|| {
+        let first = |is: &dyn Fn(&StageEntry) -> bool| {
             let mut of_job = self.stages.iter().filter(|(id, _)| id.job == job);
-            of_job.find(|(_, e)| waits(e)).map(|(id, _)| id.stage)
-        });
+            of_job.find(|(_, e)| is(e)).map(|(id, _)| id.stage)
+        };
+        // Of a stage that has just begun it is not known yet how much waits.
+        let stage = stage.or_else(|| first(&waits).or_else(|| first(&StageEntry::waits)));
         let here = StageRef {
             job,
             stage: stage.unwrap_or(0),

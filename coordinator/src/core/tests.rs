@@ -53,11 +53,7 @@ fn jobs_that_want_the_same_outputs_share_the_work() {
         assert_eq!(look(second).shared, a.hi - a.lo);
         world.check_shared();
         // What the second job made counts for the first, and the other way round.
-        world.finish_all().await;
-        world.check().await;
-        for instance in &world.instances {
-            instance.catalog.close().await;
-        }
+        world.end().await;
     });
 }
 
@@ -82,11 +78,39 @@ fn what_a_worker_of_another_instance_has_in_hand_is_not_begun_for_another_job() 
             }
         };
         assert_eq!(second.lo, there.hi, "the second job's first task but those");
-        world.finish_all().await;
-        world.check().await;
-        for instance in &world.instances {
-            instance.catalog.close().await;
+        world.end().await;
+    });
+}
+
+#[test]
+fn a_stage_that_has_just_begun_is_the_one_that_a_job_waits_for() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let mut world = World::on_sqlite(folder.path()).await;
+        world.connect(0, 0).await;
+        let able = |world: &mut World, able: bool| {
+            let mut workers = world.instances[0].core.workers.values_mut();
+            let kinds = &mut workers.next().unwrap().abilities.kinds;
+            match able {
+                true => kinds.insert("reprocess".into(), "r".into()),
+                false => kinds.remove("reprocess"),
+            };
+        };
+        able(&mut world, false);
+        for _ in 0..TASKS {
+            world.act(&Op::Credit(0)).await;
+            let lease = world.workers[0].leases[0].clone();
+            let session = world.workers[0].session.unwrap().1;
+            for index in lease.lo..lease.hi {
+                world.finish(0, session, &lease, index).await;
+            }
         }
+        let core = &world.instances[0].core;
+        let why = core.look_at(world.jobs[0], None, None, world.now);
+        let why = why.candidates[0].may_run.clone().unwrap_err();
+        assert!(why.contains("reprocess"), "{why}");
+        able(&mut world, true);
+        world.end().await;
     });
 }
 
@@ -233,11 +257,7 @@ fn an_instance_forgets_a_lease_that_ended_elsewhere_when_its_tasks_come_back() {
             "only the second worker has leases"
         );
         world.act(&Op::Pass(1_400)).await;
-        world.finish_all().await;
-        world.check().await;
-        for instance in &world.instances {
-            instance.catalog.close().await;
-        }
+        world.end().await;
     });
 }
 

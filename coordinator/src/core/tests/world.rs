@@ -557,7 +557,7 @@ impl World {
     }
 
     /// An honest worker finishes what is left.
-    pub(super) async fn finish_all(&mut self) {
+    async fn finish_all(&mut self) {
         for w in 0..WORKERS {
             self.act(&Op::Drop(w, true)).await;
         }
@@ -588,6 +588,15 @@ impl World {
             }
         }
         panic!("the jobs do not end");
+    }
+
+    /// All is finished, the laws hold, and the catalogs are closed.
+    pub(super) async fn end(mut self) {
+        self.finish_all().await;
+        self.check().await;
+        for instance in &self.instances {
+            instance.catalog.close().await;
+        }
     }
 
     /// One worker takes everything, and another comes and has nothing: trimming, then doubling.
