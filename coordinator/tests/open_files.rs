@@ -13,6 +13,7 @@ use tokio::{
     time::timeout,
 };
 use tokio_util::sync::CancellationToken;
+use tonic::Code;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 const FILES: u64 = 240;
@@ -64,9 +65,11 @@ async fn a_listener_without_a_file_left_goes_on_when_there_are_some_again() {
         assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
         let url = format!("http://{}", running.address);
         let mut jobs = JobsClient::connect(url).await.unwrap();
-        jobs.get_server_info(wire::GetServerInfoRequest {})
-            .await
-            .unwrap();
+        // Where the catalog was to be opened while there was no file left, it is tried again a little later.
+        while let Err(status) = jobs.get_server_info(wire::GetServerInfoRequest {}).await {
+            assert_eq!(status.code(), Code::Unavailable, "{status}");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
     };
     timeout(PATIENCE, asked).await.expect("answers in time");
 }
