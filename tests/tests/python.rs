@@ -24,7 +24,7 @@ fn python(name: &str) -> Option<OsString> {
 
 /// Runs a script of this repository to its successful end, where the variables of `cli` hold.
 fn run(python: &OsString, cli: &Cli, script: &str, args: &[&str]) -> Ended {
-    let folder = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap()).join("..");
+    let folder = Path::new(&picofarm_tests::package()).join("..");
     let script = folder.join(script).display().to_string();
     // `-B`: nothing is left beside the scripts.
     cli.run_other(python, &[&["-B", &script], args].concat())

@@ -208,7 +208,7 @@ fn an_interrupted_render_exits_130_and_leaves_nothing() {
 
 #[test]
 fn a_reference_scene_renders_with_the_same_depth_as_its_walls() {
-    let file = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
+    let file = Path::new(&picofarm_tests::package())
         .join("../../shared/reference/transients/room-diffuse-1.json");
     if !file.is_file() {
         eprintln!("skipped: there is no reference scene at {}", file.display());

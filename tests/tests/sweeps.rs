@@ -347,8 +347,7 @@ fn a_sweep_is_extended_by_what_its_trials_found_and_only_new_ones_are_trained() 
 
 /// What TensorBoard shows of the runs is what the trials found.
 fn shown_by_tensorboard(farm: &Farm, python: &OsStr, runs: &str, trials: &[Value]) {
-    let script = Path::new(&std::env::var("CARGO_MANIFEST_DIR").unwrap())
-        .join("interop/read_tensorboard.py");
+    let script = Path::new(&picofarm_tests::package()).join("interop/read_tensorboard.py");
     let script = script.display().to_string();
     let shown = farm
         .cli()

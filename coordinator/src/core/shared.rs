@@ -44,10 +44,17 @@ impl Core {
 
     /// How many tasks of a stage wait only because they are in hand for other stages.
     pub(super) fn waits_for_others(&self, id: StageRef) -> u64 {
-        let own = &self.stages[&id].stage;
-        let in_hand = |task: u64| own.leased().any(|(range, _)| range.has_to_do(task));
         let runs = self.done_for_others(id);
-        let tasks = runs.iter().flat_map(|run| run.lo..run.hi);
-        tasks.filter(|task| !in_hand(*task)).count() as u64
+        let among = |task: u64| {
+            let before = runs.partition_point(|run| run.lo <= task);
+            before > 0 && task < runs[before - 1].hi
+        };
+        // Of another instance's it may have some in hand itself.
+        let own = self.stages[&id].stage.leased().map(|(range, _)| {
+            let both = (range.lo..range.hi).filter(|t| range.has_to_do(*t) && among(*t));
+            both.count() as u64
+        });
+        let own: u64 = own.sum();
+        runs.iter().map(|run| run.hi - run.lo).sum::<u64>() - own
     }
 }
