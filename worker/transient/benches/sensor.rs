@@ -89,6 +89,7 @@ fn main() {
                 ..analytic.clone()
             },
         ),
+        ("427 ps", 128, 0.128, analytic.clone()),
         (
             "8 ps to 32 ps",
             1502,

@@ -1,6 +1,8 @@
 //! Convolution of one pixel's histogram, directly: all terms are positive, so a bin of 0.1 photons beside one of
 //! 4·10⁷ is as exact as any other, which a Fourier transform would not give.
 
+use pulp::{Arch, Simd, WithSimd};
+
 use super::kernel::Kernel;
 
 /// A kernel made ready for histograms of one length, with room to work in.
@@ -51,18 +53,23 @@ impl Convolver {
         };
         let end = h.iter().rposition(|h| *h != 0.0).map_or(0, |i| i + 1);
         self.padded.fill(0.0);
-        for (b, h) in h.iter().enumerate().take(end).skip(start) {
-            let at = b as i64 + self.lead;
-            if (0..self.padded.len() as i64).contains(&at) {
-                self.padded[at as usize] = f64::from(*h);
-            }
+        // Bin b stands at b + lead, as far as there is room.
+        let skipped = (start as i64 + self.lead).min(0).unsigned_abs() as usize;
+        let at = (start as i64 + self.lead).max(0) as usize;
+        let seen = h[start..end].iter().skip(skipped);
+        for (padded, h) in self.padded.iter_mut().skip(at).zip(seen) {
+            *padded = f64::from(*h);
         }
         // Only the bins that light can reach.
         let reach = |b: i64| b.clamp(0, self.bins as i64) as usize;
         let from = reach(start as i64 + self.first);
         let to = reach(end as i64 + self.first + self.reversed.len() as i64 - 1);
         if from < to {
-            accumulate(&self.reversed, &self.padded[from..], &mut out[from..to]);
+            Arch::new().dispatch(Sums {
+                taps: &self.reversed,
+                x: &self.padded[from..],
+                out: &mut out[from..to],
+            });
         }
         self.outside(&h[start..end], start)
     }
@@ -70,40 +77,56 @@ impl Convolver {
     /// Energy of the bins from `start` on that lands outside the gate.
     fn outside(&self, h: &[f32], start: usize) -> f64 {
         let taps = self.reversed.len() as i64;
-        let mut energy = 0.0;
-        for (i, h) in h.iter().enumerate() {
+        let share = |i: usize| {
             let target = (start + i) as i64 + self.first;
             let below = (-target).clamp(0, taps) as usize;
             let above = (self.bins as i64 - target).clamp(0, taps) as usize;
-            if below > 0 || above < taps as usize {
-                energy += f64::from(*h) * (self.before[below] + self.after[above]);
-            }
-        }
-        energy
+            f64::from(h[i]) * (self.before[below] + self.after[above])
+        };
+        // All of what the bins between these two send arrives.
+        let index = |bin: i64| (bin - start as i64).clamp(0, h.len() as i64) as usize;
+        let early = index(-self.first);
+        let late = index(self.bins as i64 - self.first - taps + 1).max(early);
+        (0..early).chain(late..h.len()).map(share).sum()
     }
 }
 
-/// out[i] += Σ_j taps[j]·x[i + j].
-fn accumulate(taps: &[f64], x: &[f64], out: &mut [f64]) {
-    let n = out.len();
-    let mut quads = taps.chunks_exact(4);
-    let mut j = 0;
-    for quad in &mut quads {
-        let &[a, b, c, d] = quad else {
-            unreachable!("chunks of four")
-        };
-        let x = &x[j..j + n + 3];
-        let (x0, x1, x2, x3) = (&x[..n], &x[1..n + 1], &x[2..n + 2], &x[3..n + 3]);
-        for i in 0..n {
-            out[i] += (a * x0[i] + b * x1[i]) + (c * x2[i] + d * x3[i]);
+/// Sums that are made side by side: four registers of four.
+const BLOCK: usize = 16;
+
+/// out[i] = Σ_j taps[j]·x[i + j], summed in the order of j. With the machine's longest registers, to the same bits as without:
+/// products and sums stay apart.
+struct Sums<'a> {
+    taps: &'a [f64],
+    x: &'a [f64],
+    out: &'a mut [f64],
+}
+
+impl WithSimd for Sums<'_> {
+    type Output = ();
+
+    // Inlined into a function that has these registers; a closure would not be.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { taps, x, out } = self;
+        let (blocks, rest) = out.as_chunks_mut::<BLOCK>();
+        let done = blocks.len() * BLOCK;
+        for (i, block) in blocks.iter_mut().enumerate() {
+            let x = &x[i * BLOCK..][..taps.len() + BLOCK - 1];
+            let mut sums = [0.0; BLOCK];
+            for (j, t) in taps.iter().enumerate() {
+                if let Some(x) = x[j..].first_chunk::<BLOCK>() {
+                    for (sum, x) in sums.iter_mut().zip(x) {
+                        *sum += t * x;
+                    }
+                }
+            }
+            *block = sums;
         }
-        j += 4;
-    }
-    for t in quads.remainder() {
-        for (out, x) in out.iter_mut().zip(&x[j..j + n]) {
-            *out += t * x;
+        for (i, out) in rest.iter_mut().enumerate() {
+            let x = &x[done + i..][..taps.len()];
+            *out = taps.iter().zip(x).fold(0.0, |sum, (t, x)| sum + t * x);
         }
-        j += 1;
     }
 }
 

@@ -1,5 +1,7 @@
 //! Random counts: a generator of its own for each (seed, scene, pixel, bin), and exact Poisson and binomial draws.
 
+use super::alias::{Cut, TABLED};
+
 /// What a stream of numbers is for.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Purpose {
@@ -52,18 +54,23 @@ impl Draws {
         PixelKey::new(seed, Purpose::Counts, scene, pixel).bin(bin)
     }
 
-    /// Uniform in [0, 1), 53 bits.
+    /// 64 uniform bits.
     #[inline(always)]
-    pub fn uniform(&mut self) -> f64 {
+    fn bits(&mut self) -> u64 {
         // The hashed start is as good as any later number, and most bins need only one.
-        let x = if self.first {
+        if self.first {
             self.first = false;
             self.state
         } else {
             self.state = self.state.wrapping_add(GOLDEN);
             mix(self.state)
-        };
-        (x >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
+        }
+    }
+
+    /// Uniform in [0, 1), 53 bits.
+    #[inline(always)]
+    pub fn uniform(&mut self) -> f64 {
+        (self.bits() >> 11) as f64 * (1.0 / 9_007_199_254_740_992.0)
     }
 
     /// A standard normal number (Marsaglia's polar method).
@@ -78,10 +85,10 @@ impl Draws {
     }
 }
 
-/// Expected counts from which on rejection is used instead of inversion.
+/// Expected successes from which on binomial counts use rejection instead of inversion.
 const LARGE: f64 = 10.0;
 
-/// A Poisson count, exact for rates up to 10¹²: inversion below a rate of 10, from there Hörmann's transformed rejection
+/// A Poisson count, exact for rates up to 10¹²: tables below a rate of 48, from there Hörmann's transformed rejection
 /// (PTRS; W. Hörmann, "The transformed rejection method for generating Poisson random variables", Insurance:
 /// Mathematics and Economics 12, 1993). A rate that is not above 0 gives 0.
 ///
@@ -92,13 +99,15 @@ pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
     if rate.is_nan() || rate <= 0.0 {
         return 0;
     }
-    if rate < LARGE {
+    if rate < TABLED {
+        let cut = Cut::of(rate);
+        let count = cut.count(|| draws.bits());
         let u = draws.uniform();
-        // 1 − rate ≤ exp(−rate): most dark bins need no exponential.
-        if u < 1.0 - rate {
-            return 0;
+        // 1 − rest ≤ exp(−rest): most bins need no exponential.
+        if u < 1.0 - cut.rest {
+            return count;
         }
-        return poisson_inverse(rate, u);
+        return count + poisson_inverse(cut.rest, u);
     }
     assert!(rate <= 1e12, "a rate of {rate} is beyond exact counting");
     poisson_ptrs(rate, draws)
@@ -319,7 +328,7 @@ mod tests {
         assert_eq!(poisson(1e-300, &mut draws), 0);
         let n = poisson(1e12, &mut draws) as f64;
         assert!((n - 1e12).abs() < 6e6, "{n}");
-        assert!(poisson_inverse(9.999, 1.0 - f64::EPSILON / 2.0) < 60);
+        assert!(poisson_inverse(0.0624, 1.0 - f64::EPSILON / 2.0) < 20);
         assert_eq!(binomial(5, 1e9, &mut draws), 5);
         assert_eq!(binomial(0, 1.0, &mut draws), 0);
         assert_eq!(binomial(7, 0.0, &mut draws), 0);

@@ -10,6 +10,7 @@
 //! What the convolution pushes out of the gate is dropped and counted. Every random number depends on
 //! (seed, scene, pixel, bin) alone: the number of threads changes nothing, nor does the order of the pixels.
 
+mod alias;
 mod bins;
 mod convolve;
 mod draw;
@@ -25,4 +26,4 @@ pub use sense::{Dropped, Histograms, Sensed, Values, narrow, sense, sense_again}
 pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
 
 /// Version of the sensed values: change it whenever any output bit may change.
-pub const SENSOR_VERSION: &str = "sensor-1";
+pub const SENSOR_VERSION: &str = "sensor-2";

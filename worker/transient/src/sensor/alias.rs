@@ -1,0 +1,208 @@
+//! Poisson counts of small rates from tables.
+//!
+//! The sum of independent Poisson counts is a Poisson count of the summed rates. So a rate is cut into a multiple of 4, a
+//! multiple of 1/16 below 4, and a rest below 1/16. The first two have tables (the alias method; A. J. Walker, "An efficient
+//! method for generating discrete random variables with general distributions", ACM TOMS 3, 1977; tables as M. D. Vose, "A
+//! linear algorithm for generating random numbers with a given distribution", IEEE TSE 17, 1991), and the rest is nearly
+//! always nothing. No exponential, no logarithm, no loop for most bins.
+
+use std::sync::LazyLock;
+
+/// Tables cover rates below this.
+pub(super) const TABLED: f64 = 48.0;
+/// Parts of a photon that rates are cut into.
+const PARTS: usize = 16;
+/// One step of the coarse tables, in parts.
+const COARSE: usize = 4 * PARTS;
+/// Columns of a table: more than counts that have a chance of 2⁻⁵⁷ or more.
+const FINE_COLUMNS: usize = 32;
+const COARSE_COLUMNS: usize = 128;
+
+/// Counts of one rate, a column for each: the chance that a column keeps its own count (the upper 56 bits), and how many counts
+/// on from the table's first its other one is (the lower 8).
+#[derive(Debug, Clone)]
+struct Table<const COLUMNS: usize> {
+    first: u64,
+    columns: [u64; COLUMNS],
+}
+
+impl<const COLUMNS: usize> Table<COLUMNS> {
+    fn new(rate: f64) -> Self {
+        let (first, chances) = chances::<COLUMNS>(rate);
+        let mut columns = [0; COLUMNS];
+        // Each column has room for the average chance. What is above it goes where room is left.
+        let mut share = chances.map(|p| p * COLUMNS as f64);
+        let (mut small, mut large): (Vec<usize>, Vec<usize>) =
+            (0..COLUMNS).partition(|k| share[*k] < 1.0);
+        while let Some(low) = small.pop() {
+            // What rounding left over is a whole column, but for less than 2⁻⁴⁰.
+            let Some(high) = large.last().copied() else {
+                columns[low] = pack(1.0, low);
+                continue;
+            };
+            columns[low] = pack(share[low], high);
+            share[high] -= 1.0 - share[low];
+            if share[high] < 1.0 {
+                large.pop();
+                small.push(high);
+            }
+        }
+        for k in large {
+            columns[k] = pack(1.0, k);
+        }
+        Self { first, columns }
+    }
+
+    /// The count that 64 uniform bits stand for.
+    #[inline(always)]
+    fn count(&self, bits: u64) -> u64 {
+        let column = (bits >> (64 - COLUMNS.ilog2())) as usize;
+        let rest = bits << COLUMNS.ilog2();
+        let entry = self.columns[column];
+        let offset = if rest < entry {
+            column as u64
+        } else {
+            entry & 0xff
+        };
+        self.first + offset
+    }
+}
+
+fn pack(share: f64, other: usize) -> u64 {
+    // Casts of numbers that are too large give the largest.
+    ((share * 18_446_744_073_709_551_616.0) as u64 & !0xff) | other as u64
+}
+
+/// The probabilities of so many counts, those with the largest among them, from the given first one; their sum is 1.
+fn chances<const COLUMNS: usize>(rate: f64) -> (u64, [f64; COLUMNS]) {
+    let mut chances = [0.0; COLUMNS];
+    if rate <= 0.0 {
+        chances[0] = 1.0;
+        return (0, chances);
+    }
+    // From the most likely count outwards, where no product is small by chance alone.
+    let mode = rate as usize;
+    let first = mode.saturating_sub(COLUMNS * 2 / 5);
+    chances[mode - first] = 1.0;
+    for k in mode + 1..first + COLUMNS {
+        chances[k - first] = chances[k - 1 - first] * rate / k as f64;
+    }
+    for k in (first..mode).rev() {
+        chances[k - first] = chances[k + 1 - first] * (k + 1) as f64 / rate;
+    }
+    let total: f64 = chances.iter().sum();
+    (first as u64, chances.map(|p| p / total))
+}
+
+/// All tables: 32 KiB.
+struct Tables {
+    fine: Vec<Table<FINE_COLUMNS>>,
+    coarse: Vec<Table<COARSE_COLUMNS>>,
+}
+
+static TABLES: LazyLock<Tables> = LazyLock::new(|| {
+    let rate = |parts: usize| parts as f64 / PARTS as f64;
+    Tables {
+        fine: (0..COARSE).map(|i| Table::new(rate(i))).collect(),
+        coarse: (0..TABLED as usize * PARTS / COARSE)
+            .map(|i| Table::new(rate(i * COARSE)))
+            .collect(),
+    }
+});
+
+/// A rate below [`TABLED`], cut up.
+pub(super) struct Cut {
+    coarse: usize,
+    fine: usize,
+    /// What no table covers: at least 0, below 1/16.
+    pub rest: f64,
+}
+
+impl Cut {
+    #[inline(always)]
+    pub fn of(rate: f64) -> Self {
+        let parts = (rate * PARTS as f64) as usize;
+        Self {
+            coarse: parts / COARSE,
+            fine: parts % COARSE,
+            // Exact: both have the same exponent, or the second is 0.
+            rest: rate - parts as f64 * (1.0 / PARTS as f64),
+        }
+    }
+
+    /// A count of the part that tables cover; `bits` gives 64 uniform bits at each call.
+    #[inline(always)]
+    pub fn count(&self, mut bits: impl FnMut() -> u64) -> u64 {
+        let tables = &*TABLES;
+        let mut count = 0;
+        if self.coarse > 0 {
+            count += tables.coarse[self.coarse].count(bits());
+        }
+        if self.fine > 0 {
+            count += tables.fine[self.fine].count(bits());
+        }
+        count
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The chance of each count that a table gives, from its columns.
+    fn given<const COLUMNS: usize>(table: &Table<COLUMNS>) -> Vec<f64> {
+        let mut chances = vec![0.0; table.first as usize + COLUMNS];
+        for (k, entry) in table.columns.iter().enumerate() {
+            let keeps = *entry as f64 / 18_446_744_073_709_551_616.0;
+            let first = table.first as usize;
+            chances[first + k] += keeps / COLUMNS as f64;
+            chances[first + (entry & 0xff) as usize] += (1.0 - keeps) / COLUMNS as f64;
+        }
+        chances
+    }
+
+    fn is_poisson<const COLUMNS: usize>(table: &Table<COLUMNS>, rate: f64) {
+        let chances = given(table);
+        let (mut exact, mut sum) = (libm::exp(-rate), 0.0);
+        for (k, chance) in chances.iter().enumerate() {
+            if k > 0 {
+                exact *= rate / k as f64;
+            }
+            sum += exact;
+            assert!(
+                (chance - exact).abs() < 1e-15,
+                "rate {rate}, count {k}: {chance} for {exact}"
+            );
+        }
+        assert!((sum - 1.0).abs() < 1e-14, "rate {rate}: {sum} in the table");
+    }
+
+    #[test]
+    fn every_table_holds_the_exact_probabilities() {
+        for (i, table) in TABLES.fine.iter().enumerate() {
+            is_poisson(table, i as f64 / 16.0);
+        }
+        for (i, table) in TABLES.coarse.iter().enumerate() {
+            is_poisson(table, i as f64 * 4.0);
+        }
+    }
+
+    #[test]
+    fn a_rate_is_the_sum_of_its_parts() {
+        for rate in [
+            0.0,
+            1e-300,
+            0.06249,
+            0.0625,
+            3.999_999,
+            4.0,
+            17.3,
+            TABLED - 1e-12,
+        ] {
+            let cut = Cut::of(rate);
+            assert!((0.0..0.0625).contains(&cut.rest), "{rate}");
+            let sum = cut.coarse as f64 * 4.0 + cut.fine as f64 / 16.0 + cut.rest;
+            assert_eq!(sum, rate);
+        }
+    }
+}
