@@ -82,7 +82,7 @@ pub async fn run(command: Command, settings: &Settings, output: Output) -> Resul
 fn info_json(place: &str, info: &Summary) -> serde_json::Value {
     json!({
         "dataset": place, "spec": info.spec, "scenes": info.scenes, "bytes": info.bytes,
-        "noise": info.noise, "max_sigma": info.max_sigma, "rms_sigma": info.rms_sigma, "overflow": info.overflow,
+        "noise": info.noise, "rays": info.rays, "max_sigma": info.max_sigma, "rms_sigma": info.rms_sigma, "overflow": info.overflow,
     })
 }
 
@@ -135,6 +135,9 @@ fn further(info: &Summary) -> String {
             "Monte Carlo error {:.1} %, median over pixels, then over scenes\n",
             100.0 * noise
         );
+    }
+    if let Some(rays) = info.rays {
+        text += &format!("{:.1} million rays a scene\n", rays / 1e6);
     }
     text
 }

@@ -262,6 +262,8 @@ fn a_job_with_subsets_stores_them_beside_the_transient_and_they_add_up() {
     let text = farm.run(&["dataset", "info", "store/rooms"]).ok().stdout;
     assert!(text.contains("4 of them, 25 of them, each alone"), "{text}");
     assert!(text.contains("Monte Carlo error"), "{text}");
+    assert!(info["rays"].as_f64().unwrap() > 1.0, "{info}");
+    assert!(text.contains("million rays a scene"), "{text}");
     farm.run(&["dataset", "picture", "store/rooms", "--out", "pictures"])
         .ok();
 

@@ -29,6 +29,9 @@ pub struct Summary {
     /// Median over the scenes of the Monte Carlo error that the renderer states (`error.median_relative` in the
     /// provenance's plan: median over pixels of standard error / h); `None` where no scene states one.
     pub noise: Option<f64>,
+    /// Mean over the scenes of the rays that the renderer traced, which its time follows (`rays` in the provenance's plan); `None`
+    /// where no scene states them.
+    pub rays: Option<f64>,
 }
 
 impl Dataset {
@@ -46,8 +49,9 @@ impl Dataset {
             rms_sigma: None,
             overflow: 0,
             noise: None,
+            rays: None,
         };
-        let mut noise = Vec::new();
+        let (mut noise, mut rays) = (Vec::new(), Vec::new());
         let read = |scene: u64| -> BoxFuture<'_, Result<Manifest, DatasetError>> {
             self.manifest(scene).boxed()
         };
@@ -62,12 +66,15 @@ impl Dataset {
                 summary.max_sigma = summary.max_sigma.max(subset.error.max_sigma);
             }
             noise.extend(manifest.provenance.plan["error"]["median_relative"].as_f64());
+            rays.extend(manifest.provenance.plan["rays"].as_u64());
             let rms = manifest.error.rms_sigma;
             let (low, high) = summary.rms_sigma.unwrap_or((rms, rms));
             summary.rms_sigma = Some((low.min(rms), high.max(rms)));
         }
         noise.sort_by(f64::total_cmp);
         summary.noise = noise.get(noise.len() / 2).copied();
+        let mean = |rays: &[u64]| rays.iter().sum::<u64>() as f64 / rays.len() as f64;
+        summary.rays = Some(mean(&rays)).filter(|rays| rays.is_finite());
         Ok(summary)
     }
 }
