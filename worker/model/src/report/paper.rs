@@ -29,7 +29,8 @@ impl Published {
 /// What has to be said beside them.
 pub(super) const NOTE: &str = "Published figures are of Shoot-Bounce-3D. They stand only beside experiments of its size: 25 spots, \
     rooms of 256 × 256 pixels and 637 bins, 87,688 scenes to learn from, networks of width 128 and 6 levels. Others are \
-    compared in order alone.";
+    compared in order alone. Data sets say how many spots there are and not how they were aimed: spots that were aimed at random pass \
+    for the paper's grid.";
 
 /// The paper's size.
 const SPOTS: u32 = 25;
