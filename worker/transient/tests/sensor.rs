@@ -324,7 +324,7 @@ fn an_empty_scene_gives_nothing_but_dark_counts() {
 
 #[test]
 fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
-    use picofarm_transient::sensor::{sense, sense_again};
+    use picofarm_transient::sensor::{Sensing, sense};
     let h = |p: usize, b: usize| {
         if b > 3 {
             1.0 / (1.0 + (p * 7 + b * 3) as f32 % 13.0)
@@ -364,6 +364,14 @@ fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
         ),
         (
             Sensor {
+                poisson: false,
+                scale: range,
+                ..Sensor::default()
+            },
+            true,
+        ),
+        (
+            Sensor {
                 scale: Scale::Fixed {
                     photons_per_unit: 50.0,
                 },
@@ -372,13 +380,24 @@ fn a_peak_that_was_found_before_gives_the_same_bits_in_every_draw() {
             false,
         ),
     ] {
-        let first = sense(&sensor, &seen, 1, 4).unwrap();
-        assert_eq!(first.peak.is_some(), known, "{sensor:?}");
+        let sensing = Sensing::new(sensor.clone(), seen.bins, seen.bin_width_ps).unwrap();
+        let radiance = |seed, peak| {
+            let mut out = vec![f32::NAN; 3];
+            let found = sensing.radiance(&values, (seed, 4), peak, &mut out);
+            (out, found.unwrap())
+        };
+        let (first, peak) = radiance(1, None);
+        assert_eq!(peak.is_some(), known, "{sensor:?}");
         for seed in 2..6 {
             let plain = sense(&sensor, &seen, seed, 4).unwrap();
-            let again = sense_again(&sensor, &seen, seed, 4, first.peak).unwrap();
-            assert_eq!(plain, again, "{sensor:?}");
-            assert_ne!(plain.values, first.values);
+            let photons: Vec<f32> = match &plain.values {
+                Values::Counts(counts) => counts.iter().map(|n| *n as f32).collect(),
+                Values::Rate(rate) => rate.clone(),
+            };
+            let expected: Vec<f32> = photons.iter().map(|n| n / plain.scale as f32).collect();
+            let (again, _) = radiance(seed, peak);
+            assert_eq!(again, expected, "{sensor:?}");
+            assert_ne!(again, first);
         }
     }
 }

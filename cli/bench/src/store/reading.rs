@@ -13,7 +13,7 @@ use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, open_store,
 };
 use picofarm_model::{
-    input::{Normalise, planes},
+    input::{Normalise, planes_of},
     scene::{Order, Scene},
 };
 use serde::Serialize;
@@ -286,10 +286,11 @@ fn loader(
                 Into::Input => {
                     let read = dataset.read_planes_into(scene, Quantity::Transient, &mut buffer);
                     pool.install(|| runtime.block_on(read))?;
-                    let seen = seen(dataset.spec(), std::mem::take(&mut buffer));
-                    scaled.resize(seen.histogram.len(), 0.0);
-                    planes(&seen, seen.bins, Normalise::MinMax, &mut scaled);
+                    let mut seen = seen(dataset.spec(), std::mem::take(&mut buffer));
+                    let bins = seen.bins;
+                    planes_of(&mut seen, bins, Normalise::MinMax, &mut scaled);
                     buffer = seen.histogram;
+                    // It joins its batch.
                     drop(std::hint::black_box(scaled.clone()));
                 }
             }

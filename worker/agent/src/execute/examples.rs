@@ -14,16 +14,10 @@ use picofarm_proto::{
     model::Histogram,
     split::{Rank, SplitRecord},
 };
-use picofarm_transient::sensor::{
-    Histograms, Multiplex, PS_PER_M, Sensor, SensorError, sense_again,
-};
+use picofarm_transient::sensor::{Multiplex, PS_PER_M, Sensing, Sensor, SensorError};
 use tokio::runtime::Handle;
 
-use super::{
-    Control, TaskError,
-    output::Stores,
-    reprocess::{as_radiance, quantity},
-};
+use super::{Control, TaskError, output::Stores, reprocess::quantity};
 
 #[cfg(test)]
 mod folded;
@@ -48,7 +42,7 @@ pub(super) struct Examples {
     spots: Option<Vec<u32>>,
     scenes: Vec<u64>,
     /// What histograms go through, and the seed of its noise.
-    sensor: Option<(Sensor, u64)>,
+    sensor: Option<(Sensing, u64)>,
     /// Depths that two-bounce times follow from; the truth's where there are none.
     depths: Option<Predictions>,
     kept: Mutex<Kept>,
@@ -158,10 +152,21 @@ impl Examples {
         Self { depths, ..self }
     }
 
-    /// The same through a sensor.
-    #[must_use]
-    pub(super) fn through(self, sensor: Option<(Sensor, u64)>) -> Self {
-        Self { sensor, ..self }
+    /// The same through a sensor, whose noise has a seed.
+    ///
+    /// # Errors
+    /// [`TaskError::User`] naming the sensor's field that cannot be.
+    pub(super) fn through(self, sensor: Option<(Sensor, u64)>) -> Result<Self, TaskError> {
+        let gate = &self.dataset.spec().gate;
+        let sensing = |(sensor, seed)| {
+            let sensing = Sensing::new(sensor, gate.bins as usize, gate.bin_width_m * PS_PER_M)?;
+            Ok((sensing, seed))
+        };
+        let sensor = sensor.map(sensing).transpose();
+        let sensor = sensor.map_err(|SensorError::Invalid { field, what }| {
+            TaskError::User(format!("train.{field}: {what}"))
+        })?;
+        Ok(Self { sensor, ..self })
     }
 
     /// Spots whose light the histogram holds.
@@ -193,25 +198,28 @@ impl Examples {
         let Some((sensor, seed)) = &self.sensor else {
             return Ok(stored);
         };
-        let input = Histograms {
-            transient: &stored.histogram,
-            two_bounce: None,
-            bins: stored.bins,
-            bin_width_ps: stored.bin_width_m * PS_PER_M,
-        };
         let seed = Random::new(*seed, &[SENSED, draw]).bits();
         let peaks = || self.peaks.lock().expect("no panic while locked");
-        let peak = peaks().get(&index).copied();
-        let sensed = sense_again(sensor, &input, seed, self.scenes[index], peak).map_err(
+        let known = peaks().get(&index).copied();
+        let mut seen = self.room();
+        let of = (seed, self.scenes[index]);
+        let peak = sensor.radiance(&stored.histogram, of, known, &mut seen);
+        let peak = peak.map_err(
             |SensorError::Invalid { field, what }| DatasetError::Invalid {
                 field: format!("train.{field}"),
                 what: format!("scene {}: {what}", self.scenes[index]),
             },
         )?;
-        if let Some(found) = sensed.peak.filter(|_| peak.is_none()) {
+        if let Some(found) = peak.filter(|_| known.is_none()) {
             peaks().insert(index, found);
         }
-        Ok(Arc::new(stored.showing(as_radiance(&sensed).0)))
+        Ok(Arc::new(stored.showing(seen)))
+    }
+
+    /// Room of a histogram that nobody looks at any more, or none.
+    fn room(&self) -> Vec<f32> {
+        let mut spare = self.spare.lock().expect("no panic while locked");
+        spare.pop().unwrap_or_default()
     }
 
     /// What is seen of a scene, and in which order: as networks take it where no sensor stands before them.
@@ -221,8 +229,7 @@ impl Examples {
             .as_ref()
             .filter(|_| self.quantity == Quantity::TransientSpots)
         else {
-            let spare = || self.spare.lock().expect("no panic while locked").pop();
-            let mut h = spare().unwrap_or_default();
+            let mut h = self.room();
             let (dataset, quantity) = (&self.dataset, self.quantity);
             let order = match self.sensor {
                 None => {

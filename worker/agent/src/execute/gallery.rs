@@ -72,7 +72,7 @@ pub(super) fn show(
     let histogram = (histogram, &*settings.spots);
     let sensor = settings.sensor.filter(|_| evaluation.sensor);
     let examples = Examples::new(stores, &dataset, histogram, scenes, "report")?
-        .through(sensor.map(|sensor| (*sensor, settings.seed)))
+        .through(sensor.map(|sensor| (*sensor, settings.seed)))?
         .timed_by(depths);
     let pictures = pictures(&known.model, &examples, &indices, 2).map_err(of_model)?;
     Ok(Shown {

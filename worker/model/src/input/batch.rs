@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-use super::{Question, ShadowVariant, Target, intensity, merged, planes};
+use super::{Question, ShadowVariant, Target, intensity, merged, planes, planes_of};
 use crate::{ModelError, net::Input, scene::Scene};
 
 /// How a scene is looked at once.
@@ -44,6 +44,32 @@ pub fn example(
     visit: Visit,
 ) -> Result<(), ModelError> {
     check(batch, question, scene)?;
+    add(batch, question, scene, visit, false);
+    Ok(())
+}
+
+/// The same of a scene that nobody needs afterwards: its histogram may become the batch's, and the batch's room the scene's.
+///
+/// # Errors
+/// Those of [`example`].
+pub(crate) fn example_of(
+    batch: &mut Batch,
+    question: &Question,
+    scene: &mut Scene,
+    visit: Visit,
+) -> Result<(), ModelError> {
+    check(batch, question, scene)?;
+    let nothing_else = question.channels().0 == question.bins && !question.intensity_only;
+    let ready = batch.images == 0 && nothing_else;
+    if ready {
+        planes_of(scene, question.bins, question.normalise, &mut batch.dense);
+    }
+    add(batch, question, scene, visit, ready);
+    Ok(())
+}
+
+/// What was checked; with `ready` the histogram's planes are in the batch already.
+fn add(batch: &mut Batch, question: &Question, scene: &Scene, visit: Visit, ready: bool) {
     (batch.height, batch.width) = (scene.height, scene.width);
     if batch.images == 0 {
         batch.one_hot.clear();
@@ -59,8 +85,10 @@ pub fn example(
         intensity(scene, &mut dense[..pixels]);
         1
     } else {
-        let room = &mut dense[..question.bins * pixels];
-        planes(scene, question.bins, question.normalise, room);
+        if !ready {
+            let room = &mut dense[..question.bins * pixels];
+            planes(scene, question.bins, question.normalise, room);
+        }
         question.bins
     };
     if question.by_spot() {
@@ -114,7 +142,6 @@ pub fn example(
     for plane in batch.target[at..].chunks_exact_mut(pixels) {
         flip(plane, scene.width, visit);
     }
-    Ok(())
 }
 
 /// What a depth network should say: z over the question's scale, within 0..1; 1 where nothing is seen.

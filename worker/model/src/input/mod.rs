@@ -7,8 +7,9 @@ mod normalise;
 pub use picofarm_settings::{ShadowVariant, Target};
 use serde::{Deserialize, Serialize};
 
+pub(crate) use batch::example_of;
 pub use batch::{Batch, Visit, example};
-pub use normalise::{intensity, merged, planes};
+pub use normalise::{intensity, merged, planes, planes_of};
 
 use crate::{ModelError, net::NetSpec};
 

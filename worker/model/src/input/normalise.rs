@@ -67,6 +67,65 @@ pub fn planes(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32])
     }
 }
 
+/// [`planes`] into room of any length, of a scene that nobody needs afterwards: where each number stays in its place, it is scaled
+/// there, and the scene is left with the room that `out` had.
+///
+/// # Panics
+/// As [`planes`].
+pub fn planes_of(scene: &mut Scene, bins: usize, normalise: Normalise, out: &mut Vec<f32>) {
+    if scene.order == Order::Bins && scene.bins == bins && normalise == Normalise::MinMax {
+        std::mem::swap(&mut scene.histogram, out);
+        return in_place(out, scene.pixels());
+    }
+    out.resize(bins * scene.pixels(), 0.0);
+    planes(scene, bins, normalise, out);
+}
+
+/// (h − min)/(max − min) of each pixel, bin by bin.
+fn in_place(planes: &mut [f32], pixels: usize) {
+    let (mut least, mut most) = ([0.0f32; STRIP], [0.0f32; STRIP]);
+    for from in (0..pixels).step_by(STRIP) {
+        let of = from..(from + STRIP).min(pixels);
+        let (least, most) = (&mut least[..of.len()], &mut most[..of.len()]);
+        least.fill(f32::INFINITY);
+        most.fill(f32::NEG_INFINITY);
+        for plane in planes.chunks_exact(pixels) {
+            widen(&plane[of.clone()], least, most);
+        }
+        ranges(least, most);
+        for plane in planes.chunks_exact_mut(pixels) {
+            for (h, (least, range)) in plane[of.clone()].iter_mut().zip(least.iter().zip(&*most)) {
+                *h = within(*h, *least, *range);
+            }
+        }
+    }
+}
+
+/// The least and the greatest of each pixel so far.
+#[inline]
+fn widen(plane: &[f32], least: &mut [f32], most: &mut [f32]) {
+    for ((h, least), most) in plane.iter().zip(least).zip(most) {
+        // As `f32::min` and `max` do, which compilers do not make one instruction of.
+        *least = if *h < *least { *h } else { *least };
+        *most = if *h > *most { *h } else { *most };
+    }
+}
+
+/// The greatest of each pixel becomes its range.
+fn ranges(least: &mut [f32], most: &mut [f32]) {
+    for (least, most) in least.iter_mut().zip(most) {
+        // A range of infinity makes zeros of all.
+        let range = *most - *least;
+        *most = match range > 0.0 && range.is_finite() {
+            true => range,
+            false => f32::INFINITY,
+        };
+        if !least.is_finite() {
+            *least = 0.0;
+        }
+    }
+}
+
 /// [`planes`] of what lies so already: to the same bits. What a strip of pixels holds is looked at twice, and stays in the
 /// second-level cache meanwhile.
 fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
@@ -94,11 +153,7 @@ fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
                     &*sums
                 }
             };
-            for ((h, least), most) in sum.iter().zip(least.iter_mut()).zip(most.iter_mut()) {
-                // As `f32::min` and `max` do, which compilers do not make one instruction of.
-                *least = if *h < *least { *h } else { *least };
-                *most = if *h > *most { *h } else { *most };
-            }
+            widen(sum, least, most);
         }
         if let Normalise::Log { .. } = normalise {
             for (b, plane) in out.chunks_exact_mut(pixels).enumerate() {
@@ -110,17 +165,7 @@ fn strips(scene: &Scene, bins: usize, normalise: Normalise, out: &mut [f32]) {
             }
             continue;
         }
-        for (least, most) in least.iter_mut().zip(most.iter_mut()) {
-            // A range of infinity makes zeros of all.
-            let range = *most - *least;
-            *most = match range > 0.0 && range.is_finite() {
-                true => range,
-                false => f32::INFINITY,
-            };
-            if !least.is_finite() {
-                *least = 0.0;
-            }
-        }
+        ranges(least, most);
         for (b, plane) in out.chunks_exact_mut(pixels).enumerate() {
             let plane = &mut plane[of.clone()];
             if merged == 1 {
@@ -247,6 +292,11 @@ mod tests {
                 planes(&one, bins, normalise, &mut out[0]);
                 planes(&other, bins, normalise, &mut out[1]);
                 assert_eq!(bits(&out[0]), bits(&out[1]), "{normalise:?} {bins}");
+                for scene in [&one, &other] {
+                    let mut room = vec![f32::NAN; 7];
+                    planes_of(&mut scene.clone(), bins, normalise, &mut room);
+                    assert_eq!(bits(&out[0]), bits(&room), "{normalise:?} {bins}");
+                }
             }
         }
         let mut out = [(); 2].map(|()| vec![f32::NAN; pixels]);

@@ -13,7 +13,7 @@ use std::{
 use super::{Plan, order, position::Position};
 use crate::{
     ModelError,
-    input::{Batch, Visit, example},
+    input::{Batch, Visit, example, example_of},
     scene::Scenes,
 };
 
@@ -169,7 +169,17 @@ impl Making<'_> {
             scene: index,
             source,
         })?;
-        example(&mut made, &self.plan.question, &scene, visit)?;
+        let question = &self.plan.question;
+        let scene = match Arc::try_unwrap(scene) {
+            Ok(mut alone) => {
+                example_of(&mut made, question, &mut alone, visit)?;
+                Arc::new(alone)
+            }
+            Err(shared) => {
+                example(&mut made, question, &shared, visit)?;
+                shared
+            }
+        };
         *bytes = scene.bytes() + made.bytes();
         self.scenes.take_back(scene);
         Ok(made)

@@ -1,25 +1,26 @@
 //! Poisson counts of small rates from tables.
 //!
-//! The sum of independent Poisson counts is a Poisson count of the summed rates. So a rate is cut into a multiple of 4, a
-//! multiple of 1/16 below 4, and a rest below 1/16. The first two have tables (the alias method; A. J. Walker, "An efficient
-//! method for generating discrete random variables with general distributions", ACM TOMS 3, 1977; tables as M. D. Vose, "A
-//! linear algorithm for generating random numbers with a given distribution", IEEE TSE 17, 1991), and the rest is nearly
-//! always nothing. No exponential, no logarithm, no loop for most bins.
+//! The sum of independent Poisson counts is a Poisson count of the summed rates. So a rate is cut into a multiple of 64, a
+//! multiple of 4 below 64, a multiple of 1/16 below 4, and a rest below 1/16. The first three have tables (the alias method; A. J.
+//! Walker, "An efficient method for generating discrete random variables with general distributions", ACM TOMS 3, 1977; tables
+//! as M. D. Vose, "A linear algorithm for generating random numbers with a given distribution", IEEE TSE 17, 1991), and the rest
+//! is nearly always nothing. No exponential, no logarithm, no loop for most bins.
 
 use std::sync::LazyLock;
 
 /// Tables cover rates below this.
-pub(super) const TABLED: f64 = 48.0;
-/// Parts of a photon that rates are cut into.
+pub(super) const TABLED: f64 = 1024.0;
+/// Steps of the fine, the coarse and the wide tables: 1/16, 4 and 64 photons.
 const PARTS: usize = 16;
-/// One step of the coarse tables, in parts.
-const COARSE: usize = 4 * PARTS;
-/// Columns of a table: more than counts that have a chance of 2⁻⁵⁷ or more.
+const COARSE: usize = 4;
+const WIDE: usize = 64;
+/// Columns of a table: enough for all counts that have a chance of 10⁻¹⁶ or more.
 const FINE_COLUMNS: usize = 32;
 const COARSE_COLUMNS: usize = 128;
+const WIDE_COLUMNS: usize = 1024;
 
-/// Counts of one rate, a column for each: the chance that a column keeps its own count (the upper 56 bits), and how many counts
-/// on from the table's first its other one is (the lower 8).
+/// Counts of one rate, a column for each: the chance that a column keeps its own count (the upper bits), and which column's is its
+/// other one (as many lower bits as that takes).
 #[derive(Debug, Clone)]
 struct Table<const COLUMNS: usize> {
     first: u64,
@@ -37,10 +38,10 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
         while let Some(low) = small.pop() {
             // What rounding left over is a whole column, but for less than 2⁻⁴⁰.
             let Some(high) = large.last().copied() else {
-                columns[low] = pack(1.0, low);
+                columns[low] = Self::pack(1.0, low);
                 continue;
             };
-            columns[low] = pack(share[low], high);
+            columns[low] = Self::pack(share[low], high);
             share[high] -= 1.0 - share[low];
             if share[high] < 1.0 {
                 large.pop();
@@ -48,7 +49,7 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
             }
         }
         for k in large {
-            columns[k] = pack(1.0, k);
+            columns[k] = Self::pack(1.0, k);
         }
         Self { first, columns }
     }
@@ -62,15 +63,18 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
         let offset = if rest < entry {
             column as u64
         } else {
-            entry & 0xff
+            entry & Self::OTHER
         };
         self.first + offset
     }
-}
 
-fn pack(share: f64, other: usize) -> u64 {
-    // Casts of numbers that are too large give the largest.
-    ((share * 18_446_744_073_709_551_616.0) as u64 & !0xff) | other as u64
+    /// The bits that name another column.
+    const OTHER: u64 = COLUMNS as u64 - 1;
+
+    fn pack(share: f64, other: usize) -> u64 {
+        // Casts of numbers that are too large give the largest.
+        ((share * 18_446_744_073_709_551_616.0) as u64 & !Self::OTHER) | other as u64
+    }
 }
 
 /// The probabilities of so many counts, those with the largest among them, from the given first one; their sum is 1.
@@ -94,24 +98,28 @@ fn chances<const COLUMNS: usize>(rate: f64) -> (u64, [f64; COLUMNS]) {
     (first as u64, chances.map(|p| p / total))
 }
 
-/// All tables: 32 KiB.
+/// All tables: 152 KiB, of which darker bins use 32.
 struct Tables {
     fine: Vec<Table<FINE_COLUMNS>>,
     coarse: Vec<Table<COARSE_COLUMNS>>,
+    wide: Vec<Table<WIDE_COLUMNS>>,
 }
 
-static TABLES: LazyLock<Tables> = LazyLock::new(|| {
-    let rate = |parts: usize| parts as f64 / PARTS as f64;
-    Tables {
-        fine: (0..COARSE).map(|i| Table::new(rate(i))).collect(),
-        coarse: (0..TABLED as usize * PARTS / COARSE)
-            .map(|i| Table::new(rate(i * COARSE)))
-            .collect(),
-    }
+static TABLES: LazyLock<Tables> = LazyLock::new(|| Tables {
+    fine: (0..COARSE * PARTS)
+        .map(|i| Table::new(i as f64 / PARTS as f64))
+        .collect(),
+    coarse: (0..WIDE / COARSE)
+        .map(|i| Table::new((i * COARSE) as f64))
+        .collect(),
+    wide: (0..TABLED as usize / WIDE)
+        .map(|i| Table::new((i * WIDE) as f64))
+        .collect(),
 });
 
 /// A rate below [`TABLED`], cut up.
 pub(super) struct Cut {
+    wide: usize,
     coarse: usize,
     fine: usize,
     /// What no table covers: at least 0, below 1/16.
@@ -122,9 +130,11 @@ impl Cut {
     #[inline(always)]
     pub fn of(rate: f64) -> Self {
         let parts = (rate * PARTS as f64) as usize;
+        let whole = parts / PARTS;
         Self {
-            coarse: parts / COARSE,
-            fine: parts % COARSE,
+            wide: whole / WIDE,
+            coarse: whole % WIDE / COARSE,
+            fine: parts % (COARSE * PARTS),
             // Exact: both have the same exponent, or the second is 0.
             rest: rate - parts as f64 * (1.0 / PARTS as f64),
         }
@@ -135,6 +145,9 @@ impl Cut {
     pub fn count(&self, mut bits: impl FnMut() -> u64) -> u64 {
         let tables = &*TABLES;
         let mut count = 0;
+        if self.wide > 0 {
+            count += tables.wide[self.wide].count(bits());
+        }
         if self.coarse > 0 {
             count += tables.coarse[self.coarse].count(bits());
         }
@@ -156,25 +169,28 @@ mod tests {
             let keeps = *entry as f64 / 18_446_744_073_709_551_616.0;
             let first = table.first as usize;
             chances[first + k] += keeps / COLUMNS as f64;
-            chances[first + (entry & 0xff) as usize] += (1.0 - keeps) / COLUMNS as f64;
+            chances[first + (entry & Table::<COLUMNS>::OTHER) as usize] +=
+                (1.0 - keeps) / COLUMNS as f64;
         }
         chances
     }
 
     fn is_poisson<const COLUMNS: usize>(table: &Table<COLUMNS>, rate: f64) {
         let chances = given(table);
-        let (mut exact, mut sum) = (libm::exp(-rate), 0.0);
+        let mut sum = 0.0;
         for (k, chance) in chances.iter().enumerate() {
-            if k > 0 {
-                exact *= rate / k as f64;
-            }
+            let count = k as f64;
+            let exact = match rate > 0.0 {
+                true => libm::exp(count * libm::log(rate) - rate - libm::lgamma(count + 1.0)),
+                false => f64::from(k == 0),
+            };
             sum += exact;
             assert!(
-                (chance - exact).abs() < 1e-15,
+                (chance - exact).abs() < 1e-15 * (1.0 + rate),
                 "rate {rate}, count {k}: {chance} for {exact}"
             );
         }
-        assert!((sum - 1.0).abs() < 1e-14, "rate {rate}: {sum} in the table");
+        assert!((sum - 1.0).abs() < 1e-11, "rate {rate}: {sum} in the table");
     }
 
     #[test]
@@ -184,6 +200,9 @@ mod tests {
         }
         for (i, table) in TABLES.coarse.iter().enumerate() {
             is_poisson(table, i as f64 * 4.0);
+        }
+        for (i, table) in TABLES.wide.iter().enumerate() {
+            is_poisson(table, i as f64 * 64.0);
         }
     }
 
@@ -201,7 +220,8 @@ mod tests {
         ] {
             let cut = Cut::of(rate);
             assert!((0.0..0.0625).contains(&cut.rest), "{rate}");
-            let sum = cut.coarse as f64 * 4.0 + cut.fine as f64 / 16.0 + cut.rest;
+            let tabled = (cut.wide * 64 + cut.coarse * 4) as f64 + cut.fine as f64 / 16.0;
+            let sum = tabled + cut.rest;
             assert_eq!(sum, rate);
         }
     }

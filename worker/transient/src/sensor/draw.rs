@@ -88,7 +88,7 @@ impl Draws {
 /// Expected successes from which on binomial counts use rejection instead of inversion.
 const LARGE: f64 = 10.0;
 
-/// A Poisson count, exact for rates up to 10¹²: tables below a rate of 48, from there Hörmann's transformed rejection
+/// A Poisson count, exact for rates up to 10¹²: tables below a rate of 1024, from there Hörmann's transformed rejection
 /// (PTRS; W. Hörmann, "The transformed rejection method for generating Poisson random variables", Insurance:
 /// Mathematics and Economics 12, 1993). A rate that is not above 0 gives 0.
 ///

@@ -22,7 +22,7 @@ pub use bins::{Rebinned, crop, intensity, rebin, rebin_counts, rebin_errors};
 pub use draw::{Draws, binomial, poisson};
 pub use kernel::Kernel;
 pub use picofarm_settings::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
-pub use sense::{Dropped, Histograms, Sensed, Values, narrow, sense, sense_again};
+pub use sense::{Dropped, Histograms, Sensed, Sensing, Values, narrow, sense};
 pub use spots::{Multiplex, SPOTS_4_OF_100, SPOTS_25_OF_100, multiplex};
 
 /// Version of the sensed values: change it whenever any output bit may change.

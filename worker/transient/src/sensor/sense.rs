@@ -65,9 +65,6 @@ pub struct Sensed {
     pub scale: f64,
     /// The peak that set the scale, photons; `None` for a fixed scale and for scenes without light.
     pub peak_photons: Option<f64>,
-    /// The brightest bin of the median pixel, in units of h, where the scale follows from it and it is the same in every draw: what
-    /// [`sense_again`] is spared.
-    pub peak: Option<f64>,
     /// Bins by which the pulse was shifted (`sb3d_compat` jitter; otherwise 0).
     pub shift_bins: i64,
     /// What is not in the image.
@@ -116,58 +113,119 @@ pub fn sense(
     seed: u64,
     scene: u64,
 ) -> Result<Sensed, SensorError> {
-    sense_again(sensor, h, seed, scene, None)
-}
-
-/// The same with the [`Sensed::peak`] that was found before, with the same sensor and histograms and whatever seed. To the same
-/// bits, without looking at all histograms twice.
-///
-/// # Errors
-/// Those of [`sense`].
-pub fn sense_again(
-    sensor: &Sensor,
-    h: &Histograms<'_>,
-    seed: u64,
-    scene: u64,
-    peak: Option<f64>,
-) -> Result<Sensed, SensorError> {
-    let count = check(sensor, h)?;
-    let kernel = Kernel::new(sensor, h.bin_width_ps)?;
-    let shift_bins = shift(sensor, seed, scene);
-    let convolver = Convolver::new(&kernel.shifted(shift_bins), h.bins);
-    let scale = scale_of(sensor, h, (&convolver, peak), seed, scene)?;
-    let chain = Chain {
-        sensor,
-        h,
-        convolver,
-        scale: scale.per_unit,
-        factor: sensor.rebin as usize,
-        out_bins: h.bins / sensor.rebin as usize,
-        seed,
-        scene,
-    };
-    let len = count * chain.out_bins;
+    let sensing = Sensing::new(sensor.clone(), h.bins, h.bin_width_ps)?;
+    let chain = sensing.chain(h, None, seed, scene)?;
+    let len = h.transient.len() / h.bins * chain.out_bins;
     let (values, facts) = if sensor.poisson {
         let mut counts = vec![0u32; len];
-        let facts = chain.run(&mut counts, Chain::count);
+        let facts = chain.run(&mut counts, |chain, pixel, rate, out| {
+            chain.count(pixel, rate, out, |count| count)
+        });
         (Values::Counts(counts), facts)
     } else {
         let mut rate = vec![0f32; len];
-        let facts = chain.run(&mut rate, Chain::expect);
+        let facts = chain.run(&mut rate, |chain, _, rate, out| {
+            chain.expect(rate, out, |rate| rate)
+        });
         (Values::Rate(rate), facts)
     };
     Ok(Sensed {
         values,
         bins: chain.out_bins,
         bin_width_ps: h.bin_width_ps * f64::from(sensor.rebin),
-        scale: scale.per_unit,
-        peak_photons: scale.photons,
-        peak: scale
-            .peak
-            .filter(|_| matches!(sensor.jitter, Jitter::Gaussian { .. })),
-        shift_bins,
+        scale: chain.scale.per_unit,
+        peak_photons: chain.scale.photons,
+        shift_bins: shift(sensor, seed, scene),
         dropped: total(&facts, h.bins % chain.factor)?,
     })
+}
+
+/// A sensor that looks at many histograms of the same bins: what they have in common is worked out once.
+#[derive(Debug, Clone)]
+pub struct Sensing {
+    sensor: Sensor,
+    kernel: Kernel,
+    bins: usize,
+    bin_width_ps: f64,
+}
+
+impl Sensing {
+    /// Of histograms of `bins` bins that are `bin_width_ps` picoseconds wide.
+    ///
+    /// # Errors
+    /// Those of [`Kernel::new`], or [`SensorError::Invalid`] where the bins cannot be summed as the sensor says.
+    pub fn new(sensor: Sensor, bins: usize, bin_width_ps: f64) -> Result<Self, SensorError> {
+        let kernel = Kernel::new(&sensor, bin_width_ps)?;
+        pixels(0, bins)?;
+        check_factor(bins, sensor.rebin as usize)?;
+        Ok(Self {
+            sensor,
+            kernel,
+            bins,
+            bin_width_ps,
+        })
+    }
+
+    /// What [`sense`] measures, in units of h: photons over the scale, into `out`, which becomes as long as needed and is
+    /// overwritten. `peak` is what an earlier call for the same histograms gave, with whatever seed: it is spared a look at all of
+    /// them, to the same bits. Gives the brightest bin of the median pixel, in units of h, where the scale follows from it and it is the
+    /// same in every draw.
+    ///
+    /// # Errors
+    /// Those of [`sense`].
+    pub fn radiance(
+        &self,
+        transient: &[f32],
+        (seed, scene): (u64, u64),
+        peak: Option<f64>,
+        out: &mut Vec<f32>,
+    ) -> Result<Option<f64>, SensorError> {
+        let h = Histograms {
+            transient,
+            two_bounce: None,
+            bins: self.bins,
+            bin_width_ps: self.bin_width_ps,
+        };
+        let chain = self.chain(&h, peak, seed, scene)?;
+        out.resize(transient.len() / self.bins * chain.out_bins, 0.0);
+        let scale = chain.scale.per_unit as f32;
+        let facts = if self.sensor.poisson {
+            chain.run(out, |chain, pixel, rate, out| {
+                chain.count(pixel, rate, out, |count| count as f32 / scale)
+            })
+        } else {
+            chain.run(out, |chain, _, rate, out| {
+                chain.expect(rate, out, |rate| rate / scale)
+            })
+        };
+        total(&facts, self.bins % chain.factor)?;
+        let same = matches!(self.sensor.jitter, Jitter::Gaussian { .. });
+        Ok(chain.scale.peak.filter(|_| same))
+    }
+
+    fn chain<'a>(
+        &'a self,
+        h: &'a Histograms<'a>,
+        peak: Option<f64>,
+        seed: u64,
+        scene: u64,
+    ) -> Result<Chain<'a>, SensorError> {
+        check(h)?;
+        let sensor = &self.sensor;
+        let kernel = self.kernel.clone().shifted(shift(sensor, seed, scene));
+        let convolver = Convolver::new(&kernel, h.bins);
+        let scale = scale_of(sensor, h, (&convolver, peak), seed, scene)?;
+        Ok(Chain {
+            sensor,
+            h,
+            convolver,
+            scale,
+            factor: sensor.rebin as usize,
+            out_bins: h.bins / sensor.rebin as usize,
+            seed,
+            scene,
+        })
+    }
 }
 
 fn shift(sensor: &Sensor, seed: u64, scene: u64) -> i64 {
@@ -181,6 +239,7 @@ fn shift(sensor: &Sensor, seed: u64, scene: u64) -> i64 {
 }
 
 /// Photons for a unit of h, and what that follows from.
+#[derive(Debug, Clone, Copy)]
 struct Scaled {
     per_unit: f64,
     /// Photons of the peak, and the peak in units of h.
@@ -244,23 +303,19 @@ fn median_peak(h: &[f32], bins: usize, convolver: &Convolver) -> Option<f64> {
     Some(*peaks.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-fn check(sensor: &Sensor, h: &Histograms<'_>) -> Result<usize, SensorError> {
-    sensor.check()?;
-    let count = pixels(h.transient.len(), h.bins)?;
-    check_factor(h.bins, sensor.rebin as usize)?;
-    if let Some(two) = h.two_bounce
-        && two.len() != h.transient.len()
-    {
-        return Err(SensorError::new(
+fn check(h: &Histograms<'_>) -> Result<(), SensorError> {
+    pixels(h.transient.len(), h.bins)?;
+    match h.two_bounce {
+        Some(two) if two.len() != h.transient.len() => Err(SensorError::new(
             "two_bounce",
             format!(
                 "expected {} values as in the transient, found {}",
                 h.transient.len(),
                 two.len()
             ),
-        ));
+        )),
+        _ => Ok(()),
     }
-    Ok(count)
 }
 
 /// What all pixels share.
@@ -268,7 +323,7 @@ struct Chain<'a> {
     sensor: &'a Sensor,
     h: &'a Histograms<'a>,
     convolver: Convolver,
-    scale: f64,
+    scale: Scaled,
     factor: usize,
     out_bins: usize,
     seed: u64,
@@ -310,11 +365,12 @@ impl Chain<'_> {
                 ..Facts::default()
             };
         }
-        let outside = self.scale * convolver.run(h, rate);
+        let scale = self.scale.per_unit;
+        let outside = scale * convolver.run(h, rate);
         let (mut light, mut brightest) = ([0.0; 4], [0.0; 4]);
         for quad in rate.chunks_mut(4) {
             for ((r, light), brightest) in quad.iter_mut().zip(&mut light).zip(&mut brightest) {
-                let photons = self.scale * *r;
+                let photons = scale * *r;
                 *light += photons;
                 *r = photons + self.sensor.dark_per_bin;
                 *brightest = if *r > *brightest { *r } else { *brightest };
@@ -347,8 +403,8 @@ impl Chain<'_> {
         all + n * libm::expm1(-all / n)
     }
 
-    /// Expected counts, rebinned.
-    fn expect(&self, _pixel: usize, rate: &[f64], out: &mut [f32]) -> Option<Fault> {
+    /// Expected counts, rebinned, and what `of` makes of them.
+    fn expect(&self, rate: &[f64], out: &mut [f32], of: impl Fn(f32) -> f32) -> Option<Fault> {
         let mut earlier = 0.0;
         for (out, group) in out.iter_mut().zip(rate.chunks_exact(self.factor)) {
             let sum: f64 = match self.sensor.dead_time {
@@ -362,13 +418,19 @@ impl Chain<'_> {
                     seen
                 }
             };
-            *out = sum as f32;
+            *out = of(sum as f32);
         }
         None
     }
 
-    /// Drawn counts, rebinned.
-    fn count(&self, pixel: usize, rate: &[f64], out: &mut [u32]) -> Option<Fault> {
+    /// Drawn counts, rebinned, and what `of` makes of them.
+    fn count<T>(
+        &self,
+        pixel: usize,
+        rate: &[f64],
+        out: &mut [T],
+        of: impl Fn(u32) -> T,
+    ) -> Option<Fault> {
         let key = PixelKey::new(self.seed, Purpose::Counts, self.scene, pixel as u64);
         let mut waiting = match self.sensor.dead_time {
             Some(DeadTime::FirstPhoton { pulses }) => pulses,
@@ -398,7 +460,7 @@ impl Chain<'_> {
                     rate: sum as f64,
                 });
             };
-            *out = sum;
+            *out = of(sum);
         }
         None
     }

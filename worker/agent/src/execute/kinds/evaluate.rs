@@ -382,10 +382,8 @@ impl<'a> EvaluationRun<'a> {
                 scenes.to_vec(),
                 "evaluate",
             )
-            .map(|examples| {
-                let examples = examples.through(asked.sensor.clone());
-                examples.staying(self.left_mib)
-            })
+            .and_then(|examples| examples.through(asked.sensor.clone()))
+            .map(|examples| examples.staying(self.left_mib))
         };
         let depths = asked.times.as_ref();
         let depths = depths.and_then(|times| times.predictions.clone());

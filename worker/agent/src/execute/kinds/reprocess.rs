@@ -363,7 +363,7 @@ fn read(
 }
 
 /// What was measured in units of h (dark counts included), and the scale that makes photons of it.
-pub(in crate::execute) fn as_radiance(sensed: &Sensed) -> (Vec<f32>, f32) {
+fn as_radiance(sensed: &Sensed) -> (Vec<f32>, f32) {
     use rayon::prelude::*;
     let scale = sensed.scale as f32;
     let h = match &sensed.values {

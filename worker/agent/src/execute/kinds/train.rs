@@ -152,12 +152,9 @@ impl<'a> TrainingRun<'a> {
         let depths = times.pin(stores, named.0, &used, &data, control)?;
         let histogram = (settings.histogram, &*settings.spots);
         let examples = |scenes| {
-            let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?.through(
-                settings
-                    .sensor
-                    .clone()
-                    .map(|sensor| (*sensor, settings.seed)),
-            );
+            let sensor = settings.sensor.clone();
+            let scenes = Examples::new(stores, &dataset, histogram, scenes, "train")?
+                .through(sensor.map(|sensor| (*sensor, settings.seed)))?;
             let scenes = scenes.timed_by(times.predictions.clone());
             Ok(Arc::new(scenes.staying(left_mib)))
         };
