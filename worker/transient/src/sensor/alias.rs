@@ -60,12 +60,10 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
         let column = (bits >> (64 - COLUMNS.ilog2())) as usize;
         let rest = bits << COLUMNS.ilog2();
         let entry = self.columns[column];
-        let offset = if rest < entry {
-            column as u64
-        } else {
-            entry & Self::OTHER
-        };
-        self.first + offset
+        // Without a branch: nobody could foretell it.
+        let keeps = u64::from(rest < entry).wrapping_neg();
+        let other = entry & Self::OTHER;
+        self.first + (other ^ ((other ^ column as u64) & keeps))
     }
 
     /// The bits that name another column.

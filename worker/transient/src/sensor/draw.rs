@@ -94,7 +94,7 @@ const LARGE: f64 = 10.0;
 ///
 /// # Panics
 /// Where the rate is above 10¹².
-#[inline]
+#[inline(always)]
 pub fn poisson(rate: f64, draws: &mut Draws) -> u64 {
     if rate.is_nan() || rate <= 0.0 {
         return 0;
