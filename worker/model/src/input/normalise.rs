@@ -5,8 +5,8 @@ use crate::scene::{Order, Scene};
 
 /// Pixels that change from pixel by pixel to bin by bin together: they fill a cache line of each bin's plane.
 const BLOCK: usize = 16;
-/// Pixels whose planes are scaled together: 1.3 MB of 637 bins.
-const STRIP: usize = 512;
+/// Pixels whose planes are scaled together: 0.7 MB of 637 bins.
+const STRIP: usize = 256;
 
 /// How many adjacent bins of `stored` are summed for one of `bins`. What is left over at the end, and dropped, must be fewer
 /// than are summed: otherwise most of a gate could go without a word.
