@@ -96,7 +96,7 @@ fn chances<const COLUMNS: usize>(rate: f64) -> (u64, [f64; COLUMNS]) {
     (first as u64, chances.map(|p| p / total))
 }
 
-/// All tables: 152 KiB, of which darker bins use 32.
+/// All tables: 160 KiB, of which bins below 64 photons use 32.
 struct Tables {
     fine: Vec<Table<FINE_COLUMNS>>,
     coarse: Vec<Table<COARSE_COLUMNS>>,
@@ -214,6 +214,9 @@ mod tests {
             3.999_999,
             4.0,
             17.3,
+            63.99,
+            64.0,
+            777.7,
             TABLED - 1e-12,
         ] {
             let cut = Cut::of(rate);
