@@ -1,15 +1,17 @@
 """The networks of picofarm in PyTorch: the same numbers, and how long they take.
 
 usage: model_torch.py parity FILE...
-       model_torch.py bench [--channels-last] FILE
+       model_torch.py bench [--channels-last] [--device cuda [--tf32]] FILE
 
 FILE comes from `picofarm bench model --record FILE`: weights, a batch, and what picofarm made of them. `parity` computes
 the same and fails where outputs differ by more than 1e-4, a gradient by more than 1e-3 of its norm, or the losses of the
 steps of AdamW by more than 1e-3; in bfloat16 (`--precision bf16`, autocast here), where the gradient as a whole differs by
 more than rounding moves PyTorch's own. `bench` takes steps when told to: it reads numbers of steps line by line and answers with
-seconds (`picofarm bench model --peer` does that between its own). Needs torch and safetensors.
+seconds (`picofarm bench model --peer` does that between its own); on an NVIDIA card with `--device cuda`, in 32 bits there unless
+`--tf32` lets products be rounded to 19 bits. Needs torch and safetensors.
 """
 
+import argparse
 import json
 import sys
 import time
@@ -216,7 +218,7 @@ class SwinBlock(nn.Module):
         _, h, w, _ = x.shape
         shift = self.window // 2 if self.shifted and min(h, w) > self.window else 0
         y = torch.roll(self.norm1(x), (-shift, -shift), (1, 2))
-        y = self.attn(to_windows(y, self.window), self.mask(h, w, shift) if shift else None)
+        y = self.attn(to_windows(y, self.window), self.mask(h, w, shift).to(y.device) if shift else None)
         y = torch.roll(from_windows(y, self.window, h, w), (shift, shift), (1, 2))
         x = x + y
         return x + self.mlp.fc2(F.gelu(self.mlp.fc1(self.norm2(x))))
@@ -342,19 +344,20 @@ NETWORKS = {"unet2d": Unet2d, "unet25d": Unet25d, "swinir": SwinIR, "embeddings"
 
 
 class Trial:
-    def __init__(self, path):
-        with safe_open(path, "pt") as file:
+    def __init__(self, path, device="cpu"):
+        self.device = device
+        with safe_open(path, "pt", device) as file:
             self.spec = json.loads(file.metadata()["trial"])
             self.tensors = {name: file.get_tensor(name) for name in file.keys()}
         net = self.spec["net"]
         self.bf16 = net.get("precision") == "bf16"
-        self.model = NETWORKS[net["architecture"]](net)
+        self.model = NETWORKS[net["architecture"]](net).to(device)
         self.reset()
         self.dense, self.target = self.tensors["input/dense"], self.tensors["target"]
         self.one_hot = None
         if net["one_hot"]:
             bins = self.tensors["input/one_hot"].long()
-            self.one_hot = (bins[:, None] == torch.arange(net["one_hot"])[:, None, None]).float()
+            self.one_hot = (bins[:, None] == torch.arange(net["one_hot"], device=device)[:, None, None]).float()
 
     def part(self, name):
         return {k[len(name) + 1 :]: v for k, v in self.tensors.items() if k.startswith(name + "/")}
@@ -370,7 +373,7 @@ class Trial:
         self.optimiser = torch.optim.AdamW(learned, lr=self.spec["learning_rate"], weight_decay=self.spec["decay"])
 
     def ask(self):
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bf16):
+        with torch.autocast(self.device, dtype=torch.bfloat16, enabled=self.bf16):
             return self.model(self.dense, self.one_hot).float()
 
     def loss(self):
@@ -447,13 +450,16 @@ def parity(path):
     return all(value <= limits[name] for name, value in figures.items())
 
 
-def bench(path, channels_last=False):
-    trial = Trial(path)
+def bench(path, channels_last, device, tf32):
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = tf32
+    torch.backends.cudnn.benchmark = True
+    trial = Trial(path, device)
     if channels_last:
         trial.model = trial.model.to(memory_format=torch.channels_last)
         trial.dense = trial.dense.to(memory_format=torch.channels_last)
         trial.reset()
-    name = f"PyTorch {torch.__version__}" + (", channels last" if channels_last else "")
+    more = (", " + device if device != "cpu" else "") + (", TF32" if tf32 else "") + (", channels last" if channels_last else "")
+    name = f"PyTorch {torch.__version__}{more}"
     print(json.dumps({"tool": name, "threads": torch.get_num_threads()}), flush=True)
     for line in sys.stdin:
         begun = time.perf_counter()
@@ -463,12 +469,15 @@ def bench(path, channels_last=False):
 
 
 if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["parity", *paths] if paths:
-            sys.exit(0 if all([parity(path) for path in paths]) else 1)
-        case ["bench", path]:
-            bench(path)
-        case ["bench", "--channels-last", path]:
-            bench(path, channels_last=True)
-        case _:
-            sys.exit(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True, dest="command")
+    commands.add_parser("parity").add_argument("files", nargs="+")
+    timed = commands.add_parser("bench")
+    timed.add_argument("--channels-last", action="store_true")
+    timed.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    timed.add_argument("--tf32", action="store_true")
+    timed.add_argument("file")
+    asked = parser.parse_args()
+    if asked.command == "parity":
+        sys.exit(0 if all([parity(path) for path in asked.files]) else 1)
+    bench(asked.file, asked.channels_last, asked.device, asked.tf32)

@@ -1,6 +1,6 @@
 //! `picofarm model devices`: the graphics processors of this machine, each tried.
 
-use picofarm_model::device::{self, RUNTIMES};
+use picofarm_model::device::{self, OpenGpu, RUNTIMES};
 use serde::Serialize;
 
 use crate::{
@@ -16,26 +16,31 @@ struct Listed {
     kind: &'static str,
     /// As it calls itself; none where it cannot be opened or computes wrongly.
     device: Option<String>,
+    /// How far a product, a convolution and their gradients lie from the CPU's at most, over the greatest value of each.
+    apart: Option<f32>,
     /// Why it cannot be used.
     fault: Option<String>,
+    /// For people.
+    #[serde(skip)]
+    tried: String,
 }
 
 pub fn run(output: Output) -> Result<()> {
     let listed: Vec<Listed> = device::gpus()
         .iter()
         .map(|gpu| {
-            let (device, fault) = match gpu.open() {
-                Ok(gpu) => (Some(gpu.name), None),
-                Err(error) => (None, Some(error.to_string())),
-            };
+            let opened = gpu.open().map_err(|error| error.to_string());
+            let tried = opened.as_ref().map_or_else(Clone::clone, OpenGpu::accuracy);
             Listed {
                 name: gpu.id().to_owned(),
                 kind: match gpu.is_software() {
                     true => "software",
                     false => "card",
                 },
-                device,
-                fault,
+                device: opened.as_ref().ok().map(|gpu| gpu.name.clone()),
+                apart: opened.as_ref().ok().map(|gpu| gpu.apart),
+                fault: opened.err(),
+                tried,
             }
         })
         .collect();
@@ -56,9 +61,7 @@ pub fn run(output: Output) -> Result<()> {
                 gpu.name.clone(),
                 gpu.kind.to_owned(),
                 gpu.device.clone().unwrap_or_default(),
-                gpu.fault
-                    .clone()
-                    .unwrap_or_else(|| "computes as the CPU does".into()),
+                gpu.tried.clone(),
             ]
         }));
         table(&rows)

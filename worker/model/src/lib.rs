@@ -30,4 +30,4 @@ pub use model::Model;
 pub use random::Random;
 
 /// Version of everything that decides the bytes of trained weights and the figures of evaluations.
-pub const VERSION: &str = "model-5";
+pub const VERSION: &str = "model-6";

@@ -104,7 +104,7 @@ fn attention_within_windows_is_a_loop_over_pairs_of_tokens_and_its_gradient_the_
         Tensor::<3>::from_data(TensorData::new(values.to_vec(), shape), &device)
     };
     let x = tensor(&qkv, [W, T, 3 * H * S]).require_grad();
-    let y = ops::window_attention(
+    let y = ops::attend(
         x.clone(),
         tensor(&bias, [H, T, T]),
         Some(tensor(&mask, [2, T, T])),

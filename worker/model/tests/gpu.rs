@@ -106,13 +106,15 @@ fn networks_answer_and_learn_as_on_the_cpu() {
                 );
                 worst
             };
+            // Cards that round what they multiply (TF32) are off by so much more.
+            let coarse = f64::from(gpu.apart / 1e-6).max(1.0);
             assert_eq!(part("weights"), 0.0);
-            assert!(part("evaluated") < 1e-4);
-            assert!(part("output") < 1e-4);
-            assert!(part("gradient") < 2e-3);
-            assert!(part("after") < 1e-4);
+            assert!(part("evaluated") < 1e-4 * coarse);
+            assert!(part("output") < 1e-4 * coarse);
+            assert!(part("gradient") < 2e-3 * coarse);
+            assert!(part("after") < 1e-4 * coarse);
             // A weight whose gradient is almost zero goes either way at once.
-            assert!(part("losses") < 1e-2);
+            assert!(part("losses") < 1e-2 * coarse.min(10.0));
             let losses = &theirs["losses"].1;
             assert!(
                 losses[STEPS - 1] < losses[0],
@@ -166,7 +168,8 @@ fn a_network_says_on_any_device_what_it_says_on_the_cpu() {
         let scale = ours.iter().fold(0f32, |m, x| m.max(x.abs()));
         assert!(ours.len() == 128 && scale > 0.0);
         for (a, b) in ours.iter().zip(&theirs) {
-            assert!((a - b).abs() <= 1e-4 * scale, "{gpu}: {a} and {b}");
+            let coarse = (gpu.apart / 1e-6).max(1.0);
+            assert!((a - b).abs() <= 1e-4 * coarse * scale, "{gpu}: {a} and {b}");
         }
     }
 }

@@ -60,6 +60,32 @@ fn convolutions_equal_burns_and_so_do_their_gradients() {
 }
 
 #[test]
+fn attention_and_gelu_equal_burns_and_so_do_their_gradients() {
+    for (window, shift, heads, size) in [(4, 2, 2, 3), (8, 0, 1, 5), (2, 1, 3, 1)] {
+        let (h, w) = (2 * window, 3 * window);
+        let qkv = random([2, h, w, 3 * heads * size], 1);
+        let tokens = window * window;
+        let bias = random([heads, tokens, tokens], 2);
+        let windows = ops::Windows::new([h, w], window, shift, &qkv.device());
+        let mask = ops::window_mask([h, w], window, shift);
+        let mask = TensorData::new(mask, [h * w / tokens, tokens, tokens]);
+        let mask = (shift > 0).then(|| Tensor::from_data(mask, &qkv.device()));
+        equal!(
+            ops::window_attention(qkv.clone(), bias.clone(), &windows),
+            plain::window_attention(qkv.clone(), bias.clone(), window, shift, mask),
+            qkv,
+            bias
+        );
+    }
+    let x = random([3, 5, 7], 3);
+    equal!(
+        ops::gelu(x.clone() * 4.0),
+        burn::tensor::activation::gelu(x.clone() * 4.0),
+        x
+    );
+}
+
+#[test]
 fn batch_norm_with_relu_equals_burns_and_so_do_its_gradients_and_statistics() {
     let (x, gamma, beta) = (random([3, 5, 4, 6], 1), random([5], 2), random([5], 3));
     let ours = ops::batch_norm_relu(x.clone(), gamma.clone(), beta.clone());

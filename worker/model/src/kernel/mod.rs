@@ -9,8 +9,10 @@
 //! length disagrees with the shape: shapes are the caller's invariant.
 
 mod adam;
+mod attention;
 mod conv;
 mod conv_shape;
+mod exp;
 mod grad;
 mod norm;
 mod onehot;
@@ -22,6 +24,7 @@ mod winograd;
 mod winograd_grad;
 
 pub use adam::AdamW;
+pub use attention::AttentionShape;
 pub use conv_shape::ConvShape;
 pub use norm::{BatchNorm, NormShape};
 pub use onehot::OneHotShape;

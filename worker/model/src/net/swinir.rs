@@ -4,7 +4,7 @@
 //! The network for images of noise adds what it finds to its input; here output and input are different things, so nothing is
 //! added. Stochastic depth is left out.
 
-use burn::tensor::{Tensor, TensorData, activation::gelu};
+use burn::tensor::Tensor;
 
 use super::{
     layer::{Conv, Dense, LayerNorm, table},
@@ -86,19 +86,14 @@ impl Swinir {
             true => self.window / 2,
             false => 0,
         };
-        let mask = (shift > 0).then(|| {
-            let tokens = self.window * self.window;
-            let windows = h * w / tokens;
-            let mask = ops::window_mask([h, w], self.window, shift);
-            let mask = TensorData::new(mask, [windows, tokens, tokens]);
-            Tensor::<3>::from_data(mask, &first.device())
-        });
+        let windows = |shift| ops::Windows::new([h, w], self.window, shift, &first.device());
+        let (straight, shifted) = (windows(0), windows(shift));
         let mut x = self.embedded.forward(pass, tokens_last(first.clone()));
         for group in &self.groups {
             let before = x.clone();
             for block in &group.blocks {
-                let shift = if block.shifted { shift } else { 0 };
-                x = block.forward(pass, x, self.window, shift, mask.as_ref());
+                let windows = if block.shifted { &shifted } else { &straight };
+                x = block.forward(pass, x, windows);
             }
             let y = group.conv.forward(pass, channels_first(x), None);
             x = tokens_last(y) + before;
@@ -134,25 +129,14 @@ impl Block {
     }
 
     /// (N, H, W, C) to the same.
-    fn forward(
-        &self,
-        pass: &Pass,
-        x: Tensor<4>,
-        window: usize,
-        shift: usize,
-        mask: Option<&Tensor<3>>,
-    ) -> Tensor<4> {
-        let [_, h, w, _] = x.dims();
-        let seen = ops::shifted(self.norms[0].forward(pass, x.clone()), shift);
-        let qkv = self.qkv.forward(pass, ops::windows(seen, window));
-        let bias = ops::position_bias(pass.get(self.positions), window);
-        let mask = mask.filter(|_| shift > 0).cloned();
-        let said = ops::window_attention(qkv, bias, mask);
-        let said = self.project.forward(pass, said);
-        let said = ops::from_windows(said, window, [h, w]);
-        let x = x + ops::shifted_back(said, shift);
+    fn forward(&self, pass: &Pass, x: Tensor<4>, windows: &ops::Windows) -> Tensor<4> {
+        let seen = self.norms[0].forward(pass, x.clone());
+        let qkv = self.qkv.forward(pass, seen);
+        let bias = ops::position_bias(pass.get(self.positions), windows.window);
+        let said = ops::window_attention(qkv, bias, windows);
+        let x = x + self.project.forward(pass, said);
         let [first, second] = &self.perceptron;
-        let between = gelu(first.forward(pass, self.norms[1].forward(pass, x.clone())));
+        let between = ops::gelu(first.forward(pass, self.norms[1].forward(pass, x.clone())));
         x + second.forward(pass, between)
     }
 }

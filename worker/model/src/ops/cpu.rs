@@ -9,7 +9,9 @@ use burn::{
 };
 
 use super::EPSILON;
-use crate::kernel::{AdamW, BatchNorm, ConvShape, Kernels, NormShape, OneHotShape, PlaneShape};
+use crate::kernel::{
+    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, NormShape, OneHotShape, PlaneShape,
+};
 
 /// Operations of networks; shapes as in [`super`].
 #[backend_extension(Flex, Autodiff)]
@@ -35,6 +37,12 @@ pub trait NetOps: Backend {
     ) -> FloatTensor<Self>;
     fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn join_upsampled(skip: FloatTensor<Self>, x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn window_attention(
+        qkv: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        shape: AttentionShape,
+    ) -> FloatTensor<Self>;
+    fn gelu(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
         p: FloatTensor<Self>,
         g: FloatTensor<Self>,
@@ -73,6 +81,14 @@ pub(super) fn made<const D: usize>(dims: [usize; D], fill: impl FnOnce(&mut [f32
     let mut out = vec![0.0; dims.iter().product()];
     fill(&mut out);
     tensor(out, dims)
+}
+
+/// [`made`] in the shape of another, whichever that is.
+pub(super) fn alike(like: &Cpu, fill: impl FnOnce(&mut [f32])) -> Cpu {
+    let shape = like.shape();
+    let mut out = vec![0.0; shape.num_elements()];
+    fill(&mut out);
+    Cpu::from_data(TensorData::new(out, shape))
 }
 
 pub(super) fn conv_shape(
@@ -222,6 +238,18 @@ impl NetOps for Flex {
                 Kernels::best().upsample(&s, x, rest);
             }
         })
+    }
+
+    fn window_attention(qkv: Cpu, bias: Cpu, s: AttentionShape) -> Cpu {
+        let (qkv, bias) = (contiguous(qkv), contiguous(bias));
+        made([s.images, s.height, s.width, s.channels()], |out| {
+            Kernels::best().window_attention(&s, values(&qkv), values(&bias), out);
+        })
+    }
+
+    fn gelu(x: Cpu) -> Cpu {
+        let x = contiguous(x);
+        alike(&x, |y| Kernels::best().gelu(values(&x), y))
     }
 
     fn adamw(p: Cpu, g: Cpu, m: Cpu, v: Cpu, settings: AdamW) -> (Cpu, Cpu, Cpu) {

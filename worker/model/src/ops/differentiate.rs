@@ -11,7 +11,7 @@ use burn::backend::{
 };
 
 use super::{cpu::NetOps, gradient};
-use crate::kernel::AdamW;
+use crate::kernel::{AdamW, AttentionShape};
 
 type Cpu = FloatTensor<Flex>;
 type Tracked = FloatTensor<Autodiff<Flex>>;
@@ -111,6 +111,31 @@ impl Backward<Flex, 2> for Join {
     }
 }
 
+#[derive(Debug)]
+struct Attention;
+impl Backward<Flex, 2> for Attention {
+    type State = (Cpu, Cpu, AttentionShape);
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let (qkv, bias, shape) = ops.state;
+        let (dqkv, dbias) = gradient::window_attention_grad(qkv, bias, &shape, dy);
+        let [to_qkv, to_bias] = ops.parents;
+        give!(grads, to_qkv, dqkv);
+        give!(grads, to_bias, dbias);
+    }
+}
+
+#[derive(Debug)]
+struct Gelu;
+impl Backward<Flex, 1> for Gelu {
+    type State = Cpu;
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [to_x] = ops.parents;
+        give!(grads, to_x, gradient::gelu_grad(ops.state, dy));
+    }
+}
+
 impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
     fn conv3x3(x: Tracked, w: Tracked) -> Tracked {
         let y = Flex::conv3x3(x.primitive().clone(), w.primitive().clone());
@@ -172,6 +197,25 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         let nodes = [skip.node(), x.node()];
         match Join.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(to) => to.finish(channels, y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn window_attention(qkv: Tracked, bias: Tracked, shape: AttentionShape) -> Tracked {
+        let y = Flex::window_attention(qkv.primitive().clone(), bias.primitive().clone(), shape);
+        let nodes = [qkv.node(), bias.node()];
+        match Attention.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(to) => {
+                to.finish((qkv.into_primitive(), bias.into_primitive(), shape), y)
+            }
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn gelu(x: Tracked) -> Tracked {
+        let y = Flex::gelu(x.primitive().clone());
+        match Gelu.prepare::<C>([x.node()]).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish(x.into_primitive(), y),
             OpsKind::UnTracked(to) => to.finish(y),
         }
     }

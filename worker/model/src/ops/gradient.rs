@@ -5,11 +5,11 @@ use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
 use super::{
     EPSILON,
     cpu::{
-        Cpu, bins, contiguous, conv_shape, dims, made, norm_shape, one_hot_shape, planes, tensor,
-        values,
+        Cpu, alike, bins, contiguous, conv_shape, dims, made, norm_shape, one_hot_shape, planes,
+        tensor, values,
     },
 };
-use crate::kernel::{BatchNorm, Kernels};
+use crate::kernel::{AttentionShape, BatchNorm, Kernels};
 
 /// By the input.
 pub(super) fn conv3x3_by_input(dy: Cpu, w: Cpu) -> Cpu {
@@ -137,4 +137,28 @@ pub(super) fn join_upsampled_grad(dy: Cpu, c: usize) -> (Cpu, Cpu) {
         }
     });
     (tensor(dskip, [n, c, h, w]), dx)
+}
+
+/// By queries, keys and values, and by the bias.
+pub(super) fn window_attention_grad(
+    qkv: Cpu,
+    bias: Cpu,
+    s: &AttentionShape,
+    dy: Cpu,
+) -> (Cpu, Cpu) {
+    let (qkv, bias, dy) = (contiguous(qkv), contiguous(bias), contiguous(dy));
+    let mut dbias = vec![0.0; s.heads * s.tokens() * s.tokens()];
+    let dqkv = alike(&qkv, |dqkv| {
+        let (qkv, bias, dy) = (values(&qkv), values(&bias), values(&dy));
+        Kernels::best().window_attention_grad(s, qkv, bias, dy, dqkv, &mut dbias);
+    });
+    (dqkv, tensor(dbias, [s.heads, s.tokens(), s.tokens()]))
+}
+
+/// By the input.
+pub(super) fn gelu_grad(x: Cpu, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    alike(&x, |dx| {
+        Kernels::best().gelu_grad(values(&x), values(&dy), dx);
+    })
 }

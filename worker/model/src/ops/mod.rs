@@ -16,8 +16,8 @@ use burn::{
 use crate::kernel::AdamW;
 use cpu::NetOps;
 pub use window::{
-    APART, from_windows, layer_norm, linear, position_bias, relative_positions, shifted,
-    shifted_back, window_attention, window_mask, windows,
+    APART, Windows, attend, from_windows, gelu, layer_norm, linear, position_bias,
+    relative_positions, shifted, shifted_back, window_attention, window_mask, windows,
 };
 
 /// Added to variances: PyTorch's default.

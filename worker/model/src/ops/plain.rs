@@ -6,7 +6,7 @@ use burn::tensor::{
     ops::{ConvOptions, InterpolateMode, InterpolateOptions, MaxPoolOptions},
 };
 
-use super::{EPSILON, Normalised};
+use super::{EPSILON, Normalised, attend, from_windows, shifted, shifted_back, windows};
 use crate::kernel::AdamW;
 
 /// See [`super::conv3x3`].
@@ -72,6 +72,20 @@ pub fn max_pool(x: Tensor<4>) -> Tensor<4> {
 pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
     let options = InterpolateOptions::new(InterpolateMode::Nearest).with_scale_factor([2.0, 2.0]);
     Tensor::cat(vec![skip, module::interpolate(x, options)], 1)
+}
+
+/// See [`super::window_attention`]; `mask` is [`super::window_mask`] where windows are shifted.
+pub fn window_attention(
+    qkv: Tensor<4>,
+    bias: Tensor<3>,
+    window: usize,
+    shift: usize,
+    mask: Option<Tensor<3>>,
+) -> Tensor<4> {
+    let [_, h, w, _] = qkv.dims();
+    let seen = windows(shifted(qkv, shift), window);
+    let said = from_windows(attend(seen, bias, mask), window, [h, w]);
+    shifted_back(said, shift)
 }
 
 /// See [`super::adamw`].

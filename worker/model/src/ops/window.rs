@@ -1,12 +1,17 @@
 //! Attention within windows, as in Swin transformers (Liu et al., ICCV 2021, sections 3.2 and 3.3) and SwinIR (Liang et al.,
-//! ICCVW 2021): compositions of burn's operations, the same on every device.
+//! ICCVW 2021). [`window_attention`] and [`gelu`] have kernels of ours; the rest are compositions of burn's operations, of which
+//! the plain form of attention is made too.
 //!
 //! A *token* is a pixel's row of features. Feature maps lie with their channels last here, (N, H, W, C), and windows of
 //! w×w tokens as (N·H/w·W/w, w², C), windows row by row within an image, tokens row by row within a window.
 
-use burn::tensor::{Int, Tensor, TensorData, activation::softmax, module};
+use burn::{
+    backend::Dispatch,
+    tensor::{Device, Int, Tensor, TensorData, activation, module},
+};
 
-use super::EPSILON;
+use super::{EPSILON, cpu::NetOps, has_kernels, plain};
+use crate::kernel::AttentionShape;
 
 /// What keeps tokens apart that a shift brought into one window: added to their scores, as in the released code.
 pub const APART: f64 = -100.0;
@@ -119,12 +124,80 @@ pub fn window_mask([h, w]: [usize; 2], window: usize, shift: usize) -> Vec<f32> 
     mask
 }
 
-/// Multi-head attention within windows.
+/// How an image is cut into windows.
+#[derive(Debug, Clone)]
+pub struct Windows {
+    /// Rows and columns of a window.
+    pub window: usize,
+    /// How far the windows lie from the first pixel, around the image's ends.
+    pub shift: usize,
+    /// [`window_mask`], where a device needs it.
+    mask: Option<Tensor<3>>,
+}
+
+impl Windows {
+    /// Windows of an image of (H, W) tokens; H and W are multiples of `window`, `shift` is less.
+    pub fn new([h, w]: [usize; 2], window: usize, shift: usize, device: &Device) -> Self {
+        let mask = (shift > 0 && !has_kernels(device)).then(|| {
+            let tokens = window * window;
+            let mask = TensorData::new(
+                window_mask([h, w], window, shift),
+                [h * w / tokens, tokens, tokens],
+            );
+            Tensor::from_data(mask, device)
+        });
+        Self {
+            window,
+            shift,
+            mask,
+        }
+    }
+
+    fn shape(&self, [images, height, width, all]: [usize; 4], heads: usize) -> AttentionShape {
+        AttentionShape {
+            images,
+            height,
+            width,
+            window: self.window,
+            shift: self.shift,
+            heads,
+            size: all / 3 / heads,
+            apart: APART as f32,
+        }
+    }
+}
+
+/// Multi-head attention within windows of a map.
+///
+/// `qkv` (N, H, W, 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩ times
+/// (C/heads)^−½, plus `bias` (heads, w², w²), plus [`window_mask`]. Gives (N, H, W, C), head after head.
+pub fn window_attention(qkv: Tensor<4>, bias: Tensor<3>, windows: &Windows) -> Tensor<4> {
+    if !has_kernels(&qkv.device()) {
+        let mask = windows.mask.clone();
+        return plain::window_attention(qkv, bias, windows.window, windows.shift, mask);
+    }
+    let shape = windows.shape(qkv.dims(), bias.dims()[0]);
+    Tensor::from_dispatch(Dispatch::window_attention(
+        qkv.into_dispatch(),
+        bias.into_dispatch(),
+        shape,
+    ))
+}
+
+/// x·Φ(x), with Φ the standard normal distribution (Hendrycks and Gimpel, 2016; the exact form).
+pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    if !has_kernels(&x.device()) {
+        return activation::gelu(x);
+    }
+    Tensor::from_dispatch(Dispatch::gelu(x.into_dispatch()))
+}
+
+/// Multi-head attention within windows that are cut out already: what [`window_attention`] is elsewhere than on the CPU.
 ///
 /// `qkv` (windows, w², 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩
 /// times (C/heads)^−½, plus `bias` (heads, w², w²), plus `mask` (windows of an image, w², w²), the same for every image. Gives
 /// (windows, w², C), head after head.
-pub fn window_attention(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>) -> Tensor<3> {
+pub fn attend(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>) -> Tensor<3> {
     let [all, tokens, channels] = qkv.dims();
     let [heads, ..] = bias.dims();
     let size = channels / 3 / heads;
@@ -147,7 +220,7 @@ pub fn window_attention(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>
         let mask = mask.reshape([1, of_image, 1, tokens, tokens]);
         scores = (by_image + mask).reshape([all, heads, tokens, tokens]);
     }
-    softmax(scores, 3)
+    activation::softmax(scores, 3)
         .matmul(v)
         .swap_dims(1, 2)
         .reshape([all, tokens, heads * size])

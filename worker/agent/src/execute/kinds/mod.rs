@@ -237,7 +237,7 @@ impl TaskExecutor {
             let opened = picofarm_model::device::open(gpus);
             self.0.gpus = opened.map_err(|e| refused(device::plain(e)))?;
             for gpu in &self.0.gpus {
-                tracing::info!(%gpu, "computes as the CPU does");
+                tracing::info!(%gpu, "{}", gpu.accuracy());
             }
         }
         #[cfg(not(feature = "networks"))]

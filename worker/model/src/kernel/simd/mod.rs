@@ -113,6 +113,10 @@ pub(super) trait Lanes: Copy {
     fn relu(self) -> Self;
     /// `self` where `gate > 0`, else +0.
     fn where_positive(self, gate: Self) -> Self;
+    /// `self > o ? self : o`: where either is NaN, `o`.
+    fn max(self, o: Self) -> Self;
+    /// 2 to the power of whole numbers from -126 to 127.
+    fn power_of_two(self) -> Self;
 
     /// The first sixteen values of a slice.
     #[inline(always)]
@@ -254,6 +258,14 @@ impl Lanes for [f32; LANES] {
     #[inline(always)]
     fn where_positive(self, gate: Self) -> Self {
         std::array::from_fn(|i| if gate[i] > 0.0 { self[i] } else { 0.0 })
+    }
+    #[inline(always)]
+    fn max(self, o: Self) -> Self {
+        std::array::from_fn(|i| if self[i] > o[i] { self[i] } else { o[i] })
+    }
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        self.map(|n| f32::from_bits((n as i32).wrapping_add(127).cast_unsigned() << 23))
     }
 }
 

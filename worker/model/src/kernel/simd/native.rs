@@ -75,6 +75,17 @@ impl Lanes for Wide {
         })
     }
     #[inline(always)]
+    fn max(self, o: Self) -> Self {
+        Self(unsafe { _mm512_max_ps(self.0, o.0) })
+    }
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        Self(unsafe {
+            let exponent = _mm512_add_epi32(_mm512_cvtps_epi32(self.0), _mm512_set1_epi32(127));
+            _mm512_castsi512_ps(_mm512_slli_epi32::<23>(exponent))
+        })
+    }
+    #[inline(always)]
     fn unzip(a: Self, b: Self) -> (Self, Self) {
         unsafe {
             let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
@@ -203,6 +214,20 @@ impl Lanes for Pair {
             let a = _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0, zero);
             let b = _mm256_cmp_ps::<_CMP_GT_OQ>(gate.1, zero);
             Self(_mm256_and_ps(a, self.0), _mm256_and_ps(b, self.1))
+        }
+    }
+    #[inline(always)]
+    fn max(self, o: Self) -> Self {
+        unsafe { Self(_mm256_max_ps(self.0, o.0), _mm256_max_ps(self.1, o.1)) }
+    }
+    #[inline(always)]
+    fn power_of_two(self) -> Self {
+        unsafe {
+            let of = |n| {
+                let exponent = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
+                _mm256_castsi256_ps(_mm256_slli_epi32::<23>(exponent))
+            };
+            Self(of(self.0), of(self.1))
         }
     }
 }

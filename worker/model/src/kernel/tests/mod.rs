@@ -3,7 +3,9 @@
 
 use super::{simd::Isa, *};
 
+mod attention;
 mod conv;
+mod exp;
 mod norm;
 mod rest;
 
