@@ -86,6 +86,37 @@ fn attention_and_gelu_equal_burns_and_so_do_their_gradients() {
 }
 
 #[test]
+fn what_is_done_along_time_equals_burns_and_so_do_its_gradients() {
+    for (images, moments, c, h, w) in [(2, 4, 3, 5, 2), (1, 2, 1, 4, 6), (3, 6, 2, 3, 3)] {
+        let x = random([images * moments, c, h, w], 1);
+        equal!(
+            ops::beside(x.clone(), moments),
+            plain::beside(x.clone(), moments),
+            x
+        );
+        equal!(ops::halve_time(x.clone()), plain::halve_time(x.clone()), x);
+    }
+    let x = random([3, 2, 2, 2], 2);
+    equal!(ops::beside(x.clone(), 1), plain::beside(x.clone(), 1), x);
+}
+
+#[test]
+fn a_projection_of_bins_equals_that_of_their_one_hot_tensor() {
+    let (n, h, w, channels, outputs) = (2, 3, 5, 7, 4);
+    // -1 and what lies beyond the channels are pixels of zeros.
+    let bins: Vec<i64> = (0..n * h * w).map(|i| i as i64 * 5 % 10 - 1).collect();
+    let bins = TensorData::new(bins, [n, h, w]);
+    let bins = Tensor::<3, Int>::from_data(bins, &Device::flex().autodiff());
+    let (k, b) = (random([outputs, channels, 1, 1], 1), random([outputs], 2));
+    equal!(
+        ops::one_hot_conv1x1(bins.clone(), k.clone(), b.clone()),
+        plain::conv1x1(plain::one_hot(bins.clone(), channels), k.clone(), b.clone()),
+        k,
+        b
+    );
+}
+
+#[test]
 fn batch_norm_with_relu_equals_burns_and_so_do_its_gradients_and_statistics() {
     let (x, gamma, beta) = (random([3, 5, 4, 6], 1), random([5], 2), random([5], 3));
     let ours = ops::batch_norm_relu(x.clone(), gamma.clone(), beta.clone());

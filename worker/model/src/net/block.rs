@@ -167,6 +167,18 @@ impl Linear {
             pass.lower(bias),
         ))
     }
+
+    /// The same of one-hot channels.
+    pub(super) fn one_hot(&self, pass: &Pass, bins: Tensor<3, Int>) -> Tensor<4> {
+        let bias: Tensor<1> = pass.get(self.bias);
+        let [outputs, inputs] = [bias.dims()[0], self.inputs(pass)];
+        let weight = pass.flat(self.weight).reshape([outputs, inputs, 1, 1]);
+        pass.raise(ops::one_hot_conv1x1(
+            bins,
+            pass.lower(weight),
+            pass.lower(bias),
+        ))
+    }
 }
 
 /// The last layer: 1×1 convolution with a bias.

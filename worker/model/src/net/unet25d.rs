@@ -94,25 +94,25 @@ impl Unet25d {
 
     /// What the encoder gives at each level, (N·T, C, H, W), from the finest.
     fn features(&self, pass: &mut Pass, input: Input) -> Vec<Tensor<4>> {
-        let [n, bins, h, w] = input.dense.dims();
-        let mut streams = vec![input.dense];
-        if let Some(one_hot) = input.one_hot {
-            streams.push(ops::plain::one_hot(one_hot, bins));
+        let [n, _, h, w] = input.dense.dims();
+        // A shared projection is the first and the last.
+        let (Some(of_dense), Some(of_one_hot)) =
+            (self.projections.first(), self.projections.last())
+        else {
+            unreachable!("a network has a projection")
+        };
+        let mut streams = vec![of_dense.forward(pass, input.dense)];
+        if let Some(bins) = input.one_hot {
+            streams.push(of_one_hot.one_hot(pass, bins));
         }
-        // A shared projection is the only one, whatever the number of streams.
-        let streams = streams.into_iter().zip(self.projections.iter().cycle());
-        let streams: Vec<Tensor<5>> = streams
-            .map(|(x, projection)| {
-                let x = projection.forward(pass, x);
-                x.reshape([n, self.time, 1, h, w])
-            })
-            .collect();
+        let moments = |x: Tensor<4>| x.reshape([n, self.time, 1, h, w]);
+        let streams: Vec<Tensor<5>> = streams.into_iter().map(moments).collect();
         let channels = streams.len();
         let mut x = Tensor::cat(streams, 2).reshape([n * self.time, channels, h, w]);
         let mut features = Vec::new();
         for (level, block) in self.encoders.iter().enumerate() {
             if level > 0 {
-                x = halve_time(ops::max_pool(x));
+                x = ops::halve_time(ops::max_pool(x));
             }
             for cbr in block {
                 x = cbr.forward(pass, x, self.time >> level);
@@ -121,13 +121,6 @@ impl Unet25d {
         }
         features
     }
-}
-
-/// The greater of each two moments.
-fn halve_time(x: Tensor<4>) -> Tensor<4> {
-    let [images, c, h, w] = x.dims();
-    let pairs = x.reshape([images / 2, 2, c, h, w]);
-    pairs.max_dim(1).reshape([images / 2, c, h, w])
 }
 
 /// (N·T, C, H, W) to (N, C, H, W) through layers over time, with ReLU between them.
@@ -170,13 +163,8 @@ impl Cbr {
     }
 
     fn forward(&self, pass: &mut Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
-        let [images, c, h, w] = x.dims();
-        let n = images / time;
-        let dark = Tensor::<5>::zeros([n, 1, c, h, w], &x.device());
-        let x = x.reshape([n, time, c, h, w]);
-        let padded = Tensor::cat(vec![dark.clone(), x, dark], 1);
-        let moments = (0..3).map(|k| padded.clone().narrow(1, k, time)).collect();
-        let beside = Tensor::cat(moments, 2).reshape([images, 3 * c, h, w]);
+        let c = x.dims()[1];
+        let beside = ops::beside(x, time);
         let weight: Tensor<5> = pass.get(self.weight);
         let outputs = weight.dims()[0];
         let weight = weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3]);

@@ -10,7 +10,8 @@ use burn::{
 
 use super::EPSILON;
 use crate::kernel::{
-    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, NormShape, OneHotShape, PlaneShape,
+    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, MomentShape, NormShape, OneHotShape,
+    PlaneShape,
 };
 
 /// Operations of networks; shapes as in [`super`].
@@ -43,6 +44,8 @@ pub trait NetOps: Backend {
         shape: AttentionShape,
     ) -> FloatTensor<Self>;
     fn gelu(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn beside(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
+    fn halve_time(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
         p: FloatTensor<Self>,
         g: FloatTensor<Self>,
@@ -118,6 +121,15 @@ pub(super) fn planes([n, c, height, width]: [usize; 4]) -> PlaneShape {
         planes: n * c,
         height,
         width,
+    }
+}
+
+/// Images of `moments` each.
+pub(super) fn moment_shape([all, c, h, w]: [usize; 4], moments: usize) -> MomentShape {
+    MomentShape {
+        images: all / moments,
+        moments,
+        values: c * h * w,
     }
 }
 
@@ -250,6 +262,24 @@ impl NetOps for Flex {
     fn gelu(x: Cpu) -> Cpu {
         let x = contiguous(x);
         alike(&x, |y| Kernels::best().gelu(values(&x), y))
+    }
+
+    fn beside(x: Cpu, moments: usize) -> Cpu {
+        let x = contiguous(x);
+        let [n, c, h, w] = dims(&x);
+        let s = moment_shape([n, c, h, w], moments);
+        made([n, 3 * c, h, w], |out| {
+            Kernels::best().beside(&s, values(&x), out);
+        })
+    }
+
+    fn halve_time(x: Cpu) -> Cpu {
+        let x = contiguous(x);
+        let [n, c, h, w] = dims(&x);
+        let s = moment_shape([n, c, h, w], 2);
+        made([n / 2, c, h, w], |y| {
+            Kernels::best().halve_time(&s, values(&x), y);
+        })
     }
 
     fn adamw(p: Cpu, g: Cpu, m: Cpu, v: Cpu, settings: AdamW) -> (Cpu, Cpu, Cpu) {

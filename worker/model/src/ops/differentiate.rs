@@ -136,6 +136,29 @@ impl Backward<Flex, 1> for Gelu {
     }
 }
 
+#[derive(Debug)]
+struct Beside;
+impl Backward<Flex, 1> for Beside {
+    /// Moments of an image.
+    type State = usize;
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [to_x] = ops.parents;
+        give!(grads, to_x, gradient::beside_grad(dy, ops.state));
+    }
+}
+
+#[derive(Debug)]
+struct HalveTime;
+impl Backward<Flex, 1> for HalveTime {
+    type State = Cpu;
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [to_x] = ops.parents;
+        give!(grads, to_x, gradient::halve_time_grad(ops.state, dy));
+    }
+}
+
 impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
     fn conv3x3(x: Tracked, w: Tracked) -> Tracked {
         let y = Flex::conv3x3(x.primitive().clone(), w.primitive().clone());
@@ -215,6 +238,26 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
     fn gelu(x: Tracked) -> Tracked {
         let y = Flex::gelu(x.primitive().clone());
         match Gelu.prepare::<C>([x.node()]).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish(x.into_primitive(), y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn beside(x: Tracked, moments: usize) -> Tracked {
+        let y = Flex::beside(x.primitive().clone(), moments);
+        match Beside.prepare::<C>([x.node()]).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish(moments, y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn halve_time(x: Tracked) -> Tracked {
+        let y = Flex::halve_time(x.primitive().clone());
+        match HalveTime
+            .prepare::<C>([x.node()])
+            .compute_bound()
+            .stateful()
+        {
             OpsKind::Tracked(to) => to.finish(x.into_primitive(), y),
             OpsKind::UnTracked(to) => to.finish(y),
         }

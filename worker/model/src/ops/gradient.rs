@@ -5,8 +5,8 @@ use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
 use super::{
     EPSILON,
     cpu::{
-        Cpu, alike, bins, contiguous, conv_shape, dims, made, norm_shape, one_hot_shape, planes,
-        tensor, values,
+        Cpu, alike, bins, contiguous, conv_shape, dims, made, moment_shape, norm_shape,
+        one_hot_shape, planes, tensor, values,
     },
 };
 use crate::kernel::{AttentionShape, BatchNorm, Kernels};
@@ -160,5 +160,24 @@ pub(super) fn gelu_grad(x: Cpu, dy: Cpu) -> Cpu {
     let (x, dy) = (contiguous(x), contiguous(dy));
     alike(&x, |dx| {
         Kernels::best().gelu_grad(values(&x), values(&dy), dx);
+    })
+}
+
+/// By the input.
+pub(super) fn beside_grad(dy: Cpu, moments: usize) -> Cpu {
+    let dy = contiguous(dy);
+    let [n, c, h, w] = dims(&dy);
+    let s = moment_shape([n, c / 3, h, w], moments);
+    made([n, c / 3, h, w], |dx| {
+        Kernels::best().beside_grad(&s, values(&dy), dx);
+    })
+}
+
+/// By the input.
+pub(super) fn halve_time_grad(x: Cpu, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    let s = moment_shape(dims(&x), 2);
+    alike(&x, |dx| {
+        Kernels::best().halve_time_grad(&s, values(&x), values(&dy), dx);
     })
 }

@@ -150,6 +150,35 @@ pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
     ))
 }
 
+/// Images of `moments` each, (N·T, C, H, W), with the channels of the moments before, at and after each beside each other: (N·T,
+/// 3·C, H, W), zeros beyond the first and the last.
+pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return plain::beside(x, moments);
+    }
+    Tensor::from_dispatch(Dispatch::beside(x.into_dispatch(), moments))
+}
+
+/// The greater of each two images in a row, (N, C, H, W) to (N/2, C, H, W); the first of equals wins.
+pub fn halve_time(x: Tensor<4>) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return plain::halve_time(x);
+    }
+    Tensor::from_dispatch(Dispatch::halve_time(x.into_dispatch()))
+}
+
+/// [`conv1x1`] of the one-hot tensor of `bins` (N, H, W) with (O, B, 1, 1) and a bias (O), without making that tensor: a row of
+/// the weights for each pixel. A bin outside 0..B is a pixel of zeros.
+pub fn one_hot_conv1x1(bins: Tensor<3, Int>, w: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
+    let ([n, h, wide], [outputs, channels, ..]) = (bins.dims(), w.dims());
+    let none = Tensor::<2>::zeros([1, outputs], &w.device()).cast(w.dtype());
+    let rows = Tensor::cat(vec![w.reshape([outputs, channels]).transpose(), none], 0);
+    let outside = bins.clone().lower_elem(0) | bins.clone().greater_equal_elem(channels as i64);
+    let rows = rows.select(0, bins.mask_fill(outside, channels as i64).flatten(0, 2));
+    let y = (rows + bias.reshape([1, outputs])).reshape([n, h, wide, outputs]);
+    y.permute([0, 3, 1, 2])
+}
+
 /// One step of AdamW over one parameter: the parameter and its two moments after it.
 pub fn adamw(
     settings: AdamW,

@@ -88,6 +88,24 @@ pub fn window_attention(
     shifted_back(said, shift)
 }
 
+/// See [`super::beside`].
+pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let n = images / moments;
+    let dark = Tensor::<5>::zeros([n, 1, c, h, w], &x.device()).cast(x.dtype());
+    let x = x.reshape([n, moments, c, h, w]);
+    let padded = Tensor::cat(vec![dark.clone(), x, dark], 1);
+    let each = (0..3).map(|k| padded.clone().narrow(1, k, moments));
+    Tensor::cat(each.collect(), 2).reshape([images, 3 * c, h, w])
+}
+
+/// See [`super::halve_time`].
+pub fn halve_time(x: Tensor<4>) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let pairs = x.reshape([images / 2, 2, c, h, w]);
+    pairs.max_dim(1).reshape([images / 2, c, h, w])
+}
+
 /// See [`super::adamw`].
 pub fn adamw(
     a: AdamW,
