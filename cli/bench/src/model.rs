@@ -12,6 +12,7 @@ use picofarm_model::{
     ModelError,
     device::{self, Gpus},
     input::{Batch, Target},
+    memory::Kept,
     net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
     train::Learner,
     trial::Trial,
@@ -82,6 +83,8 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         });
         return Ok(());
     }
+    // As where a worker trains.
+    let _kept = Kept::from_now();
     let mut peers = Vec::new();
     let folder = tempfile::tempdir().map_err(|e| io("a temporary folder", &e))?;
     if !args.peer.is_empty() {

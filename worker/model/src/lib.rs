@@ -8,6 +8,7 @@ mod error;
 mod evaluate;
 pub mod input;
 mod kernel;
+pub mod memory;
 pub mod metric;
 mod model;
 pub mod net;

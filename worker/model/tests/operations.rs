@@ -60,7 +60,7 @@ fn convolutions_equal_burns_and_so_do_their_gradients() {
 }
 
 #[test]
-fn attention_and_gelu_equal_burns_and_so_do_their_gradients() {
+fn what_transformers_are_made_of_equals_burns_and_so_do_its_gradients() {
     for (window, shift, heads, size) in [(4, 2, 2, 3), (8, 0, 1, 5), (2, 1, 3, 1)] {
         let (h, w) = (2 * window, 3 * window);
         let qkv = random([2, h, w, 3 * heads * size], 1);
@@ -75,6 +75,20 @@ fn attention_and_gelu_equal_burns_and_so_do_their_gradients() {
             plain::window_attention(qkv.clone(), bias.clone(), window, shift, mask),
             qkv,
             bias
+        );
+    }
+    for (rows, wide) in [(7, 24), (3, 5), (600, 16), (2, 33)] {
+        let (x, gamma, beta) = (
+            random([2, rows, wide], 1),
+            random([wide], 2),
+            random([wide], 3),
+        );
+        equal!(
+            ops::layer_norm(x.clone(), gamma.clone(), beta.clone()),
+            plain::layer_norm(x.clone(), gamma.clone(), beta.clone()),
+            x,
+            gamma,
+            beta
         );
     }
     let x = random([3, 5, 7], 3);

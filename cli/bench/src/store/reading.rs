@@ -3,8 +3,9 @@
 use std::{
     path::Path,
     sync::{
-        Arc, Barrier,
+        Arc, Mutex, PoisonError,
         atomic::{AtomicUsize, Ordering},
+        mpsc,
     },
     time::{Duration, Instant},
 };
@@ -273,8 +274,8 @@ fn loader(
     let pools = (0..threads).map(|_| pool(1)).collect::<Result<Vec<_>>>()?;
     let next = AtomicUsize::new(0);
     let total = READS * threads;
-    let ready = Barrier::new(threads + 1);
-    let one = |pool: &rayon::ThreadPool| -> Result<(), DatasetError> {
+    let begin = Mutex::new(());
+    let one = |pool: &rayon::ThreadPool, ready: mpsc::Sender<()>| -> Result<(), DatasetError> {
         let (mut buffer, mut scaled) = (Vec::new(), Vec::new());
         let mut read = |i: usize| -> Result<(), DatasetError> {
             let scene = (i % scenes) as u64;
@@ -296,10 +297,9 @@ fn loader(
             }
             Ok(())
         };
-        let first = (0..FIRST).try_for_each(&mut read);
-        // Whether it could read or not: the others wait.
-        ready.wait();
-        first?;
+        (0..FIRST).try_for_each(&mut read)?;
+        drop(ready);
+        drop(begin.lock().unwrap_or_else(PoisonError::into_inner));
         loop {
             match next.fetch_add(1, Ordering::Relaxed) {
                 i if i < total => read(i)?,
@@ -308,8 +308,18 @@ fn loader(
         }
     };
     let (results, cpu_s, seconds) = std::thread::scope(|scope| {
-        let readers: Vec<_> = pools.iter().map(|p| scope.spawn(|| one(p))).collect();
-        ready.wait();
+        let held = begin.lock().unwrap_or_else(PoisonError::into_inner);
+        let (ready, all_ready) = mpsc::channel();
+        let one = &one;
+        let reader = |pool| {
+            let ready = ready.clone();
+            scope.spawn(move || one(pool, ready))
+        };
+        let readers: Vec<_> = pools.iter().map(reader).collect();
+        drop(ready);
+        // Nothing is ever sent: this ends once every reader is ready, or has ended.
+        let _ = all_ready.recv();
+        drop(held);
         let start = Instant::now();
         let join = |r: std::thread::ScopedJoinHandle<'_, Result<(), DatasetError>>| r.join();
         let all = || readers.into_iter().map(join).collect::<Vec<_>>();

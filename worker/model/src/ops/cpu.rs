@@ -10,8 +10,8 @@ use burn::{
 
 use super::EPSILON;
 use crate::kernel::{
-    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, MomentShape, NormShape, OneHotShape,
-    PlaneShape,
+    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, LayerNorm, MomentShape, NormShape,
+    OneHotShape, PlaneShape,
 };
 
 /// Operations of networks; shapes as in [`super`].
@@ -44,6 +44,11 @@ pub trait NetOps: Backend {
         shape: AttentionShape,
     ) -> FloatTensor<Self>;
     fn gelu(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn layer_norm(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+    ) -> FloatTensor<Self>;
     fn beside(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
     fn halve_time(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
@@ -121,6 +126,15 @@ pub(super) fn planes([n, c, height, width]: [usize; 4]) -> PlaneShape {
         planes: n * c,
         height,
         width,
+    }
+}
+
+/// The parameters of a layer norm.
+pub(super) fn layer<'a>(gamma: &'a Cpu, beta: &'a Cpu) -> LayerNorm<'a> {
+    LayerNorm {
+        gamma: values(gamma),
+        beta: values(beta),
+        eps: EPSILON as f32,
     }
 }
 
@@ -262,6 +276,12 @@ impl NetOps for Flex {
     fn gelu(x: Cpu) -> Cpu {
         let x = contiguous(x);
         alike(&x, |y| Kernels::best().gelu(values(&x), y))
+    }
+
+    fn layer_norm(x: Cpu, gamma: Cpu, beta: Cpu) -> Cpu {
+        let (x, gamma, beta) = (contiguous(x), contiguous(gamma), contiguous(beta));
+        let norm = layer(&gamma, &beta);
+        alike(&x, |y| Kernels::best().layer_norm(&norm, values(&x), y))
     }
 
     fn beside(x: Cpu, moments: usize) -> Cpu {

@@ -137,6 +137,22 @@ impl Backward<Flex, 1> for Gelu {
 }
 
 #[derive(Debug)]
+struct Layer;
+impl Backward<Flex, 3> for Layer {
+    /// Input, scale, shift.
+    type State = [Cpu; 3];
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [x, gamma, beta] = ops.state;
+        let (dx, dgamma, dbeta) = gradient::layer_norm_grad(x, gamma, beta, dy);
+        let [to_x, to_gamma, to_beta] = ops.parents;
+        give!(grads, to_x, dx);
+        give!(grads, to_gamma, dgamma);
+        give!(grads, to_beta, dbeta);
+    }
+}
+
+#[derive(Debug)]
 struct Beside;
 impl Backward<Flex, 1> for Beside {
     /// Moments of an image.
@@ -239,6 +255,17 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         let y = Flex::gelu(x.primitive().clone());
         match Gelu.prepare::<C>([x.node()]).compute_bound().stateful() {
             OpsKind::Tracked(to) => to.finish(x.into_primitive(), y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn layer_norm(x: Tracked, gamma: Tracked, beta: Tracked) -> Tracked {
+        let inputs = [&x, &gamma, &beta].map(|t| t.primitive().clone());
+        let [a, b, c] = inputs.clone();
+        let y = Flex::layer_norm(a, b, c);
+        let nodes = [x.node(), gamma.node(), beta.node()];
+        match Layer.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish(inputs, y),
             OpsKind::UnTracked(to) => to.finish(y),
         }
     }

@@ -5,7 +5,7 @@ use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
 use super::{
     EPSILON,
     cpu::{
-        Cpu, alike, bins, contiguous, conv_shape, dims, made, moment_shape, norm_shape,
+        Cpu, alike, bins, contiguous, conv_shape, dims, layer, made, moment_shape, norm_shape,
         one_hot_shape, planes, tensor, values,
     },
 };
@@ -180,4 +180,23 @@ pub(super) fn halve_time_grad(x: Cpu, dy: Cpu) -> Cpu {
     alike(&x, |dx| {
         Kernels::best().halve_time_grad(&s, values(&x), values(&dy), dx);
     })
+}
+
+/// By input, scale and shift.
+pub(super) fn layer_norm_grad(x: Cpu, gamma: Cpu, beta: Cpu, dy: Cpu) -> (Cpu, Cpu, Cpu) {
+    let [x, gamma, beta, dy] = [x, gamma, beta, dy].map(contiguous);
+    let norm = layer(&gamma, &beta);
+    let wide = norm.gamma.len();
+    let (mut dgamma, mut dbeta) = (vec![0.0; wide], vec![0.0; wide]);
+    let dx = alike(&x, |dx| {
+        Kernels::best().layer_norm_grad(
+            &norm,
+            values(&x),
+            values(&dy),
+            dx,
+            &mut dgamma,
+            &mut dbeta,
+        );
+    });
+    (dx, tensor(dgamma, [wide]), tensor(dbeta, [wide]))
 }

@@ -74,6 +74,11 @@ pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
     Tensor::cat(vec![skip, module::interpolate(x, options)], 1)
 }
 
+/// See [`super::layer_norm`].
+pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<D> {
+    module::layer_norm(x, gamma, Some(beta), EPSILON)
+}
+
 /// See [`super::window_attention`]; `mask` is [`super::window_mask`] where windows are shifted.
 pub fn window_attention(
     qkv: Tensor<4>,

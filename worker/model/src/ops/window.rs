@@ -1,5 +1,5 @@
 //! Attention within windows, as in Swin transformers (Liu et al., ICCV 2021, sections 3.2 and 3.3) and SwinIR (Liang et al.,
-//! ICCVW 2021). [`window_attention`] and [`gelu`] have kernels of ours; the rest are compositions of burn's operations, of which
+//! ICCVW 2021). [`window_attention`], [`gelu`] and [`layer_norm`] have kernels of ours; the rest are compositions of burn's operations, of which
 //! the plain form of attention is made too.
 //!
 //! A *token* is a pixel's row of features. Feature maps lie with their channels last here, (N, H, W, C), and windows of
@@ -7,10 +7,10 @@
 
 use burn::{
     backend::Dispatch,
-    tensor::{Device, Int, Tensor, TensorData, activation, module},
+    tensor::{Device, Int, Tensor, TensorData, activation},
 };
 
-use super::{EPSILON, cpu::NetOps, has_kernels, plain};
+use super::{cpu::NetOps, has_kernels, plain};
 use crate::kernel::AttentionShape;
 
 /// What keeps tokens apart that a shift brought into one window: added to their scores, as in the released code.
@@ -18,7 +18,14 @@ pub const APART: f64 = -100.0;
 
 /// Layer norm over the last dimension, with PyTorch's epsilon: (…, C), scale (C) and shift (C) to (…, C).
 pub fn layer_norm<const D: usize>(x: Tensor<D>, gamma: Tensor<1>, beta: Tensor<1>) -> Tensor<D> {
-    module::layer_norm(x, gamma, Some(beta), EPSILON)
+    if !has_kernels(&x.device()) {
+        return plain::layer_norm(x, gamma, beta);
+    }
+    Tensor::from_dispatch(Dispatch::layer_norm(
+        x.into_dispatch(),
+        gamma.into_dispatch(),
+        beta.into_dispatch(),
+    ))
 }
 
 /// (…, I), weights (O, I) and a bias (O) to (…, O), as PyTorch's `Linear`.

@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use picofarm_dataset::{Dataset, Evaluation, Models, Pinned, ShardName, SplitUsed, sha256_hex};
-use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline};
+use picofarm_model::{Answered, Device, Evaluated, answered, baseline::Baseline, memory::Kept};
 use picofarm_proto::{
     key::evaluation_key,
     model::{EvaluateShardTask, EvaluateTask, Histogram, TaskSpec, TrainSettings},
@@ -36,6 +36,7 @@ impl RunTask for EvaluateTask {
 
     /// Evaluates the models that `task` names; joins their shards where they have some.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let _kept = Kept::from_now();
         let evaluation = EvaluationRun::new((context, context.device(task)?), self, control)?;
         let (mut documents, mut computed) = (Vec::new(), false);
         for which in 0..self.evaluate.models.len() {
@@ -59,6 +60,7 @@ impl RunTask for EvaluateShardTask {
 
     /// Asks the models of the scenes of shard `task.index`, but those whose evaluation or shard is there.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let _kept = Kept::from_now();
         let evaluation =
             EvaluationRun::new((context, context.device(task)?), &self.whole, control)?;
         let (mut bytes, mut computed) = (0, false);

@@ -17,6 +17,7 @@ use picofarm_dataset::{
 use picofarm_members::Members;
 use picofarm_model::{
     Device, ModelError, cpu,
+    memory::Kept,
     scene::Scenes,
     train::{Ended, Event, Line, Plan, Sources, Trained, Training},
 };
@@ -69,6 +70,7 @@ impl RunTask for TrainTask {
 
     /// Trains what `task` names; with `force` although it is there, and on a graphics processor where the job asks for `gpus`.
     fn run(&self, context: &Context, task: &Task, control: &Control) -> Result<Output, TaskError> {
+        let _kept = Kept::from_now();
         let stores = &context.stores;
         let force = task.spec.force;
         let training = TrainingRun {

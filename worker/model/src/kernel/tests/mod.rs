@@ -6,6 +6,7 @@ use super::{simd::Isa, *};
 mod attention;
 mod conv;
 mod exp;
+mod layer_norm;
 mod moments;
 mod norm;
 mod rest;
