@@ -115,6 +115,32 @@ fn what_is_done_along_time_equals_burns_and_so_do_its_gradients() {
 }
 
 #[test]
+fn borders_and_leaky_relu_equal_burns_and_so_do_their_gradients() {
+    for (images, moments, c, h, w) in [(2, 4, 3, 5, 2), (1, 1, 2, 1, 1), (3, 2, 2, 4, 37)] {
+        let x = random([images * moments, c, h, w], 1);
+        for volume in [false, true] {
+            equal!(
+                ops::surround(x.clone(), moments, volume),
+                plain::surround(x.clone(), moments, volume),
+                x
+            );
+        }
+        let (x, b) = (random([images, c, h + 2, w + 2], 2), random([c], 3));
+        equal!(
+            ops::crop(x.clone(), b.clone()),
+            plain::crop(x.clone(), b.clone()),
+            x,
+            b
+        );
+        equal!(
+            ops::leaky_relu(x.clone(), 0.2),
+            burn::tensor::activation::leaky_relu(x.clone(), 0.2),
+            x
+        );
+    }
+}
+
+#[test]
 fn a_projection_of_bins_equals_that_of_their_one_hot_tensor() {
     let (n, h, w, channels, outputs) = (2, 3, 5, 7, 4);
     // -1 and what lies beyond the channels are pixels of zeros.

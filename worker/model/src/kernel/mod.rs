@@ -10,6 +10,7 @@
 
 mod adam;
 mod attention;
+mod border;
 mod conv;
 mod conv_shape;
 mod exp;
@@ -27,6 +28,7 @@ mod winograd_grad;
 
 pub use adam::AdamW;
 pub use attention::AttentionShape;
+pub use border::BorderShape;
 pub use conv_shape::ConvShape;
 pub use layer_norm::LayerNorm;
 pub use moments::MomentShape;

@@ -8,11 +8,11 @@ use burn::tensor::{Tensor, activation::relu};
 
 use super::{
     pass::{Input, Pass},
-    residual::{Chain, Residual, bordered},
+    residual::{Chain, Residual},
     spec::NetSpec,
 };
 use crate::{
-    ops,
+    ops::{self, plain::bordered},
     parameters::{Begin, Declarations, Id},
 };
 

@@ -3,7 +3,7 @@
 //!
 //! A volume lies as (N·T, C, H, W), an image for each moment, as in the 2.5D U-Net.
 
-use burn::tensor::{Tensor, activation::leaky_relu};
+use burn::tensor::Tensor;
 
 use super::pass::Pass;
 use crate::{
@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// Slope of leaky ReLU below 0.
-const SLOPE: f64 = 0.2;
+const SLOPE: f32 = 0.2;
 
 /// 3×3 or 3×3×3 convolution with a bias, whose border is repeated around what it sees.
 #[derive(Debug, Clone, Copy)]
@@ -43,26 +43,19 @@ impl Bordered {
 
     /// Of `time` moments; 1 for images.
     pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
-        let [images, c, h, w] = x.dims();
-        let (beside, weight) = match self.volume {
-            false => (x, pass.get(self.weight)),
+        let c = x.dims()[1];
+        let weight = match self.volume {
+            false => pass.get(self.weight),
             true => {
-                let x = bordered(x.reshape([images / time, time, c, h, w]), 1);
-                let moments = (0..3).map(|k| x.clone().narrow(1, k, time)).collect();
-                let beside = Tensor::cat(moments, 2).reshape([images, 3 * c, h, w]);
                 let weight: Tensor<5> = pass.get(self.weight);
                 let outputs = weight.dims()[0];
                 // Channels of a moment lie beside each other.
-                let weight = weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3]);
-                (beside, weight)
+                weight.swap_dims(1, 2).reshape([outputs, 3 * c, 3, 3])
             }
         };
-        let around = bordered(bordered(beside, 2), 3);
-        let y = ops::conv3x3(pass.lower(around), pass.lower(weight));
-        let y = pass.raise(y.narrow(2, 1, h).narrow(3, 1, w));
-        let bias: Tensor<1> = pass.get(self.bias);
-        let outputs = bias.dims()[0];
-        y + bias.reshape([1, outputs, 1, 1])
+        let around = ops::surround(x, time, self.volume);
+        let y = pass.raise(ops::conv3x3(pass.lower(around), pass.lower(weight)));
+        ops::crop(y, pass.get(self.bias))
     }
 }
 
@@ -82,8 +75,8 @@ impl Residual {
 
     pub(super) fn forward(&self, pass: &Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
         let [first, second] = &self.0;
-        let between = leaky_relu(first.forward(pass, x.clone(), time), SLOPE);
-        leaky_relu(second.forward(pass, between, time) + x, SLOPE)
+        let between = ops::leaky_relu(first.forward(pass, x.clone(), time), SLOPE);
+        ops::leaky_relu(second.forward(pass, between, time) + x, SLOPE)
     }
 }
 
@@ -124,12 +117,4 @@ impl Chain {
             None => x,
         }
     }
-}
-
-/// One more at either end of a dimension, as what lies there.
-pub(super) fn bordered<const D: usize>(x: Tensor<D>, dim: usize) -> Tensor<D> {
-    let last = x.dims()[dim] - 1;
-    let ends = [0, last].map(|at| x.clone().narrow(dim, at, 1));
-    let [first, last] = ends;
-    Tensor::cat(vec![first, x, last], dim)
 }

@@ -10,8 +10,8 @@ use burn::{
 
 use super::EPSILON;
 use crate::kernel::{
-    AdamW, AttentionShape, BatchNorm, ConvShape, Kernels, LayerNorm, MomentShape, NormShape,
-    OneHotShape, PlaneShape,
+    AdamW, AttentionShape, BatchNorm, BorderShape, ConvShape, Kernels, LayerNorm, MomentShape,
+    NormShape, OneHotShape, PlaneShape,
 };
 
 /// Operations of networks; shapes as in [`super`].
@@ -49,6 +49,9 @@ pub trait NetOps: Backend {
         gamma: FloatTensor<Self>,
         beta: FloatTensor<Self>,
     ) -> FloatTensor<Self>;
+    fn surround(x: FloatTensor<Self>, moments: usize, volume: bool) -> FloatTensor<Self>;
+    fn crop(x: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self>;
     fn beside(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
     fn halve_time(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
@@ -135,6 +138,22 @@ pub(super) fn layer<'a>(gamma: &'a Cpu, beta: &'a Cpu) -> LayerNorm<'a> {
         gamma: values(gamma),
         beta: values(beta),
         eps: EPSILON as f32,
+    }
+}
+
+/// Images without their border, of which `moments` in a row belong together.
+pub(super) fn border_shape(
+    [images, channels, height, width]: [usize; 4],
+    moments: usize,
+    volume: bool,
+) -> BorderShape {
+    BorderShape {
+        images,
+        moments,
+        volume,
+        channels,
+        height,
+        width,
     }
 }
 
@@ -282,6 +301,31 @@ impl NetOps for Flex {
         let (x, gamma, beta) = (contiguous(x), contiguous(gamma), contiguous(beta));
         let norm = layer(&gamma, &beta);
         alike(&x, |y| Kernels::best().layer_norm(&norm, values(&x), y))
+    }
+
+    fn surround(x: Cpu, moments: usize, volume: bool) -> Cpu {
+        let x = contiguous(x);
+        let [n, c, h, w] = dims(&x);
+        let s = border_shape([n, c, h, w], moments, volume);
+        let parts = if volume { 3 } else { 1 };
+        made([n, parts * c, h + 2, w + 2], |out| {
+            Kernels::best().surround(&s, values(&x), out);
+        })
+    }
+
+    fn crop(x: Cpu, bias: Cpu) -> Cpu {
+        let (x, bias) = (contiguous(x), contiguous(bias));
+        let [n, c, h, w] = dims(&x);
+        let at = [n, c, h - 2, w - 2];
+        let s = border_shape(at, 1, false);
+        made(at, |out| {
+            Kernels::best().crop(&s, values(&x), values(&bias), out);
+        })
+    }
+
+    fn leaky_relu(x: Cpu, slope: f32) -> Cpu {
+        let x = contiguous(x);
+        alike(&x, |y| Kernels::best().leaky_relu(slope, values(&x), y))
     }
 
     fn beside(x: Cpu, moments: usize) -> Cpu {

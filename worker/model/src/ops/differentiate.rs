@@ -153,6 +153,41 @@ impl Backward<Flex, 3> for Layer {
 }
 
 #[derive(Debug)]
+struct Surround;
+impl Backward<Flex, 1> for Surround {
+    /// Moments in a row, and whether they lie beside each other.
+    type State = (usize, bool);
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let ((moments, volume), [to_x]) = (ops.state, ops.parents);
+        give!(grads, to_x, gradient::surround_grad(dy, moments, volume));
+    }
+}
+
+#[derive(Debug)]
+struct Crop;
+impl Backward<Flex, 2> for Crop {
+    type State = ();
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [to_x, to_bias] = ops.parents;
+        give!(grads, to_x, gradient::crop_grad(dy.clone()));
+        give!(grads, to_bias, gradient::conv1x1_by_bias(dy));
+    }
+}
+
+#[derive(Debug)]
+struct Leaky;
+impl Backward<Flex, 1> for Leaky {
+    type State = (Cpu, f32);
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let ((x, slope), [to_x]) = (ops.state, ops.parents);
+        give!(grads, to_x, gradient::leaky_relu_grad(x, slope, dy));
+    }
+}
+
+#[derive(Debug)]
 struct Beside;
 impl Backward<Flex, 1> for Beside {
     /// Moments of an image.
@@ -266,6 +301,31 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         let nodes = [x.node(), gamma.node(), beta.node()];
         match Layer.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(to) => to.finish(inputs, y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn surround(x: Tracked, moments: usize, volume: bool) -> Tracked {
+        let y = Flex::surround(x.primitive().clone(), moments, volume);
+        match Surround.prepare::<C>([x.node()]).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish((moments, volume), y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn crop(x: Tracked, bias: Tracked) -> Tracked {
+        let y = Flex::crop(x.primitive().clone(), bias.primitive().clone());
+        let nodes = [x.node(), bias.node()];
+        match Crop.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish((), y),
+            OpsKind::UnTracked(to) => to.finish(y),
+        }
+    }
+
+    fn leaky_relu(x: Tracked, slope: f32) -> Tracked {
+        let y = Flex::leaky_relu(x.primitive().clone(), slope);
+        match Leaky.prepare::<C>([x.node()]).compute_bound().stateful() {
+            OpsKind::Tracked(to) => to.finish((x.into_primitive(), slope), y),
             OpsKind::UnTracked(to) => to.finish(y),
         }
     }

@@ -5,8 +5,8 @@ use burn::backend::{Flex, TensorMetadata, tensor::IntTensor};
 use super::{
     EPSILON,
     cpu::{
-        Cpu, alike, bins, contiguous, conv_shape, dims, layer, made, moment_shape, norm_shape,
-        one_hot_shape, planes, tensor, values,
+        Cpu, alike, bins, border_shape, contiguous, conv_shape, dims, layer, made, moment_shape,
+        norm_shape, one_hot_shape, planes, tensor, values,
     },
 };
 use crate::kernel::{AttentionShape, BatchNorm, Kernels};
@@ -199,4 +199,31 @@ pub(super) fn layer_norm_grad(x: Cpu, gamma: Cpu, beta: Cpu, dy: Cpu) -> (Cpu, C
         );
     });
     (dx, tensor(dgamma, [wide]), tensor(dbeta, [wide]))
+}
+
+/// By the input, which has the output's size without its border.
+pub(super) fn surround_grad(dy: Cpu, moments: usize, volume: bool) -> Cpu {
+    let dy = contiguous(dy);
+    let [n, c, h, w] = dims(&dy);
+    let at = [n, c / if volume { 3 } else { 1 }, h - 2, w - 2];
+    let s = border_shape(at, moments, volume);
+    made(at, |dx| Kernels::best().surround_grad(&s, values(&dy), dx))
+}
+
+/// By the input; by the bias it is [`conv1x1_by_bias`].
+pub(super) fn crop_grad(dy: Cpu) -> Cpu {
+    let dy = contiguous(dy);
+    let [n, c, h, w] = dims(&dy);
+    let s = border_shape([n, c, h, w], 1, false);
+    made([n, c, h + 2, w + 2], |dx| {
+        Kernels::best().crop_grad(&s, values(&dy), dx);
+    })
+}
+
+/// By the input.
+pub(super) fn leaky_relu_grad(x: Cpu, slope: f32, dy: Cpu) -> Cpu {
+    let (x, dy) = (contiguous(x), contiguous(dy));
+    alike(&x, |dx| {
+        Kernels::best().leaky_relu_grad(slope, values(&x), values(&dy), dx);
+    })
 }

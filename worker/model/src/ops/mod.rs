@@ -10,7 +10,7 @@ mod window;
 
 use burn::{
     backend::{Dispatch, DispatchDevice},
-    tensor::{Device, FloatDType, Int, Tensor},
+    tensor::{Device, FloatDType, Int, Tensor, activation},
 };
 
 use crate::kernel::AdamW;
@@ -148,6 +148,32 @@ pub fn join_upsampled(skip: Tensor<4>, x: Tensor<4>) -> Tensor<4> {
         skip.into_dispatch(),
         x.into_dispatch(),
     ))
+}
+
+/// One pixel more at every side of images (N·T, C, H, W), as what lies there: (N·T, C, H + 2, W + 2). In a volume of `moments` with
+/// the channels of the moments before, at and after each beside each other, the first and the last repeated: (N·T, 3·C, H + 2,
+/// W + 2).
+pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return plain::surround(x, moments, volume);
+    }
+    Tensor::from_dispatch(Dispatch::surround(x.into_dispatch(), moments, volume))
+}
+
+/// Images (N, C, H + 2, W + 2) without their outermost pixels, and a bias (C) added: (N, C, H, W).
+pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return plain::crop(x, bias);
+    }
+    Tensor::from_dispatch(Dispatch::crop(x.into_dispatch(), bias.into_dispatch()))
+}
+
+/// x where it is above 0, else `slope`·x; the slope lies below 1.
+pub fn leaky_relu(x: Tensor<4>, slope: f32) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return activation::leaky_relu(x, f64::from(slope));
+    }
+    Tensor::from_dispatch(Dispatch::leaky_relu(x.into_dispatch(), slope))
 }
 
 /// Images of `moments` each, (N·T, C, H, W), with the channels of the moments before, at and after each beside each other: (N·T,

@@ -93,6 +93,34 @@ pub fn window_attention(
     shifted_back(said, shift)
 }
 
+/// One more at either end of a dimension, as what lies there.
+pub fn bordered<const D: usize>(x: Tensor<D>, dim: usize) -> Tensor<D> {
+    let last = x.dims()[dim] - 1;
+    let ends = [0, last].map(|at| x.clone().narrow(dim, at, 1));
+    let [first, last] = ends;
+    Tensor::cat(vec![first, x, last], dim)
+}
+
+/// See [`super::surround`].
+pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let beside = match volume {
+        false => x,
+        true => {
+            let x = bordered(x.reshape([images / moments, moments, c, h, w]), 1);
+            let each = (0..3).map(|k| x.clone().narrow(1, k, moments));
+            Tensor::cat(each.collect(), 2).reshape([images, 3 * c, h, w])
+        }
+    };
+    bordered(bordered(beside, 2), 3)
+}
+
+/// See [`super::crop`].
+pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
+    let [_, c, h, w] = x.dims();
+    x.narrow(2, 1, h - 2).narrow(3, 1, w - 2) + bias.reshape([1, c, 1, 1])
+}
+
 /// See [`super::beside`].
 pub fn beside(x: Tensor<4>, moments: usize) -> Tensor<4> {
     let [images, c, h, w] = x.dims();

@@ -4,6 +4,7 @@
 use super::{simd::Isa, *};
 
 mod attention;
+mod border;
 mod conv;
 mod exp;
 mod layer_norm;

@@ -1,0 +1,265 @@
+//! What stands around convolutions that see a border repeated: images with one more pixel at every side, cut off again behind the
+//! convolution, and leaky ReLU.
+
+use rayon::prelude::*;
+
+use super::simd::{Kernels, LANES, Lanes, Op};
+
+/// Values of one task where values do not belong together.
+const PART: usize = 1 << 14;
+
+/// Images, each one of some moments.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BorderShape {
+    /// All images.
+    pub images: usize,
+    /// Images in a row that are moments of one thing; the first and the last are repeated too.
+    pub moments: usize,
+    /// Whether the channels of the moments before and after lie beside those of each.
+    pub volume: bool,
+    /// Channels.
+    pub channels: usize,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+}
+
+impl BorderShape {
+    /// Values of the images.
+    pub fn len(&self) -> usize {
+        self.images * self.channels * self.height * self.width
+    }
+
+    /// True without values.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Images beside each other in one with its border.
+    fn parts(&self) -> usize {
+        if self.volume { 3 } else { 1 }
+    }
+
+    fn image(&self) -> usize {
+        self.channels * self.height * self.width
+    }
+
+    /// Values of an image with its border, one part of it.
+    fn around(&self) -> usize {
+        self.channels * (self.height + 2) * (self.width + 2)
+    }
+
+    /// The image that is part `part` of one.
+    fn seen(&self, image: usize, part: usize) -> usize {
+        if !self.volume {
+            return image;
+        }
+        let (first, moment) = (image / self.moments * self.moments, image % self.moments);
+        first + (moment + part).clamp(1, self.moments) - 1
+    }
+}
+
+impl Kernels {
+    /// Images with their border repeated, and the moments before, at and after each beside each other where the shape says so:
+    /// writes all of `out`, (images, 1 or 3 times channels, height + 2, width + 2).
+    pub fn surround(self, s: &BorderShape, x: &[f32], out: &mut [f32]) {
+        assert_eq!(x.len(), s.len(), "input length");
+        assert_eq!(
+            out.len(),
+            s.images * s.parts() * s.around(),
+            "output length"
+        );
+        if s.is_empty() {
+            return;
+        }
+        let each = out.par_chunks_exact_mut(s.around()).enumerate();
+        each.for_each(|(at, out)| {
+            let from = s.seen(at / s.parts(), at % s.parts()) * s.image();
+            let planes = x[from..][..s.image()].chunks_exact(s.height * s.width);
+            let to = out.chunks_exact_mut((s.height + 2) * (s.width + 2));
+            for (plane, to) in planes.zip(to) {
+                for (y, to) in to.chunks_exact_mut(s.width + 2).enumerate() {
+                    let row = &plane[(y.clamp(1, s.height) - 1) * s.width..][..s.width];
+                    to[0] = row[0];
+                    to[1..=s.width].copy_from_slice(row);
+                    to[s.width + 1] = row[s.width - 1];
+                }
+            }
+        });
+    }
+
+    /// Gradient of [`Kernels::surround`]: writes all of `dx`.
+    pub fn surround_grad(self, s: &BorderShape, dy: &[f32], dx: &mut [f32]) {
+        assert_eq!(dx.len(), s.len(), "input gradient length");
+        assert_eq!(
+            dy.len(),
+            s.images * s.parts() * s.around(),
+            "gradient length"
+        );
+        if s.is_empty() {
+            return;
+        }
+        let each = dx.par_chunks_exact_mut(s.image()).enumerate();
+        each.for_each(|(image, dx)| {
+            dx.fill(0.0);
+            let first = image / s.moments * s.moments;
+            let near = image.saturating_sub(1).max(first)..(image + 2).min(first + s.moments);
+            for (other, part) in near.flat_map(|i| (0..s.parts()).map(move |part| (i, part))) {
+                if s.seen(other, part) != image {
+                    continue;
+                }
+                let dy = &dy[(other * s.parts() + part) * s.around()..][..s.around()];
+                let planes = dx.chunks_exact_mut(s.height * s.width);
+                let from = dy.chunks_exact((s.height + 2) * (s.width + 2));
+                for (dx, dy) in planes.zip(from) {
+                    self.run(Fold { s, dy, dx });
+                }
+            }
+        });
+    }
+
+    /// Images without their outermost pixels, and each channel's bias added: writes all of `out`, which has the shape's size;
+    /// `x` has two rows and columns more.
+    pub fn crop(self, s: &BorderShape, x: &[f32], bias: &[f32], out: &mut [f32]) {
+        assert_eq!(x.len(), s.images * s.around(), "input length");
+        assert_eq!((out.len(), bias.len()), (s.len(), s.channels), "lengths");
+        if s.is_empty() {
+            return;
+        }
+        let planes = x.par_chunks_exact((s.height + 2) * (s.width + 2));
+        let planes = planes.zip(out.par_chunks_exact_mut(s.height * s.width));
+        planes.enumerate().for_each(|(at, (x, out))| {
+            let bias = bias[at % s.channels];
+            self.run(Crop { s, x, bias, out });
+        });
+    }
+
+    /// Gradient of [`Kernels::crop`] by the images: writes all of `dx`, zeros around.
+    pub fn crop_grad(self, s: &BorderShape, dy: &[f32], dx: &mut [f32]) {
+        assert_eq!(dx.len(), s.images * s.around(), "input gradient length");
+        assert_eq!(dy.len(), s.len(), "gradient length");
+        if s.is_empty() {
+            return;
+        }
+        let planes = dx.par_chunks_exact_mut((s.height + 2) * (s.width + 2));
+        let planes = planes.zip(dy.par_chunks_exact(s.height * s.width));
+        planes.for_each(|(dx, dy)| {
+            dx.fill(0.0);
+            let rows = dx.chunks_exact_mut(s.width + 2).skip(1);
+            for (dx, dy) in rows.zip(dy.chunks_exact(s.width)) {
+                dx[1..=s.width].copy_from_slice(dy);
+            }
+        });
+    }
+
+    /// x where it is above 0, else `slope`·x, with a slope below 1: writes all of `y`.
+    pub fn leaky_relu(self, slope: f32, x: &[f32], y: &mut [f32]) {
+        assert_eq!(x.len(), y.len(), "one length for all");
+        let parts = x.par_chunks(PART).zip(y.par_chunks_mut(PART));
+        parts.for_each(|(x, y)| self.run(Leaky { slope, x, y }));
+    }
+
+    /// Gradient of [`Kernels::leaky_relu`] from its input or its output: writes all of `dx`.
+    pub fn leaky_relu_grad(self, slope: f32, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+        assert_eq!(
+            (x.len(), dy.len()),
+            (dx.len(), dx.len()),
+            "one length for all"
+        );
+        let parts = x.par_chunks(PART).zip(dy.par_chunks(PART));
+        let parts = parts.zip(dx.par_chunks_mut(PART));
+        parts.for_each(|((x, dy), dx)| self.run(LeakyGrad { slope, x, dy, dx }));
+    }
+}
+
+/// Adds a plane with its border to one without.
+struct Fold<'a> {
+    s: &'a BorderShape,
+    dy: &'a [f32],
+    dx: &'a mut [f32],
+}
+
+impl Op for Fold<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(self) {
+        let (height, width) = (self.s.height, self.s.width);
+        for (y, row) in self.dy.chunks_exact(width + 2).enumerate() {
+            let to = &mut self.dx[(y.clamp(1, height) - 1) * width..][..width];
+            to[0] += row[0];
+            to[width - 1] += row[width + 1];
+            let inner = row[1..=width].chunks(LANES);
+            for (from, to) in inner.zip(to.chunks_mut(LANES)) {
+                let sum = L::load_part(to, 0.0).add(L::load_part(from, 0.0));
+                sum.store_part(to);
+            }
+        }
+    }
+}
+
+struct Crop<'a> {
+    s: &'a BorderShape,
+    x: &'a [f32],
+    bias: f32,
+    out: &'a mut [f32],
+}
+
+impl Op for Crop<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(self) {
+        let width = self.s.width;
+        let bias = L::splat(self.bias);
+        let rows = self.x.chunks_exact(width + 2).skip(1);
+        for (x, out) in rows.zip(self.out.chunks_exact_mut(width)) {
+            let inner = x[1..=width].chunks(LANES);
+            for (x, out) in inner.zip(out.chunks_mut(LANES)) {
+                L::load_part(x, 0.0).add(bias).store_part(out);
+            }
+        }
+    }
+}
+
+struct Leaky<'a> {
+    slope: f32,
+    x: &'a [f32],
+    y: &'a mut [f32],
+}
+
+impl Op for Leaky<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(self) {
+        let slope = L::splat(self.slope);
+        for (x, y) in self.x.chunks(LANES).zip(self.y.chunks_mut(LANES)) {
+            let x = L::load_part(x, 0.0);
+            x.mul(slope).max(x).store_part(y);
+        }
+    }
+}
+
+struct LeakyGrad<'a> {
+    slope: f32,
+    x: &'a [f32],
+    dy: &'a [f32],
+    dx: &'a mut [f32],
+}
+
+impl Op for LeakyGrad<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<L: Lanes>(self) {
+        let slope = L::splat(self.slope);
+        let from = self.x.chunks(LANES).zip(self.dy.chunks(LANES));
+        for ((x, dy), dx) in from.zip(self.dx.chunks_mut(LANES)) {
+            let dy = L::load_part(dy, 0.0);
+            let above = dy.where_positive(L::load_part(x, 0.0));
+            dy.sub(above).fma(slope, above).store_part(dx);
+        }
+    }
+}
