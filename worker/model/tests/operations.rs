@@ -141,6 +141,20 @@ fn borders_and_leaky_relu_equal_burns_and_so_do_their_gradients() {
 }
 
 #[test]
+fn taps_with_stride_two_equal_burns() {
+    for [n, t, s, h, w] in [[2, 5, 2, 4, 6], [1, 4, 1, 6, 2], [1, 1, 3, 2, 40]] {
+        let x = random([n, t, s, h, w], 1);
+        for repeated in [false, true] {
+            let (ours, plain) = (
+                ops::taps(x.clone(), repeated),
+                plain::taps(x.clone(), repeated),
+            );
+            close(ours.inner(), plain.inner(), "taps");
+        }
+    }
+}
+
+#[test]
 fn a_projection_of_bins_equals_that_of_their_one_hot_tensor() {
     let (n, h, w, channels, outputs) = (2, 3, 5, 7, 4);
     // -1 and what lies beyond the channels are pixels of zeros.

@@ -23,6 +23,7 @@ mod plane;
 mod pool;
 mod scratch;
 mod simd;
+mod taps;
 mod winograd;
 mod winograd_grad;
 
@@ -36,6 +37,7 @@ pub use norm::{BatchNorm, NormShape};
 pub use onehot::OneHotShape;
 pub use pool::PlaneShape;
 pub use simd::Kernels;
+pub use taps::TapShape;
 
 #[cfg(test)]
 mod tests;

@@ -111,7 +111,7 @@ impl Embeddings {
 
     /// Features (N·T/2, streams + width, H/2, W/2), and T/2.
     fn volume(&self, pass: &Pass, input: Input) -> (Tensor<4>, usize) {
-        let [n, bins, h, w] = input.dense.dims();
+        let bins = input.dense.dims()[1];
         let mut streams = vec![input.dense.unsqueeze_dim::<5>(2)];
         if let Some(one_hot) = input.one_hot {
             streams.push(ops::plain::one_hot(one_hot, bins).unsqueeze_dim(2));
@@ -119,10 +119,9 @@ impl Embeddings {
         let channels = streams.len();
         // (N, T, streams, H, W)
         let x = Tensor::cat(streams, 2);
-        let (time, rows, columns) = (bins.div_ceil(2), h / 2, w / 2);
-        let images = n * time;
+        let time = bins.div_ceil(2);
 
-        let seen = taps(bordered(bordered(bordered(x.clone(), 1), 3), 4), time);
+        let seen = ops::taps(x.clone(), true);
         let weight: Tensor<5> = pass.get(self.first.weight);
         let width = weight.dims()[0];
         // Taps, then streams, are the channels of a 1×1 convolution.
@@ -130,7 +129,7 @@ impl Embeddings {
             .permute([0, 2, 3, 4, 1])
             .reshape([width, 27 * channels, 1, 1]);
         let mut features = pass.raise(ops::conv1x1(
-            pass.lower(seen.reshape([images, 27 * channels, rows, columns])),
+            pass.lower(seen),
             pass.lower(weight),
             pass.lower(pass.get(self.first.bias)),
         ));
@@ -138,60 +137,15 @@ impl Embeddings {
             features = block.forward(pass, features, time);
         }
 
-        let seen = taps(dark(dark(dark(x, 1), 3), 4), time);
-        let filters = pass.flat(self.filters).reshape([1, channels, 27, 1, 1]);
-        let filters = filters.swap_dims(1, 2);
-        let filtered = (seen * filters)
-            .sum_dim(1)
-            .reshape([images, channels, rows, columns]);
+        // A filter of its own for each stream: zeros for those of the others.
+        let seen = ops::taps(x, false);
+        let device = seen.device();
+        let filters = pass.flat(self.filters).reshape([channels, 27, 1]);
+        let own = Tensor::<2>::eye(channels, &device).reshape([channels, 1, channels]);
+        let filters = (filters * own).reshape([channels, 27 * channels, 1, 1]);
+        let filtered = ops::conv1x1(seen, filters, Tensor::zeros([channels], &device));
         (Tensor::cat(vec![filtered, features], 1), time)
     }
-}
-
-/// What a 3×3×3 convolution with stride 2 sees, one more at either end of T, H and W given: (N, T + 2, S, H + 2, W + 2) to (N·T/2, 27,
-/// S, H/2, W/2), those of a moment first, then those of a row.
-fn taps(x: Tensor<5>, time: usize) -> Tensor<5> {
-    let [n, there, s, h, w] = x.dims();
-    let (rows, columns) = (h / 2 - 1, w / 2 - 1);
-    let short = 2 * time + 2 - there;
-    let mut x = x;
-    if short > 0 {
-        // An odd number of moments: what is beside the last is never seen.
-        let none = Tensor::zeros([n, short, s, h, w], &x.device());
-        x = Tensor::cat(vec![x, none], 1);
-    }
-    let every_second = |x: Tensor<5>, dim: usize, from: usize, count: usize| {
-        let mut shape = x.dims();
-        let (before, after) = (
-            shape[..dim].iter().product::<usize>(),
-            shape[dim + 1..].iter().product::<usize>(),
-        );
-        let pairs = x.narrow(dim, from, 2 * count);
-        shape[dim] = count;
-        pairs
-            .reshape([before, count, 2, after])
-            .narrow(2, 0, 1)
-            .reshape(shape)
-    };
-    let mut all = Vec::with_capacity(27);
-    for moment in 0..3 {
-        let x = every_second(x.clone(), 1, moment, time);
-        for row in 0..3 {
-            let x = every_second(x.clone(), 3, row, rows);
-            all.extend((0..3).map(|column| {
-                every_second(x.clone(), 4, column, columns).reshape([n * time, 1, s, rows, columns])
-            }));
-        }
-    }
-    Tensor::cat(all, 1)
-}
-
-/// A zero more at either end of a dimension.
-fn dark(x: Tensor<5>, dim: usize) -> Tensor<5> {
-    let mut shape = x.dims();
-    shape[dim] = 1;
-    let none = Tensor::zeros(shape, &x.device());
-    Tensor::cat(vec![none.clone(), x, none], dim)
 }
 
 /// Features without what is negative, (f − min)/(max − min) of each channel of a volume; then their greatest values over time, and the

@@ -11,7 +11,7 @@ use burn::{
 use super::EPSILON;
 use crate::kernel::{
     AdamW, AttentionShape, BatchNorm, BorderShape, ConvShape, Kernels, LayerNorm, MomentShape,
-    NormShape, OneHotShape, PlaneShape,
+    NormShape, OneHotShape, PlaneShape, TapShape,
 };
 
 /// Operations of networks; shapes as in [`super`].
@@ -52,6 +52,7 @@ pub trait NetOps: Backend {
     fn surround(x: FloatTensor<Self>, moments: usize, volume: bool) -> FloatTensor<Self>;
     fn crop(x: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self>;
     fn leaky_relu(x: FloatTensor<Self>, slope: f32) -> FloatTensor<Self>;
+    fn taps(x: FloatTensor<Self>, repeated: bool) -> FloatTensor<Self>;
     fn beside(x: FloatTensor<Self>, moments: usize) -> FloatTensor<Self>;
     fn halve_time(x: FloatTensor<Self>) -> FloatTensor<Self>;
     fn adamw(
@@ -326,6 +327,23 @@ impl NetOps for Flex {
     fn leaky_relu(x: Cpu, slope: f32) -> Cpu {
         let x = contiguous(x);
         alike(&x, |y| Kernels::best().leaky_relu(slope, values(&x), y))
+    }
+
+    fn taps(x: Cpu, repeated: bool) -> Cpu {
+        let x = contiguous(x);
+        let [images, moments, streams, height, width] = dims(&x);
+        let s = TapShape {
+            images,
+            moments,
+            streams,
+            height,
+            width,
+            repeated,
+        };
+        let [t, h, w] = s.halved();
+        made([images * t, 27 * streams, h, w], |out| {
+            Kernels::best().taps(&s, values(&x), out);
+        })
     }
 
     fn beside(x: Cpu, moments: usize) -> Cpu {

@@ -330,6 +330,11 @@ impl<C: CheckpointStrategy> NetOps for Autodiff<Flex, C> {
         }
     }
 
+    /// Without a gradient, as its users say.
+    fn taps(x: Tracked, repeated: bool) -> Tracked {
+        Tracked::new(Flex::taps(x.into_primitive(), repeated))
+    }
+
     fn beside(x: Tracked, moments: usize) -> Tracked {
         let y = Flex::beside(x.primitive().clone(), moments);
         match Beside.prepare::<C>([x.node()]).compute_bound().stateful() {

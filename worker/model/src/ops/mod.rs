@@ -160,6 +160,16 @@ pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::surround(x.into_dispatch(), moments, volume))
 }
 
+/// What a 3×3×3 convolution with stride 2 sees of volumes (N, T, S, H, W), their ends repeated or dark beyond them: (N·⌈T/2⌉,
+/// 27·S, H/2, W/2), taps of a moment first, then of a row, a tap's streams beside each other. **It has no gradient**: it is for
+/// inputs.
+pub fn taps(x: Tensor<5>, repeated: bool) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return plain::taps(x.detach(), repeated);
+    }
+    Tensor::from_dispatch(Dispatch::taps(x.into_dispatch(), repeated))
+}
+
 /// Images (N, C, H + 2, W + 2) without their outermost pixels, and a bias (C) added: (N, C, H, W).
 pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     if !has_kernels(&x.device()) {

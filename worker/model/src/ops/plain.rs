@@ -115,6 +115,61 @@ pub fn surround(x: Tensor<4>, moments: usize, volume: bool) -> Tensor<4> {
     bordered(bordered(beside, 2), 3)
 }
 
+/// See [`super::taps`].
+pub fn taps(x: Tensor<5>, repeated: bool) -> Tensor<4> {
+    let [n, moments, s, h, w] = x.dims();
+    let more = if repeated { bordered } else { dark };
+    let time = moments.div_ceil(2);
+    let seen = tapped(more(more(more(x, 1), 3), 4), time);
+    seen.reshape([n * time, 27 * s, h / 2, w / 2])
+}
+
+/// What a 3×3×3 convolution with stride 2 sees, one more at either end of T, H and W given: (N, T + 2, S, H + 2, W + 2) to (N·T/2, 27,
+/// S, H/2, W/2), those of a moment first, then those of a row.
+fn tapped(x: Tensor<5>, time: usize) -> Tensor<5> {
+    let [n, there, s, h, w] = x.dims();
+    let (rows, columns) = (h / 2 - 1, w / 2 - 1);
+    let short = 2 * time + 2 - there;
+    let mut x = x;
+    if short > 0 {
+        // An odd number of moments: what is beside the last is never seen.
+        let none = Tensor::zeros([n, short, s, h, w], &x.device());
+        x = Tensor::cat(vec![x, none], 1);
+    }
+    let every_second = |x: Tensor<5>, dim: usize, from: usize, count: usize| {
+        let mut shape = x.dims();
+        let (before, after) = (
+            shape[..dim].iter().product::<usize>(),
+            shape[dim + 1..].iter().product::<usize>(),
+        );
+        let pairs = x.narrow(dim, from, 2 * count);
+        shape[dim] = count;
+        pairs
+            .reshape([before, count, 2, after])
+            .narrow(2, 0, 1)
+            .reshape(shape)
+    };
+    let mut all = Vec::with_capacity(27);
+    for moment in 0..3 {
+        let x = every_second(x.clone(), 1, moment, time);
+        for row in 0..3 {
+            let x = every_second(x.clone(), 3, row, rows);
+            all.extend((0..3).map(|column| {
+                every_second(x.clone(), 4, column, columns).reshape([n * time, 1, s, rows, columns])
+            }));
+        }
+    }
+    Tensor::cat(all, 1)
+}
+
+/// A zero more at either end of a dimension.
+fn dark(x: Tensor<5>, dim: usize) -> Tensor<5> {
+    let mut shape = x.dims();
+    shape[dim] = 1;
+    let none = Tensor::zeros(shape, &x.device());
+    Tensor::cat(vec![none.clone(), x, none], dim)
+}
+
 /// See [`super::crop`].
 pub fn crop(x: Tensor<4>, bias: Tensor<1>) -> Tensor<4> {
     let [_, c, h, w] = x.dims();
