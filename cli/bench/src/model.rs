@@ -83,8 +83,6 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         });
         return Ok(());
     }
-    // As where a worker trains.
-    let _kept = Kept::from_now();
     let mut peers = Vec::new();
     let folder = tempfile::tempdir().map_err(|e| io("a temporary folder", &e))?;
     if !args.peer.is_empty() {
@@ -122,6 +120,8 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
             .map_err(of_model)?;
         peaks.push(before.and_then(|b| Some(peak()?.saturating_sub(b))));
     }
+    // As where a worker trains; only now, so that what earlier steps left does not hide what one takes.
+    let _kept = Kept::from_now();
     for peer in &mut peers {
         peer.steps(1)?;
     }

@@ -9,6 +9,8 @@ use super::shape::{BIN, Shape};
 const LEARNT: f64 = 7.0;
 /// Bytes of a value that a pass keeps for its way back, in 32 bits, with what is computed from it at the same time.
 const KEPT: f64 = 5.0;
+/// The same where time is a dimension: gradients of three moments beside each other live beside more of them.
+const KEPT_OF_TIME: f64 = 7.0;
 /// Feature maps of the finest level that live at once when a network is asked.
 const LIVE: f64 = 7.0;
 /// The same of the widest convolution, which is computed in a transformed form of four times the values on either side.
@@ -40,9 +42,8 @@ pub struct Network {
 }
 
 /// Feature maps that a transformer block keeps for its way back: norms, queries, keys, values, sums and the perceptron.
-const BLOCK: f64 = 24.0;
-/// Forms in which scores of attention are kept.
-const SCORES: f64 = 5.0;
+/// Scores of attention are not among them: the gradient computes them again.
+const BLOCK: f64 = 15.0;
 
 impl Network {
     /// Inputs, middle and outputs of each level's encoder, from the finest.
@@ -91,16 +92,16 @@ impl Network {
         if self.architecture == Architecture::Swinir {
             let blocks = f64::from(self.swin.groups * self.swin.depth);
             let convolutions = 3.0 * f64::from(self.swin.groups + 3);
-            let values = self.width * convolutions + blocks * self.of_block();
+            let values = self.width * (convolutions + blocks * BLOCK);
             return source.pixels() * (self.dense + values);
         }
         if self.architecture == Architecture::Embeddings {
             let [width, streams, flat] = self.embedded();
-            // An eighth of the voxels: what the first convolutions see, and four others with what lies around them.
+            // An eighth of the voxels: what the first convolutions see, and four others with what lies around them (fitted to
+            // processes that trained).
             let voxels = source.pixels() * self.dense / 8.0;
-            let volume = voxels * (2.0 * 27.0 * streams + 4.0 * 10.0 * width + 8.0 * flat);
-            return volume
-                + source.pixels() * (self.dense + flat * (5.0 * 6.0 / 4.0 + 2.0 * 5.0 * 6.0));
+            let volume = voxels * (2.0 * 27.0 * streams + 4.0 * 4.5 * width + 4.0 * flat);
+            return volume + source.pixels() * (self.dense + 30.0 * flat);
         }
         let mut sum = source.pixels() * (self.dense + 2.0 * self.stem);
         for (level, [inputs, between, outputs]) in self.encoders().enumerate() {
@@ -138,18 +139,13 @@ impl Network {
         9.0 * e * convolutions + f64::from(swin.groups * swin.depth) * block
     }
 
-    /// Values of a pixel that a transformer block keeps: its scores are as many as a window has pixels, for each head.
-    fn of_block(&self) -> f64 {
-        let tokens = f64::from(self.swin.window).powi(2);
-        BLOCK * self.width + SCORES * tokens * f64::from(self.swin.heads)
-    }
-
     /// Bytes that a training takes, `images` at a time.
     pub(in crate::model) fn learn(&self, source: &Shape, images: u32) -> f64 {
         let images = f64::from(images);
         // Two batches wait for the network.
         let batches = 2.0 * images * BIN * source.pixels() * self.dense;
-        LEARNT * self.weights() + KEPT * images * self.kept(source) + batches
+        let kept = if self.time > 1.0 { KEPT_OF_TIME } else { KEPT };
+        LEARNT * self.weights() + kept * images * self.kept(source) + batches
     }
 
     /// Bytes that asking it about one image takes, its weights included.
@@ -157,7 +153,7 @@ impl Network {
         match self.architecture {
             Architecture::Unet2d | Architecture::Unet25d => {}
             Architecture::Swinir => {
-                let values = self.dense + LIVE * self.width + self.of_block();
+                let values = self.dense + (LIVE + BLOCK) * self.width;
                 return self.weights() + BIN * source.pixels() * values;
             }
             Architecture::Embeddings => {
