@@ -17,14 +17,14 @@ pub(super) fn exp<L: Lanes>(x: L) -> L {
     let x = L::splat(-87.3).max(x);
     let n = x.fma(log2_e, round).sub(round);
     // ln 2 in two parts, so that n·ln 2 is exact enough.
-    let r = n.fma(L::splat(-0.693_359_375), x);
+    let r = n.fma(L::splat(-0.693_359_4), x);
     let r = n.fma(L::splat(2.121_944_4e-4), r);
     let polynomial = [
         1.398_199_9e-3,
         8.333_452e-3,
         4.166_579_6e-2,
         1.666_666_5e-1,
-        5.000_000_1e-1,
+        0.5,
     ];
     let mut p = L::splat(1.987_569_1e-4);
     for c in polynomial {

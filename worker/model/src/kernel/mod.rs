@@ -1,5 +1,6 @@
-//! CPU kernels of the model runtime: 3×3 and 1×1 convolutions, batch norm with ReLU, pooling, AdamW, and
-//! the convolution over one-hot bins; all on `f32` slices in NCHW order.
+//! CPU kernels of the model runtime: 3×3 and 1×1 convolutions, batch norm with ReLU, pooling, AdamW, the convolution over
+//! one-hot bins, attention within windows, layer norm, GELU, and what is done along time and around borders; all on `f32` slices, in
+//! NCHW order unless said.
 //!
 //! **The same bits everywhere**: every result is a fixed-order chain of fused multiply-adds or a fixed tree
 //! over a fixed number of virtual lanes; neither the number of threads nor the instruction set
@@ -10,6 +11,7 @@
 
 mod adam;
 mod attention;
+mod attention_shape;
 mod border;
 mod conv;
 mod conv_shape;
@@ -28,7 +30,7 @@ mod winograd;
 mod winograd_grad;
 
 pub use adam::AdamW;
-pub use attention::AttentionShape;
+pub use attention_shape::AttentionShape;
 pub use border::BorderShape;
 pub use conv_shape::ConvShape;
 pub use layer_norm::LayerNorm;
