@@ -10,7 +10,10 @@
     reason = "the allocator's options are C functions; proof below"
 )]
 
-use std::sync::{Mutex, PoisonError};
+use std::{
+    ffi::c_long,
+    sync::{Mutex, PoisonError},
+};
 
 use libmimalloc_sys::{mi_option_get, mi_option_set, mi_option_t};
 
@@ -18,19 +21,19 @@ use libmimalloc_sys::{mi_option_get, mi_option_set, mi_option_t};
 const PURGE_DELAY: mi_option_t = 15;
 
 /// How long free memory is kept, milliseconds.
-const KEPT_MS: i64 = 10_000;
+const KEPT_MS: c_long = 10_000;
 
 /// How many ask for it, and what the option was before the first.
-static ASKED: Mutex<(usize, i64)> = Mutex::new((0, 0));
+static ASKED: Mutex<(usize, c_long)> = Mutex::new((0, 0));
 
 // SAFETY of the two calls below: both read or write one number in a table, for any option below the table's length (47 in mimalloc
 // 3), at any time and from any thread; mimalloc reads it anew whenever it frees.
 
-fn delay() -> i64 {
+fn delay() -> c_long {
     unsafe { mi_option_get(PURGE_DELAY) }
 }
 
-fn set_delay(ms: i64) {
+fn set_delay(ms: c_long) {
     unsafe { mi_option_set(PURGE_DELAY, ms) };
 }
 
@@ -71,7 +74,7 @@ mod tests {
     /// Also that the number is still that option's: its default is a second.
     #[test]
     fn free_memory_is_kept_for_longer_while_anybody_asks() {
-        assert_eq!(delay(), 1000);
+        assert_eq!(delay(), 1000, "unset MIMALLOC_PURGE_DELAY");
         let one = Kept::from_now();
         let other = Kept::from_now();
         drop(one);
