@@ -1,11 +1,16 @@
-//! An independent tracer of light paths in f64: from a spot by the surfaces' own scattering, each vertex connected to the
-//! camera. It shares no code with the renderer, and no estimator: the renderer has no such paths but in special cases.
+//! An independent tracer in f64. Light paths start at a spot, scatter as the surfaces do, and each vertex that is no
+//! near-mirror is connected to the camera. What the camera sees in near-mirrors comes from the camera's side: the glint of a
+//! spot by points drawn around its mirror image, all else by camera paths (both in [`super::seen`]). It shares no
+//! code with the renderer.
 
 use std::f64::consts::PI;
 
 use picofarm_scene::{Bsdf, Distribution, Scene};
 
-use super::brute::{Noise, P, f};
+use super::{
+    brute::{Noise, P, f},
+    tree::{Tree, Vertex},
+};
 
 /// A mean and its standard error.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -14,18 +19,34 @@ pub struct Energy {
     pub se: f64,
 }
 
-/// A vertex: place, unit normal on the side of the light, scattering.
-#[derive(Clone, Copy)]
-struct Vertex {
-    p: P,
-    n: P,
-    bsdf: Bsdf,
+impl Energy {
+    /// From estimates of equal weight that know nothing of each other.
+    pub fn of(all: &[f64]) -> Self {
+        let n = all.len() as f64;
+        let mean = all.iter().sum::<f64>() / n;
+        let spread = all.iter().map(|x| (x - mean).powi(2)).sum::<f64>();
+        let se = (spread / (n * (n - 1.0))).sqrt();
+        Self { mean, se }
+    }
 }
 
-/// Triangles in f64 and a camera.
+impl std::ops::Add for Energy {
+    type Output = Self;
+    fn add(self, o: Self) -> Self {
+        Self {
+            mean: self.mean + o.mean,
+            se: self.se.hypot(o.se),
+        }
+    }
+}
+
+/// Bounces of the longest light paths: few get as far.
+pub const LONGEST: u32 = 400;
+
+/// Surfaces in f64 and a camera.
 pub struct Tracer {
-    triangles: Vec<([P; 3], P, Bsdf)>,
-    scene: Scene,
+    pub tree: Tree,
+    pub scene: Scene,
 }
 
 /// Where light starts: a point in f64 that f32 could not hold, its normal, and the object whose first material it has.
@@ -36,90 +57,183 @@ pub struct Start {
     pub object: usize,
 }
 
+/// A spot: place, normal, unit direction back along the beam, scattering.
+#[derive(Debug, Clone, Copy)]
+pub struct Source {
+    pub p: P,
+    pub n: P,
+    pub back: P,
+    pub bsdf: Bsdf,
+}
+
+impl Source {
+    /// Radiant intensity per unit power towards a unit direction.
+    pub fn intensity(&self, w: P) -> f64 {
+        let c = self.n.dot(w);
+        if c > 0.0 {
+            f(self.bsdf, self.n, self.back, w) * c
+        } else {
+            0.0
+        }
+    }
+}
+
+/// The roughness of a near-mirror: beams are folded there, and the camera's side takes over.
+pub fn mirror(bsdf: Bsdf) -> Option<f64> {
+    match bsdf {
+        Bsdf::RoughConductor { alpha, .. } if alpha <= 0.1 => Some(f64::from(alpha)),
+        _ => None,
+    }
+}
+
+pub fn is_mirror(bsdf: Bsdf) -> bool {
+    mirror(bsdf).is_some()
+}
+
 impl Tracer {
     pub fn new(scene: &Scene) -> Self {
-        let mut triangles = vec![];
-        for o in &scene.objects {
-            for (t, &m) in o.mesh.triangles.iter().zip(&o.mesh.triangle_material) {
-                let v = t.map(|i| P::from(o.to_world.point(o.mesh.positions[i as usize])));
-                let n = (v[1] - v[0]).cross(v[2] - v[0]);
-                triangles.push((v, n.unit(), o.mesh.materials[m as usize].bsdf));
-            }
-        }
         Self {
-            triangles,
+            tree: Tree::new(scene),
             scene: scene.clone(),
         }
     }
 
-    /// The first surface beyond 1e-11 along a unit direction.
-    fn hit(&self, o: P, d: P, limit: f64) -> Option<Vertex> {
-        let (mut nearest, mut best) = (limit, None);
-        for (v, n, bsdf) in &self.triangles {
-            let (e, f) = (v[1] - v[0], v[2] - v[0]);
-            let h = d.cross(f);
-            let det = e.dot(h);
-            if det.abs() < 1e-30 {
-                continue;
-            }
-            let s = o - v[0];
-            let (u, q) = (s.dot(h) / det, s.cross(e));
-            let (w, t) = (d.dot(q) / det, f.dot(q) / det);
-            let inside = u >= -1e-12 && w >= -1e-12 && u + w <= 1.0 + 1e-12;
-            if inside && t > 1e-11 && t < nearest {
-                nearest = t;
-                let n = if n.dot(d) <= 0.0 { *n } else { *n * -1.0 };
-                best = Some(Vertex {
-                    p: o + d * t,
-                    n,
-                    bsdf: *bsdf,
+    pub fn origin(&self) -> P {
+        P::from(self.scene.camera.origin)
+    }
+
+    /// The spot of beam `k`: as the beam states it, or by following the beam, by exact reflection on near-mirrors.
+    pub fn source(&self, k: usize) -> Option<Source> {
+        let beam = &self.scene.laser.beams[k];
+        if let Some(s) = beam.spot {
+            let materials = &self.scene.objects[s.object as usize].mesh.materials;
+            return Some(Source {
+                p: s.point.into(),
+                n: s.normal.into(),
+                back: P::from(s.arriving) * -1.0,
+                bsdf: materials[s.material as usize].bsdf,
+            });
+        }
+        let mut from = P::from(self.scene.laser.origin);
+        let mut d = P::from(beam.direction).unit();
+        for _ in 0..64 {
+            let hit = self.tree.hit(from, d, f64::INFINITY)?;
+            if !is_mirror(hit.bsdf) {
+                return Some(Source {
+                    p: hit.p,
+                    n: hit.n,
+                    back: d * -1.0,
+                    bsdf: hit.bsdf,
                 });
             }
+            from = hit.p;
+            d = (d - hit.n * (2.0 * hit.n.dot(d))).unit();
         }
-        best
+        None
     }
 
-    /// What a vertex of unit flux sends to the camera: the sum over the pixels of the radiance they see.
-    fn seen(&self, v: &Vertex, back: P) -> f64 {
+    /// The film position of a point, pixels; `None` outside of the image.
+    pub fn film(&self, p: P) -> Option<(f64, f64)> {
         let c = &self.scene.camera;
         let i = &c.intrinsics;
-        let to = v.p - P::from(c.origin);
-        let q = P(
-            to.dot(c.right.into()),
-            to.dot(c.down.into()),
-            to.dot(c.forward.into()),
-        );
-        let d = to.length();
-        let (fx, fy) = (f64::from(i.fx), f64::from(i.fy));
-        let (x, y) = (
-            fx * q.0 / q.2 + f64::from(i.cx),
-            fy * q.1 / q.2 + f64::from(i.cy),
-        );
+        let to = p - self.origin();
+        let depth = to.dot(c.forward.into());
+        let x = f64::from(i.fx) * to.dot(c.right.into()) / depth + f64::from(i.cx);
+        let y = f64::from(i.fy) * to.dot(c.down.into()) / depth + f64::from(i.cy);
         let inside = x >= 0.0 && y >= 0.0 && x < f64::from(i.width) && y < f64::from(i.height);
-        let w = to * (-1.0 / d);
-        let co = v.n.dot(w);
-        if !(q.2 > 0.0 && inside && co > 0.0) || self.hit(v.p, w, d * (1.0 - 1e-9)).is_some() {
-            return 0.0;
-        }
-        let cos = q.2 / d;
-        f(v.bsdf, v.n, back, w) * co * fx * fy / (d * d * cos * cos * cos)
+        (depth > 0.0 && inside).then_some((x, y))
     }
 
-    /// Energy of the image by exactly two bounces, and by three and more, of the light of beam `k` that starts at `start`.
+    /// The unit direction of a film position.
+    pub fn ray(&self, (x, y): (f64, f64)) -> P {
+        let c = &self.scene.camera;
+        let i = &c.intrinsics;
+        let right = (x - f64::from(i.cx)) / f64::from(i.fx);
+        let down = (y - f64::from(i.cy)) / f64::from(i.fy);
+        (P::from(c.right) * right + P::from(c.down) * down + P::from(c.forward)).unit()
+    }
+
+    /// Pixels of the film that a unit of solid angle covers in the direction `w` from the camera.
+    pub fn pixels_per_steradian(&self, w: P) -> f64 {
+        let i = &self.scene.camera.intrinsics;
+        let cos = P::from(self.scene.camera.forward).dot(w);
+        f64::from(i.fx) * f64::from(i.fy) / cos.powi(3)
+    }
+
+    /// Index of the pixel at a film position.
+    pub fn pixel(&self, (x, y): (f64, f64)) -> usize {
+        y as usize * self.scene.camera.intrinsics.width as usize + x as usize
+    }
+
+    /// What a vertex of unit flux sends to the camera: the sum over the pixels of the radiance they see, and the pixel.
+    fn seen(&self, v: &Vertex, back: P) -> Option<(usize, f64)> {
+        let film = self.film(v.p)?;
+        let to = v.p - self.origin();
+        let d = to.length();
+        let w = to * (-1.0 / d);
+        let co = v.n.dot(w);
+        let free = co > 0.0 && self.tree.hit(v.p, w, d * (1.0 - 1e-9)).is_none();
+        free.then(|| {
+            let density = self.pixels_per_steradian(w * -1.0);
+            (
+                self.pixel(film),
+                f(v.bsdf, v.n, back, w) * co * density / (d * d),
+            )
+        })
+    }
+
+    /// Energy of the image by exactly two bounces, and by three and more, of the light of beam `k` that starts at `start`;
+    /// near-mirrors as any other surface.
     pub fn energies(&self, k: usize, start: Start, paths: usize, seed: u64) -> [Energy; 2] {
+        const BATCHES: usize = 50;
         let spot = self.scene.laser.beams[k].spot.expect("a stated spot");
-        let first = Vertex {
+        let source = Source {
             p: start.p,
             n: start.n,
+            back: P::from(spot.arriving) * -1.0,
             bsdf: self.scene.objects[start.object].mesh.materials[0].bsdf,
         };
         let mut rng = Noise(seed);
-        let mut sums = [(0.0f64, 0.0f64); 2];
-        for _ in 0..paths {
-            let mut got = [0.0; 2];
-            let (mut at, mut back, mut flux) = (first, P::from(spot.arriving) * -1.0, 1.0);
-            for bounces in 2..400 {
-                let Some((w, weight)) = scatter(&at, back, &mut rng) else {
+        let batches: Vec<[f64; 2]> = (0..BATCHES)
+            .map(|_| {
+                let mut got = [0.0; 2];
+                self.carry(
+                    &source,
+                    (paths / BATCHES, LONGEST),
+                    &mut rng,
+                    |_, more, value, _| {
+                        got[usize::from(more)] += value;
+                    },
+                );
+                got
+            })
+            .collect();
+        [0, 1].map(|part| Energy::of(&batches.iter().map(|b| b[part]).collect::<Vec<_>>()))
+    }
+
+    /// `paths` light paths from a source, of `longest` bounces at most, their first directions stratified. Each vertex that the camera sees is told to
+    /// `add`: its pixel, whether it is the third bounce or a later one, its share of the mean, and its scattering.
+    pub fn carry(
+        &self,
+        source: &Source,
+        (paths, longest): (usize, u32),
+        rng: &mut Noise,
+        mut add: impl FnMut(usize, bool, f64, Bsdf),
+    ) {
+        let first = Vertex {
+            p: source.p,
+            n: source.n,
+            bsdf: source.bsdf,
+            t: 0.0,
+        };
+        let side = (paths as f64).sqrt() as usize;
+        let unit = 1.0 / (side * side) as f64;
+        for path in 0..side * side {
+            let (mut at, mut back, mut flux) = (first, source.back, unit);
+            let cell = ((path % side) as f64, (path / side) as f64);
+            let mut pair = [cell.0, cell.1].map(|k| (k + rng.next()) / side as f64);
+            for bounces in 2..=longest {
+                let Some((w, weight)) = scatter(&at, back, pair) else {
                     break;
                 };
                 flux *= weight;
@@ -129,54 +243,53 @@ impl Tracer {
                     }
                     flux /= 0.7;
                 }
-                let Some(next) = self.hit(at.p, w, f64::INFINITY) else {
+                let Some(next) = self.tree.hit(at.p, w, f64::INFINITY) else {
                     break;
                 };
                 (at, back) = (next, w * -1.0);
-                got[usize::from(bounces > 2)] += flux * self.seen(&at, back);
-            }
-            for (sum, got) in sums.iter_mut().zip(got) {
-                sum.0 += got;
-                sum.1 += got * got;
+                if let Some((pixel, value)) = self.seen(&at, back) {
+                    add(pixel, bounces > 2, flux * value, at.bsdf);
+                }
+                pair = [rng.next(), rng.next()];
             }
         }
-        let n = paths as f64;
-        sums.map(|(a, b)| Energy {
-            mean: a / n,
-            se: ((b / n - (a / n).powi(2)) / n).max(0.0).sqrt(),
-        })
     }
 }
 
-/// A direction and f·cos/pdf: cosine-distributed for Lambertians, by Beckmann's half vectors for conductors.
-fn scatter(v: &Vertex, back: P, rng: &mut Noise) -> Option<(P, f64)> {
+/// Two unit vectors at right angles to `n` and to each other.
+pub fn frame(n: P) -> (P, P) {
+    let side = if n.0.abs() > 0.7 {
+        P(0.0, 1.0, 0.0)
+    } else {
+        P(1.0, 0.0, 0.0)
+    };
+    let t = n.cross(side).unit();
+    (t, n.cross(t))
+}
+
+/// A direction and f·cos/pdf from two numbers of [0, 1): cosine-distributed for Lambertians, by Beckmann's half vectors for
+/// conductors.
+pub fn scatter(v: &Vertex, back: P, [a, b]: [f64; 2]) -> Option<(P, f64)> {
     let mut alpha = None;
     if let Bsdf::RoughConductor {
-        alpha: a,
+        alpha: rough,
         distribution,
         ..
     } = v.bsdf
     {
         assert_eq!(distribution, Distribution::Beckmann);
-        alpha = Some(f64::from(a));
+        alpha = Some(f64::from(rough));
     }
-    let side = if v.n.0.abs() > 0.7 {
-        P(0.0, 1.0, 0.0)
-    } else {
-        P(1.0, 0.0, 0.0)
-    };
-    let t = v.n.cross(side).unit();
-    let b = v.n.cross(t);
-    let angle = 2.0 * PI * rng.next();
-    let around = t * angle.cos() + b * angle.sin();
+    let (t, u) = frame(v.n);
+    let angle = 2.0 * PI * a;
+    let around = t * angle.cos() + u * angle.sin();
     let (w, pdf) = match alpha {
         None => {
-            let r2 = rng.next();
-            let z = (1.0 - r2).sqrt();
-            (around * r2.sqrt() + v.n * z, z / PI)
+            let z = (1.0 - b).sqrt();
+            (around * b.sqrt() + v.n * z, z / PI)
         }
         Some(alpha) => {
-            let slope = alpha * (-(1.0 - rng.next()).ln()).sqrt();
+            let slope = alpha * (-(1.0 - b).ln()).sqrt();
             let h = (around * slope + v.n).unit();
             let ih = back.dot(h);
             let ch = v.n.dot(h);

@@ -5,6 +5,8 @@ pub mod brute;
 pub mod light;
 pub mod npz;
 pub mod reference;
+pub mod seen;
+pub mod tree;
 
 use std::sync::Arc;
 

@@ -1,0 +1,286 @@
+//! The whole image's energy by exactly two bounces and by three and more, against an independent tracer in f64: furnished
+//! rooms among the scenes, spots beside and in near-mirrors; pixels that hold a spot and pixels that see a near-mirror by
+//! themselves. `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent -- --nocapture` measures
+//! with 32 times the paths: what docs/accuracy.md says.
+
+mod common;
+
+use common::{
+    beam_to,
+    brute::Noise,
+    grey,
+    light::{Energy, LONGEST, Source, Tracer, is_mirror},
+    ok, quad, room, scene, settings, sphere, v,
+};
+use picofarm_scene::{
+    AssetLibrary, Material, Scene, Vec3,
+    furnished::{self, FurnishedSettings},
+    primitive,
+};
+use picofarm_settings::{MirrorWall, PrimitiveRooms, Spots};
+use picofarm_transient::{Budget, Settings, trace_spots};
+use rayon::prelude::*;
+
+/// Estimates that know nothing of each other, on both sides.
+const BATCHES: u64 = 16;
+const PIXELS: u32 = 64;
+
+/// What is compared: which pixels, which bounces.
+const REGIONS: [&str; 3] = ["other pixels", "pixels of spots", "pixels of near-mirrors"];
+const PARTS: [&str; 2] = ["two", "more"];
+
+fn effort() -> usize {
+    let text = std::env::var("PICOFARM_EFFORT").unwrap_or_else(|_| "1".into());
+    text.parse().expect("PICOFARM_EFFORT is a whole number")
+}
+
+/// `[region][part]`.
+type Sums = [[f64; 2]; 3];
+type Energies = [[Energy; 2]; 3];
+
+fn joined(batches: &[Sums]) -> Energies {
+    std::array::from_fn(|region| {
+        std::array::from_fn(|part| {
+            Energy::of(&batches.iter().map(|b| b[region][part]).collect::<Vec<_>>())
+        })
+    })
+}
+
+/// The region of each pixel.
+fn regions(tracer: &Tracer, sources: &[Source]) -> Vec<usize> {
+    let size = PIXELS as usize;
+    let mut all: Vec<usize> = (0..size * size)
+        .map(|k| {
+            let corners = (0..9).map(|c| (k % size, k / size, c % 3, c / 3));
+            let mirror = corners.into_iter().any(|(x, y, i, j)| {
+                let at = (x as f64 + 0.5 * i as f64, y as f64 + 0.5 * j as f64);
+                let hit = tracer
+                    .tree
+                    .hit(tracer.origin(), tracer.ray(at), f64::INFINITY);
+                hit.is_some_and(|h| is_mirror(h.bsdf))
+            });
+            2 * usize::from(mirror)
+        })
+        .collect();
+    for s in sources {
+        if let Some(at) = tracer
+            .film(s.p)
+            .filter(|_| tracer.tree.free(tracer.origin(), s.p))
+        {
+            all[tracer.pixel(at)] = 1;
+        }
+    }
+    all
+}
+
+fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize) -> Energies {
+    let likely: Vec<usize> = (0..regions.len()).filter(|&k| regions[k] == 2).collect();
+    let batches: Vec<Sums> = (0..BATCHES)
+        .into_par_iter()
+        .map(|batch| {
+            let mut rng = Noise(1_000 + batch);
+            let mut sums = Sums::default();
+            for s in sources {
+                let share = effort * 5_000 / sources.len();
+                for (part, paths, longest) in [(0, 8 * share, 2), (1, share, LONGEST)] {
+                    tracer.carry(s, (paths, longest), &mut rng, |pixel, more, value, bsdf| {
+                        if !is_mirror(bsdf) && usize::from(more) == part {
+                            sums[regions[pixel]][part] += value;
+                        }
+                    });
+                }
+            }
+            tracer.glints(sources, effort * 5_000, &mut rng, |pixel, value| {
+                sums[regions[pixel]][0] += value;
+            });
+            tracer.through_mirrors(
+                sources,
+                &likely,
+                effort * 5_000,
+                &mut rng,
+                |pixel, value| {
+                    sums[regions[pixel]][1] += value;
+                },
+            );
+            sums
+        })
+        .collect();
+    joined(&batches)
+}
+
+fn rendered(scene: &Scene, regions: &[usize], effort: usize) -> Energies {
+    let batches: Vec<Sums> = (0..BATCHES)
+        .map(|seed| {
+            let set = Settings {
+                seed,
+                gate: picofarm_transient::Gate {
+                    start_m: 0.0,
+                    bin_width_m: 1.0,
+                    bins: 400,
+                },
+                ..settings(Budget::Samples(6 * (effort as f64).sqrt() as u32))
+            };
+            let r = ok(scene, &set);
+            let split = r.split.expect("a split was asked for");
+            let mut sums = Sums::default();
+            for (part, h) in [&split.two, &split.multi].into_iter().enumerate() {
+                for (pixel, h) in h.chunks_exact(400).enumerate() {
+                    sums[regions[pixel]][part] += common::energy(h);
+                }
+            }
+            sums
+        })
+        .collect();
+    joined(&batches)
+}
+
+/// Compares, prints, and fails where the two sides differ by more than four standard errors and 0.05 %.
+#[track_caller]
+fn agrees(name: &str, scene: &Scene, parts: usize) {
+    let tracer = Tracer::new(scene);
+    let sources: Vec<Source> = (0..scene.laser.beams.len())
+        .filter_map(|k| tracer.source(k))
+        .collect();
+    let spots = trace_spots(scene).unwrap();
+    assert_eq!(
+        spots.iter().flatten().count(),
+        sources.len(),
+        "{name}: spots"
+    );
+    let regions = regions(&tracer, &sources);
+    let ours = rendered(scene, &regions, effort());
+    let theirs = traced(&tracer, &sources, &regions, effort());
+    for part in 0..parts {
+        let all = |e: &Energies| e[0][part] + e[1][part] + e[2][part];
+        let rows = (0..3).map(|k| (REGIONS[k], ours[k][part], theirs[k][part]));
+        let whole = all(&theirs).mean;
+        for (region, a, b) in rows.chain([("whole image", all(&ours), all(&theirs))]) {
+            // Far tails of lobes: far below what a sum of f32 holds.
+            if a.mean.max(b.mean) < 1e-9 * whole {
+                continue;
+            }
+            let se = a.se.hypot(b.se);
+            println!(
+                "{name}, {}, {region} ({:.1} %): {:+.3} % ± {:.3} % (ours {:.3} %), z {:+.2}",
+                PARTS[part],
+                100.0 * b.mean / whole,
+                100.0 * (a.mean / b.mean - 1.0),
+                100.0 * se / b.mean,
+                100.0 * a.se / b.mean,
+                (a.mean - b.mean) / se
+            );
+            let slack = 5e-4 * b.mean + 4.0 * se;
+            assert!(
+                (a.mean - b.mean).abs() <= slack,
+                "{name}, {}, {region}",
+                PARTS[part]
+            );
+        }
+    }
+}
+
+fn furnished(seed: u64, mirrors: u32) -> Scene {
+    let library = AssetLibrary::find("parametric", &[]).unwrap();
+    let set = FurnishedSettings {
+        spots: Spots::Grid(25),
+        width: PIXELS,
+        height: PIXELS,
+        specular_at_least: mirrors,
+        ..FurnishedSettings::default()
+    };
+    furnished::generate(seed, &set, &library).unwrap()
+}
+
+#[test]
+fn furnished_rooms_have_the_energy_of_an_independent_tracer() {
+    agrees("furnished 5", &furnished(5, 0), 2);
+    agrees("furnished 8", &furnished(8, 0), 2);
+    agrees("furnished 21, with a mirror", &furnished(21, 1), 2);
+}
+
+#[test]
+fn a_room_with_a_mirror_on_its_wall_has_the_energy_of_an_independent_tracer() {
+    let set = primitive::PrimitiveSettings {
+        spots: Spots::Grid(25),
+        width: PIXELS,
+        height: PIXELS,
+        rooms: PrimitiveRooms {
+            mirror_wall: MirrorWall::Back,
+            ..PrimitiveRooms::LIVING
+        },
+        ..primitive::PrimitiveSettings::default()
+    };
+    agrees("primitive 3", &primitive::generate(3, &set).unwrap(), 2);
+}
+
+/// A room with a mirror on its far wall, and beams to it: `beams` are points.
+fn mirrored(beams: &[Vec3]) -> Scene {
+    let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
+    let pane = Material::mirror("pane", 0.01);
+    objects.push(quad(
+        v(-0.6, -0.8, -3.98),
+        v(1.2, 0.0, 0.0),
+        v(0.0, 1.6, 0.0),
+        pane,
+    ));
+    objects.push(sphere(v(1.0, -1.0, -2.8), 0.5, 3, grey(0.3)));
+    scene(objects, PIXELS, beams)
+}
+
+#[test]
+fn spots_beside_a_mirror_and_folded_by_it_have_the_energy_of_an_independent_tracer() {
+    // 1 and 5 cm beside the mirror's edges, onto the wall behind it; two beams that it folds; one far from it.
+    let beams = [
+        v(0.61, 0.2, -4.0),
+        v(0.1, 0.85, -4.0),
+        v(0.3, 0.3, -3.98),
+        v(-0.2, -0.4, -3.98),
+        v(-2.0, 0.4, -2.5),
+    ];
+    agrees("beside a mirror", &mirrored(&beams), 2);
+}
+
+#[test]
+fn a_spot_on_a_mirror_has_the_energy_of_an_independent_tracer() {
+    // A mirror on the left wall throws it onto the far one.
+    let mut s = mirrored(&[]);
+    let pane = Material::mirror("pane", 0.01);
+    s.objects.push(quad(
+        v(-1.98, -0.5, -3.0),
+        v(0.0, 1.0, 0.0),
+        v(0.0, 0.0, 1.0),
+        pane,
+    ));
+    let object = s.objects.len() as u32 - 1;
+    s.laser
+        .beams
+        .push(beam_to(v(-1.98, 0.2, -2.6), v(1.0, 0.0, 0.0), object));
+    agrees("on a mirror", &s, 1);
+}
+
+#[test]
+fn glints_of_curved_and_angled_mirrors_have_the_energy_of_an_independent_tracer() {
+    let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
+    let pane = |alpha| Material::mirror("pane", alpha);
+    objects.push(quad(
+        v(-1.8, -1.2, -3.6),
+        v(1.1, 0.0, -0.2),
+        v(0.0, 2.0, 0.0),
+        pane(0.01),
+    ));
+    objects.push(quad(
+        v(1.4, -1.2, -3.6),
+        v(0.4, 0.0, 1.2),
+        v(0.0, 2.0, 0.0),
+        pane(0.002),
+    ));
+    objects.push(sphere(v(0.3, -0.9, -2.4), 0.4, 4, pane(0.01)));
+    let beams = [
+        v(0.75, 0.55, -1.0),
+        v(-0.8, -0.5, -1.0),
+        v(-0.3, 0.35, -1.0),
+        v(0.05, -0.1, -1.0),
+    ];
+    // Of three bounces and more only chance finds some here, on both sides.
+    agrees("angled", &scene(objects, PIXELS, &beams), 1);
+}
