@@ -17,7 +17,7 @@ pub enum Budget {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Strategy {
-    /// Side in pixels of the tiles that share vertices, 1 to 16; 1 = every pixel by itself.
+    /// Side in pixels of the tiles that share vertices, 1 to 32; 1 = every pixel by itself.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path_reuse: Option<u32>,
     /// Walks connect to light vertices drawn from the spots.

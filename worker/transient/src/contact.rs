@@ -31,8 +31,8 @@ use crate::{
 };
 
 /// Least distance of a spot from other surfaces, render units: a lift at the far end of a scene, which is 4 to 8 units wide
-/// (about 0.1 mm in a room).
-const CLEARANCE: f32 = 1.0 / 8192.0;
+/// (about 0.03 mm in a room).
+const CLEARANCE: f32 = 1.0 / 32768.0;
 /// How much of a beam must be free before a spot, in units of the distance that it is moved by.
 const BEAM: f32 = 64.0;
 /// How often the distance is doubled to get clear.

@@ -391,16 +391,22 @@ fn point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
 
 /// A point moved off its surface by a few units in the last place, along `n` (Wächter and Binder, Ray
 /// Tracing Gems, chapter 6): enough that a ray does not meet the surface it starts from, too little to
-/// pass through anything. Never less than 2⁻¹⁶: triangles reach to 8 units, and their rounding with them.
+/// pass through anything. Never less than 2⁻¹⁸: triangles reach to 8 units, and their rounding with them. Rays that graze
+/// tilted planes meet their own with a quarter of this now and then, and never with this. Not more: what stands close to a
+/// spot throws its shadow from the lifted place (1 cm beside a step of 2 cm, 256 units were 0.08 % of the light too much).
 #[inline]
 pub(crate) fn lift(p: Vec3, n: Vec3) -> Vec3 {
     let axis = |p: f32, n: f32| {
         if p.abs() < 0.5 {
-            return p + n * (1.0 / 65536.0);
+            return p + n * (1.0 / 262144.0);
         }
-        let steps = (256.0 * n) as i32;
+        let steps = (64.0 * n) as i32;
         let bits = p.to_bits() as i32;
         f32::from_bits(bits.wrapping_add(if p < 0.0 { -steps } else { steps }) as u32)
     };
     Vec3::new(axis(p.x, n.x), axis(p.y, n.y), axis(p.z, n.z))
 }
+
+#[cfg(test)]
+#[path = "world/tests.rs"]
+mod tests;

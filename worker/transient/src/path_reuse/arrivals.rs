@@ -2,8 +2,11 @@
 
 use std::f32::consts::PI;
 
+use picofarm_scene::Vec3;
+
 use super::{ArrivalSink, Effort, ROUGH_SPOTS, Sharing};
 use crate::{
+    emitter::Columns,
     film::Film,
     rng::Rng,
     sink::{Place, Sink, Way},
@@ -189,9 +192,8 @@ impl Sharing {
         self.offset.clear();
         self.weight.resize(count * self.shared.len(), 0.0);
         self.offset.resize(count * self.shared.len(), 0.0);
-        let per_metre = 1.0 / film.gate.bin_width_m;
-        let nearest = self.nearest_m();
         let share = drawn as f32 / count as f32;
+        self.lengths.lay((walk, film), &self.gathers);
         let rows = self
             .weight
             .chunks_mut(count)
@@ -229,25 +231,25 @@ impl Sharing {
                 }
             }
             let mut density = 0.0;
-            for ((w, o), (v, _)) in weight.iter_mut().zip(offset).zip(&self.gathers) {
-                if *w == 0.0 {
+            self.apart.clear();
+            for &i in &self.glossy {
+                if weight[i] == 0.0 {
                     continue;
                 }
+                let v = &self.gathers[i].0;
                 let x = &v.hit;
                 let to = h.p - x.p;
                 let d2 = to.dot(to);
-                let d = d2.sqrt();
-                if x.surface.diffuse() {
-                    density += *w / PI;
-                    *w *= v.beta * x.surface.lambertian();
-                } else {
-                    let w_in = to / d;
-                    let cos = h.n.dot(w_in).abs() / d2;
-                    density += x.surface.pdf(x.n, v.wo, w_in) * cos;
-                    *w = v.beta * x.surface.scatter(x.n, v.wo, w_in) * cos;
-                }
-                *o = ((v.length_m - nearest + walk.world.metres(d) - film.gate.start_m + nearest)
-                    * per_metre) as f32;
+                let w_in = to / d2.sqrt();
+                let cos = h.n.dot(w_in).abs() / d2;
+                density += x.surface.pdf(x.n, v.wo, w_in) * cos;
+                let value = v.beta * x.surface.scatter(x.n, v.wo, w_in) * cos;
+                self.apart.push((i, value));
+                weight[i] = 0.0;
+            }
+            density += self.lengths.weigh(&self.columns, h.p, weight, offset);
+            for &(i, value) in &self.apart {
+                weight[i] = value;
             }
             let density = density * share + y.light;
             let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
@@ -320,6 +322,58 @@ impl Sharing {
                 }
             }
         }
+    }
+}
+
+/// What the gather points do with light of a direction, side by side.
+#[derive(Debug, Default)]
+pub(super) struct Lengths {
+    /// Albedo/π times the weight of the camera path; of surfaces that are not Lambertian anything.
+    factor: Vec<f32>,
+    /// Optical path from the camera less the gate's start, in bins.
+    bins: Vec<f64>,
+    /// Bins in a render unit.
+    per_unit: f64,
+}
+
+impl Lengths {
+    fn lay(&mut self, (walk, film): (&Walk, &Film), gathers: &[(Vertex, usize)]) {
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        self.per_unit = walk.world.metres(1.0) * per_metre;
+        self.factor.clear();
+        self.bins.clear();
+        for (v, _) in gathers {
+            self.factor.push(v.beta * v.hit.surface.lambertian());
+            self.bins.push((v.length_m - film.gate.start_m) * per_metre);
+        }
+    }
+
+    /// Turns the irradiances that a shared vertex in `y` casts on Lambertian gather points into what they send to the
+    /// camera, and finds the optical paths by way of it, in bins. Returns the density of drawing the vertex from them. No
+    /// branches, and sums side by side: the compiler works on several at once.
+    fn weigh(&self, columns: &Columns, y: Vec3, weight: &mut [f32], offset: &mut [f32]) -> f32 {
+        const SIDE: usize = 8;
+        let count = weight.len();
+        let (px, py, pz) = (
+            &columns.px[..count],
+            &columns.py[..count],
+            &columns.pz[..count],
+        );
+        let (factor, bins) = (&self.factor[..count], &self.bins[..count]);
+        let mut sums = [0.0f32; SIDE];
+        for chunk in weight.chunks(SIDE) {
+            for (sum, w) in sums.iter_mut().zip(chunk) {
+                *sum += w;
+            }
+        }
+        let offset = &mut offset[..count];
+        for i in 0..count {
+            let (dx, dy, dz) = (y.x - px[i], y.y - py[i], y.z - pz[i]);
+            let d = (dx * dx + dy * dy + dz * dz).sqrt();
+            offset[i] = (bins[i] + f64::from(d) * self.per_unit) as f32;
+            weight[i] *= factor[i];
+        }
+        sums.iter().sum::<f32>() / PI
     }
 }
 

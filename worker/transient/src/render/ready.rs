@@ -3,7 +3,13 @@
 
 use picofarm_scene::{Scene, Spot};
 
-use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
+use super::{
+    FIRST_PASSES, MAX_PASSES,
+    image::{Image, MANY},
+    splat::Splats,
+    tile::Frame,
+    warn,
+};
 use crate::{
     api::{
         Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
@@ -16,7 +22,7 @@ use crate::{
     film::Film,
     mirror_images::Mirrors,
     one_bounce,
-    path_reuse::Effort,
+    path_reuse::{Effort, NARROW_TILE, WIDE_TILE},
     photo,
     plan::plan as decide,
     truth::{self, Centres},
@@ -25,8 +31,6 @@ use crate::{
     world::World,
 };
 
-/// Side in pixels of the tiles that share vertices.
-const REUSE: u32 = 8;
 /// Passes of light paths where no other passes are made.
 const TWO_PASSES: u32 = 64;
 /// Rows from which the rays of the ground truth are forecast.
@@ -104,7 +108,10 @@ pub(super) fn prepare<R>(
         film: &film,
         sampling: &sampling,
         effort: Effort::new(
-            strategy.path_reuse.unwrap_or(REUSE),
+            strategy.path_reuse.unwrap_or_else(|| {
+                let apart = narrow || film.channels >= MANY || mostly_rough(&centres);
+                if apart { NARROW_TILE } else { WIDE_TILE }
+            }),
             narrow,
             world.has_narrow_lobes(),
         ),
@@ -120,6 +127,13 @@ pub(super) fn prepare<R>(
         centres: &centres,
         spots: &spots,
     })
+}
+
+/// Whether most of what the camera sees is rough: there each arrival is weighed for each pixel, and wide tiles do not pay.
+fn mostly_rough(centres: &Centres) -> bool {
+    let seen = || centres.hits.iter().flatten();
+    let rough = seen().filter(|h| !h.surface.diffuse() && !h.surface.specular);
+    2 * rough.count() > seen().count()
 }
 
 impl Ready<'_> {
@@ -315,11 +329,11 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
     if settings
         .strategy
         .path_reuse
-        .is_some_and(|s| !(1..=16).contains(&s))
+        .is_some_and(|s| !(1..=32).contains(&s))
     {
         return bad(
             "strategy.path_reuse",
-            "expected a tile of 1 to 16 pixels a side".into(),
+            "expected a tile of 1 to 32 pixels a side".into(),
         );
     }
     if settings.groups.len() > 1024 {

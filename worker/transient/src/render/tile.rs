@@ -328,14 +328,8 @@ impl Bench {
         let size = film.pixel();
         let start = u64::from(region.row) * u64::from(frame.width) + u64::from(region.col);
         let mut rng = Rng::new(frame.seed, Stream::Grid, start, u64::from(pass));
-        let mut shift = |length: u32| {
-            if length > side {
-                (rng.uniform() * side as f32) as u32
-            } else {
-                0
-            }
-        };
-        let (down, right) = (shift(region.rows), shift(region.cols));
+        let mut shift = || (rng.uniform() * side as f32) as u32;
+        let (down, right) = (shift(), shift());
         let cuts = |shift: u32, length: u32| {
             let starts = (0..length).filter(move |i| *i == 0 || (i + shift).is_multiple_of(side));
             starts.map(move |i| (i, (side - (i + shift) % side).min(length - i)))
