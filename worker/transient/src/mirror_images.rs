@@ -159,9 +159,10 @@ impl Mirrors {
     pub fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> f32 {
         let mut total = 0.0;
         for (m, out) in self.list.iter().zip(out.chunks_mut(self.spots)) {
-            m.weights(x, n, out);
-            for w in out.iter() {
-                total += w;
+            if m.weights(x, n, out) {
+                for w in out.iter() {
+                    total += w;
+                }
             }
         }
         total
@@ -283,8 +284,8 @@ impl Mirror {
         }
     }
 
-    fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
-        self.images.irradiance(x, n, out);
+    /// Writes the weights of all spots at `x`; returns whether `x` is on a side that reflects (else all are 0).
+    fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> bool {
         let hx = self.normal.dot(x) - self.offset;
         // `reflects` without branches, for all spots side by side.
         let (im, count) = (&self.images, out.len());
@@ -297,8 +298,9 @@ impl Mirror {
             -1.0
         } else {
             out.fill(0.0);
-            return;
+            return false;
         };
+        self.images.irradiance(x, n, out);
         for i in 0..count {
             let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
             let d2 = dx * dx + dy * dy + dz * dz;
@@ -314,6 +316,7 @@ impl Mirror {
                 & (b < self.high[1] + margin);
             out[i] = if inside { out[i] } else { 0.0 };
         }
+        true
     }
 
     fn weight(&self, spot: usize, x: Vec3, n: Vec3) -> f32 {
