@@ -1,4 +1,4 @@
-//! The coordinator's mind: what this instance has in hand, synchronous methods over it, no I/O. Time and ids are
+//! The coordinator's state: what this instance has in hand, synchronous methods over it, no I/O. Time and ids are
 //! passed in. Each method notes what must become durable ([`Changes`]) and what to say afterwards ([`Say`]).
 //!
 //! In hand are the active jobs, the ranges leased to connected workers (or to those that may come back), and the pending

@@ -27,9 +27,24 @@ pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: u
     // Along the bins.
     for (out, v) in other.chunks_mut(slots).zip(variance.chunks(slots)) {
         let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
-        for (k, o) in out.iter_mut().enumerate() {
+        let width = 2 * reach + 1;
+        let edge = reach.min(slots);
+        for k in (0..edge).chain((slots - edge).max(edge)..slots) {
             let near = &v[k.saturating_sub(reach)..(k + reach + 1).min(slots)];
-            *o = near.iter().sum::<f32>() / near.len() as f32 + floor;
+            out[k] = near.iter().sum::<f32>() / near.len() as f32 + floor;
+        }
+        // All others side by side.
+        if slots > 2 * reach {
+            let inner = &mut out[reach..slots - reach];
+            inner.copy_from_slice(&v[..inner.len()]);
+            for j in 1..width {
+                for (o, x) in inner.iter_mut().zip(&v[j..]) {
+                    *o += x;
+                }
+            }
+            for o in inner {
+                *o = *o / width as f32 + floor;
+            }
         }
     }
     // Along rows and columns of pixels.
@@ -62,9 +77,15 @@ fn mean_of_three(
         let low = (k.max(1) - 1).max(first(k));
         let high = (k + 1).min(first(k) + count - 1);
         let share = 1.0 / (high - low + 1) as f32;
-        for (i, o) in out.iter_mut().enumerate() {
-            let sum: f32 = (low..=high).map(|j| from[j * size + i]).sum();
-            *o = sum * share;
+        let item = |j: usize| &from[j * size..(j + 1) * size];
+        out.copy_from_slice(item(low));
+        for j in low + 1..=high {
+            for (o, x) in out.iter_mut().zip(item(j)) {
+                *o += x;
+            }
+        }
+        for o in out {
+            *o *= share;
         }
     }
 }
@@ -217,4 +238,54 @@ pub(super) fn passes_for(
         n = (n + (n / 8).max(1)).min(most);
     }
     n
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::{FLOOR, OWN, Region, pool};
+
+    /// The definition, a bin at a time.
+    fn plain(v: &[f32], (rows, cols, slots): (usize, usize, usize), reach: usize) -> Vec<f32> {
+        let near =
+            |k: usize, n: usize, reach: usize| k.saturating_sub(reach)..(k + reach + 1).min(n);
+        let mean = |all: Vec<f32>| all.iter().sum::<f32>() / all.len() as f32;
+        let bins = |row: usize, col: usize, slot: usize| {
+            let pixel = &v[(row * cols + col) * slots..][..slots];
+            let floor = FLOOR * pixel.iter().sum::<f32>() / slots as f32;
+            mean(pixel[near(slot, slots, reach)].to_vec()) + floor
+        };
+        let along_rows = |row: usize, col: usize, slot: usize| {
+            mean(near(col, cols, 1).map(|c| bins(row, c, slot)).collect())
+        };
+        let each = (0..rows * cols * slots).map(|k| {
+            let (row, col, slot) = (k / slots / cols, k / slots % cols, k % slots);
+            let pooled = mean(
+                near(row, rows, 1)
+                    .map(|r| along_rows(r, col, slot))
+                    .collect(),
+            );
+            pooled + OWN * (v[k] - pooled)
+        });
+        each.collect()
+    }
+
+    proptest! {
+        #[test]
+        fn pooled_variances_are_half_their_neighbours_mean(
+            (rows, cols, slots) in (1usize..5, 1usize..5, 3usize..20),
+            reach in 0usize..4,
+            values in prop::collection::vec(0.0f32..1.0, 4 * 4 * 19),
+        ) {
+            let region = Region { row: 0, col: 0, rows: rows as u32, cols: cols as u32 };
+            let before = &values[..rows * cols * slots];
+            let mut after = before.to_vec();
+            pool(&mut after, &region, slots, reach);
+            let expected = plain(before, (rows, cols, slots), reach);
+            for (a, b) in after.iter().zip(&expected) {
+                prop_assert!((a - b).abs() < 1e-6, "{a} instead of {b}");
+            }
+        }
+    }
 }

@@ -7,7 +7,7 @@ use super::{
     FIRST_PASSES, GOAL, MAX_PASSES,
     error::{Stat, median_after, passes_for, relative_median},
     region::Region,
-    tile::{Bench, Done, Frame, Order},
+    tile::{Done, Frame, Order, TileRenderer},
 };
 use crate::{
     api::{Budget, Plan},
@@ -124,13 +124,13 @@ fn look(frame: &Frame, passes: u32) -> Found {
     let found: Vec<(Vec<Stat>, u64)> = regions
         .into_par_iter()
         .map_init(
-            || Bench::new(frame),
-            |bench, region| {
-                bench
+            || TileRenderer::new(frame),
+            |renderer, region| {
+                renderer
                     .render(frame, &region, &order, &|_| true)
                     .expect("nobody stops it");
-                let stats = (0..region.pixels()).map(|k| stat(&bench.done, frame.film, k));
-                (stats.collect(), bench.done.rays)
+                let stats = (0..region.pixels()).map(|k| stat(&renderer.done, frame.film, k));
+                (stats.collect(), renderer.done.rays)
             },
         )
         .collect();

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     error::{Spread, Stat},
     region::Region,
-    tile::{Bench, Done, Frame, Order},
+    tile::{Done, Frame, Order, TileRenderer},
 };
 use crate::api::{Progress, RenderError};
 
@@ -306,8 +306,8 @@ impl Image {
         let rays: Vec<Option<u64>> = range
             .into_par_iter()
             .map_init(
-                || Bench::new(frame),
-                |bench, t| {
+                || TileRenderer::new(frame),
+                |renderer, t| {
                     if watch.stopped.load(Ordering::Relaxed) {
                         return None;
                     }
@@ -318,12 +318,12 @@ impl Image {
                         first: spent[t],
                         count: waves[t],
                     };
-                    bench.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
+                    renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
                     let mut image = image.lock().unwrap_or_else(|e| e.into_inner());
-                    image.join(frame, t, &bench.done);
+                    image.join(frame, t, &renderer.done);
                     drop(image);
                     watch.tiles.fetch_add(1, Ordering::Relaxed);
-                    Some(bench.done.rays)
+                    Some(renderer.done.rays)
                 },
             )
             .collect();

@@ -35,8 +35,8 @@ pub(super) struct Order {
     pub count: u32,
 }
 
-/// Buffers of one thread.
-pub(super) struct Bench {
+/// Renders one tile after another in buffers that it keeps: one for each thread.
+pub(super) struct TileRenderer {
     scratch: Scratch,
     sharing: Sharing,
     blocks: Blocks,
@@ -217,7 +217,7 @@ impl Done {
     }
 }
 
-impl Bench {
+impl TileRenderer {
     pub fn new(frame: &Frame) -> Self {
         let walk = &frame.walk;
         Self {

@@ -7,7 +7,7 @@ use super::{
     forecast::regions,
     ready::prepare,
     region::Region,
-    tile::{Bench, Frame, Order},
+    tile::{Frame, Order, TileRenderer},
 };
 use crate::{
     api::{RenderError, Settings, Stop, Unstopped},
@@ -71,14 +71,14 @@ fn look((frame, by_class): (&Frame, &Frame), region: &Region, passes: u32) -> Fo
         first,
         count: passes,
     };
-    let mut bench = Bench::new(frame);
-    bench
+    let mut renderer = TileRenderer::new(frame);
+    renderer
         .render(frame, region, &order, &|_| true)
         .expect("nobody stops it");
     let pixels = region.pixels();
     let norm2 = |k| {
         let slots = 1..frame.film.slots - 1;
-        let h = |slot| bench.done.value(frame.film, k, 0, slot);
+        let h = |slot| renderer.done.value(frame.film, k, 0, slot);
         slots.map(|slot| h(slot).powi(2)).sum()
     };
     let norm2 = (0..pixels).map(norm2).collect();
