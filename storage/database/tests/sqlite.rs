@@ -27,6 +27,20 @@ async fn only_one_may_hold_it() {
 }
 
 #[tokio::test]
+async fn a_closed_catalog_is_free_whoever_still_has_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let first = open(&folder).await;
+    first.close().await;
+    let second = open(&folder).await;
+    // What is closed twice stays closed, and takes nothing from the second.
+    first.close().await;
+    let path = folder.path().join("a/b/c.db");
+    let error = SqliteCatalog::open(&path, "the third").await.err().unwrap();
+    assert!(matches!(error, CatalogError::Held { .. }));
+    drop((first, second));
+}
+
+#[tokio::test]
 async fn a_newer_schema_is_left_alone() {
     let folder = tempfile::tempdir().unwrap();
     let catalog = open(&folder).await;

@@ -55,8 +55,8 @@ pub struct SqliteCatalog {
     readers: SqlitePool,
     /// A reader opens the file anew, and shall not open another.
     files: files::Files,
-    // Last, so that it is dropped after the connections.
-    _lock: CatalogLock,
+    /// Until the catalog is closed, whoever still has it. Last, so that otherwise it is dropped after the connections.
+    lock: std::sync::Mutex<Option<CatalogLock>>,
 }
 
 impl SqliteCatalog {
@@ -103,7 +103,7 @@ impl SqliteCatalog {
             writer: Mutex::new(Some(writer::Writer::new(connection, options, files()?))),
             readers,
             files: files()?,
-            _lock: lock,
+            lock: std::sync::Mutex::new(Some(lock)),
         })
     }
 
@@ -432,5 +432,6 @@ impl Catalog for SqliteCatalog {
         if let Some(writer) = self.writer.lock().await.take() {
             writer.close().await;
         }
+        self.lock.lock().expect("no panic while locked").take();
     }
 }
