@@ -10,7 +10,7 @@ const MANY: f64 = 5.0;
 const LARGE_TILE: f64 = 1024.0;
 const SMALL_TILE: f64 = 256.0;
 /// Sums that a thread keeps of each slot of its tile: of all channels, and of the first alone.
-const TILE_SUMS: (f64, f64) = (2.0, 6.0);
+const TILE_SUMS: (f64, f64) = (3.0, 6.0);
 /// Share of the sums over light paths that is counted: not every scene has mirrors that need them, and only the scene
 /// tells.
 pub(in crate::model) const LIGHT_PATHS: f64 = 0.6;

@@ -24,7 +24,7 @@ const LARGE_TILE: u32 = 32;
 const SMALL_TILE: u32 = 16;
 /// Pixels from which an image is large, channels from which a pixel has many histograms.
 const LARGE: usize = 1 << 16;
-pub(super) const MANY: usize = 5;
+const MANY: usize = 5;
 /// The parts with their standard errors.
 #[derive(Debug)]
 pub(super) struct Parts {

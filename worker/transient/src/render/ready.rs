@@ -3,13 +3,7 @@
 
 use picofarm_scene::{Scene, Spot};
 
-use super::{
-    FIRST_PASSES, MAX_PASSES,
-    image::{Image, MANY},
-    splat::Splats,
-    tile::Frame,
-    warn,
-};
+use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
 use crate::{
     api::{
         Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
@@ -109,7 +103,7 @@ pub(super) fn prepare<R>(
         sampling: &sampling,
         effort: Effort::new(
             strategy.path_reuse.unwrap_or_else(|| {
-                let apart = narrow || film.channels >= MANY || mostly_rough(&centres);
+                let apart = narrow || mostly_rough(&centres);
                 if apart { NARROW_TILE } else { WIDE_TILE }
             }),
             narrow,
