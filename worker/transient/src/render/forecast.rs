@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::{
     FIRST_PASSES, GOAL, MAX_PASSES,
     error::{Stat, median_after, passes_for, relative_median},
+    image::tile_side,
     region::Region,
     tile::{Done, Frame, Order, TileRenderer},
 };
@@ -14,8 +15,7 @@ use crate::{
     film::Film,
 };
 
-/// Side and number of the tiles looked at along each side of the image, and their passes.
-const SIDE: u32 = 16;
+/// Number of the tiles looked at along each side of the image, and their passes.
 const TILES: u32 = 3;
 const PASSES: u32 = 8;
 
@@ -91,8 +91,10 @@ struct Found {
 
 /// The tiles looked at.
 pub(super) fn regions(frame: &Frame) -> Vec<Region> {
+    // As wide as the image's own: the more pixels share vertices, the smaller is their error.
+    let widest = tile_side(frame);
     let starts = |length: u32| -> Vec<u32> {
-        let side = SIDE.min(length);
+        let side = widest.min(length);
         let count = TILES.min(length / side);
         let middle = |i| length * (2 * i + 1) / (2 * count);
         (0..count)
@@ -106,8 +108,8 @@ pub(super) fn regions(frame: &Frame) -> Vec<Region> {
             columns.iter().map(move |&col| Region {
                 row,
                 col,
-                rows: SIDE.min(frame.height),
-                cols: SIDE.min(frame.width),
+                rows: widest.min(frame.height),
+                cols: widest.min(frame.width),
             })
         })
         .collect()

@@ -130,6 +130,15 @@ pub(super) fn zeros(count: usize, what: &str) -> Result<Vec<f32>, RenderError> {
     Ok(vec![0.0; count])
 }
 
+/// Side in pixels of the tiles that an image is rendered in.
+pub(super) fn tile_side(frame: &Frame) -> u32 {
+    let pixels = frame.width as usize * frame.height as usize;
+    match pixels >= LARGE && frame.film.channels < MANY {
+        true => LARGE_TILE,
+        false => SMALL_TILE,
+    }
+}
+
 impl Image {
     /// An image that nothing was found in yet.
     ///
@@ -142,11 +151,7 @@ impl Image {
         let all = frame.film.channels + if frame.split { 6 } else { 0 };
         room::<f32>(pixels * bins * all, "the histograms of the image")?;
         let empty = || zeros(pixels * bins, "the histograms of the image");
-        let side = if pixels >= LARGE && frame.film.channels < MANY {
-            LARGE_TILE
-        } else {
-            SMALL_TILE
-        };
+        let side = tile_side(frame);
         let starts = |length: u32| (0..length).step_by(side as usize);
         let tiles: Vec<Region> = starts(height)
             .flat_map(|row| {
