@@ -49,6 +49,19 @@ pub enum Bsdf {
         /// Share of the conductor, in [0, 1].
         weight: f32,
     },
+    /// Thin glass. Light goes straight on through it and **what it reflects is lost**: glass shines nowhere, is no surface of the
+    /// ground truth, and no beam makes a spot on it. A pane lets through T = `transmittance` · ½ Σ (1 − r)/(1 + r) over the two
+    /// polarisations, r Fresnel's reflectance of one face at the light's angle: unpolarised light, reflected to and fro between
+    /// the faces any number of times.
+    ThinDielectric {
+        /// Index of refraction against air, in [1, 4]; 1 reflects nothing.
+        ior: f32,
+        /// Share of the light that is not reflected which a whole pane lets through: its tint at the laser's wavelength, in [0, 1].
+        transmittance: f32,
+        /// The surface is one of the two faces of a pane whose thickness the mesh has: each lets through √T. Otherwise a
+        /// surface is a whole pane.
+        face: bool,
+    },
 }
 
 impl Bsdf {
@@ -58,6 +71,7 @@ impl Bsdf {
             Bsdf::Diffuse { .. } => "diffuse",
             Bsdf::RoughConductor { .. } => "rough_conductor",
             Bsdf::Mixed { .. } => "mixed",
+            Bsdf::ThinDielectric { .. } => "thin_dielectric",
         }
     }
 
@@ -89,6 +103,7 @@ impl Bsdf {
                 specular_reflectance: specular_reflectance * factor,
                 weight,
             },
+            glass @ Bsdf::ThinDielectric { .. } => glass,
         }
     }
 }
@@ -104,7 +119,7 @@ pub struct Material {
     pub name: String,
     /// Scattering at the laser's wavelength.
     pub bsdf: Bsdf,
-    /// Linear RGB albedo for the companion image, each in [0, 1].
+    /// Linear RGB albedo for the companion image, each in [0, 1]; of glass what it lets through.
     pub rgb: [f32; 3],
     /// Scales the albedo from point to point; needs a mesh with texture coordinates.
     pub texture: Option<Arc<Texture>>,
@@ -140,6 +155,26 @@ impl Material {
         }
     }
 
+    /// A clear pane of window glass, index of refraction 1.5: 92 % of the light passes at a right angle.
+    pub fn glass(name: impl Into<String>) -> Self {
+        Self {
+            name: name.into(),
+            bsdf: Bsdf::ThinDielectric {
+                ior: Self::IOR,
+                transmittance: 1.0,
+                face: false,
+            },
+            rgb: [1.0; 3],
+            texture: None,
+            two_sided: true,
+        }
+    }
+
+    /// True for thin glass, which is no surface but lets light through.
+    pub fn is_glass(&self) -> bool {
+        matches!(self.bsdf, Bsdf::ThinDielectric { .. })
+    }
+
     /// Factors of the albedo at a point of texture space: that of `rgb`, and the one of the reflectances
     /// (the mean of the three). Ones without a texture.
     pub fn factors(&self, uv: [f32; 2]) -> ([f32; 3], f32) {
@@ -157,7 +192,7 @@ impl Material {
     /// Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
-            Bsdf::Diffuse { .. } => false,
+            Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,
             Bsdf::RoughConductor { alpha, .. } => alpha <= Self::SPECULAR_ALPHA,
             Bsdf::Mixed { alpha, weight, .. } => weight >= 0.5 && alpha <= Self::SPECULAR_ALPHA,
         }
@@ -165,6 +200,26 @@ impl Material {
 
     /// Roughness up to which a conductor counts as a mirror for masks and for aiming beams.
     pub const SPECULAR_ALPHA: f32 = 0.1;
+
+    /// Thin glass that a file describes by its opacity alone: what covers at most half of what is behind it, with the index of
+    /// refraction of window glass where the file knows none. `None` for what is more opaque.
+    pub(crate) fn by_opacity(opacity: f32, ior: Option<f32>, face: bool) -> Option<Bsdf> {
+        let transmittance = (1.0 - opacity).clamp(0.0, 1.0);
+        let ior = ior.filter(|ior| *ior > 1.0).unwrap_or(Self::IOR);
+        (transmittance >= Self::LEAST_GLASS).then_some(Bsdf::ThinDielectric {
+            ior: ior.min(Self::MAX_IOR),
+            transmittance,
+            face,
+        })
+    }
+
+    /// Share of the light that must pass a material of a file for it to be glass.
+    pub(crate) const LEAST_GLASS: f32 = 0.5;
+    /// Index of refraction of window glass.
+    pub(crate) const IOR: f32 = 1.5;
+
+    /// Largest index of refraction of glass.
+    pub const MAX_IOR: f32 = 4.0;
 
     /// Smallest roughness of a conductor.
     pub const MIN_ALPHA: f32 = 1e-3;
@@ -204,6 +259,17 @@ impl Material {
                 unit("reflectance", reflectance)?;
                 unit("specular_reflectance", specular_reflectance)?;
                 unit("weight", weight)?;
+            }
+            Bsdf::ThinDielectric {
+                ior, transmittance, ..
+            } => {
+                if !(1.0..=Self::MAX_IOR).contains(&ior) {
+                    return Err(format!("ior = {ior} lies outside [1, 4]"));
+                }
+                unit("transmittance", transmittance)?;
+                if self.texture.is_some() {
+                    return Err("glass takes no texture; remove it".into());
+                }
             }
         }
         self.rgb.iter().try_for_each(|&v| unit("rgb", v))

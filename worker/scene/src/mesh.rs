@@ -1,5 +1,7 @@
 //! Triangle meshes with one material index per triangle.
 
+use std::collections::BTreeMap;
+
 use crate::{Material, Vec3};
 
 /// An indexed triangle mesh with flat geometric normals (v1−v0)×(v2−v0).
@@ -41,6 +43,24 @@ impl Mesh {
             .iter()
             .map(|&m| self.materials[m as usize].clone())
             .collect();
+    }
+
+    /// Whether the facets of a material have no rim: an even number of them meet along every edge, so that they bound a
+    /// volume. Vertices in one place are one.
+    pub(crate) fn is_closed(&self, material: u32) -> bool {
+        let mut edges: BTreeMap<[[u32; 3]; 2], u32> = BTreeMap::new();
+        let facets = self.triangles.iter().zip(&self.triangle_material);
+        for (t, _) in facets.filter(|f| *f.1 == material) {
+            // −0 is 0.
+            let place =
+                |v: u32| <[f32; 3]>::from(self.positions[v as usize]).map(|x| (x + 0.0).to_bits());
+            let corners = t.map(place);
+            for k in 0..3 {
+                let (a, b) = (corners[k], corners[(k + 1) % 3]);
+                *edges.entry([a.min(b), a.max(b)]).or_default() += 1;
+            }
+        }
+        edges.values().all(|n| n % 2 == 0)
     }
 
     /// Smallest and largest coordinates over the vertices; `None` without vertices.

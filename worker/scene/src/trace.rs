@@ -94,6 +94,17 @@ impl Model {
 
     /// Closest hit with t in (0, `limit`) in the mesh's own frame: (t, triangle).
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<(f32, u32)> {
+        self.closest_of(origin, direction, limit, |_| true)
+    }
+
+    /// The same, of the triangles that `counts` is true for.
+    fn closest_of(
+        &self,
+        origin: Vec3,
+        direction: Vec3,
+        limit: f32,
+        counts: impl Fn(usize) -> bool,
+    ) -> Option<(f32, u32)> {
         // obvhs's 8-wide nodes lose rays with a component of −0.0; adding 0.0 makes it +0.0.
         let direction = direction + Vec3::ZERO;
         let (o, d): ([f32; 3], [f32; 3]) = (origin.into(), direction.into());
@@ -105,7 +116,7 @@ impl Model {
                 let k = self.tree.primitive_indices[id] as usize;
                 let corners = self.mesh.triangles[k].map(|v| self.mesh.positions[v as usize]);
                 match intersect(corners, origin, direction) {
-                    Some(t) if t > 0.0 => t,
+                    Some(t) if t > 0.0 && counts(k) => t,
                     _ => f32::INFINITY,
                 }
             },
@@ -159,7 +170,7 @@ impl World {
         });
     }
 
-    /// Closest hit with t > 0 over all placed models; the first added wins ties.
+    /// Closest hit with t > 0 over all placed models, through glass; the first added wins ties.
     pub(crate) fn closest(&self, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let inverse = Vec3::new(1.0 / direction.x, 1.0 / direction.y, 1.0 / direction.z);
         let mut best: Option<Hit> = None;
@@ -172,7 +183,12 @@ impl World {
             let [r0, r1, r2] = placed.to_world.linear;
             let back = |d: Vec3| r0 * d.x + r1 * d.y + r2 * d.z;
             let local = back(origin - placed.to_world.translation);
-            if let Some((t, triangle)) = placed.model.closest(local, back(direction), limit)
+            let mesh = &placed.model.mesh;
+            let opaque = |k: usize| !mesh.materials[mesh.triangle_material[k] as usize].is_glass();
+            let hit = placed
+                .model
+                .closest_of(local, back(direction), limit, opaque);
+            if let Some((t, triangle)) = hit
                 && t < limit
             {
                 best = Some(Hit {

@@ -160,8 +160,12 @@ fn extensions_are_honoured_or_noted() {
         ),
         (r#"{"extensions":{"KHR_materials_unlit":{}}}"#, "unlit"),
         (
-            r#"{"extensions":{"KHR_materials_transmission":{"transmissionFactor":1}}}"#,
+            r#"{"extensions":{"KHR_materials_transmission":{"transmissionFactor":0.4}}}"#,
             "transmission",
+        ),
+        (
+            r#"{"pbrMetallicRoughness":{"metallicFactor":0},"extensions":{"KHR_materials_transmission":{"transmissionFactor":1}}}"#,
+            "glass",
         ),
         (
             r#"{"extensions":{"KHR_materials_sheen":{}}}"#,
@@ -177,4 +181,44 @@ fn extensions_are_honoured_or_noted() {
             scene.provenance.notes
         );
     }
+}
+
+#[test]
+fn what_lets_light_through_is_thin_glass() {
+    let of = |material: &str| {
+        let scene = read(file(material, ""));
+        scene.objects[0].mesh.materials[0].clone()
+    };
+    let glass = |ior, transmittance, face| Bsdf::ThinDielectric {
+        ior,
+        transmittance,
+        face,
+    };
+    let tinted = of(
+        r#"{"pbrMetallicRoughness":{"baseColorFactor":[1,0.5,0.75,1],"metallicFactor":0},
+            "extensions":{"KHR_materials_transmission":{"transmissionFactor":0.8},"KHR_materials_ior":{"ior":1.6}}}"#,
+    );
+    assert_eq!(tinted.bsdf, glass(1.6, 0.6, false));
+    assert_eq!(tinted.rgb, [0.8, 0.4, 0.6]);
+    // A solid, which has two faces; what it absorbs on the way.
+    let solid = of(r#"{"pbrMetallicRoughness":{"metallicFactor":0},
+            "extensions":{"KHR_materials_transmission":{"transmissionFactor":1},
+            "KHR_materials_volume":{"thicknessFactor":0.02,"attenuationDistance":0.01,"attenuationColor":[0.5,0.5,0.5]}}}"#);
+    assert_eq!(solid.bsdf, glass(1.5, 0.25, true));
+    // By opacity, in the mode that blends and in no other.
+    let text = |mode: &str, opacity: f32| {
+        format!(
+            r#"{{"alphaMode":"{mode}","pbrMetallicRoughness":{{"baseColorFactor":[1,1,1,{opacity}],"metallicFactor":0}}}}"#
+        )
+    };
+    assert_eq!(of(&text("BLEND", 0.25)).bsdf, glass(1.5, 0.75, false));
+    for opaque in [text("BLEND", 0.75), text("OPAQUE", 0.25)] {
+        assert_eq!(of(&opaque).bsdf, Bsdf::Diffuse { reflectance: 1.0 });
+    }
+    // A metal lets nothing through.
+    let metal = of(
+        r#"{"pbrMetallicRoughness":{"metallicFactor":1,"roughnessFactor":0.5},
+            "extensions":{"KHR_materials_transmission":{"transmissionFactor":1}}}"#,
+    );
+    assert!(matches!(metal.bsdf, Bsdf::RoughConductor { .. }));
 }

@@ -320,7 +320,7 @@ fn the_dictionary_of_a_scene_is_understood() {
     assert_eq!(scene.laser.beams[0].direction, Vec3::new(0.0, 0.0, 1.0));
     for (from, to, expected) in [
         ("\"sphere\"", "\"hair\"", "scene.ball (type \"hair\")"),
-        ("\"twosided\"", "\"thindielectric\"", "\"thindielectric\""),
+        ("\"twosided\"", "\"dielectric\"", "\"dielectric\""),
         ("0.5, 0.6, 0.7", "0.5, 0.6", "scene.white.inner.reflectance"),
         (
             "\"id\": \"white\"",
@@ -369,4 +369,79 @@ fn a_grid_stated_on_import_replaces_the_beams() {
     };
     let scene = read_scene_with(&path, &options, &Bounds::default()).expect("reads");
     assert_eq!(scene.laser.beams.len(), 4);
+}
+
+#[test]
+fn thin_glass_comes_back_as_it_went_and_is_read_from_others() {
+    use picofarm_scene::Material;
+    let folder = tempfile::tempdir().expect("a folder");
+    for (k, face) in [false, true].into_iter().enumerate() {
+        let mut scene = common::textured_room();
+        let mut glass = Material::glass("green glass");
+        glass.rgb = [0.5, 0.75, 0.625];
+        glass.bsdf = Bsdf::ThinDielectric {
+            ior: 1.52,
+            transmittance: 0.625,
+            face,
+        };
+        let mesh = std::sync::Arc::make_mut(&mut scene.objects[0].mesh);
+        mesh.materials[0] = glass.clone();
+        let path = folder.path().join(format!("{k}.xml"));
+        let notes = export::write_mitsuba(&scene, &path).expect("writes");
+        assert_eq!(
+            notes.iter().any(|n| n.contains("whole pane")),
+            face,
+            "{notes:?}"
+        );
+        let back = import::read_scene(&path).expect("reads");
+        let all = |s: &picofarm_scene::Scene| -> Vec<Material> {
+            let each = s.objects.iter().flat_map(|o| o.mesh.materials.clone());
+            each.filter(Material::is_glass).collect()
+        };
+        assert_eq!(all(&back), [glass.clone()]);
+        let glb = folder.path().join(format!("{k}.glb"));
+        export::write_glb(&scene, &glb).expect("writes");
+        assert_eq!(all(&import::read_scene(&glb).expect("reads")), [glass]);
+    }
+    // Mitsuba's own words: named media, and what it reflects by default.
+    let plain = r#"{"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.6, 0.7]}}"#;
+    let text = |glass: &str| {
+        DICTIONARY.replacen(
+            &format!(r#"{{"type": "twosided", "inner": {plain}}}"#),
+            glass,
+            1,
+        )
+    };
+    let read = |glass: &str| read_text("scene.json", &text(glass));
+    let scene = read(r#"{"type": "thindielectric"}"#).expect("reads");
+    assert!(scene.provenance.notes.contains_key("import.glass"));
+    let wall = scene
+        .objects
+        .iter()
+        .find(|o| o.name == "wall")
+        .expect("there");
+    let Bsdf::ThinDielectric { ior, .. } = wall.mesh.materials[0].bsdf else {
+        panic!("glass");
+    };
+    assert!((ior - 1.5046 / 1.000_277).abs() < 1e-6, "{ior}");
+    let quiet = r#"{"type": "thindielectric", "int_ior": "water", "ext_ior": 1.0, "specular_reflectance": 0.0}"#;
+    let scene = read(quiet).expect("reads");
+    assert!(!scene.provenance.notes.contains_key("import.glass"));
+    for (glass, expected) in [
+        (
+            r#"{"type": "thindielectric", "int_ior": "jelly"}"#,
+            "\"jelly\" is not known",
+        ),
+        (
+            r#"{"type": "thindielectric", "int_ior": 0.5}"#,
+            "outside [1, 4]",
+        ),
+        (
+            r#"{"type": "twosided", "inner": {"type": "thindielectric"}}"#,
+            "thindielectric by itself",
+        ),
+    ] {
+        let error = read(glass).expect_err(expected).to_string();
+        assert!(error.contains(expected), "{error}");
+    }
 }

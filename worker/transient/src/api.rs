@@ -6,7 +6,7 @@ pub use picofarm_settings::{Budget, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-7";
+pub const RENDERER_VERSION: &str = "transient-8";
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -120,7 +120,7 @@ pub struct Split {
 }
 
 /// Ground truth. Depth and its kin are those of the ray through the pixel's centre.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct GroundTruth {
     /// z-depth, metres; 0 where the ray leaves the scene.
     pub depth: Vec<f32>,

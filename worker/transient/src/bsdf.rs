@@ -74,6 +74,8 @@ impl Surface {
                     of(Kind::Mixed(distribution), strength, alpha, base)
                 }
             }
+            // No surface: see `glass`.
+            Bsdf::ThinDielectric { .. } => of(Kind::Lambertian, 0.0, 0.0, 0.0),
         }
     }
 

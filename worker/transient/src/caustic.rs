@@ -263,6 +263,7 @@ impl Caustics {
             };
             next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
+            flux *= next.through;
             let before = hit.surface.specular;
             (hit, wo) = (next, -w);
             bounces += 1;
@@ -351,7 +352,7 @@ impl Caustics {
         let aimed = shares.aimed as f32 * self.density(spot, k as usize);
         let plain = shares.plain as f32 / spots as f32 * e.surface.pdf(e.n, e.back, w) * turn;
         let density = aimed + plain;
-        let flux = e.intensity(w) * turn / density;
+        let flux = e.intensity(w) * turn * hit.through / density;
         (density > 0.0 && flux > 0.0).then(|| Start {
             spot,
             hit,
@@ -395,11 +396,15 @@ pub(crate) fn splat(
     let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
     let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
     let intensity = z.flux * z.hit.surface.scatter(z.hit.n, z.back, -p / d);
-    if !inside || intensity == 0.0 || !world.seen(stack, p, z.hit.n) {
+    if !inside || intensity == 0.0 {
+        return None;
+    }
+    let seen = world.seen(stack, p, z.hit.n);
+    if seen == 0.0 {
         return None;
     }
     let cos = q.z / d;
-    let value = intensity * i.fx * i.fy / (d * d * cos * cos * cos);
+    let value = intensity * seen * i.fx * i.fy / (d * d * cos * cos * cos);
     Some(Splat {
         pixel: y as u32 * i.width + x as u32,
         slot: film.slot(z.path_m + world.metres(d)) as u32,

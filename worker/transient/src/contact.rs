@@ -167,6 +167,7 @@ impl Contacts {
             };
             hit.choose_lobe(rng);
             path_m += world.metres((hit.p - from).length());
+            flux *= hit.through;
             if flux == 0.0 || hit.surface.is_black() || path_m > within.gate.end_m() {
                 return;
             }

@@ -27,17 +27,17 @@ pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
 
 pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
     let mut stack = world.bvh.stack();
-    beams
-        .iter()
-        .map(|b| b.spot.or_else(|| follow(world, &mut stack, b.direction)))
-        .collect()
+    let mut end = |b: &Beam| Some(follow(world, &mut stack, b.direction)?.0);
+    beams.iter().map(|b| b.spot.or_else(|| end(b))).collect()
 }
 
-fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
+/// Where a beam ends, and the share of its light that glass lets through to there.
+fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<(Spot, f32)> {
     let (mut from, mut start, mut direction) = (world.laser, world.laser, direction);
-    let mut path = 0.0;
+    let (mut path, mut through) = (0.0, 1.0);
     for _ in 0..MAX_REFLECTIONS {
         let mut hit = world.closest(stack, start, direction)?;
+        through *= hit.through;
         // Where the beam meets that facet without the lift off the mirror before it.
         hit.p = world.point(hit.triangle, from, direction);
         path += world.metres((hit.p - from).length());
@@ -49,17 +49,34 @@ fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<Spot> {
             continue;
         }
         let t = hit.triangle as usize;
-        return Some(Spot {
+        let spot = Spot {
             point: world.outward(hit.p),
             normal: hit.n,
             arriving: direction,
             path_m: path as f32,
             object: world.object[t],
             material: world.material[world.surface[t] as usize],
-        });
+        };
+        return Some((spot, through));
     }
     None
 }
+
+/// The share of a beam's light that glass lets through to its spot: along the beam, or in a straight line where the spot is
+/// stated elsewhere.
+fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f32 {
+    if !world.has_glass() {
+        return 1.0;
+    }
+    let p = world.inward(spot.point);
+    match follow(world, stack, direction) {
+        Some((found, through)) if (world.inward(found.point) - p).length() < SAME_PLACE => through,
+        _ => world.glass(stack, world.laser, lift(p, spot.normal)),
+    }
+}
+
+/// How far a stated spot may lie from where its beam ends, render units.
+const SAME_PLACE: f32 = 1e-3;
 
 /// A spot as a point source: unit power arrives along the beam and leaves by the BRDF.
 #[derive(Debug, Clone, Copy)]
@@ -74,12 +91,18 @@ pub(crate) struct Emitter {
     pub back: Vec3,
     /// Optical path from the laser, metres.
     pub path_m: f64,
-    /// Scattering on the lit side (black behind a one-sided surface).
+    /// Scattering on the lit side (black behind a one-sided surface), times what glass lets through of the beam.
     pub surface: Surface,
 }
 
 impl Emitter {
-    fn new(world: &World, stack: &mut Stack, beam: usize, spot: &Spot, material: u32) -> Self {
+    fn new(
+        world: &World,
+        stack: &mut Stack,
+        (beam, direction): (usize, Vec3),
+        spot: &Spot,
+        material: u32,
+    ) -> Self {
         let surface = world.surfaces[material as usize];
         let p = world.inward(spot.point);
         let p = contact::clear(world, stack, p, spot.normal, -spot.arriving);
@@ -91,6 +114,11 @@ impl Emitter {
             Some(h) if !surface.two_sided && h.surface.is_black() => surface.black(),
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
+        };
+        let through = through(world, stack, direction, spot);
+        let surface = match through == 1.0 {
+            true => surface,
+            false => surface.scaled(through),
         };
         Self {
             beam,
@@ -223,7 +251,12 @@ impl Emitters {
                 });
             }
             let surface = world.first_surface[spot.object as usize] + spot.material;
-            let e = Emitter::new(world, &mut stack, beam, spot, surface);
+            let direction = scene
+                .laser
+                .beams
+                .get(beam)
+                .map_or(spot.arriving, |b| b.direction);
+            let e = Emitter::new(world, &mut stack, (beam, direction), spot, surface);
             let index = all.list.len();
             let strength = if e.surface.diffuse() {
                 e.surface.lambertian()

@@ -10,6 +10,7 @@ mod ellipsoid;
 mod emitter;
 mod extent;
 mod film;
+mod glass;
 mod light_vertices;
 mod mirror_images;
 mod one_bounce;

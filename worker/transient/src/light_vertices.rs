@@ -82,7 +82,7 @@ impl LightVertices {
             }
             let leg = hit.p - e.p;
             let d2 = leg.dot(leg);
-            let flux = weight / (chance * count as f32);
+            let flux = weight * hit.through / (chance * count as f32);
             self.push(LightVertex {
                 hit,
                 back: -w,

@@ -30,13 +30,17 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
         let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
         let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
         let intensity = e.intensity(-e.p / d);
-        if !inside || intensity == 0.0 || !world.seen(stack, e.p, e.n) {
+        if !inside || intensity == 0.0 {
+            continue;
+        }
+        let seen = world.seen(stack, e.p, e.n);
+        if seen == 0.0 {
             continue;
         }
         let cos = f64::from(q.z) / f64::from(d);
         let metres = world.metres(d);
         let area = 1.0 / (f64::from(i.fx) * f64::from(i.fy));
-        let value = f64::from(intensity) / (metres * metres * cos * cos * cos * area);
+        let value = f64::from(intensity * seen) / (metres * metres * cos * cos * cos * area);
         peaks.push(Peak {
             spot,
             pixel: y as usize * i.width as usize + x as usize,

@@ -127,8 +127,9 @@ fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) ->
             return tint.map(|t| 0.6 * t);
         };
         let albedo = world.albedo(&h);
+        let glass = world.tint(stack, from, lift(h.p, h.n));
         for k in 0..3 {
-            tint[k] *= albedo[k];
+            tint[k] *= albedo[k] * glass[k];
         }
         if h.surface.specular && reflection < REFLECTIONS {
             d = (d - h.n * (2.0 * h.n.dot(d))).normalized();
@@ -137,9 +138,9 @@ fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) ->
         }
         let to = light - h.p;
         let cos = h.n.dot(to) / to.length();
-        let direct = if cos > 0.0 && world.free(stack, h.p, h.n, light, Vec3::ZERO) {
+        let direct = if cos > 0.0 {
             let near = lamp.reach * lamp.reach / (to.dot(to) + 0.25 * lamp.reach * lamp.reach);
-            0.8 * cos * near
+            0.8 * cos * near * world.free(stack, h.p, h.n, light, Vec3::ZERO)
         } else {
             0.0
         };

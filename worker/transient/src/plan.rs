@@ -62,6 +62,10 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
             );
         }
     }
+    if walk.world.has_glass() {
+        approximations
+            .push("glass: light goes straight on through it; what it reflects is left out".into());
+    }
     if walk.window.is_some() {
         if longest >= 3 {
             strategies.push("narrow gate: ellipsoidal connections".into());

@@ -105,7 +105,7 @@ fn lit(world: &World, e: &Emitter, row: usize, hits: &[Option<Hit>], out: &mut [
         // Points on the spot's own wall see it at a right angle, give or take rounding.
         let slack = 1e-3 * to.length();
         let facing = h.n.dot(to) > -slack && e.n.dot(to) < slack;
-        *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n));
+        *lit = u8::from(facing && world.free(&mut stack, h.p, h.n, e.p, e.n) > 0.0);
     }
     stack.rays
 }

@@ -138,6 +138,9 @@ impl Strata {
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
                 emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
+                if h.through != 1.0 {
+                    weights.iter_mut().for_each(|w| *w *= h.through);
+                }
                 walk.leave_to_zones(&h, weights);
                 walk.keep_in_window(h.p, world.metres(range), weights);
                 (lift(h.p, h.n), range)
@@ -168,7 +171,9 @@ impl Strata {
                     let leg = world.metres((e.p - h.p).length());
                     let slot = film.slot(e.path_m + leg + self.range_m[sample]);
                     let at = sample * spots + spot;
-                    self.found[at] = (slot as u32, self.weights[at]);
+                    let (a, b) = (emitters.lifted[spot], self.lifted[sample]);
+                    let through = world.glass(&mut scratch.stack, a, b);
+                    self.found[at] = (slot as u32, self.weights[at] * through);
                 }
             }
         }

@@ -250,7 +250,7 @@ impl Walk<'_> {
         let next = Vertex {
             hit,
             wo: -w,
-            beta: v.beta * weight,
+            beta: v.beta * weight * hit.through,
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
             after_mirror: h.surface.specular,

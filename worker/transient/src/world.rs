@@ -11,6 +11,7 @@ use crate::{
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
     extent::{self, Point, wide},
+    glass::Panes,
     rng::Rng,
 };
 
@@ -56,6 +57,8 @@ pub(crate) struct World {
     horizon: f32,
     /// The camera (its origin is the origin of render units).
     pub camera: Camera,
+    /// Glass, which none of the triangles is.
+    panes: Option<Panes>,
 }
 
 /// A point on a surface, seen from somewhere.
@@ -69,6 +72,8 @@ pub(crate) struct Hit {
     pub triangle: u32,
     /// Scattering; black where the ray came from behind a one-sided surface.
     pub surface: Surface,
+    /// Share of light that glass lets through on the way here of the ray that found it; 1 without glass.
+    pub through: f32,
 }
 
 impl Hit {
@@ -91,6 +96,8 @@ impl World {
         let origin = scene.camera.origin;
         let centre = wide(origin);
         let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
+        // Triangles of glass, and their materials.
+        let (mut panes, mut glass): (Vec<[Point; 3]>, Vec<&Material>) = (vec![], vec![]);
         let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
         let textured = |m: &Material| m.texture.is_some();
         let textured = scene
@@ -119,6 +126,12 @@ impl World {
             };
             let placed: Vec<[f64; 3]> = o.mesh.positions.iter().map(|&p| place(p)).collect();
             for (t, &m) in o.mesh.triangles.iter().zip(&o.mesh.triangle_material) {
+                let material = &o.mesh.materials[m as usize];
+                if material.is_glass() {
+                    panes.push(t.map(|v| placed[v as usize]));
+                    glass.push(material);
+                    continue;
+                }
                 points.push(t.map(|v| placed[v as usize]));
                 if textured {
                     uv.push(t.map(|v| o.mesh.uv.get(v as usize).copied().unwrap_or_default()));
@@ -129,6 +142,7 @@ impl World {
         }
         let widest = points
             .iter()
+            .chain(&panes)
             .flatten()
             .flatten()
             .fold(0.0f64, |a, x| a.max(x.abs()));
@@ -148,30 +162,17 @@ impl World {
         let scale = scale_for(reach);
         let mut normals = None;
         if reach < widest {
-            let mut cut = Cut::default();
-            for (k, t) in points.iter().enumerate() {
-                if k % 1024 == 0 {
-                    stop.check()?;
-                }
-                cut.push(k, t, uv.get(k), f64::from(scale));
-                if cut.points.len() > 2 * points.len() + MOST_PIECES {
-                    return Err(RenderError::Invalid {
-                        field: "objects".into(),
-                        what: format!(
-                            "too many triangles reach far beyond what camera and light do ({reach:.3e} m of {widest:.3e} m): cut there, the first {} of {} make {} pieces; remove large surfaces that are out of sight, or check where the camera stands",
-                            k + 1,
-                            points.len(),
-                            cut.points.len(),
-                        ),
-                    });
-                }
-            }
+            let cut = Cut::of(&points, &uv, (reach, widest, scale), stop)?;
             let of = |all: &[u32]| cut.of.iter().map(|&k| all[k]).collect();
             (surface, object) = (of(&surface), of(&object));
             (points, uv, normals) = (cut.points, cut.uv, Some(cut.normals));
+            let cut = Cut::of(&panes, &[], (reach, widest, scale), stop)?;
+            glass = cut.of.iter().map(|&k| glass[k]).collect();
+            panes = cut.points;
         }
         let unit = |p: Point| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32));
         let triangles: Vec<[Vec3; 3]> = points.iter().map(|t| t.map(unit)).collect();
+        let panes: Vec<[Vec3; 3]> = panes.iter().map(|t| t.map(unit)).collect();
         let normals = normals.unwrap_or_else(|| {
             let each = triangles.iter();
             each.map(|t| normal(t).unwrap_or_default()).collect()
@@ -198,7 +199,31 @@ impl World {
             diagonal: (high - low).length().max(edge),
             horizon: (horizon_m * f64::from(scale)) as f32,
             camera: scene.camera,
+            panes: Panes::new(&panes, &glass, stop)?,
         })
+    }
+
+    /// Whether there is glass.
+    pub fn has_glass(&self) -> bool {
+        self.panes.is_some()
+    }
+
+    /// Share of light that glass lets through on the straight way from `a` to `b`; 1 without glass. Surfaces in the way are not
+    /// looked at.
+    #[inline(always)]
+    pub fn glass(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> f32 {
+        match &self.panes {
+            None => 1.0,
+            Some(panes) => panes.through(stack, a, b),
+        }
+    }
+
+    /// The same of red, green and blue.
+    pub fn tint(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 3] {
+        match &self.panes {
+            None => [1.0; 3],
+            Some(panes) => panes.tint(stack, a, b),
+        }
     }
 
     /// False where all light that scatters on a triangle comes too late to count.
@@ -238,7 +263,11 @@ impl World {
         let (_, id) = self.bvh.closest(stack, origin, direction, f32::INFINITY)?;
         let front = self.normals[id as usize].dot(direction) <= 0.0;
         let p = point(&self.triangles[id as usize], origin, direction);
-        Some(self.hit(id, p, front))
+        let mut hit = self.hit(id, p, front);
+        if self.panes.is_some() {
+            hit.through = self.glass(stack, origin, lift(hit.p, hit.n));
+        }
+        Some(hit)
     }
 
     /// A point of a triangle as seen from a place.
@@ -264,6 +293,7 @@ impl World {
             } else {
                 surface.black()
             },
+            through: 1.0,
         }
     }
 
@@ -304,17 +334,24 @@ impl World {
         point(&self.triangles[triangle as usize], origin, direction)
     }
 
-    /// True where the straight way between two surface points is free. Each end is lifted off its
-    /// surface, along the normal given, towards the side of the other end.
+    /// Share of light that passes on the straight way between two surface points: 0 where a surface is in the way, 1 where
+    /// nothing is. Each end is lifted off its surface, along the normal given, towards the side of the other end.
     #[inline]
-    pub fn free(&self, stack: &mut Stack, a: Vec3, na: Vec3, b: Vec3, nb: Vec3) -> bool {
+    pub fn free(&self, stack: &mut Stack, a: Vec3, na: Vec3, b: Vec3, nb: Vec3) -> f32 {
         let (a, b) = (lift(a, na), lift(b, nb));
-        !self.bvh.occluded(stack, a, b - a, 1.0)
+        match self.bvh.occluded(stack, a, b - a, 1.0) {
+            true => 0.0,
+            false => self.glass(stack, a, b),
+        }
     }
 
-    /// True where the straight way from the camera to a surface point is free.
-    pub fn seen(&self, stack: &mut Stack, p: Vec3, n: Vec3) -> bool {
-        !self.bvh.occluded(stack, Vec3::ZERO, lift(p, n), 1.0)
+    /// Share of light that passes on the straight way from the camera to a surface point.
+    pub fn seen(&self, stack: &mut Stack, p: Vec3, n: Vec3) -> f32 {
+        let p = lift(p, n);
+        match self.bvh.occluded(stack, Vec3::ZERO, p, 1.0) {
+            true => 0.0,
+            false => self.glass(stack, Vec3::ZERO, p),
+        }
     }
 }
 
@@ -329,6 +366,34 @@ struct Cut {
 }
 
 impl Cut {
+    /// All triangles, cut; `uv` is empty without texture coordinates.
+    fn of(
+        points: &[[Point; 3]],
+        uv: &[[[f32; 2]; 3]],
+        (reach, widest, scale): (f64, f64, f32),
+        stop: Stop,
+    ) -> Result<Self, RenderError> {
+        let mut cut = Self::default();
+        for (k, t) in points.iter().enumerate() {
+            if k % 1024 == 0 {
+                stop.check()?;
+            }
+            cut.push(k, t, uv.get(k), f64::from(scale));
+            if cut.points.len() > 2 * points.len() + MOST_PIECES {
+                return Err(RenderError::Invalid {
+                    field: "objects".into(),
+                    what: format!(
+                        "too many triangles reach far beyond what camera and light do ({reach:.3e} m of {widest:.3e} m): cut there, the first {} of {} make {} pieces; remove large surfaces that are out of sight, or check where the camera stands",
+                        k + 1,
+                        points.len(),
+                        cut.points.len(),
+                    ),
+                });
+            }
+        }
+        Ok(cut)
+    }
+
     fn push(&mut self, k: usize, t: &[Point; 3], uv: Option<&[[f32; 2]; 3]>, scale: f64) {
         let unit = |p: Point| Vec3::from(p.map(|x| (x * scale) as f32));
         let corner = |i: usize| (t[i], uv.map_or([0.0; 2], |uv| uv[i].map(f64::from)));

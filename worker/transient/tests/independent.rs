@@ -13,7 +13,7 @@ use common::{
     ok, quad, room, scene, settings, sphere, v,
 };
 use picofarm_scene::{
-    AssetLibrary, Material, Scene, Vec3,
+    AssetLibrary, Bsdf, Material, Scene, Vec3,
     furnished::{self, FurnishedSettings},
     primitive,
 };
@@ -225,6 +225,64 @@ fn mirrored(beams: &[Vec3]) -> Scene {
     ));
     objects.push(sphere(v(1.0, -1.0, -2.8), 0.5, 3, grey(0.3)));
     scene(objects, PIXELS, beams)
+}
+
+/// Tinted glass: a partition across the room, aslant, a show-case with faces of its own and a curved near-mirror in it, a window
+/// before the mirror, and one between the laser and a spot. A spot in a corner behind the partition has a zone.
+#[test]
+fn rooms_with_glass_have_the_energy_of_an_independent_tracer() {
+    let glass = |ior, transmittance, face| Material {
+        bsdf: Bsdf::ThinDielectric {
+            ior,
+            transmittance,
+            face,
+        },
+        ..Material::glass("glass")
+    };
+    let beams = [
+        v(0.3, 0.3, -3.98),
+        v(-2.0, 0.4, -2.5),
+        v(0.8, -1.5, -1.8),
+        v(-0.9, 1.5, -3.2),
+        v(-1.985, 0.9, -4.0),
+    ];
+    let mut s = mirrored(&beams);
+    s.objects.push(quad(
+        v(-2.0, -1.5, -2.2),
+        v(4.0, 0.0, 0.6),
+        v(0.0, 2.2, 0.0),
+        glass(1.5, 0.7, false),
+    ));
+    s.objects.extend(room(
+        v(-1.6, -1.5, -3.6),
+        v(-0.9, -0.6, -2.9),
+        &glass(1.6, 0.9, true),
+    ));
+    s.objects.push(quad(
+        v(-0.7, -0.9, -3.9),
+        v(1.4, 0.0, 0.0),
+        v(0.0, 1.8, 0.0),
+        glass(1.45, 1.0, false),
+    ));
+    s.objects.push(quad(
+        v(-0.8, 0.2, -1.2),
+        v(0.6, 0.0, 0.0),
+        v(0.0, 0.6, 0.3),
+        glass(1.8, 0.5, false),
+    ));
+    let ball = Material::mirror("ball", 0.05);
+    s.objects.push(sphere(v(-1.25, -1.1, -3.25), 0.3, 3, ball));
+    let mut rough = furnished(8, 0);
+    let middle = rough.camera.origin + rough.camera.forward * 1.2;
+    let (right, down) = (rough.camera.right, rough.camera.down);
+    rough.objects.push(quad(
+        middle - right * 0.9 - down * 0.7,
+        right * 1.8 + rough.camera.forward * 0.4,
+        down * 1.1,
+        glass(1.5, 0.8, false),
+    ));
+    agrees("glass", &s, 2);
+    agrees("furnished 8 behind glass", &rough, 2);
 }
 
 #[test]

@@ -65,7 +65,8 @@ pub(super) fn open(dir: &Path) -> Result<List, SceneError> {
         .read(&path, MAX_LIST)
         .map_err(|e| fail(format!("{e}; a longer list can be split")))?;
     let text = String::from_utf8(text).map_err(|e| fail(format!("is not UTF-8 text: {e}")))?;
-    let mut hash = Sha256::new_with_prefix(&text);
+    let mut hash = Sha256::new_with_prefix(super::READING);
+    hash.update(&text);
     let records = records(text.trim_start_matches('\u{feff}')).map_err(fail)?;
     let mut records = records.into_iter();
     let columns = Columns::of(records.next()).map_err(fail)?;

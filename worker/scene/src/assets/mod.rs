@@ -27,6 +27,8 @@ pub use install::install;
 
 /// Changes whenever a parametric model changes shape.
 const PARAMETRIC_VERSION: &str = "parametric-1";
+/// Changes whenever the files of a model are read as other materials or another shape.
+const READING: &str = "models-2";
 /// Name of the library of a folder of glTF models.
 const GLTF: &str = "gltf";
 /// Name of the library of Sweet Home 3D's furniture.
@@ -115,7 +117,8 @@ impl AssetLibrary {
                 hint: INSTALL,
             });
         }
-        let (mut assets, mut hash, mut newest) = (Vec::new(), Sha256::new(), String::new());
+        let (mut assets, mut newest) = (Vec::new(), String::new());
+        let mut hash = Sha256::new_with_prefix(READING);
         for file in files {
             let archive = Arc::new(Archive::open(&file)?);
             archive.fingerprint(&mut hash)?;

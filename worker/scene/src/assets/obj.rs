@@ -3,7 +3,7 @@
 
 use std::io::Cursor;
 
-use crate::{Material, Mesh, Vec3};
+use crate::{Bsdf, Material, Mesh, Vec3};
 
 use super::catalogue::{Archive, Item};
 
@@ -66,7 +66,7 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
         },
         made_opaque: materials
             .iter()
-            .any(|m| m.dissolve.is_some_and(|d| d < 1.0)),
+            .any(|m| m.dissolve.is_some_and(|d| d < 1.0) && glass(m).is_none()),
         untextured: materials.iter().any(|m| m.diffuse_texture.is_some()),
     };
     let mesh = &mut loaded.mesh;
@@ -94,6 +94,12 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     }
     stretch(mesh, item.size)?;
     drop_degenerate(mesh);
+    for slot in 0..mesh.materials.len() {
+        let closed = mesh.materials[slot].is_glass() && mesh.is_closed(slot as u32);
+        if let Bsdf::ThinDielectric { face, .. } = &mut mesh.materials[slot].bsdf {
+            *face = closed;
+        }
+    }
     mesh.make_canonical();
     Ok(loaded)
 }
@@ -145,6 +151,11 @@ pub(super) fn drop_degenerate(mesh: &mut Mesh) {
         .retain(|_| *k.next().expect("one flag a triangle"));
 }
 
+/// What lets half of the light or more through. Most programs write an index of 1 where they know none.
+fn glass(file: &tobj::Material) -> Option<Bsdf> {
+    Material::by_opacity(file.dissolve?, file.optical_density, false)
+}
+
 /// Kd is a display colour: linear albedo by a 2.2 power, kept within what real surfaces have.
 fn material(file: &tobj::Material) -> Material {
     let linear = |v: f32| libm::powf(v.clamp(0.0, 1.0), 2.2).clamp(0.04, 0.9);
@@ -154,7 +165,14 @@ fn material(file: &tobj::Material) -> Material {
         Some(kd) => kd.map(linear),
         None => [GREY; 3],
     };
-    Material::diffuse(file.name.clone(), rgb)
+    match (glass(file), file.dissolve) {
+        (Some(bsdf), Some(opacity)) => Material {
+            bsdf,
+            rgb: [(1.0 - opacity).clamp(0.0, 1.0); 3],
+            ..Material::glass(file.name.clone())
+        },
+        _ => Material::diffuse(file.name.clone(), rgb),
+    }
 }
 
 #[cfg(test)]
@@ -183,7 +201,7 @@ mod tests {
             ("a/chair.obj", OBJ),
             (
                 "a/chair.mtl",
-                "newmtl wood\nKd 1 0 0\nnewmtl glass\nKd 0.5 0.5 0.5\nd 0.3\n",
+                "newmtl wood\nKd 1 0 0\nd 0.9\nnewmtl glass\nKd 0.5 0.5 0.5\nNi 1\nd 0.25\n",
             ),
             ("a/broken.obj", "v NaN 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ] {
@@ -196,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn models_are_upright_of_catalogue_size_clean_and_opaque() {
+    fn models_are_upright_of_catalogue_size_and_clean_and_thin_glass_where_transparent() {
         let folder = tempfile::tempdir().expect("a folder");
         let library = library(folder.path());
         assert_eq!(library.len(), 2, "an item without its model is left out");
@@ -223,6 +241,13 @@ mod tests {
                 .iter()
                 .any(|p| (p.y - 1.0).abs() < 1e-6)
         );
+        // A closed surface has two faces for each pane; an index of 1 is none.
+        let face = crate::Bsdf::ThinDielectric {
+            ior: 1.5,
+            transmittance: 0.75,
+            face: true,
+        };
+        assert_eq!(model.mesh.materials[0].bsdf, face);
         let changes: Vec<_> = asset.changes().collect();
         assert_eq!(changes, ["transparent materials made opaque"]);
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use crate::{
-    Affine, Camera, Material, Mesh, Scene, Vec3,
+    Affine, Bsdf, Camera, Material, Mesh, Scene, Vec3,
     extras::{FORMAT, Keyed, MaterialExtras, NodeExtras, SceneExtras, metallic_roughness},
 };
 
@@ -20,6 +20,8 @@ use super::{
 #[serde(rename_all = "camelCase")]
 pub(super) struct Document {
     asset: Asset,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    extensions_used: Vec<&'static str>,
     scene: u32,
     scenes: [SceneEntry; 1],
     nodes: Vec<Node>,
@@ -112,8 +114,50 @@ struct MaterialEntry {
     name: String,
     double_sided: bool,
     pbr_metallic_roughness: Pbr,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    extensions: Option<Glass>,
     extras: Keyed<MaterialExtras>,
 }
+
+/// What other programs draw glass by.
+#[derive(Debug, Serialize)]
+struct Glass {
+    #[serde(rename = "KHR_materials_transmission")]
+    transmission: Transmission,
+    #[serde(rename = "KHR_materials_ior")]
+    ior: Ior,
+    #[serde(
+        rename = "KHR_materials_volume",
+        skip_serializing_if = "Option::is_none"
+    )]
+    volume: Option<Volume>,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Transmission {
+    transmission_factor: f32,
+}
+
+#[derive(Debug, Serialize)]
+struct Ior {
+    ior: f32,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Volume {
+    thickness_factor: f32,
+}
+
+/// Above 0: the mesh bounds the glass.
+const THICKNESS_M: f32 = 0.005;
+/// The extensions of [`Glass`].
+const EXTENSIONS: [&str; 3] = [
+    "KHR_materials_transmission",
+    "KHR_materials_ior",
+    "KHR_materials_volume",
+];
 
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
@@ -181,6 +225,10 @@ impl Document {
                 version: "2.0",
                 generator: concat!("picofarm-scene ", env!("CARGO_PKG_VERSION")),
                 copyright: scene.provenance.attribution.join("; "),
+            },
+            extensions_used: match materials.iter().any(|m| m.extensions.is_some()) {
+                true => EXTENSIONS.to_vec(),
+                false => Vec::new(),
             },
             scene: 0,
             scenes: [SceneEntry {
@@ -256,6 +304,7 @@ fn material_entry(material: &Material, textures: &mut Textures) -> MaterialEntry
             metallic_factor,
             roughness_factor,
         },
+        extensions: glass(material.bsdf),
         extras: Keyed {
             picofarm: MaterialExtras {
                 bsdf: material.bsdf,
@@ -263,6 +312,21 @@ fn material_entry(material: &Material, textures: &mut Textures) -> MaterialEntry
             },
         },
     }
+}
+
+fn glass(bsdf: Bsdf) -> Option<Glass> {
+    let Bsdf::ThinDielectric { ior, face, .. } = bsdf else {
+        return None;
+    };
+    Some(Glass {
+        transmission: Transmission {
+            transmission_factor: 1.0,
+        },
+        ior: Ior { ior },
+        volume: face.then_some(Volume {
+            thickness_factor: THICKNESS_M,
+        }),
+    })
 }
 
 /// Column-major 4×4 matrix of an affine map.

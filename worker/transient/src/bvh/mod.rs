@@ -6,6 +6,7 @@
 //! The kernels (AVX-512, AVX2, portable) run the same operations in the same order: same bits.
 
 mod alike;
+mod all;
 mod build;
 mod bundle;
 mod bundle_leaf;
@@ -84,6 +85,8 @@ pub struct Stack {
     /// Bundles: which rays an entry is for.
     masks: Vec<u64>,
     bundle: Box<bundle::Scratch>,
+    /// What a segment meets of glass.
+    pub(crate) met: Vec<(f32, u32)>,
     /// Rays traced with this stack.
     pub rays: u64,
 }
@@ -108,13 +111,26 @@ impl Bvh {
         Some(self)
     }
 
+    /// A bundle's entries, and above them those of a single ray that it sends on.
+    fn deepest(&self) -> usize {
+        2 * 8 * (self.depth + 2)
+    }
+
+    /// Makes the stack of another tree deep enough for this one.
+    pub(crate) fn deepen(&self, stack: &mut Stack) {
+        if stack.entries.len() < self.deepest() {
+            stack.entries.resize(self.deepest(), (0, 0.0));
+            stack.masks.resize(self.deepest(), 0);
+        }
+    }
+
     /// A stack deep enough for this tree.
     pub fn stack(&self) -> Stack {
-        // A bundle's entries, and above them those of a single ray that it sends on.
-        let deepest = 2 * 8 * (self.depth + 2);
+        let deepest = self.deepest();
         Stack {
             entries: vec![(0, 0.0); deepest],
             masks: vec![0; deepest],
+            met: vec![],
             bundle: Box::new(bundle::Scratch::new()),
             rays: 0,
         }

@@ -147,8 +147,18 @@ impl Sharing {
             let mut lit = self.ends_of.iter().zip(&self.blocked);
             let lit = lit.by_ref().filter(|(_, blocked)| !**blocked);
             let lit: Vec<usize> = lit.map(|(&spot, _)| spot).collect();
+            // The densities below are of what is drawn: with glass in the way as without.
+            let mut through = vec![];
+            if walk.world.has_glass() {
+                let from = lift(h.p, h.n);
+                let share = |spot: &usize| {
+                    let to = emitters.lifted[*spot];
+                    walk.world.glass(&mut scratch.stack, from, to)
+                };
+                through = lit.iter().map(share).collect();
+            }
             let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
-            for &spot in &lit {
+            for (k, &spot) in lit.iter().enumerate() {
                 let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
                 {
                     let to = h.p - e.p;
@@ -162,7 +172,8 @@ impl Sharing {
                         e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
                     };
                     let path = nearest + walk.world.metres(d) + e.path_m;
-                    let carried = carry.share(w);
+                    let through = through.get(k).copied().unwrap_or(1.0);
+                    let carried = carry.share(w) * through;
                     if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
                         sink.toward(to * (-1.0 / d));
                         sink.add(path, carried, spot, bounce + 1, Way::Spot);
@@ -255,6 +266,14 @@ impl Sharing {
             let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
             for w in weight.iter_mut() {
                 *w *= inverse;
+            }
+            if walk.world.has_glass() {
+                let from = lift(h.p, h.n);
+                for (&i, &to) in self.ends_of.iter().zip(&self.ends) {
+                    if weight[i] > 0.0 {
+                        weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
+                    }
+                }
             }
         }
     }

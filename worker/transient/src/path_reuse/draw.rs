@@ -113,7 +113,8 @@ impl Sharing {
                 if !blocked && walk.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
                     let spot = film.tag(y.spot, Place::Gather, Way::Zone);
-                    film.add(pixel, film.slot(path), self.weight[i], spot);
+                    let through = walk.world.glass(stack, from, lift(v.hit.p, v.hit.n));
+                    film.add(pixel, film.slot(path), self.weight[i] * through, spot);
                 }
             }
         }
@@ -303,7 +304,7 @@ fn first(walk: &Walk, (x, y): (f32, f32), scratch: &mut Scratch) -> Option<Verte
     Some(Vertex {
         hit,
         wo: -hit.p / range,
-        beta: 1.0,
+        beta: hit.through,
         length_m: world.metres(range),
         bounce: 1,
         after_mirror: false,

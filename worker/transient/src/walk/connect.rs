@@ -53,9 +53,11 @@ impl Walk<'_> {
         }
         let mut each = |spot: usize, value: f32| {
             let e = &self.emitters.list[spot];
-            if self.world.free(stack, h.p, h.n, e.p, e.n) {
+            let free = self.world.free(stack, h.p, h.n, e.p, e.n);
+            if free > 0.0 {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-                sink.add(path, v.beta * value, spot, v.bounce + 1, Way::Spot);
+                let value = v.beta * value * free;
+                sink.add(path, value, spot, v.bounce + 1, Way::Spot);
             }
         };
         if count == ALL {
@@ -167,13 +169,16 @@ impl Walk<'_> {
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
         let path = v.length_m + lengths + e.path_m;
-        let counts = value != 0.0 && self.window.is_none_or(|w| w.holds(path));
-        if !counts || !self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n) {
+        if value == 0.0 || !self.window.is_none_or(|w| w.holds(path)) {
+            return;
+        }
+        let free = m.through * self.world.free(&mut scratch.stack, m.p, m.n, e.p, e.n);
+        if free == 0.0 {
             return;
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
-        let value = v.beta * value / (aimed + plain);
+        let value = v.beta * value * free / (aimed + plain);
         sink.toward(w);
         sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
     }
@@ -238,11 +243,15 @@ impl Walk<'_> {
         draw(lights, count, rng.uniform(), |i, value| {
             let y = &vertices.list[i];
             let (there, bounces) = (&y.hit, v.bounce + y.bounces);
-            if bounces <= self.max_bounces && self.world.free(stack, h.p, h.n, there.p, there.n) {
+            if bounces > self.max_bounces {
+                return;
+            }
+            let free = self.world.free(stack, h.p, h.n, there.p, there.n);
+            if free > 0.0 {
                 let leg = there.p - h.p;
                 let path = v.length_m + self.world.metres(leg.length()) + y.path_m;
                 sink.toward(leg.normalized());
-                sink.add(path, v.beta * value, y.spot, bounces, way);
+                sink.add(path, v.beta * value * free, y.spot, bounces, way);
             }
         });
     }

@@ -248,6 +248,7 @@ pub fn f(bsdf: Bsdf, n: P, i: P, o: P) -> f64 {
             let rough = conductor(f64::from(alpha), distribution, n, i, o);
             (1.0 - w) * f64::from(reflectance) / PI + w * f64::from(specular_reflectance) * rough
         }
+        Bsdf::ThinDielectric { .. } => panic!("glass scatters nothing"),
     }
 }
 

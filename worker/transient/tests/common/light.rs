@@ -115,15 +115,17 @@ impl Tracer {
             });
         }
         let mut from = P::from(self.scene.laser.origin);
+        let mut through = 1.0;
         let mut d = P::from(beam.direction).unit();
         for _ in 0..64 {
             let hit = self.tree.hit(from, d, f64::INFINITY)?;
+            through *= self.tree.through(from, hit.p);
             if !is_mirror(hit.bsdf) {
                 return Some(Source {
                     p: hit.p,
                     n: hit.n,
                     back: d * -1.0,
-                    bsdf: hit.bsdf,
+                    bsdf: hit.bsdf.scaled(through as f32),
                 });
             }
             from = hit.p;
@@ -175,9 +177,10 @@ impl Tracer {
         let free = co > 0.0 && self.tree.hit(v.p, w, d * (1.0 - 1e-9)).is_none();
         free.then(|| {
             let density = self.pixels_per_steradian(w * -1.0);
+            let through = self.tree.through(v.p, self.origin());
             (
                 self.pixel(film),
-                f(v.bsdf, v.n, back, w) * co * density / (d * d),
+                f(v.bsdf, v.n, back, w) * co * density / (d * d) * through,
             )
         })
     }
@@ -246,6 +249,7 @@ impl Tracer {
                 let Some(next) = self.tree.hit(at.p, w, f64::INFINITY) else {
                     break;
                 };
+                flux *= self.tree.through(at.p, next.p);
                 (at, back) = (next, w * -1.0);
                 if let Some((pixel, value)) = self.seen(&at, back) {
                     add(pixel, bounces > 2, flux * value, at.bsdf);

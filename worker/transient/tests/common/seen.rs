@@ -153,6 +153,7 @@ impl Tracer {
             let density = share * (0.5 / area + 0.5 * radial);
             let value = self.lit(&vertex, w * -1.0, source);
             let films = self.pixels_per_steradian(w) * vertex.n.dot(w * -1.0) / to.dot(to);
+            let value = value * self.tree.through(origin, p);
             add(self.pixel(film), value * films / density / samples as f64);
         }
     }
@@ -169,7 +170,7 @@ impl Tracer {
         }
         let value = f(x.bsdf, x.n, wo, w) * cos * intensity / (d * d);
         if value > 0.0 && self.tree.free(x.p, source.p) {
-            value
+            value * self.tree.through(x.p, source.p)
         } else {
             0.0
         }
@@ -224,6 +225,7 @@ impl Tracer {
             if !is_mirror(at.bsdf) {
                 continue;
             }
+            let unit = unit * self.tree.through(self.origin(), at.p);
             let (mut back, mut beta, mut got) = (d * -1.0, unit, 0.0);
             for bounces in 3..400 {
                 let pair = [rng.next(), rng.next()];
@@ -242,6 +244,7 @@ impl Tracer {
                 let Some(next) = self.tree.hit(at.p, w, f64::INFINITY) else {
                     break;
                 };
+                beta *= self.tree.through(at.p, next.p);
                 (at, back) = (next, w * -1.0);
                 let one = (rng.next() * sources.len() as f64) as usize;
                 got += beta * sources.len() as f64 * self.lit(&at, back, &sources[one]);

@@ -32,15 +32,29 @@ pub struct Vertex {
     pub t: f64,
 }
 
-/// A binary tree of boxes, split at the median.
+/// A binary tree of boxes, split at the median, and the glass beside it.
 pub struct Tree {
     nodes: Vec<Node>,
     triangles: Vec<Triangle>,
+    panes: Vec<Triangle>,
+}
+
+/// Share of light that passes a pane: reflections to and fro between its faces summed one by one, polarisations apart.
+fn passes(ior: f64, cos: f64) -> f64 {
+    let inside = (1.0 - cos.acos().sin().powi(2) / (ior * ior)).sqrt();
+    let s = ((cos - ior * inside) / (cos + ior * inside)).powi(2);
+    let p = ((ior * cos - inside) / (ior * cos + inside)).powi(2);
+    let series = |r: f64| {
+        (0..200)
+            .map(|k| (1.0 - r).powi(2) * r.powi(2 * k))
+            .sum::<f64>()
+    };
+    0.5 * (series(s) + series(p))
 }
 
 impl Tree {
     pub fn new(scene: &Scene) -> Self {
-        let mut triangles = vec![];
+        let (mut triangles, mut panes) = (vec![], vec![]);
         for o in &scene.objects {
             for (t, &m) in o.mesh.triangles.iter().zip(&o.mesh.triangle_material) {
                 let corners = t.map(|i| P::from(o.to_world.point(o.mesh.positions[i as usize])));
@@ -51,8 +65,12 @@ impl Tree {
                     "textures are not for this tracer"
                 );
                 let black = Bsdf::Diffuse { reflectance: 0.0 };
+                let list = match material.bsdf {
+                    Bsdf::ThinDielectric { .. } => &mut panes,
+                    _ => &mut triangles,
+                };
                 if n.length() > 0.0 {
-                    triangles.push(Triangle {
+                    list.push(Triangle {
                         corners,
                         normal: n.unit(),
                         sides: match material.two_sided {
@@ -66,7 +84,30 @@ impl Tree {
         let mut nodes = vec![];
         let count = triangles.len();
         build(&mut nodes, &mut triangles, 0..count);
-        Self { nodes, triangles }
+        Self {
+            nodes,
+            triangles,
+            panes,
+        }
+    }
+
+    /// Share of light that the glass between two points lets through.
+    pub fn through(&self, a: P, b: P) -> f64 {
+        let way = b - a;
+        let d = way.unit();
+        let across = |pane: &&Triangle| pane.distance(a, d, way.length()).is_some();
+        self.panes.iter().filter(across).fold(1.0, |all, pane| {
+            let Bsdf::ThinDielectric {
+                ior,
+                transmittance,
+                face,
+            } = pane.sides[0]
+            else {
+                panic!("a pane is of glass");
+            };
+            let whole = passes(f64::from(ior), pane.normal.dot(d).abs()) * f64::from(transmittance);
+            all * if face { whole.sqrt() } else { whole }
+        })
     }
 
     /// The first surface along a unit direction, beyond 1e-11 and nearer than `limit`.

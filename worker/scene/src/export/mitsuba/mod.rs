@@ -186,6 +186,13 @@ impl Writer<'_> {
             let what = format!("material {:?}: colours cut off at 1", material.name);
             self.notes.push(what);
         }
+        if written.whole {
+            let what = format!(
+                "material {:?}: each face of the glass is a whole pane, which lets the square of its light through",
+                material.name
+            );
+            self.notes.push(what);
+        }
         self.text.push_str(&written.text);
         self.text.push('\n');
         let extras = MaterialExtras {

@@ -52,6 +52,8 @@ pub(crate) struct BsdfText {
     pub(crate) images: Vec<(String, Texture)>,
     /// A colour would have to exceed 1.
     pub(crate) clamped: bool,
+    /// Glass whose thickness the mesh has: a surface of it is a whole pane in Mitsuba.
+    pub(crate) whole: bool,
 }
 
 /// The `<bsdf>` of a material. Colours are `rgb`, scaled so that their mean is the laser's reflectance; with a
@@ -65,7 +67,31 @@ pub(crate) fn bsdf_text(
         text: String::new(),
         images: Vec::new(),
         clamped: false,
+        whole: false,
     };
+    if let Bsdf::ThinDielectric {
+        ior,
+        transmittance,
+        face,
+    } = material.bsdf
+    {
+        let tint = colour(
+            &mut out,
+            "specular_transmittance",
+            id,
+            material,
+            None,
+            transmittance,
+        );
+        // What it reflects is left out here as there.
+        out.text = format!(
+            "<bsdf type=\"thindielectric\"{}><float name=\"int_ior\" value=\"{ior}\"/><float name=\"ext_ior\" value=\"1\"/>\
+             <rgb name=\"specular_reflectance\" value=\"0 0 0\"/>{tint}</bsdf>",
+            id_attribute(id)
+        );
+        out.whole = face;
+        return out;
+    }
     let outer = if material.two_sided { "" } else { id };
     let body = match material.bsdf {
         Bsdf::Diffuse { reflectance } => {
@@ -98,6 +124,7 @@ pub(crate) fn bsdf_text(
                 id_attribute(outer)
             )
         }
+        Bsdf::ThinDielectric { .. } => unreachable!("glass was written above"),
     };
     out.text = if material.two_sided {
         format!("<bsdf type=\"twosided\"{}>{body}</bsdf>", id_attribute(id))

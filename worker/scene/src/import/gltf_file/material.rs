@@ -103,16 +103,38 @@ impl Walk<'_> {
         let mut material =
             Material::diffuse(file.name().unwrap_or("material").to_owned(), standard.rgb);
         material.bsdf = standard.bsdf;
-        if let Some(info) = standard.texture {
-            if has_uv {
-                material.texture = Some(self.texture(&info.texture(), &at)?);
-            } else {
-                self.note(
-                    "textures",
-                    "left out where a mesh has no texture coordinates",
-                );
-            }
+        let exact = self.exact(file, &at, &material)?;
+        if let Some(ours) = exact {
+            (material.bsdf, material.two_sided) = (ours.bsdf, ours.two_sided);
+        } else if let Some((tint, bsdf)) = self.glass(file, standard.rgb, &material) {
+            (material.rgb, material.bsdf) = (tint, bsdf);
+        } else if file.ior().is_some() || file.specular().is_some() {
+            self.note(
+                "coats",
+                "KHR_materials_ior and _specular: opaque dielectrics are Lambertian",
+            );
         }
+        match standard.texture {
+            Some(_) if material.is_glass() => self.note("glass.textures", "left out"),
+            Some(info) if has_uv => {
+                material.texture = Some(self.texture(&info.texture(), &at)?);
+            }
+            Some(_) => self.note(
+                "textures",
+                "left out where a mesh has no texture coordinates",
+            ),
+            None => {}
+        }
+        Ok(material)
+    }
+
+    /// What our own extras say of a material, where its standard factors are as we wrote them.
+    fn exact(
+        &mut self,
+        file: &gltf::Material<'_>,
+        at: &str,
+        standard: &Material,
+    ) -> Result<Option<MaterialExtras>, SceneError> {
         let pbr = file.pbr_metallic_roughness();
         let extras = format!("{at}.extras.picofarm");
         let ours: Option<MaterialExtras> = keyed(
@@ -120,22 +142,78 @@ impl Walk<'_> {
             &extras,
             file.extras().as_deref().map(|r| r.get()),
         )?;
-        if let Some(ours) = ours {
-            let exact = Material {
-                bsdf: ours.bsdf,
-                two_sided: ours.two_sided,
-                ..material.clone()
-            };
-            // Someone who edits the file in another program changes the standard factors: they win then.
-            let (metallic, roughness) = metallic_roughness(&exact);
-            let same = (metallic - pbr.metallic_factor()).abs() < SAME_FACTOR
-                && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
-            if same {
-                return Ok(exact);
-            }
+        let Some(ours) = ours else { return Ok(None) };
+        // Someone who edits the file in another program changes the standard factors: they win then.
+        let (metallic, roughness) = metallic_roughness(&Material {
+            bsdf: ours.bsdf,
+            ..standard.clone()
+        });
+        let same = (metallic - pbr.metallic_factor()).abs() < SAME_FACTOR
+            && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
+        if !same {
             self.note("materials", "edited since export; standard factors used");
         }
-        Ok(material)
+        Ok(same.then_some(ours))
+    }
+
+    /// What a material lets through, and its BSDF, where that is at least half of the light: by KHR_materials_transmission, or
+    /// by an opacity below one half.
+    fn glass(
+        &mut self,
+        file: &gltf::Material<'_>,
+        [r, g, b]: [f32; 3],
+        opaque: &Material,
+    ) -> Option<([f32; 3], Bsdf)> {
+        let unit = |x: f32| x.clamp(0.0, 1.0);
+        let solid = file.volume().filter(|v| v.thickness_factor() > 0.0);
+        let [.., opacity] = match file.pbr_specular_glossiness() {
+            Some(pbr) => pbr.diffuse_factor(),
+            None => file.pbr_metallic_roughness().base_color_factor(),
+        };
+        let passes = file
+            .transmission()
+            .map_or(0.0, |t| unit(t.transmission_factor()));
+        let metal = matches!(opaque.bsdf, Bsdf::RoughConductor { .. });
+        let by_opacity = || match file.alpha_mode() {
+            AlphaMode::Blend => Material::by_opacity(opacity, file.ior(), solid.is_some()),
+            _ => None,
+        };
+        let (tint, bsdf) = if passes >= Material::LEAST_GLASS && !metal {
+            // What the way through the glass takes away.
+            let absorbed = |k: usize| match &solid {
+                Some(v) if v.attenuation_distance().is_finite() => libm::powf(
+                    unit(v.attenuation_color()[k]),
+                    v.thickness_factor() / v.attenuation_distance().max(1e-9),
+                ),
+                _ => 1.0,
+            };
+            let base = [r, g, b];
+            let tint: [f32; 3] = std::array::from_fn(|k| unit(passes * base[k] * absorbed(k)));
+            let bsdf = Bsdf::ThinDielectric {
+                ior: file
+                    .ior()
+                    .unwrap_or(Material::IOR)
+                    .clamp(1.0, Material::MAX_IOR),
+                transmittance: (tint[0] + tint[1] + tint[2]) / 3.0,
+                face: solid.is_some(),
+            };
+            (tint, bsdf)
+        } else if let Some(bsdf) = by_opacity() {
+            ([unit(1.0 - opacity); 3], bsdf)
+        } else {
+            if passes > 0.0 {
+                self.note("transmission", "of less than one half: ignored, opaque");
+            }
+            if file.alpha_mode() != AlphaMode::Opaque {
+                self.note("transparency", "ignored; such materials are opaque");
+            }
+            return None;
+        };
+        self.note(
+            "glass",
+            "thin: light goes straight on, what it reflects and scatters is left out",
+        );
+        Some((tint, bsdf))
     }
 
     fn metallic_roughness<'f>(
@@ -144,10 +222,7 @@ impl Walk<'_> {
         at: &str,
     ) -> Result<Standard<'f>, SceneError> {
         let pbr = file.pbr_metallic_roughness();
-        let [r, g, b, opacity] = pbr.base_color_factor();
-        if opacity < 1.0 {
-            self.note("transparency", "ignored; such materials are opaque");
-        }
+        let [r, g, b, _] = pbr.base_color_factor();
         let (mut metallic, mut roughness) = (pbr.metallic_factor(), pbr.roughness_factor());
         if let Some(info) = pbr.metallic_roughness_texture() {
             let texture = self.texture(&info.texture(), at)?;
@@ -177,10 +252,7 @@ impl Walk<'_> {
         &mut self,
         pbr: &gltf::material::PbrSpecularGlossiness<'f>,
     ) -> Standard<'f> {
-        let [r, g, b, opacity] = pbr.diffuse_factor();
-        if opacity < 1.0 {
-            self.note("transparency", "ignored; such materials are opaque");
-        }
+        let [r, g, b, _] = pbr.diffuse_factor();
         if pbr.specular_glossiness_texture().is_some() {
             self.note("specular_glossiness_textures", "ignored; factors used");
         }
@@ -216,23 +288,11 @@ impl Walk<'_> {
 
     /// Notes the features of a material that our model has no words for.
     fn dropped_features(&mut self, file: &gltf::Material<'_>) {
-        if file.alpha_mode() != AlphaMode::Opaque {
-            self.note("transparency", "ignored; such materials are opaque");
-        }
-        if file.transmission().is_some() || file.volume().is_some() {
-            self.note("transmission", "ignored; such materials are opaque");
-        }
         if file.emissive_factor() != [0.0; 3] || file.emissive_strength().is_some() {
             self.note("emission", "ignored; only the laser shines");
         }
         if file.normal_texture().is_some() || file.occlusion_texture().is_some() {
             self.note("normal_and_occlusion_textures", "ignored");
-        }
-        if file.ior().is_some() || file.specular().is_some() {
-            self.note(
-                "coats",
-                "KHR_materials_ior and _specular: dielectrics are Lambertian",
-            );
         }
         if file.unlit() {
             self.note(

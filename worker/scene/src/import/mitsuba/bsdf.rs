@@ -25,7 +25,16 @@ const METALS: [(&str, [f32; 3]); 5] = [
     ("Cr", [0.550, 0.556, 0.554]),
     ("Cu", [0.955, 0.638, 0.538]),
 ];
-const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these";
+const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these, or thindielectric by itself";
+
+/// Mitsuba's names of media, with their indices of refraction.
+const MEDIA: [(&str, f64); 5] = [
+    ("vacuum", 1.0),
+    ("air", 1.000_277),
+    ("water", 1.333),
+    ("acrylic glass", 1.49),
+    ("bk7", 1.5046),
+];
 
 /// A material, and what its textures do to texture coordinates.
 #[derive(Debug, Clone)]
@@ -72,6 +81,10 @@ impl Reader<'_> {
         let look = match self.exact(node)? {
             Some(material) => Look {
                 material,
+                to_uv: Matrix::IDENTITY,
+            },
+            None if node.kind == "thindielectric" => Look {
+                material: self.glass(node)?,
                 to_uv: Matrix::IDENTITY,
             },
             None => {
@@ -157,6 +170,43 @@ impl Reader<'_> {
             "blendbsdf" => self.blend(node, depth),
             other => Err(node.fail(format!("bsdf {other:?} is not supported; {SUBSET}"))),
         }
+    }
+
+    /// Thin glass.
+    fn glass(&mut self, node: &Node) -> Result<Material, String> {
+        self.ignored(
+            node,
+            &[
+                "int_ior",
+                "ext_ior",
+                "specular_reflectance",
+                "specular_transmittance",
+            ],
+        );
+        let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
+        if !(1.0..=f64::from(Material::MAX_IOR)).contains(&ior) {
+            return Err(node.fail(format!("int_ior / ext_ior = {ior} lies outside [1, 4]")));
+        }
+        let plain = |colour: Option<Colour>, name: &str| match colour {
+            Some(c) if c.texture.is_some() => {
+                Err(node.fail(format!("{name}: textures on glass are not supported")))
+            }
+            colour => Ok(colour.unwrap_or(Colour::grey(1.0))),
+        };
+        let reflected = self.colour(node, "specular_reflectance")?;
+        if plain(reflected, "specular_reflectance")?.mean() > 0.0 {
+            self.note("glass", "what it reflects is left out");
+        }
+        let tint = self.colour(node, "specular_transmittance")?;
+        let tint = plain(tint, "specular_transmittance")?;
+        let mut material = Material::glass(named(node));
+        material.rgb = tint.rgb;
+        material.bsdf = Bsdf::ThinDielectric {
+            ior: ior as f32,
+            transmittance: tint.mean(),
+            face: false,
+        };
+        Ok(material)
     }
 
     fn blend(&mut self, node: &Node, depth: usize) -> Result<Parts, String> {
@@ -359,6 +409,32 @@ impl Reader<'_> {
     }
 }
 
+/// What a material is called.
+fn named(node: &Node) -> String {
+    match node.id.is_empty() {
+        true => node.kind.clone(),
+        false => node.id.clone(),
+    }
+}
+
+/// An index of refraction: a number, or one of Mitsuba's names.
+fn index(node: &Node, name: &str, default: &str) -> Result<f64, String> {
+    if let Ok(Some(number)) = node.number(name) {
+        return match number.is_finite() && number > 0.0 {
+            true => Ok(number),
+            false => Err(node.fail(format!("{name}: {number} is no index of refraction"))),
+        };
+    }
+    let medium = node.text(name)?.unwrap_or(default);
+    let known = MEDIA.iter().find(|(known, _)| *known == medium);
+    known.map(|(_, ior)| *ior).ok_or_else(|| {
+        node.fail(format!(
+            "{name}: {medium:?} is not known; use a number, or one of {}",
+            MEDIA.map(|m| m.0).join(", ")
+        ))
+    })
+}
+
 fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
     let texture_of = |c: &Option<Colour>| c.as_ref().and_then(|c| c.texture.clone());
     let diffuse = texture_of(&parts.diffuse);
@@ -405,12 +481,7 @@ fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
         (None, None) => return Err(node.fail("has no BSDF")),
     };
     let (texture, to_uv) = texture.map_or((None, Matrix::IDENTITY), |(t, m)| (Some(t), m));
-    let name = if node.id.is_empty() {
-        &node.kind
-    } else {
-        &node.id
-    };
-    let mut material = Material::diffuse(name.clone(), rgb);
+    let mut material = Material::diffuse(named(node), rgb);
     material.bsdf = bsdf;
     material.texture = texture;
     material.two_sided = parts.two_sided;

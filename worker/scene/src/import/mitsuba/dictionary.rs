@@ -23,6 +23,7 @@ const TAGS: [(&str, &[&str]); 6] = [
             "conductor",
             "twosided",
             "blendbsdf",
+            "thindielectric",
         ],
     ),
     ("sensor", &["perspective"]),
