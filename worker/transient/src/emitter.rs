@@ -7,6 +7,7 @@ use crate::{
     bsdf::Surface,
     bvh::Stack,
     contact,
+    lanes::{Wide, widest},
     world::{World, lift},
 };
 
@@ -179,16 +180,44 @@ impl Columns {
     /// power of each Lambertian source, unshadowed.
     #[inline]
     pub fn irradiance(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
+        widest(Irradiance {
+            columns: self,
+            x,
+            n,
+            out,
+        });
+    }
+}
+
+/// [`Columns::irradiance`].
+pub(crate) struct Irradiance<'a> {
+    pub columns: &'a Columns,
+    pub x: Vec3,
+    pub n: Vec3,
+    pub out: &'a mut [f32],
+}
+
+impl Wide for Irradiance<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let Self {
+            columns: c,
+            x,
+            n,
+            out,
+        } = self;
         let count = out.len();
-        let (px, py, pz) = (&self.px[..count], &self.py[..count], &self.pz[..count]);
-        let (nx, ny, nz) = (&self.nx[..count], &self.ny[..count], &self.nz[..count]);
-        let strength = &self.strength[..count];
+        let (px, py, pz) = (&c.px[..count], &c.py[..count], &c.pz[..count]);
+        let (nx, ny, nz) = (&c.nx[..count], &c.ny[..count], &c.nz[..count]);
+        let strength = &c.strength[..count];
         for i in 0..count {
             let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
             let d2 = dx * dx + dy * dy + dz * dz;
             let cx = n.x * dx + n.y * dy + n.z * dz;
             let cs = -(nx[i] * dx + ny[i] * dy + nz[i] * dz);
-            let lit = cx > 0.0 && cs > 0.0;
+            let lit = (cx > 0.0) & (cs > 0.0);
             let value = strength[i] * cx * cs / (d2 * d2);
             out[i] = if lit { value } else { 0.0 };
         }

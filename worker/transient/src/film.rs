@@ -73,6 +73,12 @@ impl Film {
     #[inline]
     pub fn add(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
         pixel[slot] += value;
+        self.add_to_groups(pixel, slot, value, spot);
+    }
+
+    /// Adds a value to a pixel's channels but the first.
+    #[inline]
+    pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, value: f32, spot: usize) {
         if self.channels > 1 {
             for &c in &self.of_spot[spot] {
                 pixel[usize::from(c) * self.slots + slot] += value;

@@ -11,6 +11,7 @@ mod emitter;
 mod extent;
 mod film;
 mod glass;
+mod lanes;
 mod light_vertices;
 mod mirror_images;
 mod one_bounce;

@@ -13,7 +13,8 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Stop,
     bsdf::frame,
-    emitter::{Columns, Emitters},
+    emitter::{Columns, Emitters, Irradiance},
+    lanes::{self, Wide, widest},
     rng::Rng,
     world::World,
 };
@@ -157,15 +158,12 @@ impl Mirrors {
 
     /// Writes the unshadowed contribution at `x` of every spot by every mirror; returns their sum.
     pub fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> f32 {
-        let mut total = 0.0;
-        for (m, out) in self.list.iter().zip(out.chunks_mut(self.spots)) {
-            if m.weights(x, n, out) {
-                for w in out.iter() {
-                    total += w;
-                }
-            }
-        }
-        total
+        widest(Weights {
+            mirrors: self,
+            x,
+            n,
+            out,
+        })
     }
 
     /// Chooses a spot and mirror by unshadowed contribution at `x` and a point to aim at; `None` with no
@@ -220,6 +218,30 @@ impl Mirrors {
         let d2 = to.dot(to);
         let cos = mirror.normal.dot(to).abs() / d2.sqrt();
         falloff / (PI * s2) * shape.jt * shape.js * d2 / cos
+    }
+}
+
+/// [`Mirrors::weights`].
+struct Weights<'a> {
+    mirrors: &'a Mirrors,
+    x: Vec3,
+    n: Vec3,
+    out: &'a mut [f32],
+}
+
+impl Wide for Weights<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn run(self) -> f32 {
+        let Self { mirrors, x, n, out } = self;
+        let mut total = 0.0;
+        for (m, out) in mirrors.list.iter().zip(out.chunks_mut(mirrors.spots)) {
+            if m.weights(x, n, out) {
+                total += lanes::sum(out);
+            }
+        }
+        total
     }
 }
 
@@ -285,6 +307,7 @@ impl Mirror {
     }
 
     /// Writes the weights of all spots at `x`; returns whether `x` is on a side that reflects (else all are 0).
+    #[inline(always)]
     fn weights(&self, x: Vec3, n: Vec3, out: &mut [f32]) -> bool {
         let hx = self.normal.dot(x) - self.offset;
         // `reflects` without branches, for all spots side by side.
@@ -300,7 +323,13 @@ impl Mirror {
             out.fill(0.0);
             return false;
         };
-        self.images.irradiance(x, n, out);
+        let images = Irradiance {
+            columns: im,
+            x,
+            n,
+            out: &mut *out,
+        };
+        images.run();
         for i in 0..count {
             let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
             let d2 = dx * dx + dy * dy + dz * dz;

@@ -8,6 +8,7 @@ use super::{ArrivalSink, Effort, ROUGH_SPOTS, Sharing};
 use crate::{
     emitter::Columns,
     film::Film,
+    lanes::{self, SIDE, Wide, widest},
     rng::Rng,
     sink::{Place, Sink, Way},
     vertex::Vertex,
@@ -280,11 +281,24 @@ impl Sharing {
 
     /// Carries the arrivals to the pixels.
     pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        widest(Spread {
+            sharing: self,
+            walk,
+            film,
+            pixels,
+        });
+    }
+
+    #[inline(always)]
+    fn spread_wide(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
         let lowest = self.lowest();
         let bounded = walk.max_bounces < u32::MAX;
+        // Every second arrival is summed here: a sum that waits for the one just before it in the same slot takes several
+        // times as long.
+        let mut second = vec![0.0f32; film.slots];
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             let deeper = v.bounce - lowest;
@@ -318,29 +332,68 @@ impl Sharing {
                 }
                 let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
                 if film.channels == 1 && !bounded {
-                    let pixel = &mut pixel[..film.slots];
-                    // Slots eight at a time: that part the compiler can do side by side.
-                    for (bins, values) in bins.chunks(8).zip(values.chunks(8)) {
-                        let mut slots = [0u32; 8];
-                        for (slot, &b) in slots.iter_mut().zip(bins) {
+                    let first = &mut pixel[..film.slots];
+                    let (many, few) = bins.as_chunks::<SIDE>();
+                    let (values, last_values) = values.as_chunks::<SIDE>();
+                    // Slots and values side by side.
+                    for (bins, values) in many.iter().zip(values) {
+                        let (mut slots, mut found) = ([0u32; SIDE], [0.0f32; SIDE]);
+                        for (slot, b) in slots.iter_mut().zip(bins) {
                             *slot = floor(b + offset, last);
                         }
-                        for (&slot, &value) in slots.iter().zip(values) {
-                            pixel[slot as usize] += weight * value;
+                        for (found, v) in found.iter_mut().zip(values) {
+                            *found = weight * v;
                         }
+                        for k in (0..SIDE).step_by(2) {
+                            first[slots[k] as usize] += found[k];
+                            second[slots[k + 1] as usize] += found[k + 1];
+                        }
+                    }
+                    for (k, (b, v)) in few.iter().zip(last_values).enumerate() {
+                        let sums = if k % 2 == 0 { &mut *first } else { &mut second };
+                        sums[floor(b + offset, last) as usize] += weight * v;
                     }
                     continue;
                 }
                 let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
-                for ((&b, &value), (&spot, &bounces)) in bins.iter().zip(values).zip(rest) {
+                let each = bins.iter().zip(values).zip(rest);
+                // In the same order as above: groups of spots change no bit.
+                for (k, ((&b, &value), (&spot, &bounces))) in each.enumerate() {
                     if u32::from(bounces) + deeper > walk.max_bounces {
                         continue;
                     }
-                    let slot = floor(b + offset, last) as usize;
-                    film.add(pixel, slot, weight * value, usize::from(spot));
+                    let (slot, value) = (floor(b + offset, last) as usize, weight * value);
+                    let first = if k % 2 == 0 {
+                        &mut pixel[slot]
+                    } else {
+                        &mut second[slot]
+                    };
+                    *first += value;
+                    film.add_to_groups(pixel, slot, value, usize::from(spot));
                 }
             }
+            for (sum, second) in pixel.iter_mut().zip(&mut second) {
+                *sum += std::mem::take(second);
+            }
         }
+    }
+}
+
+/// [`Sharing::spread`].
+struct Spread<'a> {
+    sharing: &'a Sharing,
+    walk: &'a Walk<'a>,
+    film: &'a Film,
+    pixels: &'a mut [f32],
+}
+
+impl Wide for Spread<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let of = (self.walk, self.film);
+        self.sharing.spread_wide(of, self.pixels);
     }
 }
 
@@ -371,7 +424,23 @@ impl Lengths {
     /// camera, and finds the optical paths by way of it, in bins. Returns the density of drawing the vertex from them. No
     /// branches, and sums side by side: the compiler works on several at once.
     fn weigh(&self, columns: &Columns, y: Vec3, weight: &mut [f32], offset: &mut [f32]) -> f32 {
-        const SIDE: usize = 8;
+        widest(Weigh {
+            lengths: self,
+            columns,
+            y,
+            weight,
+            offset,
+        })
+    }
+
+    #[inline(always)]
+    fn weigh_wide(
+        &self,
+        columns: &Columns,
+        y: Vec3,
+        weight: &mut [f32],
+        offset: &mut [f32],
+    ) -> f32 {
         let count = weight.len();
         let (px, py, pz) = (
             &columns.px[..count],
@@ -379,12 +448,7 @@ impl Lengths {
             &columns.pz[..count],
         );
         let (factor, bins) = (&self.factor[..count], &self.bins[..count]);
-        let mut sums = [0.0f32; SIDE];
-        for chunk in weight.chunks(SIDE) {
-            for (sum, w) in sums.iter_mut().zip(chunk) {
-                *sum += w;
-            }
-        }
+        let sum = lanes::sum(weight);
         let offset = &mut offset[..count];
         for i in 0..count {
             let (dx, dy, dz) = (y.x - px[i], y.y - py[i], y.z - pz[i]);
@@ -392,7 +456,32 @@ impl Lengths {
             offset[i] = (bins[i] + f64::from(d) * self.per_unit) as f32;
             weight[i] *= factor[i];
         }
-        sums.iter().sum::<f32>() / PI
+        sum / PI
+    }
+}
+
+/// [`Lengths::weigh`].
+struct Weigh<'a> {
+    lengths: &'a Lengths,
+    columns: &'a Columns,
+    y: Vec3,
+    weight: &'a mut [f32],
+    offset: &'a mut [f32],
+}
+
+impl Wide for Weigh<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn run(self) -> f32 {
+        let Self {
+            lengths,
+            columns,
+            y,
+            weight,
+            offset,
+        } = self;
+        lengths.weigh_wide(columns, y, weight, offset)
     }
 }
 

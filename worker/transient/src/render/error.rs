@@ -20,39 +20,89 @@ const OWN: f32 = 0.5;
 /// neighbours have nearly the same true variance, and together they know it. The floor stands for paths
 /// that might come and did not. Over many seeds the rms of (h − mean) / error is then 1 within a few
 /// percent, where single sample variances give any number.
-pub(super) fn pool(variance: &mut [f32], region: &Region, slots: usize, reach: usize) {
-    let (rows, cols) = (region.rows as usize, region.cols as usize);
-    let mut other = vec![0.0f32; variance.len()];
-    let own = variance.to_vec();
-    // Along the bins.
-    for (out, v) in other.chunks_mut(slots).zip(variance.chunks(slots)) {
-        let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
-        let width = 2 * reach + 1;
-        let edge = reach.min(slots);
-        for k in (0..edge).chain((slots - edge).max(edge)..slots) {
-            let near = &v[k.saturating_sub(reach)..(k + reach + 1).min(slots)];
-            out[k] = near.iter().sum::<f32>() / near.len() as f32 + floor;
+pub(super) fn pool(
+    variance: &mut [f32],
+    region: &Region,
+    slots: usize,
+    reach: usize,
+    rows: &mut Pool,
+) {
+    let (height, width) = (region.rows as usize, region.cols as usize);
+    let size = width * slots;
+    let Pool { bins, smooth } = rows;
+    bins.resize(size, 0.0);
+    for row in smooth.iter_mut() {
+        row.resize(size, 0.0);
+    }
+    // Rows of pixels in turn, of which three are kept: a large region would not stay in the cache.
+    let mut done = 0;
+    for row in 0..height {
+        while done < height && done <= row + 1 {
+            let v = &variance[done * size..(done + 1) * size];
+            for (out, v) in bins.chunks_mut(slots).zip(v.chunks(slots)) {
+                along_bins(out, v, reach);
+            }
+            let smooth = &mut smooth[done % 3];
+            for (col, out) in smooth.chunks_mut(slots).enumerate() {
+                let near = col.max(1) - 1..(col + 2).min(width);
+                mean(out, near.map(|c| &bins[c * slots..(c + 1) * slots]));
+            }
+            done += 1;
         }
-        // All others side by side.
-        if slots > 2 * reach {
-            let inner = &mut out[reach..slots - reach];
-            inner.copy_from_slice(&v[..inner.len()]);
-            for j in 1..width {
-                for (o, x) in inner.iter_mut().zip(&v[j..]) {
-                    *o += x;
-                }
-            }
-            for o in inner {
-                *o = *o / width as f32 + floor;
-            }
+        let near = row.max(1) - 1..done;
+        mean(&mut bins[..], near.map(|r| &smooth[r % 3][..]));
+        let own = &mut variance[row * size..(row + 1) * size];
+        for (v, pooled) in own.iter_mut().zip(&*bins) {
+            *v = pooled + OWN * (*v - pooled);
         }
     }
-    // Along rows and columns of pixels.
-    mean_of_three(variance, &other, slots, cols, |k| k / cols * cols);
-    other.copy_from_slice(variance);
-    mean_of_three(variance, &other, slots * cols, rows, |_| 0);
-    for (v, own) in variance.iter_mut().zip(&own) {
-        *v += OWN * (own - *v);
+}
+
+/// Room that [`pool`] works in: a row of pixels after the mean over bins, and the latest three after that over columns.
+#[derive(Debug, Default)]
+pub(super) struct Pool {
+    bins: Vec<f32>,
+    smooth: [Vec<f32>; 3],
+}
+
+/// Means of a pixel's bins and their neighbours, with the floor.
+fn along_bins(out: &mut [f32], v: &[f32], reach: usize) {
+    let slots = v.len();
+    let floor = FLOOR * v.iter().sum::<f32>() / slots as f32;
+    let width = 2 * reach + 1;
+    let edge = reach.min(slots);
+    for k in (0..edge).chain((slots - edge).max(edge)..slots) {
+        let near = &v[k.saturating_sub(reach)..(k + reach + 1).min(slots)];
+        out[k] = near.iter().sum::<f32>() / near.len() as f32 + floor;
+    }
+    // All others side by side.
+    if slots > 2 * reach {
+        let inner = &mut out[reach..slots - reach];
+        inner.copy_from_slice(&v[..inner.len()]);
+        for j in 1..width {
+            for (o, x) in inner.iter_mut().zip(&v[j..]) {
+                *o += x;
+            }
+        }
+        for o in inner {
+            *o = *o / width as f32 + floor;
+        }
+    }
+}
+
+/// The mean of one to three items.
+fn mean<'a>(out: &mut [f32], mut items: impl ExactSizeIterator<Item = &'a [f32]>) {
+    let share = 1.0 / items.len() as f32;
+    if let Some(first) = items.next() {
+        out.copy_from_slice(first);
+    }
+    for item in items {
+        for (o, x) in out.iter_mut().zip(item) {
+            *o += x;
+        }
+    }
+    for o in out {
+        *o *= share;
     }
 }
 
@@ -62,31 +112,6 @@ pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
     for v in variance.chunks_mut(slots) {
         v[0] = v[1];
         v[slots - 1] = v[slots - 2];
-    }
-}
-
-/// out\[k\] = mean of from\[k − 1..=k + 1\], items of `size`, within the `count` items from `first(k)`.
-fn mean_of_three(
-    out: &mut [f32],
-    from: &[f32],
-    size: usize,
-    count: usize,
-    first: impl Fn(usize) -> usize,
-) {
-    for (k, out) in out.chunks_mut(size).enumerate() {
-        let low = (k.max(1) - 1).max(first(k));
-        let high = (k + 1).min(first(k) + count - 1);
-        let share = 1.0 / (high - low + 1) as f32;
-        let item = |j: usize| &from[j * size..(j + 1) * size];
-        out.copy_from_slice(item(low));
-        for j in low + 1..=high {
-            for (o, x) in out.iter_mut().zip(item(j)) {
-                *o += x;
-            }
-        }
-        for o in out {
-            *o *= share;
-        }
     }
 }
 
@@ -244,7 +269,7 @@ pub(super) fn passes_for(
 mod tests {
     use proptest::prelude::*;
 
-    use super::{FLOOR, OWN, Region, pool};
+    use super::{FLOOR, OWN, Pool, Region, pool};
 
     /// The definition, a bin at a time.
     fn plain(v: &[f32], (rows, cols, slots): (usize, usize, usize), reach: usize) -> Vec<f32> {
@@ -281,7 +306,7 @@ mod tests {
             let region = Region { row: 0, col: 0, rows: rows as u32, cols: cols as u32 };
             let before = &values[..rows * cols * slots];
             let mut after = before.to_vec();
-            pool(&mut after, &region, slots, reach);
+            pool(&mut after, &region, slots, reach, &mut Pool::default());
             let expected = plain(before, (rows, cols, slots), reach);
             for (a, b) in after.iter().zip(&expected) {
                 prop_assert!((a - b).abs() < 1e-6, "{a} instead of {b}");

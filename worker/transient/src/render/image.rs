@@ -3,7 +3,7 @@
 use std::{
     ops::Range,
     sync::{
-        Mutex,
+        Mutex, MutexGuard,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
 };
@@ -106,6 +106,10 @@ impl<'a> Watch<'a> {
         }
         !self.stopped.load(Ordering::Relaxed)
     }
+}
+
+fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(|e| e.into_inner())
 }
 
 /// Whether so many values find room, all at once.
@@ -308,29 +312,30 @@ impl Image {
         let spent = self.spent.clone();
         let count = range.len();
         let image = Mutex::new(&mut *self);
+        // As many as threads, for the whole round: their buffers are large, and new memory is dear.
+        let idle: Mutex<Vec<TileRenderer>> = Mutex::default();
         let rays: Vec<Option<u64>> = range
             .into_par_iter()
-            .map_init(
-                || TileRenderer::new(frame),
-                |renderer, t| {
-                    if watch.stopped.load(Ordering::Relaxed) {
-                        return None;
-                    }
-                    if waves[t] == 0 && spent[t] > 0 {
-                        return Some(0);
-                    }
-                    let order = Order {
-                        first: spent[t],
-                        count: waves[t],
-                    };
-                    renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
-                    let mut image = image.lock().unwrap_or_else(|e| e.into_inner());
-                    image.join(frame, t, &renderer.done);
-                    drop(image);
-                    watch.tiles.fetch_add(1, Ordering::Relaxed);
-                    Some(renderer.done.rays)
-                },
-            )
+            .map(|t| {
+                if watch.stopped.load(Ordering::Relaxed) {
+                    return None;
+                }
+                if waves[t] == 0 && spent[t] > 0 {
+                    return Some(0);
+                }
+                let order = Order {
+                    first: spent[t],
+                    count: waves[t],
+                };
+                let known = lock(&idle).pop();
+                let mut renderer = known.unwrap_or_else(|| TileRenderer::new(frame));
+                renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
+                lock(&image).join(frame, t, &renderer.done);
+                watch.tiles.fetch_add(1, Ordering::Relaxed);
+                let rays = renderer.done.rays;
+                lock(&idle).push(renderer);
+                Some(rays)
+            })
             .collect();
         let mut all = 0;
         for r in rays {

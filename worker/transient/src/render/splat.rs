@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::{MULTI_REACH, Spread, Stat, estimate, pool},
+    error::{MULTI_REACH, Pool, Spread, Stat, estimate, pool},
     image::{Image, Watch, zeros},
     region::Region,
     tile::Frame,
@@ -150,7 +150,7 @@ impl Layer {
         // The alternating sum has n times a pass' variance, and the mean has 1/n of it.
         let noise = unit / n;
         let size = frame.film.pixel();
-        let mut variance = vec![];
+        let (mut variance, mut pooling) = (vec![], Pool::default());
         for (block, rows) in self.0.iter().enumerate() {
             stop.check()?;
             let Some(rows) = rows else { continue };
@@ -165,7 +165,7 @@ impl Layer {
                     variance.push((spread / n) as f32);
                 }
             }
-            pool(&mut variance, &region, slots, MULTI_REACH);
+            pool(&mut variance, &region, slots, MULTI_REACH, &mut pooling);
             for pixel in 0..region.pixels() {
                 for slot in 1..slots - 1 {
                     let x = f64::from(rows.sum[pixel * size + slot]);

@@ -2,7 +2,7 @@
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
 use super::{
-    error::{MULTI_REACH, Spread, TWO_REACH, pool, shut_out},
+    error::{MULTI_REACH, Pool, Spread, TWO_REACH, pool, shut_out},
     region::Region,
 };
 use crate::{
@@ -72,6 +72,7 @@ pub(super) struct Done {
     pixel_variance: Vec<(f64, f64)>,
     /// Energy of the whole tile by pass.
     all: Vec<f64>,
+    pooling: Pool,
     pub passes: u32,
     pub rays: u64,
 }
@@ -184,7 +185,8 @@ impl Done {
         {
             out.1 = inside(film, v);
         }
-        pool(&mut self.multi_variance, region, film.slots, MULTI_REACH);
+        let (variance, pooling) = (&mut self.multi_variance, &mut self.pooling);
+        pool(variance, region, film.slots, MULTI_REACH, pooling);
     }
 
     /// Σ over the gate's slots of both parts' variances in pixel `k`.
@@ -317,7 +319,12 @@ impl TileRenderer {
         for (out, v) in self.done.pixel_variance.iter_mut().zip(variances) {
             out.0 = inside(film, v);
         }
-        pool(&mut self.done.two_variance, region, film.slots, TWO_REACH);
+        let Done {
+            two_variance,
+            pooling,
+            ..
+        } = &mut self.done;
+        pool(two_variance, region, film.slots, TWO_REACH, pooling);
         Some(())
     }
 
