@@ -277,7 +277,9 @@ mod tests {
             .replace("spots = 25 ", "spots = 100 ")
             .replace("# subsets", "subsets")
             .replace("# per_spot", "per_spot")
-            .replace("# strategy", "strategy");
+            .replace("# strategy", "strategy")
+            .replace("# beam", "beam")
+            .replace("# fill_factor", "fill_factor");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
             unreachable!("the template renders");
@@ -286,6 +288,16 @@ mod tests {
         assert!(render.per_spot);
         assert_eq!(render.strategy.path_reuse, Some(1));
         assert!(render.strategy.mirror_images.is_some());
+        assert_eq!(render.fill_factor, 0.3);
+        let beam = render.beam.expect("it has a width");
+        assert_eq!((beam.diameter_mm, beam.divergence_mrad), (4.0, 1.0));
+        let wrong = text.replace("diameter_mm = 4", "diameter_mm = -4");
+        let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
+        assert!(
+            error.message.contains("render.beam.diameter_mm"),
+            "{}",
+            error.message
+        );
         let wrong = text.replace("mirror_images", "lobes");
         let error = read(&written(dir.path(), &wrong), dir.path()).unwrap_err();
         assert!(

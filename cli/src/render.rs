@@ -79,11 +79,14 @@ impl Order {
                 None => Budget::Samples(samples),
             },
             max_bounces: args.max_bounces.unwrap_or(0),
+            beam: args.beam.width(),
+            fill_factor: args.fill_factor.unwrap_or(1.0),
             ..RenderSettings::default()
         };
         // As in a job: one place knows the ranges.
         asked.check().map_err(|e| {
-            let option = e.field.trim_start_matches("render.").replace('_', "-");
+            let option = e.field.trim_start_matches("render.");
+            let option = option.replace(['_', '.'], "-");
             CliError::input(format!("--{option}: {}", e.what))
         })?;
         if let Some(px) = args.resolution {
@@ -100,6 +103,8 @@ impl Order {
             split,
             groups: wanted.iter().flat_map(|w| w.groups.clone()).collect(),
             strategy: choices::together(&args.strategy)?,
+            beam: asked.beam,
+            fill_factor: asked.fill_factor,
         };
         Ok(Self {
             scene,

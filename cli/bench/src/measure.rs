@@ -45,6 +45,8 @@ pub fn settings(args: &BenchRender, budget: Budget, seed: u64) -> Settings {
         split: false,
         groups: vec![],
         strategy: Strategy::default(),
+        beam: None,
+        fill_factor: 1.0,
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use picofarm_scene::import::Bounds;
-use picofarm_transient::Gate;
+use picofarm_transient::{BeamWidth, Gate};
 
 use crate::{
     choices::{Chosen, Ways},
@@ -60,11 +60,46 @@ pub struct RenderArgs {
     /// Choose ways of finding light by hand, e.g. path-reuse=1,mirror-images=off [default: the renderer chooses by the scene]
     #[arg(long, value_delimiter = ',', value_name = "NAME=VALUE,…", value_parser = crate::choices::parse)]
     pub strategy: Vec<Chosen>,
+    #[command(flatten)]
+    pub beam: BeamArgs,
+    /// Share of each pixel's area that is sensitive, a square in its middle [default: 1]
+    #[arg(long, value_name = "SHARE")]
+    pub fill_factor: Option<f64>,
     /// Threads [default: all cores]
     #[arg(long, value_parser = super::ranges::threads)]
     pub threads: Option<usize>,
     #[command(flatten)]
     pub gate: GateArgs,
+}
+
+/// How wide the laser's beams are.
+#[derive(Args)]
+pub struct BeamArgs {
+    /// Diameter of the laser's beams where they leave it, millimetres, 1/e² of the intensity [default: 0; without it and
+    /// --beam-divergence-mrad beams have no width]
+    #[arg(long, value_name = "MM")]
+    pub beam_diameter_mm: Option<f64>,
+    /// Divergence of the beams, full angle, milliradians, 1/e² of the intensity [default: 0]
+    #[arg(long, value_name = "MRAD")]
+    pub beam_divergence_mrad: Option<f64>,
+    /// Rays that stand for a beam that has a width [default: 16]
+    #[arg(long, value_name = "N")]
+    pub beam_points: Option<u32>,
+}
+
+impl BeamArgs {
+    /// The width; `None` where nothing was said.
+    pub fn width(&self) -> Option<BeamWidth> {
+        let default = BeamWidth::default();
+        let said = self.beam_diameter_mm.is_some()
+            || self.beam_divergence_mrad.is_some()
+            || self.beam_points.is_some();
+        said.then(|| BeamWidth {
+            diameter_mm: self.beam_diameter_mm.unwrap_or(default.diameter_mm),
+            divergence_mrad: self.beam_divergence_mrad.unwrap_or(default.divergence_mrad),
+            points: self.beam_points.unwrap_or(default.points),
+        })
+    }
 }
 
 #[derive(Args)]

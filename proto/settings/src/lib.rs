@@ -16,7 +16,7 @@ pub use network::{
     Architecture, Precision, Schedule, ShadowVariant, StemForm, Swin, Target, TimeProjection,
 };
 pub use reconstruct::{FieldKind, GridSettings, MOST_NODES, MlpSettings, ShadowLoss, Shadows};
-pub use render::{Budget, Choice, Strategy};
+pub use render::{BeamWidth, Budget, Choice, Strategy};
 pub use rooms::{MirrorWall, PrimitiveRooms, Sizes};
 pub use sensor::{DeadTime, Jitter, PS_PER_M, Pulse, Scale, Sensor, SensorError};
 pub use spots::Spots;

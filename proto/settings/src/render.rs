@@ -91,9 +91,80 @@ impl Strategy {
     }
 }
 
+/// The width of a laser's beams, as data sheets state it: Gaussian, by the diameter in which the intensity has fallen to 1/e². At a
+/// distance z it is √(`diameter_mm`² + (`divergence_mrad` · z in metres)²) millimetres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BeamWidth {
+    /// Diameter where the laser stands, millimetres.
+    pub diameter_mm: f64,
+    /// Divergence, full angle, milliradians.
+    pub divergence_mrad: f64,
+    /// Rays that stand for a beam, each with an equal share of its light: the cost of a render grows as with so many times the
+    /// spots.
+    pub points: u32,
+}
+
+impl Default for BeamWidth {
+    fn default() -> Self {
+        Self {
+            diameter_mm: 0.0,
+            divergence_mrad: 0.0,
+            points: 16,
+        }
+    }
+}
+
+impl BeamWidth {
+    /// Checks the fields against their limits.
+    ///
+    /// # Errors
+    /// The field and what was expected of it.
+    pub fn check(&self) -> Result<(), (&'static str, String)> {
+        let range = |field, value: f64, most: f64, unit: &str| match (0.0..=most).contains(&value) {
+            true => Ok(()),
+            false => Err((field, format!("is {value}, expected 0 to {most} {unit}"))),
+        };
+        let (wide, angle) = (self.diameter_mm, self.divergence_mrad);
+        range("diameter_mm", wide, 1000.0, "mm (1/e² of the intensity)")?;
+        range("divergence_mrad", angle, 500.0, "mrad (full angle, 1/e²)")?;
+        if wide == 0.0 && angle == 0.0 {
+            let what = "is 0, and so is divergence_mrad; give one of them, or leave the beam out: without it beams have no width";
+            return Err(("diameter_mm", what.into()));
+        }
+        match self.points {
+            4..=64 => Ok(()),
+            n => Err((
+                "points",
+                format!("is {n}, expected 4 to 64 rays for each beam"),
+            )),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_width_without_a_size_or_beyond_any_laser_is_refused_by_its_field() {
+        let of = |diameter_mm, divergence_mrad, points| {
+            let width = BeamWidth {
+                diameter_mm,
+                divergence_mrad,
+                points,
+            };
+            width.check().map_err(|(field, _)| field)
+        };
+        assert_eq!(of(4.0, 0.0, 16), Ok(()));
+        assert_eq!(of(0.0, 1.5, 64), Ok(()));
+        assert_eq!(of(0.0, 0.0, 16), Err("diameter_mm"));
+        assert_eq!(of(-1.0, 1.0, 16), Err("diameter_mm"));
+        assert_eq!(of(f64::NAN, 1.0, 16), Err("diameter_mm"));
+        assert_eq!(of(1.0, 501.0, 16), Err("divergence_mrad"));
+        assert_eq!(of(1.0, 1.0, 3), Err("points"));
+        assert_eq!(of(1.0, 1.0, 65), Err("points"));
+    }
 
     #[test]
     fn every_field_is_a_name_and_takes_one_kind_of_choice() {

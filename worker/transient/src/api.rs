@@ -2,7 +2,7 @@
 //! are `[row][column][bin]`; per-spot images are `[spot][row][column]`.
 
 use picofarm_scene::Spot;
-pub use picofarm_settings::{Budget, Gate, Strategy};
+pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
@@ -30,6 +30,22 @@ pub struct Settings {
     /// Ways of finding light.
     #[serde(default)]
     pub strategy: Strategy,
+    /// The width of the laser's beams; without it they have none. Spots and ground truth are those of the beams' middles.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beam: Option<BeamWidth>,
+    /// Share of each pixel's area that is sensitive, above 0 and at most 1: a square in its middle. Histograms are means over it; the
+    /// ground truth is that of pixels' middles all the same.
+    #[serde(default = "whole", skip_serializing_if = "is_whole")]
+    pub fill_factor: f64,
+}
+
+fn whole() -> f64 {
+    1.0
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_whole(share: &f64) -> bool {
+    *share == 1.0
 }
 
 /// Called with the progress of a render; may end it.

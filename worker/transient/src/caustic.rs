@@ -379,7 +379,7 @@ impl Caustics {
 }
 
 /// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
-/// distance d and angle θ gives I/(d² cos³θ) over the pixel's area on the film at unit distance.
+/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance.
 pub(crate) fn splat(
     world: &World,
     film: &Film,
@@ -390,13 +390,9 @@ pub(crate) fn splat(
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);
     let d = p.length();
-    if !(q.z > 0.0 && d > 0.0) {
-        return None;
-    }
-    let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
-    let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
+    let pixel = world.pixel(q).filter(|_| d > 0.0)?;
     let intensity = z.flux * z.hit.surface.scatter(z.hit.n, z.back, -p / d);
-    if !inside || intensity == 0.0 {
+    if intensity == 0.0 {
         return None;
     }
     let seen = world.seen(stack, p, z.hit.n);
@@ -404,9 +400,10 @@ pub(crate) fn splat(
         return None;
     }
     let cos = q.z / d;
-    let value = intensity * seen * i.fx * i.fy / (d * d * cos * cos * cos);
+    let area = world.sensitive * world.sensitive;
+    let value = intensity * seen * i.fx * i.fy / (d * d * cos * cos * cos) / area;
     Some(Splat {
-        pixel: y as u32 * i.width + x as u32,
+        pixel: pixel as u32,
         slot: film.slot(z.path_m + world.metres(d)) as u32,
         spot: z.spot as u16,
         value,

@@ -3,7 +3,8 @@
 use picofarm_scene::{Beam, Scene, Spot, Vec3};
 
 use crate::{
-    api::{RenderError, Stop, Unstopped},
+    api::{BeamWidth, RenderError, Stop, Unstopped},
+    beam_width,
     bsdf::Surface,
     bvh::Stack,
     contact,
@@ -28,13 +29,18 @@ pub fn trace_spots(scene: &Scene) -> Result<Vec<Option<Spot>>, RenderError> {
 
 pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
     let mut stack = world.bvh.stack();
-    let mut end = |b: &Beam| Some(follow(world, &mut stack, b.direction)?.0);
+    let mut end = |b: &Beam| Some(follow(world, &mut stack, world.laser, b.direction)?.0);
     beams.iter().map(|b| b.spot.or_else(|| end(b))).collect()
 }
 
-/// Where a beam ends, and the share of its light that glass lets through to there.
-fn follow(world: &World, stack: &mut Stack, direction: Vec3) -> Option<(Spot, f32)> {
-    let (mut from, mut start, mut direction) = (world.laser, world.laser, direction);
+/// Where a ray of the laser that starts at `origin` ends, and the share of its light that glass lets through to there.
+fn follow(
+    world: &World,
+    stack: &mut Stack,
+    origin: Vec3,
+    mut direction: Vec3,
+) -> Option<(Spot, f32)> {
+    let (mut from, mut start) = (origin, origin);
     let (mut path, mut through) = (0.0, 1.0);
     for _ in 0..MAX_REFLECTIONS {
         let mut hit = world.closest(stack, start, direction)?;
@@ -70,10 +76,17 @@ fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f3
         return 1.0;
     }
     let p = world.inward(spot.point);
-    match follow(world, stack, direction) {
-        Some((found, through)) if (world.inward(found.point) - p).length() < SAME_PLACE => through,
-        _ => world.glass(stack, world.laser, lift(p, spot.normal)),
+    match ends_at(world, stack, direction, spot) {
+        Some(through) => through,
+        None => world.glass(stack, world.laser, lift(p, spot.normal)),
     }
+}
+
+/// The share of a beam's light that glass lets through, if the beam ends at `spot`.
+fn ends_at(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> Option<f32> {
+    let (found, through) = follow(world, stack, world.laser, direction)?;
+    let apart = world.inward(found.point) - world.inward(spot.point);
+    (apart.length() < SAME_PLACE).then_some(through)
 }
 
 /// How far a stated spot may lie from where its beam ends, render units.
@@ -92,7 +105,7 @@ pub(crate) struct Emitter {
     pub back: Vec3,
     /// Optical path from the laser, metres.
     pub path_m: f64,
-    /// Scattering on the lit side (black behind a one-sided surface), times what glass lets through of the beam.
+    /// Scattering on the lit side (black behind a one-sided surface), times the source's share of the beam: what glass lets through.
     pub surface: Surface,
 }
 
@@ -100,7 +113,7 @@ impl Emitter {
     fn new(
         world: &World,
         stack: &mut Stack,
-        (beam, direction): (usize, Vec3),
+        (beam, share): (usize, f32),
         spot: &Spot,
         material: u32,
     ) -> Self {
@@ -116,10 +129,9 @@ impl Emitter {
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
-        let through = through(world, stack, direction, spot);
-        let surface = match through == 1.0 {
+        let surface = match share == 1.0 {
             true => surface,
-            false => surface.scaled(through),
+            false => surface.scaled(share),
         };
         Self {
             beam,
@@ -224,8 +236,8 @@ impl Wide for Irradiance<'_> {
     }
 }
 
-/// All spots that exist, as sources.
-#[derive(Debug)]
+/// All spots that exist, as sources; of beams with a width several for each.
+#[derive(Debug, Default)]
 pub(crate) struct Emitters {
     /// The sources.
     pub list: Vec<Emitter>,
@@ -242,13 +254,7 @@ pub(crate) struct Emitters {
 impl Emitters {
     pub fn new(scene: &Scene, world: &World, spots: &[Option<Spot>]) -> Result<Self, RenderError> {
         let mut stack = world.bvh.stack();
-        let mut all = Self {
-            list: vec![],
-            lifted: vec![],
-            columns: Columns::default(),
-            glossy: vec![],
-            on_mirror: vec![],
-        };
+        let mut all = Self::default();
         for (beam, spot) in spots.iter().enumerate() {
             let Some(spot) = spot else { continue };
             let material = scene
@@ -285,26 +291,75 @@ impl Emitters {
                 .beams
                 .get(beam)
                 .map_or(spot.arriving, |b| b.direction);
-            let e = Emitter::new(world, &mut stack, (beam, direction), spot, surface);
-            let index = all.list.len();
-            let strength = if e.surface.diffuse() {
-                e.surface.lambertian()
-            } else {
-                0.0
-            };
-            // A beam that arrives from behind its own normal lights nothing.
-            let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
-            all.columns.push(e.p, e.n, strength);
-            if !e.surface.diffuse() {
-                all.glossy.push(index);
-                if e.surface.specular {
-                    all.on_mirror.push(index);
-                }
-            }
-            all.lifted.push(lift(e.p, e.n));
-            all.list.push(e);
+            let through = through(world, &mut stack, direction, spot);
+            all.push(Emitter::new(
+                world,
+                &mut stack,
+                (beam, through),
+                spot,
+                surface,
+            ));
         }
         Ok(all)
+    }
+
+    /// The sources of beams that have a width: as many for each beam as `width` has points, with equal shares of its light.
+    /// What of a beam meets nothing is lost.
+    ///
+    /// # Errors
+    /// [`RenderError::Invalid`] where the width cannot be used, or a beam does not end at the spot that the scene states for it.
+    pub fn widened(scene: &Scene, world: &World, width: &BeamWidth) -> Result<Self, RenderError> {
+        let invalid = |field: String, what: String| Err(RenderError::Invalid { field, what });
+        if let Err((field, what)) = width.check() {
+            return invalid(format!("beam.{field}"), what);
+        }
+        let mut stack = world.bvh.stack();
+        let mut all = Self::default();
+        for (beam, b) in scene.laser.beams.iter().enumerate() {
+            if let Some(spot) = &b.spot
+                && ends_at(world, &mut stack, b.direction, spot).is_none()
+            {
+                let what = "lies elsewhere than its beam ends, so that it cannot be said where the rays of a wide beam end; \
+                            drop the spot to have the beam traced, or render without a width";
+                return invalid(format!("laser.beams[{beam}].spot"), what.into());
+            }
+            for ray in beam_width::rays(width, b.direction) {
+                let start = world.laser + ray.beside_m * world.scale;
+                let Some((spot, through)) = follow(world, &mut stack, start, ray.direction) else {
+                    continue;
+                };
+                let surface = world.first_surface[spot.object as usize] + spot.material;
+                let share = through / width.points as f32;
+                all.push(Emitter::new(
+                    world,
+                    &mut stack,
+                    (beam, share),
+                    &spot,
+                    surface,
+                ));
+            }
+        }
+        Ok(all)
+    }
+
+    fn push(&mut self, e: Emitter) {
+        let index = self.list.len();
+        let strength = if e.surface.diffuse() {
+            e.surface.lambertian()
+        } else {
+            0.0
+        };
+        // A beam that arrives from behind its own normal lights nothing.
+        let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
+        self.columns.push(e.p, e.n, strength);
+        if !e.surface.diffuse() {
+            self.glossy.push(index);
+            if e.surface.specular {
+                self.on_mirror.push(index);
+            }
+        }
+        self.lifted.push(lift(e.p, e.n));
+        self.list.push(e);
     }
 
     /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s cos_s

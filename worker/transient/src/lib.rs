@@ -2,6 +2,7 @@
 //! jobs, stores or files.
 
 mod api;
+mod beam_width;
 mod bsdf;
 mod bvh;
 mod caustic;

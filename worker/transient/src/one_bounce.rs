@@ -16,7 +16,7 @@ pub(crate) struct Peak {
 }
 
 /// The peaks of all spots that the camera sees. A spot of intensity I at distance d and angle θ from the
-/// optical axis gives I/(d² cos³θ) over the pixel's area on the film at unit distance.
+/// optical axis gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance.
 pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Vec<Peak> {
     let c = &world.camera;
     let i = &c.intrinsics;
@@ -24,13 +24,11 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
     for (spot, e) in emitters.list.iter().enumerate() {
         let q = c.direction_to_camera(e.p);
         let d = e.p.length();
-        if !(q.z > 0.0 && d > 0.0) {
+        let Some(pixel) = world.pixel(q).filter(|_| d > 0.0) else {
             continue;
-        }
-        let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
-        let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
+        };
         let intensity = e.intensity(-e.p / d);
-        if !inside || intensity == 0.0 {
+        if intensity == 0.0 {
             continue;
         }
         let seen = world.seen(stack, e.p, e.n);
@@ -39,11 +37,11 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
         }
         let cos = f64::from(q.z) / f64::from(d);
         let metres = world.metres(d);
-        let area = 1.0 / (f64::from(i.fx) * f64::from(i.fy));
+        let area = f64::from(world.sensitive).powi(2) / (f64::from(i.fx) * f64::from(i.fy));
         let value = f64::from(intensity * seen) / (metres * metres * cos * cos * cos * area);
         peaks.push(Peak {
             spot,
-            pixel: y as usize * i.width as usize + x as usize,
+            pixel,
             path_m: e.path_m + metres,
             value: value as f32,
         });

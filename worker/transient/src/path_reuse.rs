@@ -272,11 +272,11 @@ impl Sharing {
                 // Spread over the pixel beside the first (Roberts 2018).
                 let at = |start: f32, step: f32| (start + j as f32 * step).fract();
                 let at = (at(x, 0.754_877_7), at(y, 0.569_840_3));
-                let at = (col as f32 + at.0, row as f32 + at.1);
-                only_mirrors(walk, &mut rng, at, share, scratch, &mut sink);
+                let ray = walk.world.camera_ray((row, col), at);
+                only_mirrors(walk, &mut rng, ray, share, scratch, &mut sink);
             }
-            let at = (col as f32 + x, row as f32 + y);
-            if let Some(v) = gather_point(walk, &mut rng, at, share, scratch, &mut sink) {
+            let ray = walk.world.camera_ray((row, col), (x, y));
+            if let Some(v) = gather_point(walk, &mut rng, ray, share, scratch, &mut sink) {
                 self.gathers.push((v, k));
             }
         }

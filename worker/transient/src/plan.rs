@@ -13,6 +13,22 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
     if settings.one_bounce {
         strategies.push("one bounce: analytic".into());
     }
+    if let Some(width) = &settings.beam {
+        strategies.push(format!(
+            "wide beams: {} rays for each, {} mm and {} mrad",
+            width.points, width.diameter_mm, width.divergence_mrad
+        ));
+        approximations.push(
+            "spots of wide beams are as many points as rays; depth, masks and two-bounce times are those of the beams' middles"
+                .into(),
+        );
+    }
+    if settings.fill_factor != 1.0 {
+        strategies.push(format!(
+            "pixels: {} of their area is sensitive",
+            settings.fill_factor
+        ));
+    }
     if longest >= 2 {
         let (side, fine) = sampling.sides(paths);
         let refined = sampling.refined.iter().filter(|&&r| r).count();

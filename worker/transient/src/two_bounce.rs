@@ -28,7 +28,7 @@ impl Sampling {
         let i = world.camera.intrinsics;
         // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
         // its width: wider pixels straddle more bins.
-        let pixel = 1.0 / i.fx.min(i.fy);
+        let pixel = world.sensitive / i.fx.min(i.fy);
         let base = 4.0 * (pixel * 128.0).sqrt();
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
@@ -129,9 +129,7 @@ impl Strata {
             let (block, corner) = (stratum as u32 / 4, stratum as u32 % 4);
             let a = (2 * (block % (side / 2)) + corner % 2) as f32 + rng.uniform();
             let b = (2 * (block / (side / 2)) + corner / 2) as f32 + rng.uniform();
-            let d = world
-                .camera
-                .ray(col as f32 + a / side as f32, row as f32 + b / side as f32);
+            let d = world.camera_ray((row, col), (a / side as f32, b / side as f32));
             let hit = world
                 .closest(&mut scratch.stack, Vec3::ZERO, d)
                 .filter(|h| !h.surface.is_black());

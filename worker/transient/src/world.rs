@@ -57,6 +57,8 @@ pub(crate) struct World {
     horizon: f32,
     /// The camera (its origin is the origin of render units).
     pub camera: Camera,
+    /// Side of the sensitive square in the middle of each pixel, as a share of the pixel's.
+    pub sensitive: f32,
     /// Glass, which none of the triangles is.
     panes: Option<Panes>,
 }
@@ -199,6 +201,7 @@ impl World {
             diagonal: (high - low).length().max(edge),
             horizon: (horizon_m * f64::from(scale)) as f32,
             camera: scene.camera,
+            sensitive: 1.0,
             panes: Panes::new(&panes, &glass, stop)?,
         })
     }
@@ -224,6 +227,30 @@ impl World {
             None => [1.0; 3],
             Some(panes) => panes.tint(stack, a, b),
         }
+    }
+
+    /// The ray through a point of a pixel's sensitive square: (0, 0) is its upper left corner, (1, 1) its lower right one.
+    #[inline(always)]
+    pub fn camera_ray(&self, (row, col): (u32, u32), (x, y): (f32, f32)) -> Vec3 {
+        let (col, row) = (col as f32, row as f32);
+        if self.sensitive == 1.0 {
+            return self.camera.ray(col + x, row + y);
+        }
+        let inward = |x: f32| 0.5 + (x - 0.5) * self.sensitive;
+        self.camera.ray(col + inward(x), row + inward(y))
+    }
+
+    /// The pixel, row-major, whose sensitive square is seen along a direction in the camera's frame.
+    pub fn pixel(&self, q: Vec3) -> Option<usize> {
+        if q.z <= 0.0 {
+            return None;
+        }
+        let i = &self.camera.intrinsics;
+        let (x, y) = (i.fx * (q.x / q.z) + i.cx, i.fy * (q.y / q.z) + i.cy);
+        let inside = x >= 0.0 && y >= 0.0 && x < i.width as f32 && y < i.height as f32;
+        let sensed =
+            |x: f32| self.sensitive == 1.0 || 2.0 * (x.fract() - 0.5).abs() < self.sensitive;
+        (inside && sensed(x) && sensed(y)).then(|| y as usize * i.width as usize + x as usize)
     }
 
     /// False where all light that scatters on a triangle comes too late to count.

@@ -114,6 +114,8 @@ mod tests {
             split: false,
             groups: vec![],
             strategy: Strategy::default(),
+            beam: None,
+            fill_factor: 1.0,
         };
         assert_eq!(check_memory(&settings, (16, 16), 2), Ok(()));
         settings.groups = (0..100).map(|beam| vec![beam]).collect();

@@ -35,6 +35,8 @@ impl CaptureSettings {
             split: false,
             groups: Vec::new(),
             strategy: Strategy::default(),
+            beam: None,
+            fill_factor: 1.0,
         }
     }
 }
@@ -57,6 +59,8 @@ pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, Reco
         split: false,
         groups: Vec::new(),
         strategy: Strategy::default(),
+        beam: None,
+        fill_factor: 1.0,
     };
     Ok(render(scene, &settings, progress)?)
 }

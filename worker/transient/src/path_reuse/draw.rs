@@ -233,12 +233,12 @@ impl Sharing {
 pub(super) fn gather_point(
     walk: &Walk,
     rng: &mut Rng,
-    at: (f32, f32),
+    ray: Vec3,
     share: f32,
     scratch: &mut Scratch,
     sink: &mut PixelSink,
 ) -> Option<Vertex> {
-    let mut vertex = first(walk, at, scratch)?;
+    let mut vertex = first(walk, ray, scratch)?;
     loop {
         vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
@@ -267,12 +267,12 @@ pub(super) fn gather_point(
 pub(super) fn only_mirrors(
     walk: &Walk,
     rng: &mut Rng,
-    at: (f32, f32),
+    ray: Vec3,
     share: f32,
     scratch: &mut Scratch,
     sink: &mut PixelSink,
 ) {
-    let Some(mut vertex) = first(walk, at, scratch) else {
+    let Some(mut vertex) = first(walk, ray, scratch) else {
         return;
     };
     sink.factor = share;
@@ -297,9 +297,9 @@ pub(super) fn only_mirrors(
 }
 
 /// What a camera ray meets.
-fn first(walk: &Walk, (x, y): (f32, f32), scratch: &mut Scratch) -> Option<Vertex> {
+fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
     let world = walk.world;
-    let hit = world.closest(&mut scratch.stack, Vec3::ZERO, world.camera.ray(x, y))?;
+    let hit = world.closest(&mut scratch.stack, Vec3::ZERO, ray)?;
     let range = hit.p.length();
     Some(Vertex {
         hit,

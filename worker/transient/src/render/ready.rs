@@ -27,6 +27,8 @@ use crate::{
 
 /// Passes of light paths where no other passes are made.
 const TWO_PASSES: u32 = 64;
+/// Most point sources: arrivals name theirs in 16 bits.
+const MOST_SPOTS: usize = 1 << 16;
 /// Rows from which the rays of the ground truth are forecast.
 const ROWS: usize = 128;
 
@@ -37,6 +39,8 @@ pub(super) struct Ready<'a> {
     pub frame: Frame<'a>,
     centres: &'a Centres,
     spots: &'a [Option<Spot>],
+    /// The spots as sources: those that light the image unless the beams have a width.
+    middles: &'a Emitters,
 }
 
 /// Checks a scene and its settings, makes the scene ready and hands it to `then`.
@@ -48,28 +52,43 @@ pub(super) fn prepare<R>(
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let world = World::new(scene, settings.gate.end_m(), stop)?;
+    let mut world = World::new(scene, settings.gate.end_m(), stop)?;
+    world.sensitive = settings.fill_factor.sqrt() as f32;
     let spots = find_spots(&world, &scene.laser.beams);
-    let emitters = Emitters::new(scene, &world, &spots)?;
+    let middles = Emitters::new(scene, &world, &spots)?;
+    let wide = settings.beam.as_ref();
+    let wide = wide
+        .map(|width| Emitters::widened(scene, &world, width))
+        .transpose()?;
+    let emitters = wide.as_ref().unwrap_or(&middles);
+    if emitters.list.len() > MOST_SPOTS {
+        return Err(RenderError::Invalid {
+            field: "laser.beams".into(),
+            what: format!(
+                "make {} point sources, expected at most {MOST_SPOTS}; use fewer beams, or beam.points",
+                emitters.list.len()
+            ),
+        });
+    }
     let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {
-        Mirrors::find(&world, &emitters, stop)
+        Mirrors::find(&world, emitters, stop)
     } else {
         Mirrors::default()
     };
     let centres = truth::centres(&world, stop)?;
-    let sampling = Sampling::plan(&world, &emitters, &centres, stop);
+    let sampling = Sampling::plan(&world, emitters, &centres, stop);
     stop.check()?;
-    let of_spot = groups_of(settings, &emitters, spots.len())?;
+    let of_spot = groups_of(settings, emitters, spots.len())?;
     let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
         .unwrap_or_else(|| ellipsoid::pays(&settings.gate, &world));
-    let patches = narrow.then(|| Patches::new(&world, &emitters));
+    let patches = narrow.then(|| Patches::new(&world, emitters));
     stop.check()?;
     let mut walk = Walk {
         world: &world,
-        emitters: &emitters,
+        emitters,
         mirrors: &mirrors,
         gate: &settings.gate,
         max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
@@ -85,7 +104,7 @@ pub(super) fn prepare<R>(
     };
     let caustics = match strategy.caustics {
         Some(false) => None,
-        wanted => Caustics::find(&world, &emitters, stop).filter(|c| {
+        wanted => Caustics::find(&world, emitters, stop).filter(|c| {
             walk.max_bounces >= 3
                 && (wanted.is_some() || c.pay(&walk.surroundings(), settings.seed))
         }),
@@ -94,7 +113,7 @@ pub(super) fn prepare<R>(
     walk.caustics = caustics.as_ref();
     let contacts = match walk.max_bounces {
         0 | 1 => None,
-        _ => Contacts::find(&world, &emitters),
+        _ => Contacts::find(&world, emitters),
     };
     walk.contacts = contacts.as_ref();
     let frame = Frame {
@@ -120,6 +139,7 @@ pub(super) fn prepare<R>(
         frame,
         centres: &centres,
         spots: &spots,
+        middles: &middles,
     })
 }
 
@@ -162,7 +182,7 @@ impl Ready<'_> {
     /// [`RenderError::Stopped`].
     pub fn seen(&self, stop: Stop) -> Result<(GroundTruth, u64), RenderError> {
         let walk = &self.frame.walk;
-        let (beams, of) = (self.spots.len(), (walk.world, walk.emitters));
+        let (beams, of) = (self.spots.len(), (walk.world, self.middles));
         let (mut truth, rays) = truth::ground_truth(self.scene, of, self.centres, beams, stop)?;
         let (rgb, photo_rays) = photo::photo(walk.world, self.settings.seed, stop)?;
         truth.rgb = rgb;
@@ -173,7 +193,7 @@ impl Ready<'_> {
     pub fn seen_rays(&self) -> u64 {
         let walk = &self.frame.walk;
         let step = (self.frame.height as usize / ROWS).max(1);
-        let truth = truth::rays(walk.world, walk.emitters, self.centres, step);
+        let truth = truth::rays(walk.world, self.middles, self.centres, step);
         self.centres.rays + truth + photo::rays(walk.world, self.settings.seed, step)
     }
 
@@ -181,8 +201,8 @@ impl Ready<'_> {
     pub fn foreseen(&self) -> Vec<String> {
         let walk = &self.frame.walk;
         let mut warnings = warn::beams(self.spots);
-        let any = warn::arrivals(walk.world, walk.emitters, self.centres, |_, _| true);
-        if any.is_none() && !walk.emitters.list.is_empty() {
+        let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
+        if any.is_none() && !self.middles.list.is_empty() {
             warnings.push("the camera sees no surface".into());
         }
         warnings.extend(warn::before_light(&self.settings.gate, any));
@@ -198,8 +218,8 @@ impl Ready<'_> {
         let walk = &self.frame.walk;
         let pixels = self.centres.hits.len();
         let seen = |beam: usize, pixel: usize| truth.visibility[beam * pixels + pixel] != 0;
-        let lit = warn::arrivals(walk.world, walk.emitters, self.centres, seen);
-        let any = warn::arrivals(walk.world, walk.emitters, self.centres, |_, _| true);
+        let lit = warn::arrivals(walk.world, self.middles, self.centres, seen);
+        let any = warn::arrivals(walk.world, self.middles, self.centres, |_, _| true);
         let gate = &self.settings.gate;
         warnings.push(warn::empty(gate, self.spots, (lit, any), outside > 0.0));
         warnings
@@ -315,6 +335,15 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
         return bad(
             "gate.start_m",
             format!("is {}, expected a path length of 0 m or more", g.start_m),
+        );
+    }
+    if !(settings.fill_factor > 0.0 && settings.fill_factor <= 1.0) {
+        return bad(
+            "fill_factor",
+            format!(
+                "is {}, expected a share of a pixel's area above 0 and at most 1",
+                settings.fill_factor
+            ),
         );
     }
     if g.bins == 0 || g.bins > 1 << 20 {

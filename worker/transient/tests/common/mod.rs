@@ -48,6 +48,8 @@ pub fn settings(budget: Budget) -> Settings {
         split: true,
         groups: vec![],
         strategy: Strategy::default(),
+        beam: None,
+        fill_factor: 1.0,
     }
 }
 

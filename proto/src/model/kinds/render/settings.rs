@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use picofarm_settings::{Budget, Choice, Gate, Strategy};
+use picofarm_settings::{BeamWidth, Budget, Choice, Gate, Strategy};
 use serde::{Deserialize, Serialize};
 
 use crate::model::spec_error::{SpecError, within};
@@ -35,6 +35,17 @@ pub struct RenderSettings {
     /// The renderer's ways of finding light that are chosen by hand; the others are left to the renderer.
     #[serde(skip_serializing_if = "Strategy::is_default")]
     pub strategy: Strategy,
+    /// The width of the laser's beams; without it they have none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub beam: Option<BeamWidth>,
+    /// Share of each pixel's area that is sensitive: a square in its middle.
+    #[serde(skip_serializing_if = "is_whole")]
+    pub fill_factor: f64,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde passes it")]
+fn is_whole(share: &f64) -> bool {
+    *share == 1.0
 }
 
 impl Default for RenderSettings {
@@ -51,6 +62,8 @@ impl Default for RenderSettings {
             subsets: vec![],
             per_spot: false,
             strategy: Strategy::default(),
+            beam: None,
+            fill_factor: 1.0,
         }
     }
 }
@@ -117,6 +130,11 @@ impl RenderSettings {
                 check_share(e).map_err(|what| SpecError::new("render.error", what))?
             }
         }
+        let share = "of a pixel's area; 1 is all of it";
+        within("render.fill_factor", self.fill_factor, (0.01, 1.0), share)?;
+        if let Some(Err((field, what))) = self.beam.map(|beam| beam.check()) {
+            return fail(&format!("beam.{field}"), what);
+        }
         match self.max_bounces {
             1 => fail(
                 "max_bounces",
@@ -145,6 +163,8 @@ struct RenderSettingsText {
     per_spot: bool,
     #[serde(default)]
     strategy: BTreeMap<String, Choice>,
+    beam: Option<BeamWidth>,
+    fill_factor: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -226,6 +246,8 @@ impl TryFrom<RenderSettingsText> for RenderSettings {
             subsets,
             per_spot: text.per_spot,
             strategy,
+            beam: text.beam,
+            fill_factor: text.fill_factor.unwrap_or(default.fill_factor),
         })
     }
 }

@@ -119,6 +119,8 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
         split: false,
         groups: vec![],
         strategy: Strategy::default(),
+        beam: None,
+        fill_factor: 1.0,
     };
     let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
     let spots = rendered.spots.iter();

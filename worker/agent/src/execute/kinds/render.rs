@@ -207,6 +207,8 @@ fn settings(
         split: false,
         groups: subsets::groups(dataset),
         strategy: render.strategy,
+        beam: render.beam,
+        fill_factor: render.fill_factor,
     })
 }
 

@@ -1,0 +1,110 @@
+//! Beams with a width: rays that stand for a Gaussian beam.
+//!
+//! The rays of a Gaussian beam are straight lines on hyperboloids around its axis: one that leaves the laser beside the axis
+//! by `s` times the standard deviation there is tilted by `s` times that of the angle, at a right angle to where it stands. So at a distance z
+//! it is √(σ₀² + σ_θ²z²)·s from the axis, which is how wide such a beam is there.
+//!
+//! Each of a fixed number of rays carries an equal share of the light and ends in a point source of its own: a spot is as a small group
+//! of spots, on whatever surfaces the rays meet, and everything that holds of spots holds of it (mirrors, glass, subsets). Nothing
+//! is drawn at random, so that there is no noise to it; what is smaller than the distance between two rays is not resolved.
+
+use picofarm_scene::Vec3;
+
+use crate::{api::BeamWidth, bsdf::frame};
+
+/// A ray of a beam.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Ray {
+    /// Where it leaves the laser, from the laser's place, metres.
+    pub beside_m: Vec3,
+    /// Unit direction.
+    pub direction: Vec3,
+}
+
+/// The rays of a beam along `direction`.
+pub(crate) fn rays(width: &BeamWidth, direction: Vec3) -> impl Iterator<Item = Ray> {
+    let (u, v) = frame(direction);
+    // A diameter to 1/e² is four standard deviations.
+    let (beside, tilt) = (
+        0.25e-3 * width.diameter_mm as f32,
+        0.25e-3 * width.divergence_mrad as f32,
+    );
+    places(width.points).into_iter().map(move |[a, b]| Ray {
+        beside_m: (u * a + v * b) * beside,
+        direction: (direction + (v * a - u * b) * tilt).normalized(),
+    })
+}
+
+/// Places of a normal distribution in the plane: a spiral by the golden angle, at the distances of equal shares, moved and scaled so
+/// that their mean is 0 and the mean square of each coordinate is 1 on average over both.
+fn places(count: u32) -> Vec<[f32; 2]> {
+    let n = f64::from(count);
+    let mut all: Vec<[f64; 2]> = (0..count)
+        .map(|k| {
+            let k = f64::from(k);
+            let r = (-2.0 * libm::log(1.0 - (k + 0.5) / n)).sqrt();
+            let angle = 2.399_963_229_728_653 * k;
+            [r * libm::cos(angle), r * libm::sin(angle)]
+        })
+        .collect();
+    for axis in 0..2 {
+        let mean = all.iter().map(|p| p[axis]).sum::<f64>() / n;
+        all.iter_mut().for_each(|p| p[axis] -= mean);
+    }
+    let square = all.iter().flatten().map(|x| x * x).sum::<f64>() / (2.0 * n);
+    let scale = 1.0 / square.sqrt();
+    let place = |p: [f64; 2]| p.map(|x| (x * scale) as f32);
+    all.into_iter().map(place).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_have_the_moments_of_a_normal_distribution() {
+        for count in 4..=64 {
+            let all = places(count);
+            let n = f64::from(count);
+            let mean = |of: &dyn Fn(&[f32; 2]) -> f32| {
+                all.iter().map(|p| f64::from(of(p))).sum::<f64>() / n
+            };
+            assert!(mean(&|p| p[0]).abs() < 1e-6 && mean(&|p| p[1]).abs() < 1e-6);
+            let (xx, yy) = (mean(&|p| p[0] * p[0]), mean(&|p| p[1] * p[1]));
+            let xy = mean(&|p| p[0] * p[1]);
+            assert!((xx + yy - 2.0).abs() < 1e-5, "{count}: {xx} {yy}");
+            // The longer of few has no partner on the other side.
+            let round = 2.0 / n.sqrt();
+            assert!(
+                (xx - yy).abs() < round && xy.abs() < round,
+                "{count}: {xx} {yy} {xy}"
+            );
+        }
+    }
+
+    #[test]
+    fn rays_are_as_wide_as_a_gaussian_beam_at_every_distance() {
+        let width = BeamWidth {
+            diameter_mm: 4.0,
+            divergence_mrad: 2.0,
+            points: 64,
+        };
+        let axis = Vec3::new(0.6, -0.64, 0.48);
+        for z in [0.0f32, 1.0, 2.0, 10.0] {
+            let mut square = 0.0;
+            for ray in rays(&width, axis) {
+                let along = ray.direction.dot(axis);
+                let at = ray.beside_m + ray.direction * (z / along);
+                let off = at - axis * at.dot(axis);
+                square += f64::from(off.dot(off)) / 64.0;
+            }
+            // Two coordinates, each of a quarter of the diameter.
+            let diameter = 4.0 * (square / 2.0).sqrt() * 1e3;
+            let expected = libm::hypot(4.0, 2.0 * f64::from(z));
+            assert!(
+                (diameter / expected - 1.0).abs() < 2e-3,
+                "{z}: {diameter} {expected}"
+            );
+        }
+    }
+}
