@@ -3,6 +3,7 @@
 mod error;
 mod forecast;
 mod image;
+mod layer;
 mod part;
 mod ready;
 mod region;

@@ -360,4 +360,12 @@ fn widths_that_cannot_be_used_are_refused_by_their_field() {
         error.contains("laser.beams[0].spot") && error.contains("drop the spot"),
         "{error}"
     );
+    // More point sources than arrivals can name.
+    s.laser.beams = vec![s.laser.beams[0]; 1025];
+    s.laser.beams.iter_mut().for_each(|b| b.spot = None);
+    let error = refused(&s, width(5.0, 0.0, 64));
+    assert!(
+        error.contains("65600 point sources") && error.contains("beam.points"),
+        "{error}"
+    );
 }

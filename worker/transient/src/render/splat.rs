@@ -5,9 +5,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::{MULTI_REACH, Pool, Spread, Stat, estimate, pool},
-    image::{Image, Watch, zeros},
-    region::Region,
+    error::{Spread, Stat, estimate},
+    image::{Image, Watch},
+    layer::Layer,
     tile::Frame,
 };
 use crate::{
@@ -26,8 +26,6 @@ const CHUNK: u32 = 1024;
 /// Light paths of a pass in all zones for each pixel, and in one zone at least and at most.
 const ZONE_SHARE: u32 = 4;
 const ZONE_PATHS: (u32, u32) = (256, 1024);
-/// Rows of pixels whose sums are kept together.
-const ROWS: u32 = 16;
 
 /// Where light paths come from.
 #[derive(Debug, Clone, Copy)]
@@ -41,167 +39,6 @@ impl<'a> Sources<'a> {
     pub fn of(frame: &Frame<'a>) -> Option<Self> {
         let (caustics, contacts) = (frame.walk.caustics, frame.walk.contacts);
         (caustics.is_some() || contacts.is_some()).then_some(Self { caustics, contacts })
-    }
-}
-
-/// Sums over passes of one part of the image, in render units, by blocks of rows: `None` where nothing came.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Layer(Vec<Option<Rows>>);
-
-/// Sums over some rows.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Rows {
-    /// Σ, `[pixel]` as [`crate::film::Film::pixel`] slots.
-    sum: Vec<f32>,
-    /// Σ of squares, channel 0.
-    square: Vec<f32>,
-    /// Σ with alternating sign, channel 0; empty where not wanted.
-    alternating: Vec<f32>,
-}
-
-impl Rows {
-    /// Of the three sums of a block.
-    fn lengths(frame: &Frame, block: usize) -> [usize; 3] {
-        let pixels = region(frame, block).pixels();
-        let narrow = pixels * frame.film.slots;
-        let alternating = if frame.split { narrow } else { 0 };
-        [pixels * frame.film.pixel(), narrow, alternating]
-    }
-
-    fn new(frame: &Frame, block: usize) -> Result<Self, RenderError> {
-        let [sum, square, alternating] = Self::lengths(frame, block);
-        let zeros = |count| zeros(count, "the sums over light paths");
-        Ok(Self {
-            sum: zeros(sum)?,
-            square: zeros(square)?,
-            alternating: zeros(alternating)?,
-        })
-    }
-
-    fn fits(&self, frame: &Frame, block: usize) -> bool {
-        let lengths = [self.sum.len(), self.square.len(), self.alternating.len()];
-        lengths == Self::lengths(frame, block)
-    }
-}
-
-/// The rows of a block.
-fn region(frame: &Frame, block: usize) -> Region {
-    let row = block as u32 * ROWS;
-    Region {
-        row,
-        col: 0,
-        rows: ROWS.min(frame.height - row),
-        cols: frame.width,
-    }
-}
-
-impl Layer {
-    fn new(frame: &Frame) -> Self {
-        Self(vec![None; frame.height.div_ceil(ROWS) as usize])
-    }
-
-    fn fits(&self, frame: &Frame) -> bool {
-        let mut rows = self.0.iter().enumerate();
-        self.0.len() == frame.height.div_ceil(ROWS) as usize
-            && rows.all(|(block, r)| r.as_ref().is_none_or(|r| r.fits(frame, block)))
-    }
-
-    /// Adds a pass, sorted by pixel and slot; returns its energy within the gate.
-    fn add(&mut self, frame: &Frame, splats: &[Splat], sign: f32) -> Result<f64, RenderError> {
-        let film = frame.film;
-        let (size, slots) = (film.pixel(), film.slots);
-        let mut all = 0.0f64;
-        for group in splats.chunk_by(|a, b| (a.pixel, a.slot) == (b.pixel, b.slot)) {
-            let (pixel, slot) = (group[0].pixel as usize, group[0].slot as usize);
-            let of_block = (ROWS * frame.width) as usize;
-            let (block, pixel) = (pixel / of_block, pixel % of_block);
-            let rows = match &mut self.0[block] {
-                Some(rows) => rows,
-                none => none.insert(Rows::new(frame, block)?),
-            };
-            let out = &mut rows.sum[pixel * size..(pixel + 1) * size];
-            let mut sum = 0.0f32;
-            for s in group {
-                film.add(out, slot, s.value, usize::from(s.spot));
-                sum += s.value;
-            }
-            rows.square[pixel * slots + slot] += sum * sum;
-            if let Some(x) = rows.alternating.get_mut(pixel * slots + slot) {
-                *x += sign * sum;
-            }
-            if slot > 0 && slot + 1 < slots {
-                all += f64::from(sum);
-            }
-        }
-        Ok(all)
-    }
-
-    /// Mean over `passes`, its variance, and a draw of its error, by pixel and bin, in metres; pooled as the tiles are.
-    fn each(
-        &self,
-        frame: &Frame,
-        passes: u32,
-        stop: Stop,
-        mut each: impl FnMut(usize, usize, [f64; 3]),
-    ) -> Result<(), RenderError> {
-        let slots = frame.film.slots;
-        let n = f64::from(passes.max(1));
-        let unit = unit(frame);
-        // The alternating sum has n times a pass' variance, and the mean has 1/n of it.
-        let noise = unit / n;
-        let size = frame.film.pixel();
-        let (mut variance, mut pooling) = (vec![], Pool::default());
-        for (block, rows) in self.0.iter().enumerate() {
-            stop.check()?;
-            let Some(rows) = rows else { continue };
-            let region = region(frame, block);
-            let first = (region.row * frame.width) as usize;
-            variance.clear();
-            for pixel in 0..region.pixels() {
-                for slot in 0..slots {
-                    let x = f64::from(rows.sum[pixel * size + slot]);
-                    let square = f64::from(rows.square[pixel * slots + slot]);
-                    let spread = (square - x * x / n).max(0.0) / (n - 1.0).max(1.0);
-                    variance.push((spread / n) as f32);
-                }
-            }
-            pool(&mut variance, &region, slots, MULTI_REACH, &mut pooling);
-            for pixel in 0..region.pixels() {
-                for slot in 1..slots - 1 {
-                    let x = f64::from(rows.sum[pixel * size + slot]);
-                    let alternating = rows.alternating.get(pixel * slots + slot);
-                    let found = [
-                        x * unit / n,
-                        f64::from(variance[pixel * slots + slot]) * unit * unit,
-                        alternating.map_or(0.0, |&x| f64::from(x) * noise),
-                    ];
-                    each(first + pixel, slot - 1, found);
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Adds the channels beyond 0, and what lies outside the gate, to the image.
-    fn join(&self, frame: &Frame, passes: u32, image: &mut Image) {
-        let (size, slots) = (frame.film.pixel(), frame.film.slots);
-        let bins = frame.film.gate.bins as usize;
-        let factor = unit(frame) / f64::from(passes.max(1));
-        for (block, rows) in self.0.iter().enumerate() {
-            let Some(rows) = rows else { continue };
-            let first = (region(frame, block).row * frame.width) as usize;
-            for (k, sums) in rows.sum.chunks(size).enumerate() {
-                let pixel = first + k;
-                for (group, sums) in image.groups.iter_mut().zip(sums.chunks(slots).skip(1)) {
-                    let out = &mut group[pixel * bins..(pixel + 1) * bins];
-                    for (out, &x) in out.iter_mut().zip(&sums[1..slots - 1]) {
-                        *out += (f64::from(x) * factor) as f32;
-                    }
-                }
-                let outside = f64::from(sums[0]) + f64::from(sums[slots - 1]);
-                image.overflow += outside * factor;
-            }
-        }
     }
 }
 
@@ -256,6 +93,8 @@ impl Splats {
                 return Err(RenderError::Stopped);
             }
         }
+        self.two.settle(frame)?;
+        self.multi.settle(frame)?;
         Ok(rays)
     }
 
@@ -310,18 +149,13 @@ impl Splats {
 
     /// Adds one pass.
     fn add(&mut self, frame: &Frame, splats: Vec<Splat>) -> Result<(), RenderError> {
-        let sign = if self.passes.is_multiple_of(2) {
-            1.0
-        } else {
-            -1.0
-        };
         let (mut two, mut multi): (Vec<_>, Vec<_>) =
             splats.into_iter().partition(|s| s.bounces == 2);
         let mut all = 0.0;
         for (layer, splats) in [(&mut self.two, &mut two), (&mut self.multi, &mut multi)] {
             // Stable: what falls into one slot is summed in the order of the paths.
             splats.sort_by_key(|s| (s.pixel, s.slot));
-            all += layer.add(frame, splats, sign)?;
+            all += layer.add(frame, splats, self.passes)?;
         }
         self.all.push(all);
         self.passes += 1;
@@ -338,18 +172,16 @@ impl Splats {
         let bins = frame.film.gate.bins as usize;
         let mut stats: Vec<Stat> = image.stats.clone();
         for layer in [&self.two, &self.multi] {
-            layer.each(
-                frame,
-                self.passes,
-                stop,
-                |pixel, bin, [mean, variance, _]| {
-                    let (stat, h) = (&mut stats[pixel], image.transient[pixel * bins + bin]);
-                    stat.norm2 += mean * (mean + 2.0 * f64::from(h));
+            layer.each(frame, self.passes, stop, |pixel, found| {
+                let h = &image.transient[pixel * bins..(pixel + 1) * bins];
+                let stat = &mut stats[pixel];
+                for (bin, mean, _) in found.light() {
+                    stat.norm2 += mean * (mean + 2.0 * f64::from(h[bin]));
                     stat.total += mean;
-                    // Of two bounces as well: it falls with the passes as that of more does.
-                    stat.multi_variance += variance;
-                },
-            )?;
+                }
+                // Of two bounces as well: it falls with the passes as that of more does.
+                found.variance().for_each(|v| stat.multi_variance += v);
+            })?;
         }
         let own = Spread::of(&self.all).scaled(unit(frame));
         Ok(estimate(
@@ -363,25 +195,27 @@ impl Splats {
     pub fn join(&self, frame: &Frame, image: &mut Image, stop: Stop) -> Result<(), RenderError> {
         let bins = frame.film.gate.bins as usize;
         for (layer, is_two) in [(&self.two, true), (&self.multi, false)] {
-            layer.each(
-                frame,
-                self.passes,
-                stop,
-                |pixel, bin, [mean, variance, noise]| {
-                    let at = pixel * bins + bin;
-                    image.transient[at] += mean as f32;
-                    if let Some(s) = &mut image.split {
-                        let (value, se, draw) = match is_two {
-                            true => (&mut s.two, &mut s.two_se, &mut s.two_noise),
-                            false => (&mut s.multi, &mut s.multi_se, &mut s.multi_noise),
-                        };
-                        value[at] += mean as f32;
-                        let old = f64::from(se[at]);
-                        se[at] = (old * old + variance).sqrt() as f32;
-                        draw[at] += noise as f32;
-                    }
-                },
-            )?;
+            layer.each(frame, self.passes, stop, |pixel, found| {
+                let of_pixel = pixel * bins..(pixel + 1) * bins;
+                let h = &mut image.transient[of_pixel.clone()];
+                for (bin, mean, _) in found.light() {
+                    h[bin] += mean as f32;
+                }
+                let Some(s) = &mut image.split else { return };
+                let (value, se, draw) = match is_two {
+                    true => (&mut s.two, &mut s.two_se, &mut s.two_noise),
+                    false => (&mut s.multi, &mut s.multi_se, &mut s.multi_noise),
+                };
+                let (value, draw) = (&mut value[of_pixel.clone()], &mut draw[of_pixel.clone()]);
+                for (bin, mean, noise) in found.light() {
+                    value[bin] += mean as f32;
+                    draw[bin] += noise as f32;
+                }
+                for (se, variance) in se[of_pixel].iter_mut().zip(found.variance()) {
+                    let old = f64::from(*se);
+                    *se = (old * old + variance).sqrt() as f32;
+                }
+            })?;
             layer.join(frame, self.passes, image);
         }
         Ok(())
@@ -415,6 +249,6 @@ fn side_by_side(
 }
 
 /// Render units → metres: every path has one 1/d² left over.
-fn unit(frame: &Frame) -> f64 {
+pub(super) fn unit(frame: &Frame) -> f64 {
     f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale)
 }

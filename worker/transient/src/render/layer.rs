@@ -1,0 +1,443 @@
+//! Sums of what light paths draw into the image. They come to few of its bins (to some 2 % in a furnished room of 256×256 pixels and 637 bins), so
+//! sums are kept of those alone, by pixel and slot.
+//!
+//! What a pass brings waits until there is enough of it, and is then merged with the sums, pass after pass: so that the bits
+//! do not depend on when that happens, and the work for a contribution does not grow with the number of sums.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    error::{MULTI_REACH, Pool, pool},
+    image::{Image, room},
+    region::Region,
+    splat::unit,
+    tile::Frame,
+};
+use crate::{
+    api::{RenderError, Stop},
+    caustic::Splat,
+};
+
+/// Rows of pixels whose sums are kept together.
+const ROWS: u32 = 16;
+/// Contributions that wait in a block at least, and share of the number of its sums, before they are merged.
+const LEAST: usize = 4096;
+const SHARE: usize = 4;
+
+/// Sums over passes of one part of the image, in render units, by blocks of rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Layer(Vec<Block>);
+
+/// Sums over some rows.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+struct Block {
+    /// Of channel 0.
+    all: Sparse<Moments>,
+    /// Of the other channels; their slots lie one channel behind the other, as [`crate::film::Film::pixel`] has them.
+    groups: Sparse<f32>,
+    #[serde(skip)]
+    waiting: Vec<Waiting>,
+}
+
+/// Σ, Σ of squares, and Σ with alternating sign, over passes.
+type Moments = [f32; 3];
+
+/// Values by pixel and slot.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+struct Sparse<V> {
+    /// Where each pixel's begin, and where the last one's end; empty where there are none at all.
+    starts: Vec<u32>,
+    /// Their slots, ascending within a pixel.
+    slots: Vec<u32>,
+    values: Vec<V>,
+}
+
+/// A contribution that is not in the sums yet.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Waiting {
+    /// Within the block.
+    pixel: u32,
+    slot: u32,
+    pass: u32,
+    value: f32,
+    spot: u16,
+}
+
+/// What light paths brought to a pixel, over passes, in metres.
+pub(super) struct Found<'a> {
+    slots: &'a [u32],
+    values: &'a [Moments],
+    /// By slot, in render units.
+    variance: &'a [f32],
+    /// Factors from the sums to the mean and to a draw of its error, and from render units to metres.
+    mean: (f64, f64),
+    noise: f64,
+    unit: f64,
+}
+
+impl Found<'_> {
+    /// Bin, mean, and a draw of the mean's error, for each bin that anything came to.
+    pub fn light(&self) -> impl Iterator<Item = (usize, f64, f64)> {
+        let last = self.variance.len() - 1;
+        let each = self.slots.iter().zip(self.values);
+        let inside = each.filter(move |(slot, _)| (1..last).contains(&(**slot as usize)));
+        inside.map(|(slot, &[sum, _, alternating])| {
+            let mean = f64::from(sum) * self.mean.0 / self.mean.1;
+            (
+                *slot as usize - 1,
+                mean,
+                f64::from(alternating) * self.noise,
+            )
+        })
+    }
+
+    /// Variance of the mean of each bin of the gate, pooled as the tiles' is.
+    pub fn variance(&self) -> impl Iterator<Item = f64> {
+        let inside = &self.variance[1..self.variance.len() - 1];
+        inside.iter().map(|v| f64::from(*v) * self.unit * self.unit)
+    }
+}
+
+/// The rows of a block.
+fn region(frame: &Frame, block: usize) -> Region {
+    let row = block as u32 * ROWS;
+    Region {
+        row,
+        col: 0,
+        rows: ROWS.min(frame.height - row),
+        cols: frame.width,
+    }
+}
+
+impl Layer {
+    pub fn new(frame: &Frame) -> Self {
+        Self(vec![Block::default(); frame.height.div_ceil(ROWS) as usize])
+    }
+
+    /// Whether it was made for such an image, and is whole.
+    pub fn fits(&self, frame: &Frame) -> bool {
+        let (slots, size) = (frame.film.slots as u32, frame.film.pixel() as u32);
+        let mut blocks = self.0.iter().enumerate();
+        self.0.len() == frame.height.div_ceil(ROWS) as usize
+            && blocks.all(|(k, block)| {
+                let pixels = region(frame, k).pixels();
+                block.all.fits(pixels, 0..slots) && block.groups.fits(pixels, slots..size)
+            })
+    }
+
+    /// Adds a pass, sorted by pixel and slot; returns its energy within the gate.
+    pub fn add(&mut self, frame: &Frame, splats: &[Splat], pass: u32) -> Result<f64, RenderError> {
+        let of_block = ROWS * frame.width;
+        let last = frame.film.slots - 1;
+        let mut all = 0.0f64;
+        for group in splats.chunk_by(|a, b| (a.pixel, a.slot) == (b.pixel, b.slot)) {
+            if (1..last).contains(&(group[0].slot as usize)) {
+                all += f64::from(group.iter().map(|s| s.value).sum::<f32>());
+            }
+        }
+        for group in splats.chunk_by(|a, b| a.pixel / of_block == b.pixel / of_block) {
+            let waiting = &mut self.0[(group[0].pixel / of_block) as usize].waiting;
+            waiting.extend(group.iter().map(|s| Waiting {
+                pixel: s.pixel % of_block,
+                slot: s.slot,
+                pass,
+                value: s.value,
+                spot: s.spot,
+            }));
+        }
+        self.merge(frame, |block| {
+            block.waiting.len() >= LEAST + block.all.slots.len() / SHARE
+        })?;
+        Ok(all)
+    }
+
+    /// Merges all that waits.
+    pub fn settle(&mut self, frame: &Frame) -> Result<(), RenderError> {
+        self.merge(frame, |block| !block.waiting.is_empty())?;
+        self.0.iter_mut().for_each(|b| b.waiting = vec![]);
+        Ok(())
+    }
+
+    fn merge(
+        &mut self,
+        frame: &Frame,
+        which: impl Fn(&Block) -> bool + Sync,
+    ) -> Result<(), RenderError> {
+        let blocks = self.0.par_iter_mut().enumerate();
+        blocks
+            .filter(|(_, block)| which(block))
+            .try_for_each(|(k, block)| block.merge(frame, region(frame, k).pixels()))
+    }
+
+    /// What was found in each pixel, over `passes`; pixels of rows to which nothing came are left out.
+    pub fn each(
+        &self,
+        frame: &Frame,
+        passes: u32,
+        stop: Stop,
+        mut each: impl FnMut(usize, &Found<'_>),
+    ) -> Result<(), RenderError> {
+        let slots = frame.film.slots;
+        let n = f64::from(passes.max(1));
+        let unit = unit(frame);
+        let (mut variance, mut pooling) = (vec![], Pool::default());
+        for (block, sums) in self.0.iter().enumerate() {
+            stop.check()?;
+            let sums = &sums.all;
+            if sums.slots.is_empty() {
+                continue;
+            }
+            let region = region(frame, block);
+            let first = (region.row * frame.width) as usize;
+            variance.clear();
+            variance.resize(region.pixels() * slots, 0.0);
+            for (pixel, of_pixel) in variance.chunks_mut(slots).enumerate() {
+                let (slots, values) = sums.of(pixel);
+                for (slot, [sum, square, _]) in slots.iter().zip(values) {
+                    let (x, square) = (f64::from(*sum), f64::from(*square));
+                    let spread = (square - x * x / n).max(0.0) / (n - 1.0).max(1.0);
+                    of_pixel[*slot as usize] = (spread / n) as f32;
+                }
+            }
+            pool(&mut variance, &region, slots, MULTI_REACH, &mut pooling);
+            for (pixel, variance) in variance.chunks(slots).enumerate() {
+                let (slots, values) = sums.of(pixel);
+                let found = Found {
+                    slots,
+                    values,
+                    variance,
+                    mean: (unit, n),
+                    // The alternating sum has n times a pass' variance, and the mean has 1/n of it.
+                    noise: unit / n,
+                    unit,
+                };
+                each(first + pixel, &found);
+            }
+        }
+        Ok(())
+    }
+
+    /// Adds the channels beyond 0, and what lies outside the gate, to the image.
+    pub fn join(&self, frame: &Frame, passes: u32, image: &mut Image) {
+        let slots = frame.film.slots;
+        let bins = frame.film.gate.bins as usize;
+        let factor = unit(frame) / f64::from(passes.max(1));
+        for (block, sums) in self.0.iter().enumerate() {
+            let region = region(frame, block);
+            let first = (region.row * frame.width) as usize;
+            for k in 0..region.pixels() {
+                let pixel = first + k;
+                let (of_groups, values) = sums.groups.of(k);
+                for (at, x) in of_groups.iter().zip(values) {
+                    let (group, slot) = (*at as usize / slots - 1, *at as usize % slots);
+                    if (1..slots - 1).contains(&slot) {
+                        let out = &mut image.groups[group][pixel * bins + slot - 1];
+                        *out += (f64::from(*x) * factor) as f32;
+                    }
+                }
+                let (of_all, values) = sums.all.of(k);
+                let outside: f64 = of_all
+                    .iter()
+                    .zip(values)
+                    .filter(|(slot, _)| !(1..slots - 1).contains(&(**slot as usize)))
+                    .map(|(_, v)| f64::from(v[0]))
+                    .sum();
+                image.overflow += outside * factor;
+            }
+        }
+    }
+}
+
+impl Block {
+    /// Merges what waits with the sums of so many pixels.
+    fn merge(&mut self, frame: &Frame, pixels: usize) -> Result<(), RenderError> {
+        let film = frame.film;
+        let split = frame.split;
+        let by_place = |w: &Waiting| (w.pixel, w.slot);
+        if film.channels > 1 {
+            let mut of_groups: Vec<Waiting> = vec![];
+            for w in &self.waiting {
+                of_groups.extend(film.of_spot[usize::from(w.spot)].iter().map(|&c| Waiting {
+                    slot: u32::from(c) * film.slots as u32 + w.slot,
+                    ..*w
+                }));
+            }
+            of_groups.sort_by_key(by_place);
+            self.groups.take(pixels, &of_groups, |value, group| {
+                group.iter().for_each(|w| *value += w.value);
+            })?;
+        }
+        // Stable: what falls into one slot is summed in the order of the passes, and of the paths.
+        self.waiting.sort_by_key(by_place);
+        let add = |[sum, square, alternating]: &mut Moments, group: &[Waiting]| {
+            for pass in group.chunk_by(|a, b| a.pass == b.pass) {
+                let mut of_pass = 0.0f32;
+                for w in pass {
+                    *sum += w.value;
+                    of_pass += w.value;
+                }
+                *square += of_pass * of_pass;
+                if split {
+                    let even = pass[0].pass.is_multiple_of(2);
+                    *alternating += if even { of_pass } else { -of_pass };
+                }
+            }
+        };
+        self.all.take(pixels, &self.waiting, add)?;
+        self.waiting.clear();
+        Ok(())
+    }
+}
+
+impl<V: Copy + Default> Sparse<V> {
+    /// Slots and values of a pixel.
+    fn of(&self, pixel: usize) -> (&[u32], &[V]) {
+        match self.starts.get(pixel..pixel + 2) {
+            Some(&[start, end]) => {
+                let range = start as usize..end as usize;
+                (&self.slots[range.clone()], &self.values[range])
+            }
+            _ => (&[], &[]),
+        }
+    }
+
+    fn fits(&self, pixels: usize, within: std::ops::Range<u32>) -> bool {
+        let count = self.slots.len();
+        if self.values.len() != count {
+            return false;
+        }
+        if self.starts.is_empty() {
+            return count == 0;
+        }
+        self.starts.len() == pixels + 1
+            && self.starts.is_sorted()
+            && (self.starts[0], self.starts[pixels] as usize) == (0, count)
+            && self.slots.iter().all(|slot| within.contains(slot))
+            && (0..pixels).all(|k| self.of(k).0.is_sorted_by(|a, b| a < b))
+    }
+
+    /// Adds contributions, sorted by pixel and slot, to the values of so many pixels: `add` gets all of one slot.
+    fn take(
+        &mut self,
+        pixels: usize,
+        found: &[Waiting],
+        add: impl Fn(&mut V, &[Waiting]),
+    ) -> Result<(), RenderError> {
+        let groups = found.chunk_by(|a, b| (a.pixel, a.slot) == (b.pixel, b.slot));
+        let most = self.slots.len() + groups.clone().count();
+        room::<(u32, V)>(most, "the sums over light paths")?;
+        let mut groups = groups.peekable();
+        let mut merged = Self {
+            starts: Vec::with_capacity(pixels + 1),
+            slots: Vec::with_capacity(most),
+            values: Vec::with_capacity(most),
+        };
+        merged.starts.push(0);
+        for pixel in 0..pixels {
+            let (slots, values) = self.of(pixel);
+            let mut old = slots.iter().copied().zip(values.iter().copied()).peekable();
+            loop {
+                let next = groups.peek().filter(|g| g[0].pixel as usize == pixel);
+                let slot = match (old.peek(), next) {
+                    (None, None) => break,
+                    (Some((a, _)), Some(b)) => (*a).min(b[0].slot),
+                    (Some((a, _)), None) => *a,
+                    (None, Some(b)) => b[0].slot,
+                };
+                let mut value = match old.next_if(|(a, _)| *a == slot) {
+                    Some((_, value)) => value,
+                    None => V::default(),
+                };
+                let new = groups.next_if(|g| g[0].pixel as usize == pixel && g[0].slot == slot);
+                if let Some(new) = new {
+                    add(&mut value, new);
+                }
+                merged.slots.push(slot);
+                merged.values.push(value);
+            }
+            merged.starts.push(merged.slots.len() as u32);
+        }
+        *self = merged;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::{Sparse, Waiting};
+
+    const PIXELS: usize = 5;
+    const SLOTS: usize = 7;
+
+    /// Merges `found` in pieces that end where `cuts` says.
+    fn merged(found: &[Waiting], cuts: &[usize]) -> Sparse<f32> {
+        let mut sums = Sparse::default();
+        let mut from = 0;
+        for &to in cuts.iter().chain([&found.len()]) {
+            let to = to.clamp(from, found.len());
+            let mut piece = found[from..to].to_vec();
+            piece.sort_by_key(|w| (w.pixel, w.slot));
+            let add = |sum: &mut f32, group: &[Waiting]| {
+                group.iter().for_each(|w| *sum += w.value);
+            };
+            sums.take(PIXELS, &piece, add).expect("there is room");
+            from = to;
+        }
+        sums
+    }
+
+    proptest! {
+        #[test]
+        fn sums_are_those_of_every_bin_whenever_they_are_merged(
+            found in prop::collection::vec((0..PIXELS as u32, 0..SLOTS as u32, 0.1f32..9.0), 0..80),
+            mut cuts in prop::collection::vec(0usize..80, 0..6),
+        ) {
+            cuts.sort_unstable();
+            let waiting = |(pixel, slot, value)| Waiting { pixel, slot, pass: 0, value, spot: 0 };
+            let found: Vec<Waiting> = found.into_iter().map(waiting).collect();
+            let mut every = [[0.0f32; SLOTS]; PIXELS];
+            for w in &found {
+                every[w.pixel as usize][w.slot as usize] += w.value;
+            }
+            let sums = merged(&found, &cuts);
+            prop_assert!(sums.fits(PIXELS, 0..SLOTS as u32));
+            prop_assert_eq!(&sums, &merged(&found, &[]));
+            for (pixel, row) in every.iter().enumerate() {
+                let (slots, values) = sums.of(pixel);
+                let mut of_slot = [0.0f32; SLOTS];
+                for (slot, value) in slots.iter().zip(values) {
+                    of_slot[*slot as usize] = *value;
+                }
+                // To the bit.
+                prop_assert_eq!(&of_slot, row);
+            }
+        }
+    }
+
+    #[test]
+    fn sums_that_are_not_whole_do_not_fit() {
+        let whole = Sparse {
+            starts: vec![0, 2, 2, 3],
+            slots: vec![1, 4, 0],
+            values: vec![1.0f32; 3],
+        };
+        assert!(whole.fits(3, 0..5));
+        assert!(Sparse::<f32>::default().fits(3, 0..5));
+        let broken = |change: &dyn Fn(&mut Sparse<f32>)| {
+            let mut sums = whole.clone();
+            change(&mut sums);
+            !sums.fits(3, 0..5)
+        };
+        assert!(!whole.fits(2, 0..5) && !whole.fits(3, 0..4) && !whole.fits(3, 1..5));
+        assert!(broken(&|s| s.starts = vec![]));
+        assert!(broken(&|s| s.starts[1] = 3));
+        assert!(broken(&|s| s.starts[0] = 1));
+        assert!(broken(&|s| s.starts[3] = 9));
+        assert!(broken(&|s| s.slots.swap(0, 1)));
+        assert!(broken(&|s| s.slots[1] = 1));
+        assert!(broken(&|s| s.values.truncate(2)));
+    }
+}
