@@ -100,7 +100,7 @@ pub struct BeamWidth {
     pub diameter_mm: f64,
     /// Divergence, full angle, milliradians.
     pub divergence_mrad: f64,
-    /// Rays that stand for a beam, each with an equal share of its light: the cost of a render grows as with so many times the
+    /// Rays that stand for a beam, each with an equal share of its light: three bounces and more cost as with so many times the
     /// spots.
     pub points: u32,
 }

@@ -12,7 +12,7 @@ use picofarm_scene::Vec3;
 
 use crate::{api::BeamWidth, bsdf::frame};
 
-/// A ray of a beam.
+/// A ray of a beam that has a width.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
     /// Where it leaves the laser, from the laser's place, metres.
@@ -21,23 +21,23 @@ pub(crate) struct Ray {
     pub direction: Vec3,
 }
 
-/// The rays of a beam along `direction`.
-pub(crate) fn rays(width: &BeamWidth, direction: Vec3) -> impl Iterator<Item = Ray> {
+/// The ray of a beam along `direction` that stands for a place of the normal distribution.
+pub(crate) fn ray(width: &BeamWidth, [a, b]: [f32; 2], direction: Vec3) -> Ray {
     let (u, v) = frame(direction);
     // A diameter to 1/e² is four standard deviations.
     let (beside, tilt) = (
         0.25e-3 * width.diameter_mm as f32,
         0.25e-3 * width.divergence_mrad as f32,
     );
-    places(width.points).into_iter().map(move |[a, b]| Ray {
+    Ray {
         beside_m: (u * a + v * b) * beside,
         direction: (direction + (v * a - u * b) * tilt).normalized(),
-    })
+    }
 }
 
 /// Places of a normal distribution in the plane: a spiral by the golden angle, at the distances of equal shares, moved and scaled so
 /// that their mean is 0 and the mean square of each coordinate is 1 on average over both.
-fn places(count: u32) -> Vec<[f32; 2]> {
+pub(crate) fn places(count: u32) -> Vec<[f32; 2]> {
     let n = f64::from(count);
     let mut all: Vec<[f64; 2]> = (0..count)
         .map(|k| {
@@ -92,7 +92,8 @@ mod tests {
         let axis = Vec3::new(0.6, -0.64, 0.48);
         for z in [0.0f32, 1.0, 2.0, 10.0] {
             let mut square = 0.0;
-            for ray in rays(&width, axis) {
+            for place in places(width.points) {
+                let ray = ray(&width, place, axis);
                 let along = ray.direction.dot(axis);
                 let at = ray.beside_m + ray.direction * (z / along);
                 let off = at - axis * at.dot(axis);

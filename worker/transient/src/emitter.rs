@@ -1,5 +1,7 @@
 //! Illumination spots: tracing beams to them, and how they scatter light into the scene.
 
+use std::ops::Range;
+
 use picofarm_scene::{Beam, Scene, Spot, Vec3};
 
 use crate::{
@@ -249,6 +251,8 @@ pub(crate) struct Emitters {
     pub glossy: Vec<usize>,
     /// Indices of those on mirrors.
     pub on_mirror: Vec<usize>,
+    /// Those of each ray of the beams: one range for all where beams have no width.
+    pub rays: Vec<Range<usize>>,
 }
 
 impl Emitters {
@@ -292,14 +296,10 @@ impl Emitters {
                 .get(beam)
                 .map_or(spot.arriving, |b| b.direction);
             let through = through(world, &mut stack, direction, spot);
-            all.push(Emitter::new(
-                world,
-                &mut stack,
-                (beam, through),
-                spot,
-                surface,
-            ));
+            let of_beam = (beam, through);
+            all.push(Emitter::new(world, &mut stack, of_beam, spot, surface));
         }
+        all.rays = vec![0..all.list.len()];
         Ok(all)
     }
 
@@ -314,8 +314,8 @@ impl Emitters {
             return invalid(format!("beam.{field}"), what);
         }
         let mut stack = world.bvh.stack();
-        let mut all = Self::default();
-        for (beam, b) in scene.laser.beams.iter().enumerate() {
+        let beams = || scene.laser.beams.iter().enumerate();
+        for (beam, b) in beams() {
             if let Some(spot) = &b.spot
                 && ends_at(world, &mut stack, b.direction, spot).is_none()
             {
@@ -323,21 +323,21 @@ impl Emitters {
                             drop the spot to have the beam traced, or render without a width";
                 return invalid(format!("laser.beams[{beam}].spot"), what.into());
             }
-            for ray in beam_width::rays(width, b.direction) {
+        }
+        let mut all = Self::default();
+        for place in beam_width::places(width.points) {
+            let first = all.list.len();
+            for (beam, b) in beams() {
+                let ray = beam_width::ray(width, place, b.direction);
                 let start = world.laser + ray.beside_m * world.scale;
                 let Some((spot, through)) = follow(world, &mut stack, start, ray.direction) else {
                     continue;
                 };
                 let surface = world.first_surface[spot.object as usize] + spot.material;
-                let share = through / width.points as f32;
-                all.push(Emitter::new(
-                    world,
-                    &mut stack,
-                    (beam, share),
-                    &spot,
-                    surface,
-                ));
+                let of_beam = (beam, through / width.points as f32);
+                all.push(Emitter::new(world, &mut stack, of_beam, &spot, surface));
             }
+            all.rays.push(first..all.list.len());
         }
         Ok(all)
     }

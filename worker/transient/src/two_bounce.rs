@@ -1,5 +1,5 @@
 //! Exactly two bounces: stratified sub-pixel samples, each connected to every spot, a whole
-//! pixel's samples at once. No random walk.
+//! pixel's samples at once. No random walk. Of beams with a width each sample takes one ray, in turn, for all of them.
 
 use picofarm_scene::Vec3;
 
@@ -85,7 +85,7 @@ pub(crate) struct Strata {
     /// Places of the hits, lifted off the surface.
     lifted: Vec<Vec3>,
     range_m: Vec<f64>,
-    /// `[sample][spot]`.
+    /// `[sample][spot]`, spots of the sample's ray.
     weights: Vec<f32>,
     /// Which of its strata each block samples twice; those samples come after all others.
     twice: Vec<u32>,
@@ -108,7 +108,15 @@ impl Strata {
         blocks: &mut Blocks,
     ) -> u32 {
         let (world, emitters) = (walk.world, walk.emitters);
-        let (count, spots) = ((side * side) as usize, emitters.list.len());
+        let rays = emitters.rays.len();
+        let spots = emitters.rays.iter().map(ExactSizeIterator::len).max();
+        let (count, spots) = ((side * side) as usize, spots.unwrap_or(0));
+        // Which ray the first sample takes.
+        let first = match rays {
+            1 => 0,
+            _ => (rng.uniform() * rays as f32) as usize,
+        };
+        let ray = |sample: usize| &emitters.rays[(first + sample) % rays];
         self.hits.clear();
         self.lifted.clear();
         self.range_m.clear();
@@ -135,50 +143,60 @@ impl Strata {
                 .filter(|h| !h.surface.is_black());
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
-                emitters.weights(h.p, h.n, -h.p / range, &h.surface, weights);
+                let all = &mut scratch.weights;
+                emitters.weights(h.p, h.n, -h.p / range, &h.surface, all);
                 if h.through != 1.0 {
-                    weights.iter_mut().for_each(|w| *w *= h.through);
+                    all.iter_mut().for_each(|w| *w *= h.through);
                 }
-                walk.leave_to_zones(&h, weights);
-                walk.keep_in_window(h.p, world.metres(range), weights);
+                walk.leave_to_zones(&h, all);
+                walk.keep_in_window(h.p, world.metres(range), all);
+                let own = &all[ray(sample).clone()];
+                for (out, w) in weights.iter_mut().zip(own) {
+                    *out = w * rays as f32;
+                }
                 (lift(h.p, h.n), range)
             });
             self.hits.push(hit);
             self.lifted.push(lifted);
             self.range_m.push(world.metres(range));
         }
-        for (spot, e) in emitters.list.iter().enumerate() {
-            self.ends.clear();
-            self.ends_of.clear();
-            for sample in 0..samples {
-                if self.weights[sample * spots + spot] > 0.0 {
-                    self.ends.push(self.lifted[sample]);
-                    self.ends_of.push(sample);
+        for (of_ray, range) in emitters.rays.iter().enumerate() {
+            let samples = ((of_ray + rays - first) % rays..samples).step_by(rays);
+            for (k, spot) in range.clone().enumerate() {
+                self.ends.clear();
+                self.ends_of.clear();
+                for sample in samples.clone() {
+                    if self.weights[sample * spots + k] > 0.0 {
+                        self.ends.push(self.lifted[sample]);
+                        self.ends_of.push(sample);
+                    }
                 }
-            }
-            self.blocked.resize(self.ends.len(), false);
-            world.bvh.occluded_bundle(
-                &mut scratch.stack,
-                emitters.lifted[spot],
-                &self.ends,
-                &mut self.blocked,
-            );
-            for (&sample, &blocked) in self.ends_of.iter().zip(&self.blocked) {
-                let hit = self.hits[sample].as_ref().filter(|_| !blocked);
-                if let Some(h) = hit {
-                    let leg = world.metres((e.p - h.p).length());
-                    let slot = film.slot(e.path_m + leg + self.range_m[sample]);
-                    let at = sample * spots + spot;
-                    let (a, b) = (emitters.lifted[spot], self.lifted[sample]);
-                    let through = world.glass(&mut scratch.stack, a, b);
-                    self.found[at] = (slot as u32, self.weights[at] * through);
+                self.blocked.resize(self.ends.len(), false);
+                world.bvh.occluded_bundle(
+                    &mut scratch.stack,
+                    emitters.lifted[spot],
+                    &self.ends,
+                    &mut self.blocked,
+                );
+                let e = &emitters.list[spot];
+                for (&sample, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                    let hit = self.hits[sample].as_ref().filter(|_| !blocked);
+                    if let Some(h) = hit {
+                        let leg = world.metres((e.p - h.p).length());
+                        let slot = film.slot(e.path_m + leg + self.range_m[sample]);
+                        let at = sample * spots + k;
+                        let (a, b) = (emitters.lifted[spot], self.lifted[sample]);
+                        let through = world.glass(&mut scratch.stack, a, b);
+                        self.found[at] = (slot as u32, self.weights[at] * through);
+                    }
                 }
             }
         }
         let found = |sample: usize| {
             let row = &self.found[sample * spots..(sample + 1) * spots];
             let lit = row.iter().enumerate().filter(|(_, f)| f.1 > 0.0);
-            lit.map(|(spot, &(slot, value))| (spot, slot as usize, value))
+            let start = ray(sample).start;
+            lit.map(move |(k, &(slot, value))| (start + k, slot as usize, value))
         };
         for (block, &twice) in self.twice.iter().enumerate() {
             for corner in 0..4 {

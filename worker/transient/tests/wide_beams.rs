@@ -325,7 +325,8 @@ fn a_beam_of_almost_no_width_is_a_beam_without_one() {
     let of = |beam| pixels(&ok(&s, &Settings { beam, ..two_only() }));
     let (thin, none) = (of(Some(width(1e-3, 0.0, 16))), of(None));
     for (a, b) in thin.iter().zip(&none) {
-        assert!((a - b).abs() <= 1e-4 * b, "{a} {b}");
+        // Other places within the pixels.
+        assert!((a - b).abs() <= 1e-3 * b, "{a} {b}");
     }
     assert!(none.iter().filter(|e| **e > 0.0).count() > 100);
 }
