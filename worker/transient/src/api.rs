@@ -33,7 +33,7 @@ pub struct Settings {
     /// The width of the laser's beams; without it they have none. Spots and ground truth are those of the beams' middles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<BeamWidth>,
-    /// Share of each pixel's area that is sensitive, above 0 and at most 1: a square in its middle. Histograms are means over it; the
+    /// Share of each pixel's area that is sensitive, 10⁻⁶ to 1: a square in its middle. Histograms are means over it; the
     /// ground truth is that of pixels' middles all the same.
     #[serde(default = "whole", skip_serializing_if = "is_whole")]
     pub fill_factor: f64,

@@ -299,7 +299,7 @@ impl Emitters {
             let of_beam = (beam, through);
             all.push(Emitter::new(world, &mut stack, of_beam, spot, surface));
         }
-        all.rays = vec![0..all.list.len()];
+        all.rays.push(0..all.list.len());
         Ok(all)
     }
 

@@ -8,7 +8,9 @@ use picofarm_scene::{
     Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Material, Object, Provenance, Scene, Spot,
     Vec3,
 };
-use picofarm_transient::{Budget, Gate, RenderError, Rendered, Settings, Strategy, render};
+use picofarm_transient::{
+    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, render,
+};
 use proptest::{prelude::*, strategy::Strategy as Draw};
 
 /// A coordinate: mostly of a room's size, at times absurd.
@@ -209,6 +211,17 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         proptest::option::of(any::<bool>()),
         proptest::option::of(any::<bool>()),
     );
+    let size = || prop_oneof![3 => 0.0f64..50.0, 1 => Just(1000.0), 1 => Just(-1.0)];
+    let beam =
+        (size(), 0.0f64..600.0, 3u32..8).prop_map(|(diameter_mm, divergence_mrad, points)| {
+            BeamWidth {
+                diameter_mm,
+                divergence_mrad,
+                points,
+            }
+        });
+    let fill_factor =
+        prop_oneof![3 => Just(1.0), 3 => 0.01f64..1.0, 1 => Just(1e-6), 1 => Just(0.0)];
     (
         start,
         width,
@@ -217,6 +230,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         proptest::option::of(1u32..8),
         any::<(bool, bool, u64)>(),
         strategy,
+        (proptest::option::of(beam), fill_factor),
     )
         .prop_map(
             |(
@@ -227,6 +241,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                 max_bounces,
                 (one_bounce, split, seed),
                 strategy,
+                (beam, fill_factor),
             )| {
                 // 10⁵ bins cost memory by the pixel; an error to reach would take passes without end there.
                 let budget = if bins > 1000 {
@@ -253,6 +268,8 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                         mirror_images,
                         ..Strategy::default()
                     },
+                    beam,
+                    fill_factor,
                 }
             },
         )

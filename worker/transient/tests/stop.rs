@@ -54,6 +54,8 @@ fn settings(budget: Budget) -> Settings {
             ellipsoidal: Some(true),
             ..Strategy::default()
         },
+        beam: None,
+        fill_factor: 1.0,
     }
 }
 

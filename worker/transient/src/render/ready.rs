@@ -337,11 +337,11 @@ fn check(settings: &Settings) -> Result<(), RenderError> {
             format!("is {}, expected a path length of 0 m or more", g.start_m),
         );
     }
-    if !(settings.fill_factor > 0.0 && settings.fill_factor <= 1.0) {
+    if !(1e-6..=1.0).contains(&settings.fill_factor) {
         return bad(
             "fill_factor",
             format!(
-                "is {}, expected a share of a pixel's area above 0 and at most 1",
+                "is {}, expected a share of a pixel's area, 0.000001 to 1",
                 settings.fill_factor
             ),
         );
