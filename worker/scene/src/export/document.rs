@@ -152,12 +152,18 @@ struct Volume {
 
 /// Above 0: the mesh bounds the glass.
 const THICKNESS_M: f32 = 0.005;
-/// The extensions of [`Glass`].
-const EXTENSIONS: [&str; 3] = [
-    "KHR_materials_transmission",
-    "KHR_materials_ior",
-    "KHR_materials_volume",
-];
+/// The extensions that materials use.
+fn extensions(materials: &[MaterialEntry]) -> Vec<&'static str> {
+    let glass = || materials.iter().filter_map(|m| m.extensions.as_ref());
+    let mut names = vec![];
+    if glass().next().is_some() {
+        names.extend(["KHR_materials_transmission", "KHR_materials_ior"]);
+    }
+    if glass().any(|g| g.volume.is_some()) {
+        names.push("KHR_materials_volume");
+    }
+    names
+}
 
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
@@ -226,10 +232,7 @@ impl Document {
                 generator: concat!("picofarm-scene ", env!("CARGO_PKG_VERSION")),
                 copyright: scene.provenance.attribution.join("; "),
             },
-            extensions_used: match materials.iter().any(|m| m.extensions.is_some()) {
-                true => EXTENSIONS.to_vec(),
-                false => Vec::new(),
-            },
+            extensions_used: extensions(&materials),
             scene: 0,
             scenes: [SceneEntry {
                 name: scene.name.clone(),
