@@ -450,13 +450,20 @@ def parity(path):
     return all(value <= limits[name] for name, value in figures.items())
 
 
+def with_channels_last(tensor):
+    """The tensor with its channels last in memory: of images and of volumes; others as they are."""
+    form = {4: torch.channels_last, 5: torch.channels_last_3d}.get(tensor.dim())
+    return tensor if form is None else tensor.contiguous(memory_format=form)
+
+
 def bench(path, channels_last, device, tf32):
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = tf32
     torch.backends.cudnn.benchmark = True
     trial = Trial(path, device)
     if channels_last:
-        trial.model = trial.model.to(memory_format=torch.channels_last)
-        trial.dense = trial.dense.to(memory_format=torch.channels_last)
+        for held in [*trial.model.parameters(), *trial.model.buffers()]:
+            held.data = with_channels_last(held.data)
+        trial.dense = with_channels_last(trial.dense)
         trial.reset()
     more = (", " + device if device != "cpu" else "") + (", TF32" if tf32 else "") + (", channels last" if channels_last else "")
     name = f"PyTorch {torch.__version__}{more}"
