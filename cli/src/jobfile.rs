@@ -278,8 +278,8 @@ mod tests {
             .replace("# subsets", "subsets")
             .replace("# per_spot", "per_spot")
             .replace("# strategy", "strategy")
-            .replace("# beam", "beam")
-            .replace("# fill_factor", "fill_factor");
+            .replace("# beam =", "beam =")
+            .replace("# fill_factor =", "fill_factor =");
         let spec = read(&written(dir.path(), &text), dir.path()).unwrap();
         let TaskSpec::Render(RenderTask { render, .. }) = &spec.stages[0].task else {
             unreachable!("the template renders");
