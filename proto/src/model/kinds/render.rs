@@ -169,7 +169,8 @@ impl TaskKind for RenderTask {
         let rendering = self.rendering(threads);
         let parts = match self.parts {
             1 => 0.0,
-            _ => rendering.images() + rendering.paths() * LIGHT_PATHS,
+            // Read, decoded and put into the image one after the other; the allocator holds for a second what the last one took.
+            _ => 2.0 * rendering.images() + rendering.paths() * LIGHT_PATHS,
         };
         Some(rendering.coded() + parts)
     }
