@@ -293,7 +293,9 @@ async fn the_audit_log_outlives_the_coordinator_and_pages_and_notes_new_tokens()
         farm.stop().await;
         let farm = Farm::start(catalog, Visibility::All).await;
         let whole = farm.audit().await;
-        assert_eq!(whole.len(), 5);
+        // A submission that met a coordinator that begins anew was made again; the log has both.
+        let done: Vec<_> = whole.iter().filter(|line| line.outcome == "done").collect();
+        assert_eq!(done.len(), 5, "{whole:#?}");
         let mut paged = Vec::new();
         loop {
             let request = wire::ListAuditRequest {
@@ -314,11 +316,11 @@ async fn the_audit_log_outlives_the_coordinator_and_pages_and_notes_new_tokens()
         paged.reverse();
         assert_eq!(paged, whole);
         let one = wire::ListAuditRequest {
-            job_id: whole[2].job_id.clone(),
+            job_id: done[2].job_id.clone(),
             ..Default::default()
         };
         let answer = farm.jobs("root").list_audit(one).await.unwrap();
-        assert_eq!(answer.into_inner().entries, whole[2..3]);
+        assert_eq!(answer.into_inner().entries.iter().collect::<Vec<_>>(), done[2..3]);
 
         let mut tokens = Tokens::read(&farm.tokens).unwrap();
         tokens.revoke("vic");
