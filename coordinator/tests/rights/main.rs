@@ -320,7 +320,10 @@ async fn the_audit_log_outlives_the_coordinator_and_pages_and_notes_new_tokens()
             ..Default::default()
         };
         let answer = farm.jobs("root").list_audit(one).await.unwrap();
-        assert_eq!(answer.into_inner().entries.iter().collect::<Vec<_>>(), done[2..3]);
+        assert_eq!(
+            answer.into_inner().entries.iter().collect::<Vec<_>>(),
+            done[2..3]
+        );
 
         let mut tokens = Tokens::read(&farm.tokens).unwrap();
         tokens.revoke("vic");

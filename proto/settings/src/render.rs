@@ -100,8 +100,7 @@ pub struct BeamWidth {
     pub diameter_mm: f64,
     /// Divergence, full angle, milliradians.
     pub divergence_mrad: f64,
-    /// Rays that stand for a beam, each with an equal share of its light: three bounces and more cost as with so many times the
-    /// spots.
+    /// Rays that stand for a beam, each with an equal share of its light, as so many spots. More take more time.
     pub points: u32,
 }
 
