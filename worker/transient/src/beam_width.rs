@@ -5,8 +5,8 @@
 //! it is √(σ₀² + σ_θ²z²)·s from the axis, which is how wide such a beam is there.
 //!
 //! Each of a fixed number of rays carries an equal share of the light and ends in a point source of its own: a spot is as a small group
-//! of spots, on whatever surfaces the rays meet, and everything that holds of spots holds of it (mirrors, glass, subsets). Nothing
-//! is drawn at random, so that there is no noise to it; what is smaller than the distance between two rays is not resolved.
+//! of spots, on whatever surfaces the rays meet, and everything that holds of spots holds of it (mirrors, glass, subsets). The
+//! rays are the same in every render. What is smaller than the distance between two of them is not resolved.
 
 use picofarm_scene::Vec3;
 

@@ -1,5 +1,5 @@
-//! Sums of what light paths draw into the image. They come to few of its bins (to some 2 % in a furnished room of 256×256 pixels and 637 bins), so
-//! sums are kept of those alone, by pixel and slot.
+//! Sums of what light paths draw into the image. They come to few of its bins, so sums are kept of those alone, by pixel
+//! and slot.
 //!
 //! What a pass brings waits until there is enough of it, and is then merged with the sums, pass after pass: so that the bits
 //! do not depend on when that happens, and the work for a contribution does not grow with the number of sums.
