@@ -194,8 +194,15 @@ impl Columns {
     /// power of each Lambertian source, unshadowed.
     #[inline]
     pub fn irradiance(&self, x: Vec3, n: Vec3, out: &mut [f32]) {
+        self.irradiance_from(0, x, n, out);
+    }
+
+    /// The same of as many sources as `out` holds, from the `first` on.
+    #[inline]
+    pub fn irradiance_from(&self, first: usize, x: Vec3, n: Vec3, out: &mut [f32]) {
         widest(Irradiance {
             columns: self,
+            first,
             x,
             n,
             out,
@@ -203,29 +210,32 @@ impl Columns {
     }
 }
 
-/// [`Columns::irradiance`].
+/// [`Columns::irradiance_from`].
 pub(crate) struct Irradiance<'a> {
     pub columns: &'a Columns,
+    pub first: usize,
     pub x: Vec3,
     pub n: Vec3,
     pub out: &'a mut [f32],
 }
 
-impl Wide for Irradiance<'_> {
+impl<'a> Wide for Irradiance<'a> {
     type Output = ();
 
     #[inline(always)]
     fn run(self) {
         let Self {
             columns: c,
+            first,
             x,
             n,
             out,
         } = self;
         let count = out.len();
-        let (px, py, pz) = (&c.px[..count], &c.py[..count], &c.pz[..count]);
-        let (nx, ny, nz) = (&c.nx[..count], &c.ny[..count], &c.nz[..count]);
-        let strength = &c.strength[..count];
+        let of = |column: &'a [f32]| &column[first..first + count];
+        let (px, py, pz) = (of(&c.px), of(&c.py), of(&c.pz));
+        let (nx, ny, nz) = (of(&c.nx), of(&c.ny), of(&c.nz));
+        let strength = of(&c.strength);
         for i in 0..count {
             let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
             let d2 = dx * dx + dy * dy + dz * dz;
@@ -366,17 +376,30 @@ impl Emitters {
     /// f_x cos_x / d². `wo` is the unit direction in which the point is seen.
     #[inline]
     pub fn weights(&self, x: Vec3, n: Vec3, wo: Vec3, surface: &Surface, out: &mut [f32]) {
+        self.weights_of(0..self.list.len(), (x, n, wo), surface, out);
+    }
+
+    /// The same for the sources of a range at the point (x, n, wo); what `out` holds of others stays.
+    #[inline]
+    pub fn weights_of(
+        &self,
+        range: Range<usize>,
+        (x, n, wo): (Vec3, Vec3, Vec3),
+        surface: &Surface,
+        out: &mut [f32],
+    ) {
         if surface.diffuse() {
-            self.columns.irradiance(x, n, out);
-            for w in out.iter_mut() {
+            let own = &mut out[range.clone()];
+            self.columns.irradiance_from(range.start, x, n, own);
+            for w in own {
                 *w *= surface.lambertian();
             }
-            for &i in &self.glossy {
+            for &i in self.glossy.iter().filter(|i| range.contains(i)) {
                 out[i] = self.weight(i, x, n, wo, surface);
             }
         } else {
-            for (i, w) in out.iter_mut().enumerate() {
-                *w = self.weight(i, x, n, wo, surface);
+            for i in range {
+                out[i] = self.weight(i, x, n, wo, surface);
             }
         }
     }

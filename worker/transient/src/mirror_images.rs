@@ -324,6 +324,7 @@ impl Mirror {
             return false;
         };
         let images = Irradiance {
+            first: 0,
             columns: im,
             x,
             n,

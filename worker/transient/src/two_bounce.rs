@@ -144,14 +144,16 @@ impl Strata {
             let (lifted, range) = hit.map_or((Vec3::ZERO, 0.0), |h| {
                 let range = h.p.length();
                 let all = &mut scratch.weights;
-                emitters.weights(h.p, h.n, -h.p / range, &h.surface, all);
+                let own = ray(sample).clone();
+                // Of the other rays nothing counts here.
+                all.fill(0.0);
+                emitters.weights_of(own.clone(), (h.p, h.n, -h.p / range), &h.surface, all);
                 if h.through != 1.0 {
                     all.iter_mut().for_each(|w| *w *= h.through);
                 }
                 walk.leave_to_zones(&h, all);
                 walk.keep_in_window(h.p, world.metres(range), all);
-                let own = &all[ray(sample).clone()];
-                for (out, w) in weights.iter_mut().zip(own) {
+                for (out, w) in weights.iter_mut().zip(&all[own]) {
                     *out = w * rays as f32;
                 }
                 (lift(h.p, h.n), range)
