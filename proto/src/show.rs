@@ -136,6 +136,10 @@ fn named(message: &str) -> String {
     else {
         return message.to_owned();
     };
+    // Readers within readers, each of which passes it here.
+    if after.contains("; did you mean `") {
+        return message.to_owned();
+    }
     let Some((text, rest)) = after.split_once('`') else {
         return message.to_owned();
     };
@@ -219,6 +223,11 @@ mod tests {
         assert_eq!(
             suggest("unknown variant `tff`, expected `tof` or `shadow`\n"),
             "unknown variant `tff`, expected `tof` or `shadow`; did you mean `tof`?"
+        );
+        let once = suggest("unknown variant `tff`, expected `tof` or `shadow`");
+        assert_eq!(
+            suggest(&format!("stage[4]: {once}")),
+            format!("stage[4]: {once}")
         );
         assert_eq!(suggest("missing field `name`"), "missing field `name`");
         assert_eq!(
