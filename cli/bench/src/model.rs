@@ -15,7 +15,7 @@ use picofarm_model::{
     memory::Kept,
     net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
     train::Learner,
-    trial::Trial,
+    trial::{Apart, Trial},
 };
 use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
@@ -42,6 +42,10 @@ struct Report {
     forms: Vec<Form>,
     /// The largest difference between the outputs of the gather and the dense form.
     forms_differ: Option<f64>,
+    /// From the CPU in 32 bits: lengths of differences over lengths.
+    from_cpu: Option<Apart>,
+    /// Seconds of our first step; on a graphics processor kernels are chosen and compiled in it.
+    first_step_s: f64,
 }
 
 /// One way of taking the step.
@@ -113,11 +117,15 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         forms.push((name.into(), learner, batch));
     }
     let mut peaks = Vec::new();
+    let mut first = Vec::new();
     for (_, learner, batch) in &mut forms {
         let before = reset_peak();
+        let begun = Instant::now();
         learner
-            .step(std::slice::from_ref(batch), trial.pace())
+            .step(vec![batch.clone()], trial.pace())
             .map_err(of_model)?;
+        learner.wait().map_err(of_model)?;
+        first.push(begun.elapsed().as_secs_f64());
         peaks.push(before.and_then(|b| Some(peak()?.saturating_sub(b))));
     }
     // As where a worker trains; only now, so that what earlier steps left does not hide what one takes.
@@ -129,12 +137,13 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
     for round in 0..args.rounds {
         output.say(format!("round {} of {}", round + 1, args.rounds));
         for ((_, learner, batch), to) in forms.iter_mut().zip(&mut seconds) {
+            // Where a worker trains, its loader makes them.
+            let batches: Vec<Batch> = (0..args.steps).map(|_| batch.clone()).collect();
             let begun = Instant::now();
-            for _ in 0..args.steps {
-                learner
-                    .step(std::slice::from_ref(batch), trial.pace())
-                    .map_err(of_model)?;
-            }
+            learner
+                .steps_along(batches, trial.pace())
+                .map_err(of_model)?;
+            learner.wait().map_err(of_model)?;
             to.push(begun.elapsed().as_secs_f64() / args.steps as f64);
         }
         for (peer, to) in peers.iter_mut().zip(&mut seconds[forms.len()..]) {
@@ -144,6 +153,10 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
             return Err(CliError::new(Code::Interrupted, "stopped"));
         }
     }
+    let from_cpu = match args.compare {
+        true => Some(trial.from_cpu(&device).map_err(of_model)?),
+        false => None,
+    };
     let names = forms.iter().map(|(name, ..)| name.clone());
     let names: Vec<String> = names.chain(peers.iter().map(|p| p.name.clone())).collect();
     let report = Report {
@@ -171,6 +184,8 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
             })
             .collect(),
         forms_differ,
+        from_cpu,
+        first_step_s: first[0],
         trial,
     };
     output.result(&report, || text(&report));
@@ -270,6 +285,18 @@ fn text(report: &Report) -> String {
         None => format!("{} threads", report.threads),
     };
     out += &format!(", {on}\n\n{}", table(&rows));
+    if report.gpu.is_some() {
+        out += &format!(
+            "\nfirst step of ours: {:.1} s (kernels are chosen and compiled in it)",
+            report.first_step_s
+        );
+    }
+    if let Some(apart) = report.from_cpu {
+        out += &format!(
+            "\nfrom the CPU in 32 bits: outputs {:.1e}, gradient {:.1e} (length of the difference over the length)",
+            apart.output, apart.gradient
+        );
+    }
     if let Some(differ) = report.forms_differ {
         out += &format!("\nlargest difference between gather and dense form: {differ:.1e}");
     }

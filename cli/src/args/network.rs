@@ -48,6 +48,9 @@ pub struct BenchModel {
     /// On a graphics processor, as `picofarm model devices` names it (a build with --features wgpu or cuda)
     #[arg(long, value_name = "NAME")]
     pub gpu: Option<String>,
+    /// Say how far outputs and gradient are from those of the CPU in 32 bits, besides; takes a step there
+    #[arg(long, requires = "gpu", conflicts_with = "record")]
+    pub compare: bool,
     /// Numbers in which convolutions are computed
     #[arg(long, value_enum, default_value_t = Numbers::F32)]
     pub precision: Numbers,

@@ -121,8 +121,25 @@ impl fmt::Display for OpenGpu {
     }
 }
 
+/// Has CubeCL keep what it finds out about a card: which kernels are fastest, and compiled ones. Both take minutes for a network that a
+/// card has not met yet. They are kept in the user's cache folder, unless a `cubecl.toml` says elsewhere; what such a file or
+/// CubeCL's environment variables say counts.
+#[cfg(feature = "cuda")]
+fn keep_kernels() {
+    use burn::cubecl::config::{CubeClRuntimeConfig, RuntimeConfig, cache::CacheConfig};
+    let mut config = CubeClRuntimeConfig::from_current_dir().override_from_env();
+    config.compilation.cache = true;
+    if matches!(config.environment.path, CacheConfig::Target) {
+        config.environment.path = CacheConfig::Global;
+    }
+    // Refused where it has been asked for already: then it is as it was said before.
+    CubeClRuntimeConfig::try_set(config);
+}
+
 /// Every graphics processor that drivers list, those of the best runtime first.
 pub fn gpus() -> Vec<Gpu> {
+    #[cfg(feature = "cuda")]
+    keep_kernels();
     #[cfg_attr(
         not(any(feature = "cuda", feature = "wgpu")),
         allow(unused_mut, reason = "nothing is listed then")

@@ -7,9 +7,9 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    ModelError, Random,
+    ModelError, Random, cpu,
     input::{Batch, Target},
-    net::{Net, NetSpec},
+    net::{Net, NetSpec, Precision},
     parameters::{Named, Parameters, download},
     train::{Learner, Pace, predict},
     weights,
@@ -168,7 +168,7 @@ impl Trial {
         let (mut learner, _) = self.begin(device)?;
         let mut losses = Vec::with_capacity(steps);
         for _ in 0..steps {
-            losses.push(learner.step(std::slice::from_ref(&batch), self.pace())?);
+            losses.push(learner.step(vec![batch.clone()], self.pace())?);
         }
         named.insert("losses".into(), (vec![steps], losses));
         let text = serde_json::to_string(self).expect("plain data");
@@ -176,6 +176,33 @@ impl Trial {
             &named,
             &BTreeMap::from([("trial".into(), text)]),
         ))
+    }
+
+    /// How far a device is from the CPU in 32 bits, at the beginning: in what the network says in training, and in the gradient.
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`].
+    pub fn from_cpu(&self, device: &Device) -> Result<Apart, ModelError> {
+        let of = |trial: &Self, device| {
+            let (mut learner, batch) = trial.begin(device)?;
+            let (said, _, gradients) = learner.gradients(batch);
+            let gradient: Vec<f32> = gradients.iter().flatten().flat_map(download).collect();
+            Ok::<_, ModelError>((said, gradient))
+        };
+        let mut precise = self.clone();
+        precise.net.precision = Precision::F32;
+        let (said, gradient) = of(self, device)?;
+        let (cpu_said, cpu_gradient) = of(&precise, &cpu())?;
+        let far = |a: &[f32], b: &[f32]| {
+            let pairs = || a.iter().zip(b).map(|(a, b)| [f64::from(*a), f64::from(*b)]);
+            let apart: f64 = pairs().map(|[a, b]| (a - b).powi(2)).sum();
+            let length: f64 = pairs().map(|[_, b]| b * b).sum();
+            (apart / length).sqrt()
+        };
+        Ok(Apart {
+            output: far(&said, &cpu_said),
+            gradient: far(&gradient, &cpu_gradient),
+        })
     }
 
     /// The slope of the loss along its own gradient g at the beginning: measured over ±`reach` · g/|g|, and expected: |g|.
@@ -215,6 +242,15 @@ impl Trial {
             expected: norm,
         })
     }
+}
+
+/// See [`Trial::from_cpu`]: length of the difference over the length, all numbers as one vector.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Apart {
+    /// Of what the network says.
+    pub output: f64,
+    /// Of the gradient.
+    pub gradient: f64,
 }
 
 /// See [`Trial::slope`].

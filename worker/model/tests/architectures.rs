@@ -299,7 +299,7 @@ fn other_networks_learn_a_batch_by_heart() {
             learning_rate: 2e-3,
             beta1: 0.9,
         };
-        let mut loss = || learner.step(std::slice::from_ref(&batch), pace).unwrap();
+        let mut loss = || learner.step(vec![batch.clone()], pace).unwrap();
         let first = loss();
         let last = (0..150).map(|_| loss()).last().unwrap();
         assert!(last < 0.3 * first, "{architecture:?}: {first} to {last}");

@@ -8,11 +8,11 @@ use std::collections::BTreeMap;
 
 use common::{plan, scene, sources};
 use picofarm_model::{
-    Model, answers, cpu,
+    Model, ModelError, answers, cpu,
     device::{OpenGpu, gpus},
     input::{ShadowVariant, Target},
     net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
-    train::{Control, Ended, Event, Plan, Trained, Training},
+    train::{Control, Ended, Event, Learner, Plan, Trained, Training},
     trial::Trial,
     weights,
 };
@@ -171,6 +171,47 @@ fn a_network_says_on_any_device_what_it_says_on_the_cpu() {
             let coarse = (gpu.apart / 1e-6).max(1.0);
             assert!((a - b).abs() <= 1e-4 * coarse * scale, "{gpu}: {a} and {b}");
         }
+    }
+}
+
+/// The next batch comes to the device while it computes, and losses are asked for late.
+#[test]
+fn batches_that_are_brought_ahead_give_the_bits_of_one_after_another() {
+    for gpu in opened() {
+        let trial = |seed| Trial {
+            seed,
+            ..networks().next().unwrap()
+        };
+        let begin = |seed| trial(seed).begin(&gpu.device).unwrap();
+        let (mut along, first) = begin(1);
+        let (mut single, _) = begin(1);
+        let batches = vec![first, begin(2).1, begin(3).1];
+        let pace = trial(1).pace();
+        along.steps_along(batches.clone(), pace).unwrap();
+        for batch in batches.clone() {
+            single.step(vec![batch], pace).unwrap();
+        }
+        let numbers = |learner: &Learner| learner.parameters().to_named();
+        assert_eq!(numbers(&along), numbers(&single), "{gpu}");
+        let before = numbers(&along);
+        let mut broken = batches.clone();
+        broken[1].dense[5] = f32::NAN;
+        for at in [1, 2] {
+            let error = along.step(broken[..=at].to_vec(), pace).unwrap_err();
+            assert!(matches!(error, ModelError::NotFinite { .. }), "{error}");
+            assert_eq!(numbers(&along), before, "{gpu}");
+        }
+    }
+}
+
+#[test]
+fn a_device_is_as_far_from_the_cpu_as_it_says() {
+    for gpu in opened() {
+        let trial = networks().next().unwrap();
+        let apart = trial.from_cpu(&gpu.device).unwrap();
+        let coarse = f64::from(gpu.apart / 1e-6).max(1.0);
+        assert!(apart.output < 1e-4 * coarse, "{gpu}: {apart:?}");
+        assert!(apart.gradient < 2e-3 * coarse, "{gpu}: {apart:?}");
     }
 }
 

@@ -40,7 +40,13 @@ macro_rules! equal {
 
 #[test]
 fn convolutions_equal_burns_and_so_do_their_gradients() {
-    for (n, c, o, h, w) in [(1, 1, 1, 4, 4), (2, 5, 9, 8, 6), (3, 17, 4, 2, 2)] {
+    for (n, c, o, h, w) in [
+        (1, 1, 1, 4, 4),
+        (2, 5, 9, 8, 6),
+        (3, 17, 4, 2, 2),
+        (2, 19, 35, 4, 6),
+        (1, 16, 32, 2, 2),
+    ] {
         let (x, k) = (random([n, c, h, w], 1), random([o, c, 3, 3], 2));
         equal!(
             ops::conv3x3(x.clone(), k.clone()),

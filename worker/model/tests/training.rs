@@ -279,11 +279,11 @@ fn parts_of_a_step_give_the_bits_that_they_gave_together() {
     let (_, other) = trial(6).begin(&device).unwrap();
     let (mut two, _) = trial(5).begin(&device).unwrap();
     let pace = trial(5).pace();
-    let loss = one.step(&[batch.clone(), other.clone()], pace).unwrap();
+    let loss = one.step(vec![batch.clone(), other.clone()], pace).unwrap();
     let mut sum = picofarm_model::train::Gradients::default();
-    two.add(&mut sum, 0, batch).unwrap();
-    two.add(&mut sum, 1, other).unwrap();
-    assert_eq!(two.finish(sum, 2, pace), loss);
+    two.add(&mut sum, 0, two.bring(batch)).unwrap();
+    two.add(&mut sum, 1, two.bring(other)).unwrap();
+    assert_eq!(two.finish(sum, 2, pace).unwrap(), loss);
     assert_eq!(one.parameters().to_named(), two.parameters().to_named());
 }
 

@@ -9,9 +9,32 @@ use burn::tensor::{
 use super::{EPSILON, Normalised, attend, from_windows, shifted, shifted_back, windows};
 use crate::kernel::AdamW;
 
-/// See [`super::conv3x3`].
+/// Channels that matrix units take at once. Kernels of graphics processors read value by value where a layer has another number
+/// (637 bins, say), and take several times as long.
+const ALIGNED: usize = 16;
+
+/// See [`super::conv3x3`]. Channels are filled up to a multiple of [`ALIGNED`] with zeros, unless there are fewer.
 pub fn conv3x3(x: Tensor<4>, w: Tensor<4>) -> Tensor<4> {
-    module::conv2d(x, w, None, ConvOptions::new([1, 1], [1, 1], [1, 1], 1))
+    let outputs = w.dims()[0];
+    let x = filled(x, 1);
+    let w = filled(filled(w, 0), 1);
+    let y = module::conv2d(x, w, None, ConvOptions::new([1, 1], [1, 1], [1, 1], 1));
+    match y.dims()[1] == outputs {
+        true => y,
+        false => y.narrow(1, 0, outputs),
+    }
+}
+
+/// Zeros after the last of a dimension, up to a multiple of [`ALIGNED`]; as it is where there are fewer than that.
+fn filled(x: Tensor<4>, dim: usize) -> Tensor<4> {
+    let mut shape = x.dims();
+    let there = shape[dim];
+    shape[dim] = there.next_multiple_of(ALIGNED) - there;
+    if there < ALIGNED || shape[dim] == 0 {
+        return x;
+    }
+    let none = Tensor::<4>::zeros(shape, &x.device()).cast(x.dtype());
+    Tensor::cat(vec![x, none], dim)
 }
 
 /// See [`super::conv1x1`].

@@ -5,14 +5,14 @@ use rayon::{iter::ParallelIterator, slice::ParallelSlice};
 
 use super::{
     group::{Block, Blocks, Part},
-    loss::loss,
+    loss::{Loss, loss},
     schedule::Pace,
 };
 use crate::{
     ModelError,
     input::{Batch, Target},
     kernel::AdamW,
-    net::{Net, Pass},
+    net::{Input, Net, Pass},
     ops,
     parameters::{Declared, Id, Parameters, download, upload},
 };
@@ -60,12 +60,20 @@ pub struct Gradients {
     blocks: Blocks<Summed>,
     /// Running statistics after the step's first batch, where that is among them.
     moved: Vec<(Id, Tensor<1>)>,
+    /// Of the batch that was added last.
+    latest: Option<Loss>,
+}
+
+/// A batch on the device of a learner.
+pub struct Brought {
+    input: Input,
+    target: Vec<f32>,
 }
 
 /// Gradients of every parameter by declaration, none of those that are not learned, and losses; summed over batches.
 struct Summed {
     gradients: Vec<Option<Tensor<1>>>,
-    losses: f32,
+    losses: Loss,
 }
 
 impl Summed {
@@ -73,7 +81,7 @@ impl Summed {
         let both = one.gradients.into_iter().zip(other.gradients);
         Self {
             gradients: both.map(|(a, b)| Some(a? + b?)).collect(),
-            losses: one.losses + other.losses,
+            losses: one.losses.plus(other.losses),
         }
     }
 }
@@ -139,6 +147,17 @@ impl Learner {
         &self.parameters
     }
 
+    /// Waits until the device has done all it was given: what is measured ends then.
+    ///
+    /// # Errors
+    /// [`ModelError::Gpu`] with what its driver failed with.
+    pub fn wait(&self) -> Result<(), ModelError> {
+        self.device.sync().map_err(|error| ModelError::Gpu {
+            id: "graphics processor".into(),
+            what: error.to_string(),
+        })
+    }
+
     /// Steps taken.
     pub fn steps(&self) -> u64 {
         self.steps
@@ -147,11 +166,11 @@ impl Learner {
     /// What the network said, loss, and the gradient of every learned parameter by declaration; moves the running
     /// statistics.
     pub(crate) fn gradients(&mut self, batch: Batch) -> (Vec<f32>, f32, Vec<Option<Tensor<1>>>) {
-        let (output, of) = self.backward(batch);
+        let (output, of) = self.backward(self.bring(batch));
         self.move_statistics(of.moved);
         let said = output.into_data_as::<f32>();
         let said = said.try_into_vec().expect("asked for f32");
-        (said, of.summed.losses, of.summed.gradients)
+        (said, of.summed.losses.value(), of.summed.gradients)
     }
 
     fn move_statistics(&mut self, moved: Vec<(Id, Tensor<1>)>) {
@@ -160,8 +179,18 @@ impl Learner {
         }
     }
 
-    fn backward(&self, batch: Batch) -> (Tensor<4>, OfBatch) {
-        let device = self.device.clone().autodiff();
+    /// Brings a batch to the device. What a graphics processor was given before it still computes meanwhile.
+    pub fn bring(&self, batch: Batch) -> Brought {
+        let (input, target) = batch.into_input(&self.device.clone().autodiff());
+        Brought { input, target }
+    }
+
+    /// Whether the device computes by itself, so that batches are better brought while it does.
+    pub fn computes_apart(&self) -> bool {
+        !ops::has_kernels(&self.device)
+    }
+
+    fn backward(&self, batch: Brought) -> (Tensor<4>, OfBatch) {
         let leaves: Vec<Tensor<1>> = self
             .net
             .declared()
@@ -173,10 +202,9 @@ impl Learner {
             })
             .collect();
         let mut pass = Pass::training(self.net.declared(), &leaves);
-        let (input, target) = batch.into_input(&device);
-        let output = self.net.forward(&mut pass, input);
+        let output = self.net.forward(&mut pass, batch.input);
         let moved = pass.into_moved();
-        let (loss, root) = loss(self.target, output.clone(), &target);
+        let (loss, root) = loss(self.target, output.clone(), &batch.target);
         let mut gradients = root.backward();
         let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
         let summed = Summed {
@@ -190,24 +218,45 @@ impl Learner {
     ///
     /// # Errors
     /// [`ModelError::NotFinite`]; everything is then as before.
-    pub fn step(&mut self, batches: &[Batch], pace: Pace) -> Result<f32, ModelError> {
+    pub fn step(&mut self, batches: Vec<Batch>, pace: Pace) -> Result<f32, ModelError> {
         let mut sum = Gradients::default();
-        for (at, batch) in batches.iter().enumerate() {
-            self.add(&mut sum, at, batch.clone())?;
+        let count = batches.len();
+        for (at, batch) in batches.into_iter().enumerate() {
+            self.add(&mut sum, at, self.bring(batch))?;
         }
-        Ok(self.finish(sum, batches.len(), pace))
+        self.finish(sum, count, pace)
+    }
+
+    /// A step along each of some batches, as a training takes them: a graphics processor gets the next one while it computes.
+    ///
+    /// # Errors
+    /// [`ModelError::NotFinite`]; everything is then as after the step before.
+    pub fn steps_along(&mut self, batches: Vec<Batch>, pace: Pace) -> Result<(), ModelError> {
+        let mut batches = batches.into_iter();
+        let mut ahead = None;
+        while let Some(batch) = ahead.take().or_else(|| Some(self.bring(batches.next()?))) {
+            let mut sum = Gradients::default();
+            self.add(&mut sum, 0, batch)?;
+            if self.computes_apart() {
+                ahead = batches.next().map(|batch| self.bring(batch));
+            }
+            self.finish(sum, 1, pace)?;
+        }
+        Ok(())
     }
 
     /// Adds the gradients of batch `at` of a step to those before it, and lets go of the batch. Running statistics follow the
-    /// first batch of a step.
+    /// first batch of a step. A graphics processor has then begun with it, and is done with the batch before.
     ///
     /// # Errors
     /// [`ModelError::NotFinite`]; everything is then as before.
-    pub fn add(&self, sum: &mut Gradients, at: usize, batch: Batch) -> Result<(), ModelError> {
+    pub fn add(&self, sum: &mut Gradients, at: usize, batch: Brought) -> Result<(), ModelError> {
+        self.check(sum.latest.take())?;
         let (_, of) = self.backward(batch);
-        if !of.summed.losses.is_finite() {
-            return Err(self.not_finite(of.summed.losses));
+        if of.summed.losses.is_broken() {
+            return Err(self.not_finite(of.summed.losses.value()));
         }
+        sum.latest = Some(of.summed.losses.clone());
         if at == 0 {
             sum.moved = of.moved;
         }
@@ -220,11 +269,28 @@ impl Learner {
         Ok(())
     }
 
+    /// Waits for the loss of a batch.
+    fn check(&self, loss: Option<Loss>) -> Result<(), ModelError> {
+        match loss.map(Loss::value) {
+            Some(loss) if !loss.is_finite() => Err(self.not_finite(loss)),
+            _ => Ok(()),
+        }
+    }
+
     /// Takes the step of the optimiser along the mean of the gradients of all its batches. Returns the mean loss.
+    ///
+    /// # Errors
+    /// [`ModelError::NotFinite`]; everything is then as before.
     ///
     /// # Panics
     /// Where some of them are missing.
-    pub fn finish(&mut self, sum: Gradients, batches: usize, pace: Pace) -> f32 {
+    pub fn finish(
+        &mut self,
+        sum: Gradients,
+        batches: usize,
+        pace: Pace,
+    ) -> Result<f32, ModelError> {
+        self.check(sum.latest)?;
         assert!(sum.blocks.is_whole(batches), "a step has all its batches");
         let summed = sum
             .blocks
@@ -257,7 +323,7 @@ impl Learner {
             self.moments[i] = moments;
         }
         self.follow();
-        summed.losses * share
+        Ok(summed.losses.value() * share)
     }
 
     /// What a step's gradient, `share` times `summed`, is to be multiplied by so that it is not too long.
@@ -295,7 +361,7 @@ impl Learner {
             for gradient in summed.gradients.iter().flatten() {
                 values.extend(download(gradient));
             }
-            values.push(summed.losses);
+            values.push(summed.losses.value());
             values
         };
         Part {
@@ -348,12 +414,13 @@ impl Learner {
                     .iter()
                     .map(|d| d.learned.then(|| take(d.len())))
                     .collect(),
-                losses: values[values.len() - 1],
+                losses: Loss::Known(values[values.len() - 1]),
             }
         };
         Ok(Gradients {
             blocks: part.blocks.map(deep),
             moved,
+            latest: None,
         })
     }
 

@@ -299,6 +299,11 @@ pub(super) struct Ready<'a> {
 }
 
 impl Ready<'_> {
+    /// Whether all visits have been asked for.
+    pub(super) fn is_over(&self) -> bool {
+        self.exchange.lock().taken == self.count
+    }
+
     /// The next batch; a smaller one at the very end, if visits are left over.
     ///
     /// # Errors

@@ -4,23 +4,52 @@ use burn::tensor::{Tensor, TensorData};
 
 use crate::{input::Target, ops};
 
+/// A mean loss, or a sum of them, which a device may still be computing.
+#[derive(Debug, Clone)]
+pub enum Loss {
+    Known(f32),
+    OnDevice(Box<Tensor<1>>),
+}
+
+impl Loss {
+    /// Waits for all that the device was given before.
+    pub fn value(self) -> f32 {
+        match self {
+            Self::Known(loss) => loss,
+            Self::OnDevice(loss) => loss.into_scalar::<f32>(),
+        }
+    }
+
+    /// Whether it is known to be no number; of a device nothing is known.
+    pub fn is_broken(&self) -> bool {
+        matches!(self, Self::Known(loss) if !loss.is_finite())
+    }
+
+    pub fn plus(self, other: Self) -> Self {
+        match (self, other) {
+            (Self::OnDevice(a), Self::OnDevice(b)) => Self::OnDevice(Box::new(*a + *b)),
+            (a, b) => Self::Known(a.value() + b.value()),
+        }
+    }
+}
+
 /// Mean loss of a batch, and what to go backward from: outputs and truth (N, C, H, W).
 ///
 /// On the CPU both are computed here, in a fixed order and with `libm`, so that neither the instruction set nor the
 /// system's mathematics changes a bit; elsewhere by the device.
-pub fn loss(target: Target, output: Tensor<4>, truth: &[f32]) -> (f32, Tensor<1>) {
+pub fn loss(target: Target, output: Tensor<4>, truth: &[f32]) -> (Loss, Tensor<1>) {
     if !ops::has_kernels(&output.device()) {
         let truth = TensorData::new(truth.to_vec(), output.dims());
         let truth = Tensor::from_data(truth, &output.device());
         let loss = on_device(target, output, truth);
-        return (loss.clone().inner().into_scalar::<f32>(), loss);
+        return (Loss::OnDevice(Box::new(loss.clone().inner())), loss);
     }
     let said = output.clone().inner().into_data_as::<f32>();
     let said: Vec<f32> = said.try_into_vec().expect("asked for f32");
     let (loss, gradient) = by_hand(target, &said, truth);
     let gradient = TensorData::new(gradient, output.dims());
     let gradient = Tensor::<4>::from_data(gradient, &output.device());
-    (loss, (output * gradient).sum())
+    (Loss::Known(loss), (output * gradient).sum())
 }
 
 /// Loss and gradient, value by value.

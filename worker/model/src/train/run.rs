@@ -311,6 +311,8 @@ impl Training {
         let mut clock = Clock::new();
         let of = self.steps();
         let batches = self.plan.accumulate;
+        // Brought to a graphics processor while it computes.
+        let mut ahead = None;
         while !self.is_over() {
             let mut events = Vec::new();
             if !self.line_is_due() {
@@ -321,10 +323,17 @@ impl Training {
                 }
                 let mut sum = Gradients::default();
                 for at in share.clone() {
-                    let since = Instant::now();
-                    let batch = ready.next()?;
-                    clock.waited += since.elapsed();
+                    let mut next = || {
+                        let since = Instant::now();
+                        let batch = ready.next()?;
+                        clock.waited += since.elapsed();
+                        Ok::<_, ModelError>(self.learner.bring(batch))
+                    };
+                    let batch = ahead.take().map_or_else(&mut next, Ok)?;
                     self.learner.add(&mut sum, at, batch)?;
+                    if self.learner.computes_apart() && !ready.is_over() {
+                        ahead = Some(next()?);
+                    }
                 }
                 if let Some(group) = group.as_deref_mut()
                     && !group.is_alone()
@@ -337,7 +346,7 @@ impl Training {
                 }
                 clock.samples += batches * self.plan.batch;
                 let pace = self.pace(self.learner.steps());
-                let loss = self.learner.finish(sum, batches, pace);
+                let loss = self.learner.finish(sum, batches, pace)?;
                 let position = &mut self.position;
                 position.batches += batches as u64;
                 position.losses += f64::from(loss);
