@@ -124,7 +124,7 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
         learner
             .step(vec![batch.clone()], trial.pace())
             .map_err(of_model)?;
-        learner.wait().map_err(of_model)?;
+        learner.wait().map_err(of_driver)?;
         first.push(begun.elapsed().as_secs_f64());
         peaks.push(before.and_then(|b| Some(peak()?.saturating_sub(b))));
     }
@@ -143,7 +143,7 @@ pub fn run(args: &BenchModel, output: Output, stop: &CancellationToken) -> Resul
             learner
                 .steps_along(batches, trial.pace())
                 .map_err(of_model)?;
-            learner.wait().map_err(of_model)?;
+            learner.wait().map_err(of_driver)?;
             to.push(begun.elapsed().as_secs_f64() / args.steps as f64);
         }
         for (peer, to) in peers.iter_mut().zip(&mut seconds[forms.len()..]) {
@@ -241,6 +241,10 @@ fn trial(args: &BenchModel) -> Trial {
         decay: 1e-3,
         seed: 1,
     }
+}
+
+fn of_driver(what: String) -> CliError {
+    CliError::new(Code::Failed, format!("the device failed: {what}"))
 }
 
 fn of_model(error: ModelError) -> CliError {

@@ -9,8 +9,8 @@ use burn::tensor::{
 use super::{EPSILON, Normalised, attend, from_windows, shifted, shifted_back, windows};
 use crate::kernel::AdamW;
 
-/// Channels that matrix units take at once. Kernels of graphics processors read value by value where a layer has another number
-/// (637 bins, say), and take several times as long.
+/// Channels that matrix units take at once. Where a layer has another number (637 bins, say), kernels of graphics processors read value by
+/// value.
 const ALIGNED: usize = 16;
 
 /// See [`super::conv3x3`]. Channels are filled up to a multiple of [`ALIGNED`] with zeros, unless there are fewer.

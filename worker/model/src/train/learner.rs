@@ -150,12 +150,9 @@ impl Learner {
     /// Waits until the device has done all it was given: what is measured ends then.
     ///
     /// # Errors
-    /// [`ModelError::Gpu`] with what its driver failed with.
-    pub fn wait(&self) -> Result<(), ModelError> {
-        self.device.sync().map_err(|error| ModelError::Gpu {
-            id: "graphics processor".into(),
-            what: error.to_string(),
-        })
+    /// What its driver failed with.
+    pub fn wait(&self) -> Result<(), String> {
+        self.device.sync().map_err(|error| error.to_string())
     }
 
     /// Steps taken.
