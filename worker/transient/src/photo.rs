@@ -17,6 +17,9 @@ const SIDE: u32 = 3;
 /// Mirrors followed.
 const REFLECTIONS: u32 = 2;
 
+/// What is nearer to the camera counts as this far for the lamp, render units: squares of much smaller lengths are no numbers.
+const NEAREST: f32 = 1e-9;
+
 /// A disc of light beneath the ceiling and parallel to it, so that no part of it sticks out above.
 struct Lamp {
     centre: Vec3,
@@ -94,7 +97,8 @@ fn lamp(world: &World) -> Lamp {
     let up = -world.camera.down;
     let ahead = world
         .closest(&mut stack, Vec3::ZERO, world.camera.forward)
-        .map_or(2.0, |h| h.p.length());
+        .map_or(2.0, |h| h.p.length())
+        .max(NEAREST);
     let under = world.camera.forward * (0.4 * ahead);
     let (above, normal) = world
         .closest(&mut stack, under, up)
@@ -137,8 +141,9 @@ fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) ->
             continue;
         }
         let to = light - h.p;
-        let cos = h.n.dot(to) / to.length();
-        let direct = if cos > 0.0 {
+        let far = to.length();
+        let cos = h.n.dot(to) / far;
+        let direct = if far > 0.0 && cos > 0.0 {
             let near = lamp.reach * lamp.reach / (to.dot(to) + 0.25 * lamp.reach * lamp.reach);
             0.8 * cos * near * world.free(stack, h.p, h.n, light, Vec3::ZERO)
         } else {

@@ -372,6 +372,85 @@ fn a_camera_that_all_but_touches_a_surface_is_served_in_time() {
     }
 }
 
+/// One corner of a surface is 10⁻²⁸ m from the camera, so that squares of distances vanish.
+#[test]
+fn a_surface_nearer_than_squares_can_tell_leaves_a_finite_photo() {
+    let positions = [
+        [-1.5, 0.0, 1.3586438],
+        [-3.274711, -3.2796097, -2.2765107],
+        [1.0, -1.4868157, -3.095264],
+        [-1.5, 1e-17, -1.7481439],
+        [2.3049014, 2.276526, 2.9968834],
+        [1e-28, 1e-29, 0.0],
+        [2.0, -2.0, 2.3408718],
+        [-1.9006321, 0.0, 3.4168699],
+        [2.0674775, -3.0975115, 0.014293911],
+        [-2.3873553, -1.6398048, -0.45893347],
+    ];
+    let triangles = vec![
+        [2, 4, 7],
+        [0, 4, 9],
+        [3, 3, 6],
+        [1, 7, 2],
+        [7, 0, 3],
+        [3, 8, 2],
+        [9, 1, 3],
+        [6, 2, 4],
+        [1, 7, 9],
+        [0, 2, 6],
+        [8, 5, 7],
+        [0, 3, 7],
+        [8, 1, 1],
+        [5, 7, 7],
+        [8, 1, 7],
+        [4, 1, 9],
+        [1, 6, 1],
+        [2, 5, 0],
+        [5, 4, 3],
+        [7, 7, 7],
+        [5, 2, 9],
+        [7, 6, 4],
+        [3, 3, 8],
+        [6, 7, 2],
+        [5, 4, 3],
+        [8, 9, 1],
+        [4, 1, 1],
+        [7, 4, 4],
+        [4, 6, 6],
+        [7, 8, 9],
+        [1, 4, 9],
+        [2, 2, 1],
+        [9, 9, 2],
+    ];
+    let soup = object(
+        "soup",
+        positions.into_iter().map(Vec3::from).collect(),
+        triangles,
+        common::grey(0.0),
+    );
+    let mut s = common::scene(vec![soup], 6, &[]);
+    s.camera = Camera {
+        intrinsics: Intrinsics {
+            fx: 7.206_976,
+            fy: 8.300_374,
+            cx: 1.503_962,
+            cy: 438_846.5,
+            width: 6,
+            height: 5,
+        },
+        origin: Vec3::ZERO,
+        right: Vec3::new(0.0, 0.0, 1.0),
+        down: Vec3::new(0.0, -1.0, 0.0),
+        forward: Vec3::new(1.0, 0.0, 0.0),
+    };
+    s.laser.origin = Vec3::new(0.271_982_52, -1.856_426_4, -1.123_946_9);
+    for seed in 0..20 {
+        let mut set = common::settings(Budget::Samples(1));
+        set.seed = seed;
+        sane(&render(&s, &set, &Quiet).unwrap()).unwrap();
+    }
+}
+
 /// Boxes that are all alike give a tree's builder nothing to go by.
 #[test]
 fn copies_of_one_triangle_without_number_are_served_in_time() {
