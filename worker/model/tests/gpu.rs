@@ -12,7 +12,7 @@ use picofarm_model::{
     device::{OpenGpu, gpus},
     input::{ShadowVariant, Target},
     net::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection},
-    train::{Control, Ended, Event, Learner, Plan, Trained, Training},
+    train::{Control, Ended, Event, Gradients, Learner, Plan, Trained, Training},
     trial::Trial,
     weights,
 };
@@ -201,6 +201,29 @@ fn batches_that_are_brought_ahead_give_the_bits_of_one_after_another() {
             assert!(matches!(error, ModelError::NotFinite { .. }), "{error}");
             assert_eq!(numbers(&along), before, "{gpu}");
         }
+    }
+}
+
+/// Of a batch that another process had, too: its numbers come as a part.
+#[test]
+fn a_loss_that_is_no_number_moves_nothing_wherever_the_batch_was() {
+    let devices = opened().into_iter().map(|gpu| gpu.device);
+    for device in std::iter::once(cpu()).chain(devices) {
+        let trial = networks().next().unwrap();
+        let (other, batch) = trial.begin(&device).unwrap();
+        let (mut learner, _) = trial.begin(&device).unwrap();
+        let mut sum = Gradients::default();
+        other.add(&mut sum, 0, other.bring(batch)).unwrap();
+        let mut part = other.part(sum);
+        part.blocks = part.blocks.map(|mut values: Vec<f32>| {
+            *values.last_mut().unwrap() = f32::NAN;
+            values
+        });
+        let before = learner.parameters().to_named();
+        let sum = learner.gradients_of(part).unwrap();
+        let error = learner.finish(sum, 1, trial.pace()).unwrap_err();
+        assert!(matches!(error, ModelError::NotFinite { .. }), "{error}");
+        assert_eq!(learner.parameters().to_named(), before);
     }
 }
 

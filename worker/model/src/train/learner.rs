@@ -248,7 +248,9 @@ impl Learner {
     /// # Errors
     /// [`ModelError::NotFinite`]; everything is then as before.
     pub fn add(&self, sum: &mut Gradients, at: usize, batch: Brought) -> Result<(), ModelError> {
-        self.check(sum.latest.take())?;
+        if let Some(latest) = sum.latest.take() {
+            self.finite(latest)?;
+        }
         let (_, of) = self.backward(batch);
         if of.summed.losses.is_broken() {
             return Err(self.not_finite(of.summed.losses.value()));
@@ -266,11 +268,12 @@ impl Learner {
         Ok(())
     }
 
-    /// Waits for the loss of a batch.
-    fn check(&self, loss: Option<Loss>) -> Result<(), ModelError> {
-        match loss.map(Loss::value) {
-            Some(loss) if !loss.is_finite() => Err(self.not_finite(loss)),
-            _ => Ok(()),
+    /// What a loss is; waits for the device.
+    fn finite(&self, loss: Loss) -> Result<f32, ModelError> {
+        let loss = loss.value();
+        match loss.is_finite() {
+            true => Ok(loss),
+            false => Err(self.not_finite(loss)),
         }
     }
 
@@ -287,12 +290,13 @@ impl Learner {
         batches: usize,
         pace: Pace,
     ) -> Result<f32, ModelError> {
-        self.check(sum.latest)?;
         assert!(sum.blocks.is_whole(batches), "a step has all its batches");
         let summed = sum
             .blocks
             .total(&mut Summed::add)
             .expect("a step has a batch");
+        // Of all batches, those of other processes too.
+        let losses = self.finite(summed.losses)?;
         self.move_statistics(sum.moved);
         let share = 1.0 / batches as f32;
         let scale = share * self.shortened(&summed.gradients, share);
@@ -320,7 +324,7 @@ impl Learner {
             self.moments[i] = moments;
         }
         self.follow();
-        Ok(summed.losses.value() * share)
+        Ok(losses * share)
     }
 
     /// What a step's gradient, `share` times `summed`, is to be multiplied by so that it is not too long.
