@@ -2,9 +2,11 @@
 
 mod block;
 mod cost;
+mod downsample;
 mod embeddings;
 mod layer;
 mod pass;
+mod rendering;
 mod residual;
 mod spec;
 mod swinir;
