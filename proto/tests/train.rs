@@ -287,6 +287,26 @@ fn an_unusable_field_is_named() {
             "concat",
         ),
         (
+            "target = \"shadow\", model = \"m\", shadow = { variant = \"index\" }, net = { architecture = \"nlost\" }",
+            "train.shadow.variant",
+            "nlost",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"nlost\", width = 30 }",
+            "train.net.width",
+            "multiple of 4",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"nlost\", levels = 3 }",
+            "train.net.levels",
+            "nlost",
+        ),
+        (
+            "target = \"tof\", model = \"m\", net = { architecture = \"nlost\", swin = { heads = 4 } }",
+            "train.net.swin",
+            "swinir",
+        ),
+        (
             "target = \"tof\", model = \"m\", optimise = { batch = 32, accumulate = 5 }",
             "train.optimise.accumulate",
             "does not divide",

@@ -207,6 +207,7 @@ fn trial(args: &BenchModel) -> Trial {
                 Kind::Unet25d => Architecture::Unet25d,
                 Kind::Swinir => Architecture::Swinir,
                 Kind::Embeddings => Architecture::Embeddings,
+                Kind::Nlost => Architecture::Nlost,
             },
             dense,
             one_hot: if target == Target::Shadow { dense } else { 0 },

@@ -108,4 +108,6 @@ pub enum Kind {
     Swinir,
     /// A volume of features, flattened over time, and a network over those images
     Embeddings,
+    /// The same with attention in the volume
+    Nlost,
 }

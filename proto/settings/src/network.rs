@@ -73,6 +73,8 @@ pub enum Architecture {
     /// Learned feature embeddings: a volume of features, its greatest values over time and their moments, and a network over those
     /// images (Chen et al., SIGGRAPH Asia 2020).
     Embeddings,
+    /// NLOST: such a volume, attention in it within windows and over all of it, and a network over images (Li et al., CVPR 2023).
+    Nlost,
 }
 
 impl Architecture {
@@ -83,6 +85,7 @@ impl Architecture {
             Self::Unet25d => "unet25d",
             Self::Swinir => "swinir",
             Self::Embeddings => "embeddings",
+            Self::Nlost => "nlost",
         }
     }
 }

@@ -23,8 +23,8 @@ pub enum Begin {
     /// Normal around 0 with this deviation: what transformers begin with. Their code cuts it off at ±2, a hundred deviations of
     /// 0.02 away, where no value ever lies.
     Normal(f32),
-    /// These, again and again.
-    Repeated(&'static [f32]),
+    /// These times that, again and again.
+    Repeated(&'static [f32], f32),
 }
 
 /// A parameter as a network declares it.
@@ -95,7 +95,10 @@ impl Parameters {
                     let mut draw = || (2.0 * random.unit() - 1.0) * bound;
                     (0..d.len()).map(|_| draw()).collect()
                 }
-                Begin::Repeated(values) => values.iter().copied().cycle().take(d.len()).collect(),
+                Begin::Repeated(values, by) => {
+                    let values = values.iter().map(|value| value * by);
+                    values.cycle().take(d.len()).collect()
+                }
                 Begin::Normal(deviation) => {
                     let mut draw = || random.normal() * deviation;
                     (0..d.len()).map(|_| draw()).collect()

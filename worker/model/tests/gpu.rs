@@ -38,6 +38,7 @@ fn networks() -> impl Iterator<Item = Trial> {
             Architecture::Unet25d,
             Architecture::Swinir,
             Architecture::Embeddings,
+            Architecture::Nlost,
         ]
         .map(|architecture| Trial {
             target,
@@ -62,7 +63,12 @@ fn networks() -> impl Iterator<Item = Trial> {
                 precision: Precision::F32,
             },
             batch: 3,
-            side: 16,
+            // Windows of 16² in an image of half the size.
+            side: if architecture == Architecture::Nlost {
+                32
+            } else {
+                16
+            },
             learning_rate: 2e-4,
             decay: 1e-3,
             seed: 1,

@@ -1,6 +1,7 @@
 //! What a pass costs: multiply-adds, counted from the shape alone. Norms, activations, softmax and pooling are not counted.
 
 use super::{
+    nlost,
     spec::{Architecture, NetSpec, StemForm},
     swinir, unet25d,
 };
@@ -13,6 +14,7 @@ impl NetSpec {
             Architecture::Unet25d => self.of_unet25d(side),
             Architecture::Swinir => self.of_swinir(side),
             Architecture::Embeddings => self.of_embeddings(side),
+            Architecture::Nlost => self.of_nlost(side),
         }
     }
 
@@ -64,17 +66,53 @@ impl NetSpec {
         sum + self.of_decoder(side)
     }
 
-    fn of_embeddings(&self, side: usize) -> f64 {
-        let (streams, width, outputs) = (self.streams(), self.width, self.outputs);
-        let (pixels, coarse) = (side * side, (side / 2).pow(2));
-        // The box filters, the first convolution, four others.
+    /// Half of time, rows and columns: a filter for each stream, a convolution to `width` channels, four others.
+    fn of_downsample(&self, side: usize, width: usize) -> f64 {
+        let streams = self.streams();
         let voxel = 27 * (streams + streams * width + 4 * width * width);
-        let features = 2 * (width + streams);
-        let volume = voxel * self.dense.div_ceil(2) * coarse;
+        (voxel * self.dense.div_ceil(2) * (side / 2).pow(2)) as f64
+    }
+
+    /// From a volume of `channels`, half as many rows and columns, to the output.
+    fn of_rendering(&self, side: usize, channels: usize) -> f64 {
+        let (pixels, coarse) = (side * side, (side / 2).pow(2));
+        let (features, outputs) = (2 * channels, self.outputs);
         let images = 9 * 5 * features * features * coarse;
         let fine = (features + outputs) * 2 * features + 16 * features * features;
         let fine = 9 * (fine + 2 * features * outputs) + 2 * outputs;
-        (volume + images + fine * pixels) as f64
+        (images + fine * pixels) as f64
+    }
+
+    fn of_embeddings(&self, side: usize) -> f64 {
+        let (streams, width) = (self.streams(), self.width);
+        self.of_downsample(side, width) + self.of_rendering(side, width + streams)
+    }
+
+    fn of_nlost(&self, side: usize) -> f64 {
+        let (c, features) = (self.width, self.streams() + nlost::FIRST);
+        let [_, second, third, fourth, fifth] = nlost::moments(self.dense);
+        let (pixels, coarse) = ((side / 2).pow(2), (side / 4).pow(2));
+        let part = c / 4;
+        let scales = 27 * 2 * (features * part + part * part) * second;
+        let halved = 27 * 6 * c * c * third;
+        let embedded = 125 * c * c * fourth + (125 + 1) * c * c * fifth;
+        // Queries, keys, values and what follows from them over the image and over time; scores and their sums of values.
+        let attention = |tokens: usize| {
+            let layers = (8 + 2 * nlost::BETWEEN) * c * c;
+            (layers + 2 * (tokens + fifth) * c) * fifth
+        };
+        let near = 27 * c * c * fifth + attention(nlost::WINDOW.pow(2));
+        let far = (125 + 27) * c * c * fifth + attention(coarse);
+        let upwards = 27 * c * c * fifth;
+        let sums = 2 * (3 * c * c + c * c / nlost::groups(c) + 2 * c);
+        let decoders = 2 * (sums + 2 * nlost::BETWEEN * c * c) * fifth;
+        let over_time = 27 * (c * c / 2 * 2 + c * c / 8 * 4 + c * c / 4 * 8) * fifth;
+        let joined = 27 * (3 * c * c + c * features) * second;
+        let of_pixel =
+            scales + halved + embedded + near + upwards + decoders + 2 * over_time + joined;
+        self.of_downsample(side, nlost::FIRST)
+            + (of_pixel * pixels + far * coarse) as f64
+            + self.of_rendering(side, features)
     }
 
     fn of_swinir(&self, side: usize) -> f64 {

@@ -13,7 +13,7 @@ use crate::{
 };
 
 /// The mean of the last two taps of each dimension: what the learnt box filter begins with.
-const BOX: [f32; 27] = {
+pub(super) const BOX: [f32; 27] = {
     let mut taps = [0.0; 27];
     let mut k = 0;
     while k < 27 {
@@ -49,7 +49,7 @@ impl Downsample {
             filters: d.add(
                 name("weights"),
                 &[streams, 1, 3, 3, 3],
-                Begin::Repeated(&BOX),
+                Begin::Repeated(&BOX, 1.0),
                 true,
             ),
             first: First {

@@ -57,24 +57,58 @@ impl Conv {
     }
 }
 
-/// A linear layer with a bias over the last dimension.
+/// A linear layer over the last dimension.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Dense {
     weight: Id,
-    bias: Id,
+    bias: Option<Id>,
 }
 
 impl Dense {
+    /// As layers of transformers begin, with a bias.
     pub(super) fn declare(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
-        let begin = Begin::Normal(DEVIATION);
+        let begin = [Begin::Normal(DEVIATION), Begin::Constant(0.0)];
+        Self::begun(d, at, inputs, outputs, begin)
+    }
+
+    /// As PyTorch's begin, with a bias.
+    pub(super) fn usual(d: &mut Declarations, at: &str, inputs: usize, outputs: usize) -> Self {
+        Self::begun(d, at, inputs, outputs, [Begin::FanIn(inputs); 2])
+    }
+
+    fn begun(
+        d: &mut Declarations,
+        at: &str,
+        inputs: usize,
+        outputs: usize,
+        [weight, bias]: [Begin; 2],
+    ) -> Self {
+        let this = Self::without_bias(d, at, inputs, outputs, weight);
+        Self {
+            bias: Some(d.add(format!("{at}.bias"), &[outputs], bias, true)),
+            ..this
+        }
+    }
+
+    pub(super) fn without_bias(
+        d: &mut Declarations,
+        at: &str,
+        inputs: usize,
+        outputs: usize,
+        begin: Begin,
+    ) -> Self {
         Self {
             weight: d.add(format!("{at}.weight"), &[outputs, inputs], begin, true),
-            bias: d.add(format!("{at}.bias"), &[outputs], Begin::Constant(0.0), true),
+            bias: None,
         }
     }
 
     pub(super) fn forward<const D: usize>(&self, pass: &Pass, x: Tensor<D>) -> Tensor<D> {
-        let (weight, bias) = (pass.get(self.weight), pass.get(self.bias));
+        let weight: Tensor<2> = pass.get(self.weight);
+        let bias = match self.bias {
+            Some(id) => pass.get(id),
+            None => Tensor::zeros([weight.dims()[0]], &x.device()),
+        };
         pass.raise(ops::linear(
             pass.lower(x),
             pass.lower(weight),

@@ -5,6 +5,7 @@ mod cost;
 mod downsample;
 mod embeddings;
 mod layer;
+mod nlost;
 mod pass;
 mod rendering;
 mod residual;
@@ -12,6 +13,7 @@ mod spec;
 mod swinir;
 mod unet25d;
 mod unet2d;
+mod volume;
 
 use burn::tensor::Tensor;
 
@@ -24,6 +26,7 @@ use crate::{
     parameters::{Declarations, Declared},
 };
 use embeddings::Embeddings;
+use nlost::Nlost;
 use swinir::Swinir;
 use unet2d::Unet2d;
 use unet25d::Unet25d;
@@ -42,6 +45,7 @@ enum Body {
     Unet25d(Unet25d),
     Swinir(Swinir),
     Embeddings(Box<Embeddings>),
+    Nlost(Box<Nlost>),
 }
 
 impl Net {
@@ -60,6 +64,7 @@ impl Net {
                 let net = Embeddings::declare(&mut declarations, &spec);
                 Body::Embeddings(Box::new(net))
             }
+            Architecture::Nlost => Body::Nlost(Box::new(Nlost::declare(&mut declarations, &spec))),
         };
         Ok(Self {
             spec,
@@ -97,6 +102,7 @@ impl Net {
             Body::Unet25d(net) => net.forward(pass, input, self.spec.frozen),
             Body::Swinir(net) => net.forward(pass, input),
             Body::Embeddings(net) => net.forward(pass, input),
+            Body::Nlost(net) => net.forward(pass, input),
         }
     }
 }

@@ -28,7 +28,7 @@ impl Rendering {
             raw: d.add(
                 format!("{at}.weights"),
                 &[outputs, 2, 1, 1],
-                Begin::Repeated(&[0.0, 1.0]),
+                Begin::Repeated(&[0.0, 1.0], 1.0),
                 true,
             ),
             coarse: Chain::declare(d, &format!("{at}.conv1"), features, features, None),

@@ -12,7 +12,7 @@ use crate::{
 };
 
 /// Slope of leaky ReLU below 0.
-const SLOPE: f32 = 0.2;
+pub(super) const SLOPE: f32 = 0.2;
 
 /// 3×3 or 3×3×3 convolution with a bias, whose border is repeated around what it sees.
 #[derive(Debug, Clone, Copy)]

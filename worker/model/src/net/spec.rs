@@ -3,6 +3,7 @@
 pub use picofarm_settings::{Architecture, Precision, StemForm, Swin, TimeProjection};
 use serde::{Deserialize, Serialize};
 
+use super::nlost;
 use crate::ModelError;
 
 /// Shape of a network.
@@ -78,6 +79,7 @@ impl NetSpec {
             Architecture::Unet2d | Architecture::Unet25d => 1 << (self.levels - 1),
             Architecture::Swinir => self.swin.window as usize,
             Architecture::Embeddings => 2,
+            Architecture::Nlost => 2 * nlost::WINDOW,
         }
     }
 
@@ -93,6 +95,13 @@ impl NetSpec {
                 ("net.swin.window", what)
             }
             Architecture::Embeddings => ("net.architecture", "embeddings halve the image".into()),
+            Architecture::Nlost => {
+                let what = format!(
+                    "nlost halves the image, and windows have {0}×{0} pixels of that",
+                    nlost::WINDOW
+                );
+                ("net.architecture", what)
+            }
         }
     }
 
@@ -136,7 +145,7 @@ impl NetSpec {
         }
         let timed = matches!(
             self.architecture,
-            Architecture::Unet25d | Architecture::Embeddings
+            Architecture::Unet25d | Architecture::Embeddings | Architecture::Nlost
         );
         if timed && self.one_hot != 0 && self.one_hot != self.dense {
             let what = "the two streams of a network over time must have the same bins";
@@ -159,6 +168,14 @@ impl NetSpec {
         if self.frozen {
             let what = "a frozen encoder with a decoder of its own is for unet2d and unet25d";
             return Err(ModelError::invalid("net.frozen", what));
+        }
+        if self.architecture == Architecture::Nlost && !self.width.is_multiple_of(nlost::HEADS) {
+            let what = format!(
+                "{} must be a multiple of {}: heads and scales share it",
+                self.width,
+                nlost::HEADS
+            );
+            return Err(ModelError::invalid("net.width", what));
         }
         if self.architecture == Architecture::Swinir {
             self.swin

@@ -112,7 +112,8 @@ pub fn window_attention(
 ) -> Tensor<4> {
     let [_, h, w, _] = qkv.dims();
     let seen = windows(shifted(qkv, shift), window);
-    let said = from_windows(attend(seen, bias, mask), window, [h, w]);
+    let heads = bias.dims()[0];
+    let said = from_windows(attend(seen, heads, Some(bias), mask), window, [h, w]);
     shifted_back(said, shift)
 }
 

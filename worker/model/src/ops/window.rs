@@ -203,10 +203,14 @@ pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 ///
 /// `qkv` (windows, w², 3·C) has queries, keys and values beside each other, each head after head. A head's scores are ⟨q, k⟩
 /// times (C/heads)^−½, plus `bias` (heads, w², w²), plus `mask` (windows of an image, w², w²), the same for every image. Gives
-/// (windows, w², C), head after head.
-pub fn attend(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>) -> Tensor<3> {
+/// (windows, w², C), head after head. Instead of w² there may be any number of tokens.
+pub fn attend(
+    qkv: Tensor<3>,
+    heads: usize,
+    bias: Option<Tensor<3>>,
+    mask: Option<Tensor<3>>,
+) -> Tensor<3> {
     let [all, tokens, channels] = qkv.dims();
-    let [heads, ..] = bias.dims();
     let size = channels / 3 / heads;
     let apart = qkv
         .reshape([all, tokens, 3, heads, size])
@@ -219,7 +223,10 @@ pub fn attend(qkv: Tensor<3>, bias: Tensor<3>, mask: Option<Tensor<3>>) -> Tenso
     };
     let [q, k, v] = [0, 1, 2].map(part);
     let q = q.mul_scalar((size as f64).powf(-0.5));
-    let mut scores = q.matmul(k.swap_dims(2, 3)) + bias.reshape([1, heads, tokens, tokens]);
+    let mut scores = q.matmul(k.swap_dims(2, 3));
+    if let Some(bias) = bias {
+        scores = scores + bias.reshape([1, heads, tokens, tokens]);
+    }
     if let Some(mask) = mask {
         let [of_image, ..] = mask.dims();
         let images = all / of_image;

@@ -289,6 +289,7 @@ pub(super) fn sees(report: &Report, group: &Group) -> String {
             net.width, net.swin.groups, net.swin.depth, net.swin.heads, net.swin.window
         ),
         Architecture::Embeddings => format!("learned feature embeddings, width {}", net.width),
+        Architecture::Nlost => format!("NLOST, width {}", net.width),
     };
     let stem = match (net.stem, net.stem_form) {
         (0, _) => String::new(),

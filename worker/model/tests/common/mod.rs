@@ -12,7 +12,12 @@ use picofarm_model::{
 
 /// A slanted wall whose two-bounce peaks lie where its depth says, with one mirror and half of it lit.
 pub fn scene(seed: u64) -> Arc<Scene> {
-    let (height, width, bins) = (8, 8, 16);
+    sized(seed, 8)
+}
+
+/// Of `side`² pixels.
+pub fn sized(seed: u64, side: usize) -> Arc<Scene> {
+    let (height, width, bins) = (side, side, 16);
     let mut random = Random::new(seed, &[9]);
     let (near, slope) = (1.0 + 2.0 * random.unit(), random.unit() / 8.0);
     let pixels = height * width;
@@ -52,9 +57,15 @@ pub fn scenes(from: u64, count: u64) -> Vec<Arc<Scene>> {
 }
 
 pub fn sources() -> Sources {
+    sources_of(8)
+}
+
+/// Of `side`² pixels.
+pub fn sources_of(side: usize) -> Sources {
+    let scenes = |from, to| -> Vec<Arc<Scene>> { (from..to).map(|s| sized(s, side)).collect() };
     Sources {
         train: Arc::new(scenes(0, 9)),
-        validation: Arc::new(scenes(100, 3)),
+        validation: Arc::new(scenes(100, 103)),
     }
 }
 

@@ -73,12 +73,17 @@ impl TrainSettings {
             );
             return fail("specular.on", what);
         }
-        if self.net.architecture == Architecture::Embeddings
-            && self.shadow.variant == ShadowVariant::Index
-        {
-            let what = "\"index\" adds planes that are no moments of time, which architecture = \"embeddings\" cannot see; \
-                        take variant = \"concat\", or another architecture";
-            return fail("shadow.variant", what.into());
+        let volume = matches!(
+            self.net.architecture,
+            Architecture::Embeddings | Architecture::Nlost
+        );
+        if volume && self.shadow.variant == ShadowVariant::Index {
+            let what = format!(
+                "\"index\" adds planes that are no moments of time, which architecture = {:?} cannot see; \
+                 take variant = \"concat\", or another architecture",
+                self.net.architecture.name()
+            );
+            return fail("shadow.variant", what);
         }
         if !self.specular.on.is_empty() && !self.from.is_empty() {
             let what = "is not for a network on the features of another (train.specular.on); remove one of them";
@@ -207,6 +212,21 @@ impl NetSettings {
                 self.check_timeless()?;
                 self.check_stemless()?;
                 self.check_flat()
+            }
+            Architecture::Nlost => {
+                self.check_timeless()?;
+                self.check_stemless()?;
+                self.check_flat()?;
+                match self.width.is_multiple_of(4) {
+                    true => Ok(()),
+                    false => {
+                        let what = format!(
+                            "{} must be a multiple of 4: heads of attention and scales share it (32 in the released code)",
+                            self.width
+                        );
+                        fail("width", what)
+                    }
+                }
             }
             Architecture::Swinir => {
                 self.check_timeless()?;

@@ -115,7 +115,7 @@ pub struct NetSettings {
     /// Its kind.
     pub architecture: Architecture,
     /// Channels of the first level of a U-Net; each further one has twice as many. Of `swinir` the channels of all its
-    /// features, of `embeddings` those of the volume's.
+    /// features, of `embeddings` those of the volume's, of `nlost` those of its attention.
     pub width: u32,
     /// Levels of a U-Net's encoder; between two of them the image is halved.
     pub levels: u32,
@@ -334,7 +334,10 @@ impl TrainSettings {
             levels: net.levels,
             time: match net.architecture {
                 Architecture::Unet25d => f64::from(net.time_features.max(1)),
-                Architecture::Unet2d | Architecture::Swinir | Architecture::Embeddings => 1.0,
+                Architecture::Unet2d
+                | Architecture::Swinir
+                | Architecture::Embeddings
+                | Architecture::Nlost => 1.0,
             },
             architecture: net.architecture,
             swin: net.swin,

@@ -1,0 +1,594 @@
+//! NLOST (Li et al., "NLOST: Non-line-of-sight imaging with transformer", CVPR 2023; released code): a volume of features, attention
+//! in it near and far, and the images that embeddings end with. Names of its parameters are the released code's.
+//!
+//! As released, unless it says otherwise here:
+//! - The volume has half of the rows and columns, as in learned feature embeddings, so that at 256² it has the 128² that theirs has;
+//!   what comes out is doubled again. Between the two parts of the volume stands a transform of light in theirs, for confocal
+//!   scans of a wall; here it is the identity. Of their two outputs, intensity and depth, there is the one that is learnt.
+//! - Attention over time has a bias for each difference of moments. Theirs counts 16 moments as pixels of a 4×4 window.
+//! - Theirs brings features of one place to another where axes are exchanged (after attention over time in the global encoder,
+//!   after both sums of the decoders): here places stay.
+//! - The decoders' first norm begins with a scale of 1. Theirs begins with 0 as the second does, and then neither scale has ever a
+//!   gradient: what stands between the norms is not learnt.
+
+use burn::tensor::{Tensor, activation::relu};
+
+use super::{
+    downsample::{BOX, Downsample},
+    layer::{Dense, LayerNorm, table},
+    pass::{Input, Pass},
+    rendering::{Rendering, by_channel, normalised},
+    residual::{Residual, SLOPE},
+    spec::NetSpec,
+    volume::{self, Seen},
+};
+use crate::{
+    ops,
+    parameters::{Begin, Declarations, Id},
+};
+
+/// Features of the first volume that convolutions make, besides the filtered ones.
+pub(super) const FIRST: usize = 3;
+/// Heads of attention.
+pub(super) const HEADS: usize = 4;
+/// Rows and columns of a window of the local encoder: what the released code comes to at 128².
+pub(super) const WINDOW: usize = 16;
+/// Channels between the two layers of a perceptron, over those of the features.
+pub(super) const BETWEEN: usize = 4;
+
+/// Groups of features that are summed apart in the decoders.
+pub(super) fn groups(width: usize) -> usize {
+    if width.is_multiple_of(8) { 8 } else { 4 }
+}
+
+/// Moments of the volume after each part that halves them, from that of the input.
+pub(super) fn moments(bins: usize) -> [usize; 5] {
+    let mut time = bins;
+    [(); 5].map(|()| {
+        time = time.div_ceil(2);
+        time
+    })
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Nlost {
+    first: Downsample,
+    /// Stride 2, the same with gaps, 3×3×3 of that, with gaps of the first.
+    scales: [Kernel; 4],
+    /// Third part that halves time: a filter, and convolutions beside it.
+    filter: Id,
+    halved: Kernel,
+    blocks: [Residual; 2],
+    embedded: [Kernel; 2],
+    fused: Kernel,
+    coarse: Kernel,
+    positions: [Kernel; 2],
+    local: Encoder,
+    global: Encoder,
+    upwards: Kernel,
+    decoders: [Decoder; 2],
+    over_time: [[Kernel; 3]; 2],
+    joined: [Kernel; 2],
+    depth: Rendering,
+}
+
+/// What a convolution has.
+#[derive(Debug, Clone, Copy)]
+struct Kernel {
+    weight: Id,
+    bias: Option<Id>,
+}
+
+impl Kernel {
+    /// Weights of a normal distribution that keeps deviations through ReLU (He et al., 2015), for that many taps; no bias yet.
+    fn declare(d: &mut Declarations, at: &str, shape: [usize; 5], taps: usize) -> Self {
+        let begin = Begin::Normal((2.0 / taps as f32).sqrt());
+        Self::begun(d, at, shape, begin)
+    }
+
+    fn begun(d: &mut Declarations, at: &str, shape: [usize; 5], begin: Begin) -> Self {
+        Self {
+            weight: d.add(format!("{at}.weight"), &shape, begin, true),
+            bias: None,
+        }
+    }
+
+    /// As PyTorch's convolutions begin, with a bias.
+    fn usual(d: &mut Declarations, at: &str, shape: [usize; 5]) -> Self {
+        let begin = Begin::FanIn(shape[1..].iter().product());
+        let this = Self::begun(d, at, shape, begin);
+        this.with_bias(d, at, shape[0], begin)
+    }
+
+    fn with_bias(self, d: &mut Declarations, at: &str, outputs: usize, begin: Begin) -> Self {
+        Self {
+            bias: Some(d.add(format!("{at}.bias"), &[outputs], begin, true)),
+            ..self
+        }
+    }
+
+    fn weight(&self, pass: &Pass) -> Tensor<5> {
+        pass.get(self.weight)
+    }
+
+    /// What the convolution gave, and the bias.
+    fn biased(&self, pass: &Pass, y: Tensor<4>) -> Tensor<4> {
+        match self.bias {
+            None => y,
+            Some(bias) => {
+                let bias: Tensor<1> = pass.get(bias);
+                let channels = bias.dims()[0];
+                y + bias.reshape([1, channels, 1, 1])
+            }
+        }
+    }
+}
+
+/// Taps of 3 moments, one after the other.
+const fn three(stride: usize) -> Seen {
+    Seen {
+        taps: 3,
+        apart: 1,
+        stride,
+    }
+}
+
+/// Taps of 3 moments, every second one.
+const fn gaps(stride: usize) -> Seen {
+    Seen {
+        taps: 3,
+        apart: 2,
+        stride,
+    }
+}
+
+/// Taps of 5 moments, for every second one.
+const FIVE: Seen = Seen {
+    taps: 5,
+    apart: 1,
+    stride: 2,
+};
+
+impl Nlost {
+    pub(super) fn declare(d: &mut Declarations, spec: &NetSpec) -> Self {
+        let (streams, c) = (spec.streams(), spec.width);
+        let features = streams + FIRST;
+        let zero = Begin::Constant(0.0);
+        let first = Downsample::declare(d, "sig_expand", streams, FIRST);
+        let part = c / 4;
+        let scale = |d: &mut Declarations, k: usize, inputs: usize| {
+            let at = format!("msfeat.conv{k}.0");
+            Kernel::declare(d, &at, [part, inputs, 3, 3, 3], 27 * inputs)
+                .with_bias(d, &at, part, zero)
+        };
+        let scales = [
+            scale(d, 1, features),
+            scale(d, 2, features),
+            scale(d, 3, part),
+            scale(d, 4, part),
+        ];
+        let mean = Begin::Repeated(&BOX, 1.0 / (c * c) as f32);
+        let filter = d.add("sig_feat.weights".into(), &[c, c, 3, 3, 3], mean, true);
+        let halved = Kernel::usual(d, "sig_feat.conv1.1", [c, c, 3, 3, 3]);
+        let blocks = [2, 3].map(|k| Residual::declare(d, &format!("sig_feat.conv1.{k}"), c, true));
+        let embedded = [
+            Kernel::declare(d, "dsfusion.ds.0", [c, c, 5, 5, 5], 125 * c).with_bias(
+                d,
+                "dsfusion.ds.0",
+                c,
+                zero,
+            ),
+            Kernel::usual(d, "dsfusion.ds.2", [c, c, 5, 5, 5]),
+        ];
+        let fused = Kernel::declare(d, "dsfusion.fusion.0", [c, c, 1, 1, 1], c).with_bias(
+            d,
+            "dsfusion.fusion.0",
+            c,
+            zero,
+        );
+        // Theirs is uniform with the same deviation.
+        let coarse = Kernel::declare(d, "spds.dsop.0", [c, c, 5, 5, 5], 125 * c).with_bias(
+            d,
+            "spds.dsop.0",
+            c,
+            zero,
+        );
+        let positions = ["posenc_l.proj", "posenc_g.proj"]
+            .map(|at| Kernel::declare(d, at, [c, c, 3, 3, 3], 27 * c).with_bias(d, at, c, zero));
+        let time = moments(spec.dense)[4];
+        let local = Encoder::declare(d, "loc_encds.0", c, Some(time));
+        let global = Encoder::declare(d, "glb_encds.0", c, None);
+        let upwards = Kernel::declare(
+            d,
+            "locglb_inte.upop_G.upop.0.0",
+            [c, c, 3, 6, 6],
+            // Taps of the outputs, as PyTorch counts for transposed convolutions.
+            108 * c,
+        );
+        let decoders = ["locglb_inte.loc_decs.0", "locglb_inte.glb_decs.0"]
+            .map(|at| Decoder::declare(d, at, c));
+        let over_time = ["inte_rec.tmup1.temup", "inte_rec.tmup2.temup"].map(|at| {
+            let shape = |inputs, outputs| [inputs, outputs, 6, 3, 3];
+            let he = |d: &mut Declarations, k: usize, inputs: usize, outputs: usize| {
+                Kernel::declare(
+                    d,
+                    &format!("{at}.{k}.0"),
+                    shape(inputs, outputs),
+                    54 * outputs,
+                )
+            };
+            [
+                he(d, 0, c, c / 2),
+                he(d, 1, c / 2, c / 4),
+                Kernel::begun(
+                    d,
+                    &format!("{at}.2.0"),
+                    shape(c / 4, c),
+                    Begin::Normal(1e-3),
+                ),
+            ]
+        });
+        let joined = [
+            Kernel::usual(d, "inte_rec.fuse.0", [c, 3 * c, 3, 3, 3]),
+            Kernel::usual(d, "inte_rec.fuse.2", [features, c, 3, 3, 3]),
+        ];
+        Self {
+            first,
+            scales,
+            filter,
+            halved,
+            blocks,
+            embedded,
+            fused,
+            coarse,
+            positions,
+            local,
+            global,
+            upwards,
+            decoders,
+            over_time,
+            joined,
+            depth: Rendering::declare(d, "dep_refine", features, spec.outputs),
+        }
+    }
+
+    pub(super) fn forward(&self, pass: &Pass, input: Input) -> Tensor<4> {
+        let (x, time) = self.first.forward(pass, input);
+        let [images, channels, h, w] = x.dims();
+        let n = images / time;
+        let x = normalised(by_channel(x, time))
+            .swap_dims(1, 2)
+            .reshape([images, channels, h, w]);
+
+        let (shallow, second) = self.scales(pass, x, time);
+        let (x, third) = self.halved(pass, shallow.clone(), second);
+        let (fine, time) = self.embedded(pass, x, third);
+        let coarse = volume::conv5_halved(pass, fine.clone(), time, self.coarse.weight(pass));
+        let coarse = relu(self.coarse.biased(pass, coarse));
+
+        let placed = |x: Tensor<4>, of: &Kernel| {
+            let place = volume::conv(pass, x.clone(), time, of.weight(pass), three(1));
+            tokens(x + of.biased(pass, place))
+        };
+        let [of_fine, of_coarse] = &self.positions;
+        let fine = self.local.forward(pass, placed(fine, of_fine), time);
+        let coarse = self.global.forward(pass, placed(coarse, of_coarse), time);
+        let coarse = images_of(coarse);
+        let far = volume::doubled_in_space(pass, coarse, time, self.upwards.weight(pass));
+        let far = tokens(relu(far));
+        let (near, far) = (
+            self.decoders[0].forward(pass, fine.clone(), far.clone(), n),
+            self.decoders[1].forward(pass, far, fine, n),
+        );
+
+        let fine_in_time = |x: Tensor<4>, kernels: &[Kernel; 3]| {
+            let (mut x, mut moments) = (images_of(x), time);
+            for (k, kernel) in kernels.iter().enumerate() {
+                x = volume::doubled_in_time(pass, x, moments, kernel.weight(pass));
+                moments *= 2;
+                if k < 2 {
+                    x = relu(x);
+                }
+            }
+            // Halved moments were rounded up.
+            let c = x.dims()[1];
+            x.reshape([n, moments, c * h * w])
+                .narrow(1, 0, second)
+                .reshape([n * second, c, h, w])
+        };
+        let [of_near, of_far] = &self.over_time;
+        let (near, far) = (fine_in_time(near, of_near), fine_in_time(far, of_far));
+        let x = Tensor::cat(vec![shallow, far, near], 1);
+        let [join, last] = &self.joined;
+        let x = volume::conv(pass, x, second, join.weight(pass), three(1));
+        let x = ops::leaky_relu(join.biased(pass, x), SLOPE);
+        let x = volume::conv(pass, x, second, last.weight(pass), three(1));
+        let x = last.biased(pass, x);
+        self.depth.forward(pass, by_channel(x, second), h)
+    }
+
+    /// Features of four scales, and how many moments there are.
+    fn scales(&self, pass: &Pass, x: Tensor<4>, time: usize) -> (Tensor<4>, usize) {
+        let [straight, wide, of_wide, of_straight] = &self.scales;
+        let of = |kernel: &Kernel, y| relu(kernel.biased(pass, y));
+        let a = volume::conv(pass, x.clone(), time, straight.weight(pass), three(2));
+        let b = volume::dilated(pass, x, time, wide.weight(pass), gaps(2));
+        let (a, b, time) = (of(straight, a), of(wide, b), three(2).moments(time));
+        let c = volume::conv(pass, b.clone(), time, of_wide.weight(pass), three(1));
+        let d = volume::dilated(pass, a.clone(), time, of_straight.weight(pass), gaps(1));
+        let (c, d) = (of(of_wide, c), of(of_straight, d));
+        (Tensor::cat(vec![a, b, c, d], 1), time)
+    }
+
+    /// Half of the moments: filtered, and residual blocks.
+    fn halved(&self, pass: &Pass, x: Tensor<4>, time: usize) -> (Tensor<4>, usize) {
+        let filtered = volume::conv(pass, x.clone(), time, pass.get(self.filter), three(2));
+        let y = volume::conv_bordered_halved(pass, x, time, self.halved.weight(pass));
+        let bias = self.halved.bias.expect("declared with one");
+        let mut y = ops::crop(y, pass.get(bias));
+        let time = three(2).moments(time);
+        for block in &self.blocks {
+            y = block.forward(pass, y, time);
+        }
+        (filtered + y, time)
+    }
+
+    /// A quarter of the moments.
+    fn embedded(&self, pass: &Pass, mut x: Tensor<4>, mut time: usize) -> (Tensor<4>, usize) {
+        for kernel in &self.embedded {
+            let y = volume::conv5(pass, x, time, kernel.weight(pass), FIVE);
+            x = relu(kernel.biased(pass, y));
+            time = FIVE.moments(time);
+        }
+        let weight = self.fused.weight(pass);
+        let [outputs, inputs, ..] = weight.dims();
+        let bias = self.fused.bias.expect("declared with one");
+        let y = ops::conv1x1(
+            pass.lower(x),
+            pass.lower(weight.reshape([outputs, inputs, 1, 1])),
+            pass.lower(pass.get(bias)),
+        );
+        (relu(pass.raise(y)), time)
+    }
+}
+
+/// Images with their channels last.
+fn tokens(x: Tensor<4>) -> Tensor<4> {
+    x.permute([0, 2, 3, 1])
+}
+
+/// Tokens as images.
+fn images_of(x: Tensor<4>) -> Tensor<4> {
+    x.permute([0, 3, 1, 2])
+}
+
+/// (N·T, H, W, C) as a row of moments for each pixel: (N·H·W, T, C).
+fn by_pixel(x: Tensor<4>, time: usize) -> Tensor<3> {
+    let [images, h, w, c] = x.dims();
+    let n = images / time;
+    x.reshape([n, time, h * w, c])
+        .swap_dims(1, 2)
+        .reshape([n * h * w, time, c])
+}
+
+/// The inverse of [`by_pixel`] in images of (H, W).
+fn by_moment(x: Tensor<3>, [h, w]: [usize; 2]) -> Tensor<4> {
+    let [rows, time, c] = x.dims();
+    let n = rows / (h * w);
+    x.reshape([n, h * w, time, c])
+        .swap_dims(1, 2)
+        .reshape([n * time, h, w, c])
+}
+
+/// Two linear layers with GELU between them.
+#[derive(Debug, Clone)]
+struct Perceptron([Dense; 2]);
+
+impl Perceptron {
+    fn declare(d: &mut Declarations, at: &str, c: usize) -> Self {
+        Self([
+            Dense::usual(d, &format!("{at}.fc1"), c, BETWEEN * c),
+            Dense::usual(d, &format!("{at}.fc2"), BETWEEN * c, c),
+        ])
+    }
+
+    fn forward(&self, pass: &Pass, x: Tensor<4>) -> Tensor<4> {
+        let [first, last] = &self.0;
+        last.forward(pass, ops::gelu(first.forward(pass, x)))
+    }
+}
+
+/// x + attention over time(attention over the image(norm(x))), then x + perceptron(norm(x)).
+#[derive(Debug, Clone)]
+struct Encoder {
+    norms: [LayerNorm; 2],
+    /// Of pixels and moments; none in the global one.
+    positions: Option<[Id; 2]>,
+    qkv: [Dense; 2],
+    project: [Dense; 2],
+    perceptron: Perceptron,
+}
+
+impl Encoder {
+    /// With windows and biases of positions where `moments` says over how many; without either over all pixels.
+    fn declare(d: &mut Declarations, at: &str, c: usize, moments: Option<usize>) -> Self {
+        let parts = ["attn_hw", "attn_t"];
+        let positions = moments.map(|moments| {
+            let rows = [(2 * WINDOW - 1).pow(2), 2 * moments - 1];
+            [0, 1].map(|k| {
+                let name = format!("{at}.{}.relative_position_bias_table", parts[k]);
+                table(d, name, rows[k], HEADS)
+            })
+        });
+        Self {
+            positions,
+            qkv: parts.map(|part| {
+                let at = format!("{at}.{part}.qkv");
+                match moments {
+                    Some(_) => Dense::usual(d, &at, c, 3 * c),
+                    None => Dense::without_bias(d, &at, c, 3 * c, Begin::FanIn(c)),
+                }
+            }),
+            project: parts.map(|part| Dense::usual(d, &format!("{at}.{part}.proj"), c, c)),
+            norms: ["norm1", "norm2"].map(|norm| LayerNorm::declare(d, &format!("{at}.{norm}"), c)),
+            perceptron: Perceptron::declare(d, &format!("{at}.mlp"), c),
+        }
+    }
+
+    /// (N·T, H, W, C) to the same.
+    fn forward(&self, pass: &Pass, x: Tensor<4>, time: usize) -> Tensor<4> {
+        let [images, h, w, c] = x.dims();
+        let device = x.device();
+        let seen = self.norms[0].forward(pass, x.clone());
+        let qkv = self.qkv[0].forward(pass, seen);
+        let said = match self.positions {
+            Some([pixels, _]) => {
+                let windows = ops::Windows::new([h, w], WINDOW, 0, &device);
+                let bias = ops::position_bias(pass.get(pixels), WINDOW);
+                ops::window_attention(qkv, bias, &windows)
+            }
+            None => ops::attend(qkv.reshape([images, h * w, 3 * c]), HEADS, None, None)
+                .reshape([images, h, w, c]),
+        };
+        let said = self.project[0].forward(pass, said);
+
+        let qkv = self.qkv[1].forward(pass, by_pixel(said, time));
+        let bias = self
+            .positions
+            .map(|[_, moments]| differences(pass.get(moments), time));
+        let said = self.project[1].forward(pass, ops::attend(qkv, HEADS, bias, None));
+        let x = x + by_moment(said, [h, w]);
+        let seen = self.norms[1].forward(pass, x.clone());
+        x + self.perceptron.forward(pass, seen)
+    }
+}
+
+/// Rows of a table (2T − 1, heads) for each pair of moments, by the second's distance from the first: (heads, T, T).
+fn differences(table: Tensor<2>, time: usize) -> Tensor<3> {
+    let table = table.transpose();
+    let rows = (0..time).map(|at| table.clone().narrow(1, time - 1 - at, time));
+    Tensor::stack(rows.collect(), 1)
+}
+
+/// x + sums over time(sums over the image(norms)), then x + perceptron(norm(x)).
+#[derive(Debug, Clone)]
+struct Decoder {
+    /// Of what it works on, and of what asks.
+    norms: [LayerNorm; 2],
+    over_image: Sums,
+    over_time: Sums,
+    last: LayerNorm,
+    perceptron: Perceptron,
+}
+
+impl Decoder {
+    fn declare(d: &mut Declarations, at: &str, c: usize) -> Self {
+        let name = |name: &str| format!("{at}.{name}");
+        Self {
+            norms: ["norm1", "norm12"].map(|at| LayerNorm::declare(d, &name(at), c)),
+            over_image: Sums::declare(d, &name("attn_hw.attn"), c, 1.0),
+            over_time: Sums::declare(d, &name("attn_t.attn"), c, 0.0),
+            last: LayerNorm::declare(d, &name("norm2"), c),
+            perceptron: Perceptron::declare(d, &name("mlp"), c),
+        }
+    }
+
+    /// Both (N·T, H, W, C).
+    fn forward(&self, pass: &Pass, x: Tensor<4>, asks: Tensor<4>, n: usize) -> Tensor<4> {
+        let [images, h, w, c] = x.dims();
+        let time = images / n;
+        let own = self.norms[0].forward(pass, x.clone());
+        let asks = self.norms[1].forward(pass, asks);
+        let rows = |x: Tensor<4>| x.reshape([images, h * w, c]);
+        let own = rows(own);
+        let said = self
+            .over_image
+            .forward(pass, rows(asks.clone()), own.clone(), own);
+        let said = by_pixel(said.reshape([images, h, w, c]), time);
+        let said = self
+            .over_time
+            .forward(pass, by_pixel(asks, time), said.clone(), said);
+        let x = x + by_moment(said, [h, w]);
+        let seen = self.last.forward(pass, x.clone());
+        x + self.perceptron.forward(pass, seen)
+    }
+}
+
+/// Compact generalised non-local attention (Yue et al., "Compact generalized non-local network", NeurIPS 2018) in groups of channels:
+/// θ·⟨φ, g⟩ with the product over all places and channels of a group, a layer, and group norm.
+#[derive(Debug, Clone, Copy)]
+struct Sums {
+    /// θ, φ, g.
+    projections: [Id; 3],
+    /// A layer for each group.
+    out: Id,
+    scale: Id,
+    shift: Id,
+}
+
+impl Sums {
+    fn declare(d: &mut Declarations, at: &str, c: usize, scale: f32) -> Self {
+        let groups = groups(c);
+        let he = |fan_in: usize| Begin::Normal((2.0 / fan_in as f32).sqrt());
+        let projections = ["t", "p", "g"]
+            .map(|name| d.add(format!("{at}.{name}.weight"), &[c, c, 1], he(c), true));
+        let part = c / groups;
+        Self {
+            projections,
+            out: d.add(format!("{at}.z.weight"), &[c, part, 1], he(part), true),
+            scale: d.add(
+                format!("{at}.gn.weight"),
+                &[c],
+                Begin::Constant(scale),
+                true,
+            ),
+            shift: d.add(format!("{at}.gn.bias"), &[c], Begin::Constant(0.0), true),
+        }
+    }
+
+    /// Rows of places (R, P, C) that ask, with keys and values; to the same shape.
+    fn forward(
+        &self,
+        pass: &Pass,
+        asks: Tensor<3>,
+        keys: Tensor<3>,
+        values: Tensor<3>,
+    ) -> Tensor<3> {
+        let ([rows, places, c], device) = (values.dims(), values.device());
+        let groups = groups(c);
+        let part = c / groups;
+        // (G, R, P·C/G)
+        let grouped = |id: Id, x: Tensor<3>| {
+            let weight: Tensor<3> = pass.get(id);
+            let y = ops::linear(
+                pass.lower(x),
+                pass.lower(weight.reshape([c, c])),
+                pass.lower(Tensor::zeros([c], &device)),
+            );
+            pass.raise(y)
+                .reshape([rows, places, groups, part])
+                .permute([2, 0, 1, 3])
+                .reshape([groups, rows, places * part])
+        };
+        let [of_values, of_asks, of_keys] = &self.projections;
+        let theta = grouped(*of_values, values);
+        let phi = grouped(*of_asks, asks);
+        let g = grouped(*of_keys, keys);
+        let product = (phi * g).sum_dim(2).mul_scalar((part as f64).powf(-0.5));
+        let x = (theta * product).reshape([groups, rows * places, part]);
+        let out: Tensor<3> = pass.get(self.out);
+        let out = out.reshape([groups, part, part]).swap_dims(1, 2);
+        let x = pass.raise(pass.lower(x).matmul(pass.lower(out)));
+        // Group norm.
+        let x = x.reshape([groups, rows, places * part]);
+        let x = x.clone() - x.mean_dim(2);
+        let variance = x.clone().square().mean_dim(2);
+        let x = x / (variance + ops::EPSILON).sqrt();
+        let x = x
+            .reshape([groups, rows, places, part])
+            .permute([1, 2, 0, 3])
+            .reshape([rows, places, c]);
+        let one = |id| -> Tensor<3> { pass.get::<1>(id).reshape([1, 1, c]) };
+        x * one(self.scale) + one(self.shift)
+    }
+}
