@@ -16,7 +16,7 @@ use picofarm_model::{
     ModelError,
     train::{
         Line,
-        group::{Group, Member, Next, Part, share},
+        group::{Compute, Group, Member, Next, Part, share},
     },
 };
 use tracing::{info, warn};
@@ -616,16 +616,20 @@ impl Group for Members<'_> {
         self.mesh.as_ref().is_none_or(|mesh| mesh.len() == 1)
     }
 
-    fn sum(&mut self, step: u64, part: Part) -> Result<Option<Part>, ModelError> {
+    fn sum(&mut self, step: u64, compute: Compute<'_>) -> Result<Option<Vec<Part>>, ModelError> {
         let Some(mesh) = &self.mesh else {
             return Ok(None);
         };
-        match mesh.sum(step, self.batches, part, &self.breaker, self.stopped) {
-            Ok(whole) => Ok(Some(whole)),
-            Err(error) => {
+        let (computed, sums) = mesh.sums(step, self.batches, compute, &self.breaker, self.stopped);
+        match (computed, sums) {
+            (Ok(()), Ok(whole)) => Ok(Some(whole)),
+            (computed, sums) => {
                 self.mesh = None;
                 self.breaker.break_off();
-                if !(self.stopped)() {
+                if let Err(error) = sums
+                    && computed.is_ok()
+                    && !(self.stopped)()
+                {
                     info!(%error, step, "a step is not added up; the processes of the training agree anew");
                 }
                 let generation = self.generation;
@@ -636,7 +640,7 @@ impl Group for Members<'_> {
                     Role::Leads(leads) => leads.lost = true,
                     Role::None => {}
                 }
-                Ok(None)
+                computed.map(|()| None)
             }
         }
     }

@@ -13,7 +13,10 @@ use std::{
     time::Duration,
 };
 
-use picofarm_model::train::group::{Block, Blocks, Part, add_values};
+use picofarm_model::{
+    ModelError,
+    train::group::{Block, Blocks, Compute, Part, add_values},
+};
 
 /// How often whoever adds up asks whether it shall stop.
 const ASK: Duration = Duration::from_millis(100);
@@ -45,6 +48,17 @@ impl Breaker {
     }
 }
 
+/// Closes all connections where a panic passes, so that nobody waits for what does not come.
+struct BrokenBy<'a>(&'a Breaker);
+
+impl Drop for BrokenBy<'_> {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            self.0.break_off();
+        }
+    }
+}
+
 /// Connections of one process with all others.
 pub struct Mesh {
     rank: usize,
@@ -71,11 +85,59 @@ impl Mesh {
         self.peers.len()
     }
 
-    /// The sum over all processes of what each has of a step of so many batches.
+    /// The sums over all processes of what each computes of a step of so many batches, part by part: a part is added up while the
+    /// next is computed. Also what `compute` gave; where that is an error, all others are told by the end of their connections.
+    pub fn sums(
+        &self,
+        step: u64,
+        batches: usize,
+        compute: Compute<'_>,
+        breaker: &Breaker,
+        stopped: &dyn Fn() -> bool,
+    ) -> (Result<(), ModelError>, io::Result<Vec<Part>>) {
+        let (hand, handed) = channel::<Part>();
+        let (done, sums) = channel();
+        let stop = AtomicBool::new(false);
+        thread::scope(|scope| {
+            let _broken = BrokenBy(breaker);
+            let stop = &stop;
+            scope.spawn(move || {
+                let stopped = || stop.load(Ordering::SeqCst);
+                let parts = handed.iter();
+                let sums = parts.map(|part| self.sum(step, batches, part, breaker, &stopped));
+                // Nobody waits for it where computing panicked.
+                let _ = done.send(sums.collect::<io::Result<Vec<Part>>>());
+            });
+            let computed = compute(&mut |part| {
+                // Where adding up failed already, nobody takes it: known below.
+                let _ = hand.send(part);
+            });
+            drop(hand);
+            if computed.is_err() {
+                breaker.break_off();
+            }
+            let sums = loop {
+                match sums.recv_timeout(ASK) {
+                    Ok(sums) => break sums,
+                    Err(RecvTimeoutError::Timeout) => {
+                        if stopped() {
+                            stop.store(true, Ordering::SeqCst);
+                        }
+                    }
+                    Err(RecvTimeoutError::Disconnected) => {
+                        break Err(io::Error::other("a thread that adds up gradients panicked"));
+                    }
+                }
+            };
+            (computed, sums)
+        })
+    }
+
+    /// The sum over all processes of what each has of a part of a step.
     ///
     /// # Errors
     /// Where a connection ends, or what comes is of another step.
-    pub fn sum(
+    fn sum(
         &self,
         step: u64,
         batches: usize,

@@ -22,6 +22,7 @@ use burn::tensor::Device;
 use common::{plan, scenes};
 use picofarm_members::{Call, Members, Rendezvous};
 use picofarm_model::{
+    ModelError,
     input::{ShadowVariant, Target},
     scene::Scenes,
     train::{Control, Ended, Event, Plan, Sources, Trained, Training},
@@ -146,6 +147,40 @@ fn any_number_of_processes_comes_to_the_bits_of_one() {
                 .all(|(ended, _)| matches!(ended, Ended::Finished | Ended::Elsewhere))
         );
     }
+}
+
+/// After a step of this length no loss is a number. Whoever computes one ends, and nobody waits.
+#[test]
+fn a_step_that_cannot_be_computed_ends_the_training_of_all() {
+    let plan = Plan {
+        learning_rate: 1e30,
+        ..of_steps(2)
+    };
+    let board = Board::default();
+    let steps = AtomicU64::new(0);
+    let errors: Vec<ModelError> = thread::scope(|scope| {
+        let run = || {
+            let never = || false;
+            let mut training = training(&plan);
+            let mut members = Members::new(&board, "127.0.0.1", "t", "here", &never).unwrap();
+            let ended = training.run_among(&mut members, &mut |_, _| {
+                steps.fetch_add(1, Ordering::SeqCst);
+                // Time for the other one to come.
+                thread::sleep(Duration::from_millis(500));
+                Control::Continue
+            });
+            ended.unwrap_err()
+        };
+        let both = [scope.spawn(run), scope.spawn(run)];
+        both.map(|process| process.join().unwrap()).into()
+    });
+    for error in errors {
+        assert!(matches!(error, ModelError::NotFinite { .. }), "{error}");
+    }
+    assert!(
+        steps.load(Ordering::SeqCst) <= 2,
+        "nobody took another step"
+    );
 }
 
 #[test]

@@ -58,9 +58,17 @@ pub struct Declarations {
     pub(crate) list: Vec<Declared>,
     /// What is declared now is not learned.
     pub(crate) frozen: bool,
+    /// Where the second and further segments begin.
+    pub(crate) cuts: Vec<usize>,
 }
 
 impl Declarations {
+    /// What is declared from now on is of the next segment of a network: gradients of a segment come before those of the segments
+    /// before it.
+    pub(crate) fn cut(&mut self) {
+        self.cuts.push(self.list.len());
+    }
+
     /// Declares one.
     pub fn add(&mut self, name: String, shape: &[usize], begin: Begin, learned: bool) -> Id {
         self.list.push(Declared {

@@ -2,6 +2,8 @@
 
 mod common;
 
+use std::sync::Arc;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use picofarm_model::{
     Model, Random,
@@ -9,7 +11,8 @@ use picofarm_model::{
     net::{Architecture, Net, NetSpec, Swin},
     ops,
     parameters::Declared,
-    train::{Control, Event, Plan, Trained, Training},
+    scene::Scene,
+    train::{Control, Event, Plan, Sources, Trained, Training},
     trial::Trial,
     weights,
 };
@@ -428,9 +431,24 @@ fn what_cannot_be_built_is_refused_by_name() {
     assert!(text.contains("multiple of 8"), "{text}");
 }
 
+/// Scenes that a network of an architecture can see.
+fn sources(architecture: Architecture) -> Sources {
+    let side = side(architecture);
+    if side == 8 {
+        return common::sources();
+    }
+    let scenes = |seeds: std::ops::Range<u64>| -> Arc<Vec<Arc<Scene>>> {
+        Arc::new(seeds.map(|seed| common::sized(seed, side)).collect())
+    };
+    Sources {
+        train: scenes(0..9),
+        validation: scenes(100..103),
+    }
+}
+
 /// Trained, once stopped after `stop` steps and gone on from the checkpoint.
 fn trained(plan: &Plan, stop: Option<u64>) -> Trained {
-    let sources = || common::sources_of(side(plan.net.architecture));
+    let sources = || sources(plan.net.architecture);
     let device = Device::flex();
     let mut training = Training::start(plan.clone(), None, sources(), &device).unwrap();
     if let Some(stop) = stop {
@@ -472,7 +490,7 @@ fn other_networks_learn_every_target_go_on_after_a_stop_and_are_read_back_to_the
             let device = Device::flex();
             let model = Model::read(&whole.weights, &device).unwrap();
             assert_eq!(model.plan(), &plan);
-            let sources = common::sources_of(side(architecture));
+            let sources = sources(architecture);
             let again = Training::start(plan, Some(&whole.weights), sources, &device);
             assert!(again.unwrap().finish().weights == whole.weights);
         }

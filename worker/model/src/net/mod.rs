@@ -15,10 +15,12 @@ mod unet25d;
 mod unet2d;
 mod volume;
 
+use std::ops::Range;
+
 use burn::tensor::Tensor;
 
 pub use block::ONE_HOT;
-pub use pass::{Input, MOMENTUM, Pass};
+pub use pass::{Cut, Input, MOMENTUM, Pass};
 pub use spec::{Architecture, NetSpec, Precision, StemForm, Swin, TimeProjection};
 
 use crate::{
@@ -36,6 +38,7 @@ use unet25d::Unet25d;
 pub struct Net {
     spec: NetSpec,
     declared: Vec<Declared>,
+    segments: Vec<Range<usize>>,
     body: Body,
 }
 
@@ -66,8 +69,12 @@ impl Net {
             }
             Architecture::Nlost => Body::Nlost(Box::new(Nlost::declare(&mut declarations, &spec))),
         };
+        let begins = std::iter::once(0).chain(declarations.cuts.iter().copied());
+        let ends = declarations.cuts.iter().copied();
+        let ends = ends.chain([declarations.list.len()]);
         Ok(Self {
             spec,
+            segments: begins.zip(ends).map(|(begin, end)| begin..end).collect(),
             declared: declarations.list,
             body,
         })
@@ -81,6 +88,12 @@ impl Net {
     /// Its parameters.
     pub fn declared(&self) -> &[Declared] {
         &self.declared
+    }
+
+    /// Parts of a network by what they need of one another, as ranges of its parameters: the gradients of the last segment are
+    /// there first, while those of the others are still to be computed.
+    pub fn segments(&self) -> &[Range<usize>] {
+        &self.segments
     }
 
     /// (N, C, H, W) to (N, outputs, H, W): logits or depths, no activation.

@@ -28,6 +28,18 @@ pub struct Pass<'a> {
     precision: Precision,
     /// Statistics after this batch.
     moved: Vec<(Id, Tensor<1>)>,
+    /// What segments hand on, where the graph is cut between them.
+    cuts: Option<Vec<Cut>>,
+}
+
+/// What a segment of a network hands on to later ones, where the graph of a pass is cut: two graphs instead of one.
+pub struct Cut {
+    /// The segment that it comes from.
+    pub segment: usize,
+    /// As that segment made it.
+    pub made: Tensor<4>,
+    /// The same as later segments see it: a leaf of theirs.
+    pub seen: Tensor<4>,
 }
 
 impl<'a> Pass<'a> {
@@ -39,7 +51,31 @@ impl<'a> Pass<'a> {
             training: true,
             precision: Precision::F32,
             moved: Vec::new(),
+            cuts: None,
         }
+    }
+
+    /// The same with a graph for each segment, so that gradients come one segment after the other.
+    #[must_use]
+    pub fn in_segments(self) -> Self {
+        Self {
+            cuts: Some(Vec::new()),
+            ..self
+        }
+    }
+
+    /// What a segment hands on, as later segments see it.
+    pub(super) fn hand_on(&mut self, segment: usize, made: Tensor<4>) -> Tensor<4> {
+        let Some(cuts) = &mut self.cuts else {
+            return made;
+        };
+        let seen = made.clone().detach().require_grad();
+        cuts.push(Cut {
+            segment,
+            made,
+            seen: seen.clone(),
+        });
+        seen
     }
 
     /// A pass that only looks: batch norm by its running statistics.
@@ -50,6 +86,7 @@ impl<'a> Pass<'a> {
             training: false,
             precision: Precision::F32,
             moved: Vec::new(),
+            cuts: None,
         }
     }
 
@@ -119,9 +156,9 @@ impl<'a> Pass<'a> {
         y
     }
 
-    /// Statistics after this batch.
-    pub fn into_moved(self) -> Vec<(Id, Tensor<1>)> {
-        self.moved
+    /// Statistics after this batch, and what segments handed on.
+    pub fn into_moved(self) -> (Vec<(Id, Tensor<1>)>, Vec<Cut>) {
+        (self.moved, self.cuts.unwrap_or_default())
     }
 }
 

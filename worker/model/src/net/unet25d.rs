@@ -10,7 +10,7 @@ use super::{
     block::{Linear, norm},
     pass::{Input, Norm, Pass},
     spec::{NetSpec, TimeProjection},
-    unet2d::Decoder,
+    unet2d::{Decoder, hand_on, is_bottleneck},
 };
 use crate::{
     ops,
@@ -49,6 +49,9 @@ impl Unet25d {
         let mut inputs = streams;
         let mut encoders = Vec::new();
         for (i, outputs) in spec.widths().into_iter().enumerate() {
+            if is_bottleneck(i, spec.levels) && !spec.frozen {
+                d.cut();
+            }
             let at = |k| format!("encoders.{i}.basic_module.SingleConv{k}");
             let between = (outputs / 2).max(inputs);
             encoders.push([
@@ -56,6 +59,9 @@ impl Unet25d {
                 Cbr::declare(d, &at(2), between, outputs),
             ]);
             inputs = outputs;
+        }
+        if !spec.frozen {
+            d.cut();
         }
         d.frozen = false;
         let skips = (0..spec.levels)
@@ -82,8 +88,8 @@ impl Unet25d {
 
     pub(super) fn forward(&self, pass: &mut Pass, input: Input, frozen: bool) -> Tensor<4> {
         let features = match frozen {
-            true => pass.frozen(|pass| self.features(pass, input)),
-            false => self.features(pass, input),
+            true => pass.frozen(|pass| self.features(pass, input, true)),
+            false => self.features(pass, input, false),
         };
         let levels = features.into_iter().zip(&self.skips).enumerate();
         let flat = levels
@@ -93,7 +99,7 @@ impl Unet25d {
     }
 
     /// What the encoder gives at each level, (N·T, C, H, W), from the finest.
-    fn features(&self, pass: &mut Pass, input: Input) -> Vec<Tensor<4>> {
+    fn features(&self, pass: &mut Pass, input: Input, frozen: bool) -> Vec<Tensor<4>> {
         let [n, _, h, w] = input.dense.dims();
         // A shared projection is the first and the last.
         let (Some(of_dense), Some(of_one_hot)) =
@@ -117,7 +123,12 @@ impl Unet25d {
             for cbr in block {
                 x = cbr.forward(pass, x, self.time >> level);
             }
-            features.push(x.clone());
+            let (kept, next) = match frozen {
+                true => (x.clone(), x),
+                false => hand_on(pass, level, self.encoders.len(), x),
+            };
+            features.push(kept);
+            x = next;
         }
         features
     }

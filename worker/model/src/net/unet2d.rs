@@ -42,9 +42,15 @@ impl Unet2d {
         };
         let mut encoders = Vec::new();
         for (i, outputs) in spec.widths().into_iter().enumerate() {
+            if is_bottleneck(i, spec.levels) && !spec.frozen {
+                d.cut();
+            }
             let at = format!("encoders.{i}");
             encoders.push(Block::encoder(d, &at, inputs, one_hot, outputs));
             (inputs, one_hot) = (outputs, 0);
+        }
+        if !spec.frozen {
+            d.cut();
         }
         d.frozen = false;
         Self {
@@ -69,7 +75,12 @@ impl Unet2d {
                 x = ops::max_pool(x);
             }
             x = block.forward(pass, x, one_hot.take());
-            features.push(x.clone());
+            let (kept, next) = match self.frozen {
+                true => (x.clone(), x),
+                false => hand_on(pass, i, self.encoders.len(), x),
+            };
+            features.push(kept);
+            x = next;
         }
         features
     }
@@ -80,6 +91,27 @@ impl Unet2d {
             false => self.features(pass, input),
         };
         self.decoder.forward(pass, features)
+    }
+}
+
+/// Whether a level of an encoder is its last: a segment of its own, which has half of its parameters and few pixels.
+pub(super) fn is_bottleneck(level: usize, levels: usize) -> bool {
+    level + 1 == levels
+}
+
+/// What a level of an encoder hands on to the decoder and to the next level.
+pub(super) fn hand_on(
+    pass: &mut Pass,
+    level: usize,
+    levels: usize,
+    x: Tensor<4>,
+) -> (Tensor<4>, Tensor<4>) {
+    let bottleneck = is_bottleneck(level, levels);
+    let seen = pass.hand_on(usize::from(bottleneck), x.clone());
+    // The next level is of the same segment, unless it is the bottleneck.
+    match bottleneck || is_bottleneck(level + 1, levels) {
+        true => (seen.clone(), seen),
+        false => (seen, x),
     }
 }
 

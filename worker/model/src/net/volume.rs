@@ -242,7 +242,7 @@ mod tests {
     use burn::tensor::{
         Device, TensorData,
         module::{conv_transpose3d, conv3d},
-        ops::{ConvOptions, ConvTransposeOptions, PaddedConvOptions},
+        ops::{ConvOptions, ConvTransposeOptions},
     };
 
     use super::*;
@@ -279,7 +279,7 @@ mod tests {
     fn convolutions_of_volumes_are_those_in_three_dimensions() {
         let pass = Pass::training(&[], &[]);
         let options = |stride: [usize; 3], pad, dilation| {
-            PaddedConvOptions::from(ConvOptions::new(stride, [pad; 3], [dilation; 3], 1))
+            ConvOptions::new(stride, [pad; 3], [dilation; 3], 1)
         };
         let (three, five) = (numbers([4, 3, 3, 3, 3], 2), numbers([4, 3, 5, 5, 5], 3));
         for (time, x) in volumes() {

@@ -68,16 +68,21 @@ pub enum Next {
     Stop,
 }
 
-/// What a process has of a step: the sums of blocks of batches, and running statistics, where it has the step's first batch.
+/// What a process has of a segment ([`crate::net::Net::segments`]) of a step: the sums of blocks of batches; with the first segment,
+/// which comes last, running statistics where it has the step's first batch.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Part {
     /// Values of each block's sum.
     pub len: usize,
-    /// Gradients of all learned parameters by declaration, one after the other, and the loss, summed over blocks of batches.
+    /// Gradients of the segment's learned parameters by declaration, one after the other, and the loss, summed over blocks of
+    /// batches.
     pub blocks: Blocks<Vec<f32>>,
     /// Running statistics after the first batch, each by the place of its declaration.
     pub moved: Vec<(usize, Vec<f32>)>,
 }
+
+/// Computes what a process has of a step, and hands over one part after the other.
+pub type Compute<'a> = &'a mut dyn FnMut(&mut dyn FnMut(Part)) -> Result<(), ModelError>;
 
 /// Processes that train one network together, as one of them sees them.
 pub trait Group {
@@ -97,11 +102,12 @@ pub trait Group {
     /// Whether there is no other process now: then there is nothing to add up.
     fn is_alone(&self) -> bool;
 
-    /// The sum over all processes; `None` where one was lost on the way: nothing is decided, [`Self::agree`] again.
+    /// The sums over all processes of what each of them computes, part by part; a part is added up while the next is computed.
+    /// `None` where a process was lost on the way: nothing is decided, [`Self::agree`] again.
     ///
     /// # Errors
-    /// As [`Self::agree`].
-    fn sum(&mut self, step: u64, part: Part) -> Result<Option<Part>, ModelError>;
+    /// What `compute` fails with; as [`Self::agree`].
+    fn sum(&mut self, step: u64, compute: Compute<'_>) -> Result<Option<Vec<Part>>, ModelError>;
 
     /// Tells the others the line of an epoch's end or of a validation, by whoever leads; `digest` is of its numbers.
     fn tell(&mut self, line: &Line, digest: u64);
@@ -198,6 +204,20 @@ impl<T> Blocks<T> {
             sum = add(block.sum, sum);
         }
         Some(sum)
+    }
+
+    /// The same blocks with what follows from each sum.
+    pub fn each<U>(&self, mut of: impl FnMut(&T) -> U) -> Blocks<U> {
+        let blocks = self.0.iter();
+        Blocks(
+            blocks
+                .map(|block| Block {
+                    begin: block.begin,
+                    len: block.len,
+                    sum: of(&block.sum),
+                })
+                .collect(),
+        )
     }
 
     /// The same blocks with other sums.

@@ -1,10 +1,12 @@
 //! A network with its numbers and the optimiser's, one step at a time.
 
+use std::ops::Range;
+
 use burn::tensor::{Device, Tensor};
 use rayon::{iter::ParallelIterator, slice::ParallelSlice};
 
 use super::{
-    group::{Block, Blocks, Part},
+    group::{Block, Blocks, Part, add_values},
     loss::{Loss, loss},
     schedule::Pace,
 };
@@ -12,7 +14,7 @@ use crate::{
     ModelError,
     input::{Batch, Target},
     kernel::AdamW,
-    net::{Input, Net, Pass},
+    net::{Cut, Input, Net, Pass},
     ops,
     parameters::{Declared, Id, Parameters, download, upload},
 };
@@ -54,6 +56,16 @@ struct OfBatch {
     moved: Vec<(Id, Tensor<1>)>,
 }
 
+/// A pass forward.
+struct Forward {
+    leaves: Vec<Tensor<1>>,
+    output: Tensor<4>,
+    losses: Loss,
+    root: Tensor<1>,
+    moved: Vec<(Id, Tensor<1>)>,
+    cuts: Vec<Cut>,
+}
+
 /// Gradients of a step's batches, summed as [`Blocks`] are.
 #[derive(Default)]
 pub struct Gradients {
@@ -76,7 +88,68 @@ struct Summed {
     losses: Loss,
 }
 
+/// The way back through a pass whose graph is cut between segments, from the last to the first.
+struct Backward {
+    leaves: Vec<Tensor<1>>,
+    losses: Loss,
+    root: Option<Tensor<1>>,
+    /// What segments handed on, and the gradients of it so far.
+    cuts: Vec<(Cut, Option<Tensor<4>>)>,
+}
+
+impl Backward {
+    fn of(forward: Forward) -> Self {
+        Self {
+            leaves: forward.leaves,
+            losses: forward.losses,
+            root: Some(forward.root),
+            cuts: forward.cuts.into_iter().map(|cut| (cut, None)).collect(),
+        }
+    }
+
+    /// Gradients of the parameters of a segment, after those of all later segments.
+    fn segment(&mut self, segment: usize, range: &Range<usize>) -> Vec<Option<Tensor<1>>> {
+        let Some(root) = self.root.take() else {
+            return vec![None; range.len()];
+        };
+        let mut gradients = root.backward();
+        for (cut, so_far) in &mut self.cuts {
+            if let Some(gradient) = cut.seen.grad_remove(&mut gradients) {
+                *so_far = Some(match so_far.take() {
+                    Some(so_far) => so_far + gradient,
+                    None => gradient,
+                });
+            }
+        }
+        let of = self.leaves[range.clone()].iter();
+        let found = of.map(|leaf| leaf.grad_remove(&mut gradients)).collect();
+        // The slope of the loss along what the segment before handed on, as the gradient of a product.
+        for (cut, so_far) in &mut self.cuts {
+            if cut.segment + 1 == segment
+                && let Some(gradient) = so_far.take()
+            {
+                let product = (cut.made.clone() * gradient.autodiff()).sum();
+                self.root = Some(match self.root.take() {
+                    Some(root) => root + product,
+                    None => product,
+                });
+            }
+        }
+        found
+    }
+}
+
 impl Summed {
+    /// So many numbers: gradients by declaration, and the loss.
+    fn numbers(&self, len: usize) -> Vec<f32> {
+        let mut values = Vec::with_capacity(len);
+        for gradient in self.gradients.iter().flatten() {
+            values.extend(download(gradient));
+        }
+        values.push(self.losses.clone().value());
+        values
+    }
+
     fn add(one: Self, other: Self) -> Self {
         let both = one.gradients.into_iter().zip(other.gradients);
         Self {
@@ -187,7 +260,8 @@ impl Learner {
         !ops::has_kernels(&self.device)
     }
 
-    fn backward(&self, batch: Brought) -> (Tensor<4>, OfBatch) {
+    /// What the network says of a batch, and what its gradients are computed from; `apart` with a graph for each segment.
+    fn forward(&self, batch: Brought, apart: bool) -> Forward {
         let leaves: Vec<Tensor<1>> = self
             .net
             .declared()
@@ -199,16 +273,32 @@ impl Learner {
             })
             .collect();
         let mut pass = Pass::training(self.net.declared(), &leaves);
+        if apart {
+            pass = pass.in_segments();
+        }
         let output = self.net.forward(&mut pass, batch.input);
-        let moved = pass.into_moved();
-        let (loss, root) = loss(self.target, output.clone(), &batch.target);
-        let mut gradients = root.backward();
-        let of = leaves.iter().map(|leaf| leaf.grad_remove(&mut gradients));
+        let (moved, cuts) = pass.into_moved();
+        let (losses, root) = loss(self.target, output.clone(), &batch.target);
+        Forward {
+            leaves,
+            output,
+            losses,
+            root,
+            moved,
+            cuts,
+        }
+    }
+
+    fn backward(&self, batch: Brought) -> (Tensor<4>, OfBatch) {
+        let forward = self.forward(batch, false);
+        let mut gradients = forward.root.backward();
+        let of = forward.leaves.iter();
         let summed = Summed {
-            gradients: of.collect(),
-            losses: loss,
+            gradients: of.map(|leaf| leaf.grad_remove(&mut gradients)).collect(),
+            losses: forward.losses,
         };
-        (output.inner(), OfBatch { summed, moved })
+        let moved = forward.moved;
+        (forward.output.inner(), OfBatch { summed, moved })
     }
 
     /// One step of the optimiser over batches, whose gradients are averaged. Returns the mean loss.
@@ -252,9 +342,7 @@ impl Learner {
             self.finite(latest)?;
         }
         let (_, of) = self.backward(batch);
-        if of.summed.losses.is_broken() {
-            return Err(self.not_finite(of.summed.losses.value()));
-        }
+        self.unbroken(&of.summed.losses)?;
         sum.latest = Some(of.summed.losses.clone());
         if at == 0 {
             sum.moved = of.moved;
@@ -265,6 +353,70 @@ impl Learner {
             sum: of.summed,
         };
         sum.blocks.push(block, &mut Summed::add);
+        Ok(())
+    }
+
+    /// Where a loss is known already, whether it is a number.
+    fn unbroken(&self, losses: &Loss) -> Result<(), ModelError> {
+        match losses.is_broken() {
+            true => Err(self.not_finite(losses.clone().value())),
+            false => Ok(()),
+        }
+    }
+
+    /// What a process has of a step: what is summed already, and its last batch, where it has any. Gradients are handed over as numbers
+    /// one segment of the network after the other, the last segment's first, while those of the others are still to be
+    /// computed.
+    ///
+    /// # Errors
+    /// [`ModelError::NotFinite`]; nothing has changed.
+    pub fn parts(
+        &self,
+        mut sum: Gradients,
+        last: Option<(usize, Brought)>,
+        each: &mut dyn FnMut(Part),
+    ) -> Result<(), ModelError> {
+        if let Some(latest) = sum.latest.take() {
+            self.finite(latest)?;
+        }
+        let mut last = match last {
+            None => None,
+            Some((at, batch)) => {
+                let mut forward = self.forward(batch, true);
+                self.unbroken(&forward.losses)?;
+                if at == 0 {
+                    sum.moved = std::mem::take(&mut forward.moved);
+                }
+                Some((at, Backward::of(forward)))
+            }
+        };
+        for (segment, range) in self.net.segments().iter().enumerate().rev() {
+            let mut blocks = sum.blocks.each(|summed| Summed {
+                gradients: summed.gradients[range.clone()].to_vec(),
+                losses: summed.losses.clone(),
+            });
+            if let Some((at, backward)) = &mut last {
+                let block = Block {
+                    begin: *at,
+                    len: 1,
+                    sum: Summed {
+                        gradients: backward.segment(segment, range),
+                        losses: backward.losses.clone(),
+                    },
+                };
+                blocks.push(block, &mut Summed::add);
+            }
+            let len = self.gradient_len(range);
+            let moved: &[(Id, Tensor<1>)] = if segment == 0 { &sum.moved } else { &[] };
+            each(Part {
+                len,
+                blocks: blocks.map(|summed| summed.numbers(len)),
+                moved: moved
+                    .iter()
+                    .map(|(id, value)| (id.0, download(value)))
+                    .collect(),
+            });
+        }
         Ok(())
     }
 
@@ -355,71 +507,49 @@ impl Learner {
         }
     }
 
-    /// What a process has of a step, in numbers.
-    pub fn part(&self, sum: Gradients) -> Part {
-        let flat = |summed: Summed| {
-            let mut values = Vec::with_capacity(self.gradient_len());
-            for gradient in summed.gradients.iter().flatten() {
-                values.extend(download(gradient));
-            }
-            values.push(summed.losses.value());
-            values
-        };
-        Part {
-            len: self.gradient_len(),
-            blocks: sum.blocks.map(flat),
-            moved: sum
-                .moved
-                .iter()
-                .map(|(id, value)| (id.0, download(value)))
-                .collect(),
-        }
-    }
-
-    /// The same from numbers, as all processes together have them.
+    /// The sums of all processes of a step of so many batches, from [`Self::parts`] of each.
     ///
     /// # Errors
-    /// [`ModelError::Weights`] where there are more or fewer than a step has.
-    pub fn gradients_of(&self, part: Part) -> Result<Gradients, ModelError> {
+    /// [`ModelError::Weights`] where there are more or fewer numbers than a step has.
+    pub fn gradients_of(&self, parts: Vec<Part>, batches: usize) -> Result<Gradients, ModelError> {
         let wrong = |what: &str, there: usize, needed: usize| {
             ModelError::weights(format!("a step's {what} have {there} values, not {needed}"))
         };
-        let needed = self.gradient_len();
-        if let Some(block) = part
-            .blocks
-            .as_slice()
-            .iter()
-            .find(|b| b.sum.len() != needed)
-        {
-            return Err(wrong("gradients", block.sum.len(), needed));
+        let (segments, declared) = (self.net.segments(), self.net.declared());
+        if parts.len() != segments.len() {
+            return Err(wrong("segments", parts.len(), segments.len()));
         }
-        let declared = self.net.declared();
-        let mut moved = Vec::with_capacity(part.moved.len());
-        for (which, values) in part.moved {
-            let needed = declared.get(which).filter(|d| !d.learned);
-            let needed = needed.map_or(0, Declared::len);
+        let mut moved = Vec::new();
+        let mut gradients = Vec::with_capacity(declared.len());
+        let mut losses = Loss::Known(0.0);
+        // The first segment came last.
+        for (range, part) in segments.iter().zip(parts.into_iter().rev()) {
+            let needed = self.gradient_len(range);
+            let values = part.blocks.total(&mut |a, b| add_values(a, &b));
+            let values = values.unwrap_or_default();
             if values.len() != needed {
-                return Err(wrong("running statistics", values.len(), needed));
+                return Err(wrong("gradients", values.len(), needed));
             }
-            moved.push((Id(which), upload(values, &self.device)));
-        }
-        let deep = |values: Vec<f32>| {
             let mut rest = &values[..];
-            let mut take = |len: usize| {
-                let (taken, left) = rest.split_at(len);
-                rest = left;
-                upload(taken.to_vec(), &self.device)
-            };
-            Summed {
-                gradients: declared
-                    .iter()
-                    .map(|d| d.learned.then(|| take(d.len())))
-                    .collect(),
-                losses: Loss::Known(values[values.len() - 1]),
+            for d in &declared[range.clone()] {
+                gradients.push(d.learned.then(|| {
+                    let (taken, left) = rest.split_at(d.len());
+                    rest = left;
+                    upload(taken.to_vec(), &self.device)
+                }));
             }
-        };
+            losses = Loss::Known(rest[0]);
+            for (which, values) in part.moved {
+                let needed = declared.get(which).filter(|d| !d.learned);
+                let needed = needed.map_or(0, Declared::len);
+                if values.len() != needed {
+                    return Err(wrong("running statistics", values.len(), needed));
+                }
+                moved.push((Id(which), upload(values, &self.device)));
+            }
+        }
         Ok(Gradients {
-            blocks: part.blocks.map(deep),
+            blocks: Blocks::whole(batches, Summed { gradients, losses }),
             moved,
             latest: None,
         })
@@ -433,9 +563,11 @@ impl Learner {
         })
     }
 
-    /// Gradients of all learned parameters, and the loss.
-    fn gradient_len(&self) -> usize {
-        let learned = self.net.declared().iter().filter(|d| d.learned);
+    /// Gradients of all learned parameters of a segment, and the loss.
+    fn gradient_len(&self, segment: &Range<usize>) -> usize {
+        let learned = self.net.declared()[segment.clone()]
+            .iter()
+            .filter(|d| d.learned);
         learned.map(Declared::len).sum::<usize>() + 1
     }
 

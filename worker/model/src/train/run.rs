@@ -321,7 +321,9 @@ impl Training {
                 {
                     return Ok(None);
                 }
+                let mut others = group.as_deref_mut().filter(|group| !group.is_alone());
                 let mut sum = Gradients::default();
+                let mut last = None;
                 for at in share.clone() {
                     let mut next = || {
                         let since = Instant::now();
@@ -330,19 +332,25 @@ impl Training {
                         Ok::<_, ModelError>(self.learner.bring(batch))
                     };
                     let batch = ahead.take().map_or_else(&mut next, Ok)?;
+                    if others.is_some() && at + 1 == share.end {
+                        last = Some((at, batch));
+                        break;
+                    }
                     self.learner.add(&mut sum, at, batch)?;
                     if self.learner.computes_apart() && !ready.is_over() {
                         ahead = Some(next()?);
                     }
                 }
-                if let Some(group) = group.as_deref_mut()
-                    && !group.is_alone()
-                {
-                    let part = self.learner.part(sum);
-                    let Some(whole) = group.sum(self.learner.steps(), part)? else {
+                if let Some(group) = &mut others {
+                    let mut own = Some((sum, last));
+                    let whole = group.sum(self.learner.steps(), &mut |each| {
+                        let (sum, last) = own.take().expect("computed once");
+                        self.learner.parts(sum, last, each)
+                    })?;
+                    let Some(whole) = whole else {
                         return Ok(None);
                     };
-                    sum = self.learner.gradients_of(whole)?;
+                    sum = self.learner.gradients_of(whole, batches)?;
                 }
                 clock.samples += batches * self.plan.batch;
                 let pace = self.pace(self.learner.steps());
