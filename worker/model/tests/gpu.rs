@@ -122,7 +122,12 @@ fn networks_answer_and_learn_as_on_the_cpu() {
             assert_eq!(part("weights"), 0.0);
             assert!(part("evaluated") < 1e-4 * coarse);
             assert!(part("output") < 1e-4 * coarse);
-            assert!(part("gradient") < 2e-3 * coarse);
+            // The scales of NLOST's group norms have gradients that are sums of what cancels.
+            let least = match trial.net.architecture {
+                Architecture::Nlost => 1e-2,
+                _ => 2e-3,
+            };
+            assert!(part("gradient") < least * coarse);
             assert!(part("after") < 1e-4 * coarse);
             // A weight whose gradient is almost zero goes either way at once.
             assert!(part("losses") < 1e-2 * coarse.min(10.0));
