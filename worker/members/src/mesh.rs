@@ -159,7 +159,7 @@ impl Mesh {
                 }
                 to.flush()
             },
-            |from, _| Head::read(from, step)?.blocks(from, slice(self.rank).len()),
+            |from, _| Head::read(from, step, len)?.blocks(from, slice(self.rank).len()),
         )?;
         let mut found = found.into_iter();
         let mut sum = Blocks::default();
@@ -303,9 +303,10 @@ fn bad(what: &str) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidData, what)
 }
 
-/// Which batches a process has of a step.
+/// Which batches a process has of a part of a step, and of how many values.
 struct Head {
     step: u64,
+    len: u64,
     blocks: Vec<(u32, u32)>,
 }
 
@@ -314,12 +315,14 @@ impl Head {
         let blocks = part.blocks.as_slice().iter();
         Self {
             step,
+            len: part.len as u64,
             blocks: blocks.map(|b| (b.begin as u32, b.len as u32)).collect(),
         }
     }
 
     fn write(&self, to: &mut impl Write) -> io::Result<()> {
         to.write_all(&self.step.to_le_bytes())?;
+        to.write_all(&self.len.to_le_bytes())?;
         to.write_all(&(self.blocks.len() as u32).to_le_bytes())?;
         for (begin, len) in &self.blocks {
             to.write_all(&begin.to_le_bytes())?;
@@ -328,11 +331,18 @@ impl Head {
         Ok(())
     }
 
-    fn read(from: &mut impl Read, step: u64) -> io::Result<Self> {
-        let mut theirs = [0; 8];
-        from.read_exact(&mut theirs)?;
-        if u64::from_le_bytes(theirs) != step {
+    fn read(from: &mut impl Read, step: u64, len: usize) -> io::Result<Self> {
+        let len = len as u64;
+        let mut their = || {
+            let mut bytes = [0; 8];
+            from.read_exact(&mut bytes)?;
+            Ok::<_, io::Error>(u64::from_le_bytes(bytes))
+        };
+        if their()? != step {
             return Err(bad("another process is at another step"));
+        }
+        if their()? != len {
+            return Err(bad("another process adds up another part of the network"));
         }
         let count = count(from)?;
         let blocks: io::Result<Vec<(u32, u32)>> = (0..count)
@@ -340,6 +350,7 @@ impl Head {
             .collect();
         Ok(Self {
             step,
+            len,
             blocks: blocks?,
         })
     }
@@ -407,4 +418,30 @@ fn read_statistics(from: &mut impl Read) -> io::Result<Vec<(usize, Vec<f32>)>> {
         Ok((which, values(from, len)?))
     };
     (0..count).map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_of_another_step_or_length_is_refused() {
+        let mut part = Part {
+            len: 7,
+            ..Part::default()
+        };
+        let block = Block {
+            begin: 2,
+            len: 2,
+            sum: vec![1.0; 7],
+        };
+        part.blocks.push(block, &mut |a, b| add_values(a, &b));
+        let mut bytes = Vec::new();
+        Head::of(3, &part).write(&mut bytes).unwrap();
+        let read = |step, len| Head::read(&mut &bytes[..], step, len);
+        assert_eq!(read(3, 7).unwrap().blocks, [(2, 2)]);
+        let refused = |step, len| read(step, len).err().unwrap().to_string();
+        assert!(refused(4, 7).contains("another step"));
+        assert!(refused(3, 6).contains("another part"));
+    }
 }

@@ -6,7 +6,7 @@ use picofarm_model::train::{Line, group::Standing};
 use serde::{Deserialize, Serialize};
 
 /// First bytes of every message.
-const MAGIC: &[u8; 4] = b"pfm1";
+const MAGIC: &[u8; 4] = b"pfm2";
 /// Longest header: the list of all members is the longest.
 const MOST_HEADER: u32 = 1 << 20;
 /// Most bytes after a header: a training's whole state.

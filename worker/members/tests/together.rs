@@ -291,10 +291,10 @@ fn connections_without_the_secret_disturb_nothing() {
                     0 => b"GET / HTTP/1.1\r\n\r\n".to_vec(),
                     1 => vec![0xff; 4096],
                     // A header of 4 GiB.
-                    2 => [&b"pfm1"[..], &[0xff; 12]].concat(),
+                    2 => [&b"pfm2"[..], &[0xff; 12]].concat(),
                     3 => {
                         let text = br#"{"hello":{"secret":"guessed","training":"a training","wish":{"add":{"generation":1,"rank":1}}}}"#;
-                        let mut bytes = b"pfm1".to_vec();
+                        let mut bytes = b"pfm2".to_vec();
                         bytes.extend((text.len() as u32).to_le_bytes());
                         bytes.extend(0_u64.to_le_bytes());
                         bytes.extend(text);
