@@ -3,8 +3,10 @@
     python readers.py DATASET [SCENE]
 """
 
+import atexit
 import os
 import sys
+import time
 
 import numpy
 import tensorstore
@@ -17,6 +19,9 @@ def zarr_store(location):
     if "://" not in location:
         return location
     import obstore
+
+    # A moment for its threads before the interpreter ends; see transients.py.
+    atexit.register(time.sleep, 0.2)
 
     return zarr.storage.ObjectStore(obstore.store.from_url(location), read_only=True)
 

@@ -6,9 +6,11 @@
 An example to copy and change; docs/python.md explains it.
 """
 
+import atexit
 import json
 import os
 import pathlib
+import time
 
 import numpy
 import zarr
@@ -23,6 +25,9 @@ class Place:
         if self.remote:
             import obstore  # pip install obstore
 
+            # Its threads may still let go of what was read while the interpreter ends, which then crashes after all is done
+            # (https://github.com/PyO3/pyo3-async-runtimes/issues/40): a moment for them.
+            atexit.register(time.sleep, 0.2)
             self.obstore = obstore
             self.objects = obstore.store.from_url(self.location)
         else:
