@@ -1,12 +1,10 @@
 //! A network with its numbers and the optimiser's, one step at a time.
 
-use std::ops::Range;
-
 use burn::tensor::{Device, Tensor};
 use rayon::{iter::ParallelIterator, slice::ParallelSlice};
 
 use super::{
-    group::{Block, Blocks, Part, add_values},
+    group::{Block, Blocks},
     loss::{Loss, loss},
     schedule::Pace,
 };
@@ -38,7 +36,7 @@ pub struct Learner {
     clip_norm: Option<f64>,
     target: Target,
     decay: f64,
-    device: Device,
+    pub(super) device: Device,
 }
 
 /// An exponential moving average of all numbers of a network, running statistics too.
@@ -57,23 +55,23 @@ struct OfBatch {
 }
 
 /// A pass forward.
-struct Forward {
-    leaves: Vec<Tensor<1>>,
+pub(super) struct Forward {
+    pub(super) leaves: Vec<Tensor<1>>,
     output: Tensor<4>,
-    losses: Loss,
-    root: Tensor<1>,
-    moved: Vec<(Id, Tensor<1>)>,
-    cuts: Vec<Cut>,
+    pub(super) losses: Loss,
+    pub(super) root: Tensor<1>,
+    pub(super) moved: Vec<(Id, Tensor<1>)>,
+    pub(super) cuts: Vec<Cut>,
 }
 
 /// Gradients of a step's batches, summed as [`Blocks`] are.
 #[derive(Default)]
 pub struct Gradients {
-    blocks: Blocks<Summed>,
+    pub(super) blocks: Blocks<Summed>,
     /// Running statistics after the step's first batch, where that is among them.
-    moved: Vec<(Id, Tensor<1>)>,
+    pub(super) moved: Vec<(Id, Tensor<1>)>,
     /// Of the batch that was added last.
-    latest: Option<Loss>,
+    pub(super) latest: Option<Loss>,
 }
 
 /// A batch on the device of a learner.
@@ -83,65 +81,14 @@ pub struct Brought {
 }
 
 /// Gradients of every parameter by declaration, none of those that are not learned, and losses; summed over batches.
-struct Summed {
-    gradients: Vec<Option<Tensor<1>>>,
-    losses: Loss,
-}
-
-/// The way back through a pass whose graph is cut between segments, from the last to the first.
-struct Backward {
-    leaves: Vec<Tensor<1>>,
-    losses: Loss,
-    root: Option<Tensor<1>>,
-    /// What segments handed on, and the gradients of it so far.
-    cuts: Vec<(Cut, Option<Tensor<4>>)>,
-}
-
-impl Backward {
-    fn of(forward: Forward) -> Self {
-        Self {
-            leaves: forward.leaves,
-            losses: forward.losses,
-            root: Some(forward.root),
-            cuts: forward.cuts.into_iter().map(|cut| (cut, None)).collect(),
-        }
-    }
-
-    /// Gradients of the parameters of a segment, after those of all later segments.
-    fn segment(&mut self, segment: usize, range: &Range<usize>) -> Vec<Option<Tensor<1>>> {
-        let Some(root) = self.root.take() else {
-            return vec![None; range.len()];
-        };
-        let mut gradients = root.backward();
-        for (cut, so_far) in &mut self.cuts {
-            if let Some(gradient) = cut.seen.grad_remove(&mut gradients) {
-                *so_far = Some(match so_far.take() {
-                    Some(so_far) => so_far + gradient,
-                    None => gradient,
-                });
-            }
-        }
-        let of = self.leaves[range.clone()].iter();
-        let found = of.map(|leaf| leaf.grad_remove(&mut gradients)).collect();
-        // The slope of the loss along what the segment before handed on, as the gradient of a product.
-        for (cut, so_far) in &mut self.cuts {
-            if cut.segment + 1 == segment
-                && let Some(gradient) = so_far.take()
-            {
-                let product = (cut.made.clone() * gradient.autodiff()).sum();
-                self.root = Some(match self.root.take() {
-                    Some(root) => root + product,
-                    None => product,
-                });
-            }
-        }
-        found
-    }
+pub(super) struct Summed {
+    pub(super) gradients: Vec<Option<Tensor<1>>>,
+    pub(super) losses: Loss,
 }
 
 impl Summed {
     /// So many numbers: gradients by declaration, and the loss.
-    fn numbers(&self, len: usize) -> Vec<f32> {
+    pub(super) fn numbers(&self, len: usize) -> Vec<f32> {
         let mut values = Vec::with_capacity(len);
         for gradient in self.gradients.iter().flatten() {
             values.extend(download(gradient));
@@ -150,7 +97,7 @@ impl Summed {
         values
     }
 
-    fn add(one: Self, other: Self) -> Self {
+    pub(super) fn add(one: Self, other: Self) -> Self {
         let both = one.gradients.into_iter().zip(other.gradients);
         Self {
             gradients: both.map(|(a, b)| Some(a? + b?)).collect(),
@@ -261,7 +208,7 @@ impl Learner {
     }
 
     /// What the network says of a batch, and what its gradients are computed from; `apart` with a graph for each segment.
-    fn forward(&self, batch: Brought, apart: bool) -> Forward {
+    pub(super) fn forward(&self, batch: Brought, apart: bool) -> Forward {
         let leaves: Vec<Tensor<1>> = self
             .net
             .declared()
@@ -357,71 +304,15 @@ impl Learner {
     }
 
     /// Where a loss is known already, whether it is a number.
-    fn unbroken(&self, losses: &Loss) -> Result<(), ModelError> {
+    pub(super) fn unbroken(&self, losses: &Loss) -> Result<(), ModelError> {
         match losses.is_broken() {
             true => Err(self.not_finite(losses.clone().value())),
             false => Ok(()),
         }
     }
 
-    /// What a process has of a step: what is summed already, and its last batch, where it has any. Gradients are handed over as numbers
-    /// one segment of the network after the other, the last segment's first, while those of the others are still to be
-    /// computed.
-    ///
-    /// # Errors
-    /// [`ModelError::NotFinite`]; nothing has changed.
-    pub fn parts(
-        &self,
-        mut sum: Gradients,
-        last: Option<(usize, Brought)>,
-        each: &mut dyn FnMut(Part),
-    ) -> Result<(), ModelError> {
-        if let Some(latest) = sum.latest.take() {
-            self.finite(latest)?;
-        }
-        let mut last = match last {
-            None => None,
-            Some((at, batch)) => {
-                let mut forward = self.forward(batch, true);
-                self.unbroken(&forward.losses)?;
-                if at == 0 {
-                    sum.moved = std::mem::take(&mut forward.moved);
-                }
-                Some((at, Backward::of(forward)))
-            }
-        };
-        for (segment, range) in self.net.segments().iter().enumerate().rev() {
-            let mut blocks = sum.blocks.each(|summed| Summed {
-                gradients: summed.gradients[range.clone()].to_vec(),
-                losses: summed.losses.clone(),
-            });
-            if let Some((at, backward)) = &mut last {
-                let block = Block {
-                    begin: *at,
-                    len: 1,
-                    sum: Summed {
-                        gradients: backward.segment(segment, range),
-                        losses: backward.losses.clone(),
-                    },
-                };
-                blocks.push(block, &mut Summed::add);
-            }
-            let len = self.gradient_len(range);
-            let moved: &[(Id, Tensor<1>)] = if segment == 0 { &sum.moved } else { &[] };
-            each(Part {
-                len,
-                blocks: blocks.map(|summed| summed.numbers(len)),
-                moved: moved
-                    .iter()
-                    .map(|(id, value)| (id.0, download(value)))
-                    .collect(),
-            });
-        }
-        Ok(())
-    }
-
     /// What a loss is; waits for the device.
-    fn finite(&self, loss: Loss) -> Result<f32, ModelError> {
+    pub(super) fn finite(&self, loss: Loss) -> Result<f32, ModelError> {
         let loss = loss.value();
         match loss.is_finite() {
             true => Ok(loss),
@@ -507,68 +398,12 @@ impl Learner {
         }
     }
 
-    /// The sums of all processes of a step of so many batches, from [`Self::parts`] of each.
-    ///
-    /// # Errors
-    /// [`ModelError::Weights`] where there are more or fewer numbers than a step has.
-    pub fn gradients_of(&self, parts: Vec<Part>, batches: usize) -> Result<Gradients, ModelError> {
-        let wrong = |what: &str, there: usize, needed: usize| {
-            ModelError::weights(format!("a step's {what} have {there} values, not {needed}"))
-        };
-        let (segments, declared) = (self.net.segments(), self.net.declared());
-        if parts.len() != segments.len() {
-            return Err(wrong("segments", parts.len(), segments.len()));
-        }
-        let mut moved = Vec::new();
-        let mut gradients = Vec::with_capacity(declared.len());
-        let mut losses = Loss::Known(0.0);
-        // The first segment came last.
-        for (range, part) in segments.iter().zip(parts.into_iter().rev()) {
-            let needed = self.gradient_len(range);
-            let values = part.blocks.total(&mut |a, b| add_values(a, &b));
-            let values = values.unwrap_or_default();
-            if values.len() != needed {
-                return Err(wrong("gradients", values.len(), needed));
-            }
-            let mut rest = &values[..];
-            for d in &declared[range.clone()] {
-                gradients.push(d.learned.then(|| {
-                    let (taken, left) = rest.split_at(d.len());
-                    rest = left;
-                    upload(taken.to_vec(), &self.device)
-                }));
-            }
-            losses = Loss::Known(rest[0]);
-            for (which, values) in part.moved {
-                let needed = declared.get(which).filter(|d| !d.learned);
-                let needed = needed.map_or(0, Declared::len);
-                if values.len() != needed {
-                    return Err(wrong("running statistics", values.len(), needed));
-                }
-                moved.push((Id(which), upload(values, &self.device)));
-            }
-        }
-        Ok(Gradients {
-            blocks: Blocks::whole(batches, Summed { gradients, losses }),
-            moved,
-            latest: None,
-        })
-    }
-
     /// A digest of all parameters (FNV-1a over their bits): processes that train together have the same.
     pub fn digest(&self) -> u64 {
         let values = self.parameters.values().iter().flat_map(download);
         values.fold(0xcbf2_9ce4_8422_2325, |hash, value| {
             (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0100_0000_01b3)
         })
-    }
-
-    /// Gradients of all learned parameters of a segment, and the loss.
-    fn gradient_len(&self, segment: &Range<usize>) -> usize {
-        let learned = self.net.declared()[segment.clone()]
-            .iter()
-            .filter(|d| d.learned);
-        learned.map(Declared::len).sum::<usize>() + 1
     }
 
     /// What the network says in evaluation: (N, outputs, H, W), row by row.

@@ -9,6 +9,7 @@ mod order;
 mod position;
 mod run;
 mod schedule;
+mod segments;
 
 use serde::{Deserialize, Serialize};
 
