@@ -12,7 +12,7 @@
 use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
 
-use crate::{Bsdf, Camera, Laser, Material, Provenance, Vec3};
+use crate::{Bsdf, Camera, Laser, Material, Provenance, SpectrumPoint, Vec3};
 
 /// Version of the extras, raised when their meaning changes.
 pub(crate) const FORMAT: u32 = 1;
@@ -29,10 +29,12 @@ pub(crate) struct SceneExtras {
 }
 
 /// A material as this program knows it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct MaterialExtras {
     pub(crate) bsdf: Bsdf,
     pub(crate) two_sided: bool,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) spectrum: Vec<SpectrumPoint>,
 }
 
 /// The key under which scene and material extras lie.

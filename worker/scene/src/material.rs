@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Texture;
+use crate::{SpectrumPoint, Texture};
 
 /// Microfacet normal distribution of a rough conductor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -125,6 +125,9 @@ pub struct Material {
     pub texture: Option<Arc<Texture>>,
     /// Scatters on both sides of the facet; otherwise black from behind.
     pub two_sided: bool,
+    /// What it reflects by wavelength, ascending; empty where nobody measured it. Only renders of stated wavelengths look at it
+    /// ([`Material::at`]).
+    pub spectrum: Vec<SpectrumPoint>,
 }
 
 impl Material {
@@ -137,6 +140,7 @@ impl Material {
             rgb,
             texture: None,
             two_sided: true,
+            spectrum: vec![],
         }
     }
 
@@ -152,6 +156,7 @@ impl Material {
             rgb: [1.0; 3],
             texture: None,
             two_sided: true,
+            spectrum: vec![],
         }
     }
 
@@ -167,6 +172,7 @@ impl Material {
             rgb: [1.0; 3],
             texture: None,
             two_sided: true,
+            spectrum: vec![],
         }
     }
 
@@ -272,6 +278,7 @@ impl Material {
                 }
             }
         }
+        self.check_spectrum()?;
         self.rgb.iter().try_for_each(|&v| unit("rgb", v))
     }
 }

@@ -312,6 +312,7 @@ fn material_entry(material: &Material, textures: &mut Textures) -> MaterialEntry
             picofarm: MaterialExtras {
                 bsdf: material.bsdf,
                 two_sided: material.two_sided,
+                spectrum: material.spectrum.clone(),
             },
         },
     }

@@ -238,5 +238,6 @@ fn material(name: &str, file: &FileBsdf) -> Result<Material, String> {
         rgb: [grey; 3],
         texture: None,
         two_sided: false,
+        spectrum: vec![],
     })
 }

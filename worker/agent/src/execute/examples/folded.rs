@@ -56,6 +56,7 @@ fn grey() -> Material {
         rgb: [0.5; 3],
         texture: None,
         two_sided: true,
+        spectrum: vec![],
     }
 }
 

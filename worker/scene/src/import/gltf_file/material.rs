@@ -106,6 +106,7 @@ impl Walk<'_> {
         let exact = self.exact(file, &at, &material)?;
         if let Some(ours) = exact {
             (material.bsdf, material.two_sided) = (ours.bsdf, ours.two_sided);
+            material.spectrum = ours.spectrum;
         } else if let Some((tint, bsdf)) = self.glass(file, standard.rgb, &material) {
             (material.rgb, material.bsdf) = (tint, bsdf);
         } else if file.ior().is_some() || file.specular().is_some() {

@@ -121,6 +121,7 @@ impl Reader<'_> {
             rgb: *rgb,
             texture,
             two_sided: *two_sided,
+            spectrum: vec![],
         };
         if bsdf_text(&node.id, &material, known.texture.as_ref()).text == node.text {
             return Ok(Some(material));
