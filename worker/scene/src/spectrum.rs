@@ -36,7 +36,7 @@ pub const WAVELENGTHS_NM: (f32, f32) = (200.0, 20_000.0);
 /// Wavelengths between which a colour stands for reflectances, nanometres.
 const VISIBLE_NM: (f32, f32) = (400.0, 700.0);
 /// Dominant wavelengths of the primaries of linear RGB (ITU-R BT.709), nanometres: blue, green, red.
-const PRIMARIES_NM: [f32; 3] = [464.3, 549.1, 611.4];
+pub(crate) const PRIMARIES_NM: [f32; 3] = [464.3, 549.1, 611.4];
 
 /// The share of red, green and blue in what a colour reflects at a wavelength: that of the primary there, between two primaries both,
 /// linearly. `None` where colours say nothing.
@@ -101,56 +101,71 @@ impl Material {
             } => specular_reflectance,
             _ => 0.0,
         };
-        let row = |p: &SpectrumPoint| [p.reflectance, p.specular_reflectance.unwrap_or(mix)];
-        let after = self.spectrum.partition_point(|p| p.nm <= nm);
-        match (after.checked_sub(1), self.spectrum.get(after)) {
-            (None, first) => first.map(row),
-            (Some(last), None) => Some(row(&self.spectrum[last])),
-            (Some(before), Some(b)) => {
-                let a = &self.spectrum[before];
-                let t = (nm - a.nm) / (b.nm - a.nm);
-                let (a, b) = (row(a), row(b));
-                Some([0, 1].map(|k| a[k] + (b[k] - a[k]) * t))
-            }
-        }
+        interpolated(&self.spectrum, nm, |p| {
+            [p.reflectance, p.specular_reflectance.unwrap_or(mix)]
+        })
     }
 
     /// Physical limits of its spectrum; the message says what was expected.
     pub(crate) fn check_spectrum(&self) -> Result<(), String> {
-        let unit = 0.0..=1.0;
-        let (least, most) = WAVELENGTHS_NM;
-        for (k, p) in self.spectrum.iter().enumerate() {
-            let fail = |what: String| Err(format!("spectrum[{k}].{what}"));
-            if !(least..=most).contains(&p.nm) {
-                return fail(format!("nm = {} lies outside [{least}, {most}]", p.nm));
-            }
-            if k > 0 && p.nm <= self.spectrum[k - 1].nm {
-                return fail(format!("nm = {} does not ascend", p.nm));
-            }
-            if !unit.contains(&p.reflectance) {
-                return fail(format!(
-                    "reflectance = {} lies outside [0, 1]",
-                    p.reflectance
-                ));
-            }
-            match (p.specular_reflectance, self.bsdf) {
-                (None, _) => {}
-                (Some(r), Bsdf::Mixed { .. }) if unit.contains(&r) => {}
-                (Some(r), Bsdf::Mixed { .. }) => {
-                    return fail(format!("specular_reflectance = {r} lies outside [0, 1]"));
-                }
-                (Some(_), _) => {
-                    return fail(
-                        "specular_reflectance is of mixed materials alone; give reflectance".into(),
-                    );
-                }
-            }
-        }
         match self.spectrum.is_empty() || !self.is_glass() {
-            true => Ok(()),
-            false => Err("glass takes no spectrum; remove it".into()),
+            true => check_points(&self.spectrum, Some(self.bsdf)),
+            false => Err("spectrum: glass takes none; remove it".into()),
         }
     }
+}
+
+/// What rows hold at a wavelength: in between linearly, beyond the ends as at them. `None` without rows.
+pub(crate) fn interpolated<const N: usize>(
+    rows: &[SpectrumPoint],
+    nm: f32,
+    row: impl Fn(&SpectrumPoint) -> [f32; N],
+) -> Option<[f32; N]> {
+    let after = rows.partition_point(|p| p.nm <= nm);
+    match (after.checked_sub(1), rows.get(after)) {
+        (None, first) => first.map(row),
+        (Some(last), None) => Some(row(&rows[last])),
+        (Some(before), Some(b)) => {
+            let a = &rows[before];
+            let t = (nm - a.nm) / (b.nm - a.nm);
+            let (a, b) = (row(a), row(b));
+            Some(std::array::from_fn(|k| a[k] + (b[k] - a[k]) * t))
+        }
+    }
+}
+
+/// Physical limits of rows, of a material or of a part alone; the message says what was expected.
+pub(crate) fn check_points(rows: &[SpectrumPoint], bsdf: Option<Bsdf>) -> Result<(), String> {
+    let unit = 0.0..=1.0;
+    let (least, most) = WAVELENGTHS_NM;
+    for (k, p) in rows.iter().enumerate() {
+        let fail = |what: String| Err(format!("spectrum[{k}].{what}"));
+        if !(least..=most).contains(&p.nm) {
+            return fail(format!("nm = {} lies outside [{least}, {most}]", p.nm));
+        }
+        if k > 0 && p.nm <= rows[k - 1].nm {
+            return fail(format!("nm = {} does not ascend", p.nm));
+        }
+        if !unit.contains(&p.reflectance) {
+            return fail(format!(
+                "reflectance = {} lies outside [0, 1]",
+                p.reflectance
+            ));
+        }
+        match (p.specular_reflectance, bsdf) {
+            (None, _) => {}
+            (Some(r), Some(Bsdf::Mixed { .. })) if unit.contains(&r) => {}
+            (Some(r), Some(Bsdf::Mixed { .. })) => {
+                return fail(format!("specular_reflectance = {r} lies outside [0, 1]"));
+            }
+            (Some(_), _) => {
+                return fail(
+                    "specular_reflectance is of mixed materials alone; give reflectance".into(),
+                );
+            }
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! What several tests of files need.
 
 use picofarm_scene::{
-    Bsdf, Distribution, Scene, Texture, Wrap,
+    Bsdf, Distribution, Scene, SpectrumPoint, Texture, Wrap,
     primitive::{self, PrimitiveSettings},
 };
 use std::sync::Arc;
@@ -55,6 +55,24 @@ pub fn textured_room() -> Scene {
                 specular_reflectance: 0.9,
                 weight: 0.25,
             };
+        }
+    }
+    scene
+}
+
+/// [`textured_room`] in which every material has a spectrum, mixes of both parts.
+pub fn spectral_room() -> Scene {
+    let mut scene = textured_room();
+    for (k, object) in scene.objects.iter_mut().enumerate() {
+        let mesh = Arc::make_mut(&mut object.mesh);
+        for material in &mut mesh.materials {
+            let mix = matches!(material.bsdf, Bsdf::Mixed { .. });
+            let row = |n: usize| SpectrumPoint {
+                nm: 450.1 + 151.7 * n as f32,
+                reflectance: 1.0 / (k + n + 2) as f32,
+                specular_reflectance: (mix && n != 1).then_some(1.0 / (n + 3) as f32),
+            };
+            material.spectrum = (0..4).map(row).collect();
         }
     }
     scene

@@ -1,6 +1,7 @@
 //! Writing a scene for Mitsuba 3: `scene.xml`, `meshes/*.ply` and `textures/*.png`, which
 //! `mitsuba.load_file` reads and [`crate::import`] too. What Mitsuba has no words for (labels, spots,
-//! provenance, exact BSDFs) stands in a comment of the XML.
+//! provenance, exact BSDFs) stands in a comment of the XML. So do spectra, and there alone: the
+//! `<bsdf>` of a material has its colour.
 
 pub(crate) mod text;
 
@@ -193,6 +194,13 @@ impl Writer<'_> {
             );
             self.notes.push(what);
         }
+        if !material.spectrum.is_empty() {
+            let what = format!(
+                "material {:?}: its spectrum stands in the comment alone, Mitsuba renders its colour",
+                material.name
+            );
+            self.notes.push(what);
+        }
         self.text.push_str(&written.text);
         self.text.push('\n');
         let extras = MaterialExtras {
@@ -201,6 +209,7 @@ impl Writer<'_> {
             rgb: material.rgb,
             two_sided: material.two_sided,
             texture,
+            spectrum: material.spectrum.clone(),
         };
         self.known.insert(id.clone(), extras);
         Ok(id)

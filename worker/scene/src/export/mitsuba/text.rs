@@ -6,7 +6,7 @@ use std::{collections::BTreeMap, fmt::Write as _, sync::Arc};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Affine, Beam, Bsdf, Camera, Distribution, Material, Texture, Vec3, Wrap,
+    Affine, Beam, Bsdf, Camera, Distribution, Material, SpectrumPoint, Texture, Vec3, Wrap,
     extras::SceneExtras,
     texture::{linear, srgb_byte},
 };
@@ -35,6 +35,8 @@ pub(crate) struct MaterialExtras {
     pub(crate) two_sided: bool,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) texture: Option<TextureExtras>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) spectrum: Vec<SpectrumPoint>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]

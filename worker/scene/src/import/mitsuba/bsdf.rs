@@ -1,17 +1,16 @@
 //! Mitsuba's BSDFs as materials.
 
-use std::{path::Path, rc::Rc, sync::Arc};
+use std::rc::Rc;
 
 use crate::{
-    Bsdf, Distribution, Material, Texture, Wrap,
+    Bsdf, Distribution, Material,
     export::mitsuba::text::{MaterialExtras, bsdf_text},
-    import::{image, read_file},
-    texture::srgb_byte,
 };
 
 use super::{
     Reader,
-    node::{Node, Value},
+    colour::{Colour, spectrum_of},
+    node::Node,
     transform::Matrix,
 };
 
@@ -43,32 +42,24 @@ pub(super) struct Look {
     pub(super) to_uv: Matrix,
 }
 
-/// A colour, or white with a texture.
-#[derive(Debug, Clone)]
-struct Colour {
-    rgb: [f32; 3],
-    texture: Option<(Arc<Texture>, Matrix)>,
-}
-
-impl Colour {
-    fn grey(level: f32) -> Self {
-        Self {
-            rgb: [level; 3],
-            texture: None,
-        }
-    }
-
-    fn mean(&self) -> f32 {
-        (self.rgb[0] + self.rgb[1] + self.rgb[2]) / 3.0
-    }
-}
-
 /// A BSDF by its two parts.
 struct Parts {
     diffuse: Option<Colour>,
     conductor: Option<(Colour, f32, Distribution)>,
     weight: f32,
     two_sided: bool,
+}
+
+impl Parts {
+    /// True for a mix of a part that has a spectrum and one that has a colour.
+    fn lack_a_spectrum(&self) -> bool {
+        let (Some(a), Some((b, ..))) = (&self.diffuse, &self.conductor) else {
+            return false;
+        };
+        let coloured = |c: &Colour| c.spectrum.is_empty() && c.rgb != [c.rgb[0]; 3];
+        let stated = |c: &Colour| !c.spectrum.is_empty();
+        stated(a) && coloured(b) || stated(b) && coloured(a)
+    }
 }
 
 impl Reader<'_> {
@@ -89,6 +80,12 @@ impl Reader<'_> {
             },
             None => {
                 let parts = self.parts(node, 0)?;
+                if parts.lack_a_spectrum() {
+                    self.note(
+                        "spectra",
+                        "parts of mixes without one reflect their mean at every wavelength",
+                    );
+                }
                 assemble(node, parts)?
             }
         };
@@ -107,6 +104,7 @@ impl Reader<'_> {
             rgb,
             two_sided,
             texture,
+            spectrum,
         } = &known;
         let texture = match texture {
             None => None,
@@ -121,12 +119,20 @@ impl Reader<'_> {
             rgb: *rgb,
             texture,
             two_sided: *two_sided,
-            spectrum: vec![],
+            spectrum: spectrum.clone(),
         };
         if bsdf_text(&node.id, &material, known.texture.as_ref()).text == node.text {
+            let checked = material.check_spectrum();
+            checked.map_err(|what| node.fail(format!("comment picofarm: {what}")))?;
             return Ok(Some(material));
         }
         self.note("materials", "edited since export; standard parameters used");
+        if !spectrum.is_empty() {
+            self.note(
+                "spectra.edited",
+                "left out of materials edited since export",
+            );
+        }
         Ok(None)
     }
 
@@ -192,6 +198,9 @@ impl Reader<'_> {
             Some(c) if c.texture.is_some() => {
                 Err(node.fail(format!("{name}: textures on glass are not supported")))
             }
+            Some(c) if !c.spectrum.is_empty() => Err(node.fail(format!(
+                "{name}: spectra on glass are not supported; use rgb"
+            ))),
             colour => Ok(colour.unwrap_or(Colour::grey(1.0))),
         };
         let reflected = self.colour(node, "specular_reflectance")?;
@@ -321,92 +330,15 @@ impl Reader<'_> {
         let mut colour = self
             .colour(node, "specular_reflectance")?
             .unwrap_or(Colour::grey(1.0));
+        if !colour.spectrum.is_empty() && fresnel != [1.0; 3] {
+            return Err(node.fail(
+                "specular_reflectance: a spectrum needs material \"none\"; of metals only three colours are known",
+            ));
+        }
         for (c, f) in colour.rgb.iter_mut().zip(fresnel) {
             *c *= f;
         }
         Ok((colour, alpha, distribution))
-    }
-
-    /// A colour parameter: numbers, or a bitmap.
-    fn colour(&mut self, node: &Node, name: &str) -> Result<Option<Colour>, String> {
-        let rgb = match node.parameters.get(name) {
-            Some(Value::Colour(rgb)) => Some(*rgb),
-            Some(Value::Number(x)) => Some([*x as f32; 3]),
-            Some(Value::Vector(v)) => Some(v.map(|x| x as f32)),
-            Some(_) => return Err(node.fail(format!("{name}: expected a colour"))),
-            None => None,
-        };
-        if let Some(rgb) = rgb {
-            return Ok(Some(Colour { rgb, texture: None }));
-        }
-        match self.children_named(node, name)?.as_slice() {
-            [] => Ok(None),
-            [texture] => {
-                let texture = self.bitmap(&texture.clone())?;
-                Ok(Some(Colour {
-                    rgb: [1.0; 3],
-                    texture: Some(texture),
-                }))
-            }
-            _ => Err(node.fail(format!("{name}: stated twice"))),
-        }
-    }
-
-    fn bitmap(&mut self, node: &Node) -> Result<(Arc<Texture>, Matrix), String> {
-        if node.kind != "bitmap" {
-            return Err(node.fail(format!(
-                "texture {:?} is not supported; use bitmap",
-                node.kind
-            )));
-        }
-        self.ignored(
-            node,
-            &["filename", "filter_type", "wrap_mode", "raw", "to_uv"],
-        );
-        let filename = node
-            .text("filename")?
-            .ok_or_else(|| node.fail("needs a filename"))?;
-        let wrap = match node.text("wrap_mode")?.unwrap_or("repeat") {
-            "repeat" => Wrap::Repeat,
-            "mirror" => Wrap::Mirror,
-            "clamp" => Wrap::Clamp,
-            other => {
-                return Err(node.fail(format!("wrap_mode: {other:?}; use repeat, mirror or clamp")));
-            }
-        };
-        if node.text("filter_type")? == Some("nearest") {
-            self.note("textures.filter", "nearest; bilinear used");
-        }
-        let file = self.named(node, filename)?;
-        let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-        let raw = node.switch("raw")?.unwrap_or(false);
-        let texture = self.image(node, &file, &stem, wrap, raw)?;
-        Ok((texture, node.transform("to_uv")?))
-    }
-
-    fn image(
-        &mut self,
-        node: &Node,
-        file: &Path,
-        name: &str,
-        wrap: Wrap,
-        raw: bool,
-    ) -> Result<Arc<Texture>, String> {
-        let files = self.files;
-        let decode = || {
-            let bytes = read_file(files, file).map_err(|e| e.to_string())?;
-            let texture = image::decode(name, &bytes, wrap)?;
-            if !raw {
-                return Ok(texture);
-            }
-            // `raw` texels are linear already; ours are sRGB-encoded.
-            let encoded = |t: &[u8; 3]| t.map(|c| srgb_byte(f32::from(c) / 255.0));
-            let texels = texture.texels().iter().map(encoded).collect();
-            Texture::new(name, texture.width(), texture.height(), texels, wrap)
-        };
-        self.images
-            .get((file.to_path_buf(), wrap, raw), decode)
-            .map_err(|e| node.fail(e))
     }
 }
 
@@ -452,6 +384,8 @@ fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
         },
         _ => diffuse.or(conductor),
     };
+    let specular = parts.conductor.as_ref().map(|c| &c.0);
+    let spectrum = spectrum_of(parts.diffuse.as_ref(), specular);
     let (rgb, bsdf) = match (parts.diffuse, parts.conductor) {
         (Some(d), None) => (
             d.rgb,
@@ -485,6 +419,7 @@ fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
     let mut material = Material::diffuse(named(node), rgb);
     material.bsdf = bsdf;
     material.texture = texture;
+    material.spectrum = spectrum;
     material.two_sided = parts.two_sided;
     Ok(Look { material, to_uv })
 }

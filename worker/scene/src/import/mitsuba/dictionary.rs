@@ -4,8 +4,10 @@ use std::{collections::BTreeSet, fmt, rc::Rc};
 
 use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 
+use crate::SpectrumPoint;
+
 use super::{
-    node::{Child, Node, Value, triple},
+    node::{Child, Node, Value, point, triple},
     transform::Matrix,
 };
 
@@ -208,6 +210,10 @@ fn node(json: &[(String, Json)], key: &str, at: &str) -> Result<Option<Node>, St
                         .push((name.clone(), Child::Reference(id.to_owned())));
                     continue;
                 }
+                Some("spectrum") if by_wavelength(fields) => {
+                    let value = field(fields, "value").unwrap_or(&Json::Null);
+                    Value::Spectrum(pairs(value).map_err(|e| format!("{inner}: {e}"))?)
+                }
                 Some("rgb" | "spectrum" | "srgb" | "uniform") => {
                     let value = field(fields, "value").unwrap_or(&Json::Null);
                     let colour = flat(value).and_then(|n| triple(&n));
@@ -246,6 +252,29 @@ fn flat(json: &Json) -> Result<Vec<f64>, String> {
         }
         _ => Err(EXPECTED.into()),
     }
+}
+
+/// True for a spectrum whose value starts with a pair.
+fn by_wavelength(fields: &[(String, Json)]) -> bool {
+    let Some(Json::List(items)) = field(fields, "value") else {
+        return false;
+    };
+    matches!(items.first(), Some(Json::List(pair)) if pair.len() == 2)
+}
+
+/// A list of [wavelength, value].
+fn pairs(json: &Json) -> Result<Vec<SpectrumPoint>, String> {
+    let Json::List(items) = json else {
+        return Err("expected pairs [wavelength, value]".into());
+    };
+    let pair = |item: &Json| match item {
+        Json::List(pair) => match pair[..] {
+            [Json::Number(nm), Json::Number(value)] => Ok(point(nm as f32, value as f32)),
+            _ => Err("expected pairs [wavelength, value] of numbers".into()),
+        },
+        _ => Err("expected pairs [wavelength, value] alone".into()),
+    };
+    items.iter().map(pair).collect()
 }
 
 fn array(items: &[Json]) -> Result<Value, String> {

@@ -3,8 +3,9 @@
 //! Understood: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size); shapes `ply`,
 //! `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs `diffuse`,
 //! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
-//! a diffuse and a conductor; `bitmap` textures; references, `<default>` parameters, and every transform. A shape
-//! without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
+//! a diffuse and a conductor; `bitmap` textures; `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a
+//! reflectance; references, `<default>` parameters, and every transform. A shape without BSDF is Mitsuba's default, a
+//! one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
 //! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
 //! takes its axis as it is: one of another length than 1 shears.
 //!
@@ -20,6 +21,7 @@
 //! belongs to still has the text that was written; edited elements count as they stand.
 
 mod bsdf;
+mod colour;
 mod dictionary;
 mod node;
 mod shape;
@@ -47,7 +49,7 @@ use transform::Matrix;
 
 /// Category of shapes whose id names none.
 const UNLABELLED: &str = "unlabelled";
-/// Most vertices and triangles of a scene, instances counted each.
+/// Most vertices, triangles and rows of spectra of a scene, instances counted each.
 const MAX_SIZE: usize = 1 << 28;
 
 /// Reads a scene in XML; the caller validates the result.
@@ -292,10 +294,11 @@ impl<'a> Reader<'a> {
             let label =
                 u16::try_from(label).map_err(|_| first.fail("more than 65535 categories"))?;
             let (mesh, place) = self.mesh(parts, &name, ours)?;
-            size += mesh.positions.len() + mesh.triangles.len();
+            let rows: usize = mesh.materials.iter().map(|m| m.spectrum.len()).sum();
+            size += mesh.positions.len() + mesh.triangles.len() + rows;
             if size > MAX_SIZE {
                 return Err(first.fail(format!(
-                    "more than {MAX_SIZE} vertices and triangles in all"
+                    "more than {MAX_SIZE} vertices, triangles and rows of spectra in all"
                 )));
             }
             // Equal shapes of our own files share their mesh as they did.

@@ -2,6 +2,8 @@
 
 use std::{collections::BTreeMap, rc::Rc};
 
+use crate::SpectrumPoint;
+
 use super::transform::Matrix;
 
 /// A parameter's value.
@@ -11,6 +13,8 @@ pub(super) enum Value {
     Switch(bool),
     Text(String),
     Colour([f32; 3]),
+    /// By wavelength, in the file's order; unchecked.
+    Spectrum(Vec<SpectrumPoint>),
     Vector([f64; 3]),
     Transform(Matrix),
 }
@@ -104,11 +108,35 @@ impl Node {
 pub(super) fn numbers(text: &str) -> Result<Vec<f64>, String> {
     text.split(|c: char| c == ',' || c.is_ascii_whitespace())
         .filter(|w| !w.is_empty())
-        .map(|w| match w.parse::<f32>() {
-            Ok(x) if x.is_finite() => Ok(f64::from(x)),
-            _ => Err(format!("expected a finite number, found {w:?}")),
+        .map(|w| finite(w).map(f64::from))
+        .collect()
+}
+
+fn finite(word: &str) -> Result<f32, String> {
+    match word.parse::<f32>() {
+        Ok(x) if x.is_finite() => Ok(x),
+        _ => Err(format!("expected a finite number, found {word:?}")),
+    }
+}
+
+/// `wavelength:value` pairs, separated as [`numbers`].
+pub(super) fn pairs(text: &str) -> Result<Vec<SpectrumPoint>, String> {
+    text.split(|c: char| c == ',' || c.is_ascii_whitespace())
+        .filter(|w| !w.is_empty())
+        .map(|w| match w.split_once(':') {
+            Some((nm, value)) => Ok(point(finite(nm)?, finite(value)?)),
+            None => Err(format!("expected wavelength:value, found {w:?}")),
         })
         .collect()
+}
+
+/// What is reflected at one wavelength.
+pub(super) fn point(nm: f32, reflectance: f32) -> SpectrumPoint {
+    SpectrumPoint {
+        nm,
+        reflectance,
+        specular_reflectance: None,
+    }
 }
 
 /// One number for all three, or three.

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, rc::Rc};
 use roxmltree::{Document, ParsingOptions};
 
 use super::{
-    node::{Child, Node, Value, numbers, triple},
+    node::{Child, Node, Value, numbers, pairs, triple},
     transform::Matrix,
 };
 
@@ -187,6 +187,7 @@ impl<'a> Parser<'a> {
                 [x] => Value::Number(x),
                 _ => return Err(format!("expected one number, found {value:?}")),
             },
+            "spectrum" if value.contains(':') => Value::Spectrum(pairs(&value)?),
             _ => Value::Colour(colour(&value)?),
         })
     }
@@ -257,7 +258,7 @@ fn colour(text: &str) -> Result<[f32; 3], String> {
         };
     }
     if text.contains(':') {
-        return Err("spectra over wavelengths are not supported; use <rgb>".into());
+        return Err("expected 1 or 3 numbers; values by wavelength stand in <spectrum>".into());
     }
     triple(&numbers(text)?).map(|c| c.map(|x| x as f32))
 }

@@ -1,0 +1,182 @@
+//! Mitsuba's colour parameters: numbers, spectra over wavelengths, bitmaps.
+//!
+//! A spectrum becomes a material's [`Material::spectrum`](crate::Material::spectrum) as it stands. Beyond its ends it keeps its last
+//! values (in Mitsuba it is zero there).
+//! The material's `rgb` is what the spectrum has at the three primaries (611, 549 and 464 nm), by the same rule: one that
+//! lies outside the visible is grey. Its reflectance is the mean of these three, as of every other colour in Mitsuba's files.
+//! So renders without a wavelength treat it as they treat the `<rgb>` that looks like it.
+//!
+//! Of a blend of which one part alone has a spectrum, the other reflects its mean at every wavelength.
+
+use std::{path::Path, sync::Arc};
+
+use crate::{
+    SpectrumPoint, Texture, Wrap,
+    import::{image, read_file},
+    spectrum::{PRIMARIES_NM, check_points, interpolated},
+    texture::srgb_byte,
+};
+
+use super::{
+    Reader,
+    node::{Node, Value},
+    transform::Matrix,
+};
+
+/// A colour, by wavelength if stated so; or white with a texture.
+#[derive(Debug, Clone)]
+pub(super) struct Colour {
+    pub(super) rgb: [f32; 3],
+    /// Empty where the file states numbers alone.
+    pub(super) spectrum: Vec<SpectrumPoint>,
+    pub(super) texture: Option<(Arc<Texture>, Matrix)>,
+}
+
+impl Colour {
+    pub(super) fn grey(level: f32) -> Self {
+        Self {
+            rgb: [level; 3],
+            spectrum: vec![],
+            texture: None,
+        }
+    }
+
+    pub(super) fn mean(&self) -> f32 {
+        (self.rgb[0] + self.rgb[1] + self.rgb[2]) / 3.0
+    }
+
+    /// A spectrum, with the colour that it has.
+    fn by_wavelength(spectrum: Vec<SpectrumPoint>) -> Self {
+        let [blue, green, red] = PRIMARIES_NM.map(|nm| reflectance(&spectrum, nm).unwrap_or(0.0));
+        Self {
+            rgb: [red, green, blue],
+            spectrum,
+            texture: None,
+        }
+    }
+
+    /// What it reflects at a wavelength: its mean, where the file states numbers alone.
+    fn at(&self, nm: f32) -> f32 {
+        reflectance(&self.spectrum, nm).unwrap_or(self.mean())
+    }
+}
+
+fn reflectance(spectrum: &[SpectrumPoint], nm: f32) -> Option<f32> {
+    interpolated(spectrum, nm, |p| [p.reflectance]).map(|[r]| r)
+}
+
+/// The spectrum of a material by those of its parts; of a mix, at the wavelengths of both.
+pub(super) fn spectrum_of(
+    diffuse: Option<&Colour>,
+    conductor: Option<&Colour>,
+) -> Vec<SpectrumPoint> {
+    let (diffuse, conductor) = match (diffuse, conductor) {
+        (Some(diffuse), Some(conductor)) => (diffuse, conductor),
+        (one, other) => {
+            let part = one.or(other);
+            return part.map_or(vec![], |c| c.spectrum.clone());
+        }
+    };
+    let both = diffuse.spectrum.iter().chain(&conductor.spectrum);
+    let mut all: Vec<f32> = both.map(|p| p.nm).collect();
+    all.sort_by(f32::total_cmp);
+    all.dedup();
+    let row = |nm| SpectrumPoint {
+        nm,
+        reflectance: diffuse.at(nm),
+        specular_reflectance: reflectance(&conductor.spectrum, nm),
+    };
+    all.into_iter().map(row).collect()
+}
+
+impl Reader<'_> {
+    /// A colour parameter: numbers, a spectrum, or a bitmap.
+    pub(super) fn colour(&mut self, node: &Node, name: &str) -> Result<Option<Colour>, String> {
+        let rgb = match node.parameters.get(name) {
+            Some(Value::Colour(rgb)) => Some(*rgb),
+            Some(Value::Number(x)) => Some([*x as f32; 3]),
+            Some(Value::Vector(v)) => Some(v.map(|x| x as f32)),
+            Some(Value::Spectrum(spectrum)) => {
+                let checked = check_points(spectrum, None);
+                checked.map_err(|what| node.fail(format!("{name}: {what}")))?;
+                return Ok(Some(Colour::by_wavelength(spectrum.clone())));
+            }
+            Some(_) => return Err(node.fail(format!("{name}: expected a colour"))),
+            None => None,
+        };
+        if let Some(rgb) = rgb {
+            return Ok(Some(Colour {
+                rgb,
+                ..Colour::grey(1.0)
+            }));
+        }
+        match self.children_named(node, name)?.as_slice() {
+            [] => Ok(None),
+            [texture] => {
+                let texture = self.bitmap(&texture.clone())?;
+                Ok(Some(Colour {
+                    texture: Some(texture),
+                    ..Colour::grey(1.0)
+                }))
+            }
+            _ => Err(node.fail(format!("{name}: stated twice"))),
+        }
+    }
+
+    fn bitmap(&mut self, node: &Node) -> Result<(Arc<Texture>, Matrix), String> {
+        if node.kind != "bitmap" {
+            return Err(node.fail(format!(
+                "texture {:?} is not supported; use bitmap",
+                node.kind
+            )));
+        }
+        self.ignored(
+            node,
+            &["filename", "filter_type", "wrap_mode", "raw", "to_uv"],
+        );
+        let filename = node
+            .text("filename")?
+            .ok_or_else(|| node.fail("needs a filename"))?;
+        let wrap = match node.text("wrap_mode")?.unwrap_or("repeat") {
+            "repeat" => Wrap::Repeat,
+            "mirror" => Wrap::Mirror,
+            "clamp" => Wrap::Clamp,
+            other => {
+                return Err(node.fail(format!("wrap_mode: {other:?}; use repeat, mirror or clamp")));
+            }
+        };
+        if node.text("filter_type")? == Some("nearest") {
+            self.note("textures.filter", "nearest; bilinear used");
+        }
+        let file = self.named(node, filename)?;
+        let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+        let raw = node.switch("raw")?.unwrap_or(false);
+        let texture = self.image(node, &file, &stem, wrap, raw)?;
+        Ok((texture, node.transform("to_uv")?))
+    }
+
+    pub(super) fn image(
+        &mut self,
+        node: &Node,
+        file: &Path,
+        name: &str,
+        wrap: Wrap,
+        raw: bool,
+    ) -> Result<Arc<Texture>, String> {
+        let files = self.files;
+        let decode = || {
+            let bytes = read_file(files, file).map_err(|e| e.to_string())?;
+            let texture = image::decode(name, &bytes, wrap)?;
+            if !raw {
+                return Ok(texture);
+            }
+            // `raw` texels are linear already; ours are sRGB-encoded.
+            let encoded = |t: &[u8; 3]| t.map(|c| srgb_byte(f32::from(c) / 255.0));
+            let texels = texture.texels().iter().map(encoded).collect();
+            Texture::new(name, texture.width(), texture.height(), texels, wrap)
+        };
+        self.images
+            .get((file.to_path_buf(), wrap, raw), decode)
+            .map_err(|e| node.fail(e))
+    }
+}
