@@ -8,6 +8,15 @@
 //!
 //! Files of other makers may state a laser in the extras of any node: `"laser_spots": 25` (a grid over the
 //! camera's view, or `{"random": 16}`, or `{"at": [[x, y], …]}`) or `"laser_directions": [[x, y, z], …]` in that node's frame.
+//!
+//! They may also state what a material reflects by wavelength, in that material's extras (custom properties in Blender):
+//! `"spectrum": [{"nm": 532, "reflectance": 0.3}, {"nm": 905, "reflectance": 0.7}]`, by ascending wavelength in nanometres.
+//! Metals in part may have a `specular_reflectance` beside each reflectance, for their conductor. Colour and BSDF stay those of
+//! the standard parameters: only renders of stated wavelengths look at a spectrum.
+//!
+//! Our own material extras count while metalness and roughness are as we wrote them. Where someone edited these, the
+//! spectrum in our extras is left out with the BSDF, and a note says so. A `spectrum` outside `picofarm` always counts, in files
+//! of ours too.
 
 use picofarm_settings::Spots;
 use serde::{Deserialize, Serialize};
@@ -34,6 +43,12 @@ pub(crate) struct MaterialExtras {
     pub(crate) bsdf: Bsdf,
     pub(crate) two_sided: bool,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(crate) spectrum: Vec<SpectrumPoint>,
+}
+
+/// What anyone may state in a material's extras.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub(crate) struct StatedSpectrum {
     pub(crate) spectrum: Vec<SpectrumPoint>,
 }
 

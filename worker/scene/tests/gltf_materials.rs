@@ -7,7 +7,7 @@ use std::{io::Cursor, path::Path};
 
 use common::data_uri;
 use image::{ImageFormat, RgbImage};
-use picofarm_scene::{Bsdf, Distribution, Scene, SceneError, Wrap, import};
+use picofarm_scene::{Bsdf, Distribution, Scene, SceneError, SpectrumPoint, Wrap, export, import};
 
 /// Left half `a`, right half `b`.
 fn picture(format: ImageFormat, a: [u8; 3], b: [u8; 3]) -> Vec<u8> {
@@ -221,4 +221,132 @@ fn what_lets_light_through_is_thin_glass() {
             "extensions":{"KHR_materials_transmission":{"transmissionFactor":1}}}"#,
     );
     assert!(matches!(metal.bsdf, Bsdf::RoughConductor { .. }));
+}
+
+fn point(nm: f32, reflectance: f32) -> SpectrumPoint {
+    SpectrumPoint {
+        nm,
+        reflectance,
+        specular_reflectance: None,
+    }
+}
+
+#[test]
+fn anyone_may_state_a_spectrum_in_a_materials_extras() {
+    let text = |metallic: f32, rows: &str| {
+        let material = format!(
+            r#"{{"extras":{{"price":3,"spectrum":{rows}}},"pbrMetallicRoughness":{{"baseColorFactor":[0.1,0.2,0.3,1],
+            "metallicFactor":{metallic},"roughnessFactor":0.5}}}}"#
+        );
+        file(&material, "")
+    };
+    let rows = r#"[{"nm":532,"reflectance":0.3},{"nm":904.6,"reflectance":0.7}]"#;
+    let scene = read(text(0.0, rows));
+    let material = &scene.objects[0].mesh.materials[0];
+    assert_eq!(material.spectrum, [point(532.0, 0.3), point(904.6, 0.7)]);
+    assert_eq!(material.rgb, [0.1, 0.2, 0.3]);
+    assert_eq!(material.at(1550.0).lambertian, 0.7);
+
+    let rows = r#"[{"nm":905,"reflectance":0.7,"specular_reflectance":0.9}]"#;
+    let scene = read(text(0.5, rows));
+    let at = scene.objects[0].mesh.materials[0].at(905.0);
+    assert_eq!((at.lambertian, at.conductor), (0.7, 0.9));
+
+    // Extras of another shape are none of our business.
+    for extras in ["[[1]]", "\"spectrum\"", "{\"colour\":1}"] {
+        let scene = read(file(&format!(r#"{{"extras":{extras}}}"#), ""));
+        assert_eq!(scene.objects[0].mesh.materials[0].spectrum, []);
+    }
+}
+
+#[test]
+fn spectra_that_cannot_be_are_refused_by_material() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (rows, expected) in [
+        ("0.5", "expected [{\"nm\": 905, \"reflectance\": 0.7}, …]"),
+        ("[905,0.7]", "expected [{\"nm\": 905"),
+        (r#"[{"nm":905}]"#, "missing field `reflectance`"),
+        (r#"[{"nm":905,"value":1}]"#, "unknown field `value`"),
+        (r#"[{"nm":905,"reflectance":"x"}]"#, "expected f32"),
+        (
+            r#"[{"nm":905,"reflectance":1.5}]"#,
+            "spectrum[0].reflectance = 1.5 lies outside [0, 1]",
+        ),
+        (
+            r#"[{"nm":90,"reflectance":0.5}]"#,
+            "spectrum[0].nm = 90 lies outside [200, 20000]",
+        ),
+        (
+            r#"[{"nm":905,"reflectance":0.5},{"nm":532,"reflectance":0.5}]"#,
+            "spectrum[1].nm = 532 does not ascend",
+        ),
+        (
+            r#"[{"nm":905,"reflectance":0.5,"specular_reflectance":0.5}]"#,
+            "specular_reflectance is of mixed materials alone",
+        ),
+    ] {
+        let material = format!(r#"{{"extras":{{"spectrum":{rows}}}}}"#);
+        let error = read_in(folder.path(), file(&material, ""))
+            .expect_err(rows)
+            .to_string();
+        assert!(
+            error.contains("scene.gltf: materials[0].extras.spectrum") && error.contains(expected),
+            "{error}"
+        );
+    }
+    let glass = r#"{"alphaMode":"BLEND","pbrMetallicRoughness":{"baseColorFactor":[1,1,1,0.25]},
+        "extras":{"spectrum":[{"nm":905,"reflectance":0.5}]}}"#;
+    let error = read_in(folder.path(), file(glass, ""))
+        .expect_err("glass")
+        .to_string();
+    assert!(
+        error.contains("materials[0].extras.spectrum: glass takes none"),
+        "{error}"
+    );
+    let ours = r#"{"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},"extras":{"picofarm":{
+        "bsdf":{"type":"diffuse","reflectance":0.5},"two_sided":true,"spectrum":[{"nm":905,"reflectance":-1}]}}}"#;
+    let error = read_in(folder.path(), file(ours, ""))
+        .expect_err("ours")
+        .to_string();
+    assert!(
+        error.contains("materials[0].extras.picofarm.spectrum[0].reflectance = -1"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_spectrum_stated_beside_our_own_extras_counts_and_is_written_with_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (roughness, stated, expected) in [
+        ("1", "", vec![point(905.0, 0.1)]),
+        ("0.5", "", vec![]),
+        (
+            "1",
+            r#","spectrum":[{"nm":532,"reflectance":0.6}]"#,
+            vec![point(532.0, 0.6)],
+        ),
+        (
+            "0.5",
+            r#","spectrum":[{"nm":532,"reflectance":0.6}]"#,
+            vec![point(532.0, 0.6)],
+        ),
+        ("1", r#","spectrum":[]"#, vec![]),
+    ] {
+        let material = format!(
+            r#"{{"pbrMetallicRoughness":{{"metallicFactor":0,"roughnessFactor":{roughness}}},"extras":{{"picofarm":{{
+            "bsdf":{{"type":"diffuse","reflectance":0.5}},"two_sided":true,"spectrum":[{{"nm":905,"reflectance":0.1}}]}}{stated}}}}}"#
+        );
+        let scene = read(file(&material, ""));
+        assert_eq!(
+            scene.objects[0].mesh.materials[0].spectrum, expected,
+            "{roughness} {stated}"
+        );
+        let path = folder.path().join("ours.glb");
+        export::write_glb(&scene, &path).expect("writes");
+        let back = import::read_scene(&path).expect("reads");
+        assert_eq!(
+            back.objects[0].mesh.materials,
+            scene.objects[0].mesh.materials
+        );
+    }
 }

@@ -1,7 +1,7 @@
 //! Canonical `.glb` files come back exactly, and appear whole or not at all.
 
 use picofarm_scene::{
-    Bsdf, Scene, export,
+    Bsdf, Material, Scene, export,
     import::read_scene,
     primitive::{self, PrimitiveSettings},
 };
@@ -26,6 +26,18 @@ fn a_written_scene_reads_back_exactly() {
 #[test]
 fn textures_and_mixes_read_back_exactly() {
     comes_back(common::textured_room());
+}
+
+#[test]
+fn spectra_read_back_exactly() {
+    comes_back(common::spectral_room());
+}
+
+#[test]
+fn files_of_scenes_without_spectra_do_not_mention_them() {
+    let bytes = export::glb_bytes(&common::textured_room()).expect("valid");
+    let word = b"spectrum";
+    assert!(!bytes.windows(word.len()).any(|w| w == word));
 }
 
 fn comes_back(scene: Scene) {
@@ -95,28 +107,53 @@ fn normals_are_of_unit_length_and_do_not_change_what_is_read() {
     }
 }
 
-#[test]
-fn a_roughness_edited_elsewhere_takes_effect() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let path = folder.path().join("edited.glb");
-    let bytes = export::glb_bytes(&scene()).expect("valid");
+/// The scene as a file in which another program gave the mirror a roughness of 0.5.
+fn edited(scene: &Scene) -> Vec<u8> {
+    let mut bytes = export::glb_bytes(scene).expect("valid");
     let factor = b"\"roughnessFactor\":0.1}";
     let at = bytes
         .windows(factor.len())
         .position(|w| w == factor)
         .expect("the mirror's roughness");
-    let mut edited = bytes.clone();
-    edited[at + 18..at + 21].copy_from_slice(b"0.5");
-    std::fs::write(&path, edited).expect("writes");
-    let back = read_scene(&path).expect("reads");
-    let alpha = back
-        .objects
-        .iter()
-        .flat_map(|o| &o.mesh.materials)
-        .find_map(|m| match m.bsdf {
-            Bsdf::RoughConductor { alpha, .. } => Some(alpha),
-            _ => None,
-        });
-    assert_eq!(alpha, Some(0.25));
-    assert!(back.provenance.notes.contains_key("import.materials"));
+    bytes[at + 18..at + 21].copy_from_slice(b"0.5");
+    bytes
+}
+
+fn read_bytes(bytes: &[u8]) -> Scene {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("edited.glb");
+    std::fs::write(&path, bytes).expect("writes");
+    read_scene(&path).expect("reads")
+}
+
+fn mirrors(scene: &Scene) -> Vec<&Material> {
+    let all = scene.objects.iter().flat_map(|o| &o.mesh.materials);
+    all.filter(|m| matches!(m.bsdf, Bsdf::RoughConductor { .. }))
+        .collect()
+}
+
+#[test]
+fn a_roughness_edited_elsewhere_takes_effect() {
+    let back = read_bytes(&edited(&scene()));
+    let Bsdf::RoughConductor { alpha, .. } = mirrors(&back)[0].bsdf else {
+        panic!("a conductor");
+    };
+    assert_eq!(alpha, 0.25);
+    let notes = back.provenance.notes;
+    assert!(notes.contains_key("import.materials"));
+    assert!(!notes.contains_key("import.spectra.edited"));
+}
+
+#[test]
+fn a_roughness_edited_elsewhere_drops_the_spectrum_with_a_note() {
+    let scene = common::spectral_room();
+    assert_eq!(mirrors(&scene).len(), 1);
+    let back = read_bytes(&edited(&scene));
+    assert_eq!(mirrors(&back)[0].spectrum, []);
+    assert!(back.provenance.notes.contains_key("import.spectra.edited"));
+    let kept = |s: &Scene| {
+        let all = s.objects.iter().flat_map(|o| &o.mesh.materials);
+        all.filter(|m| !m.spectrum.is_empty()).count()
+    };
+    assert_eq!(kept(&back), kept(&scene) - 1);
 }

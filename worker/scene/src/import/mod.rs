@@ -67,14 +67,14 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 /// α = roughness², metals in part a mix, everything else Lambertian with the base colour, all two-sided; base
 /// colour textures are read. The camera is the first camera node; its image gets 64 rows (see
 /// [`crate::Intrinsics::resized`]). The laser comes from `laser_spots` or `laser_directions` in a node's extras,
-/// or from `options`.
+/// or from `options`. A material's extras may state its `spectrum`.
 ///
 /// Of Mitsuba 3, this is understood: sensor `perspective`; shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and
 /// `sphere`; BSDFs `diffuse`, `roughconductor`, `conductor`, `twosided`, and `blendbsdf` of a diffuse and a
-/// conductor; `bitmap` textures. Beams are emitters `projector` of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°)
-/// that start at one place; a shape's category is its id up to the first `.`. A PLY needs camera and laser from
-/// `options`. Whatever a format holds that our scenes do not is named in the provenance's notes, under keys that
-/// start with `import.`, or refused.
+/// conductor; `bitmap` textures, and spectra over wavelengths as reflectances. Beams are emitters `projector` of
+/// `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one place; a shape's category is its id up to the
+/// first `.`. A PLY needs camera and laser from `options`. Whatever a format holds that our scenes do not is named in
+/// the provenance's notes, under keys that start with `import.`, or refused.
 ///
 /// # Errors
 /// [`SceneError::Read`] for a file (also a buffer file) that cannot be read, [`SceneError::Refused`] for one outside

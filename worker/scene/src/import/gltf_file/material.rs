@@ -6,15 +6,15 @@ use std::path::Path;
 use gltf::{image::Source, material::AlphaMode, texture::WrappingMode};
 
 use crate::{
-    Bsdf, Distribution, Material, SceneError, Texture, Wrap,
-    extras::{MaterialExtras, metallic_roughness},
+    Bsdf, Distribution, Material, SceneError, SpectrumPoint, Texture, Wrap,
+    extras::{MaterialExtras, StatedSpectrum, metallic_roughness},
     import::{
         buffers::{buffer_file, data_uri},
         format_error, image, read_file,
     },
 };
 
-use super::{Walk, keyed};
+use super::{Walk, keyed, under};
 
 /// Standard parameters closer than this to those we would write leave our extras in force.
 const SAME_FACTOR: f32 = 1e-3;
@@ -22,6 +22,8 @@ const SAME_FACTOR: f32 = 1e-3;
 const PURE: f32 = 0.01;
 /// Specular factors up to this are the coat of an ordinary dielectric.
 const DIELECTRIC: f32 = 0.08;
+/// What a spectrum in extras looks like.
+const SPECTRUM: &str = r#"[{"nm": 905, "reflectance": 0.7}, …], by ascending nm"#;
 /// Extensions whose content is used, or noted by name below.
 const KNOWN: [&str; 9] = [
     "KHR_texture_transform",
@@ -115,6 +117,14 @@ impl Walk<'_> {
                 "KHR_materials_ior and _specular: opaque dielectrics are Lambertian",
             );
         }
+        let mut extras = format!("{at}.extras");
+        match self.stated_spectrum(file, &extras)? {
+            Some(spectrum) => material.spectrum = spectrum,
+            None => extras += ".picofarm",
+        }
+        material
+            .check_spectrum()
+            .map_err(|what| format_error(self.path, format!("{extras}.{what}")))?;
         match standard.texture {
             Some(_) if material.is_glass() => self.note("glass.textures", "left out"),
             Some(info) if has_uv => {
@@ -127,6 +137,22 @@ impl Walk<'_> {
             None => {}
         }
         Ok(material)
+    }
+
+    /// The spectrum that anyone may state in a material's extras; unchecked.
+    fn stated_spectrum(
+        &self,
+        file: &gltf::Material<'_>,
+        extras: &str,
+    ) -> Result<Option<Vec<SpectrumPoint>>, SceneError> {
+        let raw = file.extras().as_deref().map(|r| r.get());
+        let fail = |e| {
+            let what = format!("{extras}.spectrum: {e}; expected {SPECTRUM}");
+            format_error(self.path, what)
+        };
+        let stated: Option<StatedSpectrum> = under(self.path, extras, raw, "spectrum")
+            .and_then(|raw| raw.map(serde_json::from_str).transpose().map_err(fail))?;
+        Ok(stated.map(|s| s.spectrum))
     }
 
     /// What our own extras say of a material, where its standard factors are as we wrote them.
@@ -153,6 +179,12 @@ impl Walk<'_> {
             && (roughness - pbr.roughness_factor()).abs() < SAME_FACTOR;
         if !same {
             self.note("materials", "edited since export; standard factors used");
+            if !ours.spectrum.is_empty() {
+                self.note(
+                    "spectra.edited",
+                    "left out of materials edited since export",
+                );
+            }
         }
         Ok(same.then_some(ours))
     }

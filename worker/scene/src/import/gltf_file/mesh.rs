@@ -12,7 +12,8 @@ use crate::{Mesh, SceneError, Vec3, import::format_error};
 
 use super::{Walk, material::Coordinates};
 
-/// Most vertices and corners that one file may place in its meshes: accessors can be used many times over.
+/// Most vertices and corners that one file may place in its meshes, rows of spectra included: accessors and materials can be
+/// used many times over.
 const MAX_CORNERS: usize = 1 << 28;
 
 /// What decides whether primitives can share vertices: accessor of the positions, that of the texture
@@ -76,6 +77,7 @@ impl Walk<'_> {
                 Some(&slot) => slot,
                 None => {
                     let read = self.material(&material, uv_accessor.is_some())?;
+                    self.corners += read.spectrum.len();
                     mesh.materials.push(read);
                     let slot = mesh.materials.len() as u32 - 1;
                     material_index.insert((material.index(), uv_accessor.is_some()), slot);

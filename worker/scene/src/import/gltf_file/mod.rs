@@ -172,18 +172,28 @@ fn keyed<T: DeserializeOwned>(
     field: &str,
     raw: Option<&str>,
 ) -> Result<Option<T>, SceneError> {
+    let Some(raw) = under(path, field, raw, "picofarm")? else {
+        return Ok(None);
+    };
+    // From the text again: a generic JSON value would round f32 numbers twice.
+    serde_json::from_str::<Keyed<T>>(raw)
+        .map(|k| Some(k.picofarm))
+        .map_err(|e| format_error(path, format!("{field}: {e}")))
+}
+
+/// The text of `extras` that hold a key; `None` where they are absent or hold others.
+fn under<'r>(
+    path: &Path,
+    field: &str,
+    raw: Option<&'r str>,
+    key: &str,
+) -> Result<Option<&'r str>, SceneError> {
     let Some(raw) = raw else { return Ok(None) };
     let value: serde_json::Value = match serde_json::from_str(raw) {
         Ok(value) => value,
         Err(e) => return Err(format_error(path, format!("{field}: {e}"))),
     };
-    if value.get("picofarm").is_none() {
-        return Ok(None);
-    }
-    // From the text again: a generic JSON value would round f32 numbers twice.
-    serde_json::from_str::<Keyed<T>>(raw)
-        .map(|k| Some(k.picofarm))
-        .map_err(|e| format_error(path, format!("{field}: {e}")))
+    Ok(value.get(key).is_some().then_some(raw))
 }
 
 struct Walk<'a> {
