@@ -132,7 +132,8 @@ fn survives(folder: &Path, name: &str, bytes: &[u8]) -> Result<(), TestCaseError
 const DICTIONARY: &str = r#"{"type":"scene","sensor":{"type":"perspective","fov":90,"to_world":[[1,0,0,0],[0,1,0,0],[0,0,1,-3],[0,0,0,1]],
  "film":{"type":"hdrfilm","width":64,"height":64}},"white":{"type":"twosided","inner":{"type":"blendbsdf","weight":0.3,
  "a":{"type":"diffuse","reflectance":{"type":"rgb","value":[0.5,0.6,0.7]}},"b":{"type":"roughconductor","material":"none","alpha":0.1}}},
- "wall":{"type":"rectangle","bsdf":{"type":"ref","id":"white"}},"ball":{"type":"sphere","center":[0,0,1],"radius":0.3},
+ "paint":{"type":"diffuse","reflectance":{"type":"spectrum","value":[[450,0.25],[550,0.5],[905,0.75]]}},
+ "wall":{"type":"rectangle","bsdf":{"type":"ref","id":"white"}},"ball":{"type":"sphere","center":[0,0,1],"radius":0.3,"bsdf":{"type":"ref","id":"paint"}},
  "part":{"type":"obj","filename":"part.obj"},"beam":{"type":"projector","fov":0.2}}"#;
 
 const ASCII_PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
@@ -156,7 +157,7 @@ const FILES: [&str; 7] = [
 fn files() -> &'static [Vec<u8>] {
     static ALL: OnceLock<Vec<Vec<u8>>> = OnceLock::new();
     ALL.get_or_init(|| {
-        let mut scene = common::textured_room();
+        let mut scene = common::spectral_room();
         // Small files, so that damage hits what matters.
         scene.objects.truncate(4);
         let folder = tempfile::tempdir().expect("a folder");
@@ -185,7 +186,7 @@ fn files() -> &'static [Vec<u8>] {
 /// A folder with everything that the scenes refer to.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut scene = common::textured_room();
+    let mut scene = common::spectral_room();
     scene.objects.truncate(4);
     export::write_mitsuba(&scene, &folder.path().join("room.xml")).expect("writes");
     std::fs::write(folder.path().join("part.obj"), OBJ).expect("writes");
