@@ -19,7 +19,7 @@ use picofarm_scene::{
     import::{self, ImportOptions},
 };
 use picofarm_transient::{
-    Budget, ClassVariance, Forecast, Progress, RenderError, Rendered, Settings,
+    Budget, ClassVariance, Forecast, Progress, RenderError, Rendered, Settings, Wavelengths,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
@@ -81,6 +81,8 @@ impl Order {
             max_bounces: args.max_bounces.unwrap_or(0),
             beam: args.beam.width(),
             fill_factor: args.fill_factor.unwrap_or(1.0),
+            wavelengths_nm: Wavelengths::of(&args.wavelengths_nm)
+                .map_err(|(at, what)| CliError::input(format!("--wavelengths-nm{at}: {what}")))?,
             ..RenderSettings::default()
         };
         // As in a job: one place knows the ranges.
@@ -94,6 +96,13 @@ impl Order {
             *i = i.resized(px, px);
         }
         let wanted = groups::wanted(&args.groups, &args.group, scene.laser.beams.len())?;
+        for nm in asked.wavelengths_nm.others() {
+            let name = at_wavelength("transient", *nm);
+            if wanted.iter().any(|w| w.array == name) {
+                let what = format!("two histograms would be called {name}");
+                return Err(CliError::input(what).hint("give that --group another name"));
+            }
+        }
         let settings = Settings {
             gate: asked.gate(),
             budget: asked.budget,
@@ -105,6 +114,7 @@ impl Order {
             strategy: choices::together(&args.strategy)?,
             beam: asked.beam,
             fill_factor: asked.fill_factor,
+            wavelengths_nm: asked.wavelengths_nm,
         };
         Ok(Self {
             scene,
@@ -183,12 +193,12 @@ pub async fn render(args: SceneRender, output: Output) -> Result<()> {
         e => CliError::input(e),
     })?;
     let seconds = start.elapsed().as_secs_f64();
-    let subsets = subsets(&mut rendered, &order.wanted);
+    let beside = beside(&mut rendered, &order);
     if args.seconds.is_some() {
         // What was done, so that it can be done again.
         order.settings.budget = Budget::Samples(rendered.error.samples);
     }
-    write(&args.out, &order, &rendered, &subsets)?;
+    write(&args.out, &order, &rendered, &beside)?;
     let (e, threads) = (&rendered.error, order.threads);
     let arrays: Vec<&str> = order.wanted.iter().map(|w| w.array.as_str()).collect();
     output.result(
@@ -354,24 +364,59 @@ pub fn free_folder(out: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Takes the groups out of the render, one run of values for each array. Each group is let go as soon as it is copied,
-/// so that histograms of a hundred spots never lie in memory twice.
-fn subsets(rendered: &mut Rendered, wanted: &[Wanted]) -> Vec<Vec<f32>> {
-    let mut groups = std::mem::take(&mut rendered.groups).into_iter();
-    let one = rendered.transient.len();
-    let join = |wanted: &Wanted| {
-        if !wanted.per_spot {
-            return groups.next().unwrap_or_default();
-        }
-        let count = wanted.groups.len();
-        let mut all = Vec::with_capacity(count * one);
-        groups.by_ref().take(count).for_each(|g| all.extend(g));
-        all
-    };
-    wanted.iter().map(join).collect()
+/// A histogram beside the main one.
+struct Beside {
+    array: String,
+    per_spot: bool,
+    nm: Option<f64>,
+    data: Vec<f32>,
 }
 
-fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Result<()> {
+/// The name of an array at a wavelength.
+fn at_wavelength(array: &str, nm: f64) -> String {
+    format!("{array}_{}nm", nm.to_string().replace('.', "_"))
+}
+
+/// Takes the groups and the other wavelengths out of the render, one run of values for each array. Each group is let go as soon as
+/// it is copied, so that histograms of a hundred spots never lie in memory twice.
+fn beside(rendered: &mut Rendered, order: &Order) -> Vec<Beside> {
+    let one = rendered.transient.len();
+    let subsets = |groups: Vec<Vec<f32>>, nm: Option<f64>| {
+        let mut groups = groups.into_iter();
+        let join = move |wanted: &Wanted| Beside {
+            array: match nm {
+                None => wanted.array.clone(),
+                Some(nm) => at_wavelength(&wanted.array, nm),
+            },
+            per_spot: wanted.per_spot,
+            nm,
+            data: if wanted.per_spot {
+                let count = wanted.groups.len();
+                let mut all = Vec::with_capacity(count * one);
+                groups.by_ref().take(count).for_each(|g| all.extend(g));
+                all
+            } else {
+                groups.next().unwrap_or_default()
+            },
+        };
+        order.wanted.iter().map(join).collect::<Vec<_>>()
+    };
+    let main = order.settings.wavelengths_nm.nm().first().copied();
+    let mut all = subsets(std::mem::take(&mut rendered.groups), None);
+    all.iter_mut().for_each(|b| b.nm = main);
+    for other in std::mem::take(&mut rendered.others) {
+        all.push(Beside {
+            array: at_wavelength("transient", other.nm),
+            per_spot: false,
+            nm: Some(other.nm),
+            data: other.transient,
+        });
+        all.extend(subsets(other.groups, Some(other.nm)));
+    }
+    all
+}
+
+fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<()> {
     let Order {
         scene,
         settings,
@@ -400,14 +445,14 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
             data: &r.truth.depth,
         },
     ];
-    for (wanted, data) in wanted.iter().zip(subsets) {
-        arrays.push(match wanted.per_spot {
-            false => histogram(&wanted.array, data),
+    for b in beside {
+        arrays.push(match b.per_spot {
+            false => histogram(&b.array, &b.data),
             true => RenderArray {
-                name: &wanted.array,
+                name: &b.array,
                 shape: &each,
                 dimension_names: &["spot", "row", "column", "bin"],
-                data,
+                data: &b.data,
             },
         });
     }
@@ -425,7 +470,17 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         .iter()
         .map(|w| (w.array.clone(), json!(w.groups.concat())))
         .collect();
-    let attributes = json!({
+    let main = settings.wavelengths_nm.nm().first();
+    let wavelengths: serde_json::Map<_, _> = main
+        .map(|nm| ("transient".to_owned(), json!(nm)))
+        .into_iter()
+        .chain(
+            beside
+                .iter()
+                .filter_map(|b| Some((b.array.clone(), json!(b.nm?)))),
+        )
+        .collect();
+    let mut attributes = json!({
         "scene": scene.name,
         "provenance": scene.provenance,
         "value": "radiance reaching the pixel per unit pulse energy, averaged over its footprint, integrated over the bin; 1/(m2 sr)",
@@ -441,6 +496,9 @@ fn write(out: &Path, order: &Order, r: &Rendered, subsets: &[Vec<f32>]) -> Resul
         "plan": r.plan,
         "renderer": picofarm_transient::RENDERER_VERSION,
     });
+    if !wavelengths.is_empty() {
+        attributes["wavelengths_nm"] = json!(wavelengths);
+    }
     let attributes = attributes.as_object().expect("written as an object");
     write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
 }

@@ -63,7 +63,8 @@ pub fn template(kind: JobKind) -> String {
          # per_spot = true         # histograms of each spot alone, from the same rays: spots times the size\n\
          # strategy = {{ path_reuse = 1, mirror_images = false }}  # ways of finding light, chosen by hand\n\
          # beam = {{ diameter_mm = 4, divergence_mrad = 1 }}  # width of the laser's beams (1/e²); without it none\n\
-         # fill_factor = 0.3       # share of each pixel's area that is sensitive\n\n\
+         # fill_factor = 0.3       # share of each pixel's area that is sensitive\n\
+         # wavelengths_nm = [905, 532]  # of the laser, up to 4 in one pass; the first is that of the transient\n\n\
          [output]\n\
          store = \"picofarm-data/store\"   # a folder that every worker can reach, or s3://bucket/prefix\n\
          dataset = \"rooms\"\n\

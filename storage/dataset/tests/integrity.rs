@@ -102,6 +102,7 @@ proptest! {
             if bytes == all[key] {
                 return;
             }
+            let cut = bytes.clone();
             match harm {
                 2 => memory.delete(&path).await.unwrap(),
                 _ => memory.put(&path, bytes.into()).await.map(drop).unwrap(),
@@ -127,6 +128,12 @@ proptest! {
             if key.contains("/snapshots/") && harm == 0 && report.problems.iter().all(|p| p.object != *key) {
                 let found = opened.snapshot("v1").await.unwrap();
                 assert_eq!(found, named(&dataset, "v1").await, "a bit that means something was not named");
+                return;
+            }
+            // Metadata without their last line end say the same.
+            let says = |bytes: &[u8]| serde_json::from_slice::<serde_json::Value>(bytes).ok();
+            if key.ends_with("/zarr.json") && harm == 1 && says(&cut) == says(&all[key]) {
+                assert_eq!(said.next(), None);
                 return;
             }
             let problem = said.next().unwrap_or_else(|| panic!("{key} in {report:?}"));

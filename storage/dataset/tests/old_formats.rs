@@ -27,6 +27,7 @@ fn old_spec(profile: Profile) -> DatasetSpec {
         height: 9,
         width: 10,
         per_spot: matches!(profile, Profile::SqrtU16 { .. }),
+        wavelengths_nm: Wavelengths::NONE,
         two_bounce: false,
         ..spec(profile)
     }

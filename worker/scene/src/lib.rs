@@ -33,7 +33,7 @@ pub use laser::{Aim, Beam, Laser, Spot};
 pub use material::{Bsdf, Distribution, Material};
 pub use mesh::Mesh;
 pub use model::{Object, Provenance, Scene, SceneError};
-pub use spectrum::{AtWavelength, SpectrumPoint, WAVELENGTHS_NM};
+pub use spectrum::{AtWavelength, SpectrumPoint};
 pub use texture::{Texture, Wrap};
 pub use vec3::{Affine, Vec3};
 pub use view::{MAX_DEPTH_M, MIN_DEPTH_M};

@@ -1,5 +1,6 @@
 //! What surfaces reflect by wavelength: as a material states it, or else as its colour stands for it.
 
+use picofarm_settings::WAVELENGTHS_NM;
 use serde::{Deserialize, Serialize};
 
 use crate::{Bsdf, Material};
@@ -29,9 +30,6 @@ pub struct AtWavelength {
     /// more than makes the larger of them 1.
     pub texel: [f32; 3],
 }
-
-/// Shortest and longest wavelength that a spectrum or a render may have, nanometres.
-pub const WAVELENGTHS_NM: (f32, f32) = (200.0, 20_000.0);
 
 /// Wavelengths between which a colour stands for reflectances, nanometres.
 const VISIBLE_NM: (f32, f32) = (400.0, 700.0);
@@ -140,7 +138,7 @@ pub(crate) fn check_points(rows: &[SpectrumPoint], bsdf: Option<Bsdf>) -> Result
     let (least, most) = WAVELENGTHS_NM;
     for (k, p) in rows.iter().enumerate() {
         let fail = |what: String| Err(format!("spectrum[{k}].{what}"));
-        if !(least..=most).contains(&p.nm) {
+        if !(least..=most).contains(&f64::from(p.nm)) {
             return fail(format!("nm = {} lies outside [{least}, {most}]", p.nm));
         }
         if k > 0 && p.nm <= rows[k - 1].nm {

@@ -9,15 +9,20 @@ use crate::rng::Rng;
 
 /// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
 /// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     /// ρ/π.
     Lambertian,
     /// A rough conductor.
-    Conductor(Distribution),
+    Conductor,
     /// A Lambertian beside a rough conductor.
-    Mixed(Distribution),
+    Mixed,
 }
+
+/// Flags of a surface, one bit each.
+const TWO_SIDED: u8 = 1;
+const SPECULAR: u8 = 2;
+const GGX: u8 = 4;
 
 /// Roughness from which pixels share a conductor's vertices. There its lobe is wide enough to be weighed pixel by pixel for
 /// light that was found as if it were Lambertian; beneath, that costs more than it brings (measured at 0.12 and 0.2).
@@ -27,56 +32,97 @@ const SHARED_ALPHA: f32 = 0.15;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Surface {
     kind: Kind,
+    flags: u8,
+    /// Which tones it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = plain.
+    tone: u16,
     /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
     strength: f32,
     /// Roughness of a conductor; of others 0.
     alpha: f32,
     /// Lambertian part ρ/π of a mix times its share; of others 0.
     base: f32,
-    /// Scatters from both sides.
-    pub two_sided: bool,
-    /// Counts as a mirror (specular mask).
-    pub specular: bool,
 }
+
+const _: () = assert!(size_of::<Surface>() == 16);
 
 impl Surface {
     pub fn new(m: &Material) -> Self {
+        let ggx = match m.bsdf {
+            Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
+                distribution == Distribution::Ggx
+            }
+            Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,
+        };
+        let flag = |set: bool, flag: u8| if set { flag } else { 0 };
         let of = |kind, strength, alpha, base| Self {
             kind,
+            flags: flag(m.two_sided, TWO_SIDED)
+                | flag(m.is_specular(), SPECULAR)
+                | flag(ggx && kind != Kind::Lambertian, GGX),
+            tone: 0,
             strength,
             alpha,
             base,
-            two_sided: m.two_sided,
-            specular: m.is_specular(),
         };
         match m.bsdf {
             Bsdf::Diffuse { reflectance } => of(Kind::Lambertian, reflectance / PI, 0.0, 0.0),
             Bsdf::RoughConductor {
-                alpha,
-                distribution,
-                reflectance,
-            } => of(Kind::Conductor(distribution), reflectance, alpha, 0.0),
+                alpha, reflectance, ..
+            } => of(Kind::Conductor, reflectance, alpha, 0.0),
             Bsdf::Mixed {
                 reflectance,
                 alpha,
-                distribution,
                 specular_reflectance,
                 weight,
+                ..
             } => {
                 let strength = weight * specular_reflectance;
                 let base = (1.0 - weight) * reflectance / PI;
                 // A mix has two parts that scatter; with one it is pure.
                 if base == 0.0 {
-                    of(Kind::Conductor(distribution), strength, alpha, 0.0)
+                    of(Kind::Conductor, strength, alpha, 0.0)
                 } else if strength == 0.0 {
                     of(Kind::Lambertian, base, 0.0, 0.0)
                 } else {
-                    of(Kind::Mixed(distribution), strength, alpha, base)
+                    of(Kind::Mixed, strength, alpha, base)
                 }
             }
             // No surface: see `glass`.
             Bsdf::ThinDielectric { .. } => of(Kind::Lambertian, 0.0, 0.0, 0.0),
         }
+    }
+
+    /// The same surface with the tones of a row and the one behind it: the Lambertian part's, and the conductor's.
+    pub fn with_tone(self, row: u16) -> Self {
+        let tone = match self.kind {
+            Kind::Conductor => row + 1,
+            Kind::Lambertian | Kind::Mixed => row,
+        };
+        Self { tone, ..self }
+    }
+
+    /// Which tones it has; 0 = plain.
+    #[inline(always)]
+    pub fn tone(&self) -> u16 {
+        self.tone
+    }
+
+    /// Which tones the conductor of a mix has.
+    #[inline(always)]
+    fn gloss_tone(&self) -> u16 {
+        self.tone + u16::from(self.tone != 0)
+    }
+
+    /// Scatters from both sides.
+    #[inline(always)]
+    pub fn two_sided(&self) -> bool {
+        self.flags & TWO_SIDED != 0
+    }
+
+    /// Counts as a mirror (specular mask).
+    #[inline(always)]
+    pub fn specular(&self) -> bool {
+        self.flags & SPECULAR != 0
     }
 
     /// The same surface, scattering nothing.
@@ -110,11 +156,11 @@ impl Surface {
     pub fn white(self) -> Self {
         Self {
             kind: Kind::Lambertian,
+            flags: self.flags & TWO_SIDED,
+            tone: 0,
             strength: 1.0 / PI,
             alpha: 0.0,
             base: 0.0,
-            specular: false,
-            ..self
         }
     }
 
@@ -133,7 +179,7 @@ impl Surface {
     /// True for a mix of two parts, of which [`Surface::lobe`] chooses.
     #[inline(always)]
     pub fn is_mixed(&self) -> bool {
-        matches!(self.kind, Kind::Mixed(_))
+        matches!(self.kind, Kind::Mixed)
     }
 
     /// BRDF of a Lambertian surface, ρ/π.
@@ -151,8 +197,7 @@ impl Surface {
     /// Its conductor, if it has one, is GGX.
     #[inline(always)]
     pub fn ggx(&self) -> bool {
-        let ggx = Distribution::Ggx;
-        matches!(self.kind, Kind::Conductor(d) | Kind::Mixed(d) if d == ggx)
+        self.flags & GGX != 0
     }
 
     /// Has a conductor that is smooth enough for a mirror, alone or in a mix.
@@ -171,26 +216,28 @@ impl Surface {
     /// chance of that choice, with `specular` as for the part alone. Pure surfaces are their own part.
     #[inline]
     pub fn lobe(&self, u: f32) -> Surface {
-        let Kind::Mixed(distribution) = self.kind else {
+        if !self.is_mixed() {
             return *self;
-        };
+        }
         let total = self.strength + self.base * PI;
         if u * total < self.strength {
+            let mirror = self.alpha <= Material::SPECULAR_ALPHA;
             return Self {
-                kind: Kind::Conductor(distribution),
+                kind: Kind::Conductor,
+                flags: self.flags & !SPECULAR | if mirror { SPECULAR } else { 0 },
+                tone: self.gloss_tone(),
                 strength: total,
                 base: 0.0,
-                specular: self.alpha <= Material::SPECULAR_ALPHA,
                 ..*self
             };
         }
         Self {
             kind: Kind::Lambertian,
+            flags: self.flags & TWO_SIDED,
+            tone: self.tone,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
-            specular: false,
-            ..*self
         }
     }
 
@@ -198,12 +245,13 @@ impl Surface {
     #[inline(always)]
     pub fn gloss(self) -> Self {
         match self.kind {
-            Kind::Mixed(distribution) => Self {
-                kind: Kind::Conductor(distribution),
+            Kind::Mixed => Self {
+                kind: Kind::Conductor,
+                tone: self.gloss_tone(),
                 base: 0.0,
                 ..self
             },
-            Kind::Lambertian | Kind::Conductor(_) => self,
+            Kind::Lambertian | Kind::Conductor => self,
         }
     }
 
@@ -228,6 +276,16 @@ impl Surface {
             return self.base * co;
         }
         self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
+    }
+
+    /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.
+    #[inline]
+    pub fn parts(&self, n: Vec3, i: Vec3, o: Vec3) -> (f32, f32) {
+        let co = n.dot(o);
+        if !(n.dot(i) > 0.0 && co > 0.0) {
+            return (0.0, 0.0);
+        }
+        (self.base * co, self.gloss().scatter(n, i, o))
     }
 
     /// Draws a direction for `i`: (direction, f·cos/pdf, pdf per steradian); `None` where none leaves.

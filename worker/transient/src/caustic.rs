@@ -31,6 +31,7 @@ use crate::{
     light_vertices::{ALONE, LightVertex, LightVertices},
     mirror_images::Mirrors,
     rng::{Rng, Stream},
+    spectra::{Tone, times},
     world::{Hit, World, lift},
 };
 
@@ -78,6 +79,8 @@ pub(crate) struct Splat {
     pub slot: u32,
     /// Emitter.
     pub spot: u16,
+    /// Of which wavelength.
+    pub wavelength: u8,
     /// Radiance averaged over the pixel, render units.
     pub value: f32,
     /// Bounces of the whole path.
@@ -97,6 +100,7 @@ struct Start {
     hit: Hit,
     back: Vec3,
     flux: f32,
+    tone: Tone,
     path_m: f64,
 }
 
@@ -162,7 +166,7 @@ impl Caustics {
                 let w = to.normalized();
                 let cos = -world.normals[t as usize].dot(w);
                 let surface = &world.surfaces[world.surface[t as usize] as usize];
-                let cos = if surface.two_sided {
+                let cos = if surface.two_sided() {
                     cos.abs()
                 } else {
                     cos.max(0.0)
@@ -240,6 +244,7 @@ impl Caustics {
             mut hit,
             back: mut wo,
             mut flux,
+            mut tone,
             mut path_m,
         } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
@@ -258,19 +263,20 @@ impl Caustics {
                 weight /= survive;
             }
             flux *= weight;
+            tone = times(tone, world.tone(&hit, wo, w));
             let Some(mut next) = world.closest(stack, lift(hit.p, hit.n), w) else {
                 return;
             };
             next.choose_lobe(rng);
             path_m += world.metres((next.p - hit.p).length());
             flux *= next.through;
-            let before = hit.surface.specular;
+            let before = hit.surface.specular();
             (hit, wo) = (next, -w);
             bounces += 1;
             if hit.surface.is_black() || flux == 0.0 {
                 return;
             }
-            if hit.surface.specular {
+            if hit.surface.specular() {
                 continue;
             }
             // What is left by another lobe and meets no near-mirror is found from the camera's side, and a single planar
@@ -283,6 +289,7 @@ impl Caustics {
                 hit,
                 back: wo,
                 flux,
+                tone,
                 density: ALONE,
                 path_m,
                 spot,
@@ -340,7 +347,7 @@ impl Caustics {
         };
         let k = self.place[hit.triangle as usize];
         hit.choose_lobe(rng);
-        if k == NONE || !hit.surface.specular || hit.surface.is_black() {
+        if k == NONE || !hit.surface.specular() || hit.surface.is_black() {
             return None;
         }
         let e = &emitters.list[spot];
@@ -358,6 +365,7 @@ impl Caustics {
             hit,
             back: -w,
             flux,
+            tone: e.tone(world, w),
             path_m: e.path_m + world.metres(d),
         })
     }
@@ -379,13 +387,29 @@ impl Caustics {
 }
 
 /// What a light vertex sends straight to the camera. As in [`crate::one`], a point of intensity I at
-/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance.
-pub(crate) fn splat(
+/// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance. One for each wavelength
+/// that has channels of its own; none where the camera sees nothing of it.
+pub(crate) fn splat<'a>(
     world: &World,
-    film: &Film,
+    film: &'a Film,
     z: &LightVertex,
     stack: &mut Stack,
-) -> Option<Splat> {
+) -> impl Iterator<Item = Splat> + use<'a> {
+    let seen = seen(world, film, z, stack).into_iter();
+    seen.flat_map(|(splat, tone)| {
+        (0u8..)
+            .zip(tone)
+            .take(film.wavelengths)
+            .map(move |(wavelength, tone)| Splat {
+                wavelength,
+                value: splat.value * tone,
+                ..splat
+            })
+    })
+}
+
+/// The light of all wavelengths.
+fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<(Splat, Tone)> {
     let i = &world.camera.intrinsics;
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);
@@ -402,11 +426,13 @@ pub(crate) fn splat(
     let cos = q.z / d;
     let area = world.sensitive * world.sensitive;
     let value = intensity * seen * i.fx * i.fy / (d * d * cos * cos * cos) / area;
-    Some(Splat {
+    let splat = Splat {
         pixel: pixel as u32,
         slot: film.slot(z.path_m + world.metres(d)) as u32,
         spot: z.spot as u16,
+        wavelength: 0,
         value,
         bounces: z.bounces,
-    })
+    };
+    Some((splat, times(z.tone, world.tone(&z.hit, z.back, -p / d))))
 }

@@ -26,6 +26,7 @@ use crate::{
     emitter::{Emitter, Emitters},
     light_vertices::{ALONE, LightVertex, LightVertices},
     rng::Rng,
+    spectra::times,
     turns::Turns,
     world::{Hit, World, lift},
 };
@@ -154,6 +155,7 @@ impl Contacts {
             return;
         };
         flux /= turns.count();
+        let mut tone = e.tone(world, w);
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Within the zones, and what the vertex before was.
         let (mut inside, mut specular) = (true, false);
@@ -173,7 +175,7 @@ impl Contacts {
             }
             let end = match near {
                 true => Some(End::Near),
-                false if hit.surface.specular => None,
+                false if hit.surface.specular() => None,
                 // Behind a near-mirror, or found from the camera's side.
                 false if specular => Some(End::Beyond),
                 false => return,
@@ -184,6 +186,7 @@ impl Contacts {
                     hit,
                     back: -w,
                     flux,
+                    tone,
                     density: ALONE,
                     path_m,
                     spot,
@@ -202,7 +205,8 @@ impl Contacts {
                 weight /= survive;
             }
             flux *= weight;
-            specular = hit.surface.specular;
+            tone = times(tone, world.tone(&hit, -w, next));
+            specular = hit.surface.specular();
             (from, at, w) = (hit.p, lift(hit.p, hit.n), next);
         }
     }

@@ -11,6 +11,7 @@ use crate::{
     bvh::Stack,
     contact,
     lanes::{Wide, widest},
+    spectra::{PLAIN, Tone, times},
     world::{World, lift},
 };
 
@@ -50,7 +51,7 @@ fn follow(
         // Where the beam meets that facet without the lift off the mirror before it.
         hit.p = world.point(hit.triangle, from, direction);
         path += world.metres((hit.p - from).length());
-        if hit.surface.specular && !hit.surface.is_black() {
+        if hit.surface.specular() && !hit.surface.is_black() {
             let n = hit.n;
             direction = (direction - n * (2.0 * n.dot(direction))).normalized();
             from = hit.p;
@@ -109,6 +110,8 @@ pub(crate) struct Emitter {
     pub path_m: f64,
     /// Scattering on the lit side (black behind a one-sided surface), times the source's share of the beam: what glass lets through.
     pub surface: Surface,
+    /// Tone of the texture there.
+    tone: Tone,
 }
 
 impl Emitter {
@@ -127,9 +130,15 @@ impl Emitter {
         // It also knows the texture there.
         let beneath = beneath.filter(|h| (h.p - p).length() < 1e-3);
         let surface = match beneath {
-            Some(h) if !surface.two_sided && h.surface.is_black() => surface.black(),
+            Some(h) if !surface.two_sided() && h.surface.is_black() => surface.black(),
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
+        };
+        let tone = match &beneath {
+            Some(h) if material == world.surface[h.triangle as usize] => {
+                world.texel_tone(h.triangle, h.p)
+            }
+            _ => PLAIN,
         };
         let surface = match share == 1.0 {
             true => surface,
@@ -142,6 +151,7 @@ impl Emitter {
             back: -spot.arriving,
             path_m: f64::from(spot.path_m),
             surface,
+            tone,
         }
     }
 
@@ -149,6 +159,18 @@ impl Emitter {
     #[inline]
     pub fn intensity(&self, w: Vec3) -> f32 {
         self.surface.scatter(self.n, self.back, w)
+    }
+
+    /// The tone of that.
+    #[inline(always)]
+    pub fn tone(&self, world: &World, w: Vec3) -> Tone {
+        match world.has_wavelengths() {
+            false => PLAIN,
+            true => times(
+                self.tone,
+                world.surface_tone(&self.surface, self.n, self.back, w),
+            ),
+        }
     }
 }
 
@@ -364,7 +386,7 @@ impl Emitters {
         self.columns.push(e.p, e.n, strength);
         if !e.surface.diffuse() {
             self.glossy.push(index);
-            if e.surface.specular {
+            if e.surface.specular() {
                 self.on_mirror.push(index);
             }
         }

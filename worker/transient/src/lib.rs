@@ -23,6 +23,7 @@ mod render;
 mod rng;
 pub mod sensor;
 mod sink;
+mod spectra;
 mod truth;
 mod turns;
 mod two_bounce;

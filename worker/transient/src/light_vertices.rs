@@ -12,6 +12,7 @@ use crate::{
     contact::Contacts,
     emitter::{Columns, Emitters},
     rng::Rng,
+    spectra::Tone,
     world::{Hit, World, lift},
 };
 
@@ -23,6 +24,8 @@ pub(crate) struct LightVertex {
     pub back: Vec3,
     /// Flux that arrives, divided by the number of vertices drawn.
     pub flux: f32,
+    /// Tone of that flux.
+    pub tone: Tone,
     /// Density per area of drawing it, times the weight of this technique in MIS.
     pub density: f32,
     /// Optical path from the laser, metres.
@@ -77,7 +80,7 @@ impl LightVertices {
                 continue;
             }
             hit.choose_lobe(rng);
-            if weight == 0.0 || hit.surface.specular || hit.surface.is_black() {
+            if weight == 0.0 || hit.surface.specular() || hit.surface.is_black() {
                 continue;
             }
             let leg = hit.p - e.p;
@@ -87,6 +90,7 @@ impl LightVertices {
                 hit,
                 back: -w,
                 flux,
+                tone: e.tone(world, w),
                 density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,

@@ -90,7 +90,7 @@ impl Mirrors {
         for (i, t) in world.triangles.iter().enumerate() {
             let surface = &world.surfaces[world.surface[i] as usize];
             let n = world.normals[i];
-            if !surface.specular || n == Vec3::ZERO || !world.counts(i) {
+            if !surface.specular() || n == Vec3::ZERO || !world.counts(i) {
                 continue;
             }
             if i % 4096 == 0 && stop.asked() {
@@ -300,7 +300,7 @@ impl Mirror {
             high,
             alpha: surface.alpha(),
             ggx: surface.ggx(),
-            two_sided: surface.two_sided,
+            two_sided: surface.two_sided(),
             images,
             height,
         }

@@ -28,6 +28,7 @@ use crate::{
     film::Film,
     rng::{Rng, Stream},
     sink::{PixelSink, Place, Sink, Way},
+    spectra::{Light, Tone},
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::Hit,
@@ -147,6 +148,8 @@ struct Arrivals {
     bounces: Vec<u8>,
     /// Unit direction from which it arrives at a rough vertex; of others anything.
     from: Vec<Vec3>,
+    /// Empty where light has none.
+    tone: Vec<Tone>,
 }
 
 /// Adds arrivals; lengths counted from `base_m`.
@@ -164,12 +167,15 @@ struct ArrivalSink<'a> {
 
 impl Sink for ArrivalSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, way: Way) {
         let spot = self.film.tag(spot, self.place, way);
         let list = &mut *self.list;
         list.bins
             .push(((path_m - self.base_m) * self.per_metre) as f32);
-        list.value.push(self.factor * value);
+        list.value.push(self.factor * light.value);
+        if self.film.toned {
+            list.tone.push(light.tone);
+        }
         list.spot.push(spot as u16);
         list.bounces.push(bounces.min(255) as u8);
         list.from.push(self.from);
@@ -249,6 +255,7 @@ impl Sharing {
         a.spot.clear();
         a.bounces.clear();
         a.from.clear();
+        a.tone.clear();
         let size = film.pixel();
         Self::draw_lights((walk, effort), pixels.len() / size, &mut rng, scratch);
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {

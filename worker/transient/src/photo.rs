@@ -135,7 +135,7 @@ fn shade(world: &World, lamp: &Lamp, light: Vec3, stack: &mut Stack, d: Vec3) ->
         for k in 0..3 {
             tint[k] *= albedo[k] * glass[k];
         }
-        if h.surface.specular && reflection < REFLECTIONS {
+        if h.surface.specular() && reflection < REFLECTIONS {
             d = (d - h.n * (2.0 * h.n.dot(d))).normalized();
             from = lift(h.p, h.n);
             continue;

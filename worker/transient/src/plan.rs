@@ -1,5 +1,9 @@
 //! What the renderer decides to do in a scene, in words, for the scene's metadata.
 
+use std::collections::BTreeSet;
+
+use picofarm_scene::Scene;
+
 use crate::{
     api::{Plan, Settings},
     two_bounce::Sampling,
@@ -7,7 +11,12 @@ use crate::{
 };
 
 /// The plan that `render` follows.
-pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths: u32) -> Plan {
+pub(crate) fn plan(
+    scene: &Scene,
+    settings: &Settings,
+    walk: &Walk,
+    (sampling, paths): (&Sampling, u32),
+) -> Plan {
     let (mut strategies, mut approximations) = (vec![], vec![]);
     let longest = settings.max_bounces.unwrap_or(u32::MAX);
     if settings.one_bounce {
@@ -22,6 +31,20 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
             "spots of wide beams are as many points as rays; depth, masks and two-bounce times are those of the beams' middles"
                 .into(),
         );
+    }
+    if !settings.wavelengths_nm.is_empty() {
+        let nm = settings.wavelengths_nm.nm().iter();
+        let all: Vec<String> = nm.map(f64::to_string).collect();
+        strategies.push(format!("wavelengths: {} nm, in one pass", all.join(", ")));
+        let (coloured, materials) = colours(scene);
+        if coloured > 0 {
+            approximations.push(format!(
+                "{coloured} of {materials} materials state no spectrum: their colour stands for it from 400 to 700 nm, elsewhere they reflect as at the laser's own wavelength"
+            ));
+        }
+        if walk.world.has_glass() {
+            approximations.push("glass lets every wavelength through alike".into());
+        }
     }
     if settings.fill_factor != 1.0 {
         strategies.push(format!(
@@ -94,4 +117,14 @@ pub(crate) fn plan(settings: &Settings, walk: &Walk, sampling: &Sampling, paths:
         strategies,
         approximations,
     }
+}
+
+/// How many of a scene's materials, by name, state no spectrum, and how many there are, glass left out.
+fn colours(scene: &Scene) -> (usize, usize) {
+    let each = scene.objects.iter().flat_map(|o| &o.mesh.materials);
+    let all: BTreeSet<(bool, &str)> = each
+        .filter(|m| !m.is_glass())
+        .map(|m| (m.spectrum.is_empty(), m.name.as_str()))
+        .collect();
+    (all.iter().filter(|(none, _)| *none).count(), all.len())
 }

@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::film::Film;
+use crate::{film::Film, spectra::Light};
 
 /// Where on its path from the camera a contribution was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,9 +68,9 @@ pub(crate) fn class_name(class: usize) -> String {
     format!("{place}, {way}")
 }
 
-/// Takes what a walk finds: optical path in metres, value, spot, bounces of the whole path, and how it was found.
+/// Takes what a walk finds: optical path in metres, light, spot, bounces of the whole path, and how it was found.
 pub(crate) trait Sink {
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, bounces: u32, way: Way);
+    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, way: Way);
 
     /// Where contributions are found from now on.
     fn at(&mut self, place: Place);
@@ -92,10 +92,14 @@ pub(crate) struct PixelSink<'a> {
 
 impl Sink for PixelSink<'_> {
     #[inline]
-    fn add(&mut self, path_m: f64, value: f32, spot: usize, _bounces: u32, way: Way) {
+    fn add(&mut self, path_m: f64, light: Light, spot: usize, _bounces: u32, way: Way) {
         let slot = self.film.slot(path_m);
         let spot = self.film.tag(spot, self.place, way);
-        self.film.add(self.pixel, slot, self.factor * value, spot);
+        let light = Light {
+            value: self.factor * light.value,
+            ..light
+        };
+        self.film.add(self.pixel, slot, light, spot);
     }
 
     #[inline]

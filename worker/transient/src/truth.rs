@@ -77,7 +77,7 @@ pub(crate) fn ground_truth(
         let object = world.object[h.triangle as usize];
         truth.instance[k] = object + 1;
         truth.label[k] = scene.objects[object as usize].label + 1;
-        truth.specular[k] = u8::from(h.surface.specular);
+        truth.specular[k] = u8::from(h.surface.specular());
     }
     let mut rays = 0;
     for e in &emitters.list {

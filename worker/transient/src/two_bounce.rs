@@ -8,6 +8,7 @@ use crate::{
     emitter::Emitters,
     film::{Blocks, Film},
     rng::Rng,
+    spectra::{Light, PLAIN, times},
     truth::Centres,
     walk::{Scratch, Walk},
     world::{Hit, World, lift},
@@ -32,7 +33,7 @@ impl Sampling {
         let base = 4.0 * (pixel * 128.0).sqrt();
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
-                h.surface.specular
+                h.surface.specular()
                     || emitters.on_mirror.iter().any(|&e| {
                         let e = &emitters.list[e];
                         e.intensity((h.p - e.p).normalized()) > 0.0
@@ -198,20 +199,30 @@ impl Strata {
             let row = &self.found[sample * spots..(sample + 1) * spots];
             let lit = row.iter().enumerate().filter(|(_, f)| f.1 > 0.0);
             let start = ray(sample).start;
-            lit.map(move |(k, &(slot, value))| (start + k, slot as usize, value))
+            let hit = &self.hits[sample];
+            lit.map(move |(k, &(slot, value))| {
+                let mut tone = PLAIN;
+                if let Some(h) = hit.as_ref().filter(|_| film.toned) {
+                    let e = &emitters.list[start + k];
+                    let w = (e.p - h.p).normalized();
+                    let here = world.tone(h, -h.p.normalized(), w);
+                    tone = times(here, e.tone(world, -w));
+                }
+                (start + k, slot as usize, Light { value, tone })
+            })
         };
         for (block, &twice) in self.twice.iter().enumerate() {
             for corner in 0..4 {
                 let half = corner == twice as usize;
-                for (spot, slot, value) in found(4 * block + corner) {
+                for (spot, slot, light) in found(4 * block + corner) {
                     match half {
-                        true => blocks.add_half(film, slot, value, 1.0, spot),
-                        false => blocks.add(film, slot, value, spot),
+                        true => blocks.add_half(film, slot, light, 1.0, spot),
+                        false => blocks.add(film, slot, light, spot),
                     }
                 }
             }
-            for (spot, slot, value) in found(count + block) {
-                blocks.add_half(film, slot, value, -1.0, spot);
+            for (spot, slot, light) in found(count + block) {
+                blocks.add_half(film, slot, light, -1.0, spot);
             }
             blocks.finish(if rng.uniform() < 0.5 { 1.0 } else { -1.0 });
         }

@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use crate::world::Hit;
+use crate::{spectra::Tone, world::Hit};
 
 /// A vertex of a path from the camera.
 #[derive(Debug, Clone, Copy)]
@@ -12,6 +12,8 @@ pub(crate) struct Vertex {
     pub wo: Vec3,
     /// Product of scattering and sampling weights up to here.
     pub beta: f32,
+    /// Tone of that product.
+    pub tone: Tone,
     /// Optical path from where the walk is counted, metres.
     pub length_m: f64,
     /// Bounces up to and with this vertex.
@@ -27,7 +29,7 @@ impl Vertex {
     /// camera sees directly, or before which another such vertex comes.
     #[inline]
     pub fn open(&self) -> bool {
-        let directly = !self.hit.surface.specular && !self.after_mirror;
+        let directly = !self.hit.surface.specular() && !self.after_mirror;
         directly || self.open_before
     }
 }

@@ -17,6 +17,7 @@ use crate::{
     mirror_images::Mirrors,
     rng::Rng,
     sink::Sink,
+    spectra::times,
     vertex::Vertex,
     world::{Hit, World, lift},
 };
@@ -191,7 +192,7 @@ impl Walk<'_> {
     pub fn run(&self, rng: &mut Rng, from: Vertex, scratch: &mut Scratch, sink: &mut impl Sink) {
         let mut vertex = from;
         while self.goes_on(&vertex) {
-            let helped = !vertex.hit.surface.specular;
+            let helped = !vertex.hit.surface.specular();
             let mut aims = 0.0;
             if helped {
                 aims = self.aim(rng, &vertex, AIMS, scratch, sink);
@@ -251,9 +252,10 @@ impl Walk<'_> {
             hit,
             wo: -w,
             beta: v.beta * weight * hit.through,
+            tone: times(v.tone, self.world.tone(&h, v.wo, w)),
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
-            after_mirror: h.surface.specular,
+            after_mirror: h.surface.specular(),
             open_before: v.open(),
         };
         Some((step, next))

@@ -13,6 +13,7 @@ use crate::{
     extent::{self, Point, wide},
     glass::Panes,
     rng::Rng,
+    spectra::{Builder, PLAIN, Spectra, Tone, times},
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -61,6 +62,8 @@ pub(crate) struct World {
     pub sensitive: f32,
     /// Glass, which none of the triangles is.
     panes: Option<Panes>,
+    /// What surfaces do to tones, where wavelengths are asked for.
+    spectra: Option<Spectra>,
 }
 
 /// A point on a surface, seen from somewhere.
@@ -95,6 +98,20 @@ impl World {
     /// # Errors
     /// [`RenderError::Invalid`] where the scene is too wide or too small for f32 throughout.
     pub fn new(scene: &Scene, horizon_m: f64, stop: Stop) -> Result<Self, RenderError> {
+        Self::at(scene, &[], horizon_m, stop)
+    }
+
+    /// The same at some wavelengths, nanometres; at the one that the scene's reflectances are of where there are none.
+    ///
+    /// # Errors
+    /// Those of [`World::new`], and [`RenderError::Invalid`] where there are too many spectra.
+    pub fn at(
+        scene: &Scene,
+        wavelengths_nm: &[f64],
+        horizon_m: f64,
+        stop: Stop,
+    ) -> Result<Self, RenderError> {
+        let mut spectra = Builder::new(wavelengths_nm);
         let origin = scene.camera.origin;
         let centre = wide(origin);
         let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
@@ -112,7 +129,7 @@ impl World {
             let first = surfaces.len() as u32;
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
-                surfaces.push(Surface::new(m));
+                surfaces.push(spectra.surface(m)?);
                 material.push(k as u32);
                 rgb.push(m.rgb);
                 textures.push(m.texture.clone());
@@ -203,7 +220,53 @@ impl World {
             camera: scene.camera,
             sensitive: 1.0,
             panes: Panes::new(&panes, &glass, stop)?,
+            spectra: spectra.done(),
         })
+    }
+
+    /// Whether wavelengths are asked for, so that there are tones.
+    #[inline(always)]
+    pub fn has_wavelengths(&self) -> bool {
+        self.spectra.is_some()
+    }
+
+    /// The tone with which light scatters at a hit from `i` to `o`.
+    #[inline(always)]
+    pub fn tone(&self, h: &Hit, i: Vec3, o: Vec3) -> Tone {
+        match &self.spectra {
+            None => PLAIN,
+            Some(spectra) => self.tone_of(spectra, h, i, o),
+        }
+    }
+
+    fn tone_of(&self, spectra: &Spectra, h: &Hit, i: Vec3, o: Vec3) -> Tone {
+        // White surfaces stand for others.
+        if h.surface.tone() == 0 {
+            return PLAIN;
+        }
+        times(
+            spectra.scattered(&h.surface, h.n, i, o),
+            self.texel_tone(h.triangle, h.p),
+        )
+    }
+
+    /// The tone with which a surface scatters from `i` to `o`, without its texture.
+    #[inline(always)]
+    pub fn surface_tone(&self, surface: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Tone {
+        match &self.spectra {
+            None => PLAIN,
+            Some(spectra) => spectra.scattered(surface, n, i, o),
+        }
+    }
+
+    /// The tone of a texture at a point of a triangle.
+    pub fn texel_tone(&self, triangle: u32, p: Vec3) -> Tone {
+        match (&self.spectra, self.texel(triangle, p)) {
+            (Some(spectra), Some(texel)) => {
+                spectra.texel(self.surface[triangle as usize] as usize, texel)
+            }
+            _ => PLAIN,
+        }
     }
 
     /// Whether there is glass.
@@ -309,13 +372,17 @@ impl World {
         let geometric = self.normals[i];
         let mut surface = self.surfaces[self.surface[i] as usize];
         if let Some(texel) = self.texel(id, p) {
-            surface = surface.scaled((texel[0] + texel[1] + texel[2]) / 3.0);
+            let factor = match &self.spectra {
+                None => (texel[0] + texel[1] + texel[2]) / 3.0,
+                Some(spectra) => spectra.brightest(self.surface[i] as usize, texel),
+            };
+            surface = surface.scaled(factor);
         }
         Hit {
             p,
             n: if front { geometric } else { -geometric },
             triangle: id,
-            surface: if front || surface.two_sided {
+            surface: if front || surface.two_sided() {
                 surface
             } else {
                 surface.black()

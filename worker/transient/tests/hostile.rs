@@ -5,11 +5,11 @@ mod common;
 
 use common::{Quiet, object};
 use picofarm_scene::{
-    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Material, Object, Provenance, Scene, Spot,
-    Vec3,
+    Beam, Bsdf, Camera, Distribution, Intrinsics, Laser, Material, Object, Provenance, Scene,
+    SpectrumPoint, Spot, Vec3,
 };
 use picofarm_transient::{
-    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, render,
+    BeamWidth, Budget, Gate, RenderError, Rendered, Settings, Strategy, Wavelengths, render,
 };
 use proptest::{prelude::*, strategy::Strategy as Draw};
 
@@ -69,9 +69,21 @@ fn material() -> impl Draw<Value = Material> {
             }
         ),
     ];
-    (bsdf, any::<bool>()).prop_map(|(bsdf, two_sided)| Material {
+    let point = (450.0f32..1000.0, share()).prop_map(|(nm, reflectance)| SpectrumPoint {
+        nm,
+        reflectance,
+        specular_reflectance: None,
+    });
+    let spectrum = proptest::collection::vec(point, 0..4).prop_map(|mut rows| {
+        rows.sort_by(|a, b| a.nm.total_cmp(&b.nm));
+        rows
+    });
+    let rgb = proptest::array::uniform3(0.0f32..=1.0);
+    (bsdf, any::<bool>(), spectrum, rgb).prop_map(|(bsdf, two_sided, spectrum, rgb)| Material {
         bsdf,
         two_sided,
+        spectrum,
+        rgb,
         ..common::grey(0.5)
     })
 }
@@ -222,6 +234,12 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         });
     let fill_factor =
         prop_oneof![3 => Just(1.0), 3 => 0.01f64..1.0, 1 => Just(1e-6), 1 => Just(0.0)];
+    let wavelength = 250.0f64..2000.0;
+    let wavelengths = prop_oneof![
+        2 => Just(vec![]),
+        1 => proptest::collection::vec(wavelength, 1..4),
+    ]
+    .prop_filter_map("each once", |nm| Wavelengths::of(&nm).ok());
     (
         start,
         width,
@@ -230,7 +248,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
         proptest::option::of(1u32..8),
         any::<(bool, bool, u64)>(),
         strategy,
-        (proptest::option::of(beam), fill_factor),
+        (proptest::option::of(beam), fill_factor, wavelengths),
     )
         .prop_map(
             |(
@@ -241,7 +259,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                 max_bounces,
                 (one_bounce, split, seed),
                 strategy,
-                (beam, fill_factor),
+                (beam, fill_factor, wavelengths_nm),
             )| {
                 // 10⁵ bins cost memory by the pixel; an error to reach would take passes without end there.
                 let budget = if bins > 1000 {
@@ -270,6 +288,7 @@ fn hostile_settings() -> impl Draw<Value = Settings> {
                     },
                     beam,
                     fill_factor,
+                    wavelengths_nm,
                 }
             },
         )
@@ -283,6 +302,7 @@ fn sane(r: &Rendered) -> Result<(), TestCaseError> {
         ("range", &r.truth.range),
         ("rgb", &r.truth.rgb),
     ];
+    amounts.extend(r.others.iter().map(|o| ("others", &o.transient)));
     let mut signed = vec![("normal", &r.truth.normal)];
     if let Some(s) = &r.split {
         amounts.extend([

@@ -8,7 +8,8 @@ use picofarm_scene::{
 };
 use picofarm_settings::Spots;
 use picofarm_transient::{
-    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, render, render_within,
+    Budget, Gate, Progress, RenderError, Rendered, Settings, Strategy, Wavelengths, render,
+    render_within,
 };
 
 /// Counts how often it is asked, and says stop from one of them on.
@@ -56,6 +57,7 @@ fn settings(budget: Budget) -> Settings {
         },
         beam: None,
         fill_factor: 1.0,
+        wavelengths_nm: Wavelengths::NONE,
     }
 }
 

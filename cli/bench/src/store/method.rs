@@ -96,6 +96,7 @@ pub fn all(spec: &DatasetSpec, only: &[String]) -> Result<Vec<Method>> {
         let spec = DatasetSpec {
             profile,
             per_spot: false,
+            wavelengths_nm: picofarm_dataset::Wavelengths::NONE,
             two_bounce: false,
             subsets: picofarm_dataset::Subsets::NONE,
             ..*spec

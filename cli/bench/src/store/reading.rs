@@ -11,7 +11,8 @@ use std::{
 };
 
 use picofarm_dataset::{
-    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, open_store,
+    Dataset, DatasetError, DatasetSpec, Profile, Provenance, Quantity, Subsets, Wavelengths,
+    open_store,
 };
 use picofarm_model::{
     input::{Normalise, planes_of},
@@ -184,6 +185,7 @@ async fn written(
         profile: Profile::default(),
         subsets: Subsets::NONE,
         per_spot: false,
+        wavelengths_nm: Wavelengths::NONE,
         two_bounce: false,
         ..*source.spec()
     };

@@ -82,7 +82,10 @@ impl RenderTask {
                 bins: render.bins,
                 spots,
             },
-            histograms: 1 + render.subsets.len() as u32 + if render.per_spot { spots } else { 0 },
+            histograms: 1
+                + render.subsets.len() as u32
+                + if render.per_spot { spots } else { 0 }
+                + render.wavelengths_nm.others().len() as u32,
             split: false,
             light_paths: render.strategy.caustics != Some(false) && render.max_bounces != 2,
             threads,

@@ -40,7 +40,7 @@ pub use scene::ImportedScene;
 use files::Files;
 use scene::Shape;
 
-use crate::layout::spec::{DatasetSpec, Profile};
+use crate::layout::spec::{DatasetSpec, Profile, Wavelengths};
 
 /// Version of what an import makes of the same files. Changes whenever the same files could give other bytes.
 pub const IMPORT_VERSION: &str = "import-3";
@@ -185,6 +185,7 @@ impl Source {
             spots: self.shape.spots,
             subsets: self.shape.subsets,
             per_spot: false,
+            wavelengths_nm: Wavelengths::NONE,
             two_bounce: self.shape.two_bounce,
             gate: self.shape.gate,
             profile,

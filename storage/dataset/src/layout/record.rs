@@ -72,9 +72,9 @@ pub struct SceneRecord<'a> {
 /// The transient of a subset of the spots, or of each alone.
 #[derive(Debug, Clone)]
 pub struct SubsetRecord<'a> {
-    /// `Transient4`, `Transient25` or `TransientSpots`.
+    /// `Transient4`, `Transient25`, `TransientSpots` or `TransientWavelengths`.
     pub quantity: Quantity,
-    /// h, each `[row][column][bin]`: one for each spot of `TransientSpots`, otherwise one.
+    /// h, each `[row][column][bin]`: as many as [`DatasetSpec::planes`].
     pub planes: Vec<&'a [f32]>,
 }
 
@@ -110,10 +110,7 @@ impl SceneRecord<'_> {
             return Err(DatasetError::invalid("record.subsets", what));
         }
         for subset in self.subsets {
-            let planes = match subset.quantity {
-                Quantity::TransientSpots => spec.spots as usize,
-                _ => 1,
-            };
+            let planes = spec.planes(subset.quantity);
             let len = spec.transient_len();
             if subset.planes.len() != planes || subset.planes.iter().any(|p| p.len() != len) {
                 let what = format!("expected {planes} histograms of {len} values each");

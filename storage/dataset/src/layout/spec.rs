@@ -1,6 +1,6 @@
 //! What a data set is: its size, gate and codec profile. Fixed at creation, except that scenes may be added.
 
-pub use picofarm_settings::Gate;
+pub use picofarm_settings::{Gate, Wavelengths};
 use serde::{Deserialize, Serialize};
 
 use crate::error::DatasetError;
@@ -69,6 +69,10 @@ pub struct DatasetSpec {
     /// Each spot has a transient of its own (`transient_spots`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub per_spot: bool,
+    /// The laser's wavelengths, nanometres; of those after the main one `transient_wavelengths` holds the histograms. Without
+    /// any, nobody said which it is.
+    #[serde(default, skip_serializing_if = "Wavelengths::is_empty")]
+    pub wavelengths_nm: Wavelengths,
     /// Two-bounce paths came with the scenes (`two_bounce_path`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub two_bounce: bool,
@@ -266,12 +270,23 @@ impl DatasetSpec {
         self.pixels() * self.gate.bins as usize
     }
 
+    /// Images of a quantity that is a transient: one for each spot of `transient_spots`, one for each wavelength of
+    /// `transient_wavelengths`, otherwise one.
+    pub fn planes(&self, quantity: Quantity) -> usize {
+        match quantity {
+            Quantity::TransientSpots => self.spots as usize,
+            Quantity::TransientWavelengths => self.wavelengths_nm.others().len(),
+            _ => 1,
+        }
+    }
+
     /// The quantities that its scenes have, in the order of their objects in a manifest.
     pub fn quantities(&self) -> Vec<Quantity> {
         let has = |q: &Quantity| match q {
             Quantity::Transient4 => self.subsets.four,
             Quantity::Transient25 => self.subsets.twenty_five,
             Quantity::TransientSpots => self.per_spot,
+            Quantity::TransientWavelengths => !self.wavelengths_nm.others().is_empty(),
             Quantity::TwoBouncePath => self.two_bounce,
             _ => true,
         };
@@ -293,6 +308,11 @@ impl DatasetSpec {
                 "per_spot",
                 self.per_spot.to_string(),
                 asked.per_spot.to_string(),
+            ),
+            (
+                "wavelengths_nm",
+                format!("{:?}", self.wavelengths_nm.nm()),
+                format!("{:?}", asked.wavelengths_nm.nm()),
             ),
             (
                 "two_bounce",

@@ -59,7 +59,8 @@ fn rendering(settings: &Settings, (width, height): (u32, u32), threads: usize) -
             bins: settings.gate.bins,
             spots: 25,
         },
-        histograms: 1 + settings.groups.len() as u32,
+        histograms: (1 + settings.groups.len() as u32)
+            * settings.wavelengths_nm.nm().len().max(1) as u32,
         split: settings.split,
         light_paths: settings.strategy.caustics != Some(false)
             && settings.max_bounces.is_none_or(|most| most >= 3),
@@ -95,7 +96,7 @@ pub fn check_memory(settings: &Settings, size: (u32, u32), threads: usize) -> Re
 #[cfg(test)]
 mod tests {
     use picofarm_proto::model::JobSpec;
-    use picofarm_transient::{Budget, Gate, Strategy};
+    use picofarm_transient::{Budget, Gate, Strategy, Wavelengths};
 
     use super::*;
 
@@ -116,6 +117,7 @@ mod tests {
             strategy: Strategy::default(),
             beam: None,
             fill_factor: 1.0,
+            wavelengths_nm: Wavelengths::NONE,
         };
         assert_eq!(check_memory(&settings, (16, 16), 2), Ok(()));
         settings.groups = (0..100).map(|beam| vec![beam]).collect();

@@ -2,7 +2,9 @@
 
 use picofarm_scene::Scene;
 use picofarm_settings::Sensor;
-use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, Strategy, render};
+use picofarm_transient::{
+    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelengths, render,
+};
 
 use super::{Captures, LIT_THRESHOLD};
 use crate::{Measured, ReconstructError};
@@ -37,6 +39,7 @@ impl CaptureSettings {
             strategy: Strategy::default(),
             beam: None,
             fill_factor: 1.0,
+            wavelengths_nm: Wavelengths::NONE,
         }
     }
 }
@@ -61,6 +64,7 @@ pub fn truth_of(scene: &Scene, progress: &dyn Progress) -> Result<Rendered, Reco
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
+        wavelengths_nm: Wavelengths::NONE,
     };
     Ok(render(scene, &settings, progress)?)
 }

@@ -175,7 +175,7 @@ impl Patches {
             let t = piece.triangle as usize;
             let cos = world.normals[t].dot(front);
             flat &= cos.abs() > FLAT;
-            one_sided &= cos > FLAT && !world.surfaces[world.surface[t] as usize].two_sided;
+            one_sided &= cos > FLAT && !world.surfaces[world.surface[t] as usize].two_sided();
             area += piece.upto;
             patch_of[k as usize] = patch;
             self.pieces.push(Piece {

@@ -11,9 +11,10 @@ use crate::{
     lanes::{self, SIDE, Wide, widest},
     rng::Rng,
     sink::{Place, Sink, Way},
+    spectra::{Light, PLAIN, Tone, times},
     vertex::Vertex,
     walk::{Scratch, Walk},
-    world::lift,
+    world::{Hit, lift},
 };
 
 /// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
@@ -104,6 +105,7 @@ impl Sharing {
                 hit: *h,
                 wo: h.n,
                 beta: 1.0,
+                tone: PLAIN,
                 length_m: nearest,
                 bounce,
                 after_mirror: false,
@@ -176,8 +178,19 @@ impl Sharing {
                     let through = through.get(k).copied().unwrap_or(1.0);
                     let carried = carry.share(w) * through;
                     if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
-                        sink.toward(to * (-1.0 / d));
-                        sink.add(path, carried, spot, bounce + 1, Way::Spot);
+                        let back = to * (-1.0 / d);
+                        let light = Light {
+                            value: carried,
+                            tone: match film.toned {
+                                false => PLAIN,
+                                true => {
+                                    let here = walk.world.tone(h, h.n, back);
+                                    times(here, e.tone(walk.world, -back))
+                                }
+                            },
+                        };
+                        sink.toward(back);
+                        sink.add(path, light, spot, bounce + 1, Way::Spot);
                     }
                 }
             }
@@ -302,6 +315,11 @@ impl Sharing {
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             let deeper = v.bounce - lowest;
+            // Every vertex here is settled on a lobe, whose tone no direction changes.
+            let seen = match film.toned {
+                false => PLAIN,
+                true => times(v.tone, walk.world.tone(&v.hit, v.wo, v.wo)),
+            };
             for (y, row) in self
                 .shared
                 .iter()
@@ -313,10 +331,23 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
+                let tones = |seen: Tone| {
+                    let arriving = a.tone.get(range.clone()).unwrap_or_default();
+                    move |k: usize| arriving.get(k).map_or(seen, |&tone| times(seen, tone))
+                };
                 if let Some(surface) = &y.rough {
                     let n = y.hit.n;
+                    let rough = Hit {
+                        surface: *surface,
+                        ..y.hit
+                    };
+                    let seen = match film.toned {
+                        false => seen,
+                        true => times(seen, walk.world.tone(&rough, n, n)),
+                    };
+                    let tone = tones(seen);
                     let to = (v.hit.p - y.hit.p).normalized();
-                    for k in range {
+                    for k in range.clone() {
                         if u32::from(a.bounces[k]) + deeper > walk.max_bounces {
                             continue;
                         }
@@ -325,13 +356,17 @@ impl Sharing {
                         let value = a.value[k] * PI * surface.scatter(n, to, from) / n.dot(from);
                         if value > 0.0 {
                             let slot = floor(a.bins[k] + offset, last) as usize;
-                            film.add(pixel, slot, weight * value, usize::from(a.spot[k]));
+                            let light = Light {
+                                value: weight * value,
+                                tone: tone(k - range.start),
+                            };
+                            film.add(pixel, slot, light, usize::from(a.spot[k]));
                         }
                     }
                     continue;
                 }
                 let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
-                if film.channels == 1 && !bounded {
+                if film.channels == 1 && !bounded && !film.toned {
                     let first = &mut pixel[..film.slots];
                     let (many, few) = bins.as_chunks::<SIDE>();
                     let (values, last_values) = values.as_chunks::<SIDE>();
@@ -355,6 +390,7 @@ impl Sharing {
                     }
                     continue;
                 }
+                let tone = tones(seen);
                 let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
                 let each = bins.iter().zip(values).zip(rest);
                 // In the same order as above: groups of spots change no bit.
@@ -362,14 +398,18 @@ impl Sharing {
                     if u32::from(bounces) + deeper > walk.max_bounces {
                         continue;
                     }
-                    let (slot, value) = (floor(b + offset, last) as usize, weight * value);
+                    let slot = floor(b + offset, last) as usize;
+                    let light = Light {
+                        value: weight * value,
+                        tone: tone(k),
+                    };
                     let first = if k % 2 == 0 {
                         &mut pixel[slot]
                     } else {
                         &mut second[slot]
                     };
-                    *first += value;
-                    film.add_to_groups(pixel, slot, value, usize::from(spot));
+                    *first += light.value * light.tone[0];
+                    film.add_to_others(pixel, slot, light, usize::from(spot));
                 }
             }
             for (sum, second) in pixel.iter_mut().zip(&mut second) {

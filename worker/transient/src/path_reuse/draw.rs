@@ -9,6 +9,7 @@ use crate::{
     film::Film,
     rng::Rng,
     sink::{PixelSink, Place, Sink, Way},
+    spectra::{Light, PLAIN, times},
     turns::Turns,
     vertex::Vertex,
     walk::{ALL, Lights, Scratch, Walk},
@@ -114,7 +115,19 @@ impl Sharing {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
                     let spot = film.tag(y.spot, Place::Gather, Way::Zone);
                     let through = walk.world.glass(stack, from, lift(v.hit.p, v.hit.n));
-                    film.add(pixel, film.slot(path), self.weight[i] * through, spot);
+                    let light = Light {
+                        value: self.weight[i] * through,
+                        tone: match film.toned {
+                            false => PLAIN,
+                            true => {
+                                let w = (y.hit.p - v.hit.p).normalized();
+                                let here = times(v.tone, walk.world.tone(&v.hit, v.wo, w));
+                                let there = walk.world.tone(&y.hit, y.back, -w);
+                                times(here, times(y.tone, there))
+                            }
+                        },
+                    };
+                    film.add(pixel, film.slot(path), light, spot);
                 }
             }
         }
@@ -242,7 +255,7 @@ pub(super) fn gather_point(
     loop {
         vertex.hit.choose_lobe(rng);
         if vertex.bounce > 1 {
-            sink.factor = if vertex.hit.surface.specular {
+            sink.factor = if vertex.hit.surface.specular() {
                 share
             } else {
                 1.0
@@ -252,7 +265,7 @@ pub(super) fn gather_point(
         if !walk.goes_on(&vertex) {
             return None;
         }
-        if !vertex.hit.surface.specular {
+        if !vertex.hit.surface.specular() {
             return Some(vertex);
         }
         sink.factor = share;
@@ -278,7 +291,7 @@ pub(super) fn only_mirrors(
     sink.factor = share;
     loop {
         vertex.hit.choose_lobe(rng);
-        if !vertex.hit.surface.specular {
+        if !vertex.hit.surface.specular() {
             return;
         }
         if vertex.bounce > 1 {
@@ -305,6 +318,7 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         hit,
         wo: -hit.p / range,
         beta: hit.through,
+        tone: PLAIN,
         length_m: world.metres(range),
         bounce: 1,
         after_mirror: false,

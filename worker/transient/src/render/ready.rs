@@ -6,8 +6,8 @@ use picofarm_scene::{Scene, Spot};
 use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
 use crate::{
     api::{
-        Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered, Settings, Split,
-        Stop,
+        AtWavelength, Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered,
+        Settings, Split, Stop,
     },
     caustic::Caustics,
     contact::Contacts,
@@ -52,7 +52,8 @@ pub(super) fn prepare<R>(
 ) -> Result<R, RenderError> {
     check(settings)?;
     scene.validate()?;
-    let mut world = World::new(scene, settings.gate.end_m(), stop)?;
+    let (horizon, wavelengths) = (settings.gate.end_m(), settings.wavelengths_nm.nm());
+    let mut world = World::at(scene, wavelengths, horizon, stop)?;
     world.sensitive = settings.fill_factor.sqrt() as f32;
     let spots = find_spots(&world, &scene.laser.beams);
     let middles = Emitters::new(scene, &world, &spots)?;
@@ -79,7 +80,8 @@ pub(super) fn prepare<R>(
     let sampling = Sampling::plan(&world, emitters, &centres, stop);
     stop.check()?;
     let of_spot = groups_of(settings, emitters, spots.len())?;
-    let film = Film::new(&settings.gate, settings.groups.len(), of_spot);
+    let channels = (settings.groups.len(), wavelengths.len());
+    let film = Film::new(&settings.gate, channels, of_spot);
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
@@ -146,7 +148,7 @@ pub(super) fn prepare<R>(
 /// Whether most of what the camera sees is rough: there each arrival is weighed for each pixel, and wide tiles do not pay.
 fn mostly_rough(centres: &Centres) -> bool {
     let seen = || centres.hits.iter().flatten();
-    let rough = seen().filter(|h| !h.surface.diffuse() && !h.surface.specular);
+    let rough = seen().filter(|h| !h.surface.diffuse() && !h.surface.specular());
     2 * rough.count() > seen().count()
 }
 
@@ -173,7 +175,8 @@ impl Ready<'_> {
 
     /// What the renderer decides to do, beginning with so many passes.
     pub fn plan(&self, passes: u32) -> Plan {
-        decide(self.settings, &self.frame.walk, self.frame.sampling, passes)
+        let sampling = (self.frame.sampling, passes);
+        decide(self.scene, self.settings, &self.frame.walk, sampling)
     }
 
     /// The ground truth, and the rays it took.
@@ -249,12 +252,16 @@ impl Ready<'_> {
             let mut stack = walk.world.bvh.stack();
             let peaks = one_bounce::peaks(walk.world, &mut stack, walk.emitters);
             for peak in &peaks {
-                if !one_bounce::add(peak, &settings.gate, &mut image.transient) {
-                    overflow.energy += f64::from(peak.value);
+                let gate = &settings.gate;
+                if !one_bounce::add(peak, 0, gate, &mut image.transient) {
+                    overflow.energy += f64::from(peak.light.value * peak.light.tone[0]);
                 }
-                for &channel in &film.of_spot[peak.spot] {
-                    let group = &mut image.groups[usize::from(channel) - 1];
-                    one_bounce::add(peak, &settings.gate, group);
+                for wavelength in 0..film.wavelengths {
+                    let of_all = (wavelength > 0).then(|| film.first_channel(wavelength));
+                    let groups = film.groups_of(wavelength, peak.spot);
+                    for channel in of_all.into_iter().chain(groups) {
+                        one_bounce::add(peak, wavelength, gate, &mut image.groups[channel - 1]);
+                    }
                 }
             }
             rays += stack.rays;
@@ -265,6 +272,7 @@ impl Ready<'_> {
         } else {
             0.0
         };
+        let (groups, others) = by_wavelength(settings, image.groups);
         let mut warnings = self.warnings(&truth, inside, overflow.energy);
         warnings.extend(warn::tails(&error));
         Ok(Rendered {
@@ -281,7 +289,8 @@ impl Ready<'_> {
                 multi_se: s.multi_se,
                 multi_noise: s.multi_noise,
             }),
-            groups: image.groups,
+            groups,
+            others,
             truth,
             spots: self.spots.to_vec(),
             overflow,
@@ -290,6 +299,26 @@ impl Ready<'_> {
             rays: rays + seen,
         })
     }
+}
+
+/// The histograms beyond the first: groups of the main wavelength, and what the others have.
+fn by_wavelength(
+    settings: &Settings,
+    mut channels: Vec<Vec<f32>>,
+) -> (Vec<Vec<f32>>, Vec<AtWavelength>) {
+    let each = 1 + settings.groups.len();
+    let rest = channels.split_off(each - 1);
+    let mut rest = rest.into_iter();
+    let others = settings.wavelengths_nm.others().iter().map(|&nm| {
+        let mut of = rest.by_ref().take(each);
+        AtWavelength {
+            nm,
+            transient: of.next().expect("a film has a channel for each wavelength"),
+            groups: of.collect(),
+        }
+    });
+    let others = others.collect();
+    (channels, others)
 }
 
 /// The channels beyond 0 that each emitter's light goes to.

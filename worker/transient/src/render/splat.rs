@@ -115,7 +115,7 @@ impl Splats {
             for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
                 caustics.trace(&within, (l, count), &mut rng, stack, |z| seen.push(z));
                 let found = seen.drain(..);
-                ends.extend(found.filter_map(|z| splat(within.world, frame.film, &z, stack)));
+                ends.extend(found.flat_map(|z| splat(within.world, frame.film, &z, stack)));
             }
         };
         side_by_side(frame, count.div_ceil(CHUNK), watch, all, chunk)
@@ -141,7 +141,7 @@ impl Splats {
                 let at = (zone as usize, l, &turns);
                 contacts.trace(&within, at, &mut rng, stack, |_, z| seen.push(z));
                 let found = seen.drain(..);
-                ends.extend(found.filter_map(|z| splat(within.world, frame.film, &z, stack)));
+                ends.extend(found.flat_map(|z| splat(within.world, frame.film, &z, stack)));
             }
         };
         side_by_side(frame, contacts.count(), watch, all, zone)

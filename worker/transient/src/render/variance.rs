@@ -52,7 +52,8 @@ pub fn variance(
         if !ready.walks() {
             return Ok(vec![]);
         }
-        let film = Film::by_class(&settings.gate);
+        let toned = !settings.wavelengths_nm.is_empty();
+        let film = Film::by_class(&settings.gate, toned);
         let by_class = Frame {
             film: &film,
             ..ready.frame

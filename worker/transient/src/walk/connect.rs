@@ -2,12 +2,15 @@
 
 use std::f32::consts::PI;
 
+use picofarm_scene::Vec3;
+
 use super::{ALL, Lights, Scratch, Step, Walk};
 use crate::{
     contact::Contacts,
     light_vertices,
     rng::Rng,
     sink::{Sink, Way},
+    spectra::{Light, PLAIN, Tone, times},
     vertex::Vertex,
     world::{Hit, lift},
 };
@@ -28,7 +31,7 @@ impl Walk<'_> {
             return;
         }
         let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
-        let caustic = self.caustics.is_some() && h.surface.specular && v.open();
+        let caustic = self.caustics.is_some() && h.surface.specular() && v.open();
         if caustic && !planar {
             return;
         }
@@ -56,8 +59,12 @@ impl Walk<'_> {
             let free = self.world.free(stack, h.p, h.n, e.p, e.n);
             if free > 0.0 {
                 let path = v.length_m + self.world.metres((e.p - h.p).length()) + e.path_m;
-                let value = v.beta * value * free;
-                sink.add(path, value, spot, v.bounce + 1, Way::Spot);
+                let w = (e.p - h.p).normalized();
+                let light = Light {
+                    value: v.beta * value * free,
+                    tone: self.onward(v, w, || e.tone(self.world, -w)),
+                };
+                sink.add(path, light, spot, v.bounce + 1, Way::Spot);
             }
         };
         if count == ALL {
@@ -68,10 +75,19 @@ impl Walk<'_> {
         }
     }
 
+    /// The tone of a path that goes on from a vertex along `w` to where the rest of it has the tone `beyond`.
+    #[inline(always)]
+    fn onward(&self, v: &Vertex, w: Vec3, beyond: impl FnOnce() -> Tone) -> Tone {
+        match self.world.has_wavelengths() {
+            false => PLAIN,
+            true => times(v.tone, times(self.world.tone(&v.hit, v.wo, w), beyond())),
+        }
+    }
+
     /// Multiplies each spot's weight by the MIS weight of having reached `h` from `step` by BSDF
     /// sampling, against aiming (mirrors) or light vertices (other surfaces).
     fn plain_shares(&self, step: &Step, h: &Hit, weights: &mut [f32], images: &mut [f32]) {
-        if h.surface.specular {
+        if h.surface.specular() {
             let Some(mirror) = self.mirrors.of(h.triangle) else {
                 return;
             };
@@ -178,9 +194,20 @@ impl Walk<'_> {
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
-        let value = v.beta * value * free / (aimed + plain);
+        let mirror = Hit {
+            surface: m.surface.gloss(),
+            ..m
+        };
+        let light = Light {
+            value: v.beta * value * free / (aimed + plain),
+            tone: self.onward(v, w, || {
+                let to = (e.p - m.p).normalized();
+                let there = self.world.tone(&mirror, -w, to);
+                times(there, e.tone(self.world, -to))
+            }),
+        };
         sink.toward(w);
-        sink.add(path, value, aim.spot, v.bounce + 2, Way::Image);
+        sink.add(path, light, aim.spot, v.bounce + 2, Way::Image);
     }
 
     /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
@@ -214,7 +241,7 @@ impl Walk<'_> {
             Lights::Beyond => !vertices.list.is_empty(),
             Lights::Contact => {
                 // Near vertices are walked to within the zones, and light paths go on by way of near-mirrors.
-                let theirs = |c: &Contacts| match h.surface.specular {
+                let theirs = |c: &Contacts| match h.surface.specular() {
                     true => v.open(),
                     false => c.near(self.world, h),
                 };
@@ -250,8 +277,13 @@ impl Walk<'_> {
             if free > 0.0 {
                 let leg = there.p - h.p;
                 let path = v.length_m + self.world.metres(leg.length()) + y.path_m;
-                sink.toward(leg.normalized());
-                sink.add(path, v.beta * value * free, y.spot, bounces, way);
+                let w = leg.normalized();
+                let light = Light {
+                    value: v.beta * value * free,
+                    tone: self.onward(v, w, || times(y.tone, self.world.tone(there, y.back, -w))),
+                };
+                sink.toward(w);
+                sink.add(path, light, y.spot, bounces, way);
             }
         });
     }

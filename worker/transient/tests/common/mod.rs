@@ -14,7 +14,9 @@ use picofarm_scene::{
     Affine, Beam, Bsdf, Camera, Intrinsics, Laser, Material, Mesh, Object, Provenance, Scene, Spot,
     Vec3,
 };
-use picofarm_transient::{Budget, Gate, Progress, Rendered, Settings, Strategy, render};
+use picofarm_transient::{
+    Budget, Gate, Progress, Rendered, Settings, Strategy, Wavelengths, render,
+};
 
 /// Lets every render run to its end.
 pub struct Quiet;
@@ -50,6 +52,7 @@ pub fn settings(budget: Budget) -> Settings {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
+        wavelengths_nm: Wavelengths::NONE,
     }
 }
 
@@ -61,6 +64,7 @@ pub fn grey(reflectance: f32) -> Material {
         rgb: [reflectance; 3],
         texture: None,
         two_sided: true,
+        spectrum: vec![],
     }
 }
 

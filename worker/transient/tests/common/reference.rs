@@ -83,6 +83,7 @@ fn build(json: &Value) -> Scene {
             rgb: [0.5; 3],
             texture: None,
             two_sided: false,
+            spectrum: vec![],
         };
         objects.push(object(
             m["name"].as_str().unwrap(),

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use picofarm_dataset::{Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, open_store};
+use picofarm_dataset::{
+    Dataset, DatasetSpec, Gate, Profile, Provenance, Subsets, Wavelengths, open_store,
+};
 use picofarm_model::scene::{Scene as Seen, Scenes};
 use picofarm_proto::{key::TaskKey, model::Histogram};
 use picofarm_scene::{
@@ -102,6 +104,7 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
         spots: 1,
         subsets: Subsets::NONE,
         per_spot: false,
+        wavelengths_nm: Wavelengths::NONE,
         two_bounce: false,
         gate,
         profile: Profile::LOSSLESS,
@@ -122,6 +125,7 @@ fn seen_twice(left_mib: Option<u64>) -> [Arc<Seen>; 2] {
         strategy: Strategy::default(),
         beam: None,
         fill_factor: 1.0,
+        wavelengths_nm: Wavelengths::NONE,
     };
     let rendered = picofarm_transient::render(&scene, &settings, &Quiet).unwrap();
     let spots = rendered.spots.iter();

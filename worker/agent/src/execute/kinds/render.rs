@@ -209,6 +209,7 @@ fn settings(
         strategy: render.strategy,
         beam: render.beam,
         fill_factor: render.fill_factor,
+        wavelengths_nm: render.wavelengths_nm,
     })
 }
 

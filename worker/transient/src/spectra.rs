@@ -1,0 +1,234 @@
+//! Several wavelengths in one pass.
+//!
+//! Where light goes does not depend on its wavelength, only how much of it goes on. So paths are drawn once, by the greatest
+//! reflectance that each lobe has among the wavelengths, and carry a *tone*: for each wavelength the product over the
+//! path's vertices of the reflectance there over that greatest one. A tone is never above 1, so that no wavelength gets rarer and
+//! brighter paths than the brightest one has. A contribution of value v counts v times its tone in each wavelength's histogram.
+//!
+//! The first wavelength is the main one, whose errors are stated. A scene that asks for none has plain tones and pays nothing.
+
+use std::collections::HashMap;
+
+use picofarm_scene::{AtWavelength, Bsdf, Material, Vec3};
+use picofarm_settings::MAX_WAVELENGTHS;
+
+use crate::{api::RenderError, bsdf::Surface};
+
+/// By wavelength; those beyond the render's own are 1.
+pub(crate) type Tone = [f32; MAX_WAVELENGTHS];
+
+/// Every wavelength alike.
+pub(crate) const PLAIN: Tone = [1.0; MAX_WAVELENGTHS];
+
+/// Light of all wavelengths: what of each is `value` times its tone.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Light {
+    pub value: f32,
+    pub tone: Tone,
+}
+
+/// The tone of a path of two parts.
+#[inline(always)]
+pub(crate) fn times(a: Tone, b: Tone) -> Tone {
+    std::array::from_fn(|k| a[k] * b[k])
+}
+
+/// What surfaces do to tones.
+#[derive(Debug)]
+pub(crate) struct Spectra {
+    /// By [`Surface::tone`]; the first is plain.
+    rows: Vec<Tone>,
+    /// What texels do, by surface index; `None` without a texture.
+    texels: Vec<Option<Texels>>,
+    /// How many wavelengths there are.
+    count: usize,
+}
+
+/// What a texel does to a surface's reflectances.
+#[derive(Debug, Clone, Copy)]
+struct Texels {
+    /// Shares of the texel's red, green and blue, by wavelength.
+    shares: [[f32; 3]; MAX_WAVELENGTHS],
+    /// Most that it may multiply by: no surface gives more than it gets.
+    most: f32,
+}
+
+impl Texels {
+    /// Factors by wavelength, and the greatest.
+    fn factors(&self, texel: [f32; 3], count: usize) -> (Tone, f32) {
+        let mut factors = PLAIN;
+        let mut greatest = 0.0f32;
+        for (factor, shares) in factors.iter_mut().zip(&self.shares).take(count) {
+            let sum = shares[0] * texel[0] + shares[1] * texel[1] + shares[2] * texel[2];
+            *factor = sum.min(self.most);
+            greatest = greatest.max(*factor);
+        }
+        (factors, greatest)
+    }
+}
+
+/// Collects what [`Spectra`] holds while surfaces are made.
+pub(crate) struct Builder<'a> {
+    wavelengths_nm: &'a [f64],
+    rows: Vec<Tone>,
+    known: HashMap<[u32; 2 * MAX_WAVELENGTHS], u16>,
+    texels: Vec<Option<Texels>>,
+}
+
+impl<'a> Builder<'a> {
+    pub fn new(wavelengths_nm: &'a [f64]) -> Self {
+        Self {
+            wavelengths_nm,
+            rows: vec![PLAIN],
+            known: HashMap::new(),
+            texels: vec![],
+        }
+    }
+
+    /// The next surface.
+    ///
+    /// # Errors
+    /// [`RenderError::Invalid`] where materials have more spectra than can be told apart.
+    pub fn surface(&mut self, m: &Material) -> Result<Surface, RenderError> {
+        if self.wavelengths_nm.is_empty() {
+            return Ok(Surface::new(m));
+        }
+        let at: Vec<AtWavelength> = self
+            .wavelengths_nm
+            .iter()
+            .map(|&nm| m.at(nm as f32))
+            .collect();
+        let (lambertian, first) = greatest(at.iter().map(|a| a.lambertian));
+        let (conductor, second) = greatest(at.iter().map(|a| a.conductor));
+        self.texels.push(m.texture.is_some().then(|| {
+            let mut shares = [[0.0; 3]; MAX_WAVELENGTHS];
+            for (to, from) in shares.iter_mut().zip(&at) {
+                *to = from.texel;
+            }
+            let most = 1.0 / lambertian.max(conductor).max(f32::MIN_POSITIVE);
+            Texels { shares, most }
+        }));
+        let brightest = Material {
+            bsdf: with(m.bsdf, (lambertian, conductor)),
+            ..m.clone()
+        };
+        let row = self.row(first, second)?;
+        Ok(Surface::new(&brightest).with_tone(row))
+    }
+
+    /// Where the tones of two lobes lie.
+    fn row(&mut self, lambertian: Tone, conductor: Tone) -> Result<u16, RenderError> {
+        let mut bits = [0u32; 2 * MAX_WAVELENGTHS];
+        for (bits, x) in bits.iter_mut().zip(lambertian.iter().chain(&conductor)) {
+            *bits = x.to_bits();
+        }
+        if let Some(&row) = self.known.get(&bits) {
+            return Ok(row);
+        }
+        let row = u16::try_from(self.rows.len() + 1).map_err(|_| RenderError::Invalid {
+            field: "wavelengths_nm".into(),
+            what: "the scene's materials have more than 32,767 different spectra; make some of them alike".into(),
+        })? - 1;
+        self.rows.extend([lambertian, conductor]);
+        self.known.insert(bits, row);
+        Ok(row)
+    }
+
+    /// `None` where no wavelengths are asked for.
+    pub fn done(self) -> Option<Spectra> {
+        let count = self.wavelengths_nm.len();
+        (count > 0).then_some(Spectra {
+            rows: self.rows,
+            texels: self.texels,
+            count,
+        })
+    }
+}
+
+/// The greatest of the reflectances, and each as a share of it.
+fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Tone) {
+    let most = all.clone().fold(0.0f32, f32::max);
+    let mut tone = PLAIN;
+    if most > 0.0 {
+        for (to, r) in tone.iter_mut().zip(all) {
+            *to = r / most;
+        }
+    }
+    (most, tone)
+}
+
+/// The same kind of surface with other reflectances.
+fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
+    match bsdf {
+        Bsdf::Diffuse { .. } => Bsdf::Diffuse {
+            reflectance: lambertian,
+        },
+        Bsdf::RoughConductor {
+            alpha,
+            distribution,
+            ..
+        } => Bsdf::RoughConductor {
+            alpha,
+            distribution,
+            reflectance: conductor,
+        },
+        Bsdf::Mixed {
+            alpha,
+            distribution,
+            weight,
+            ..
+        } => Bsdf::Mixed {
+            reflectance: lambertian,
+            alpha,
+            distribution,
+            specular_reflectance: conductor,
+            weight,
+        },
+        glass @ Bsdf::ThinDielectric { .. } => glass,
+    }
+}
+
+impl Spectra {
+    /// The tone with which a surface scatters from `i` to `o`, without its texture.
+    #[inline]
+    pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Tone {
+        let row = usize::from(s.tone());
+        if !s.is_mixed() || row == 0 {
+            return self.rows[row];
+        }
+        let (base, gloss) = s.parts(n, i, o);
+        let whole = base + gloss;
+        if whole <= 0.0 {
+            return PLAIN;
+        }
+        let (lambertian, conductor) = (&self.rows[row], &self.rows[row + 1]);
+        std::array::from_fn(|k| (base * lambertian[k] + gloss * conductor[k]) / whole)
+    }
+
+    /// The factor of the brightest wavelength's reflectances at a texel of a surface.
+    #[inline]
+    pub fn brightest(&self, surface: usize, texel: [f32; 3]) -> f32 {
+        match &self.texels[surface] {
+            Some(texels) => texels.factors(texel, self.count).1,
+            None => 1.0,
+        }
+    }
+
+    /// The tone of a texel of a surface.
+    #[inline]
+    pub fn texel(&self, surface: usize, texel: [f32; 3]) -> Tone {
+        match &self.texels[surface] {
+            Some(texels) => match texels.factors(texel, self.count) {
+                (_, 0.0) => PLAIN,
+                (factors, most) => {
+                    let mut tone = PLAIN;
+                    for (to, f) in tone.iter_mut().zip(factors).take(self.count) {
+                        *to = f / most;
+                    }
+                    tone
+                }
+            },
+            None => PLAIN,
+        }
+    }
+}
