@@ -164,7 +164,7 @@ impl Emitter {
     /// The tone of that.
     #[inline(always)]
     pub fn tone(&self, world: &World, w: Vec3) -> Tone {
-        match world.has_wavelengths() {
+        match world.has_tones() {
             false => PLAIN,
             true => times(
                 self.tone,

@@ -30,7 +30,8 @@ pub(crate) struct Film {
 impl Film {
     /// A film for a gate, so many groups and wavelengths (none: light has no tone), and the groups that each emitter belongs to.
     pub fn new(gate: &Gate, (groups, wavelengths): (usize, usize), of_spot: Vec<Vec<u16>>) -> Self {
-        let toned = wavelengths > 0;
+        // One has the reflectances of the paths themselves.
+        let toned = wavelengths > 1;
         let wavelengths = wavelengths.max(1);
         Self {
             gate: *gate,
@@ -48,7 +49,8 @@ impl Film {
         let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
         Self {
             by_class: true,
-            ..Self::new(gate, (CLASSES, usize::from(toned)), of_class)
+            toned,
+            ..Self::new(gate, (CLASSES, 1), of_class)
         }
     }
 
@@ -83,35 +85,26 @@ impl Film {
     #[inline]
     pub fn add(&self, pixel: &mut [f32], slot: usize, light: Light, spot: usize) {
         pixel[slot] += light.value * light.tone[0];
-        self.add_to_others(pixel, slot, light, spot);
-    }
-
-    /// Adds light to a pixel's channels but the first.
-    #[inline]
-    pub fn add_to_others(&self, pixel: &mut [f32], slot: usize, light: Light, spot: usize) {
         if self.channels > 1 {
-            self.add_at(0, pixel, slot, &light, spot);
             for wavelength in 1..self.wavelengths {
                 let first = self.first_channel(wavelength);
                 pixel[first * self.slots + slot] += light.value * light.tone[wavelength];
-                self.add_at(wavelength, pixel, slot, &light, spot);
             }
+            self.add_to_groups(pixel, slot, &light, spot);
         }
     }
 
-    /// The groups of one wavelength.
-    #[inline(always)]
-    fn add_at(
-        &self,
-        wavelength: usize,
-        pixel: &mut [f32],
-        slot: usize,
-        light: &Light,
-        spot: usize,
-    ) {
-        let value = light.value * light.tone[wavelength];
-        for channel in self.groups_of(wavelength, spot) {
-            pixel[channel * self.slots + slot] += value;
+    /// Adds light to the channels of groups alone.
+    #[inline]
+    pub fn add_to_groups(&self, pixel: &mut [f32], slot: usize, light: &Light, spot: usize) {
+        if self.channels == self.wavelengths {
+            return;
+        }
+        for wavelength in 0..self.wavelengths {
+            let value = light.value * light.tone[wavelength];
+            for channel in self.groups_of(wavelength, spot) {
+                pixel[channel * self.slots + slot] += value;
+            }
         }
     }
 

@@ -14,6 +14,7 @@
 
 mod arrivals;
 mod draw;
+mod toned;
 
 use self::{
     arrivals::Lengths,
@@ -148,8 +149,8 @@ struct Arrivals {
     bounces: Vec<u8>,
     /// Unit direction from which it arrives at a rough vertex; of others anything.
     from: Vec<Vec3>,
-    /// Empty where light has none.
-    tone: Vec<Tone>,
+    /// Value by wavelength; empty where light has no tone.
+    light: Vec<Tone>,
 }
 
 /// Adds arrivals; lengths counted from `base_m`.
@@ -174,7 +175,8 @@ impl Sink for ArrivalSink<'_> {
             .push(((path_m - self.base_m) * self.per_metre) as f32);
         list.value.push(self.factor * light.value);
         if self.film.toned {
-            list.tone.push(light.tone);
+            let value = self.factor * light.value;
+            list.light.push(light.tone.map(|t| value * t));
         }
         list.spot.push(spot as u16);
         list.bounces.push(bounces.min(255) as u8);
@@ -255,7 +257,7 @@ impl Sharing {
         a.spot.clear();
         a.bounces.clear();
         a.from.clear();
-        a.tone.clear();
+        a.light.clear();
         let size = film.pixel();
         Self::draw_lights((walk, effort), pixels.len() / size, &mut rng, scratch);
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {

@@ -189,6 +189,12 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
 }
 
 impl Spectra {
+    /// Whether light has tones: with one wavelength all of it is of that.
+    #[inline(always)]
+    pub fn tones(&self) -> bool {
+        self.count > 1
+    }
+
     /// The tone with which a surface scatters from `i` to `o`, without its texture.
     #[inline]
     pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Tone {

@@ -224,18 +224,18 @@ impl World {
         })
     }
 
-    /// Whether wavelengths are asked for, so that there are tones.
+    /// Whether light has tones: several wavelengths are asked for.
     #[inline(always)]
-    pub fn has_wavelengths(&self) -> bool {
-        self.spectra.is_some()
+    pub fn has_tones(&self) -> bool {
+        self.spectra.as_ref().is_some_and(Spectra::tones)
     }
 
     /// The tone with which light scatters at a hit from `i` to `o`.
     #[inline(always)]
     pub fn tone(&self, h: &Hit, i: Vec3, o: Vec3) -> Tone {
         match &self.spectra {
-            None => PLAIN,
-            Some(spectra) => self.tone_of(spectra, h, i, o),
+            Some(spectra) if spectra.tones() => self.tone_of(spectra, h, i, o),
+            _ => PLAIN,
         }
     }
 

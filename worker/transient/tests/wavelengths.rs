@@ -142,7 +142,7 @@ fn one_wavelength_is_a_scene_of_its_reflectances_to_the_bit() {
             let set = settings(Budget::Samples(6));
             let found = ok(&s, &at(&[nm], set.clone()));
             let expected = ok(&alone(&s, nm), &set);
-            assert_eq!(main_bits(&found), main_bits(&expected), "{name} {nm}");
+            assert!(main_bits(&found) == main_bits(&expected), "{name} {nm}");
             assert!(found.others.is_empty());
         }
     }
@@ -230,7 +230,7 @@ fn darker_wavelengths_change_no_bit_of_the_main_one() {
         };
         let alone = ok(&s, &set);
         let found = ok(&s, &at(&NM, set));
-        assert_eq!(main_bits(&found), main_bits(&alone), "{name}");
+        assert!(main_bits(&found) == main_bits(&alone), "{name}");
         assert_eq!(found.error, alone.error);
         assert_eq!(found.rays, alone.rays);
     }
@@ -399,11 +399,11 @@ fn the_order_of_the_other_wavelengths_changes_no_bit() {
     };
     let a = ok(&s, &at(&[905.0, 532.0, 450.0], set.clone()));
     let b = ok(&s, &at(&[905.0, 450.0, 532.0], set));
-    assert_eq!(main_bits(&a), main_bits(&b));
+    assert!(main_bits(&a) == main_bits(&b));
     for (x, y) in [(0, 1), (1, 0)] {
         assert_eq!(a.others[x].nm, b.others[y].nm);
-        assert_eq!(bits(&a.others[x].transient), bits(&b.others[y].transient));
-        assert_eq!(bits(&a.others[x].groups[0]), bits(&b.others[y].groups[0]));
+        assert!(bits(&a.others[x].transient) == bits(&b.others[y].transient));
+        assert!(bits(&a.others[x].groups[0]) == bits(&b.others[y].groups[0]));
     }
     assert!(energy(&a.others[0].groups[0]) > 0.0);
 }
@@ -435,9 +435,9 @@ fn parts_of_a_render_join_to_the_same_bits_at_every_wavelength() {
         .map(|which| render_part(&s, &set, which, &Quiet).unwrap())
         .collect();
     let joined = join_parts(&s, &set, parts, &Quiet).unwrap();
-    assert_eq!(main_bits(&whole), main_bits(&joined));
+    assert!(main_bits(&whole) == main_bits(&joined));
     for (a, b) in whole.others.iter().zip(&joined.others) {
-        assert_eq!(bits(&a.transient), bits(&b.transient));
+        assert!(bits(&a.transient) == bits(&b.transient));
     }
 }
 
@@ -452,7 +452,7 @@ fn a_black_wavelength_is_black_and_harms_no_other() {
     let with = ok(&s, &at(&[905.0, 300.0], set.clone()));
     let without = ok(&s, &at(&[905.0], set.clone()));
     assert_eq!(energy(&with.others[0].transient), 0.0);
-    assert_eq!(main_bits(&with), main_bits(&without));
+    assert!(main_bits(&with) == main_bits(&without));
     // As the main one it has no light to be found by: what its paths carry is the other's.
     let first = ok(&s, &at(&[300.0, 905.0], set));
     assert_eq!(energy(&first.transient), 0.0);

@@ -11,10 +11,10 @@ use crate::{
     lanes::{self, SIDE, Wide, widest},
     rng::Rng,
     sink::{Place, Sink, Way},
-    spectra::{Light, PLAIN, Tone, times},
+    spectra::{Light, PLAIN, times},
     vertex::Vertex,
     walk::{Scratch, Walk},
-    world::{Hit, lift},
+    world::lift,
 };
 
 /// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
@@ -61,7 +61,7 @@ impl Sharing {
     }
 
     /// Fewest bounces up to a gather point.
-    fn lowest(&self) -> u32 {
+    pub(super) fn lowest(&self) -> u32 {
         let bounces = self.gathers.iter().map(|(v, _)| v.bounce);
         bounces.min().unwrap_or(1)
     }
@@ -294,6 +294,9 @@ impl Sharing {
 
     /// Carries the arrivals to the pixels.
     pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        if film.toned {
+            return self.spread_toned((walk, film), pixels);
+        }
         widest(Spread {
             sharing: self,
             walk,
@@ -315,11 +318,6 @@ impl Sharing {
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             let deeper = v.bounce - lowest;
-            // Every vertex here is settled on a lobe, whose tone no direction changes.
-            let seen = match film.toned {
-                false => PLAIN,
-                true => times(v.tone, walk.world.tone(&v.hit, v.wo, v.wo)),
-            };
             for (y, row) in self
                 .shared
                 .iter()
@@ -331,23 +329,10 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
-                let tones = |seen: Tone| {
-                    let arriving = a.tone.get(range.clone()).unwrap_or_default();
-                    move |k: usize| arriving.get(k).map_or(seen, |&tone| times(seen, tone))
-                };
                 if let Some(surface) = &y.rough {
                     let n = y.hit.n;
-                    let rough = Hit {
-                        surface: *surface,
-                        ..y.hit
-                    };
-                    let seen = match film.toned {
-                        false => seen,
-                        true => times(seen, walk.world.tone(&rough, n, n)),
-                    };
-                    let tone = tones(seen);
                     let to = (v.hit.p - y.hit.p).normalized();
-                    for k in range.clone() {
+                    for k in range {
                         if u32::from(a.bounces[k]) + deeper > walk.max_bounces {
                             continue;
                         }
@@ -358,7 +343,7 @@ impl Sharing {
                             let slot = floor(a.bins[k] + offset, last) as usize;
                             let light = Light {
                                 value: weight * value,
-                                tone: tone(k - range.start),
+                                tone: PLAIN,
                             };
                             film.add(pixel, slot, light, usize::from(a.spot[k]));
                         }
@@ -366,7 +351,7 @@ impl Sharing {
                     continue;
                 }
                 let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
-                if film.channels == 1 && !bounded && !film.toned {
+                if film.channels == 1 && !bounded {
                     let first = &mut pixel[..film.slots];
                     let (many, few) = bins.as_chunks::<SIDE>();
                     let (values, last_values) = values.as_chunks::<SIDE>();
@@ -390,7 +375,6 @@ impl Sharing {
                     }
                     continue;
                 }
-                let tone = tones(seen);
                 let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
                 let each = bins.iter().zip(values).zip(rest);
                 // In the same order as above: groups of spots change no bit.
@@ -401,15 +385,15 @@ impl Sharing {
                     let slot = floor(b + offset, last) as usize;
                     let light = Light {
                         value: weight * value,
-                        tone: tone(k),
+                        tone: PLAIN,
                     };
                     let first = if k % 2 == 0 {
                         &mut pixel[slot]
                     } else {
                         &mut second[slot]
                     };
-                    *first += light.value * light.tone[0];
-                    film.add_to_others(pixel, slot, light, usize::from(spot));
+                    *first += light.value;
+                    film.add_to_groups(pixel, slot, &light, usize::from(spot));
                 }
             }
             for (sum, second) in pixel.iter_mut().zip(&mut second) {
@@ -528,7 +512,7 @@ impl Wide for Weigh<'_> {
 /// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
 /// bits, without the checks of a cast. (An x within rounding of an integer may fall to either side.)
 #[inline(always)]
-fn floor(x: f32, last: f32) -> u32 {
+pub(super) fn floor(x: f32, last: f32) -> u32 {
     let half = x.max(0.5).min(last + 0.5) - 0.5;
     (half + 8_388_608.0).to_bits() & 0x007f_ffff
 }

@@ -52,7 +52,7 @@ pub fn variance(
         if !ready.walks() {
             return Ok(vec![]);
         }
-        let toned = !settings.wavelengths_nm.is_empty();
+        let toned = ready.frame.film.toned;
         let film = Film::by_class(&settings.gate, toned);
         let by_class = Frame {
             film: &film,

@@ -78,7 +78,7 @@ impl Walk<'_> {
     /// The tone of a path that goes on from a vertex along `w` to where the rest of it has the tone `beyond`.
     #[inline(always)]
     fn onward(&self, v: &Vertex, w: Vec3, beyond: impl FnOnce() -> Tone) -> Tone {
-        match self.world.has_wavelengths() {
+        match self.world.has_tones() {
             false => PLAIN,
             true => times(v.tone, times(self.world.tone(&v.hit, v.wo, w), beyond())),
         }
