@@ -77,6 +77,10 @@ pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
         Bsdf::Diffuse { .. } => (0.0, 1.0),
         Bsdf::RoughConductor { alpha, .. } => (1.0, alpha.sqrt()),
         Bsdf::Mixed { alpha, weight, .. } => (weight, alpha.sqrt()),
+        Bsdf::Several { parts } => {
+            let (share, alpha) = parts.conductors();
+            (share, alpha.sqrt())
+        }
         Bsdf::ThinDielectric { .. } => (0.0, 0.0),
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SpectrumPoint, Texture};
+use crate::{Parts, SpectrumPoint, Texture};
 
 /// Microfacet normal distribution of a rough conductor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,6 +49,11 @@ pub enum Bsdf {
         /// Share of the conductor, in [0, 1].
         weight: f32,
     },
+    /// Any number of Lambertians and rough conductors side by side (nested `blendbsdf` in Mitsuba): f = Σ weight · f of the part.
+    Several {
+        /// The parts.
+        parts: Parts,
+    },
     /// Thin glass. Light goes straight on through it and **what it reflects is lost**: glass shines nowhere, is no surface of the
     /// ground truth, and no beam makes a spot on it. A pane lets through T = `transmittance` · ½ Σ (1 − r)/(1 + r) over the two
     /// polarisations, r Fresnel's reflectance of one face at the light's angle: unpolarised light, reflected to and fro between
@@ -71,6 +76,7 @@ impl Bsdf {
             Bsdf::Diffuse { .. } => "diffuse",
             Bsdf::RoughConductor { .. } => "rough_conductor",
             Bsdf::Mixed { .. } => "mixed",
+            Bsdf::Several { .. } => "several",
             Bsdf::ThinDielectric { .. } => "thin_dielectric",
         }
     }
@@ -102,6 +108,9 @@ impl Bsdf {
                 distribution,
                 specular_reflectance: specular_reflectance * factor,
                 weight,
+            },
+            Bsdf::Several { parts } => Bsdf::Several {
+                parts: parts.scaled(factor),
             },
             glass @ Bsdf::ThinDielectric { .. } => glass,
         }
@@ -194,13 +203,14 @@ impl Material {
     }
 
     /// True for surfaces in the specular mask, at which beams are not spots but fold: rough conductors with
-    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix. A mix below that scatters enough by its
+    /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix or of several parts. A mix below that scatters enough by its
     /// Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
             Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,
             Bsdf::RoughConductor { alpha, .. } => alpha <= Self::SPECULAR_ALPHA,
             Bsdf::Mixed { alpha, weight, .. } => weight >= 0.5 && alpha <= Self::SPECULAR_ALPHA,
+            Bsdf::Several { parts } => parts.mirror() >= 0.5,
         }
     }
 
@@ -266,6 +276,7 @@ impl Material {
                 unit("specular_reflectance", specular_reflectance)?;
                 unit("weight", weight)?;
             }
+            Bsdf::Several { parts } => parts.check()?,
             Bsdf::ThinDielectric {
                 ior, transmittance, ..
             } => {

@@ -6,7 +6,8 @@ use std::{collections::BTreeMap, fmt::Write as _, sync::Arc};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Affine, Beam, Bsdf, Camera, Distribution, Material, SpectrumPoint, Texture, Vec3, Wrap,
+    Affine, Beam, Bsdf, Camera, Distribution, Lobe, Material, Part, SpectrumPoint, Texture, Vec3,
+    Wrap,
     extras::SceneExtras,
     texture::{linear, srgb_byte},
 };
@@ -125,6 +126,48 @@ pub(crate) fn bsdf_text(
                 "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{a}{b}</bsdf>",
                 id_attribute(outer)
             )
+        }
+        Bsdf::Several { parts } => {
+            let (mut body, mut sum) = (String::new(), 0.0f64);
+            let missing = 1.0
+                - parts
+                    .list()
+                    .iter()
+                    .map(|p| f64::from(p.weight))
+                    .sum::<f64>();
+            let black = (missing > 1e-5).then_some(Part {
+                weight: missing as f32,
+                lobe: Lobe::Diffuse { reflectance: 0.0 },
+            });
+            let all: Vec<&Part> = parts.list().iter().chain(&black).collect();
+            for (k, part) in all.iter().enumerate() {
+                let own = if all.len() == 1 { outer } else { "" };
+                let text = match part.lobe {
+                    Lobe::Diffuse { reflectance } => {
+                        diffuse(&mut out, own, id, material, texture, reflectance)
+                    }
+                    Lobe::RoughConductor {
+                        alpha,
+                        distribution,
+                        reflectance,
+                    } => {
+                        let specular = (alpha, distribution, reflectance);
+                        conductor(&mut out, own, id, material, texture, specular)
+                    }
+                };
+                sum += f64::from(part.weight);
+                // A blend's weight is the share of its second.
+                let weight = (f64::from(part.weight) / sum.max(f64::MIN_POSITIVE)) as f32;
+                let named = if k + 1 == all.len() { outer } else { "" };
+                body = match k {
+                    0 => text,
+                    _ => format!(
+                        "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{body}{text}</bsdf>",
+                        id_attribute(named)
+                    ),
+                };
+            }
+            body
         }
         Bsdf::ThinDielectric { .. } => unreachable!("glass was written above"),
     };
