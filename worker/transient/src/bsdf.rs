@@ -17,6 +17,8 @@ enum Kind {
     Conductor,
     /// A Lambertian beside a rough conductor.
     Mixed,
+    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them.
+    Several,
 }
 
 /// Flags of a surface, one bit each.
@@ -33,11 +35,13 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Which tones it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = plain.
+    /// Which tones it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = plain. Of several
+    /// parts: which they are.
     tone: u16,
-    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. 0 = black.
+    /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
     strength: f32,
-    /// Roughness of a conductor; of others 0.
+    /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
+    /// or else 1.
     alpha: f32,
     /// Lambertian part ρ/π of a mix times its share; of others 0.
     base: f32,
@@ -51,7 +55,7 @@ impl Surface {
             Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
                 distribution == Distribution::Ggx
             }
-            Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,
+            Bsdf::Diffuse { .. } | Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } => false,
         };
         let flag = |set: bool, flag: u8| if set { flag } else { 0 };
         let of = |kind, strength, alpha, base| Self {
@@ -87,8 +91,41 @@ impl Surface {
                     of(Kind::Mixed, strength, alpha, base)
                 }
             }
+            // Made of its parts by `several`.
+            Bsdf::Several { .. } => of(Kind::Several, 0.0, 1.0, 0.0),
             // No surface: see `glass`.
             Bsdf::ThinDielectric { .. } => of(Kind::Lambertian, 0.0, 0.0, 0.0),
+        }
+    }
+
+    /// A material of several parts, given as surfaces times their shares, which are found by `index`.
+    pub fn several(m: &Material, parts: &[Surface], index: u16) -> Self {
+        let lit = || parts.iter().filter(|p| !p.is_black() && !p.diffuse());
+        let mirrors = lit().filter(|p| !p.is_rough()).map(Surface::alpha);
+        let alpha = mirrors
+            .reduce(f32::max)
+            .or_else(|| lit().map(Surface::alpha).reduce(f32::min));
+        let black = parts.iter().all(Surface::is_black);
+        Self {
+            tone: index,
+            strength: if black { 0.0 } else { 1.0 },
+            alpha: alpha.unwrap_or(1.0),
+            ..Self::new(m)
+        }
+    }
+
+    /// True for several parts; which of them and times what.
+    #[inline(always)]
+    pub fn parts_of_several(&self) -> Option<(usize, f32)> {
+        (self.kind == Kind::Several).then_some((usize::from(self.tone), self.strength))
+    }
+
+    /// Share of light that it sends on, as far as masking lets it.
+    #[inline]
+    pub fn albedo(&self) -> f32 {
+        match self.kind {
+            Kind::Lambertian => self.strength * PI,
+            _ => self.strength + self.base * PI,
         }
     }
 
@@ -96,7 +133,7 @@ impl Surface {
     pub fn with_tone(self, row: u16) -> Self {
         let tone = match self.kind {
             Kind::Conductor => row + 1,
-            Kind::Lambertian | Kind::Mixed => row,
+            Kind::Lambertian | Kind::Mixed | Kind::Several => row,
         };
         Self { tone, ..self }
     }
@@ -251,7 +288,7 @@ impl Surface {
                 base: 0.0,
                 ..self
             },
-            Kind::Lambertian | Kind::Conductor => self,
+            Kind::Lambertian | Kind::Conductor | Kind::Several => self,
         }
     }
 

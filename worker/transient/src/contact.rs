@@ -167,7 +167,7 @@ impl Contacts {
                 2 if !self.own(world, spot, &hit) => return,
                 _ => inside && self.near(world, &hit),
             };
-            hit.choose_lobe(rng);
+            hit.choose_lobe(world, rng);
             path_m += world.metres((hit.p - from).length());
             flux *= hit.through;
             if flux == 0.0 || hit.surface.is_black() || path_m > within.gate.end_m() {

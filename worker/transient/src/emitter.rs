@@ -270,7 +270,7 @@ impl<'a> Wide for Irradiance<'a> {
     }
 }
 
-/// All spots that exist, as sources; of beams with a width several for each.
+/// All spots that exist, as sources; of beams with a width several for each, and of surfaces of several parts one for each part.
 #[derive(Debug, Default)]
 pub(crate) struct Emitters {
     /// The sources.
@@ -329,7 +329,8 @@ impl Emitters {
                 .map_or(spot.arriving, |b| b.direction);
             let through = through(world, &mut stack, direction, spot);
             let of_beam = (beam, through);
-            all.push(Emitter::new(world, &mut stack, of_beam, spot, surface));
+            let source = Emitter::new(world, &mut stack, of_beam, spot, surface);
+            all.push(world, source);
         }
         all.rays.push(0..all.list.len());
         Ok(all)
@@ -367,14 +368,28 @@ impl Emitters {
                 };
                 let surface = world.first_surface[spot.object as usize] + spot.material;
                 let of_beam = (beam, through / width.points as f32);
-                all.push(Emitter::new(world, &mut stack, of_beam, &spot, surface));
+                let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
+                all.push(world, source);
             }
             all.rays.push(first..all.list.len());
         }
         Ok(all)
     }
 
-    fn push(&mut self, e: Emitter) {
+    /// Adds a source; one for each part of a surface of several.
+    fn push(&mut self, world: &World, e: Emitter) {
+        match e.surface.parts_of_several() {
+            None => self.push_one(e),
+            Some((index, factor)) => {
+                for part in &world.several[index] {
+                    let surface = part.scaled(factor);
+                    self.push_one(Emitter { surface, ..e });
+                }
+            }
+        }
+    }
+
+    fn push_one(&mut self, e: Emitter) {
         let index = self.list.len();
         let strength = if e.surface.diffuse() {
             e.surface.lambertian()

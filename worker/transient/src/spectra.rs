@@ -85,13 +85,43 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// The next surface.
+    /// The next surface. Parts of a material of several are added to `several`.
     ///
     /// # Errors
-    /// [`RenderError::Invalid`] where materials have more spectra than can be told apart.
-    pub fn surface(&mut self, m: &Material) -> Result<Surface, RenderError> {
+    /// [`RenderError::Invalid`] where materials have more spectra, or more materials several parts, than can be told apart.
+    pub fn surface(
+        &mut self,
+        m: &Material,
+        several: &mut Vec<Vec<Surface>>,
+    ) -> Result<Surface, RenderError> {
+        let Bsdf::Several { parts } = m.bsdf else {
+            let (surface, texels) = self.part(m)?;
+            self.texels.push(texels);
+            return Ok(surface);
+        };
+        let (mut all, mut of_all): (Vec<Surface>, Option<Texels>) = (vec![], None);
+        for part in parts.list() {
+            let (surface, texels) = self.part(&m.part(part))?;
+            all.push(surface.scaled(part.weight));
+            of_all = match (of_all, texels) {
+                (Some(a), Some(b)) if a.most <= b.most => Some(a),
+                (_, texels) => texels,
+            };
+        }
+        self.texels.push(of_all);
+        let index = u16::try_from(several.len()).map_err(|_| RenderError::Invalid {
+            field: "objects".into(),
+            what: "have more than 65,536 materials of several parts; let meshes share them".into(),
+        })?;
+        let surface = Surface::several(m, &all, index);
+        several.push(all);
+        Ok(surface)
+    }
+
+    /// A material of one part, or a mix; and what a texel does to it.
+    fn part(&mut self, m: &Material) -> Result<(Surface, Option<Texels>), RenderError> {
         if self.wavelengths_nm.is_empty() {
-            return Ok(Surface::new(m));
+            return Ok((Surface::new(m), None));
         }
         let at: Vec<AtWavelength> = self
             .wavelengths_nm
@@ -100,20 +130,20 @@ impl<'a> Builder<'a> {
             .collect();
         let (lambertian, first) = greatest(at.iter().map(|a| a.lambertian));
         let (conductor, second) = greatest(at.iter().map(|a| a.conductor));
-        self.texels.push(m.texture.is_some().then(|| {
+        let texels = m.texture.is_some().then(|| {
             let mut shares = [[0.0; 3]; MAX_WAVELENGTHS];
             for (to, from) in shares.iter_mut().zip(&at) {
                 *to = from.texel;
             }
             let most = 1.0 / lambertian.max(conductor).max(f32::MIN_POSITIVE);
             Texels { shares, most }
-        }));
+        });
         let brightest = Material {
             bsdf: with(m.bsdf, (lambertian, conductor)),
             ..m.clone()
         };
         let row = self.row(first, second)?;
-        Ok(Surface::new(&brightest).with_tone(row))
+        Ok((Surface::new(&brightest).with_tone(row), texels))
     }
 
     /// Where the tones of two lobes lie.
@@ -184,7 +214,7 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
             specular_reflectance: conductor,
             weight,
         },
-        glass @ Bsdf::ThinDielectric { .. } => glass,
+        other @ (Bsdf::Several { .. } | Bsdf::ThinDielectric { .. }) => other,
     }
 }
 

@@ -228,7 +228,7 @@ impl Walk<'_> {
             weight /= survive;
         }
         let (step, mut next) = self.follow(v, (w, weight, pdf), aims, stack)?;
-        next.hit.choose_lobe(rng);
+        next.hit.choose_lobe(self.world, rng);
         Some((step, next))
     }
 

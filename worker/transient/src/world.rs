@@ -39,6 +39,8 @@ pub(crate) struct World {
     pub object: Vec<u32>,
     /// Scattering by surface index.
     pub surfaces: Vec<Surface>,
+    /// Parts of the surfaces of several, each times its share.
+    pub several: Vec<Vec<Surface>>,
     /// Index into `surfaces` of every object's first material.
     pub first_surface: Vec<u32>,
     /// Material index in its mesh, by surface index.
@@ -81,13 +83,53 @@ pub(crate) struct Hit {
     pub through: f32,
 }
 
+/// One of several surfaces, drawn by their albedos and divided by its chance; a black one where all are.
+fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface {
+    let total: f32 = all.clone().map(Surface::albedo).sum();
+    let (mut left, mut last) = (u * total, None);
+    for s in all.filter(|s| !s.is_black()) {
+        last = Some(s);
+        left -= s.albedo();
+        if left < 0.0 {
+            break;
+        }
+    }
+    match last {
+        Some(s) => s.scaled(total / s.albedo()),
+        None => Surface::new(&Material::diffuse("black", [0.0; 3])),
+    }
+}
+
 impl Hit {
     /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
     /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
     #[inline]
-    pub fn choose_lobe(&mut self, rng: &mut Rng) {
+    pub fn choose_lobe(&mut self, world: &World, rng: &mut Rng) {
         if self.surface.is_mixed() {
             self.surface = self.surface.lobe(rng.uniform());
+        } else {
+            self.choose_part(world, rng);
+        }
+    }
+
+    /// Settles a surface of several parts on one of them, and leaves a mix of two as it is.
+    #[inline]
+    pub fn choose_part(&mut self, world: &World, rng: &mut Rng) {
+        if let Some((index, factor)) = self.surface.parts_of_several() {
+            let all = world.several[index].iter();
+            self.surface = drawn(all, rng.uniform()).scaled(factor);
+        }
+    }
+
+    /// The near-mirror of its surface: the conductor of a mix, or one of the near-mirrors among several parts, drawn.
+    #[inline]
+    pub fn mirror(&self, world: &World, rng: &mut Rng) -> Surface {
+        match self.surface.parts_of_several() {
+            None => self.surface.gloss(),
+            Some((index, factor)) => {
+                let near = world.several[index].iter().filter(|s| s.specular());
+                drawn(near, rng.uniform()).scaled(factor)
+            }
         }
     }
 }
@@ -112,6 +154,7 @@ impl World {
         stop: Stop,
     ) -> Result<Self, RenderError> {
         let mut spectra = Builder::new(wavelengths_nm);
+        let mut several = vec![];
         let origin = scene.camera.origin;
         let centre = wide(origin);
         let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
@@ -129,7 +172,7 @@ impl World {
             let first = surfaces.len() as u32;
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
-                surfaces.push(spectra.surface(m)?);
+                surfaces.push(spectra.surface(m, &mut several)?);
                 material.push(k as u32);
                 rgb.push(m.rgb);
                 textures.push(m.texture.clone());
@@ -208,6 +251,7 @@ impl World {
             surface,
             object,
             surfaces,
+            several,
             first_surface,
             material,
             rgb,

@@ -174,7 +174,7 @@ impl Sharing {
             else {
                 continue;
             };
-            next.hit.choose_lobe(rng);
+            next.hit.choose_lobe(walk.world, rng);
             if next.hit.surface.is_black() {
                 continue;
             }
@@ -214,7 +214,7 @@ impl Sharing {
             if walk.is_own(spot, &hit) {
                 continue;
             }
-            hit.choose_lobe(rng);
+            hit.choose_lobe(walk.world, rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -235,7 +235,7 @@ impl Sharing {
             let Some(mut hit) = self.shells.draw(place, at, rng) else {
                 continue;
             };
-            hit.choose_lobe(rng);
+            hit.choose_lobe(walk.world, rng);
             self.shared.extend(Shared::new(hit));
         }
     }
@@ -253,7 +253,7 @@ pub(super) fn gather_point(
 ) -> Option<Vertex> {
     let mut vertex = first(walk, ray, scratch)?;
     loop {
-        vertex.hit.choose_lobe(rng);
+        vertex.hit.choose_lobe(walk.world, rng);
         if vertex.bounce > 1 {
             sink.factor = if vertex.hit.surface.specular() {
                 share
@@ -290,7 +290,7 @@ pub(super) fn only_mirrors(
     };
     sink.factor = share;
     loop {
-        vertex.hit.choose_lobe(rng);
+        vertex.hit.choose_lobe(walk.world, rng);
         if !vertex.hit.surface.specular() {
             return;
         }

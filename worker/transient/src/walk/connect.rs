@@ -179,9 +179,8 @@ impl Walk<'_> {
         let leg = m.p - h.p;
         let w = leg.normalized();
         let e = &self.emitters.list[aim.spot];
-        let there = self
-            .emitters
-            .weight(aim.spot, m.p, m.n, -w, &m.surface.gloss());
+        let near = m.mirror(self.world, rng);
+        let there = self.emitters.weight(aim.spot, m.p, m.n, -w, &near);
         let value = h.surface.scatter(h.n, v.wo, w) * there;
         let lengths = self.world.metres(leg.length()) + self.world.metres((e.p - m.p).length());
         let path = v.length_m + lengths + e.path_m;
@@ -194,10 +193,7 @@ impl Walk<'_> {
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
         let plain = h.surface.pdf(h.n, v.wo, w);
-        let mirror = Hit {
-            surface: m.surface.gloss(),
-            ..m
-        };
+        let mirror = Hit { surface: near, ..m };
         let light = Light {
             value: v.beta * value * free / (aimed + plain),
             tone: self.onward(v, w, || {
