@@ -194,6 +194,13 @@ fn shares_whose_rounded_sum_exceeds_1_are_metal_and_no_more() {
     let parts = weights.map(|w| common::conductor(w, 1.0, 0.5));
     let parts = picofarm_scene::Parts::of(&parts).expect("three");
     mesh.materials[0].bsdf = Bsdf::Several { parts };
+    let bytes = export::glb_bytes(&scene).expect("valid");
+    let document = gltf::Gltf::from_slice(&bytes).expect("standard glTF");
+    let pbr = document.materials().map(|m| m.pbr_metallic_roughness());
+    assert!(
+        pbr.clone()
+            .all(|p| p.metallic_factor() <= 1.0 && p.roughness_factor() <= 1.0)
+    );
     comes_back(scene);
 }
 
