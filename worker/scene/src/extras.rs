@@ -71,7 +71,8 @@ pub(crate) struct NodeExtras {
     pub(crate) laser_directions: Option<Vec<Vec3>>,
 }
 
-/// Metalness and roughness by which other programs know a BSDF: roughness = √α.
+/// Metalness and roughness by which other programs know a BSDF: roughness = √α. Of several parts it is the conductors' share and
+/// the root of their mean α by share.
 pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
     match material.bsdf {
         Bsdf::Diffuse { .. } => (0.0, 1.0),

@@ -44,6 +44,13 @@ impl Lobe {
         }
     }
 
+    /// Its reflectance at the laser's wavelength.
+    pub fn reflectance(self) -> f32 {
+        match self {
+            Lobe::Diffuse { reflectance } | Lobe::RoughConductor { reflectance, .. } => reflectance,
+        }
+    }
+
     /// The same with its reflectance multiplied by `factor`.
     fn scaled(mut self, factor: f32) -> Self {
         match &mut self {
@@ -115,7 +122,7 @@ impl Parts {
         self.list().iter().filter(near).map(|p| p.weight).sum()
     }
 
-    /// Share of its conductors, and their mean roughness by share.
+    /// Share of its conductors, and their mean roughness by share; both at most 1.
     pub(crate) fn conductors(&self) -> (f32, f32) {
         let of = |p: &Part| match p.lobe {
             Lobe::RoughConductor { alpha, .. } => (p.weight, p.weight * alpha),
@@ -123,7 +130,9 @@ impl Parts {
         };
         let all = self.list().iter().map(of);
         let (share, rough) = all.fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
-        (share, if share > 0.0 { rough / share } else { 1.0 })
+        let alpha = if share > 0.0 { rough / share } else { 1.0 };
+        // Sums of shares and their quotients are rounded.
+        (share.min(1.0), alpha.min(1.0))
     }
 
     /// Physical limits; the message says what was expected.

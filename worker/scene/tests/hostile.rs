@@ -3,7 +3,10 @@
 #[allow(dead_code)]
 mod common;
 
-use std::{path::Path, sync::OnceLock};
+use std::{
+    path::Path,
+    sync::{Arc, OnceLock},
+};
 
 use picofarm_scene::{
     Aim, export,
@@ -133,7 +136,8 @@ const DICTIONARY: &str = r#"{"type":"scene","sensor":{"type":"perspective","fov"
  "film":{"type":"hdrfilm","width":64,"height":64}},"white":{"type":"twosided","inner":{"type":"blendbsdf","weight":0.3,
  "a":{"type":"diffuse","reflectance":{"type":"rgb","value":[0.5,0.6,0.7]}},"b":{"type":"roughconductor","material":"none","alpha":0.1}}},
  "paint":{"type":"diffuse","reflectance":{"type":"spectrum","value":[[450,0.25],[550,0.5],[905,0.75]]}},
- "wall":{"type":"rectangle","bsdf":{"type":"ref","id":"white"}},"ball":{"type":"sphere","center":[0,0,1],"radius":0.3,"bsdf":{"type":"ref","id":"paint"}},
+ "coat":{"type":"blendbsdf","weight":0.25,"a":{"type":"ref","id":"white"},"b":{"type":"blendbsdf","weight":0.5,"a":{"type":"ref","id":"paint"},"b":{"type":"conductor","material":"Al"}}},
+ "wall":{"type":"rectangle","bsdf":{"type":"ref","id":"white"}},"floor":{"type":"cube","bsdf":{"type":"ref","id":"coat"}},"ball":{"type":"sphere","center":[0,0,1],"radius":0.3,"bsdf":{"type":"ref","id":"paint"}},
  "part":{"type":"obj","filename":"part.obj"},"beam":{"type":"projector","fov":0.2}}"#;
 
 const ASCII_PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
@@ -153,13 +157,20 @@ const FILES: [&str; 7] = [
     "part.obj",
 ];
 
+/// A Lambertian, mixes and a material of several parts, with textures and spectra. Small, so that damage hits what matters.
+fn room() -> picofarm_scene::Scene {
+    let mut scene = common::spectral_room();
+    scene.objects.truncate(4);
+    let several = common::parted_room().objects[1].mesh.materials[0].clone();
+    Arc::make_mut(&mut scene.objects[3].mesh).materials[0] = several;
+    scene
+}
+
 /// The undamaged files, in the order of [`FILES`].
 fn files() -> &'static [Vec<u8>] {
     static ALL: OnceLock<Vec<Vec<u8>>> = OnceLock::new();
     ALL.get_or_init(|| {
-        let mut scene = common::spectral_room();
-        // Small files, so that damage hits what matters.
-        scene.objects.truncate(4);
+        let scene = room();
         let folder = tempfile::tempdir().expect("a folder");
         export::write_mitsuba(&scene, &folder.path().join("room.xml")).expect("writes");
         let read = |name: &str| std::fs::read(folder.path().join(name)).expect("the file");
@@ -186,8 +197,7 @@ fn files() -> &'static [Vec<u8>] {
 /// A folder with everything that the scenes refer to.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut scene = common::spectral_room();
-    scene.objects.truncate(4);
+    let scene = room();
     export::write_mitsuba(&scene, &folder.path().join("room.xml")).expect("writes");
     std::fs::write(folder.path().join("part.obj"), OBJ).expect("writes");
     folder

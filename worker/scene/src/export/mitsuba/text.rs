@@ -6,8 +6,8 @@ use std::{collections::BTreeMap, fmt::Write as _, sync::Arc};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Affine, Beam, Bsdf, Camera, Distribution, Lobe, Material, Part, SpectrumPoint, Texture, Vec3,
-    Wrap,
+    Affine, Beam, Bsdf, Camera, Distribution, Lobe, Material, Part, Parts, SpectrumPoint, Texture,
+    Vec3, Wrap,
     extras::SceneExtras,
     texture::{linear, srgb_byte},
 };
@@ -81,7 +81,7 @@ pub(crate) fn bsdf_text(
         let tint = colour(
             &mut out,
             "specular_transmittance",
-            id,
+            "",
             material,
             None,
             transmittance,
@@ -96,9 +96,11 @@ pub(crate) fn bsdf_text(
         return out;
     }
     let outer = if material.two_sided { "" } else { id };
+    let image = format!("{id}-reflectance");
+    let metal_image = format!("{id}-specular_reflectance");
     let body = match material.bsdf {
         Bsdf::Diffuse { reflectance } => {
-            diffuse(&mut out, outer, id, material, texture, reflectance)
+            diffuse(&mut out, outer, &image, material, texture, reflectance)
         }
         Bsdf::RoughConductor {
             alpha,
@@ -107,7 +109,7 @@ pub(crate) fn bsdf_text(
         } => conductor(
             &mut out,
             outer,
-            id,
+            &metal_image,
             material,
             texture,
             (alpha, distribution, reflectance),
@@ -119,56 +121,15 @@ pub(crate) fn bsdf_text(
             specular_reflectance,
             weight,
         } => {
-            let a = diffuse(&mut out, "", id, material, texture, reflectance);
+            let a = diffuse(&mut out, "", &image, material, texture, reflectance);
             let specular = (alpha, distribution, specular_reflectance);
-            let b = conductor(&mut out, "", id, material, texture, specular);
+            let b = conductor(&mut out, "", &metal_image, material, texture, specular);
             format!(
                 "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{a}{b}</bsdf>",
                 id_attribute(outer)
             )
         }
-        Bsdf::Several { parts } => {
-            let (mut body, mut sum) = (String::new(), 0.0f64);
-            let missing = 1.0
-                - parts
-                    .list()
-                    .iter()
-                    .map(|p| f64::from(p.weight))
-                    .sum::<f64>();
-            let black = (missing > 1e-5).then_some(Part {
-                weight: missing as f32,
-                lobe: Lobe::Diffuse { reflectance: 0.0 },
-            });
-            let all: Vec<&Part> = parts.list().iter().chain(&black).collect();
-            for (k, part) in all.iter().enumerate() {
-                let own = if all.len() == 1 { outer } else { "" };
-                let text = match part.lobe {
-                    Lobe::Diffuse { reflectance } => {
-                        diffuse(&mut out, own, id, material, texture, reflectance)
-                    }
-                    Lobe::RoughConductor {
-                        alpha,
-                        distribution,
-                        reflectance,
-                    } => {
-                        let specular = (alpha, distribution, reflectance);
-                        conductor(&mut out, own, id, material, texture, specular)
-                    }
-                };
-                sum += f64::from(part.weight);
-                // A blend's weight is the share of its second.
-                let weight = (f64::from(part.weight) / sum.max(f64::MIN_POSITIVE)) as f32;
-                let named = if k + 1 == all.len() { outer } else { "" };
-                body = match k {
-                    0 => text,
-                    _ => format!(
-                        "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{body}{text}</bsdf>",
-                        id_attribute(named)
-                    ),
-                };
-            }
-            body
-        }
+        Bsdf::Several { parts } => several(&mut out, outer, id, material, texture, &parts),
         Bsdf::ThinDielectric { .. } => unreachable!("glass was written above"),
     };
     out.text = if material.two_sided {
@@ -177,6 +138,66 @@ pub(crate) fn bsdf_text(
         body
     };
     out
+}
+
+/// Shares below this are rounding.
+const NO_SHARE: f64 = 1e-6;
+
+/// Parts as blends of blends, in their order; the share that they lack is black.
+fn several(
+    out: &mut BsdfText,
+    outer: &str,
+    id: &str,
+    material: &Material,
+    texture: Option<&TextureExtras>,
+    parts: &Parts,
+) -> String {
+    let sum: f64 = parts.list().iter().map(|p| f64::from(p.weight)).sum();
+    let black = (1.0 - sum > NO_SHARE).then_some(Part {
+        weight: (1.0 - sum) as f32,
+        lobe: Lobe::Diffuse { reflectance: 0.0 },
+    });
+    let all: Vec<Part> = parts.list().iter().copied().chain(black).collect();
+    let mut leaves = Vec::new();
+    for part in &all {
+        let own = if all.len() == 1 { outer } else { "" };
+        let reflectance = part.lobe.reflectance();
+        // Equal parts share an image; what is black needs none.
+        let first = all.iter().position(|p| p.lobe.reflectance() == reflectance);
+        let image = format!("{id}-part{}", first.unwrap_or(0));
+        let texture = texture.filter(|_| reflectance > 0.0);
+        let text = match part.lobe {
+            Lobe::Diffuse { .. } => diffuse(out, own, &image, material, texture, reflectance),
+            Lobe::RoughConductor {
+                alpha,
+                distribution,
+                ..
+            } => {
+                let specular = (alpha, distribution, reflectance);
+                conductor(out, own, &image, material, texture, specular)
+            }
+        };
+        leaves.push((f64::from(part.weight), text));
+    }
+    blend(outer, &leaves)
+}
+
+/// Leaves with their shares as a tree of blends that is as flat as it can be.
+fn blend(id: &str, leaves: &[(f64, String)]) -> String {
+    if let [(_, text)] = leaves {
+        return text.clone();
+    }
+    let share = |of: &[(f64, String)]| of.iter().map(|l| l.0).sum::<f64>();
+    let (first, second) = leaves.split_at(leaves.len().div_ceil(2));
+    let (a, b) = (share(first), share(second));
+    // A blend's weight is the share of its second.
+    let weight = if b > 0.0 { (b / (a + b)) as f32 } else { 0.0 };
+    format!(
+        "<bsdf type=\"blendbsdf\"{}><float name=\"weight\" value=\"{weight}\"/>{}{}</bsdf>",
+        id_attribute(id),
+        blend("", first),
+        blend("", second)
+    )
 }
 
 fn id_attribute(id: &str) -> String {
@@ -190,12 +211,12 @@ fn id_attribute(id: &str) -> String {
 fn diffuse(
     out: &mut BsdfText,
     own_id: &str,
-    id: &str,
+    image: &str,
     material: &Material,
     texture: Option<&TextureExtras>,
     reflectance: f32,
 ) -> String {
-    let colour = colour(out, "reflectance", id, material, texture, reflectance);
+    let colour = colour(out, "reflectance", image, material, texture, reflectance);
     format!(
         "<bsdf type=\"diffuse\"{}>{colour}</bsdf>",
         id_attribute(own_id)
@@ -205,7 +226,7 @@ fn diffuse(
 fn conductor(
     out: &mut BsdfText,
     own_id: &str,
-    id: &str,
+    image: &str,
     material: &Material,
     texture: Option<&TextureExtras>,
     (alpha, distribution, reflectance): (f32, Distribution, f32),
@@ -213,7 +234,7 @@ fn conductor(
     let colour = colour(
         out,
         "specular_reflectance",
-        id,
+        image,
         material,
         texture,
         reflectance,
@@ -229,11 +250,11 @@ fn conductor(
     )
 }
 
-/// A colour parameter whose mean is `reflectance`.
+/// A colour parameter whose mean is `reflectance`; `image` names its file where it scales a texture.
 fn colour(
     out: &mut BsdfText,
     name: &str,
-    id: &str,
+    image: &str,
     material: &Material,
     texture: Option<&TextureExtras>,
     reflectance: f32,
@@ -254,8 +275,10 @@ fn colour(
     };
     let mut file = known.file.clone();
     if [r, g, b] != [1.0; 3] {
-        file = format!("textures/{id}-{name}.png");
-        out.images.push((file.clone(), tinted(texture, [r, g, b])));
+        file = format!("textures/{image}.png");
+        if out.images.iter().all(|known| known.0 != file) {
+            out.images.push((file.clone(), tinted(texture, [r, g, b])));
+        }
     }
     let wrap = match texture.wrap() {
         Wrap::Repeat => "repeat",

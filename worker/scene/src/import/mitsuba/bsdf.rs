@@ -9,7 +9,8 @@ use crate::{
 
 use super::{
     Reader,
-    colour::{Colour, spectrum_of},
+    blend::{Leaf, Mix},
+    colour::Colour,
     node::Node,
     transform::Matrix,
 };
@@ -42,26 +43,6 @@ pub(super) struct Look {
     pub(super) to_uv: Matrix,
 }
 
-/// A BSDF by its two parts.
-struct Parts {
-    diffuse: Option<Colour>,
-    conductor: Option<(Colour, f32, Distribution)>,
-    weight: f32,
-    two_sided: bool,
-}
-
-impl Parts {
-    /// True for a mix of a part that has a spectrum and one that has a colour.
-    fn lack_a_spectrum(&self) -> bool {
-        let (Some(a), Some((b, ..))) = (&self.diffuse, &self.conductor) else {
-            return false;
-        };
-        let coloured = |c: &Colour| c.spectrum.is_empty() && c.rgb != [c.rgb[0]; 3];
-        let stated = |c: &Colour| !c.spectrum.is_empty();
-        stated(a) && coloured(b) || stated(b) && coloured(a)
-    }
-}
-
 impl Reader<'_> {
     /// The material of a BSDF; ours, exactly, where its text is as we wrote it.
     pub(super) fn look(&mut self, node: &Rc<Node>) -> Result<Look, String> {
@@ -79,14 +60,8 @@ impl Reader<'_> {
                 to_uv: Matrix::IDENTITY,
             },
             None => {
-                let parts = self.parts(node, 0)?;
-                if parts.lack_a_spectrum() {
-                    self.note(
-                        "spectra",
-                        "parts of mixes without one reflect their mean at every wavelength",
-                    );
-                }
-                assemble(node, parts)?
+                let mix = self.mix(node, 0)?;
+                self.assemble(node, mix)?
             }
         };
         self.looks.insert(key, look.clone());
@@ -136,30 +111,13 @@ impl Reader<'_> {
         Ok(None)
     }
 
-    fn parts(&mut self, node: &Node, depth: usize) -> Result<Parts, String> {
+    /// What a BSDF is made of.
+    pub(super) fn mix(&mut self, node: &Rc<Node>, depth: usize) -> Result<Mix, String> {
         if depth > MAX_DEPTH {
             return Err(node.fail(format!("nested deeper than {MAX_DEPTH}")));
         }
         match node.kind.as_str() {
-            "diffuse" => {
-                self.ignored(node, &["reflectance"]);
-                let colour = self.colour(node, "reflectance")?;
-                Ok(Parts {
-                    diffuse: Some(colour.unwrap_or(Colour::grey(0.5))),
-                    conductor: None,
-                    weight: 0.0,
-                    two_sided: false,
-                })
-            }
-            "roughconductor" | "conductor" => {
-                let conductor = self.conductor(node)?;
-                Ok(Parts {
-                    diffuse: None,
-                    conductor: Some(conductor),
-                    weight: 1.0,
-                    two_sided: false,
-                })
-            }
+            "diffuse" | "roughconductor" | "conductor" => Ok(Mix::of(self.leaf(node)?)),
             "twosided" => {
                 let inner = self.children(node, "bsdf")?;
                 let [inner] = inner.as_slice() else {
@@ -168,15 +126,37 @@ impl Reader<'_> {
                         inner.len()
                     )));
                 };
-                let parts = self.parts(inner, depth + 1)?;
-                Ok(Parts {
-                    two_sided: true,
-                    ..parts
-                })
+                let mut mix = self.mix(inner, depth + 1)?;
+                mix.two_sided = true;
+                Ok(mix)
             }
             "blendbsdf" => self.blend(node, depth),
             other => Err(node.fail(format!("bsdf {other:?} is not supported; {SUBSET}"))),
         }
+    }
+
+    /// A Lambertian or a conductor, read once however often blends refer to it.
+    fn leaf(&mut self, node: &Rc<Node>) -> Result<Rc<Leaf>, String> {
+        let key = Rc::as_ptr(node).addr();
+        if let Some(known) = self.leaves.get(&key) {
+            return Ok(known.clone());
+        }
+        let leaf = Rc::new(if node.kind == "diffuse" {
+            self.ignored(node, &["reflectance"]);
+            let colour = self.colour(node, "reflectance")?;
+            Leaf {
+                colour: colour.unwrap_or(Colour::grey(0.5)),
+                metal: None,
+            }
+        } else {
+            let (colour, alpha, distribution) = self.conductor(node)?;
+            Leaf {
+                colour,
+                metal: Some((alpha, distribution)),
+            }
+        });
+        self.leaves.insert(key, leaf.clone());
+        Ok(leaf)
     }
 
     /// Thin glass.
@@ -217,58 +197,6 @@ impl Reader<'_> {
             face: false,
         };
         Ok(material)
-    }
-
-    fn blend(&mut self, node: &Node, depth: usize) -> Result<Parts, String> {
-        let weight = node.number("weight")?.ok_or_else(|| {
-            node.fail("weight: expected a number (textures as weights are not supported)")
-        })? as f32;
-        if !(0.0..=1.0).contains(&weight) {
-            return Err(node.fail(format!("weight: {weight} lies outside [0, 1]")));
-        }
-        let inner = self.children(node, "bsdf")?;
-        let [a, b] = inner.as_slice() else {
-            return Err(node.fail(format!("expected two BSDFs, found {}", inner.len())));
-        };
-        let (a, b) = (self.parts(a, depth + 1)?, self.parts(b, depth + 1)?);
-        let two_sided = a.two_sided && b.two_sided;
-        match (a, b) {
-            (
-                Parts {
-                    diffuse: Some(diffuse),
-                    conductor: None,
-                    ..
-                },
-                Parts {
-                    diffuse: None,
-                    conductor: Some(conductor),
-                    ..
-                },
-            ) => Ok(Parts {
-                diffuse: Some(diffuse),
-                conductor: Some(conductor),
-                weight,
-                two_sided,
-            }),
-            (
-                Parts {
-                    diffuse: None,
-                    conductor: Some(conductor),
-                    ..
-                },
-                Parts {
-                    diffuse: Some(diffuse),
-                    conductor: None,
-                    ..
-                },
-            ) => Ok(Parts {
-                diffuse: Some(diffuse),
-                conductor: Some(conductor),
-                weight: 1.0 - weight,
-                two_sided,
-            }),
-            _ => Err(node.fail("expected a diffuse and a conductor")),
-        }
     }
 
     fn conductor(&mut self, node: &Node) -> Result<(Colour, f32, Distribution), String> {
@@ -343,7 +271,7 @@ impl Reader<'_> {
 }
 
 /// What a material is called.
-fn named(node: &Node) -> String {
+pub(super) fn named(node: &Node) -> String {
     match node.id.is_empty() {
         true => node.kind.clone(),
         false => node.id.clone(),
@@ -366,60 +294,4 @@ fn index(node: &Node, name: &str, default: &str) -> Result<f64, String> {
             MEDIA.map(|m| m.0).join(", ")
         ))
     })
-}
-
-fn assemble(node: &Node, parts: Parts) -> Result<Look, String> {
-    let texture_of = |c: &Option<Colour>| c.as_ref().and_then(|c| c.texture.clone());
-    let diffuse = texture_of(&parts.diffuse);
-    let conductor = texture_of(&parts.conductor.as_ref().map(|c| c.0.clone()));
-    let texture = match (&parts.diffuse, &parts.conductor) {
-        (Some(_), Some(_)) => match (diffuse, conductor) {
-            (None, None) => None,
-            (Some(a), Some(b)) if a == b => Some(a),
-            _ => {
-                return Err(
-                    node.fail("a texture scales both parts of a mix: give both the same bitmap")
-                );
-            }
-        },
-        _ => diffuse.or(conductor),
-    };
-    let specular = parts.conductor.as_ref().map(|c| &c.0);
-    let spectrum = spectrum_of(parts.diffuse.as_ref(), specular);
-    let (rgb, bsdf) = match (parts.diffuse, parts.conductor) {
-        (Some(d), None) => (
-            d.rgb,
-            Bsdf::Diffuse {
-                reflectance: d.mean(),
-            },
-        ),
-        (None, Some((s, alpha, distribution))) => (
-            s.rgb,
-            Bsdf::RoughConductor {
-                alpha,
-                distribution,
-                reflectance: s.mean(),
-            },
-        ),
-        (Some(d), Some((s, alpha, distribution))) => {
-            let w = parts.weight;
-            let rgb = std::array::from_fn(|k| (1.0 - w) * d.rgb[k] + w * s.rgb[k]);
-            let bsdf = Bsdf::Mixed {
-                reflectance: d.mean(),
-                alpha,
-                distribution,
-                specular_reflectance: s.mean(),
-                weight: w,
-            };
-            (rgb, bsdf)
-        }
-        (None, None) => return Err(node.fail("has no BSDF")),
-    };
-    let (texture, to_uv) = texture.map_or((None, Matrix::IDENTITY), |(t, m)| (Some(t), m));
-    let mut material = Material::diffuse(named(node), rgb);
-    material.bsdf = bsdf;
-    material.texture = texture;
-    material.spectrum = spectrum;
-    material.two_sided = parts.two_sided;
-    Ok(Look { material, to_uv })
 }

@@ -6,7 +6,7 @@
 //! lies outside the visible is grey. Its reflectance is the mean of these three, as of every other colour in Mitsuba's files.
 //! So renders without a wavelength treat it as they treat the `<rgb>` that looks like it.
 //!
-//! Of a blend of which one part alone has a spectrum, the other reflects its mean at every wavelength.
+//! Of a blend of which some parts have spectra, the others reflect their means at every wavelength.
 
 use std::{path::Path, sync::Arc};
 
@@ -24,7 +24,7 @@ use super::{
 };
 
 /// A colour, by wavelength if stated so; or white with a texture.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Colour {
     pub(super) rgb: [f32; 3],
     /// Empty where the file states numbers alone.
@@ -65,6 +65,34 @@ fn reflectance(spectrum: &[SpectrumPoint], nm: f32) -> Option<f32> {
     interpolated(spectrum, nm, |p| [p.reflectance]).map(|[r]| r)
 }
 
+/// The mean of colours without textures by their shares, at the wavelengths of all.
+pub(super) fn mean_of(all: &[(f64, &Colour)]) -> Colour {
+    let sum: f64 = all.iter().map(|(share, _)| share).sum();
+    let mean = |of: &dyn Fn(&Colour) -> f32| {
+        let weighted = all.iter().map(|(share, c)| share * f64::from(of(c)));
+        (weighted.sum::<f64>() / sum) as f32
+    };
+    let nms = wavelengths(all.iter().map(|(_, c)| *c));
+    let row = |nm: f32| SpectrumPoint {
+        nm,
+        reflectance: mean(&|c| c.at(nm)),
+        specular_reflectance: None,
+    };
+    Colour {
+        rgb: std::array::from_fn(|k| mean(&|c| c.rgb[k])),
+        spectrum: nms.into_iter().map(row).collect(),
+        texture: None,
+    }
+}
+
+/// Those at which any of the colours states what it reflects, ascending.
+fn wavelengths<'a>(colours: impl Iterator<Item = &'a Colour>) -> Vec<f32> {
+    let mut all: Vec<f32> = colours.flat_map(|c| &c.spectrum).map(|p| p.nm).collect();
+    all.sort_by(f32::total_cmp);
+    all.dedup();
+    all
+}
+
 /// The spectrum of a material by those of its parts; of a mix, at the wavelengths of both.
 pub(super) fn spectrum_of(
     diffuse: Option<&Colour>,
@@ -77,10 +105,7 @@ pub(super) fn spectrum_of(
             return part.map_or(vec![], |c| c.spectrum.clone());
         }
     };
-    let both = diffuse.spectrum.iter().chain(&conductor.spectrum);
-    let mut all: Vec<f32> = both.map(|p| p.nm).collect();
-    all.sort_by(f32::total_cmp);
-    all.dedup();
+    let all = wavelengths([diffuse, conductor].into_iter());
     let row = |nm| SpectrumPoint {
         nm,
         reflectance: diffuse.at(nm),

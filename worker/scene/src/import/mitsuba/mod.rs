@@ -3,7 +3,7 @@
 //! Understood: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size); shapes `ply`,
 //! `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs `diffuse`,
 //! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
-//! a diffuse and a conductor; `bitmap` textures; `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a
+//! all these, nested too; `bitmap` textures; `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a
 //! reflectance; references, `<default>` parameters, and every transform. A shape without BSDF is Mitsuba's default, a
 //! one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
 //! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
@@ -20,6 +20,7 @@
 //! `picofarm`: exact materials, labels, spots and provenance. Each is used only while the element that it
 //! belongs to still has the text that was written; edited elements count as they stand.
 
+mod blend;
 mod bsdf;
 mod colour;
 mod dictionary;
@@ -42,6 +43,7 @@ use crate::{
 };
 
 use super::{ImportOptions, Opener, format_error, image::Images, of_file};
+use blend::Leaf;
 use bsdf::Look;
 use node::{Child, Node};
 use shape::Geometry;
@@ -127,6 +129,8 @@ struct Reader<'a> {
     images: Images<(PathBuf, Wrap, bool)>,
     /// Materials by the address of their node, which lives as long as `root`.
     looks: BTreeMap<usize, Look>,
+    /// What blends are made of, likewise.
+    leaves: BTreeMap<usize, Rc<Leaf>>,
     geometries: BTreeMap<PathBuf, Geometry>,
     notes: BTreeMap<String, String>,
 }
@@ -154,6 +158,7 @@ impl<'a> Reader<'a> {
             extras,
             images: Images::default(),
             looks: BTreeMap::new(),
+            leaves: BTreeMap::new(),
             geometries: BTreeMap::new(),
             notes: BTreeMap::new(),
         }

@@ -1,0 +1,298 @@
+//! Mitsuba's blends as materials of parts side by side.
+//!
+//! A blend is (1 − `weight`) of its first BSDF and `weight` of its second, and either may be a blend again. What is read are the
+//! leaves, Lambertians and conductors, in the file's order. The share of a leaf is the product of the weights on the way to it.
+//! Leaves that scatter alike and have one colour are one. One Lambertian and one conductor are [`Bsdf::Mixed`]. One leaf alone
+//! is what it is. All others are [`Bsdf::Several`], without the leaves that have no share and without black Lambertians.
+//!
+//! - **Colour**: a material's `rgb` is the mean of its leaves' colours by their shares, so that the mean of its three channels
+//!   is the sum of shares times reflectances. At a stated wavelength every part has the hue of this `rgb`: together the parts
+//!   reflect what they should, unless one of them would reflect more than it gets. A note says so where hues differ.
+//! - **Texture**: it scales all parts. So all leaves with a share have the same bitmap, or none has one. Black Lambertians need none.
+//! - **Spectra**: Lambertians side by side are one Lambertian of their mean. They are read as one where any leaf of a blend has a
+//!   spectrum. What a material's spectrum says of conductors holds for all of them: they have the same spectrum, or none has one.
+//! - **Sides**: a blend is two-sided where both its BSDFs are.
+
+use std::{rc::Rc, sync::Arc};
+
+use crate::{Bsdf, Distribution, Lobe, MAX_PARTS, Material, Part, Parts, SpectrumPoint, Texture};
+
+use super::{
+    Reader,
+    bsdf::{Look, named},
+    colour::{Colour, mean_of, spectrum_of},
+    node::Node,
+    transform::Matrix,
+};
+
+/// Hues closer than this are the same.
+const SAME_HUE: f32 = 1e-3;
+
+/// What blends are made of.
+#[derive(Debug, PartialEq)]
+pub(super) struct Leaf {
+    pub(super) colour: Colour,
+    /// α and distribution of a conductor; a Lambertian has none.
+    pub(super) metal: Option<(f32, Distribution)>,
+}
+
+impl Leaf {
+    /// A Lambertian that reflects nothing, as the missing share of a material does.
+    fn is_black(&self) -> bool {
+        let Colour {
+            rgb,
+            spectrum,
+            texture,
+        } = &self.colour;
+        self.metal.is_none() && *rgb == [0.0; 3] && spectrum.is_empty() && texture.is_none()
+    }
+
+    fn has_spectrum(&self) -> bool {
+        !self.colour.spectrum.is_empty()
+    }
+
+    fn lobe(&self) -> Lobe {
+        let reflectance = self.colour.mean();
+        match self.metal {
+            None => Lobe::Diffuse { reflectance },
+            Some((alpha, distribution)) => Lobe::RoughConductor {
+                alpha,
+                distribution,
+                reflectance,
+            },
+        }
+    }
+}
+
+/// A leaf with its share.
+type Share = (f64, Rc<Leaf>);
+/// Leaves with their shares.
+type Leaves = Vec<Share>;
+
+/// A BSDF as leaves side by side, no two alike; their shares sum to 1.
+pub(super) struct Mix {
+    leaves: Leaves,
+    pub(super) two_sided: bool,
+}
+
+impl Mix {
+    /// One leaf, one-sided.
+    pub(super) fn of(leaf: Rc<Leaf>) -> Self {
+        Self {
+            leaves: vec![(1.0, leaf)],
+            two_sided: false,
+        }
+    }
+
+    /// This and another side by side, which has the share `weight`.
+    fn beside(self, other: Self, weight: f64) -> Self {
+        let two_sided = self.two_sided && other.two_sided;
+        let first = self.leaves.into_iter().map(|l| (l.0 * (1.0 - weight), l.1));
+        let second = other.leaves.into_iter().map(|l| (l.0 * weight, l.1));
+        let mut leaves = Leaves::new();
+        for (share, leaf) in first.chain(second) {
+            let alike = |known: &&mut Share| Rc::ptr_eq(&known.1, &leaf) || known.1 == leaf;
+            match leaves.iter_mut().find(alike) {
+                Some(known) => known.0 += share,
+                None => leaves.push((share, leaf)),
+            }
+        }
+        Self { leaves, two_sided }
+    }
+}
+
+impl Reader<'_> {
+    pub(super) fn blend(&mut self, node: &Rc<Node>, depth: usize) -> Result<Mix, String> {
+        let weight = node.number("weight")?.ok_or_else(|| {
+            node.fail("weight: expected a number (textures as weights are not supported)")
+        })? as f32;
+        if !(0.0..=1.0).contains(&weight) {
+            return Err(node.fail(format!("weight: {weight} lies outside [0, 1]")));
+        }
+        let inner = self.children(node, "bsdf")?;
+        let [a, b] = inner.as_slice() else {
+            return Err(node.fail(format!("expected two BSDFs, found {}", inner.len())));
+        };
+        let (a, b) = (self.mix(a, depth + 1)?, self.mix(b, depth + 1)?);
+        if a.two_sided != b.two_sided {
+            self.note(
+                "blends.sides",
+                "of a two-sided and a one-sided BSDF are one-sided",
+            );
+        }
+        let mix = a.beside(b, f64::from(weight));
+        let count = mix.leaves.iter().filter(|l| has_share(l));
+        let count = count.filter(|l| !l.1.is_black()).count();
+        match count <= MAX_PARTS {
+            true => Ok(mix),
+            false => Err(node.fail(format!(
+                "has {count} different parts, expected {MAX_PARTS} at most"
+            ))),
+        }
+    }
+
+    /// The material that a mix is.
+    pub(super) fn assemble(&mut self, node: &Node, mix: Mix) -> Result<Look, String> {
+        let mut leaves = mix.leaves;
+        if !is_simple(&leaves) {
+            leaves.retain(has_share);
+        }
+        let texture = texture_of(&leaves).map_err(|what| node.fail(what))?;
+        let spectral = leaves.iter().any(|l| l.1.has_spectrum());
+        let coloured = |c: &Colour| c.spectrum.is_empty() && c.rgb != [c.rgb[0]; 3];
+        if spectral && leaves.iter().any(|l| coloured(&l.1.colour)) {
+            self.note(
+                "spectra",
+                "parts of mixes without one reflect their mean at every wavelength",
+            );
+        }
+        if spectral && !is_simple(&leaves) {
+            leaves = with_one_lambertian(leaves);
+        }
+        let (bsdf, rgb, spectrum) = match (leaves.as_slice(), pair(&leaves)) {
+            ([(_, one)], _) => (
+                one.lobe().bsdf(),
+                one.colour.rgb,
+                one.colour.spectrum.clone(),
+            ),
+            (_, Some((lambertian, metal))) => mixed(&lambertian.1.colour, metal),
+            _ => {
+                leaves.retain(|l| !l.1.is_black());
+                if !spectral && have_several_hues(&leaves) {
+                    self.note(
+                        "blends.hues",
+                        "of several parts are that of their mean at stated wavelengths",
+                    );
+                }
+                several(&leaves).map_err(|what| node.fail(what))?
+            }
+        };
+        let (texture, to_uv) = texture.map_or((None, Matrix::IDENTITY), |(t, m)| (Some(t), m));
+        let mut material = Material::diffuse(named(node), rgb);
+        material.bsdf = bsdf;
+        material.texture = texture;
+        material.spectrum = spectrum;
+        material.two_sided = mix.two_sided;
+        Ok(Look { material, to_uv })
+    }
+}
+
+type Assembled = (Bsdf, [f32; 3], Vec<SpectrumPoint>);
+
+/// False for what vanishes in a material's numbers.
+fn has_share((share, _): &Share) -> bool {
+    *share as f32 > 0.0
+}
+
+/// One Lambertian and one conductor, in this order.
+fn pair(leaves: &[Share]) -> Option<(&Share, &Share)> {
+    match leaves {
+        [a, b] if a.1.metal.is_none() && b.1.metal.is_some() => Some((a, b)),
+        [a, b] if a.1.metal.is_some() && b.1.metal.is_none() => Some((b, a)),
+        _ => None,
+    }
+}
+
+/// True for one leaf, and for one Lambertian and one conductor.
+fn is_simple(leaves: &[Share]) -> bool {
+    leaves.len() == 1 || pair(leaves).is_some()
+}
+
+/// The texture that scales all leaves.
+fn texture_of(leaves: &[Share]) -> Result<Option<(Arc<Texture>, Matrix)>, &'static str> {
+    let mut all = leaves.iter().filter(|l| !l.1.is_black());
+    let Some((_, first)) = all.next() else {
+        return Ok(None);
+    };
+    let texture = &first.colour.texture;
+    match all.all(|l| l.1.colour.texture == *texture) {
+        true => Ok(texture.clone()),
+        false => Err("a texture scales all parts of a blend: give all the same bitmap"),
+    }
+}
+
+/// The same with all Lambertians but black ones as one, in the place of the first.
+fn with_one_lambertian(leaves: Leaves) -> Leaves {
+    let united = |l: &Share| l.1.metal.is_none() && !l.1.is_black();
+    let (some, mut rest): (Leaves, Leaves) = leaves.iter().cloned().partition(united);
+    if some.len() < 2 {
+        return leaves;
+    }
+    let colours: Vec<(f64, &Colour)> = some.iter().map(|l| (l.0, &l.1.colour)).collect();
+    let leaf = Leaf {
+        colour: mean_of(&colours),
+        metal: None,
+    };
+    let share = some.iter().map(|l| l.0).sum();
+    let place = leaves.iter().position(united).unwrap_or(0);
+    rest.insert(place, (share, Rc::new(leaf)));
+    rest
+}
+
+/// A Lambertian and a conductor with its share.
+fn mixed(d: &Colour, (share, metal): &Share) -> Assembled {
+    let (s, w) = (&metal.colour, *share as f32);
+    let (alpha, distribution) = metal.metal.unwrap_or((1.0, Distribution::Beckmann));
+    let rgb = std::array::from_fn(|k| (1.0 - w) * d.rgb[k] + w * s.rgb[k]);
+    let bsdf = Bsdf::Mixed {
+        reflectance: d.mean(),
+        alpha,
+        distribution,
+        specular_reflectance: s.mean(),
+        weight: w,
+    };
+    (bsdf, rgb, spectrum_of(Some(d), Some(s)))
+}
+
+/// Leaves that are no simpler material; of those with spectra, one Lambertian at most.
+fn several(leaves: &[Share]) -> Result<Assembled, String> {
+    let part = |(share, leaf): &Share| Part {
+        weight: *share as f32,
+        lobe: leaf.lobe(),
+    };
+    let parts: Vec<Part> = leaves.iter().map(part).collect();
+    let rgb = std::array::from_fn(|k| {
+        let channel = leaves.iter().map(|l| l.0 * f64::from(l.1.colour.rgb[k]));
+        channel.sum::<f64>() as f32
+    });
+    let bsdf = Bsdf::Several {
+        parts: Parts::of(&parts)?,
+    };
+    Ok((bsdf, rgb, spectrum_of_several(leaves)?))
+}
+
+fn spectrum_of_several(leaves: &[Share]) -> Result<Vec<SpectrumPoint>, &'static str> {
+    if !leaves.iter().any(|l| l.1.has_spectrum()) {
+        return Ok(vec![]);
+    }
+    let lambertian = leaves.iter().find(|l| l.1.metal.is_none());
+    let mut conductors = leaves.iter().filter(|l| l.1.metal.is_some());
+    let conductor = conductors.next().map(|l| &l.1.colour);
+    if let Some(first) = conductor
+        && conductors.any(|l| l.1.colour.spectrum != first.spectrum)
+    {
+        return Err(
+            "conductors of one blend differ in their spectra: give all the same <spectrum>, or none",
+        );
+    }
+    let mut rows = spectrum_of(lambertian.map(|l| &l.1.colour), conductor);
+    if lambertian.is_none() {
+        for row in &mut rows {
+            row.specular_reflectance = Some(row.reflectance);
+        }
+    }
+    Ok(rows)
+}
+
+/// True where colours differ by more than their brightness.
+fn have_several_hues(leaves: &[Share]) -> bool {
+    let colours = leaves.iter().map(|l| &l.1.colour);
+    let mut hues = colours
+        .filter(|c| c.mean() > 0.0)
+        .map(|c| c.rgb.map(|x| x / c.mean()));
+    let Some(first) = hues.next() else {
+        return false;
+    };
+    let differs = |other: [f32; 3]| (0..3).any(|k| (other[k] - first[k]).abs() > SAME_HUE);
+    hues.any(differs)
+}
