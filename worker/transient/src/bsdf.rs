@@ -35,9 +35,9 @@ const SHARED_ALPHA: f32 = 0.15;
 pub(crate) struct Surface {
     kind: Kind,
     flags: u8,
-    /// Which tones it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = plain. Of several
+    /// Which ratios it has: the Lambertian part's, or a pure conductor's; those of a mix's conductor come next. 0 = ones. Of several
     /// parts: which they are.
-    tone: u16,
+    spectrum_row: u16,
     /// Lambertian: ρ/π. Conductor, also as a part of a mix: its reflectance times its share. Several parts: the factor of all. 0 = black.
     strength: f32,
     /// Roughness of a conductor; of others 0. Of several parts that of the roughest near-mirror, or else of the smoothest conductor,
@@ -63,7 +63,7 @@ impl Surface {
             flags: flag(m.two_sided, TWO_SIDED)
                 | flag(m.is_specular(), SPECULAR)
                 | flag(ggx && kind != Kind::Lambertian, GGX),
-            tone: 0,
+            spectrum_row: 0,
             strength,
             alpha,
             base,
@@ -107,7 +107,7 @@ impl Surface {
             .or_else(|| lit().map(Surface::alpha).reduce(f32::min));
         let black = parts.iter().all(Surface::is_black);
         Self {
-            tone: index,
+            spectrum_row: index,
             strength: if black { 0.0 } else { 1.0 },
             alpha: alpha.unwrap_or(1.0),
             ..Self::new(m)
@@ -117,7 +117,7 @@ impl Surface {
     /// True for several parts; which of them and times what.
     #[inline(always)]
     pub fn parts_of_several(&self) -> Option<(usize, f32)> {
-        (self.kind == Kind::Several).then_some((usize::from(self.tone), self.strength))
+        (self.kind == Kind::Several).then_some((usize::from(self.spectrum_row), self.strength))
     }
 
     /// Share of light that it sends on, as far as masking lets it.
@@ -129,25 +129,28 @@ impl Surface {
         }
     }
 
-    /// The same surface with the tones of a row and the one behind it: the Lambertian part's, and the conductor's.
-    pub fn with_tone(self, row: u16) -> Self {
-        let tone = match self.kind {
+    /// The same surface with the ratios of a row and the one behind it: the Lambertian part's, and the conductor's.
+    pub fn with_spectrum(self, row: u16) -> Self {
+        let spectrum_row = match self.kind {
             Kind::Conductor => row + 1,
             Kind::Lambertian | Kind::Mixed | Kind::Several => row,
         };
-        Self { tone, ..self }
+        Self {
+            spectrum_row,
+            ..self
+        }
     }
 
-    /// Which tones it has; 0 = plain.
+    /// Which ratios it has; 0 = ones.
     #[inline(always)]
-    pub fn tone(&self) -> u16 {
-        self.tone
+    pub fn spectrum_row(&self) -> u16 {
+        self.spectrum_row
     }
 
-    /// Which tones the conductor of a mix has.
+    /// Which ratios the conductor of a mix has.
     #[inline(always)]
-    fn gloss_tone(&self) -> u16 {
-        self.tone + u16::from(self.tone != 0)
+    fn gloss_spectrum(&self) -> u16 {
+        self.spectrum_row + u16::from(self.spectrum_row != 0)
     }
 
     /// Scatters from both sides.
@@ -194,7 +197,7 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            tone: 0,
+            spectrum_row: 0,
             strength: 1.0 / PI,
             alpha: 0.0,
             base: 0.0,
@@ -217,6 +220,12 @@ impl Surface {
     #[inline(always)]
     pub fn is_mixed(&self) -> bool {
         matches!(self.kind, Kind::Mixed)
+    }
+
+    /// True for a mix and for several parts: not settled on one of them.
+    #[inline(always)]
+    pub fn is_open(&self) -> bool {
+        matches!(self.kind, Kind::Mixed | Kind::Several)
     }
 
     /// BRDF of a Lambertian surface, ρ/π.
@@ -262,7 +271,7 @@ impl Surface {
             return Self {
                 kind: Kind::Conductor,
                 flags: self.flags & !SPECULAR | if mirror { SPECULAR } else { 0 },
-                tone: self.gloss_tone(),
+                spectrum_row: self.gloss_spectrum(),
                 strength: total,
                 base: 0.0,
                 ..*self
@@ -271,7 +280,7 @@ impl Surface {
         Self {
             kind: Kind::Lambertian,
             flags: self.flags & TWO_SIDED,
-            tone: self.tone,
+            spectrum_row: self.spectrum_row,
             strength: total / PI,
             alpha: 0.0,
             base: 0.0,
@@ -284,7 +293,7 @@ impl Surface {
         match self.kind {
             Kind::Mixed => Self {
                 kind: Kind::Conductor,
-                tone: self.gloss_tone(),
+                spectrum_row: self.gloss_spectrum(),
                 base: 0.0,
                 ..self
             },

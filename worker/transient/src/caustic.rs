@@ -31,7 +31,7 @@ use crate::{
     light_vertices::{ALONE, LightVertex, LightVertices},
     mirror_images::Mirrors,
     rng::{Rng, Stream},
-    spectra::{Tone, times},
+    spectra::{Ratios, times},
     world::{Hit, World, lift},
 };
 
@@ -100,7 +100,7 @@ struct Start {
     hit: Hit,
     back: Vec3,
     flux: f32,
-    tone: Tone,
+    ratios: Ratios,
     path_m: f64,
 }
 
@@ -244,7 +244,7 @@ impl Caustics {
             mut hit,
             back: mut wo,
             mut flux,
-            mut tone,
+            mut ratios,
             mut path_m,
         } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
@@ -263,7 +263,7 @@ impl Caustics {
                 weight /= survive;
             }
             flux *= weight;
-            tone = times(tone, world.tone(&hit, wo, w));
+            ratios = times(ratios, world.ratios(&hit, wo, w));
             let Some(mut next) = world.closest(stack, lift(hit.p, hit.n), w) else {
                 return;
             };
@@ -289,7 +289,7 @@ impl Caustics {
                 hit,
                 back: wo,
                 flux,
-                tone,
+                ratios,
                 density: ALONE,
                 path_m,
                 spot,
@@ -365,7 +365,7 @@ impl Caustics {
             hit,
             back: -w,
             flux,
-            tone: e.tone(world, w),
+            ratios: e.ratios(world, w),
             path_m: e.path_m + world.metres(d),
         })
     }
@@ -396,20 +396,20 @@ pub(crate) fn splat<'a>(
     stack: &mut Stack,
 ) -> impl Iterator<Item = Splat> + use<'a> {
     let seen = seen(world, film, z, stack).into_iter();
-    seen.flat_map(|(splat, tone)| {
+    seen.flat_map(|(splat, ratios)| {
         (0u8..)
-            .zip(tone)
+            .zip(ratios)
             .take(film.wavelengths)
-            .map(move |(wavelength, tone)| Splat {
+            .map(move |(wavelength, ratios)| Splat {
                 wavelength,
-                value: splat.value * tone,
+                value: splat.value * ratios,
                 ..splat
             })
     })
 }
 
 /// The light of all wavelengths.
-fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<(Splat, Tone)> {
+fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<(Splat, Ratios)> {
     let i = &world.camera.intrinsics;
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);
@@ -434,5 +434,5 @@ fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Optio
         value,
         bounces: z.bounces,
     };
-    Some((splat, times(z.tone, world.tone(&z.hit, z.back, -p / d))))
+    Some((splat, times(z.ratios, world.ratios(&z.hit, z.back, -p / d))))
 }

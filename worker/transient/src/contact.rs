@@ -155,7 +155,7 @@ impl Contacts {
             return;
         };
         flux /= turns.count();
-        let mut tone = e.tone(world, w);
+        let mut ratios = e.ratios(world, w);
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Within the zones, and what the vertex before was.
         let (mut inside, mut specular) = (true, false);
@@ -186,7 +186,7 @@ impl Contacts {
                     hit,
                     back: -w,
                     flux,
-                    tone,
+                    ratios,
                     density: ALONE,
                     path_m,
                     spot,
@@ -205,7 +205,7 @@ impl Contacts {
                 weight /= survive;
             }
             flux *= weight;
-            tone = times(tone, world.tone(&hit, -w, next));
+            ratios = times(ratios, world.ratios(&hit, -w, next));
             specular = hit.surface.specular();
             (from, at, w) = (hit.p, lift(hit.p, hit.n), next);
         }

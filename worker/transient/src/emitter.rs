@@ -11,7 +11,7 @@ use crate::{
     bvh::Stack,
     contact,
     lanes::{Wide, widest},
-    spectra::{PLAIN, Tone, times},
+    spectra::{ONES, Ratios, times},
     world::{World, lift},
 };
 
@@ -110,8 +110,8 @@ pub(crate) struct Emitter {
     pub path_m: f64,
     /// Scattering on the lit side (black behind a one-sided surface), times the source's share of the beam: what glass lets through.
     pub surface: Surface,
-    /// Tone of the texture there.
-    tone: Tone,
+    /// Ratios of the texture there.
+    ratios: Ratios,
 }
 
 impl Emitter {
@@ -134,11 +134,11 @@ impl Emitter {
             Some(h) if material == world.surface[h.triangle as usize] => h.surface,
             _ => surface,
         };
-        let tone = match &beneath {
+        let ratios = match &beneath {
             Some(h) if material == world.surface[h.triangle as usize] => {
-                world.texel_tone(h.triangle, h.p)
+                world.texel_ratios(h.triangle, h.p)
             }
-            _ => PLAIN,
+            _ => ONES,
         };
         let surface = match share == 1.0 {
             true => surface,
@@ -151,7 +151,7 @@ impl Emitter {
             back: -spot.arriving,
             path_m: f64::from(spot.path_m),
             surface,
-            tone,
+            ratios,
         }
     }
 
@@ -161,14 +161,14 @@ impl Emitter {
         self.surface.scatter(self.n, self.back, w)
     }
 
-    /// The tone of that.
+    /// The ratios of that.
     #[inline(always)]
-    pub fn tone(&self, world: &World, w: Vec3) -> Tone {
-        match world.has_tones() {
-            false => PLAIN,
+    pub fn ratios(&self, world: &World, w: Vec3) -> Ratios {
+        match world.is_spectral() {
+            false => ONES,
             true => times(
-                self.tone,
-                world.surface_tone(&self.surface, self.n, self.back, w),
+                self.ratios,
+                world.surface_ratios(&self.surface, self.n, self.back, w),
             ),
         }
     }

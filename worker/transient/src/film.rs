@@ -19,8 +19,8 @@ pub(crate) struct Film {
     pub channels: usize,
     /// Wavelengths that have channels of their own, 1 or more.
     pub wavelengths: usize,
-    /// Light has a tone.
-    pub toned: bool,
+    /// There are several wavelengths in the scene.
+    pub spectral: bool,
     /// Channels beyond 0 that a spot counts in, by emitter.
     pub of_spot: Vec<Vec<u16>>,
     /// Channels beyond 0 are classes of paths in place of groups of spots.
@@ -28,28 +28,28 @@ pub(crate) struct Film {
 }
 
 impl Film {
-    /// A film for a gate, so many groups and wavelengths (none: light has no tone), and the groups that each emitter belongs to.
+    /// A film for a gate, so many groups and wavelengths (none stands for one), and the groups that each emitter belongs to.
     pub fn new(gate: &Gate, (groups, wavelengths): (usize, usize), of_spot: Vec<Vec<u16>>) -> Self {
         // One has the reflectances of the paths themselves.
-        let toned = wavelengths > 1;
+        let spectral = wavelengths > 1;
         let wavelengths = wavelengths.max(1);
         Self {
             gate: *gate,
             slots: gate.bins as usize + 2,
             channels: (1 + groups) * wavelengths,
             wavelengths,
-            toned,
+            spectral,
             of_spot,
             by_class: false,
         }
     }
 
     /// A film that has a channel for each class of paths, at the first wavelength.
-    pub fn by_class(gate: &Gate, toned: bool) -> Self {
+    pub fn by_class(gate: &Gate, spectral: bool) -> Self {
         let of_class = (0..CLASSES).map(|c| vec![1 + c as u16]).collect();
         Self {
             by_class: true,
-            toned,
+            spectral,
             ..Self::new(gate, (CLASSES, 1), of_class)
         }
     }
@@ -84,11 +84,11 @@ impl Film {
     /// Adds light to a pixel's channels.
     #[inline]
     pub fn add(&self, pixel: &mut [f32], slot: usize, light: Light, spot: usize) {
-        pixel[slot] += light.value * light.tone[0];
+        pixel[slot] += light.value * light.ratios[0];
         if self.channels > 1 {
             for wavelength in 1..self.wavelengths {
                 let first = self.first_channel(wavelength);
-                pixel[first * self.slots + slot] += light.value * light.tone[wavelength];
+                pixel[first * self.slots + slot] += light.value * light.ratios[wavelength];
             }
             self.add_to_groups(pixel, slot, &light, spot);
         }
@@ -101,7 +101,7 @@ impl Film {
             return;
         }
         for wavelength in 0..self.wavelengths {
-            let value = light.value * light.tone[wavelength];
+            let value = light.value * light.ratios[wavelength];
             for channel in self.groups_of(wavelength, spot) {
                 pixel[channel * self.slots + slot] += value;
             }
@@ -181,7 +181,7 @@ impl Blocks {
         if self.contrast[slot] == 0.0 {
             self.touched.push(slot as u32);
         }
-        self.contrast[slot] += sign * CONTRAST * (light.value * light.tone[0]);
+        self.contrast[slot] += sign * CONTRAST * (light.value * light.ratios[0]);
     }
 
     /// Ends a block; `sign` is the one that its contrast counts with in `noise`.

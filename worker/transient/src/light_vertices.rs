@@ -12,7 +12,7 @@ use crate::{
     contact::Contacts,
     emitter::{Columns, Emitters},
     rng::Rng,
-    spectra::Tone,
+    spectra::Ratios,
     world::{Hit, World, lift},
 };
 
@@ -24,8 +24,8 @@ pub(crate) struct LightVertex {
     pub back: Vec3,
     /// Flux that arrives, divided by the number of vertices drawn.
     pub flux: f32,
-    /// Tone of that flux.
-    pub tone: Tone,
+    /// Ratios of that flux.
+    pub ratios: Ratios,
     /// Density per area of drawing it, times the weight of this technique in MIS.
     pub density: f32,
     /// Optical path from the laser, metres.
@@ -90,7 +90,7 @@ impl LightVertices {
                 hit,
                 back: -w,
                 flux,
-                tone: e.tone(world, w),
+                ratios: e.ratios(world, w),
                 density: share(emitters, pdf) * hit.n.dot(w).abs() / d2,
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,

@@ -45,7 +45,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
             path_m: e.path_m + metres,
             light: Light {
                 value: value as f32,
-                tone: e.tone(world, -e.p / d),
+                ratios: e.ratios(world, -e.p / d),
             },
         });
     }
@@ -56,7 +56,7 @@ pub(crate) fn peaks(world: &World, stack: &mut Stack, emitters: &Emitters) -> Ve
 pub(crate) fn add(p: &Peak, wavelength: usize, gate: &Gate, transient: &mut [f32]) -> bool {
     let bin = gate.bin(p.path_m);
     if let Some(b) = bin {
-        let value = p.light.value * p.light.tone[wavelength];
+        let value = p.light.value * p.light.ratios[wavelength];
         transient[p.pixel * gate.bins as usize + b as usize] += value;
     }
     bin.is_some()

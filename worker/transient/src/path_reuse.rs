@@ -14,7 +14,7 @@
 
 mod arrivals;
 mod draw;
-mod toned;
+mod spectral;
 
 use self::{
     arrivals::Lengths,
@@ -29,7 +29,7 @@ use crate::{
     film::Film,
     rng::{Rng, Stream},
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, Tone},
+    spectra::{Light, Ratios},
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::Hit,
@@ -149,8 +149,8 @@ struct Arrivals {
     bounces: Vec<u8>,
     /// Unit direction from which it arrives at a rough vertex; of others anything.
     from: Vec<Vec3>,
-    /// Value by wavelength; empty where light has no tone.
-    light: Vec<Tone>,
+    /// Value by wavelength; empty where there are not several.
+    light: Vec<Ratios>,
 }
 
 /// Adds arrivals; lengths counted from `base_m`.
@@ -174,9 +174,9 @@ impl Sink for ArrivalSink<'_> {
         list.bins
             .push(((path_m - self.base_m) * self.per_metre) as f32);
         list.value.push(self.factor * light.value);
-        if self.film.toned {
+        if self.film.spectral {
             let value = self.factor * light.value;
-            list.light.push(light.tone.map(|t| value * t));
+            list.light.push(light.ratios.map(|t| value * t));
         }
         list.spot.push(spot as u16);
         list.bounces.push(bounces.min(255) as u8);

@@ -1,11 +1,11 @@
 //! Several wavelengths in one pass.
 //!
 //! Where light goes does not depend on its wavelength, only how much of it goes on. So paths are drawn once, by the greatest
-//! reflectance that each lobe has among the wavelengths, and carry a *tone*: for each wavelength the product over the
-//! path's vertices of the reflectance there over that greatest one. A tone is never above 1, so that no wavelength gets rarer and
-//! brighter paths than the brightest one has. A contribution of value v counts v times its tone in each wavelength's histogram.
+//! reflectance that each lobe has among the wavelengths, and carry *ratios*: for each wavelength the product over the
+//! path's vertices of the reflectance there over that greatest one. A ratio is never above 1, so that no wavelength gets rarer and
+//! brighter paths than the brightest one has. A contribution of value v counts v times its ratio in each wavelength's histogram.
 //!
-//! The first wavelength is the main one, whose errors are stated. A scene that asks for none has plain tones and pays nothing.
+//! The first wavelength is the main one, whose errors are stated. With one or none all ratios are 1 and nobody multiplies by them.
 
 use std::collections::HashMap;
 
@@ -15,29 +15,29 @@ use picofarm_settings::MAX_WAVELENGTHS;
 use crate::{api::RenderError, bsdf::Surface};
 
 /// By wavelength; those beyond the render's own are 1.
-pub(crate) type Tone = [f32; MAX_WAVELENGTHS];
+pub(crate) type Ratios = [f32; MAX_WAVELENGTHS];
 
 /// Every wavelength alike.
-pub(crate) const PLAIN: Tone = [1.0; MAX_WAVELENGTHS];
+pub(crate) const ONES: Ratios = [1.0; MAX_WAVELENGTHS];
 
-/// Light of all wavelengths: what of each is `value` times its tone.
+/// Light of all wavelengths: of each `value` times its ratio.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Light {
     pub value: f32,
-    pub tone: Tone,
+    pub ratios: Ratios,
 }
 
-/// The tone of a path of two parts.
+/// The ratios of a path of two parts.
 #[inline(always)]
-pub(crate) fn times(a: Tone, b: Tone) -> Tone {
+pub(crate) fn times(a: Ratios, b: Ratios) -> Ratios {
     std::array::from_fn(|k| a[k] * b[k])
 }
 
-/// What surfaces do to tones.
+/// By what surfaces multiply ratios.
 #[derive(Debug)]
 pub(crate) struct Spectra {
-    /// By [`Surface::tone`]; the first is plain.
-    rows: Vec<Tone>,
+    /// By [`Surface::spectrum_row`]; the first holds ones.
+    rows: Vec<Ratios>,
     /// What texels do, by surface index; `None` without a texture.
     texels: Vec<Option<Texels>>,
     /// How many wavelengths there are.
@@ -55,8 +55,8 @@ struct Texels {
 
 impl Texels {
     /// Factors by wavelength, and the greatest.
-    fn factors(&self, texel: [f32; 3], count: usize) -> (Tone, f32) {
-        let mut factors = PLAIN;
+    fn factors(&self, texel: [f32; 3], count: usize) -> (Ratios, f32) {
+        let mut factors = ONES;
         let mut greatest = 0.0f32;
         for (factor, shares) in factors.iter_mut().zip(&self.shares).take(count) {
             let sum = shares[0] * texel[0] + shares[1] * texel[1] + shares[2] * texel[2];
@@ -70,7 +70,7 @@ impl Texels {
 /// Collects what [`Spectra`] holds while surfaces are made.
 pub(crate) struct Builder<'a> {
     wavelengths_nm: &'a [f64],
-    rows: Vec<Tone>,
+    rows: Vec<Ratios>,
     known: HashMap<[u32; 2 * MAX_WAVELENGTHS], u16>,
     texels: Vec<Option<Texels>>,
 }
@@ -79,7 +79,7 @@ impl<'a> Builder<'a> {
     pub fn new(wavelengths_nm: &'a [f64]) -> Self {
         Self {
             wavelengths_nm,
-            rows: vec![PLAIN],
+            rows: vec![ONES],
             known: HashMap::new(),
             texels: vec![],
         }
@@ -143,11 +143,11 @@ impl<'a> Builder<'a> {
             ..m.clone()
         };
         let row = self.row(first, second)?;
-        Ok((Surface::new(&brightest).with_tone(row), texels))
+        Ok((Surface::new(&brightest).with_spectrum(row), texels))
     }
 
-    /// Where the tones of two lobes lie.
-    fn row(&mut self, lambertian: Tone, conductor: Tone) -> Result<u16, RenderError> {
+    /// Where the ratios of two lobes lie.
+    fn row(&mut self, lambertian: Ratios, conductor: Ratios) -> Result<u16, RenderError> {
         let mut bits = [0u32; 2 * MAX_WAVELENGTHS];
         for (bits, x) in bits.iter_mut().zip(lambertian.iter().chain(&conductor)) {
             *bits = x.to_bits();
@@ -176,15 +176,15 @@ impl<'a> Builder<'a> {
 }
 
 /// The greatest of the reflectances, and each as a share of it.
-fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Tone) {
+fn greatest(all: impl Iterator<Item = f32> + Clone) -> (f32, Ratios) {
     let most = all.clone().fold(0.0f32, f32::max);
-    let mut tone = PLAIN;
+    let mut ratios = ONES;
     if most > 0.0 {
-        for (to, r) in tone.iter_mut().zip(all) {
+        for (to, r) in ratios.iter_mut().zip(all) {
             *to = r / most;
         }
     }
-    (most, tone)
+    (most, ratios)
 }
 
 /// The same kind of surface with other reflectances.
@@ -219,23 +219,23 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
 }
 
 impl Spectra {
-    /// Whether light has tones: with one wavelength all of it is of that.
+    /// Whether ratios differ from 1: with one wavelength all light is of that.
     #[inline(always)]
-    pub fn tones(&self) -> bool {
+    pub fn is_spectral(&self) -> bool {
         self.count > 1
     }
 
-    /// The tone with which a surface scatters from `i` to `o`, without its texture.
+    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
     #[inline]
-    pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Tone {
-        let row = usize::from(s.tone());
+    pub fn scattered(&self, s: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
+        let row = usize::from(s.spectrum_row());
         if !s.is_mixed() || row == 0 {
             return self.rows[row];
         }
         let (base, gloss) = s.parts(n, i, o);
         let whole = base + gloss;
         if whole <= 0.0 {
-            return PLAIN;
+            return ONES;
         }
         let (lambertian, conductor) = (&self.rows[row], &self.rows[row + 1]);
         std::array::from_fn(|k| (base * lambertian[k] + gloss * conductor[k]) / whole)
@@ -250,21 +250,21 @@ impl Spectra {
         }
     }
 
-    /// The tone of a texel of a surface.
+    /// The ratios of a texel of a surface.
     #[inline]
-    pub fn texel(&self, surface: usize, texel: [f32; 3]) -> Tone {
+    pub fn texel(&self, surface: usize, texel: [f32; 3]) -> Ratios {
         match &self.texels[surface] {
             Some(texels) => match texels.factors(texel, self.count) {
-                (_, 0.0) => PLAIN,
+                (_, 0.0) => ONES,
                 (factors, most) => {
-                    let mut tone = PLAIN;
-                    for (to, f) in tone.iter_mut().zip(factors).take(self.count) {
+                    let mut ratios = ONES;
+                    for (to, f) in ratios.iter_mut().zip(factors).take(self.count) {
                         *to = f / most;
                     }
-                    tone
+                    ratios
                 }
             },
-            None => PLAIN,
+            None => ONES,
         }
     }
 }

@@ -8,7 +8,7 @@ use crate::{
     emitter::Emitters,
     film::{Blocks, Film},
     rng::Rng,
-    spectra::{Light, PLAIN, times},
+    spectra::{Light, ONES, times},
     truth::Centres,
     walk::{Scratch, Walk},
     world::{Hit, World, lift},
@@ -203,14 +203,14 @@ impl Strata {
             let start = ray(sample).start;
             let hit = &self.hits[sample];
             lit.map(move |(k, &(slot, value))| {
-                let mut tone = PLAIN;
-                if let Some(h) = hit.as_ref().filter(|_| film.toned) {
+                let mut ratios = ONES;
+                if let Some(h) = hit.as_ref().filter(|_| film.spectral) {
                     let e = &emitters.list[start + k];
                     let w = (e.p - h.p).normalized();
-                    let here = world.tone(h, -h.p.normalized(), w);
-                    tone = times(here, e.tone(world, -w));
+                    let here = world.ratios(h, -h.p.normalized(), w);
+                    ratios = times(here, e.ratios(world, -w));
                 }
-                (start + k, slot as usize, Light { value, tone })
+                (start + k, slot as usize, Light { value, ratios })
             })
         };
         for (block, &twice) in self.twice.iter().enumerate() {

@@ -252,7 +252,7 @@ impl Walk<'_> {
             hit,
             wo: -w,
             beta: v.beta * weight * hit.through,
-            tone: times(v.tone, self.world.tone(&h, v.wo, w)),
+            ratios: times(v.ratios, self.world.ratios(&h, v.wo, w)),
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
             after_mirror: h.surface.specular(),

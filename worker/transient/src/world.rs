@@ -13,7 +13,7 @@ use crate::{
     extent::{self, Point, wide},
     glass::Panes,
     rng::Rng,
-    spectra::{Builder, PLAIN, Spectra, Tone, times},
+    spectra::{Builder, ONES, Ratios, Spectra, times},
 };
 
 /// Farthest that vertices and laser may be from the camera, and least reach of a scene: between them no
@@ -64,7 +64,7 @@ pub(crate) struct World {
     pub sensitive: f32,
     /// Glass, which none of the triangles is.
     panes: Option<Panes>,
-    /// What surfaces do to tones, where wavelengths are asked for.
+    /// By what surfaces multiply ratios, where wavelengths are asked for.
     spectra: Option<Spectra>,
 }
 
@@ -103,8 +103,15 @@ fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface 
 impl Hit {
     /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
     /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
-    #[inline]
+    #[inline(always)]
     pub fn choose_lobe(&mut self, world: &World, rng: &mut Rng) {
+        if self.surface.is_open() {
+            self.settle(world, rng);
+        }
+    }
+
+    #[cold]
+    fn settle(&mut self, world: &World, rng: &mut Rng) {
         if self.surface.is_mixed() {
             self.surface = self.surface.lobe(rng.uniform());
         } else {
@@ -268,48 +275,48 @@ impl World {
         })
     }
 
-    /// Whether light has tones: several wavelengths are asked for.
+    /// Whether several wavelengths are asked for.
     #[inline(always)]
-    pub fn has_tones(&self) -> bool {
-        self.spectra.as_ref().is_some_and(Spectra::tones)
+    pub fn is_spectral(&self) -> bool {
+        self.spectra.as_ref().is_some_and(Spectra::is_spectral)
     }
 
-    /// The tone with which light scatters at a hit from `i` to `o`.
+    /// The ratios with which light scatters at a hit from `i` to `o`.
     #[inline(always)]
-    pub fn tone(&self, h: &Hit, i: Vec3, o: Vec3) -> Tone {
+    pub fn ratios(&self, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
         match &self.spectra {
-            Some(spectra) if spectra.tones() => self.tone_of(spectra, h, i, o),
-            _ => PLAIN,
+            Some(spectra) if spectra.is_spectral() => self.ratios_of(spectra, h, i, o),
+            _ => ONES,
         }
     }
 
-    fn tone_of(&self, spectra: &Spectra, h: &Hit, i: Vec3, o: Vec3) -> Tone {
+    fn ratios_of(&self, spectra: &Spectra, h: &Hit, i: Vec3, o: Vec3) -> Ratios {
         // White surfaces stand for others.
-        if h.surface.tone() == 0 {
-            return PLAIN;
+        if h.surface.spectrum_row() == 0 {
+            return ONES;
         }
         times(
             spectra.scattered(&h.surface, h.n, i, o),
-            self.texel_tone(h.triangle, h.p),
+            self.texel_ratios(h.triangle, h.p),
         )
     }
 
-    /// The tone with which a surface scatters from `i` to `o`, without its texture.
+    /// The ratios with which a surface scatters from `i` to `o`, without its texture.
     #[inline(always)]
-    pub fn surface_tone(&self, surface: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Tone {
+    pub fn surface_ratios(&self, surface: &Surface, n: Vec3, i: Vec3, o: Vec3) -> Ratios {
         match &self.spectra {
-            None => PLAIN,
+            None => ONES,
             Some(spectra) => spectra.scattered(surface, n, i, o),
         }
     }
 
-    /// The tone of a texture at a point of a triangle.
-    pub fn texel_tone(&self, triangle: u32, p: Vec3) -> Tone {
+    /// The ratios of a texture at a point of a triangle.
+    pub fn texel_ratios(&self, triangle: u32, p: Vec3) -> Ratios {
         match (&self.spectra, self.texel(triangle, p)) {
             (Some(spectra), Some(texel)) => {
                 spectra.texel(self.surface[triangle as usize] as usize, texel)
             }
-            _ => PLAIN,
+            _ => ONES,
         }
     }
 

@@ -85,7 +85,13 @@ fn same(what: &str, (a, b): (&Rendered, &Rendered)) {
             own.map(|(_, h)| energy(h)).sum()
         };
         let e = of(&b.transient);
-        near(&format!("{what}, third {third}"), of(&a.transient), e, 0.0, 2.5 * se * e);
+        near(
+            &format!("{what}, third {third}"),
+            of(&a.transient),
+            e,
+            0.0,
+            2.5 * se * e,
+        );
     }
 }
 
@@ -96,7 +102,12 @@ fn scene_of(name: &str) -> Scene {
 
 #[test]
 fn a_material_said_in_more_parts_is_the_same_material() {
-    for (name, passes) in [("everything", 256), ("coated", 192), ("angled", 192), ("far-03", 192)] {
+    for (name, passes) in [
+        ("everything", 256),
+        ("coated", 192),
+        ("angled", 192),
+        ("far-03", 192),
+    ] {
         let plain = scene_of(name);
         let mut parted = plain.clone();
         each_material(&mut parted, |m| m.bsdf = said_otherwise(m.bsdf));
@@ -127,10 +138,7 @@ fn spots_on_several_parts_are_seen_with_the_light_of_them_all() {
     ];
     let directions = [v(0.1, 0.05, -1.0), v(-0.4, 0.2, -1.0)];
     let of = |bsdf: Bsdf| {
-        let wall = Material {
-            bsdf,
-            ..grey(0.5)
-        };
+        let wall = Material { bsdf, ..grey(0.5) };
         let s = scene(
             room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &wall),
             16,
@@ -162,11 +170,13 @@ fn spots_on_several_parts_are_seen_with_the_light_of_them_all() {
 fn two_near_mirrors_in_one_surface_reflect_as_each_does_by_its_share() {
     let pane = |bsdf| {
         let mut all = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
-        let m = Material {
-            bsdf,
-            ..grey(0.6)
-        };
-        all.push(quad(v(-1.98, -1.0, -3.4), v(0.0, 1.8, 0.0), v(0.0, 0.0, 1.8), m));
+        let m = Material { bsdf, ..grey(0.6) };
+        all.push(quad(
+            v(-1.98, -1.0, -3.4),
+            v(0.0, 1.8, 0.0),
+            v(0.0, 0.0, 1.8),
+            m,
+        ));
         scene(all, 18, &[v(0.4, 0.2, -1.0), v(0.6, -0.3, -1.0)])
     };
     let base = (0.4, Lobe::Diffuse { reflectance: 0.5 });
@@ -183,7 +193,10 @@ fn two_near_mirrors_in_one_surface_reflect_as_each_does_by_its_share() {
         };
         let r = ok(&pane(bsdf), &set);
         assert!(
-            r.plan.strategies.iter().any(|l| l.contains("mirror images")),
+            r.plan
+                .strategies
+                .iter()
+                .any(|l| l.contains("mirror images")),
             "{:?}",
             r.plan
         );

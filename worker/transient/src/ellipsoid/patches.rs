@@ -67,8 +67,7 @@ impl Patches {
         let areas: Vec<f32> = (0..world.triangles.len())
             .map(|t| {
                 let surface = &world.surfaces[world.surface[t] as usize];
-                let several = surface.is_mixed() || surface.parts_of_several().is_some();
-                let scatters = !surface.is_black() && (surface.diffuse() || several);
+                let scatters = !surface.is_black() && (surface.diffuse() || surface.is_open());
                 let area = area(&world.triangles[t]);
                 let lit = world.normals[t] != Vec3::ZERO && world.counts(t);
                 let counts = scatters && lit && area > 0.0;

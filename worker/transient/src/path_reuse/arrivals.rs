@@ -11,7 +11,7 @@ use crate::{
     lanes::{self, SIDE, Wide, widest},
     rng::Rng,
     sink::{Place, Sink, Way},
-    spectra::{Light, PLAIN, times},
+    spectra::{Light, ONES, times},
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::lift,
@@ -105,7 +105,7 @@ impl Sharing {
                 hit: *h,
                 wo: h.n,
                 beta: 1.0,
-                tone: PLAIN,
+                ratios: ONES,
                 length_m: nearest,
                 bounce,
                 after_mirror: false,
@@ -181,11 +181,11 @@ impl Sharing {
                         let back = to * (-1.0 / d);
                         let light = Light {
                             value: carried,
-                            tone: match film.toned {
-                                false => PLAIN,
+                            ratios: match film.spectral {
+                                false => ONES,
                                 true => {
-                                    let here = walk.world.tone(h, h.n, back);
-                                    times(here, e.tone(walk.world, -back))
+                                    let here = walk.world.ratios(h, h.n, back);
+                                    times(here, e.ratios(walk.world, -back))
                                 }
                             },
                         };
@@ -294,8 +294,8 @@ impl Sharing {
 
     /// Carries the arrivals to the pixels.
     pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
-        if film.toned {
-            return self.spread_toned((walk, film), pixels);
+        if film.spectral {
+            return self.spread_spectral((walk, film), pixels);
         }
         widest(Spread {
             sharing: self,
@@ -343,7 +343,7 @@ impl Sharing {
                             let slot = floor(a.bins[k] + offset, last) as usize;
                             let light = Light {
                                 value: weight * value,
-                                tone: PLAIN,
+                                ratios: ONES,
                             };
                             film.add(pixel, slot, light, usize::from(a.spot[k]));
                         }
@@ -385,7 +385,7 @@ impl Sharing {
                     let slot = floor(b + offset, last) as usize;
                     let light = Light {
                         value: weight * value,
-                        tone: PLAIN,
+                        ratios: ONES,
                     };
                     let first = if k % 2 == 0 {
                         &mut pixel[slot]

@@ -9,7 +9,7 @@ use crate::{
     film::Film,
     rng::Rng,
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, PLAIN, times},
+    spectra::{Light, ONES, times},
     turns::Turns,
     vertex::Vertex,
     walk::{ALL, Lights, Scratch, Walk},
@@ -117,13 +117,13 @@ impl Sharing {
                     let through = walk.world.glass(stack, from, lift(v.hit.p, v.hit.n));
                     let light = Light {
                         value: self.weight[i] * through,
-                        tone: match film.toned {
-                            false => PLAIN,
+                        ratios: match film.spectral {
+                            false => ONES,
                             true => {
                                 let w = (y.hit.p - v.hit.p).normalized();
-                                let here = times(v.tone, walk.world.tone(&v.hit, v.wo, w));
-                                let there = walk.world.tone(&y.hit, y.back, -w);
-                                times(here, times(y.tone, there))
+                                let here = times(v.ratios, walk.world.ratios(&v.hit, v.wo, w));
+                                let there = walk.world.ratios(&y.hit, y.back, -w);
+                                times(here, times(y.ratios, there))
                             }
                         },
                     };
@@ -318,7 +318,7 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         hit,
         wo: -hit.p / range,
         beta: hit.through,
-        tone: PLAIN,
+        ratios: ONES,
         length_m: world.metres(range),
         bounce: 1,
         after_mirror: false,

@@ -254,7 +254,7 @@ impl Ready<'_> {
             for peak in &peaks {
                 let gate = &settings.gate;
                 if !one_bounce::add(peak, 0, gate, &mut image.transient) {
-                    overflow.energy += f64::from(peak.light.value * peak.light.tone[0]);
+                    overflow.energy += f64::from(peak.light.value * peak.light.ratios[0]);
                 }
                 for wavelength in 0..film.wavelengths {
                     let of_all = (wavelength > 0).then(|| film.first_channel(wavelength));

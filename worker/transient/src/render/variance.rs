@@ -52,8 +52,8 @@ pub fn variance(
         if !ready.walks() {
             return Ok(vec![]);
         }
-        let toned = ready.frame.film.toned;
-        let film = Film::by_class(&settings.gate, toned);
+        let spectral = ready.frame.film.spectral;
+        let film = Film::by_class(&settings.gate, spectral);
         let by_class = Frame {
             film: &film,
             ..ready.frame

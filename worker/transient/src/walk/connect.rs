@@ -10,7 +10,7 @@ use crate::{
     light_vertices,
     rng::Rng,
     sink::{Sink, Way},
-    spectra::{Light, PLAIN, Tone, times},
+    spectra::{Light, ONES, Ratios, times},
     vertex::Vertex,
     world::{Hit, lift},
 };
@@ -62,7 +62,7 @@ impl Walk<'_> {
                 let w = (e.p - h.p).normalized();
                 let light = Light {
                     value: v.beta * value * free,
-                    tone: self.onward(v, w, || e.tone(self.world, -w)),
+                    ratios: self.onward(v, w, || e.ratios(self.world, -w)),
                 };
                 sink.add(path, light, spot, v.bounce + 1, Way::Spot);
             }
@@ -75,12 +75,15 @@ impl Walk<'_> {
         }
     }
 
-    /// The tone of a path that goes on from a vertex along `w` to where the rest of it has the tone `beyond`.
+    /// The ratios of a path that goes on from a vertex along `w` to where the rest of it has the ratios `beyond`.
     #[inline(always)]
-    fn onward(&self, v: &Vertex, w: Vec3, beyond: impl FnOnce() -> Tone) -> Tone {
-        match self.world.has_tones() {
-            false => PLAIN,
-            true => times(v.tone, times(self.world.tone(&v.hit, v.wo, w), beyond())),
+    fn onward(&self, v: &Vertex, w: Vec3, beyond: impl FnOnce() -> Ratios) -> Ratios {
+        match self.world.is_spectral() {
+            false => ONES,
+            true => times(
+                v.ratios,
+                times(self.world.ratios(&v.hit, v.wo, w), beyond()),
+            ),
         }
     }
 
@@ -196,10 +199,10 @@ impl Walk<'_> {
         let mirror = Hit { surface: near, ..m };
         let light = Light {
             value: v.beta * value * free / (aimed + plain),
-            tone: self.onward(v, w, || {
+            ratios: self.onward(v, w, || {
                 let to = (e.p - m.p).normalized();
-                let there = self.world.tone(&mirror, -w, to);
-                times(there, e.tone(self.world, -to))
+                let there = self.world.ratios(&mirror, -w, to);
+                times(there, e.ratios(self.world, -to))
             }),
         };
         sink.toward(w);
@@ -276,7 +279,9 @@ impl Walk<'_> {
                 let w = leg.normalized();
                 let light = Light {
                     value: v.beta * value * free,
-                    tone: self.onward(v, w, || times(y.tone, self.world.tone(there, y.back, -w))),
+                    ratios: self.onward(v, w, || {
+                        times(y.ratios, self.world.ratios(there, y.back, -w))
+                    }),
                 };
                 sink.toward(w);
                 sink.add(path, light, y.spot, bounces, way);

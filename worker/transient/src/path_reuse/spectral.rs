@@ -7,33 +7,33 @@ use super::{Shared, Sharing, arrivals::floor};
 use crate::{
     film::Film,
     lanes::{Wide, widest},
-    spectra::{Light, PLAIN, Tone, times},
+    spectra::{Light, ONES, Ratios, times},
     walk::Walk,
     world::Hit,
 };
 
-/// [`Sharing::spread_toned`].
-struct Toned<'a> {
+/// [`Sharing::spread_spectral`].
+struct SpreadSpectral<'a> {
     sharing: &'a Sharing,
     walk: &'a Walk<'a>,
     film: &'a Film,
     pixels: &'a mut [f32],
 }
 
-impl Wide for Toned<'_> {
+impl Wide for SpreadSpectral<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run(self) {
         let of = (self.walk, self.film);
-        self.sharing.spread_tones(of, self.pixels);
+        self.sharing.spread_wavelengths(of, self.pixels);
     }
 }
 
 /// Sums of one pixel, all wavelengths of a slot side by side. Every second arrival is summed in `second`.
 struct Sums {
-    first: Vec<Tone>,
-    second: Vec<Tone>,
+    first: Vec<Ratios>,
+    second: Vec<Ratios>,
 }
 
 impl Sums {
@@ -57,21 +57,21 @@ impl Sums {
                 *x = first[wavelength] + second[wavelength];
             }
         }
-        self.second.fill([0.0; PLAIN.len()]);
+        self.second.fill([0.0; ONES.len()]);
     }
 }
 
 #[inline(always)]
-fn add(to: &mut Tone, x: Tone) {
+fn add(to: &mut Ratios, x: Ratios) {
     for (to, x) in to.iter_mut().zip(x) {
         *to += x;
     }
 }
 
 impl Sharing {
-    /// Carries the arrivals to the pixels, where light has tones.
-    pub(super) fn spread_toned(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
-        widest(Toned {
+    /// Carries the arrivals to the pixels, where there are several wavelengths.
+    pub(super) fn spread_spectral(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        widest(SpreadSpectral {
             sharing: self,
             walk,
             film,
@@ -80,7 +80,7 @@ impl Sharing {
     }
 
     #[inline(always)]
-    fn spread_tones(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+    fn spread_wavelengths(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
@@ -88,24 +88,24 @@ impl Sharing {
         let bounded = walk.max_bounces < u32::MAX;
         let grouped = film.channels > film.wavelengths;
         let a = &self.arrivals;
-        let rough: Vec<Tone> = self.shared.iter().map(|y| own(walk, y)).collect();
+        let rough: Vec<Ratios> = self.shared.iter().map(|y| own(walk, y)).collect();
         let mut sums = Sums {
-            first: vec![PLAIN; film.slots],
-            second: vec![[0.0; PLAIN.len()]; film.slots],
+            first: vec![ONES; film.slots],
+            second: vec![[0.0; ONES.len()]; film.slots],
         };
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             sums.take(film, pixel);
             let deeper = v.bounce - lowest;
-            // Every vertex here is settled on a lobe, whose tone no direction changes.
-            let seen = times(v.tone, walk.world.tone(&v.hit, v.wo, v.wo));
+            // Every vertex here is settled on a lobe, whose ratios no direction changes.
+            let seen = times(v.ratios, walk.world.ratios(&v.hit, v.wo, v.wo));
             let rows = self.weight.chunks(count).zip(self.offset.chunks(count));
             for ((y, own), row) in self.shared.iter().zip(&rough).zip(rows) {
                 let (weight, offset) = (row.0[i], row.1[i] + 1.0);
                 if weight == 0.0 {
                     continue;
                 }
-                let weight = times([weight; PLAIN.len()], times(seen, *own));
+                let weight = times([weight; ONES.len()], times(seen, *own));
                 let range = y.first..y.end;
                 let bins = &a.bins[range.clone()];
                 let each = bins.iter().zip(&a.light[range.clone()]);
@@ -133,7 +133,7 @@ impl Sharing {
                     if grouped {
                         let found = Light {
                             value: 1.0,
-                            tone: found,
+                            ratios: found,
                         };
                         film.add_to_groups(pixel, slot, &found, usize::from(a.spot[at]));
                     }
@@ -144,13 +144,13 @@ impl Sharing {
     }
 }
 
-/// The tone of a rough vertex, whose arrivals are those of a white one.
-fn own(walk: &Walk, y: &Shared) -> Tone {
+/// The ratios of a rough vertex, whose arrivals are those of a white one.
+fn own(walk: &Walk, y: &Shared) -> Ratios {
     match y.rough {
-        None => PLAIN,
+        None => ONES,
         Some(surface) => {
             let rough = Hit { surface, ..y.hit };
-            walk.world.tone(&rough, y.hit.n, y.hit.n)
+            walk.world.ratios(&rough, y.hit.n, y.hit.n)
         }
     }
 }
