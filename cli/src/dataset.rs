@@ -130,6 +130,19 @@ fn further(info: &Summary) -> String {
     if !alone.is_empty() {
         text += &format!("transients also of the spots: {}\n", alone.join(", "));
     }
+    let nm: Vec<String> = info
+        .spec
+        .wavelengths_nm
+        .nm()
+        .iter()
+        .map(f64::to_string)
+        .collect();
+    if !nm.is_empty() {
+        text += &format!(
+            "wavelengths {} nm, the first is that of transient\n",
+            nm.join(", ")
+        );
+    }
     if let Some(noise) = info.noise {
         text += &format!(
             "Monte Carlo error {:.1} %, median over pixels, then over scenes\n",

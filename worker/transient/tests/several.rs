@@ -103,10 +103,10 @@ fn scene_of(name: &str) -> Scene {
 #[test]
 fn a_material_said_in_more_parts_is_the_same_material() {
     for (name, passes) in [
-        ("everything", 256),
-        ("coated", 192),
-        ("angled", 192),
-        ("far-03", 192),
+        ("everything", 128),
+        ("coated", 96),
+        ("angled", 96),
+        ("far-03", 96),
     ] {
         let plain = scene_of(name);
         let mut parted = plain.clone();

@@ -289,10 +289,10 @@ fn compare(what: &str, s: &Scene, passes: u32, set: &Settings) {
 #[test]
 fn each_wavelength_is_the_render_of_a_scene_that_reflects_so() {
     for (name, passes) in [
-        ("everything", 256),
-        ("coated", 192),
-        ("angled", 192),
-        ("primitive", 64),
+        ("everything", 128),
+        ("coated", 96),
+        ("angled", 96),
+        ("primitive", 32),
     ] {
         let s = coloured(name, 18);
         compare(name, &s, passes, &settings(Budget::Samples(1)));
