@@ -80,7 +80,7 @@ pub(crate) fn ground_truth(
         truth.specular[k] = u8::from(h.surface.specular());
     }
     let mut rays = 0;
-    for e in &emitters.list {
+    for e in places(emitters) {
         let plane = &mut truth.visibility[e.beam * count..(e.beam + 1) * count];
         rays += plane
             .par_chunks_mut(i.width as usize)
@@ -93,6 +93,12 @@ pub(crate) fn ground_truth(
         stop.check()?;
     }
     Ok((truth, rays))
+}
+
+/// One source for each spot: those of its parts are in the same place, one behind the other.
+fn places(emitters: &Emitters) -> impl Iterator<Item = &Emitter> {
+    let runs = emitters.list.chunk_by(|a, b| a.beam == b.beam);
+    runs.map(|run| &run[0])
 }
 
 /// Which pixels of a row a spot lights; returns the rays.
@@ -115,7 +121,7 @@ pub(crate) fn rays(world: &World, emitters: &Emitters, centres: &Centres, step: 
     let width = world.camera.intrinsics.width as usize;
     let rows = (0..world.camera.intrinsics.height as usize).step_by(step);
     let some: u64 = rows
-        .flat_map(|row| emitters.list.iter().map(move |e| (row, e)))
+        .flat_map(|row| places(emitters).map(move |e| (row, e)))
         .collect::<Vec<_>>()
         .into_par_iter()
         .map(|(row, e)| lit(world, e, row, &centres.hits, &mut vec![0; width]))

@@ -10,7 +10,8 @@ use std::sync::Arc;
 use common::{Quiet, energy, grey, near, ok, quad, room, scene, settings, two_only, v};
 use picofarm_scene::{Bsdf, Material, Object, Scene, SpectrumPoint, Texture, Vec3, Wrap};
 use picofarm_transient::{
-    BeamWidth, Budget, Part, PartOf, Rendered, Settings, Wavelengths, join_parts, render_part,
+    BeamWidth, Budget, Gate, Part, PartOf, Rendered, Settings, Wavelengths, join_parts, render,
+    render_part,
 };
 
 const NM: [f64; 3] = [905.0, 532.0, 450.0];
@@ -486,5 +487,24 @@ fn the_plan_says_whose_colour_stands_for_a_spectrum() {
     assert!(
         has(&plan.approximations, "1 of 2 materials state no spectrum"),
         "{plan:?}"
+    );
+}
+
+#[test]
+fn more_values_a_pixel_than_can_be_counted_are_refused_by_name() {
+    let s = coloured("everything", 1);
+    let set = Settings {
+        gate: Gate {
+            start_m: 0.0,
+            bin_width_m: 1e-3,
+            bins: 1 << 20,
+        },
+        groups: vec![vec![0]; 1024],
+        ..at(&[905.0, 532.0, 450.0, 633.0], two_only())
+    };
+    let refused = render(&s, &set, &Quiet).unwrap_err().to_string();
+    assert!(
+        refused.contains("groups: make 4100 histograms"),
+        "{refused}"
     );
 }

@@ -82,6 +82,18 @@ pub(super) fn prepare<R>(
     let of_spot = groups_of(settings, emitters, spots.len())?;
     let channels = (settings.groups.len(), wavelengths.len());
     let film = Film::new(&settings.gate, channels, of_spot);
+    // Sums over light paths count a pixel's slots in 32 bits.
+    if u32::try_from(film.pixel()).is_err() {
+        return Err(RenderError::Invalid {
+            field: "groups".into(),
+            what: format!(
+                "make {} histograms of {} bins for each pixel, expected at most {} values; use fewer groups, wavelengths or bins",
+                film.channels,
+                settings.gate.bins,
+                u32::MAX
+            ),
+        });
+    }
     let strategy = &settings.strategy;
     let narrow = strategy
         .ellipsoidal
