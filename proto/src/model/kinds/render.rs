@@ -173,7 +173,7 @@ impl TaskKind for RenderTask {
         let parts = match self.parts {
             1 => 0.0,
             // Read, decoded and put into the image one after the other; the allocator holds for a second what the last one took.
-            _ => 2.0 * rendering.images() + rendering.paths() * LIGHT_PATHS,
+            _ => 3.0 * rendering.images() + rendering.paths() * LIGHT_PATHS,
         };
         Some(rendering.coded() + parts)
     }

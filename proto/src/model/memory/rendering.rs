@@ -4,6 +4,8 @@ use super::shape::{BIN, PROGRAM, STORE, Shape};
 
 /// Share of a histogram's bytes that its coded form takes in memory while it is made, on average over scenes.
 const CODED: f64 = 0.45;
+/// Share of the image that the allocator still holds of the scene before, when its worker goes on with the next.
+const HELD: f64 = 0.25;
 /// Pixels from which an image has large tiles, channels from which it has small ones again, and pixels of both tiles.
 const LARGE: f64 = 65_536.0;
 const MANY: f64 = 5.0;
@@ -67,9 +69,9 @@ impl Rendering {
         (images + self.tiles() + LIGHT_PATHS * self.paths()) as u64
     }
 
-    /// The same, or what coding the result takes if that is more.
+    /// The same, or what coding the result takes if that is more, in a worker that renders one scene after another.
     pub(in crate::model) fn coded(&self) -> f64 {
         let after = PROGRAM + self.shape.truth() + self.images() * (1.0 + CODED);
-        (self.peak_bytes() as f64).max(after) + STORE
+        (self.peak_bytes() as f64).max(after) + HELD * self.images() + STORE
     }
 }
