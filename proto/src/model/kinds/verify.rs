@@ -80,7 +80,7 @@ impl TaskKind for VerifyTask {
 
     fn memory(&self, known: &Known, _threads: u32) -> Option<f64> {
         let source = known.source.as_ref()?;
-        Some(BASE + source.truth() + 2.6 * source.histogram())
+        Some(BASE + source.truth() + 2.9 * source.histogram())
     }
 
     fn tasks(&self) -> u64 {
