@@ -83,11 +83,14 @@ pub(crate) struct Hit {
     pub through: f32,
 }
 
+/// Parts that bring less than this share of the light count as black: what their chance divides would leave f32.
+const LEAST_PART: f32 = 1e-9;
+
 /// One of several surfaces, drawn by their albedos and divided by its chance; a black one where all are.
 fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface {
     let total: f32 = all.clone().map(Surface::albedo).sum();
     let (mut left, mut last) = (u * total, None);
-    for s in all.filter(|s| !s.is_black()) {
+    for s in all.filter(|s| s.albedo() > LEAST_PART * total) {
         last = Some(s);
         left -= s.albedo();
         if left < 0.0 {

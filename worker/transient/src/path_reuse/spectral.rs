@@ -123,6 +123,10 @@ impl Sharing {
                             // In place of the white Lambertian's 1/π.
                             let (n, from) = (y.hit.n, a.from[at]);
                             let scatter = surface.scatter(n, to, from);
+                            // Light along the surface, whose cosine is 0, is no number.
+                            if scatter.is_nan() || scatter <= 0.0 {
+                                continue;
+                            }
                             let cos = n.dot(from);
                             let found = light.map(|x| x * PI * scatter / cos);
                             (found, &mut sums.first[slot])
