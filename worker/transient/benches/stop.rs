@@ -96,11 +96,17 @@ fn main() {
             wavelengths(&scene, seeds);
             continue;
         }
+        let before = cpu_seconds();
         let first = match asked[0] > 0.0 {
             true => run(&scene, Budget::Error(asked[0]), 0),
             false => run(&scene, Budget::Samples(64), 0),
         };
-        println!("{name}: {} paths at first", first.error.samples);
+        println!(
+            "{name}: {} paths at first, {:.2} CPU s, says {:.2} %",
+            first.error.samples,
+            cpu_seconds() - before,
+            100.0 * first.error.median_relative
+        );
         for line in first
             .plan
             .strategies

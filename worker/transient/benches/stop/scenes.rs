@@ -200,6 +200,12 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
     .map(|(name, scene)| (name.to_owned(), scene))
     .into();
     all.extend((1..=FAR).map(|seed| (format!("far-{seed:02}"), far(seed, None, pixels))));
+    // Rooms of rough and mixed walls with Lambertians of the same albedo in their place: what roughness costs.
+    let twins = ["coated", "parts", "glossy", "far-03"].map(|name| {
+        let (_, rough) = all.iter().find(|(of, _)| of == name).expect("it is one");
+        (format!("{name}-lambertian"), lambertian(rough))
+    });
+    all.extend(twins);
     // The same rooms with walls of other materials.
     let walls = [
         ("walls-mixed-0.01", mixed(0.01, 0.5)),
@@ -212,6 +218,37 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         all.extend(rooms);
     }
     all
+}
+
+/// A scene with a Lambertian of the same albedo in place of each rough or mixed material; near-mirrors stay.
+fn lambertian(scene: &Scene) -> Scene {
+    let mut scene = scene.clone();
+    let materials = scene.objects.iter_mut().flat_map(|o| {
+        let mesh = std::sync::Arc::make_mut(&mut o.mesh);
+        &mut mesh.materials
+    });
+    for m in materials.filter(|m| !m.is_specular()) {
+        *m = grey(albedo(&m.bsdf));
+    }
+    scene
+}
+
+/// Share of light that a material sends on, masking aside.
+fn albedo(bsdf: &Bsdf) -> f32 {
+    match bsdf {
+        Bsdf::Diffuse { reflectance } | Bsdf::RoughConductor { reflectance, .. } => *reflectance,
+        Bsdf::Mixed {
+            reflectance,
+            specular_reflectance,
+            weight,
+            ..
+        } => (1.0 - weight) * reflectance + weight * specular_reflectance,
+        Bsdf::Several { parts } => {
+            let of = |p: &Part| p.weight * p.lobe.reflectance();
+            parts.list().iter().map(of).sum()
+        }
+        Bsdf::ThinDielectric { .. } => 0.0,
+    }
 }
 
 /// The side of a standing cylinder.
