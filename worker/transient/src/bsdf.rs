@@ -5,7 +5,7 @@ use std::f32::consts::PI;
 
 use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
-use crate::rng::Rng;
+use crate::{lobes::Lobe, rng::Rng};
 
 /// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
 /// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
@@ -17,7 +17,8 @@ enum Kind {
     Conductor,
     /// A Lambertian beside a rough conductor.
     Mixed,
-    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them.
+    /// Any number of both, which the world knows. Nothing scatters by it before it is settled on one of them: on a conductor, or on
+    /// a mix of one with all Lambertians.
     Several,
 }
 
@@ -27,7 +28,7 @@ const SPECULAR: u8 = 2;
 const GGX: u8 = 4;
 
 /// Roughness from which pixels share a conductor's vertices. There its lobe is wide enough to be weighed pixel by pixel for
-/// light that was found as if it were Lambertian; beneath, that costs more than it brings (measured at 0.12 and 0.2).
+/// light that was found for one of them; beneath, that costs more than it brings (measured at 0.12 and 0.2).
 const SHARED_ALPHA: f32 = 0.15;
 
 /// A material's scattering, ready for use. Sixteen bytes: every hit carries one.
@@ -111,6 +112,30 @@ impl Surface {
             strength: if black { 0.0 } else { 1.0 },
             alpha: alpha.unwrap_or(1.0),
             ..Self::new(m)
+        }
+    }
+
+    /// A mix of this conductor and a Lambertian `base` (ρ/π times its share), with the ratios of a row and of the one behind it.
+    pub fn mixed_with(self, base: f32, spectrum_row: u16) -> Self {
+        Self {
+            kind: Kind::Mixed,
+            spectrum_row,
+            base,
+            ..self
+        }
+    }
+
+    /// A mix to draw directions by at a vertex that pixels share: as this surface scatters, half of it or more Lambertian, of
+    /// albedo 1.
+    pub fn guide(self) -> Self {
+        let base = self.base.max(0.5 * self.albedo() / PI);
+        let all = 1.0 / (self.strength + base * PI);
+        Self {
+            kind: Kind::Mixed,
+            spectrum_row: 0,
+            strength: self.strength * all,
+            base: base * all,
+            ..self
         }
     }
 
@@ -222,10 +247,15 @@ impl Surface {
         matches!(self.kind, Kind::Mixed)
     }
 
-    /// True for a mix and for several parts: not settled on one of them.
+    /// True for a mix and for several parts of which a path must settle on one: all but a mix whose vertices pixels share. Its
+    /// lobes are both wide, so that a vertex can scatter by both.
     #[inline(always)]
     pub fn is_open(&self) -> bool {
-        matches!(self.kind, Kind::Mixed | Kind::Several)
+        match self.kind {
+            Kind::Several => true,
+            Kind::Mixed => !self.is_shared(),
+            Kind::Lambertian | Kind::Conductor => false,
+        }
     }
 
     /// BRDF of a Lambertian surface, ρ/π.
@@ -322,6 +352,79 @@ impl Surface {
             return self.base * co;
         }
         self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
+    }
+
+    /// How it scatters light from a direction with cosine `c`, for many directions side by side; `None` for Beckmann conductors,
+    /// and nothing from beneath.
+    #[inline]
+    pub fn lobe_from(&self, c: f32) -> Option<Lobe> {
+        let lit = c > 0.0 && !self.is_black();
+        let alpha2 = self.alpha * self.alpha;
+        match self.kind {
+            Kind::Lambertian if lit => Some(Lobe {
+                lambertian: self.strength,
+                lambertian_pdf: 1.0 / PI,
+                alpha2: 1.0,
+                ..Lobe::default()
+            }),
+            Kind::Lambertian => Some(Lobe::default()),
+            Kind::Several => None,
+            Kind::Conductor | Kind::Mixed if !self.ggx() => None,
+            Kind::Conductor | Kind::Mixed if !lit => Some(Lobe::default()),
+            Kind::Conductor | Kind::Mixed => {
+                let share = if self.is_mixed() { self.share() } else { 1.0 };
+                let seen = self.masking(c) / (4.0 * c * PI * alpha2);
+                Some(Lobe {
+                    conductor: self.strength * seen,
+                    lambertian: self.base,
+                    alpha2,
+                    conductor_pdf: share * seen,
+                    lambertian_pdf: (1.0 - share) / PI,
+                })
+            }
+        }
+    }
+
+    /// The BRDF of a surface that is not Lambertian, from a direction with cosine `c` to another, is its Lambertian part here plus
+    /// the second number here times [`Surface::leaving`] and [`Surface::lobe_of`] of the other.
+    pub fn arriving(&self, c: f32) -> (f32, f32) {
+        let a2 = self.alpha * self.alpha;
+        let conductor = self.strength * self.masking(c) / (4.0 * c * PI * a2);
+        (
+            self.base,
+            if conductor.is_finite() {
+                conductor
+            } else {
+                0.0
+            },
+        )
+    }
+
+    /// See [`Surface::arriving`].
+    pub fn leaving(&self, c: f32) -> f32 {
+        let leaving = self.masking(c) / c;
+        if leaving.is_finite() { leaving } else { 0.0 }
+    }
+
+    /// See [`Surface::arriving`]: D·π·α² of GGX by the squares of the sum of both directions and of its part along the normal. For
+    /// lobes wide enough that their difference does not cancel.
+    #[inline(always)]
+    pub fn lobe_ggx(&self, square: f32, along2: f32) -> f32 {
+        let across2 = (square - along2).max(0.0);
+        let t = square / (along2 + across2 / (self.alpha * self.alpha));
+        t * t
+    }
+
+    /// The same of Beckmann.
+    #[inline(always)]
+    pub fn lobe_beckmann(&self, square: f32, along2: f32) -> f32 {
+        let across2 = (square - along2).max(0.0);
+        let x = across2 / (along2 * self.alpha * self.alpha);
+        if x > 80.0 {
+            return 0.0;
+        }
+        let cos2 = along2 / square;
+        libm::expf(-x) / (cos2 * cos2)
     }
 
     /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.

@@ -11,6 +11,7 @@ use crate::{
     bvh::Stack,
     contact,
     lanes::{Wide, widest},
+    lobes::{Lobes, Seen},
     spectra::{ONES, Ratios, times},
     world::{World, lift},
 };
@@ -281,6 +282,8 @@ pub(crate) struct Emitters {
     pub columns: Columns,
     /// Indices of the others.
     pub glossy: Vec<usize>,
+    /// How each shines.
+    lobes: Lobes,
     /// Indices of those on mirrors.
     pub on_mirror: Vec<usize>,
     /// Those of each ray of the beams: one range for all where beams have no width.
@@ -399,6 +402,12 @@ impl Emitters {
         // A beam that arrives from behind its own normal lights nothing.
         let strength = if e.n.dot(e.back) > 0.0 { strength } else { 0.0 };
         self.columns.push(e.p, e.n, strength);
+        let place = Seen {
+            p: e.p,
+            n: e.n,
+            i: e.back,
+        };
+        self.lobes.push(&place, &e.surface);
         if !e.surface.diffuse() {
             self.glossy.push(index);
             if e.surface.specular() {
@@ -410,21 +419,30 @@ impl Emitters {
     }
 
     /// Writes the unshadowed contribution of every source to a surface point, per unit power: f_s cos_s
-    /// f_x cos_x / d². `wo` is the unit direction in which the point is seen.
+    /// f_x cos_x / d². `buffer` is overwritten.
     #[inline]
-    pub fn weights(&self, x: Vec3, n: Vec3, wo: Vec3, surface: &Surface, out: &mut [f32]) {
-        self.weights_of(0..self.list.len(), (x, n, wo), surface, out);
+    pub fn weights(&self, of: (Seen, &Surface), buffer: &mut Vec<f32>, out: &mut [f32]) {
+        self.weights_of(0..self.list.len(), of, buffer, out);
     }
 
-    /// The same for the sources of a range at the point (x, n, wo); what `out` holds of others stays.
+    /// The same for the sources of a range; what `out` holds of others stays.
     #[inline]
     pub fn weights_of(
         &self,
         range: Range<usize>,
-        (x, n, wo): (Vec3, Vec3, Vec3),
-        surface: &Surface,
+        (place, surface): (Seen, &Surface),
+        buffer: &mut Vec<f32>,
         out: &mut [f32],
     ) {
+        let Seen { p: x, n, i: wo } = place;
+        if !(surface.diffuse() && self.glossy.is_empty()) && self.lobes.complete() {
+            buffer.resize(range.len(), 0.0);
+            let own = &mut out[range.clone()];
+            let of = (&place, surface);
+            if self.lobes.between(range.clone(), of, own, buffer).is_some() {
+                return;
+            }
+        }
         if surface.diffuse() {
             let own = &mut out[range.clone()];
             self.columns.irradiance_from(range.start, x, n, own);

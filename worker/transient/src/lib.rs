@@ -14,6 +14,7 @@ mod film;
 mod glass;
 mod lanes;
 mod light_vertices;
+mod lobes;
 mod mirror_images;
 mod one_bounce;
 mod path_reuse;

@@ -11,6 +11,7 @@ use crate::{
     bvh::Stack,
     contact::Contacts,
     emitter::{Columns, Emitters},
+    lobes::{Lobes, Seen},
     rng::Rng,
     spectra::Ratios,
     world::{Hit, World, lift},
@@ -46,6 +47,8 @@ pub(crate) struct LightVertices {
     columns: Columns,
     /// Indices of those that are not Lambertian.
     glossy: Vec<usize>,
+    /// How each scatters what arrives.
+    lobes: Lobes,
 }
 
 impl LightVertices {
@@ -104,6 +107,7 @@ impl LightVertices {
         self.list.clear();
         self.glossy.clear();
         self.columns.clear();
+        self.lobes.clear();
     }
 
     /// Adds one.
@@ -115,13 +119,26 @@ impl LightVertices {
             0.0
         };
         self.columns.push(y.hit.p, y.hit.n, y.flux * lambert);
+        self.lobes.push(&Seen::of(&y.hit, y.back), &y.hit.surface);
         self.list.push(y);
     }
 
     /// Writes the unshadowed contribution of every vertex to a surface point, MIS weight included.
-    pub fn weights(&self, x: &Hit, wo: Vec3, out: &mut Vec<f32>) {
+    pub fn weights(&self, x: &Hit, wo: Vec3, (out, plain): (&mut Vec<f32>, &mut Vec<f32>)) {
         out.clear();
         out.resize(self.list.len(), 0.0);
+        let all_lambertian = x.surface.diffuse() && self.glossy.is_empty();
+        if !all_lambertian && self.lobes.complete() {
+            plain.resize(out.len(), 0.0);
+            let (place, all) = (Seen::of(x, wo), 0..out.len());
+            let told = self.lobes.between(all, (&place, &x.surface), out, plain);
+            if told.is_some() {
+                for ((w, y), plain) in out.iter_mut().zip(&self.list).zip(plain) {
+                    *w *= y.flux * y.density / (y.density + *plain);
+                }
+                return;
+            }
+        }
         if x.surface.diffuse() {
             self.columns.irradiance(x.p, x.n, out);
             for ((w, y), &s) in out.iter_mut().zip(&self.list).zip(&self.columns.strength) {

@@ -14,12 +14,16 @@
 
 mod arrivals;
 mod draw;
+mod gloss;
 mod spectral;
 
 use self::{
     arrivals::Lengths,
     draw::{gather_point, only_mirrors},
+    gloss::Gloss,
 };
+use std::f32::consts::PI;
+
 use picofarm_scene::Vec3;
 
 use crate::{
@@ -27,6 +31,7 @@ use crate::{
     ellipsoid::Shells,
     emitter::Columns,
     film::Film,
+    lobes::{Lobes, Seen},
     rng::{Rng, Stream},
     sink::{PixelSink, Place, Sink, Way},
     spectra::{Light, Ratios},
@@ -75,7 +80,7 @@ const BESIDE: u32 = 2;
 /// Light vertices on conductors that are not shared that a gather point is connected to at most.
 const GLOSSY: u32 = 2;
 /// Spots whose light at a rough vertex is carried to the pixels, at most: drawn by contribution.
-const ROUGH_SPOTS: usize = 6;
+const ROUGH_SPOTS: usize = 32;
 
 /// How many more vertices are drawn where some cannot be shared (0, 1, 3 and 7 tried on rooms with such surfaces).
 const EXTRA: u32 = 3;
@@ -114,8 +119,31 @@ struct Shared {
     /// Its arrivals.
     first: usize,
     end: usize,
-    /// How a rough surface scatters; its arrivals are those of a white Lambertian in its place.
+    /// How a surface that is not Lambertian scatters; its arrivals are those of a white Lambertian in its place.
     rough: Option<Surface>,
+}
+
+/// By what light is drawn at a rough vertex: by how it scatters towards one of the gather points, half of it or more
+/// as a Lambertian does, so that none is rare. What is found is carried as for a white Lambertian.
+#[derive(Debug, Clone, Copy)]
+struct Guide {
+    surface: Surface,
+    n: Vec3,
+    /// Unit direction to that gather point.
+    to: Vec3,
+}
+
+impl Guide {
+    /// White Lambertian's light over the guide's, from direction `w`.
+    #[inline]
+    fn share(&self, w: Vec3) -> f32 {
+        let guided = self.surface.scatter(self.n, self.to, w);
+        if guided > 0.0 {
+            self.n.dot(w) / (PI * guided)
+        } else {
+            0.0
+        }
+    }
 }
 
 impl Shared {
@@ -161,6 +189,10 @@ struct ArrivalSink<'a> {
     factor: f32,
     film: &'a Film,
     place: Place,
+    /// By what it was drawn at a rough vertex.
+    guide: Option<Guide>,
+    /// Value for the vertex of what is worth 1 as it was drawn.
+    share: f32,
     from: Vec3,
     /// `from` is that of a walk's first step and stays.
     left: bool,
@@ -173,9 +205,9 @@ impl Sink for ArrivalSink<'_> {
         let list = &mut *self.list;
         list.bins
             .push(((path_m - self.base_m) * self.per_metre) as f32);
-        list.value.push(self.factor * light.value);
+        let value = self.factor * self.share * light.value;
+        list.value.push(value);
         if self.film.spectral {
-            let value = self.factor * light.value;
             list.light.push(light.ratios.map(|t| value * t));
         }
         list.spot.push(spot as u16);
@@ -187,6 +219,7 @@ impl Sink for ArrivalSink<'_> {
     fn toward(&mut self, w: Vec3) {
         if !self.left {
             self.from = w;
+            self.share = self.guide.as_ref().map_or(1.0, |g| g.share(w));
         }
     }
 
@@ -224,11 +257,16 @@ pub(crate) struct Sharing {
     glossy: Vec<usize>,
     shared: Vec<Shared>,
     arrivals: Arrivals,
+    gloss: Gloss,
     /// Segments of one shared vertex: where they end, of what, and whether something is in the way.
     ends: Vec<Vec3>,
     ends_of: Vec<usize>,
     blocked: Vec<bool>,
     lengths: Lengths,
+    /// How the gather points of `glossy` scatter to the camera, and what of one shared vertex.
+    lobes: Lobes,
+    scattered: Vec<f32>,
+    drawn: Vec<f32>,
     /// Gather points that are not Lambertian, and their values.
     apart: Vec<(usize, f32)>,
     /// `[shared][gather]`: value of an arrival at the pixel, and path in bins to add.
@@ -313,6 +351,7 @@ impl Sharing {
             self.draw_in_shells((walk, patches), count, &mut rng);
         }
         self.light_up((walk, film, effort), light, &mut rng, scratch);
+        self.gloss.lay(&self.shared, &self.arrivals);
         self.connect((walk, film), camera, scratch);
         self.spread((walk, film), pixels);
     }
@@ -321,10 +360,13 @@ impl Sharing {
     fn index(&mut self) {
         self.columns.clear();
         self.glossy.clear();
+        self.lobes.clear();
         for (i, (v, _)) in self.gathers.iter().enumerate() {
             let diffuse = v.hit.surface.diffuse();
             if !diffuse {
                 self.glossy.push(i);
+                let place = Seen::of(&v.hit, v.wo);
+                self.lobes.push(&place, &v.hit.surface);
             }
             self.columns
                 .push(v.hit.p, v.hit.n, if diffuse { 1.0 } else { 0.0 });

@@ -33,6 +33,16 @@ pub(crate) fn times(a: Ratios, b: Ratios) -> Ratios {
     std::array::from_fn(|k| a[k] * b[k])
 }
 
+/// The ratios of light of which the Lambertian part and the conductor of a mix send so much.
+#[inline(always)]
+pub(crate) fn mix((lambertian, conductor): (f32, f32), of: &[Ratios; 2]) -> Ratios {
+    let whole = lambertian + conductor;
+    if whole <= 0.0 {
+        return ONES;
+    }
+    std::array::from_fn(|k| (lambertian * of[0][k] + conductor * of[1][k]) / whole)
+}
+
 /// By what surfaces multiply ratios.
 #[derive(Debug)]
 pub(crate) struct Spectra {
@@ -113,9 +123,46 @@ impl<'a> Builder<'a> {
             field: "objects".into(),
             what: "have more than 65,536 materials of several parts; let meshes share them".into(),
         })?;
+        let all = self.joined(all)?;
         let surface = Surface::several(m, &all, index);
         several.push(all);
         Ok(surface)
+    }
+
+    /// Parts of which few remain to choose from: the Lambertians are one, and beside each conductor whose vertices pixels share, in
+    /// proportion to what it reflects.
+    fn joined(&mut self, parts: Vec<Surface>) -> Result<Vec<Surface>, RenderError> {
+        let (lambertians, conductors): (Vec<Surface>, Vec<Surface>) = parts
+            .into_iter()
+            .filter(|s| !s.is_black())
+            .partition(Surface::diffuse);
+        let (wide, mut all): (Vec<Surface>, Vec<Surface>) =
+            conductors.into_iter().partition(Surface::is_shared);
+        let Some(first) = lambertians.first() else {
+            all.extend(wide);
+            return Ok(all);
+        };
+        let mut sums = [0.0; MAX_WAVELENGTHS];
+        for s in &lambertians {
+            let ratios = &self.rows[usize::from(s.spectrum_row())];
+            for (sum, ratio) in sums.iter_mut().zip(ratios) {
+                *sum += s.lambertian() * ratio;
+            }
+        }
+        let count = self.wavelengths_nm.len().max(1);
+        let (base, ratios) = greatest(sums.into_iter().take(count));
+        if wide.is_empty() {
+            let lambertian = first.scaled(base / first.lambertian());
+            all.push(lambertian.with_spectrum(self.row(ratios, ONES)?));
+            return Ok(all);
+        }
+        let reflected: f32 = wide.iter().map(Surface::albedo).sum();
+        for s in wide {
+            let conductor = self.rows[usize::from(s.spectrum_row())];
+            let row = self.row(ratios, conductor)?;
+            all.push(s.mixed_with(base * s.albedo() / reflected, row));
+        }
+        Ok(all)
     }
 
     /// A material of one part, or a mix; and what a texel does to it.
@@ -146,8 +193,11 @@ impl<'a> Builder<'a> {
         Ok((Surface::new(&brightest).with_spectrum(row), texels))
     }
 
-    /// Where the ratios of two lobes lie.
+    /// Where the ratios of two lobes lie; with the ones where no wavelengths are asked for.
     fn row(&mut self, lambertian: Ratios, conductor: Ratios) -> Result<u16, RenderError> {
+        if self.wavelengths_nm.is_empty() {
+            return Ok(0);
+        }
         let mut bits = [0u32; 2 * MAX_WAVELENGTHS];
         for (bits, x) in bits.iter_mut().zip(lambertian.iter().chain(&conductor)) {
             *bits = x.to_bits();
@@ -232,13 +282,14 @@ impl Spectra {
         if !s.is_mixed() || row == 0 {
             return self.rows[row];
         }
-        let (base, gloss) = s.parts(n, i, o);
-        let whole = base + gloss;
-        if whole <= 0.0 {
-            return ONES;
-        }
-        let (lambertian, conductor) = (&self.rows[row], &self.rows[row + 1]);
-        std::array::from_fn(|k| (base * lambertian[k] + gloss * conductor[k]) / whole)
+        mix(s.parts(n, i, o), &[self.rows[row], self.rows[row + 1]])
+    }
+
+    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
+    pub fn lobes(&self, s: &Surface) -> [Ratios; 2] {
+        let row = usize::from(s.spectrum_row());
+        let second = row + usize::from(s.is_mixed() && row != 0);
+        [self.rows[row], self.rows[second]]
     }
 
     /// The factor of the brightest wavelength's reflectances at a texel of a surface.

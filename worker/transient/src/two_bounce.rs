@@ -7,6 +7,7 @@ use crate::{
     api::Stop,
     emitter::Emitters,
     film::{Blocks, Film},
+    lobes::Seen,
     rng::Rng,
     spectra::{Light, ONES, times},
     truth::Centres,
@@ -150,7 +151,8 @@ impl Strata {
                 let own = ray(sample).clone();
                 // Of the other rays nothing counts here.
                 all.fill(0.0);
-                emitters.weights_of(own.clone(), (h.p, h.n, -h.p / range), &h.surface, all);
+                let seen = (Seen::of(&h, -h.p / range), &h.surface);
+                emitters.weights_of(own.clone(), seen, &mut scratch.plain, all);
                 if h.through != 1.0 {
                     all.iter_mut().for_each(|w| *w *= h.through);
                 }

@@ -79,6 +79,8 @@ pub(crate) struct Scratch {
     images: Vec<f32>,
     /// Weights of light vertices.
     lights: Vec<f32>,
+    /// Densities that go with them, or with weights of spots.
+    pub plain: Vec<f32>,
     /// Light vertices that walks connect to.
     pub vertices: LightVertices,
     /// Light vertices beyond near-mirrors.
@@ -94,6 +96,7 @@ impl Scratch {
             weights: vec![0.0; emitters.list.len()],
             images: vec![0.0; mirrors.choices()],
             lights: vec![],
+            plain: vec![],
             vertices: LightVertices::default(),
             caustics: LightVertices::default(),
             contacts: LightVertices::default(),

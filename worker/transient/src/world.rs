@@ -104,8 +104,8 @@ fn drawn<'a>(all: impl Iterator<Item = &'a Surface> + Clone, u: f32) -> Surface 
 }
 
 impl Hit {
-    /// Settles a surface of several lobes on one of them. Every vertex of a path is settled where it is
-    /// found, so that each path is of one kind: by way of a mirror's lobe, or of a Lambertian one.
+    /// Settles a surface of several lobes on one of them where one is too narrow for pixels to share its vertices, so that each path
+    /// is of one kind: by way of a near-mirror's lobe, or of others. A mix of wide lobes stays: its vertices scatter by both.
     #[inline(always)]
     pub fn choose_lobe(&mut self, world: &World, rng: &mut Rng) {
         if self.surface.is_open() {
@@ -115,10 +115,9 @@ impl Hit {
 
     #[cold]
     fn settle(&mut self, world: &World, rng: &mut Rng) {
-        if self.surface.is_mixed() {
+        self.choose_part(world, rng);
+        if self.surface.is_open() {
             self.surface = self.surface.lobe(rng.uniform());
-        } else {
-            self.choose_part(world, rng);
         }
     }
 
@@ -302,6 +301,17 @@ impl World {
             spectra.scattered(&h.surface, h.n, i, o),
             self.texel_ratios(h.triangle, h.p),
         )
+    }
+
+    /// The ratios of the Lambertian part and of the conductor of a mix; of other surfaces twice their own.
+    pub fn lobe_ratios(&self, h: &Hit) -> [Ratios; 2] {
+        match &self.spectra {
+            Some(spectra) if spectra.is_spectral() && h.surface.spectrum_row() != 0 => {
+                let texel = self.texel_ratios(h.triangle, h.p);
+                spectra.lobes(&h.surface).map(|of| times(of, texel))
+            }
+            _ => [ONES; 2],
+        }
     }
 
     /// The ratios with which a surface scatters from `i` to `o`, without its texture.

@@ -4,17 +4,18 @@ use std::f32::consts::PI;
 
 use picofarm_scene::Vec3;
 
-use super::{ArrivalSink, Effort, ROUGH_SPOTS, Sharing};
+use super::{ArrivalSink, Effort, Guide, ROUGH_SPOTS, Sharing};
 use crate::{
     emitter::Columns,
     film::Film,
     lanes::{self, SIDE, Wide, widest},
+    lobes::Seen,
     rng::Rng,
     sink::{Place, Sink, Way},
     spectra::{Light, ONES, times},
     vertex::Vertex,
     walk::{Scratch, Walk},
-    world::lift,
+    world::{Hit, lift},
 };
 
 /// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
@@ -79,6 +80,7 @@ impl Sharing {
         let nearest = self.nearest_m();
         let bounce = self.lowest() + 1;
         let share = drawn as f32 / emitters.list.len() as f32;
+        let gathers = &self.gathers;
         for y in &mut self.shared {
             y.first = self.arrivals.bins.len();
             y.end = y.first;
@@ -90,6 +92,16 @@ impl Sharing {
             if !walk.in_time(h.p, nearest) {
                 continue;
             }
+            let guide = y.rough.and_then(|surface| {
+                let at = (rng.uniform() * gathers.len() as f32) as usize;
+                let to = gathers[at.min(gathers.len() - 1)].0.hit.p - h.p;
+                (h.n.dot(to) > 0.0).then(|| Guide {
+                    surface: surface.guide(),
+                    n: h.n,
+                    to: to.normalized(),
+                })
+            });
+            let (seen_as, wo) = guide.map_or((h.surface, h.n), |g| (g.surface, g.to));
             let mut sink = ArrivalSink {
                 list: &mut self.arrivals,
                 base_m: nearest,
@@ -97,13 +109,18 @@ impl Sharing {
                 factor: 1.0,
                 film,
                 place: Place::Shared,
+                guide,
+                share: 1.0,
                 from: h.n,
                 left: false,
             };
             let mut density = 0.0;
             let vertex = Vertex {
-                hit: *h,
-                wo: h.n,
+                hit: Hit {
+                    surface: seen_as,
+                    ..*h
+                },
+                wo,
                 beta: 1.0,
                 ratios: ONES,
                 length_m: nearest,
@@ -125,7 +142,8 @@ impl Sharing {
             if walk.window.is_some() {
                 walk_on(rng, &mut sink, scratch);
             }
-            emitters.weights(h.p, h.n, h.n, &h.surface, &mut scratch.weights);
+            let of = (Seen::of(h, wo), &seen_as);
+            emitters.weights(of, &mut scratch.plain, &mut scratch.weights);
             walk.leave_to_zones(h, &mut scratch.weights);
             if sink.list.bins.len() == y.first
                 && !walk.any_in_window(h.p, nearest, &scratch.weights)
@@ -168,7 +186,7 @@ impl Sharing {
                     let d2 = to.dot(to);
                     let d = d2.sqrt();
                     let strength = emitters.columns.strength[spot];
-                    density += if strength > 0.0 {
+                    density += if strength > 0.0 && guide.is_none() {
                         w / (strength * h.surface.lambertian() * PI)
                     } else {
                         let out = to / d;
@@ -257,19 +275,27 @@ impl Sharing {
             }
             let mut density = 0.0;
             self.apart.clear();
-            for &i in &self.glossy {
+            self.scattered.resize(self.glossy.len(), 0.0);
+            self.drawn.resize(self.glossy.len(), 0.0);
+            let (scattered, drawn) = (&mut self.scattered, &mut self.drawn);
+            self.lobes.toward((h.p, h.n), scattered, drawn);
+            for ((&i, &value), &pdf) in self.glossy.iter().zip(&*scattered).zip(&*drawn) {
                 if weight[i] == 0.0 {
                     continue;
                 }
                 let v = &self.gathers[i].0;
                 let x = &v.hit;
-                let to = h.p - x.p;
-                let d2 = to.dot(to);
-                let w_in = to / d2.sqrt();
-                let cos = h.n.dot(w_in).abs() / d2;
-                density += x.surface.pdf(x.n, v.wo, w_in) * cos;
-                let value = v.beta * x.surface.scatter(x.n, v.wo, w_in) * cos;
-                self.apart.push((i, value));
+                let (mut value, mut pdf) = (value, pdf);
+                if !x.surface.ggx() {
+                    let to = h.p - x.p;
+                    let d2 = to.dot(to);
+                    let w_in = to / d2.sqrt();
+                    let cos = h.n.dot(w_in).abs() / d2;
+                    pdf = x.surface.pdf(x.n, v.wo, w_in) * cos;
+                    value = x.surface.scatter(x.n, v.wo, w_in) * cos;
+                }
+                density += pdf;
+                self.apart.push((i, v.beta * value));
                 weight[i] = 0.0;
             }
             density += self.lengths.weigh(&self.columns, h.p, weight, offset);
@@ -315,6 +341,7 @@ impl Sharing {
         // Every second arrival is summed here: a sum that waits for the one just before it in the same slot takes several
         // times as long.
         let mut second = vec![0.0f32; film.slots];
+        let mut sent = vec![];
         for (i, (v, k)) in self.gathers.iter().enumerate() {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             let deeper = v.bounce - lowest;
@@ -329,28 +356,15 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
-                if let Some(surface) = &y.rough {
-                    let n = y.hit.n;
-                    let to = (v.hit.p - y.hit.p).normalized();
-                    for k in range {
-                        if u32::from(a.bounces[k]) + deeper > walk.max_bounces {
-                            continue;
-                        }
-                        // In place of the white Lambertian's 1/π.
-                        let from = a.from[k];
-                        let value = a.value[k] * PI * surface.scatter(n, to, from) / n.dot(from);
-                        if value > 0.0 {
-                            let slot = floor(a.bins[k] + offset, last) as usize;
-                            let light = Light {
-                                value: weight * value,
-                                ratios: ONES,
-                            };
-                            film.add(pixel, slot, light, usize::from(a.spot[k]));
-                        }
+                let bins = &a.bins[range.clone()];
+                let values = match &y.rough {
+                    None => &a.value[range.clone()],
+                    Some(surface) => {
+                        let to = (v.hit.p - y.hit.p).normalized();
+                        self.gloss.send(y, surface, to, &mut sent);
+                        &sent
                     }
-                    continue;
-                }
-                let (bins, values) = (&a.bins[range.clone()], &a.value[range.clone()]);
+                };
                 if film.channels == 1 && !bounded {
                     let first = &mut pixel[..film.slots];
                     let (many, few) = bins.as_chunks::<SIDE>();
@@ -524,10 +538,12 @@ mod tests {
 
     #[test]
     fn each_spot_is_carried_with_its_own_weight_on_average() {
-        let weights: Vec<f32> = (0..25).map(|k| (1 + k * k % 17) as f32).collect();
-        let lit: Vec<usize> = (0..25).filter(|k| k % 4 != 1).collect();
+        const SPOTS: usize = 100;
+        let weights: Vec<f32> = (0..SPOTS).map(|k| (1 + k * k % 17) as f32).collect();
+        let lit: Vec<usize> = (0..SPOTS).filter(|k| k % 4 != 1).collect();
+        assert!(lit.len() > super::ROUGH_SPOTS);
         let mut rng = Rng::new(1, Stream::Paths, 2, 3);
-        let (mut sums, n) = ([0.0f64; 25], 20_000);
+        let (mut sums, n) = ([0.0f64; SPOTS], 20_000);
         for _ in 0..n {
             let mut carry = Carry::new(true, &lit, &weights, &mut rng);
             let mut carried = 0;

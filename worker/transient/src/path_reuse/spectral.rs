@@ -1,13 +1,14 @@
 //! Carrying light of several wavelengths to the pixels: as [`super::arrivals`] does it of one, in the same order, so that a main
 //! wavelength that is the brightest everywhere has the bits that it has alone.
 
-use std::f32::consts::PI;
+use picofarm_scene::Vec3;
 
 use super::{Shared, Sharing, arrivals::floor};
 use crate::{
+    bsdf::Surface,
     film::Film,
     lanes::{Wide, widest},
-    spectra::{Light, ONES, Ratios, times},
+    spectra::{Light, ONES, Ratios, mix, times},
     walk::Walk,
     world::Hit,
 };
@@ -88,7 +89,8 @@ impl Sharing {
         let bounded = walk.max_bounces < u32::MAX;
         let grouped = film.channels > film.wavelengths;
         let a = &self.arrivals;
-        let rough: Vec<Ratios> = self.shared.iter().map(|y| own(walk, y)).collect();
+        let rough: Vec<[Ratios; 2]> = self.shared.iter().map(|y| own(walk, y)).collect();
+        let mut sent = vec![];
         let mut sums = Sums {
             first: vec![ONES; film.slots],
             second: vec![[0.0; ONES.len()]; film.slots],
@@ -97,39 +99,39 @@ impl Sharing {
             let pixel = &mut pixels[k * size..(k + 1) * size];
             sums.take(film, pixel);
             let deeper = v.bounce - lowest;
-            // Every vertex here is settled on a lobe, whose ratios no direction changes.
-            let seen = times(v.ratios, walk.world.ratios(&v.hit, v.wo, v.wo));
+            let here = walk.world.lobe_ratios(&v.hit);
             let rows = self.weight.chunks(count).zip(self.offset.chunks(count));
             for ((y, own), row) in self.shared.iter().zip(&rough).zip(rows) {
                 let (weight, offset) = (row.0[i], row.1[i] + 1.0);
                 if weight == 0.0 {
                     continue;
                 }
-                let weight = times([weight; ONES.len()], times(seen, *own));
+                let to = (v.hit.p - y.hit.p).normalized();
+                let seen = joined(&v.hit.surface, &here, (v.hit.n, v.wo, -to));
+                let weight = times([weight; ONES.len()], times(v.ratios, seen));
                 let range = y.first..y.end;
                 let bins = &a.bins[range.clone()];
+                if let Some(surface) = &y.rough {
+                    self.gloss.send(y, surface, to, &mut sent);
+                }
                 let each = bins.iter().zip(&a.light[range.clone()]);
-                let to = (v.hit.p - y.hit.p).normalized();
                 for (k, (&b, &light)) in each.enumerate() {
                     let at = range.start + k;
                     if bounded && u32::from(a.bounces[at]) + deeper > walk.max_bounces {
                         continue;
                     }
                     let slot = floor(b + offset, last) as usize;
-                    let (found, sum) = match &y.rough {
-                        None if k % 2 == 0 => (light, &mut sums.first[slot]),
-                        None => (light, &mut sums.second[slot]),
+                    let sum = match k % 2 {
+                        0 => &mut sums.first[slot],
+                        _ => &mut sums.second[slot],
+                    };
+                    let found = match &y.rough {
+                        None => light,
+                        Some(_) if a.value[at] == 0.0 => continue,
                         Some(surface) => {
-                            // In place of the white Lambertian's 1/π.
-                            let (n, from) = (y.hit.n, a.from[at]);
-                            let scatter = surface.scatter(n, to, from);
-                            // Light along the surface, whose cosine is 0, is no number.
-                            if scatter.is_nan() || scatter <= 0.0 {
-                                continue;
-                            }
-                            let cos = n.dot(from);
-                            let found = light.map(|x| x * PI * scatter / cos);
-                            (found, &mut sums.first[slot])
+                            let ratios = joined(surface, own, (y.hit.n, to, a.from[at]));
+                            let (sent, carried) = (sent[k], a.value[at]);
+                            times(ratios, light.map(|x| sent * (x / carried)))
                         }
                     };
                     let found = times(weight, found);
@@ -148,13 +150,19 @@ impl Sharing {
     }
 }
 
-/// The ratios of a rough vertex, whose arrivals are those of a white one.
-fn own(walk: &Walk, y: &Shared) -> Ratios {
+/// The ratios of a rough vertex by its lobes; its arrivals are those of a white one.
+fn own(walk: &Walk, y: &Shared) -> [Ratios; 2] {
     match y.rough {
-        None => ONES,
-        Some(surface) => {
-            let rough = Hit { surface, ..y.hit };
-            walk.world.ratios(&rough, y.hit.n, y.hit.n)
-        }
+        None => [ONES; 2],
+        Some(surface) => walk.world.lobe_ratios(&Hit { surface, ..y.hit }),
+    }
+}
+
+/// The ratios with which a surface with normal `n` scatters from `i` to `o`, from those of its Lambertian part and its conductor.
+#[inline(always)]
+fn joined(surface: &Surface, of: &[Ratios; 2], (n, i, o): (Vec3, Vec3, Vec3)) -> Ratios {
+    match surface.is_mixed() {
+        false => of[0],
+        true => mix(surface.parts(n, i, o), of),
     }
 }

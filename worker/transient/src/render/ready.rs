@@ -135,10 +135,9 @@ pub(super) fn prepare<R>(
         film: &film,
         sampling: &sampling,
         effort: Effort::new(
-            strategy.path_reuse.unwrap_or_else(|| {
-                let apart = narrow || mostly_rough(&centres);
-                if apart { NARROW_TILE } else { WIDE_TILE }
-            }),
+            strategy
+                .path_reuse
+                .unwrap_or(if narrow { NARROW_TILE } else { WIDE_TILE }),
             narrow,
             world.has_narrow_lobes(),
         ),
@@ -155,13 +154,6 @@ pub(super) fn prepare<R>(
         spots: &spots,
         middles: &middles,
     })
-}
-
-/// Whether most of what the camera sees is rough: there each arrival is weighed for each pixel, and wide tiles do not pay.
-fn mostly_rough(centres: &Centres) -> bool {
-    let seen = || centres.hits.iter().flatten();
-    let rough = seen().filter(|h| !h.surface.diffuse() && !h.surface.specular());
-    2 * rough.count() > seen().count()
 }
 
 impl Ready<'_> {

@@ -8,6 +8,7 @@ use super::{ALL, Lights, Scratch, Step, Walk};
 use crate::{
     contact::Contacts,
     light_vertices,
+    lobes::Seen,
     rng::Rng,
     sink::{Sink, Way},
     spectra::{Light, ONES, Ratios, times},
@@ -38,10 +39,12 @@ impl Walk<'_> {
         let Scratch {
             stack,
             weights,
+            plain,
             images,
             ..
         } = scratch;
-        self.emitters.weights(h.p, h.n, v.wo, &h.surface, weights);
+        let of = (Seen::of(h, v.wo), &h.surface);
+        self.emitters.weights(of, plain, weights);
         if caustic {
             for &spot in &self.emitters.glossy {
                 weights[spot] = 0.0;
@@ -224,6 +227,7 @@ impl Walk<'_> {
         let Scratch {
             stack,
             lights,
+            plain,
             vertices,
             caustics,
             contacts,
@@ -253,7 +257,7 @@ impl Walk<'_> {
         if which == Lights::Glossy {
             vertices.glossy_weights(h, v.wo, lights);
         } else {
-            vertices.weights(h, v.wo, lights);
+            vertices.weights(h, v.wo, (lights, plain));
         }
         if let Some(window) = &self.window {
             for (w, y) in lights.iter_mut().zip(&vertices.list) {

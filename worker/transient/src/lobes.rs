@@ -1,0 +1,397 @@
+//! Scattering of many surface points side by side: each with a direction of its own that stays, towards or from one point.
+//!
+//! GGX conductors, Lambertians and mixes of both; Beckmann's exponential is not worked out side by side, and such surfaces
+//! have no light here.
+
+use std::ops::Range;
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    bsdf::Surface,
+    lanes::{Wide, widest},
+    world::Hit,
+};
+
+/// How a surface point scatters light from a direction that stays.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Lobe {
+    /// f · cos / (D·π·α²·G₁) of the conductor; the other direction's D and G₁ are missing.
+    pub conductor: f32,
+    /// ρ/π of the Lambertian part.
+    pub lambertian: f32,
+    /// α².
+    pub alpha2: f32,
+    /// Density of a draw from the conductor, without D.
+    pub conductor_pdf: f32,
+    /// Density of a draw from the Lambertian part, without the cosine.
+    pub lambertian_pdf: f32,
+}
+
+impl Lobe {
+    /// f·cos of the direction `w`, and the density per steradian of drawing it. `n` is the normal, `i` the direction that stays.
+    #[inline(always)]
+    fn scatter(&self, n: [f32; 3], i: [f32; 3], w: [f32; 3]) -> (f32, f32) {
+        let co = dot(n, w);
+        let s = [i[0] + w[0], i[1] + w[1], i[2] + w[2]];
+        let c = dot(n, s);
+        // The slope comes from n × s: 1 − cos² would cancel at small α.
+        let x = [
+            n[1] * s[2] - n[2] * s[1],
+            n[2] * s[0] - n[0] * s[2],
+            n[0] * s[1] - n[1] * s[0],
+        ];
+        let (along2, across2) = (c * c, dot(x, x));
+        let t = (along2 + across2) / (along2 + across2 / self.alpha2);
+        let d = t * t;
+        let tan2 = (1.0 - co * co).max(0.0) / (co * co);
+        let g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
+        let f = self.lambertian * co + self.conductor * d * g;
+        let pdf = self.lambertian_pdf * co + self.conductor_pdf * d;
+        let lit = co > 0.0;
+        (if lit { f } else { 0.0 }, if lit { pdf } else { 0.0 })
+    }
+}
+
+#[inline(always)]
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn array(v: Vec3) -> [f32; 3] {
+    [v.x, v.y, v.z]
+}
+
+/// A surface point, its normal and the direction that stays.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seen {
+    pub p: Vec3,
+    pub n: Vec3,
+    pub i: Vec3,
+}
+
+impl Seen {
+    /// A hit, seen in the direction `i`.
+    #[inline]
+    pub fn of(h: &Hit, i: Vec3) -> Self {
+        Self { p: h.p, n: h.n, i }
+    }
+}
+
+/// Many of them.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Lobes {
+    p: [Vec<f32>; 3],
+    n: [Vec<f32>; 3],
+    i: [Vec<f32>; 3],
+    conductor: Vec<f32>,
+    lambertian: Vec<f32>,
+    alpha2: Vec<f32>,
+    conductor_pdf: Vec<f32>,
+    lambertian_pdf: Vec<f32>,
+    /// How many have a Beckmann conductor.
+    beckmann: usize,
+}
+
+impl Lobes {
+    pub fn clear(&mut self) {
+        let columns = self.p.iter_mut().chain(&mut self.n).chain(&mut self.i);
+        columns.for_each(Vec::clear);
+        for column in [
+            &mut self.conductor,
+            &mut self.lambertian,
+            &mut self.alpha2,
+            &mut self.conductor_pdf,
+            &mut self.lambertian_pdf,
+        ] {
+            column.clear();
+        }
+        self.beckmann = 0;
+    }
+
+    pub fn push(&mut self, place: &Seen, surface: &Surface) {
+        for (columns, v) in [
+            (&mut self.p, place.p),
+            (&mut self.n, place.n),
+            (&mut self.i, place.i),
+        ] {
+            for (column, x) in columns.iter_mut().zip(array(v)) {
+                column.push(x);
+            }
+        }
+        let lobe = surface.lobe_from(place.n.dot(place.i));
+        self.beckmann += usize::from(lobe.is_none());
+        let lobe = lobe.unwrap_or_default();
+        self.conductor.push(lobe.conductor);
+        self.lambertian.push(lobe.lambertian);
+        self.alpha2.push(lobe.alpha2.max(f32::MIN_POSITIVE));
+        self.conductor_pdf.push(lobe.conductor_pdf);
+        self.lambertian_pdf.push(lobe.lambertian_pdf);
+    }
+
+    /// Whether all are told: none is a Beckmann conductor.
+    pub fn complete(&self) -> bool {
+        self.beckmann == 0
+    }
+
+    /// What each scatters towards the point `q` with normal `nq`, and the density of drawing it, both per area there.
+    pub fn toward(&self, (q, nq): (Vec3, Vec3), value: &mut [f32], pdf: &mut [f32]) {
+        widest(Toward {
+            lobes: self,
+            q,
+            nq,
+            value,
+            pdf,
+        });
+    }
+
+    /// What a point sends on of what those of a range send to it, f_x cos_x f_y cos_y / d², and the density per area at
+    /// each of them with which the point draws it. `None` where its conductor is not told here.
+    pub fn between(
+        &self,
+        range: Range<usize>,
+        (place, surface): (&Seen, &Surface),
+        value: &mut [f32],
+        pdf: &mut [f32],
+    ) -> Option<()> {
+        let lobe = surface.lobe_from(place.n.dot(place.i))?;
+        widest(Between {
+            lobes: self,
+            range,
+            place: *place,
+            lobe,
+            value,
+            pdf,
+        });
+        Some(())
+    }
+}
+
+/// Columns of a range, all of one length.
+struct Columns<'a> {
+    p: [&'a [f32]; 3],
+    n: [&'a [f32]; 3],
+    i: [&'a [f32]; 3],
+    conductor: &'a [f32],
+    lambertian: &'a [f32],
+    alpha2: &'a [f32],
+    conductor_pdf: &'a [f32],
+    lambertian_pdf: &'a [f32],
+}
+
+impl<'a> Columns<'a> {
+    #[inline(always)]
+    fn of(lobes: &'a Lobes, first: usize, count: usize) -> Self {
+        let of = |column: &'a [f32]| &column[first..][..count];
+        let each = |columns: &'a [Vec<f32>; 3]| [of(&columns[0]), of(&columns[1]), of(&columns[2])];
+        Self {
+            p: each(&lobes.p),
+            n: each(&lobes.n),
+            i: each(&lobes.i),
+            conductor: of(&lobes.conductor),
+            lambertian: of(&lobes.lambertian),
+            alpha2: of(&lobes.alpha2),
+            conductor_pdf: of(&lobes.conductor_pdf),
+            lambertian_pdf: of(&lobes.lambertian_pdf),
+        }
+    }
+
+    #[inline(always)]
+    fn lobe(&self, k: usize) -> Lobe {
+        Lobe {
+            conductor: self.conductor[k],
+            lambertian: self.lambertian[k],
+            alpha2: self.alpha2[k],
+            conductor_pdf: self.conductor_pdf[k],
+            lambertian_pdf: self.lambertian_pdf[k],
+        }
+    }
+}
+
+#[inline(always)]
+fn at(columns: &[&[f32]; 3], k: usize) -> [f32; 3] {
+    [columns[0][k], columns[1][k], columns[2][k]]
+}
+
+/// [`Lobes::toward`].
+struct Toward<'a> {
+    lobes: &'a Lobes,
+    q: Vec3,
+    nq: Vec3,
+    value: &'a mut [f32],
+    pdf: &'a mut [f32],
+}
+
+impl Wide for Toward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let count = self.value.len();
+        let c = Columns::of(self.lobes, 0, count);
+        let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
+        let (q, nq) = (array(self.q), array(self.nq));
+        for k in 0..count {
+            let p = at(&c.p, k);
+            let to = [q[0] - p[0], q[1] - p[1], q[2] - p[2]];
+            let d2 = dot(to, to);
+            let scale = 1.0 / d2.sqrt();
+            let w = [to[0] * scale, to[1] * scale, to[2] * scale];
+            let (f, density) = c.lobe(k).scatter(at(&c.n, k), at(&c.i, k), w);
+            let turn = dot(nq, w).abs() / d2;
+            value[k] = f * turn;
+            pdf[k] = density * turn;
+        }
+    }
+}
+
+/// [`Lobes::between`].
+struct Between<'a> {
+    lobes: &'a Lobes,
+    range: Range<usize>,
+    place: Seen,
+    lobe: Lobe,
+    value: &'a mut [f32],
+    pdf: &'a mut [f32],
+}
+
+impl Wide for Between<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let count = self.range.len();
+        let c = Columns::of(self.lobes, self.range.start, count);
+        let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
+        let Seen { p: x, n, i } = self.place;
+        let (x, n, i, lobe) = (array(x), array(n), array(i), self.lobe);
+        for k in 0..count {
+            let p = at(&c.p, k);
+            let to = [p[0] - x[0], p[1] - x[1], p[2] - x[2]];
+            let d2 = dot(to, to);
+            let scale = 1.0 / d2.sqrt();
+            let w = [to[0] * scale, to[1] * scale, to[2] * scale];
+            let (here, density) = lobe.scatter(n, i, w);
+            let back = [-w[0], -w[1], -w[2]];
+            let ny = at(&c.n, k);
+            let (there, _) = c.lobe(k).scatter(ny, at(&c.i, k), back);
+            value[k] = here * there / d2;
+            pdf[k] = density * dot(ny, w).abs() / d2;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::PI;
+
+    use picofarm_scene::{Bsdf, Distribution, Material};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn unit() -> impl Strategy<Value = Vec3> {
+        let axis = || -1.0f32..1.0;
+        (axis(), axis(), axis())
+            .prop_map(|(x, y, z)| Vec3::new(x, y, z))
+            .prop_filter("has a direction", |v| v.length() > 0.1)
+            .prop_map(Vec3::normalized)
+    }
+
+    fn surface() -> impl Strategy<Value = Surface> {
+        (0.02f32..0.9, 0.0f32..1.0, 0u8..3).prop_map(|(alpha, weight, kind)| {
+            let distribution = Distribution::Ggx;
+            let bsdf = match kind {
+                0 => Bsdf::Diffuse { reflectance: 0.7 },
+                1 => Bsdf::RoughConductor {
+                    alpha,
+                    distribution,
+                    reflectance: 0.8,
+                },
+                _ => Bsdf::Mixed {
+                    reflectance: 0.6,
+                    alpha,
+                    distribution,
+                    specular_reflectance: 0.9,
+                    weight,
+                },
+            };
+            Surface::new(&Material {
+                bsdf,
+                ..Material::diffuse("any", [0.5; 3])
+            })
+        })
+    }
+
+    fn near(a: f32, b: f32) -> bool {
+        (a - b).abs() <= 2e-3 * a.abs().max(b.abs()) + 1e-6
+    }
+
+    proptest! {
+        #[test]
+        fn points_side_by_side_scatter_as_each_alone(
+            all in prop::collection::vec((unit(), unit(), unit(), surface()), 1..20),
+            x in unit(), n in unit(), i in unit(), own in surface(),
+        ) {
+            let mut lobes = Lobes::default();
+            for (p, n, i, s) in &all {
+                lobes.push(&Seen { p: *p * 3.0, n: *n, i: *i }, s);
+            }
+            prop_assert!(lobes.complete());
+            let (mut value, mut pdf) = (vec![0.0; all.len()], vec![0.0; all.len()]);
+            lobes.toward((x, n), &mut value, &mut pdf);
+            for (k, (p, np, ip, s)) in all.iter().enumerate() {
+                let to = x - *p * 3.0;
+                let (d2, w) = (to.dot(to), to.normalized());
+                let turn = n.dot(w).abs() / d2;
+                prop_assert!(near(value[k], s.scatter(*np, *ip, w) * turn));
+                prop_assert!(near(pdf[k], s.pdf(*np, *ip, w) * turn));
+            }
+            let place = Seen { p: x, n, i };
+            lobes.between(0..all.len(), (&place, &own), &mut value, &mut pdf).unwrap();
+            for (k, (p, np, ip, s)) in all.iter().enumerate() {
+                let to = *p * 3.0 - x;
+                let (d2, w) = (to.dot(to), to.normalized());
+                let expected = own.scatter(n, i, w) * s.scatter(*np, *ip, -w) / d2;
+                prop_assert!(near(value[k], expected));
+                prop_assert!(near(pdf[k], own.pdf(n, i, w) * np.dot(w).abs() / d2));
+            }
+        }
+    }
+
+    #[test]
+    fn beckmann_is_not_told() {
+        let mut lobes = Lobes::default();
+        let (p, n) = (Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0));
+        let beckmann = Surface::new(&Material {
+            bsdf: Bsdf::RoughConductor {
+                alpha: 0.3,
+                distribution: Distribution::Beckmann,
+                reflectance: 1.0,
+            },
+            ..Material::diffuse("any", [0.5; 3])
+        });
+        let place = Seen { p, n, i: n };
+        lobes.push(&place, &beckmann);
+        assert!(!lobes.complete());
+        let (mut value, mut pdf) = ([1.0], [1.0]);
+        assert!(
+            lobes
+                .between(0..1, (&place, &beckmann), &mut value, &mut pdf)
+                .is_none()
+        );
+        lobes.toward((n, n), &mut value, &mut pdf);
+        assert_eq!(value, [0.0]);
+    }
+
+    #[test]
+    fn the_constants_are_those_of_a_lambertian() {
+        let lobe = Surface::new(&Material::diffuse("half", [0.5; 3]))
+            .lobe_from(0.3)
+            .unwrap();
+        assert_eq!((lobe.conductor, lobe.conductor_pdf), (0.0, 0.0));
+        assert_eq!(lobe.lambertian_pdf, 1.0 / PI);
+        assert_eq!(lobe.lambertian, 0.5 / PI);
+    }
+}
