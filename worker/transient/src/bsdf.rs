@@ -361,19 +361,17 @@ impl Surface {
         let lit = c > 0.0 && !self.is_black();
         let alpha2 = self.alpha * self.alpha;
         match self.kind {
-            Kind::Lambertian if lit => Some(Lobe {
-                lambertian: self.strength,
-                lambertian_pdf: 1.0 / PI,
-                alpha2: 1.0,
-                ..Lobe::default()
-            }),
-            Kind::Lambertian => Some(Lobe::default()),
             Kind::Several => None,
             Kind::Conductor | Kind::Mixed if !self.ggx() => None,
-            Kind::Conductor | Kind::Mixed if !lit => Some(Lobe::default()),
+            _ if !lit => Some(Lobe::BLACK),
+            Kind::Lambertian => Some(Lobe {
+                lambertian: self.strength,
+                lambertian_pdf: 1.0 / PI,
+                ..Lobe::BLACK
+            }),
             Kind::Conductor | Kind::Mixed => {
                 let share = if self.is_mixed() { self.share() } else { 1.0 };
-                let seen = self.masking(c) / (4.0 * c * PI * alpha2);
+                let seen = self.leaving(c) / (4.0 * PI * alpha2);
                 Some(Lobe {
                     conductor: self.strength * seen,
                     lambertian: self.base,
@@ -385,22 +383,14 @@ impl Surface {
         }
     }
 
-    /// The BRDF of a surface that is not Lambertian, from a direction with cosine `c` to another, is its Lambertian part here plus
-    /// the second number here times [`Surface::leaving`] and [`Surface::lobe_of`] of the other.
+    /// The BRDF of a surface that is not Lambertian, from a direction with cosine `c` to another, is the first number here plus the
+    /// second times [`Surface::leaving`] and [`Surface::lobe_ggx`] or [`Surface::lobe_beckmann`] of the other.
     pub fn arriving(&self, c: f32) -> (f32, f32) {
         let a2 = self.alpha * self.alpha;
-        let conductor = self.strength * self.masking(c) / (4.0 * c * PI * a2);
-        (
-            self.base,
-            if conductor.is_finite() {
-                conductor
-            } else {
-                0.0
-            },
-        )
+        (self.base, self.strength * self.leaving(c) / (4.0 * PI * a2))
     }
 
-    /// See [`Surface::arriving`].
+    /// G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
     pub fn leaving(&self, c: f32) -> f32 {
         let leaving = self.masking(c) / c;
         if leaving.is_finite() { leaving } else { 0.0 }
@@ -411,7 +401,7 @@ impl Surface {
     #[inline(always)]
     pub fn lobe_ggx(&self, square: f32, along2: f32) -> f32 {
         let across2 = (square - along2).max(0.0);
-        let t = square / (along2 + across2 / (self.alpha * self.alpha));
+        let t = square / (along2 + across2 / (self.alpha * self.alpha) + f32::MIN_POSITIVE);
         t * t
     }
 
@@ -420,7 +410,7 @@ impl Surface {
     pub fn lobe_beckmann(&self, square: f32, along2: f32) -> f32 {
         let across2 = (square - along2).max(0.0);
         let x = across2 / (along2 * self.alpha * self.alpha);
-        if x > 80.0 {
+        if x.is_nan() || x > 80.0 {
             return 0.0;
         }
         let cos2 = along2 / square;

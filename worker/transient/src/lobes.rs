@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// How a surface point scatters light from a direction that stays.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Lobe {
     /// f · cos / (D·π·α²·G₁) of the conductor; the other direction's D and G₁ are missing.
     pub conductor: f32,
@@ -29,6 +29,15 @@ pub(crate) struct Lobe {
 }
 
 impl Lobe {
+    /// Of a surface that scatters nothing.
+    pub const BLACK: Self = Self {
+        conductor: 0.0,
+        lambertian: 0.0,
+        alpha2: 1.0,
+        conductor_pdf: 0.0,
+        lambertian_pdf: 0.0,
+    };
+
     /// f·cos of the direction `w`, and the density per steradian of drawing it. `n` is the normal, `i` the direction that stays.
     #[inline(always)]
     fn scatter(&self, n: [f32; 3], i: [f32; 3], w: [f32; 3]) -> (f32, f32) {
@@ -42,7 +51,8 @@ impl Lobe {
             n[0] * s[1] - n[1] * s[0],
         ];
         let (along2, across2) = (c * c, dot(x, x));
-        let t = (along2 + across2) / (along2 + across2 / self.alpha2);
+        // Never 0/0: opposite directions have no sum.
+        let t = (along2 + across2) / (along2 + across2 / self.alpha2 + f32::MIN_POSITIVE);
         let d = t * t;
         let tan2 = (1.0 - co * co).max(0.0) / (co * co);
         let g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
@@ -122,10 +132,10 @@ impl Lobes {
         }
         let lobe = surface.lobe_from(place.n.dot(place.i));
         self.beckmann += usize::from(lobe.is_none());
-        let lobe = lobe.unwrap_or_default();
+        let lobe = lobe.unwrap_or(Lobe::BLACK);
         self.conductor.push(lobe.conductor);
         self.lambertian.push(lobe.lambertian);
-        self.alpha2.push(lobe.alpha2.max(f32::MIN_POSITIVE));
+        self.alpha2.push(lobe.alpha2);
         self.conductor_pdf.push(lobe.conductor_pdf);
         self.lambertian_pdf.push(lobe.lambertian_pdf);
     }
@@ -240,8 +250,9 @@ impl Wide for Toward<'_> {
             let w = [to[0] * scale, to[1] * scale, to[2] * scale];
             let (f, density) = c.lobe(k).scatter(at(&c.n, k), at(&c.i, k), w);
             let turn = dot(nq, w).abs() / d2;
-            value[k] = f * turn;
-            pdf[k] = density * turn;
+            // In one place with it there is no direction.
+            value[k] = if f > 0.0 { f * turn } else { 0.0 };
+            pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
         }
     }
 }
@@ -276,8 +287,10 @@ impl Wide for Between<'_> {
             let back = [-w[0], -w[1], -w[2]];
             let ny = at(&c.n, k);
             let (there, _) = c.lobe(k).scatter(ny, at(&c.i, k), back);
-            value[k] = here * there / d2;
-            pdf[k] = density * dot(ny, w).abs() / d2;
+            let (f, turn) = (here * there, dot(ny, w).abs() / d2);
+            // In one place with it there is no direction.
+            value[k] = if f > 0.0 { f / d2 } else { 0.0 };
+            pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
         }
     }
 }
@@ -356,6 +369,36 @@ mod tests {
                 let expected = own.scatter(n, i, w) * s.scatter(*np, *ip, -w) / d2;
                 prop_assert!(near(value[k], expected));
                 prop_assert!(near(pdf[k], own.pdf(n, i, w) * np.dot(w).abs() / d2));
+            }
+        }
+    }
+
+    #[test]
+    fn there_is_no_light_between_points_in_one_place_or_from_beneath() {
+        let (p, n) = (Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0));
+        let rough = Surface::new(&Material {
+            bsdf: Bsdf::RoughConductor {
+                alpha: 0.3,
+                distribution: Distribution::Ggx,
+                reflectance: 1.0,
+            },
+            ..Material::diffuse("any", [0.5; 3])
+        });
+        for i in [n, -n, Vec3::new(1.0, 0.0, 0.0)] {
+            let seen = Seen { p, n, i };
+            let mut lobes = Lobes::default();
+            lobes.push(&seen, &rough);
+            let above = n * 2.0;
+            for q in [p, if i == n { -above } else { above }] {
+                let (mut value, mut pdf) = ([1.0], [1.0]);
+                lobes.toward((q, n), &mut value, &mut pdf);
+                assert_eq!((value, pdf), ([0.0], [0.0]), "{i:?} {q:?}");
+                let at = Seen { p: q, n: -n, i: -n };
+                lobes
+                    .between(0..1, (&at, &rough), &mut value, &mut pdf)
+                    .unwrap();
+                assert_eq!(value, [0.0], "{i:?} {q:?}");
+                assert!(pdf[0].is_finite());
             }
         }
     }
