@@ -131,8 +131,8 @@ impl LightVertices {
         if !all_lambertian && self.lobes.complete() {
             plain.resize(out.len(), 0.0);
             let (place, all) = (Seen::of(x, wo), 0..out.len());
-            let told = self.lobes.between(all, (&place, &x.surface), out, plain);
-            if told.is_some() {
+            let weighed = self.lobes.between(all, (&place, &x.surface), out, plain);
+            if weighed.is_some() {
                 for ((w, y), plain) in out.iter_mut().zip(&self.list).zip(plain) {
                     *w *= y.flux * y.density / (y.density + *plain);
                 }

@@ -1,7 +1,7 @@
 //! Scattering of many surface points side by side: each with a direction of its own that stays, towards or from one point.
 //!
-//! GGX conductors, Lambertians and mixes of both; Beckmann's exponential is not worked out side by side, and such surfaces
-//! have no light here.
+//! GGX conductors, Lambertians and mixes of both; Beckmann's exponential is not worked out side by side: such surfaces are black
+//! here, and who asks weighs them one by one.
 
 use std::ops::Range;
 
@@ -140,7 +140,7 @@ impl Lobes {
         self.lambertian_pdf.push(lobe.lambertian_pdf);
     }
 
-    /// Whether all are told: none is a Beckmann conductor.
+    /// Whether all scatter here as they do: none has a Beckmann conductor.
     pub fn complete(&self) -> bool {
         self.beckmann == 0
     }
@@ -157,7 +157,7 @@ impl Lobes {
     }
 
     /// What a point sends on of what those of a range send to it, f_x cos_x f_y cos_y / d², and the density per area at
-    /// each of them with which the point draws it. `None` where its conductor is not told here.
+    /// each of them with which the point draws it. `None` where it has a Beckmann conductor.
     pub fn between(
         &self,
         range: Range<usize>,
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn beckmann_is_not_told() {
+    fn beckmann_conductors_are_left_to_others() {
         let mut lobes = Lobes::default();
         let (p, n) = (Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0));
         let beckmann = Surface::new(&Material {

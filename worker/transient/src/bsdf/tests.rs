@@ -234,3 +234,39 @@ fn conductors_agree_with_mitsuba() {
         }
     }
 }
+
+#[test]
+fn rough_surfaces_scatter_alike_by_factors_of_each_direction() {
+    let mut rng = Rng::new(7, Stream::Paths, 0, 0);
+    let n = Vec3::new(0.2, -0.5, 0.8).normalized();
+    let mut compared = 0;
+    for d in [Distribution::Beckmann, Distribution::Ggx] {
+        for alpha in [0.15, 0.3, 0.8] {
+            for s in [conductor(alpha, d), mix(alpha, d, 0.4)] {
+                for _ in 0..200 {
+                    let (Some((i, ci)), Some((o, co))) = (cosine(n, &mut rng), cosine(n, &mut rng))
+                    else {
+                        continue;
+                    };
+                    let (base, conductor) = s.arriving(co);
+                    let (square, along2) = ((i + o).dot(i + o), (ci + co) * (ci + co));
+                    let lobe = match d {
+                        Distribution::Ggx => s.lobe_ggx(square, along2),
+                        Distribution::Beckmann => s.lobe_beckmann(square, along2),
+                    };
+                    let (got, expected) = (
+                        base + conductor * s.leaving(ci) * lobe,
+                        s.scatter(n, i, o) / co,
+                    );
+                    let slack = 2e-3 * expected + 1e-6;
+                    assert!(
+                        (got - expected).abs() <= slack,
+                        "{d:?} {alpha}: {got} {expected}"
+                    );
+                    compared += 1;
+                }
+            }
+        }
+    }
+    assert!(compared > 2000);
+}
