@@ -6,7 +6,7 @@ pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelengths};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-9";
+pub const RENDERER_VERSION: &str = "transient-10";
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -186,8 +186,10 @@ pub struct Overflow {
 /// How noisy a render is, estimated from the variance between passes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ErrorEstimate {
-    /// Median over pixels of ‖standard error‖₂ / ‖h‖₂ over the bins (one bounce left out). Pixels of a
-    /// neighbourhood share vertices: their errors are alike, and sums over them err more than by chance.
+    /// Median over pixels of ‖error‖₂ / ‖h‖₂ over the bins (one bounce left out). Where bins of a pixel err together, most
+    /// pixels err by less than ‖standard error‖₂ and few by much more, so the standard errors' median is corrected by draws of
+    /// the errors of one pixel in nine. Pixels of a neighbourhood share vertices: their errors are alike, and sums over
+    /// them err more than by chance.
     pub median_relative: f32,
     /// The same, 95th percentile.
     pub p95_relative: f32,

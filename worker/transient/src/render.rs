@@ -1,5 +1,6 @@
 //! The driver: a whole render with its stopping rule, and the forecast of one.
 
+mod draws;
 mod error;
 mod forecast;
 mod image;
@@ -15,7 +16,8 @@ mod warn;
 use picofarm_scene::Scene;
 
 use self::{
-    error::{Stat, estimate, passes_for},
+    draws::likely,
+    error::{Stat, passes_for},
     image::{Image, Watch},
     ready::{Ready, prepare},
     splat::{Sources, Splats},
@@ -126,7 +128,7 @@ fn whole(
         rays += image.round(frame, 0..image.tiles(), &waves, &watch)?;
         done = until;
         let error = match &mut splats {
-            None => estimate(&image.stats, image.total_spread, image.mean_passes()),
+            None => image.estimate(),
             Some((sources, splats)) => {
                 let wave = match walks {
                     true => image.mean_passes() - before,
@@ -192,7 +194,7 @@ fn further(
         true => 0.0,
         false => sampling.variance(n),
     };
-    let target = GOAL * target;
+    let target = GOAL * target / likely(&image.stats, &image.watched(), 0.5) as f32;
     let all = passes_for(&image.stats, spent, target, (spent + 1, MAX_PASSES), two);
     let own = |(spent, stats): (u32, Vec<Stat>)| {
         let range = (all / 2, (2 * all).min(MAX_PASSES));

@@ -1,5 +1,9 @@
 //! The stored errors against the scatter over many seeds of the same small render.
 
+#[path = "../benches/stop/scenes.rs"]
+#[allow(dead_code, reason = "one of its rooms is used here")]
+mod scenes;
+
 mod common;
 
 use std::sync::OnceLock;
@@ -225,4 +229,35 @@ fn a_budget_of_ten_per_cent_ends_at_a_true_median_error_of_ten_per_cent() {
         truth += got / count as f64;
     }
     assert!((0.08..0.12).contains(&truth), "{truth}");
+}
+
+#[test]
+fn the_median_error_holds_where_the_bins_of_a_pixel_err_together() {
+    const SIDE: u32 = 24;
+    let rooms = scenes::all(SIDE).into_iter();
+    let (_, room) = rooms.filter(|(name, _)| name == "far-03").last().unwrap();
+    let all: Vec<Rendered> = (0..8)
+        .map(|k| ok(&room, &with(k, Budget::Samples(32))))
+        .collect();
+    let n = all.len() as f64;
+    let says = all.iter().map(|r| f64::from(r.error.median_relative));
+    let says = says.sum::<f64>() / n;
+    let mean: Vec<f64> = (0..all[0].transient.len())
+        .map(|i| all.iter().map(|r| f64::from(r.transient[i])).sum::<f64>() / n)
+        .collect();
+    // Standard errors, which one path in many bins makes too large for most pixels.
+    let standard = all.iter().map(|r| {
+        let split = r.split.as_ref().unwrap();
+        let noise: Vec<f32> = (0..mean.len())
+            .map(|i| mean[i] as f32 + split.multi_se[i].hypot(split.two_se[i]))
+            .collect();
+        true_median(&noise, &mean)
+    });
+    let standard = standard.sum::<f64>() / n;
+    // The mean of the renders has an eighth of each one's error in it.
+    let is = all.iter().map(|r| true_median(&r.transient, &mean));
+    let is = is.sum::<f64>() / n * (n / (n - 1.0)).sqrt();
+    println!("says {says:.4}, is {is:.4}; standard errors {standard:.4}");
+    assert!((says / is - 1.0).abs() < 0.1, "says {says}, is {is}");
+    assert!(standard > 1.15 * is, "{standard} {is}");
 }

@@ -11,8 +11,9 @@ const LARGE: f64 = 65_536.0;
 const MANY: f64 = 5.0;
 const LARGE_TILE: f64 = 1024.0;
 const SMALL_TILE: f64 = 256.0;
-/// Sums that a thread keeps of each slot of its tile: of all channels, and of the first alone.
-const TILE_SUMS: (f64, f64) = (3.0, 6.0);
+/// Sums that a thread keeps of each slot of its tile: of all channels, and of the first alone; one pixel in nine keeps nine
+/// more, for draws of its error.
+const TILE_SUMS: (f64, f64) = (3.0, 7.0);
 /// What the sums over light paths take, as a share of what sums of every bin would. They are kept of the bins that light paths come to, in
 /// twice as many bytes each: by the memory that a furnished room of 64×64 pixels took, about a fifth of the bins after 512 passes. Scenes without
 /// mirrors need none; only the scene tells.

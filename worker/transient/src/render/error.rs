@@ -2,7 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::region::Region;
+use super::{
+    draws::{Draw, likely},
+    region::Region,
+};
 use crate::api::ErrorEstimate;
 
 /// Bins on either side over which the variance of the 3+ part and of the two-bounce part is pooled.
@@ -128,6 +131,13 @@ pub(super) struct Stat {
     pub total: f64,
 }
 
+impl Stat {
+    /// ‖standard error‖ / ‖h‖; `None` for a pixel without light.
+    pub fn error(&self) -> Option<f64> {
+        relative(self.norm2, self.two_variance + self.multi_variance)
+    }
+}
+
 /// ‖standard error‖ / ‖h‖ of a pixel; `None` for a pixel without light. The measured ‖h‖² contains the
 /// variance; it is taken off, down to a tenth.
 fn relative(norm2: f64, variance: f64) -> Option<f64> {
@@ -143,14 +153,12 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
 }
 
 fn sorted(stats: impl Iterator<Item = Stat>) -> Vec<f64> {
-    let mut all: Vec<f64> = stats
-        .filter_map(|s| relative(s.norm2, s.two_variance + s.multi_variance))
-        .collect();
+    let mut all: Vec<f64> = stats.filter_map(|s| s.error()).collect();
     all.sort_by(f64::total_cmp);
     all
 }
 
-/// Median of the pixels' relative errors.
+/// Median of the pixels' relative standard errors.
 pub(super) fn relative_median(stats: impl Iterator<Item = Stat>) -> f64 {
     quantile(&sorted(stats), 0.5)
 }
@@ -213,13 +221,19 @@ impl Spread {
     }
 }
 
-/// The estimate for a whole image of that `spread` in its whole energy, after `samples` passes on average.
-pub(super) fn estimate(stats: &[Stat], spread: Spread, samples: u32) -> ErrorEstimate {
+/// The estimate for a whole image of that `spread` in its whole energy, after `samples` passes on average; `draws` of some
+/// pixels' errors.
+pub(super) fn estimate(
+    stats: &[Stat],
+    draws: &[(usize, Draw)],
+    spread: Spread,
+    samples: u32,
+) -> ErrorEstimate {
     let all = sorted(stats.iter().copied());
     let total: f64 = stats.iter().map(|s| s.total).sum();
     ErrorEstimate {
-        median_relative: quantile(&all, 0.5) as f32,
-        p95_relative: quantile(&all, 0.95) as f32,
+        median_relative: (likely(stats, draws, 0.5) * quantile(&all, 0.5)) as f32,
+        p95_relative: (likely(stats, draws, 0.95) * quantile(&all, 0.95)) as f32,
         total_relative: if total > 0.0 {
             (spread.variance.sqrt() / total) as f32
         } else {
@@ -230,7 +244,7 @@ pub(super) fn estimate(stats: &[Stat], spread: Spread, samples: u32) -> ErrorEst
     }
 }
 
-/// The median error after `n` passes of pixels that stand as `stats` says after `passes`.
+/// The median standard error after `n` passes of pixels that stand as `stats` says after `passes`.
 pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u32) -> f64) -> f64 {
     let scale = f64::from(passes) / f64::from(n);
     let then = stats.iter().map(|s| {
@@ -250,7 +264,7 @@ pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u3
 }
 
 /// The fewest passes, from `least` to `most`, with which pixels that stand as `stats` says after
-/// `passes` come down to a median error of `target`. `two` says how the two-bounce variance falls.
+/// `passes` come down to a median standard error of `target`. `two` says how the two-bounce variance falls.
 pub(super) fn passes_for(
     stats: &[Stat],
     passes: u32,

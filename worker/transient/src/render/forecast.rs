@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     FIRST_PASSES, GOAL, MAX_PASSES,
+    draws::{Draw, likely},
     error::{Stat, median_after, passes_for, relative_median},
     image::tile_side,
     region::Region,
@@ -44,7 +45,11 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
         return Forecast {
             plan,
             passes: 0,
-            error: relative_median(found.tiles.concat().into_iter()) as f32,
+            error: {
+                let stats = found.tiles.concat();
+                let likely = likely(&stats, &found.draws, 0.5);
+                (likely * relative_median(stats.into_iter())) as f32
+            },
             rays: rays + (found.rays * all) as u64,
             warnings: vec![],
         };
@@ -52,10 +57,11 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
     let (one, found) = (look(frame, 1), look(frame, PASSES));
     let two = |n: u32| frame.sampling.variance(n);
     let stats = found.tiles.concat();
+    let likely = likely(&stats, &found.draws, 0.5);
     let (passes, error) = match *budget {
         Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
         Budget::Error(target) => {
-            let target = target as f32;
+            let target = (target / likely) as f32;
             // As `further` shares them out.
             let most = (FIRST_PASSES, MAX_PASSES);
             let n = passes_for(&stats, PASSES, GOAL * target, most, two);
@@ -75,7 +81,7 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
     Forecast {
         plan,
         passes,
-        error: error as f32,
+        error: (likely * error) as f32,
         rays: rays + (of_pixel * all) as u64,
         warnings: vec![],
     }
@@ -85,8 +91,18 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
 struct Found {
     /// The pixels of each.
     tiles: Vec<Vec<Stat>>,
+    /// Draws of the errors of some of them, by their place in all tiles together.
+    draws: Vec<(usize, Draw)>,
     /// Rays of one pixel.
     rays: f64,
+}
+
+/// One of them.
+struct Looked {
+    stats: Vec<Stat>,
+    /// By pixel of the tile.
+    draws: Vec<(usize, Draw)>,
+    rays: u64,
 }
 
 /// The tiles looked at.
@@ -123,7 +139,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
         first: u32::MAX - PASSES,
         count: passes,
     };
-    let found: Vec<(Vec<Stat>, u64)> = regions
+    let found: Vec<Looked> = regions
         .into_par_iter()
         .map_init(
             || TileRenderer::new(frame),
@@ -132,13 +148,24 @@ fn look(frame: &Frame, passes: u32) -> Found {
                     .render(frame, &region, &order, &|_| true)
                     .expect("nobody stops it");
                 let stats = (0..region.pixels()).map(|k| stat(&renderer.done, frame.film, k));
-                (stats.collect(), renderer.done.rays)
+                let pixels = renderer.done.watched().iter().copied();
+                Looked {
+                    stats: stats.collect(),
+                    draws: pixels.zip(renderer.done.draws()).collect(),
+                    rays: renderer.done.rays,
+                }
             },
         )
         .collect();
+    let (mut draws, mut before) = (vec![], 0);
+    for tile in &found {
+        draws.extend(tile.draws.iter().map(|&(k, draw)| (before + k, draw)));
+        before += tile.stats.len();
+    }
     Found {
-        rays: found.iter().map(|f| f.1).sum::<u64>() as f64 / pixels as f64,
-        tiles: found.into_iter().map(|f| f.0).collect(),
+        draws,
+        rays: found.iter().map(|f| f.rays).sum::<u64>() as f64 / pixels as f64,
+        tiles: found.into_iter().map(|f| f.stats).collect(),
     }
 }
 

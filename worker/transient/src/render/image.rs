@@ -12,11 +12,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::{Spread, Stat},
+    draws::{self, Draw},
+    error::{Spread, Stat, estimate},
     region::Region,
     tile::{Done, Frame, Order, TileRenderer},
 };
-use crate::api::{Progress, RenderError};
+use crate::api::{ErrorEstimate, Progress, RenderError};
 
 /// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
 /// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
@@ -52,6 +53,8 @@ pub(super) struct Image {
     spent: Vec<u32>,
     tile_spread: Vec<Spread>,
     tile_overflow: Vec<f64>,
+    /// Draws of the errors of each tile's watched pixels.
+    tile_draws: Vec<Vec<Draw>>,
     width: usize,
     bins: usize,
 }
@@ -62,8 +65,8 @@ pub(super) struct Slice {
     /// The planes of [`Image::planes`], pixels in the order of the tiles.
     planes: Vec<Vec<f32>>,
     stats: Vec<Stat>,
-    /// Passes, spread and overflow of each tile.
-    tiles: Vec<(u32, Spread, f64)>,
+    /// Passes, spread, overflow and draws of errors of each tile.
+    tiles: Vec<(u32, Spread, f64, Vec<Draw>)>,
 }
 
 /// Tells the caller how far the render is and hears whether to stop.
@@ -189,6 +192,7 @@ impl Image {
             spent: vec![0; tiles.len()],
             tile_spread: vec![Spread::default(); tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
+            tile_draws: vec![vec![]; tiles.len()],
             tiles,
             width: width as usize,
             bins,
@@ -209,6 +213,25 @@ impl Image {
             };
             (spent, (0..region.rows * region.cols).map(pixel).collect())
         })
+    }
+
+    /// The watched pixels, and draws of their errors.
+    pub fn watched(&self) -> Vec<(usize, Draw)> {
+        let tiles = self.tiles.iter().zip(&self.tile_draws);
+        let each = tiles.flat_map(|(region, draws)| {
+            draws::watched(region).zip(draws).map(move |(k, draw)| {
+                let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
+                let (row, col) = (region.row + row, region.col + col);
+                (row as usize * self.width + col as usize, *draw)
+            })
+        });
+        each.collect()
+    }
+
+    /// The error of what was found so far.
+    pub fn estimate(&self) -> ErrorEstimate {
+        let draws = self.watched();
+        estimate(&self.stats, &draws, self.total_spread, self.mean_passes())
     }
 
     /// Everything that there is of each pixel and bin.
@@ -251,7 +274,15 @@ impl Image {
         let stats = runs
             .iter()
             .flat_map(|&(first, count)| &self.stats[first..first + count]);
-        let tile = |t| (self.spent[t], self.tile_spread[t], self.tile_overflow[t]);
+        let tile = |t: usize| {
+            let draws = self.tile_draws[t].clone();
+            (
+                self.spent[t],
+                self.tile_spread[t],
+                self.tile_overflow[t],
+                draws,
+            )
+        };
         Slice {
             planes,
             stats: stats.copied().collect(),
@@ -263,8 +294,11 @@ impl Image {
     pub fn put(&mut self, range: Range<usize>, slice: &Slice) -> bool {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let pixels: usize = runs.iter().map(|(_, count)| count).sum();
+        let mut tiles = self.tiles[range.clone()].iter().zip(&slice.tiles);
+        let watched = tiles.all(|(region, of)| of.3.len() == draws::count(region));
         let planes = self.planes();
         if slice.tiles.len() != range.len()
+            || !watched
             || slice.stats.len() != pixels
             || slice.planes.len() != planes.len()
             || slice.planes.iter().any(|p| p.len() != pixels * bins)
@@ -284,10 +318,11 @@ impl Image {
             self.stats[first..first + count].copy_from_slice(run);
             from = rest;
         }
-        for (t, &(spent, spread, overflow)) in range.zip(&slice.tiles) {
-            self.spent[t] = spent;
-            self.tile_spread[t] = spread;
-            self.tile_overflow[t] = overflow;
+        for (t, (spent, spread, overflow, draws)) in range.zip(&slice.tiles) {
+            self.spent[t] = *spent;
+            self.tile_spread[t] = *spread;
+            self.tile_overflow[t] = *overflow;
+            self.tile_draws[t].clone_from(draws);
         }
         true
     }
@@ -407,6 +442,14 @@ impl Image {
                 multi_variance: blend(old.multi_variance, stat.multi_variance * unit2),
                 ..stat
             };
+        }
+        // Errors of rounds are independent: on average their squares add up.
+        let draws = &mut self.tile_draws[t];
+        draws.resize(draws::count(&region), Draw::default());
+        for (old, new) in draws.iter_mut().zip(done.draws()) {
+            for (old, new) in old.iter_mut().zip(new) {
+                *old = blend(*old, new * unit2);
+            }
         }
         let before = self.tile_spread[t].scaled(a);
         self.tile_spread[t] = before.plus(done.total_spread().scaled(unit * b));

@@ -12,7 +12,6 @@ use picofarm_scene::Scene;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::estimate,
     image::{Image, Slice, Watch},
     ready::{Ready, prepare},
     splat::{Sources, Splats},
@@ -226,7 +225,7 @@ pub fn join_parts(
         }
         image.total();
         let error = match &splats {
-            None => estimate(&image.stats, image.total_spread, image.mean_passes()),
+            None => image.estimate(),
             Some(splats) => splats.estimate(frame, &image, stop)?,
         };
         let plan = ready.plan(shape.passes);

@@ -183,9 +183,16 @@ impl Splats {
                 found.variance().for_each(|v| stat.multi_variance += v);
             })?;
         }
+        // Of many paths, each in a bin: what they add to a draw is what they add to its mean square.
+        let mut draws = image.watched();
+        for (pixel, draw) in &mut draws {
+            let added = stats[*pixel].multi_variance - image.stats[*pixel].multi_variance;
+            draw.iter_mut().for_each(|square| *square += added);
+        }
         let own = Spread::of(&self.all).scaled(unit(frame));
         Ok(estimate(
             &stats,
+            &draws,
             image.total_spread.plus(own),
             image.mean_passes(),
         ))

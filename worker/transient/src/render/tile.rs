@@ -2,6 +2,7 @@
 //! random numbers depend on its pixels and the pass alone, so tiles may be rendered in any order.
 
 use super::{
+    draws::{Draw, Watched},
     error::{MULTI_REACH, Pool, Spread, TWO_REACH, pool, shut_out},
     region::Region,
 };
@@ -70,6 +71,7 @@ pub(super) struct Done {
     /// Sums over the gate's slots of both parts' variances by pixel, before they are pooled: sums over so
     /// many slots are sure enough by themselves, and pooling would lend bright pixels' noise to dim ones.
     pixel_variance: Vec<(f64, f64)>,
+    watched: Watched,
     /// Energy of the whole tile by pass.
     all: Vec<f64>,
     pooling: Pool,
@@ -105,7 +107,8 @@ fn inside(film: &Film, slots: &[f32]) -> f64 {
 }
 
 impl Done {
-    fn reset(&mut self, film: &Film, pixels: usize, split: bool) {
+    fn reset(&mut self, film: &Film, region: &Region, split: bool) {
+        let pixels = region.pixels();
         let zero = |v: &mut Vec<f32>, n: usize| {
             v.clear();
             v.resize(n, 0.0);
@@ -126,6 +129,7 @@ impl Done {
         self.two_total_variance.resize(pixels, 0.0);
         self.pixel_variance.clear();
         self.pixel_variance.resize(pixels, (0.0, 0.0));
+        self.watched.reset(region, film.slots);
         self.all.clear();
         self.passes = 0;
     }
@@ -194,6 +198,17 @@ impl Done {
         self.pixel_variance[k]
     }
 
+    /// Draws of the errors of the watched pixels.
+    pub fn draws(&self) -> Vec<Draw> {
+        self.watched
+            .draws(self.passes, |k| self.pixel_variance[k].1)
+    }
+
+    /// Which pixels those are.
+    pub fn watched(&self) -> &[usize] {
+        self.watched.pixels()
+    }
+
     /// Spread of the tile's whole energy. Pixels that share vertices err together, so this is not the
     /// sum of theirs.
     pub fn total_spread(&self) -> Spread {
@@ -243,7 +258,7 @@ impl TileRenderer {
         go_on: &dyn Fn(f32) -> bool,
     ) -> Option<()> {
         let rays = self.scratch.stack.rays;
-        self.done.reset(frame.film, region.pixels(), frame.split);
+        self.done.reset(frame.film, region, frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
         self.two(frame, region, order, go_on)?;
         while self.done.passes < order.count {
@@ -306,6 +321,7 @@ impl TileRenderer {
             for (out, v) in narrow.iter_mut().zip(&self.blocks.square) {
                 *out = v * n * n;
             }
+            self.done.watched.two(k, &self.blocks.noise, n);
             if frame.split {
                 let noise = &mut self.done.two_noise[k * film.slots..(k + 1) * film.slots];
                 for (out, v) in noise.iter_mut().zip(&self.blocks.noise) {
@@ -382,6 +398,7 @@ impl TileRenderer {
             *sum += v;
         }
         let pass = &pass[..film.slots];
+        self.done.watched.add(to, self.done.passes, pass);
         if !self.done.alternating.is_empty() {
             // Held back until its partner comes, so that the sum always has as many of either sign.
             let odd = self.done.passes % 2 == 1;

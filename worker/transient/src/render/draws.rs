@@ -1,0 +1,277 @@
+//! How large a pixel's error is likely to be, beside its standard error.
+//!
+//! The standard error is a quadratic mean. Where one path brings light to many bins at once, a pixel errs by a few chances
+//! alone: most pixels err by less than their standard error, and few by much more. So some pixels are *watched*: they keep
+//! the sum over every eighth pass. Differences of these sums are draws of the pixel's error, with all that its bins have in
+//! common, and the median over pixels is taken of them.
+
+use super::{error::Stat, region::Region};
+
+/// Sums over every eighth pass, and their seven independent differences.
+const PHASES: usize = 8;
+const DRAWS: usize = PHASES - 1;
+/// One pixel in so many rows and columns is watched.
+const APART: u32 = 3;
+/// Watched pixels that a statement is made from at least.
+const LEAST: usize = 16;
+
+/// ‖draw of a pixel's error‖² over the bins, for each draw.
+pub(super) type Draw = [f64; DRAWS];
+
+/// What the watched pixels of a tile keep.
+#[derive(Debug, Default)]
+pub(super) struct Watched {
+    /// By pixel of the tile.
+    places: Vec<Option<u32>>,
+    /// Which pixels are watched.
+    pixels: Vec<usize>,
+    slots: usize,
+    /// `[watched][phase][slot]`: Σ over passes of the 3+ part.
+    sums: Vec<f32>,
+    /// `[watched][slot]`: a draw of the two-bounce part's error.
+    two: Vec<f32>,
+}
+
+/// The watched pixels of a region.
+pub(super) fn watched(region: &Region) -> impl Iterator<Item = usize> + '_ {
+    let chosen = |i: u32| i % APART == APART / 2;
+    (0..region.pixels()).filter(move |&k| {
+        let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
+        chosen(region.row + row) && chosen(region.col + col)
+    })
+}
+
+/// How many pixels of a region are watched.
+pub(super) fn count(region: &Region) -> usize {
+    watched(region).count()
+}
+
+/// The sign of a phase in a draw: rows of a Hadamard matrix, so that draws are independent of the mean and of each other.
+fn sign(draw: usize, phase: usize) -> f64 {
+    match ((draw + 1) & phase).count_ones() % 2 {
+        0 => 1.0,
+        _ => -1.0,
+    }
+}
+
+impl Watched {
+    /// Empties it for a region.
+    pub fn reset(&mut self, region: &Region, slots: usize) {
+        self.slots = slots;
+        self.pixels.clear();
+        self.pixels.extend(watched(region));
+        self.places.clear();
+        self.places.resize(region.pixels(), None);
+        for (place, &k) in self.pixels.iter().enumerate() {
+            self.places[k] = Some(place as u32);
+        }
+        for (list, of_pixel) in [(&mut self.sums, PHASES), (&mut self.two, 1)] {
+            list.clear();
+            list.resize(self.pixels.len() * of_pixel * slots, 0.0);
+        }
+    }
+
+    /// Which pixels of the region are watched, ascending.
+    pub fn pixels(&self) -> &[usize] {
+        &self.pixels
+    }
+
+    /// Adds a pass over pixel `k`, if that is watched.
+    #[inline]
+    pub fn add(&mut self, k: usize, pass: u32, values: &[f32]) {
+        let Some(place) = self.places[k] else { return };
+        let phase = place as usize * PHASES + pass as usize % PHASES;
+        let sum = &mut self.sums[phase * self.slots..(phase + 1) * self.slots];
+        for (sum, v) in sum.iter_mut().zip(values) {
+            *sum += v;
+        }
+    }
+
+    /// Keeps a draw of the error of pixel `k`'s two-bounce part, if that is watched: `factor` times `noise`.
+    pub fn two(&mut self, k: usize, noise: &[f32], factor: f32) {
+        let Some(place) = self.places[k] else { return };
+        let two = &mut self.two[place as usize * self.slots..][..self.slots];
+        for (two, v) in two.iter_mut().zip(noise) {
+            *two = v * factor;
+        }
+    }
+
+    /// Draws of the watched pixels' errors after so many passes. With fewer than eight of them the 3+ part's variance, which
+    /// `multi_variance` says by pixel of the region, stands in their place.
+    pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {
+        let inside = 1..self.slots.max(2) - 1;
+        let pixels = self.pixels.iter().enumerate();
+        let each = pixels.map(|(place, &k)| {
+            let two = &self.two[place * self.slots..][..self.slots];
+            if (passes as usize) < PHASES {
+                let two: f64 = two[inside.clone()]
+                    .iter()
+                    .map(|&x| f64::from(x).powi(2))
+                    .sum();
+                return [two + multi_variance(k); DRAWS];
+            }
+            // Means over the passes of each phase. Of n passes, a phase has n/8 or one more.
+            let n = |phase: usize| (passes as usize + PHASES - 1 - phase) / PHASES;
+            let spread: f64 = (0..PHASES).map(|phase| 1.0 / n(phase) as f64).sum();
+            // A mean of all passes has 1/passes of a pass' variance.
+            let factor = (1.0 / (f64::from(passes) * spread)).sqrt();
+            let mut draw = [0.0; DRAWS];
+            for slot in inside.clone() {
+                let mean = |phase: usize| {
+                    let at = (place * PHASES + phase) * self.slots + slot;
+                    f64::from(self.sums[at]) * (factor / n(phase) as f64)
+                };
+                let means: [f64; PHASES] = std::array::from_fn(mean);
+                let two = f64::from(two[slot]);
+                for (k, square) in draw.iter_mut().enumerate() {
+                    let signed = means.iter().enumerate().map(|(j, m)| sign(k, j) * m);
+                    *square += (signed.sum::<f64>() + two).powi(2);
+                }
+            }
+            draw
+        });
+        each.collect()
+    }
+}
+
+/// By how much the `q`-quantile over pixels of the errors differs from that of the standard errors: a factor. `draws` are
+/// those of some pixels of `stats`. 1 where too few pixels are watched.
+pub(super) fn likely(stats: &[Stat], draws: &[(usize, Draw)], q: f64) -> f64 {
+    let (mut stated, mut drawn) = (vec![], vec![]);
+    for (pixel, draw) in draws {
+        let stat = &stats[*pixel];
+        let variance = stat.two_variance + stat.multi_variance;
+        if let Some(error) = stat.error() {
+            stated.push(error);
+            let of = |square: &f64| match variance > 0.0 {
+                true => error * (square / variance).sqrt(),
+                false => 0.0,
+            };
+            drawn.extend(draw.iter().map(of));
+        }
+    }
+    let quantile = |list: &mut Vec<f64>| {
+        list.sort_by(f64::total_cmp);
+        list[((list.len() - 1) as f64 * q).round() as usize]
+    };
+    if stated.len() < LEAST {
+        return 1.0;
+    }
+    match quantile(&mut stated) {
+        0.0 => 1.0,
+        stated => quantile(&mut drawn) / stated,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Draw, Region, Stat, Watched, count, likely};
+    use crate::rng::{Rng, Stream};
+
+    const SLOTS: usize = 42;
+
+    fn region() -> Region {
+        Region {
+            row: 16,
+            col: 48,
+            rows: 18,
+            cols: 18,
+        }
+    }
+
+    /// Draws and variances of pixels whose passes are as `value` says, after so many.
+    fn drawn(passes: u32, mut value: impl FnMut(&mut Rng) -> Vec<f32>) -> (Vec<Draw>, Vec<f64>) {
+        let mut watched = Watched::default();
+        watched.reset(&region(), SLOTS);
+        let mut rng = Rng::new(1, Stream::Paths, 0, 0);
+        let mut variances = vec![];
+        let pixels = watched.pixels().to_vec();
+        for &k in &pixels {
+            let all: Vec<Vec<f32>> = (0..passes).map(|_| value(&mut rng)).collect();
+            for (pass, values) in all.iter().enumerate() {
+                watched.add(k, pass as u32, values);
+            }
+            let n = f64::from(passes);
+            let of_slot = |slot: usize| {
+                let at = || all.iter().map(|v| f64::from(v[slot]));
+                let mean = at().sum::<f64>() / n;
+                at().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
+            };
+            variances.push((1..SLOTS - 1).map(of_slot).sum());
+        }
+        (watched.draws(passes, |_| 0.0), variances)
+    }
+
+    fn apart(rng: &mut Rng) -> Vec<f32> {
+        (0..SLOTS).map(|_| rng.uniform()).collect()
+    }
+
+    fn together(rng: &mut Rng) -> Vec<f32> {
+        vec![rng.uniform(); SLOTS]
+    }
+
+    #[test]
+    fn draws_have_the_variance_of_the_mean() {
+        // Of eight passes, to rounding: the draws hold all that there is but the mean.
+        let (draws, variances) = drawn(8, apart);
+        for (draw, variance) in draws.iter().zip(&variances) {
+            let mean = draw.iter().sum::<f64>() / draw.len() as f64;
+            assert!((mean / variance - 1.0).abs() < 1e-5, "{mean} {variance}");
+        }
+        // Of other numbers, on average.
+        for passes in [9, 13, 64, 101] {
+            let (draws, variances) = drawn(passes, apart);
+            let all: f64 = draws.iter().flatten().sum();
+            let ratio = all / 7.0 / variances.iter().sum::<f64>();
+            assert!((ratio - 1.0).abs() < 0.05, "{passes}: {ratio}");
+        }
+    }
+
+    #[test]
+    fn pixels_whose_bins_err_together_err_by_less_than_their_standard_error() {
+        let factor = |(draws, variances): (Vec<Draw>, Vec<f64>)| {
+            let stat = |&variance: &f64| Stat {
+                norm2: 100.0,
+                multi_variance: variance,
+                ..Stat::default()
+            };
+            let stats: Vec<Stat> = variances.iter().map(stat).collect();
+            let draws: Vec<_> = draws.into_iter().enumerate().collect();
+            likely(&stats, &draws, 0.5)
+        };
+        let f = factor(drawn(64, apart));
+        assert!((f - 1.0).abs() < 0.03, "{f}");
+        // The median of a normal variable's absolute value is 0.674 of its standard deviation.
+        let f = factor(drawn(64, together));
+        assert!((f - 0.674).abs() < 0.1, "{f}");
+    }
+
+    #[test]
+    fn few_pixels_say_nothing() {
+        let draws = [(0, [0.25; 7])];
+        let stats = [Stat {
+            norm2: 100.0,
+            multi_variance: 1.0,
+            ..Stat::default()
+        }];
+        assert_eq!(likely(&stats, &draws, 0.5), 1.0);
+        assert_eq!(likely(&[], &[], 0.5), 1.0);
+    }
+
+    #[test]
+    fn which_pixels_are_watched_does_not_depend_on_the_tile() {
+        let of = |rows: u32, cols: u32| {
+            let part = |row, col| Region {
+                row,
+                col,
+                rows,
+                cols,
+            };
+            let parts = (0..36 / rows).flat_map(|r| (0..36 / cols).map(move |c| (r, c)));
+            parts
+                .map(|(r, c)| count(&part(r * rows, c * cols)))
+                .sum::<usize>()
+        };
+        assert_eq!((of(36, 36), of(4, 6), of(1, 1)), (144, 144, 144));
+    }
+}
