@@ -234,6 +234,7 @@ struct Rung {
 /// Renders of so many passes: what they say and what is true, per pixel and of the whole image.
 fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
     let (mut says, mut is, mut p95, mut total, mut cpu_s) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    let mut says_p95 = 0.0;
     let mut sums = vec![];
     let n = f64::from(seeds);
     for seed in 0..seeds {
@@ -241,6 +242,7 @@ fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
         let r = run(scene, Budget::Samples(passes), u64::from(seed));
         cpu_s += (cpu_seconds() - before) / n;
         says += f64::from(r.error.median_relative) / n;
+        says_p95 += f64::from(r.error.p95_relative) / n;
         let [median, high] = deviation(&r.transient, truth);
         is += median / n;
         p95 += high / n;
@@ -250,11 +252,12 @@ fn fixed(scene: &Scene, (passes, seeds): (u32, u32), truth: &Truth) -> Rung {
     let whole = truth.mean.iter().sum::<f64>();
     let spread = sums.iter().map(|s| (s / whole - 1.0).powi(2)).sum::<f64>() / n;
     println!(
-        "    {passes} paths: {cpu_s:.2} CPU s; says {:.2} %, is {:.2} % ({:.2}), 95th {:.1} %; whole image says {:.3} %, is {:.3} %",
+        "    {passes} paths: {cpu_s:.2} CPU s; says {:.2} %, is {:.2} % ({:.2}), 95th {:.1} % (says {:.1} %); whole image says {:.3} %, is {:.3} %",
         100.0 * says,
         100.0 * is,
         is / says,
         100.0 * p95,
+        100.0 * says_p95,
         100.0 * total.sqrt(),
         100.0 * spread.sqrt()
     );
