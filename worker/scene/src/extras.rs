@@ -82,6 +82,6 @@ pub(crate) fn metallic_roughness(material: &Material) -> (f32, f32) {
             let (share, alpha) = parts.conductors();
             (share, alpha.sqrt())
         }
-        Bsdf::ThinDielectric { .. } => (0.0, 0.0),
+        Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => (0.0, 0.0),
     }
 }

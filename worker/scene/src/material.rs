@@ -67,6 +67,16 @@ pub enum Bsdf {
         /// surface is a whole pane.
         face: bool,
     },
+    /// The smooth surface of a body of glass or of a liquid: light is refracted (Snell) and reflected (Fresnel, unpolarised). The
+    /// body lies behind the surface's normal, air or vacuum before it; bodies are closed and do not touch one another. A beam goes
+    /// on by refraction, and makes a further spot where what is reflected of it ends.
+    Dielectric {
+        /// Index of refraction of the body against what is around it, in [1, 4].
+        ior: f32,
+        /// Share of the light that is refracted which each passing of the surface lets through: its tint at the laser's wavelength,
+        /// in [0, 1].
+        transmittance: f32,
+    },
 }
 
 impl Bsdf {
@@ -78,6 +88,7 @@ impl Bsdf {
             Bsdf::Mixed { .. } => "mixed",
             Bsdf::Several { .. } => "several",
             Bsdf::ThinDielectric { .. } => "thin_dielectric",
+            Bsdf::Dielectric { .. } => "dielectric",
         }
     }
 
@@ -112,7 +123,7 @@ impl Bsdf {
             Bsdf::Several { parts } => Bsdf::Several {
                 parts: parts.scaled(factor),
             },
-            glass @ Bsdf::ThinDielectric { .. } => glass,
+            glass @ (Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }) => glass,
         }
     }
 }
@@ -185,6 +196,17 @@ impl Material {
         }
     }
 
+    /// A body of clear glass, index of refraction 1.5.
+    pub fn solid_glass(name: impl Into<String>) -> Self {
+        Self {
+            bsdf: Bsdf::Dielectric {
+                ior: Self::IOR,
+                transmittance: 1.0,
+            },
+            ..Self::glass(name)
+        }
+    }
+
     /// True for thin glass, which is no surface but lets light through.
     pub fn is_glass(&self) -> bool {
         matches!(self.bsdf, Bsdf::ThinDielectric { .. })
@@ -202,12 +224,13 @@ impl Material {
         }
     }
 
-    /// True for surfaces in the specular mask, at which beams are not spots but fold: rough conductors with
+    /// True for surfaces in the specular mask, at which beams are not spots but fold: bodies of glass, and rough conductors with
     /// α ≤ [`Material::SPECULAR_ALPHA`], also as half or more of a mix or of several parts. A mix below that scatters enough by its
     /// Lambertian part to make a spot.
     pub fn is_specular(&self) -> bool {
         match self.bsdf {
             Bsdf::Diffuse { .. } | Bsdf::ThinDielectric { .. } => false,
+            Bsdf::Dielectric { .. } => true,
             Bsdf::RoughConductor { alpha, .. } => alpha <= Self::SPECULAR_ALPHA,
             Bsdf::Mixed { alpha, weight, .. } => weight >= 0.5 && alpha <= Self::SPECULAR_ALPHA,
             Bsdf::Several { parts } => parts.mirror() >= 0.5,
@@ -279,7 +302,8 @@ impl Material {
             Bsdf::Several { parts } => parts.check()?,
             Bsdf::ThinDielectric {
                 ior, transmittance, ..
-            } => {
+            }
+            | Bsdf::Dielectric { ior, transmittance } => {
                 if !(1.0..=Self::MAX_IOR).contains(&ior) {
                     return Err(format!("ior = {ior} lies outside [1, 4]"));
                 }

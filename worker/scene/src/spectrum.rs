@@ -61,7 +61,9 @@ impl Material {
                 specular_reflectance,
                 ..
             } => [reflectance, specular_reflectance],
-            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } => [0.0, 0.0],
+            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
+                [0.0, 0.0]
+            }
         };
         let grey = [1.0 / 3.0; 3];
         let of = |[lambertian, conductor]: [f32; 2], texel| AtWavelength {

@@ -409,7 +409,7 @@ proptest! {
             }
             Bsdf::Diffuse { reflectance } => vec![lambertian(1.0, reflectance)],
             Bsdf::RoughConductor { alpha, reflectance, .. } => vec![conductor(1.0, alpha, reflectance)],
-            Bsdf::ThinDielectric { .. } => unreachable!("no leaf is glass"),
+            Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => unreachable!("no leaf is glass"),
         };
         alike(&found, &leaves);
         let sum: f32 = found.iter().map(|p| p.weight).sum();

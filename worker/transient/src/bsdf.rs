@@ -56,13 +56,19 @@ impl Surface {
             Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
                 distribution == Distribution::Ggx
             }
-            Bsdf::Diffuse { .. } | Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } => false,
+            Bsdf::Diffuse { .. }
+            | Bsdf::Several { .. }
+            | Bsdf::ThinDielectric { .. }
+            | Bsdf::Dielectric { .. } => false,
         };
         let flag = |set: bool, flag: u8| if set { flag } else { 0 };
         let of = |kind, strength, alpha, base| Self {
             kind,
             flags: flag(m.two_sided, TWO_SIDED)
-                | flag(m.is_specular(), SPECULAR)
+                | flag(
+                    m.is_specular() && !matches!(m.bsdf, Bsdf::Dielectric { .. }),
+                    SPECULAR,
+                )
                 | flag(ggx && kind != Kind::Lambertian, GGX),
             spectrum_row: 0,
             strength,
@@ -94,8 +100,10 @@ impl Surface {
             }
             // Made of its parts by `several`.
             Bsdf::Several { .. } => of(Kind::Several, 0.0, 1.0, 0.0),
-            // No surface: see `glass`.
-            Bsdf::ThinDielectric { .. } => of(Kind::Lambertian, 0.0, 0.0, 0.0),
+            // Thin glass is no surface (see `glass`); what bodies of glass do is no scattering (see `by_glass`).
+            Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
+                of(Kind::Lambertian, 0.0, 0.0, 0.0)
+            }
         }
     }
 

@@ -264,7 +264,9 @@ fn with(bsdf: Bsdf, (lambertian, conductor): (f32, f32)) -> Bsdf {
             specular_reflectance: conductor,
             weight,
         },
-        other @ (Bsdf::Several { .. } | Bsdf::ThinDielectric { .. }) => other,
+        other @ (Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }) => {
+            other
+        }
     }
 }
 

@@ -66,7 +66,7 @@ fn alone(scene: &Scene, nm: f64) -> Scene {
                 specular_reflectance,
                 ..
             } => (*reflectance, *specular_reflectance) = (at.lambertian, at.conductor),
-            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } => {}
+            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {}
         }
         m.spectrum = vec![];
     });
@@ -161,7 +161,7 @@ fn darken(scene: &mut Scene, share: impl Fn(usize, usize) -> f32) {
                 specular_reflectance,
                 ..
             } => (reflectance, Some(specular_reflectance)),
-            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } => return,
+            Bsdf::Several { .. } | Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => return,
         };
         let at = |k: usize, x: f32| row(NM[k], lambertian * x, conductor.map(|c| c * x));
         m.spectrum = vec![at(2, share(number, 2)), at(1, share(number, 1)), at(0, 1.0)];

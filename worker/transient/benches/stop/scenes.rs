@@ -247,7 +247,7 @@ fn albedo(bsdf: &Bsdf) -> f32 {
             let of = |p: &Part| p.weight * p.lobe.reflectance();
             parts.list().iter().map(of).sum()
         }
-        Bsdf::ThinDielectric { .. } => 0.0,
+        Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => 0.0,
     }
 }
 

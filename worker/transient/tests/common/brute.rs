@@ -252,7 +252,7 @@ pub fn f(bsdf: Bsdf, n: P, i: P, o: P) -> f64 {
             let of = |p: &Part| f64::from(p.weight) * f(p.lobe.bsdf(), n, i, o);
             parts.list().iter().map(of).sum()
         }
-        Bsdf::ThinDielectric { .. } => panic!("glass scatters nothing"),
+        Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => panic!("glass scatters nothing"),
     }
 }
 

@@ -130,7 +130,9 @@ pub(crate) fn bsdf_text(
             )
         }
         Bsdf::Several { parts } => several(&mut out, outer, id, material, texture, &parts),
-        Bsdf::ThinDielectric { .. } => unreachable!("glass was written above"),
+        Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. } => {
+            unreachable!("glass was written above")
+        }
     };
     out.text = if material.two_sided {
         format!("<bsdf type=\"twosided\"{}>{body}</bsdf>", id_attribute(id))
