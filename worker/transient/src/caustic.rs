@@ -32,11 +32,10 @@ use crate::{
     mirror_images::Mirrors,
     rng::{Rng, Stream},
     spectra::{Ratios, times},
+    targets::{Drawn, Target, Targets},
     world::{Hit, World, lift},
 };
 
-/// Entries of the table of near-mirror triangles by spot; beyond that all spots share one row.
-const TABLE: usize = 1 << 22;
 /// Events before Russian roulette sets in.
 const SURE: u32 = 3;
 /// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
@@ -57,15 +56,12 @@ pub(crate) struct Surroundings<'a> {
 /// Near-mirrors as targets of light paths.
 #[derive(Debug)]
 pub(crate) struct Caustics {
-    /// Triangles with a near-mirror's lobe, and their areas in render units.
+    /// Triangles with a near-mirror's lobe.
     triangles: Vec<u32>,
-    areas: Vec<f32>,
     /// Place in `triangles` by triangle, [`NONE`] for most.
     place: Vec<u32>,
-    /// Running sums of the triangles' weights, one row a spot, or one row for all.
-    rows: Vec<f64>,
-    /// Running sums of the spots' weights.
-    spots: Vec<f64>,
+    /// How to aim at them.
+    targets: Targets,
 }
 
 const NONE: u32 = u32::MAX;
@@ -104,20 +100,6 @@ struct Start {
     path_m: f64,
 }
 
-/// Index of the entry of running sums in which `at` in [0, 1) of their total falls, the rest of `at`
-/// within it in [0, 1), and its chance.
-fn pick(sums: &[f64], at: f64) -> Option<(usize, f64, f64)> {
-    let total = *sums.last()?;
-    if !(total > 0.0 && total.is_finite()) {
-        return None;
-    }
-    let at = at * total;
-    let k = sums.partition_point(|&s| s <= at).min(sums.len() - 1);
-    let before = if k == 0 { 0.0 } else { sums[k - 1] };
-    let width = sums[k] - before;
-    (width > 0.0).then(|| (k, ((at - before) / width).clamp(0.0, 1.0), width / total))
-}
-
 impl Caustics {
     /// The near-mirrors of a scene; `None` where there are none.
     pub fn find(world: &World, emitters: &Emitters, stop: Stop) -> Option<Self> {
@@ -131,94 +113,26 @@ impl Caustics {
             return None;
         }
         let mut place = vec![NONE; world.triangles.len()];
-        let mut areas = vec![];
+        let mut all = vec![];
         for (k, &t) in triangles.iter().enumerate() {
             place[t as usize] = k as u32;
-            let [a, b, c] = world.triangles[t as usize];
-            areas.push(0.5 * (b - a).cross(c - a).length());
+            all.push(Target {
+                corners: world.triangles[t as usize],
+                normal: world.normals[t as usize],
+                two_sided: world.surfaces[world.surface[t as usize] as usize].two_sided(),
+                counts: world.counts(t as usize),
+                share: 1.0,
+            });
         }
-        let mut table = Self {
+        Some(Self {
             triangles,
-            areas,
             place,
-            rows: vec![],
-            spots: vec![],
-        };
-        table.weigh(world, emitters, stop)?;
-        Some(table)
-    }
-
-    /// Fills the running sums; `None` where the render shall stop.
-    fn weigh(&mut self, world: &World, emitters: &Emitters, stop: Stop) -> Option<()> {
-        let apart = self.triangles.len() * emitters.list.len() <= TABLE;
-        let mut spots = 0.0;
-        for e in &emitters.list {
-            if stop.asked() {
-                return None;
-            }
-            // A narrow lobe is not to be judged by the middle of a triangle.
-            let wide = e.surface.diffuse() || e.surface.is_rough();
-            let mut sum = 0.0;
-            for (&t, &area) in self.triangles.iter().zip(&self.areas) {
-                let [a, b, c] = world.triangles[t as usize];
-                let to = (a + b + c) / 3.0 - e.p;
-                let d2 = to.dot(to).max(area);
-                let w = to.normalized();
-                let cos = -world.normals[t as usize].dot(w);
-                let surface = &world.surfaces[world.surface[t as usize] as usize];
-                let cos = if surface.two_sided() {
-                    cos.abs()
-                } else {
-                    cos.max(0.0)
-                };
-                // What is too far away to count is left to chance.
-                if wide && world.counts(t as usize) {
-                    sum += f64::from(area * cos / d2 * e.intensity(w));
-                }
-                if apart {
-                    self.rows.push(sum);
-                }
-            }
-            spots += sum;
-            self.spots.push(spots);
-        }
-        if !apart {
-            let mut sum = 0.0;
-            for (&t, &area) in self.triangles.iter().zip(&self.areas) {
-                if world.counts(t as usize) {
-                    sum += f64::from(area);
-                }
-                self.rows.push(sum);
-            }
-        }
-        Some(())
-    }
-
-    /// A spot's row of running sums.
-    fn row(&self, spot: usize) -> &[f64] {
-        let n = self.triangles.len();
-        let at = if self.rows.len() > n { spot * n } else { 0 };
-        &self.rows[at..at + n]
-    }
-
-    /// Density per area of aiming from `spot` at a point of the `k`-th triangle.
-    fn density(&self, spot: usize, k: usize) -> f32 {
-        let chance = |sums: &[f64], k: usize| {
-            let before = if k == 0 { 0.0 } else { sums[k - 1] };
-            let total = sums[sums.len() - 1];
-            if total > 0.0 {
-                (sums[k] - before) / total
-            } else {
-                0.0
-            }
-        };
-        let share = chance(&self.spots, spot) * chance(self.row(spot), k);
-        share as f32 / self.areas[k]
+            targets: Targets::new(&all, emitters, stop)?,
+        })
     }
 
     fn shares(&self, count: u32) -> Shares {
-        let aims = self.spots.last().is_some_and(|&s| s > 0.0);
-        let plain = if aims { count / 4 } else { count };
+        let plain = if self.targets.any() { count / 4 } else { count };
         Shares {
             aimed: count - plain,
             plain,
@@ -324,13 +238,8 @@ impl Caustics {
         let spots = emitters.list.len();
         let (spot, mut hit) = if l < shares.aimed {
             let at = (f64::from(l) + f64::from(rng.uniform())) / f64::from(shares.aimed);
-            let (spot, rest, _) = pick(&self.spots, at)?;
-            let (k, _, _) = pick(self.row(spot), rest)?;
-            let t = self.triangles[k];
-            let [a, b, c] = world.triangles[t as usize];
-            // Uniform on the triangle.
-            let (r, v) = (rng.uniform().sqrt(), rng.uniform());
-            let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
+            let Drawn { spot, target, p } = self.targets.draw(at, || rng.uniform())?;
+            let t = self.triangles[target];
             let from = emitters.lifted[spot];
             let hit = world.closest(stack, from, p - from)?;
             if hit.triangle != t {
@@ -356,7 +265,7 @@ impl Caustics {
         let d = d2.sqrt();
         let w = to / d;
         let turn = hit.n.dot(w).abs() / d2;
-        let aimed = shares.aimed as f32 * self.density(spot, k as usize);
+        let aimed = shares.aimed as f32 * self.targets.density(spot, k as usize);
         let plain = shares.plain as f32 / spots as f32 * e.surface.pdf(e.n, e.back, w) * turn;
         let density = aimed + plain;
         let flux = e.intensity(w) * turn * hit.through / density;

@@ -10,6 +10,8 @@ use crate::{
     bsdf::Surface,
     bvh::Stack,
     contact,
+    fresnel::split,
+    glass::Crossing,
     lanes::{Wide, widest},
     lobes::{Lobes, Seen},
     spectra::{ONES, Ratios, times},
@@ -18,6 +20,8 @@ use crate::{
 
 /// Mirrors a beam may meet before it is given up.
 const MAX_REFLECTIONS: u32 = 64;
+/// Least share of a beam's light that is followed where glass turns it aside.
+const LEAST_BRANCH: f32 = 1.0 / 256.0;
 
 /// The spots of a scene's beams in their order; `None` where a beam meets nothing. A spot stated by the
 /// beam is taken as it is; otherwise the beam is followed, through mirrors (`Material::is_specular`) by
@@ -38,39 +42,142 @@ pub(crate) fn find_spots(world: &World, beams: &[Beam]) -> Vec<Option<Spot>> {
 }
 
 /// Where a ray of the laser that starts at `origin` ends, and the share of its light that glass lets through to there.
-fn follow(
-    world: &World,
-    stack: &mut Stack,
-    origin: Vec3,
-    mut direction: Vec3,
-) -> Option<(Spot, f32)> {
-    let (mut from, mut start) = (origin, origin);
-    let (mut path, mut through) = (0.0, 1.0);
-    for _ in 0..MAX_REFLECTIONS {
-        let mut hit = world.closest(stack, start, direction)?;
-        through *= hit.through;
-        // Where the beam meets that facet without the lift off the mirror before it.
-        hit.p = world.point(hit.triangle, from, direction);
-        path += world.metres((hit.p - from).length());
-        if hit.surface.specular() && !hit.surface.is_black() {
-            let n = hit.n;
-            direction = (direction - n * (2.0 * n.dot(direction))).normalized();
-            from = hit.p;
-            start = lift(from, n);
-            continue;
-        }
-        let t = hit.triangle as usize;
-        let spot = Spot {
-            point: world.outward(hit.p),
-            normal: hit.n,
-            arriving: direction,
-            path_m: path as f32,
-            object: world.object[t],
-            material: world.material[world.surface[t] as usize],
-        };
-        return Some((spot, through));
+fn follow(world: &World, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<(Spot, f32)> {
+    let mut ray = BeamRay::new(origin, direction);
+    ray.follow(world, stack, &mut vec![], |_| {})
+}
+
+/// Where what glass turns aside of a ray of the laser ends, and the shares of its light: as far as they are
+/// [`LEAST_BRANCH`] or more.
+fn branches(world: &World, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Vec<(Spot, f32)> {
+    if !world.has_glass() && !world.has_bodies() {
+        return vec![];
     }
-    None
+    let (mut crossings, mut ends) = (vec![], vec![]);
+    let mut left = vec![];
+    BeamRay::new(origin, direction).follow(world, stack, &mut crossings, |b| left.push(b));
+    while let Some(mut ray) = left.pop() {
+        let aside = |b: BeamRay| left.push(b);
+        ends.extend(ray.follow(world, stack, &mut crossings, aside));
+    }
+    ends
+}
+
+/// A ray of the laser on its way.
+#[derive(Debug, Clone, Copy)]
+struct BeamRay {
+    /// Where it is, and the same lifted off the surface there.
+    from: Vec3,
+    start: Vec3,
+    direction: Vec3,
+    /// Optical path, metres.
+    path: f64,
+    /// Share of the beam's light.
+    share: f32,
+    /// Index of refraction around it.
+    medium: f32,
+    /// How often it was reflected or refracted.
+    turns: u32,
+}
+
+impl BeamRay {
+    fn new(origin: Vec3, direction: Vec3) -> Self {
+        Self {
+            from: origin,
+            start: origin,
+            direction,
+            path: 0.0,
+            share: 1.0,
+            medium: 1.0,
+            turns: 0,
+        }
+    }
+
+    /// Reflected at a place on glass, whose unit normal faces it, with a share of its light.
+    fn reflected(&self, world: &World, (p, n): (Vec3, Vec3), share: f32) -> Self {
+        let w = self.direction;
+        Self {
+            from: p,
+            start: lift(p, n),
+            direction: (w - n * (2.0 * n.dot(w))).normalized(),
+            path: self.path + world.metres((p - self.from).length()) * f64::from(self.medium),
+            share: self.share * share,
+            turns: self.turns + 1,
+            ..*self
+        }
+    }
+
+    /// Follows it straight through thin glass, refracted by bodies of glass and folded by near-mirrors, to where it ends, with its
+    /// share of the light; what glass reflects of it goes to `aside`.
+    fn follow(
+        &mut self,
+        world: &World,
+        stack: &mut Stack,
+        crossings: &mut Vec<Crossing>,
+        mut aside: impl FnMut(Self),
+    ) -> Option<(Spot, f32)> {
+        let mut branch = |ray: Self| {
+            if ray.share >= LEAST_BRANCH {
+                aside(ray);
+            }
+        };
+        while self.turns < MAX_REFLECTIONS {
+            self.turns += 1;
+            let hit = world.ahead(stack, self.start, self.direction, crossings);
+            let mut passes = 1.0;
+            for c in crossings.iter() {
+                if let Some(panes) = world.panes.as_ref().filter(|_| c.reflects > 0.0) {
+                    let at = panes.point(c.pane, self.start, self.direction);
+                    branch(self.reflected(world, at, passes * c.reflects));
+                }
+                passes *= c.passes;
+            }
+            let mut hit = hit?;
+            self.share *= passes;
+            // Where the beam meets that facet without the lift off the mirror before it.
+            hit.p = world.point(hit.triangle, self.from, self.direction);
+            let (p, n) = (hit.p, hit.n);
+            if let Some(body) = world.body(hit.triangle) {
+                let outside = n.dot(world.normals[hit.triangle as usize]) > 0.0;
+                let (a, b) = match outside {
+                    true => (1.0, body.ior),
+                    false => (body.ior, 1.0),
+                };
+                let split = split(self.direction.normalized(), n, (a, b));
+                let reflected = self.reflected(world, (p, n), split.reflects);
+                if split.reflects == 1.0 {
+                    *self = reflected;
+                    continue;
+                }
+                branch(reflected);
+                self.path = reflected.path;
+                self.share *= (1.0 - split.reflects) * body.transmittance;
+                self.direction = split.refracted;
+                self.from = p;
+                self.start = lift(p, -n);
+                self.medium = b;
+                continue;
+            }
+            self.path += world.metres((p - self.from).length()) * f64::from(self.medium);
+            if hit.surface.specular() && !hit.surface.is_black() {
+                self.direction = (self.direction - n * (2.0 * n.dot(self.direction))).normalized();
+                self.from = p;
+                self.start = lift(p, n);
+                continue;
+            }
+            let t = hit.triangle as usize;
+            let spot = Spot {
+                point: world.outward(p),
+                normal: n,
+                arriving: self.direction,
+                path_m: self.path as f32,
+                object: world.object[t],
+                material: world.material[world.surface[t] as usize],
+            };
+            return Some((spot, self.share));
+        }
+        None
+    }
 }
 
 /// The share of a beam's light that glass lets through to its spot: along the beam, or in a straight line where the spot is
@@ -111,6 +218,8 @@ pub(crate) struct Emitter {
     pub path_m: f64,
     /// Scattering on the lit side (black behind a one-sided surface), times the source's share of the beam: what glass lets through.
     pub surface: Surface,
+    /// It is not the beam's own spot: glass turned that light aside.
+    pub aside: bool,
     /// Ratios of the texture there.
     ratios: Ratios,
 }
@@ -152,6 +261,7 @@ impl Emitter {
             back: -spot.arriving,
             path_m: f64::from(spot.path_m),
             surface,
+            aside: false,
             ratios,
         }
     }
@@ -295,7 +405,14 @@ impl Emitters {
         let mut stack = world.bvh.stack();
         let mut all = Self::default();
         for (beam, spot) in spots.iter().enumerate() {
-            let Some(spot) = spot else { continue };
+            let along = scene.laser.beams.get(beam).map(|b| b.direction);
+            let Some(spot) = spot else {
+                if let Some(direction) = along {
+                    let way = (world.laser, direction);
+                    all.push_branches(world, &mut stack, (beam, 1.0), way);
+                }
+                continue;
+            };
             let material = scene
                 .objects
                 .get(spot.object as usize)
@@ -325,15 +442,13 @@ impl Emitters {
                 });
             }
             let surface = world.first_surface[spot.object as usize] + spot.material;
-            let direction = scene
-                .laser
-                .beams
-                .get(beam)
-                .map_or(spot.arriving, |b| b.direction);
+            let direction = along.unwrap_or(spot.arriving);
             let through = through(world, &mut stack, direction, spot);
             let of_beam = (beam, through);
             let source = Emitter::new(world, &mut stack, of_beam, spot, surface);
             all.push(world, source);
+            let way = (world.laser, direction);
+            all.push_branches(world, &mut stack, (beam, 1.0), way);
         }
         all.rays.push(0..all.list.len());
         Ok(all)
@@ -366,17 +481,40 @@ impl Emitters {
             for (beam, b) in beams() {
                 let ray = beam_width::ray(width, place, b.direction);
                 let start = world.laser + ray.beside_m * world.scale;
-                let Some((spot, through)) = follow(world, &mut stack, start, ray.direction) else {
-                    continue;
-                };
-                let surface = world.first_surface[spot.object as usize] + spot.material;
-                let of_beam = (beam, through / width.points as f32);
-                let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
-                all.push(world, source);
+                let share = 1.0 / width.points as f32;
+                if let Some((spot, through)) = follow(world, &mut stack, start, ray.direction) {
+                    let surface = world.first_surface[spot.object as usize] + spot.material;
+                    let of_beam = (beam, through / width.points as f32);
+                    let source = Emitter::new(world, &mut stack, of_beam, &spot, surface);
+                    all.push(world, source);
+                }
+                all.push_branches(world, &mut stack, (beam, share), (start, ray.direction));
             }
             all.rays.push(first..all.list.len());
         }
         Ok(all)
+    }
+
+    /// Adds the sources of what glass turns aside of a ray of a beam that has a share of its light.
+    fn push_branches(
+        &mut self,
+        world: &World,
+        stack: &mut Stack,
+        (beam, share): (usize, f32),
+        (origin, direction): (Vec3, Vec3),
+    ) {
+        for (spot, of_ray) in branches(world, stack, origin, direction) {
+            let surface = world.first_surface[spot.object as usize] + spot.material;
+            let of_beam = (beam, share * of_ray);
+            let source = Emitter::new(world, stack, of_beam, &spot, surface);
+            self.push(
+                world,
+                Emitter {
+                    aside: true,
+                    ..source
+                },
+            );
+        }
     }
 
     /// Adds a source; one for each part of a surface of several.

@@ -1,6 +1,6 @@
 //! Thin glass. It is no surface: light goes straight on through it, and a straight way between two points carries the share of
 //! light that the panes across it let through. So every technique of the renderer stays what it is, with that share in the place
-//! of "free", and the densities of drawing do not change. What glass reflects is left out.
+//! of "free", and the densities of drawing do not change. Light that glass reflects comes by ways of its own: [`crate::by_glass`].
 //!
 //! The panes have a hierarchy of their own beside that of the surfaces: scenes without glass do not pay for it.
 
@@ -9,6 +9,7 @@ use picofarm_scene::{Bsdf, Material, Vec3};
 use crate::{
     api::{RenderError, Stop},
     bvh::{Bvh, Stack, normal},
+    world::point,
 };
 
 /// Triangles of glass that a ray meets within this length are one, render units: two that share the edge which it meets, and
@@ -52,6 +53,15 @@ impl Glass {
             false => passes * clear,
         })
     }
+
+    /// Share of the laser's light that is reflected at an angle with this cosine; of a pane with two faces the front of each, the
+    /// side of its normal, reflects for both.
+    fn reflects(&self, cos: f32, front: bool) -> f32 {
+        match self.face && !front {
+            true => 0.0,
+            false => reflected(self.ior, self.passes[0], cos),
+        }
+    }
 }
 
 /// Share of unpolarised light that passes a pane which absorbs nothing: with r the reflectance of a face for one polarisation
@@ -72,10 +82,39 @@ fn clear(ior: f32, cos: f32) -> f32 {
     0.5 * (share(cos, inside) + share(ior * ior * cos, inside))
 }
 
+/// Share of unpolarised light that a pane reflects: a face of reflectance r for one polarisation (Fresnel) reflects it, and of
+/// what comes from the other face 1 − r passes, (1 − r)/(1 + r) with all reflections to and fro, tinted twice.
+fn reflected(ior: f32, tint: f32, cos: f32) -> f32 {
+    let cos = cos.clamp(0.0, 1.0);
+    let inside = (ior * ior - 1.0 + cos * cos).sqrt();
+    if inside + cos <= 0.0 {
+        return 0.0;
+    }
+    let share = |a: f32, b: f32| {
+        let root = (a - b) / (a + b);
+        let r = root * root;
+        r + tint * tint * r * (1.0 - r) / (1.0 + r)
+    };
+    0.5 * (share(cos, inside) + share(ior * ior * cos, inside))
+}
+
+/// Where a straight way goes through a pane.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Crossing {
+    /// Triangle of glass.
+    pub pane: u32,
+    /// Share of the laser's light that goes straight on.
+    pub passes: f32,
+    /// Share that is reflected.
+    pub reflects: f32,
+}
+
 /// All glass of a scene.
 #[derive(Debug)]
 pub(crate) struct Panes {
     bvh: Bvh,
+    /// Corners, render units.
+    triangles: Vec<[Vec3; 3]>,
     /// Unit normals, one a triangle.
     normals: Vec<Vec3>,
     /// Glass of each triangle.
@@ -100,6 +139,7 @@ impl Panes {
         let each = triangles.iter();
         Ok(Some(Self {
             bvh: Bvh::build_unless(triangles, stop)?,
+            triangles: triangles.to_vec(),
             normals: each.map(|t| normal(t).unwrap_or_default()).collect(),
             glass,
         }))
@@ -116,12 +156,59 @@ impl Panes {
         [r, g, b]
     }
 
-    fn shares(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 4] {
+    /// Corners and unit normal of each triangle.
+    pub fn triangles(&self) -> impl Iterator<Item = ([Vec3; 3], Vec3)> {
+        let corners = self.triangles.iter().copied();
+        corners.zip(self.normals.iter().copied())
+    }
+
+    /// Share of light at a right angle that a triangle reflects.
+    pub fn reflectance(&self, pane: usize) -> f32 {
+        self.glass[pane].reflects(1.0, true)
+    }
+
+    /// Whether a triangle's back reflects as its front does.
+    pub fn two_sided(&self, pane: usize) -> bool {
+        !self.glass[pane].face
+    }
+
+    /// Where the line from `origin` along `direction` meets a triangle's plane, and its unit normal towards the origin.
+    pub fn point(&self, pane: u32, origin: Vec3, direction: Vec3) -> (Vec3, Vec3) {
+        let n = self.normals[pane as usize];
+        let p = point(&self.triangles[pane as usize], origin, direction);
+        (p, if n.dot(direction) <= 0.0 { n } else { -n })
+    }
+
+    /// Writes the panes across the straight way from `a` to `b` in their order.
+    pub fn crossings(&self, stack: &mut Stack, a: Vec3, b: Vec3, out: &mut Vec<Crossing>) {
+        out.clear();
         let way = b - a;
+        self.each(stack, a, way, |glass, pane, along| {
+            let cos = along.abs();
+            out.push(Crossing {
+                pane,
+                passes: glass.through(cos)[0],
+                reflects: glass.reflects(cos, along <= 0.0),
+            });
+        });
+    }
+
+    fn shares(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 4] {
         let mut all = [1.0; 4];
+        self.each(stack, a, b - a, |glass, _, along| {
+            let through = glass.through(along.abs());
+            for (all, through) in all.iter_mut().zip(through) {
+                *all *= through;
+            }
+        });
+        all
+    }
+
+    /// Calls `each` for every pane across a way, with its triangle and the way's direction along its normal.
+    fn each(&self, stack: &mut Stack, a: Vec3, way: Vec3, mut each: impl FnMut(&Glass, u32, f32)) {
         self.bvh.deepen(stack);
         if !self.bvh.occluded(stack, a, way, 1.0) {
-            return all;
+            return;
         }
         let length = way.length();
         let mut met = std::mem::take(&mut stack.met);
@@ -133,15 +220,10 @@ impl Panes {
                 continue;
             }
             last = at;
-            let id = id as usize;
-            let cos = self.normals[id].dot(way).abs() / length;
-            let through = self.glass[id].through(cos);
-            for (all, through) in all.iter_mut().zip(through) {
-                *all *= through;
-            }
+            let at = id as usize;
+            each(&self.glass[at], id, self.normals[at].dot(way) / length);
         }
         stack.met = met;
-        all
     }
 }
 

@@ -23,6 +23,9 @@ pub(crate) enum Stream {
     Caustic = 5,
     /// Light paths in the zones of spots beside other surfaces.
     Contact = 7,
+    /// Light paths by way of glass, and camera paths.
+    Glass = 8,
+    ByGlass = 9,
     /// How far camera and light reach.
     Extent = 6,
 }

@@ -77,7 +77,8 @@ pub(crate) fn ground_truth(
         let object = world.object[h.triangle as usize];
         truth.instance[k] = object + 1;
         truth.label[k] = scene.objects[object as usize].label + 1;
-        truth.specular[k] = u8::from(h.surface.specular());
+        let glass = world.body(h.triangle).is_some();
+        truth.specular[k] = u8::from(glass || h.surface.specular());
     }
     let mut rays = 0;
     for e in places(emitters) {
@@ -95,10 +96,11 @@ pub(crate) fn ground_truth(
     Ok((truth, rays))
 }
 
-/// One source for each spot: those of its parts are in the same place, one behind the other.
+/// One source for each spot: those of its parts are in the same place, one behind the other. Spots of light that glass turned
+/// aside are none of the ground truth's.
 fn places(emitters: &Emitters) -> impl Iterator<Item = &Emitter> {
     let runs = emitters.list.chunk_by(|a, b| a.beam == b.beam);
-    runs.map(|run| &run[0])
+    runs.filter_map(|run| run.iter().find(|e| !e.aside))
 }
 
 /// Which pixels of a row a spot lights; returns the rays.

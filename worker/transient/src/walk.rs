@@ -4,11 +4,14 @@
 
 mod connect;
 
+pub(crate) use self::connect::draw;
+
 use picofarm_scene::Vec3;
 
 use crate::{
     api::Gate,
     bvh::Stack,
+    by_glass::ByGlass,
     caustic::{Caustics, Surroundings},
     contact::Contacts,
     ellipsoid::{Patches, Window},
@@ -35,6 +38,8 @@ pub(crate) struct Walk<'a> {
     pub lights: bool,
     /// Light paths by way of near-mirrors, where they pay.
     pub caustics: Option<&'a Caustics>,
+    /// Glass that turns light, where there is any.
+    pub glass: Option<&'a ByGlass>,
     /// Zones around spots beside other surfaces, where there are any.
     pub contacts: Option<&'a Contacts>,
     /// Shortest path from the laser to a spot, metres.

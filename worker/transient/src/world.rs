@@ -11,7 +11,8 @@ use crate::{
     bsdf::Surface,
     bvh::{Bvh, Stack, normal},
     extent::{self, Point, wide},
-    glass::Panes,
+    fresnel::Body,
+    glass::{Crossing, Panes},
     rng::Rng,
     spectra::{Builder, ONES, Ratios, Spectra, times},
 };
@@ -62,8 +63,10 @@ pub(crate) struct World {
     pub camera: Camera,
     /// Side of the sensitive square in the middle of each pixel, as a share of the pixel's.
     pub sensitive: f32,
-    /// Glass, which none of the triangles is.
-    panes: Option<Panes>,
+    /// Thin glass, which none of the triangles is.
+    pub panes: Option<Panes>,
+    /// Bodies of glass by surface index; empty without any.
+    bodies: Vec<Option<Body>>,
     /// By what surfaces multiply ratios, where wavelengths are asked for.
     spectra: Option<Spectra>,
 }
@@ -170,6 +173,7 @@ impl World {
         // Triangles of glass, and their materials.
         let (mut panes, mut glass): (Vec<[Point; 3]>, Vec<&Material>) = (vec![], vec![]);
         let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
+        let mut bodies = vec![];
         let textured = |m: &Material| m.texture.is_some();
         let textured = scene
             .objects
@@ -182,6 +186,7 @@ impl World {
             first_surface.push(first);
             for (k, m) in o.mesh.materials.iter().enumerate() {
                 surfaces.push(spectra.surface(m, &mut several)?);
+                bodies.push(Body::new(m));
                 material.push(k as u32);
                 rgb.push(m.rgb);
                 textures.push(m.texture.clone());
@@ -273,6 +278,10 @@ impl World {
             camera: scene.camera,
             sensitive: 1.0,
             panes: Panes::new(&panes, &glass, stop)?,
+            bodies: match bodies.iter().any(Option::is_some) {
+                true => bodies,
+                false => vec![],
+            },
             spectra: spectra.done(),
         })
     }
@@ -333,7 +342,61 @@ impl World {
         }
     }
 
-    /// Whether there is glass.
+    /// The body of glass that a triangle bounds.
+    #[inline]
+    pub fn body(&self, triangle: u32) -> Option<Body> {
+        *self.bodies.get(self.surface[triangle as usize] as usize)?
+    }
+
+    /// Whether there are bodies of glass.
+    pub fn has_bodies(&self) -> bool {
+        !self.bodies.is_empty()
+    }
+
+    /// The first surface along a unit direction, and the panes before it in their order; without a surface those as far as the
+    /// scene goes.
+    pub fn ahead(
+        &self,
+        stack: &mut Stack,
+        from: Vec3,
+        w: Vec3,
+        crossings: &mut Vec<Crossing>,
+    ) -> Option<Hit> {
+        let hit = self.first(stack, from, w);
+        self.across(stack, (from, w), hit.as_ref(), crossings);
+        hit
+    }
+
+    /// The panes between a point and what is hit from there.
+    pub fn across(
+        &self,
+        stack: &mut Stack,
+        (from, w): (Vec3, Vec3),
+        hit: Option<&Hit>,
+        crossings: &mut Vec<Crossing>,
+    ) {
+        crossings.clear();
+        if let Some(panes) = &self.panes {
+            let to = match hit {
+                Some(hit) => lift(hit.p, hit.n),
+                None => from + w * (2.0 * self.diagonal + from.length()),
+            };
+            panes.crossings(stack, from, to, crossings);
+        }
+    }
+
+    /// The index of refraction around a point, as a ray from there finds it: that of a body whose surface it meets from within.
+    pub fn medium(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> f32 {
+        if !self.has_bodies() {
+            return 1.0;
+        }
+        let hit = self.first(stack, origin, direction);
+        let within = |h: &Hit| h.n.dot(self.normals[h.triangle as usize]) < 0.0;
+        let body = hit.filter(within).and_then(|h| self.body(h.triangle));
+        body.map_or(1.0, |body| body.ior)
+    }
+
+    /// Whether there is thin glass.
     pub fn has_glass(&self) -> bool {
         self.panes.is_some()
     }
@@ -382,7 +445,11 @@ impl World {
 
     /// False where all light that scatters on a triangle comes too late to count.
     pub fn counts(&self, triangle: usize) -> bool {
-        let t = &self.triangles[triangle];
+        self.near(&self.triangles[triangle])
+    }
+
+    /// The same of any triangle.
+    pub fn near(&self, t: &[Vec3; 3]) -> bool {
         let (low, high) = (t[0].min(t[1]).min(t[2]), t[0].max(t[1]).max(t[2]));
         // From the camera, in the origin, to the nearest point of the box around it.
         let near = low.max(Vec3::ZERO) + high.min(Vec3::ZERO);
@@ -411,13 +478,19 @@ impl World {
         f64::from(length / self.scale)
     }
 
-    /// The first surface from `origin` along `direction` (any length).
+    /// The first surface from `origin` along `direction` (any length), whatever glass there is before it.
     #[inline]
-    pub fn closest(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<Hit> {
+    pub fn first(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<Hit> {
         let (_, id) = self.bvh.closest(stack, origin, direction, f32::INFINITY)?;
         let front = self.normals[id as usize].dot(direction) <= 0.0;
         let p = point(&self.triangles[id as usize], origin, direction);
-        let mut hit = self.hit(id, p, front);
+        Some(self.hit(id, p, front))
+    }
+
+    /// The first surface from `origin` along `direction` (any length).
+    #[inline]
+    pub fn closest(&self, stack: &mut Stack, origin: Vec3, direction: Vec3) -> Option<Hit> {
+        let mut hit = self.first(stack, origin, direction)?;
         if self.panes.is_some() {
             hit.through = self.glass(stack, origin, lift(hit.p, hit.n));
         }
@@ -589,7 +662,7 @@ fn scale_for(widest: f64) -> f32 {
 /// The hit point from barycentric coordinates (the same shear as the traversal's): on the triangle to
 /// the last bits, however far the ray's origin is.
 #[inline]
-fn point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
+pub(crate) fn point(t: &[Vec3; 3], o: Vec3, d: Vec3) -> Vec3 {
     let n = Vec3::new(d.x.abs(), d.y.abs(), d.z.abs());
     let kz = if n.z >= n.x && n.z >= n.y {
         2

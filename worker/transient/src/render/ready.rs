@@ -9,6 +9,7 @@ use crate::{
         AtWavelength, Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered,
         Settings, Split, Stop,
     },
+    by_glass::ByGlass,
     caustic::Caustics,
     contact::Contacts,
     ellipsoid::{self, Patches, Window},
@@ -108,6 +109,7 @@ pub(super) fn prepare<R>(
         max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
+        glass: None,
         contacts: None,
         window: narrow.then(|| Window::new(&settings.gate)),
         patches: patches.as_ref(),
@@ -130,6 +132,8 @@ pub(super) fn prepare<R>(
         _ => Contacts::find(&world, emitters),
     };
     walk.contacts = contacts.as_ref();
+    let glass = ByGlass::find(&walk, &centres, stop)?;
+    walk.glass = glass.as_ref();
     let frame = Frame {
         walk,
         film: &film,

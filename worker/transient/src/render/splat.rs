@@ -13,14 +13,19 @@ use super::{
 use crate::{
     api::{ErrorEstimate, RenderError, Stop},
     bvh::Stack,
+    by_glass::{Buffers, ByGlass, Photons},
     caustic::{Caustics, Splat, splat},
     contact::Contacts,
+    light_vertices::LightVertex,
     rng::{Rng, Stream},
     turns::Turns,
 };
 
 /// Light paths by way of near-mirrors of a pass for each pixel.
 const PATHS: f64 = 4.0;
+/// Light paths by way of glass of a pass for each pixel, and those that the camera paths of a stream are connected to.
+const GLASS_PATHS: f64 = 1.0;
+const LAID: u32 = 128;
 /// Light paths that one random stream makes.
 const CHUNK: u32 = 1024;
 /// Light paths of a pass in all zones for each pixel, and in one zone at least and at most.
@@ -32,13 +37,20 @@ const ZONE_PATHS: (u32, u32) = (256, 1024);
 pub(super) struct Sources<'a> {
     caustics: Option<&'a Caustics>,
     contacts: Option<&'a Contacts>,
+    glass: Option<&'a ByGlass>,
 }
 
 impl<'a> Sources<'a> {
     /// Those of a scene; `None` where it needs none.
     pub fn of(frame: &Frame<'a>) -> Option<Self> {
         let (caustics, contacts) = (frame.walk.caustics, frame.walk.contacts);
-        (caustics.is_some() || contacts.is_some()).then_some(Self { caustics, contacts })
+        let glass = frame.walk.glass;
+        let any = caustics.is_some() || contacts.is_some() || glass.is_some();
+        any.then_some(Self {
+            caustics,
+            contacts,
+            glass,
+        })
     }
 }
 
@@ -84,6 +96,10 @@ impl Splats {
             }
             if let Some(contacts) = sources.contacts {
                 rays += self.in_zones((frame, contacts), watch, &mut all);
+            }
+            if let Some(glass) = sources.glass {
+                let (photons, traced) = self.from_glass((frame, glass), watch, &mut all);
+                rays += traced + self.by_glass((frame, glass, &photons), watch, &mut all);
             }
             if watch.stopped() {
                 return Err(RenderError::Stopped);
@@ -145,6 +161,68 @@ impl Splats {
             }
         };
         side_by_side(frame, contacts.count(), watch, all, zone)
+    }
+
+    /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
+    fn from_glass(
+        &self,
+        (frame, glass): (&Frame, &ByGlass),
+        watch: &Watch,
+        all: &mut Vec<Splat>,
+    ) -> (Photons, u64) {
+        let walk = &frame.walk;
+        let pixels = f64::from(frame.width) * f64::from(frame.height);
+        let count = (pixels * GLASS_PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
+        let chunk = |buffers: &mut Buffers, chunk: u32, (ends, photons): &mut Ends| {
+            let pass = u64::from(self.passes);
+            let mut rng = Rng::new(frame.seed, Stream::Glass, u64::from(chunk), pass);
+            let mut seen = vec![];
+            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
+                let each = |z, turned| seen.push((z, turned));
+                glass.trace(walk, (l, count), &mut rng, buffers, each);
+                for (z, turned) in seen.drain(..) {
+                    ends.extend(splat(walk.world, frame.film, &z, buffers.stack()));
+                    photons.extend(turned.then_some(z));
+                }
+            }
+        };
+        let (mut photons, mut rays) = (vec![], 0);
+        let chunks = with_buffers(frame, count.div_ceil(CHUNK), watch, chunk);
+        for ((ends, of_chunk), traced) in chunks {
+            all.extend(ends);
+            photons.extend(of_chunk);
+            rays += traced;
+        }
+        (Photons::new(walk.world, walk.emitters, photons), rays)
+    }
+
+    /// A pass of camera paths by way of glass.
+    fn by_glass(
+        &self,
+        (frame, glass, photons): (&Frame, &ByGlass, &Photons),
+        watch: &Watch,
+        all: &mut Vec<Splat>,
+    ) -> u64 {
+        let (walk, width) = (&frame.walk, frame.width);
+        let pixels = width * frame.height;
+        let chunk = |buffers: &mut Buffers, chunk: u32, found: &mut Vec<Splat>| {
+            let pass = u64::from(self.passes);
+            let mut rng = Rng::new(frame.seed, Stream::ByGlass, u64::from(chunk), pass);
+            glass.lay(walk, LAID, &mut rng, buffers);
+            for pixel in chunk * CHUNK..pixels.min((chunk + 1) * CHUNK) {
+                let Some(weight) = glass.chance(pixel as usize, rng.uniform()) else {
+                    continue;
+                };
+                let place = (rng.uniform(), rng.uniform());
+                let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
+                let within = (walk, frame.film, photons);
+                glass.look(within, (pixel, ray, weight), &mut rng, buffers, found);
+            }
+        };
+        joined(
+            with_buffers(frame, pixels.div_ceil(CHUNK), watch, chunk),
+            all,
+        )
     }
 
     /// Adds one pass.
@@ -237,19 +315,54 @@ fn side_by_side(
     all: &mut Vec<Splat>,
     piece: impl Fn(&mut Stack, u32, &mut Vec<Splat>) + Sync,
 ) -> u64 {
-    let found: Vec<(Vec<Splat>, u64)> = (0..count)
-        .into_par_iter()
-        .map_init(
-            || frame.walk.world.bvh.stack(),
-            |stack, k| {
-                let (mut splats, before) = (vec![], stack.rays);
-                if watch.go_on() {
-                    piece(stack, k, &mut splats);
-                }
-                (splats, stack.rays - before)
-            },
-        )
-        .collect();
+    let stack = || frame.walk.world.bvh.stack();
+    let piece = |stack: &mut Stack, k, splats: &mut Vec<Splat>| {
+        let before = stack.rays;
+        piece(stack, k, splats);
+        stack.rays - before
+    };
+    joined(pieces(count, watch, stack, piece), all)
+}
+
+/// What `count` pieces of a pass by way of glass find, in their order, each with the rays that it traced.
+fn with_buffers<T: Default + Send>(
+    frame: &Frame,
+    count: u32,
+    watch: &Watch,
+    piece: impl Fn(&mut Buffers, u32, &mut T) + Sync,
+) -> Vec<(T, u64)> {
+    let piece = |buffers: &mut Buffers, k, found: &mut T| {
+        let before = buffers.stack().rays;
+        piece(buffers, k, found);
+        buffers.stack().rays - before
+    };
+    pieces(count, watch, || Buffers::new(&frame.walk), piece)
+}
+
+/// What `count` pieces of a pass find on all threads, in their order, each with the rays that it traced.
+fn pieces<B, T: Default + Send>(
+    count: u32,
+    watch: &Watch,
+    buffers: impl Fn() -> B + Sync + Send,
+    piece: impl Fn(&mut B, u32, &mut T) -> u64 + Sync,
+) -> Vec<(T, u64)> {
+    let each = (0..count).into_par_iter();
+    each.map_init(buffers, |buffers, k| {
+        let mut found = T::default();
+        let rays = match watch.go_on() {
+            true => piece(buffers, k, &mut found),
+            false => 0,
+        };
+        (found, rays)
+    })
+    .collect()
+}
+
+/// What light paths draw into the image, and the photons that they leave.
+type Ends = (Vec<Splat>, Vec<LightVertex>);
+
+/// Joins what was found; returns the rays traced.
+fn joined(found: Vec<(Vec<Splat>, u64)>, all: &mut Vec<Splat>) -> u64 {
     let rays = found.iter().map(|f| f.1).sum();
     all.extend(found.into_iter().flat_map(|f| f.0));
     rays

@@ -297,7 +297,7 @@ impl Walk<'_> {
 /// Systematic sampling: draws `count` times in proportion to `weights`, from one random number, and
 /// calls `each` once for every entry drawn with its share of the sum. Unbiased for the sum.
 #[inline]
-fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
+pub(crate) fn draw(weights: &[f32], count: u32, u: f32, mut each: impl FnMut(usize, f32)) {
     let total: f32 = weights.iter().sum();
     // Beneath the least normal number a step could be 0.
     if !(total > 1e-30 && total.is_finite()) {

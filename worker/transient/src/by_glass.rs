@@ -1,0 +1,178 @@
+//! Light that glass turns: what panes reflect, and what bodies of glass reflect and refract.
+//!
+//! Surfaces scatter, glass turns a ray without a choice of direction: no connection between two points finds such a way. So light
+//! by way of glass has paths of its own, drawn into the image, beside all other techniques, for which thin glass is only passed and
+//! bodies are black. Call the way between two surface points a *leg*, the camera's first and the spot's last, and say that it is
+//! *turned* where glass reflects or refracts light on it. Paths without a turned leg are the other techniques'; of the rest
+//!
+//! 1. those whose last leg is straight are camera paths, connected to the spots;
+//! 2. the others are light paths. Read from the camera, the first straight leg joins the two: where it is the camera's own, the
+//!    light path is drawn into the image; else camera paths whose legs are all turned are connected to the light path's vertices.
+//!
+//! Where no leg is straight, light paths whose legs are all turned and camera paths whose first leg is meet on a surface: see
+//! [`photons`]. That alone is an approximation: it blurs what it finds over about a pixel. The spots are among what is found so,
+//! where the camera sees them in glass. Each class is found in one way, so nothing is weighed and nothing counted twice. A reflection
+//! counts as a bounce, and refraction does not; a spot that the camera sees by refraction alone, one bounce, is left out.
+//!
+//! On a leg every pane in the way may reflect, and what passes goes on. Where nothing was turned yet a reflection is chosen more often
+//! than light does, since only such paths bring anything.
+
+mod camera;
+mod light;
+mod photons;
+mod ray;
+
+use picofarm_scene::Vec3;
+
+pub(crate) use self::photons::Photons;
+use crate::{
+    api::{RenderError, Stop},
+    bvh::Stack,
+    glass::Crossing,
+    light_vertices::LightVertices,
+    targets::{Target, Targets},
+    truth::Centres,
+    walk::{Scratch, Walk},
+    world::World,
+};
+
+/// Share of the pixels that see no glass which get a path of a pass.
+const ELSEWHERE: f32 = 0.125;
+
+/// Glass as a target of light paths.
+#[derive(Debug)]
+pub(crate) struct ByGlass {
+    targets: Targets,
+    /// Index among the targets by pane, and by triangle; [`NONE`] for what is none.
+    of_pane: Vec<u32>,
+    of_triangle: Vec<u32>,
+    /// Row-major: the pixel or one of its neighbours sees glass.
+    sees: Vec<bool>,
+    /// Index of refraction around the camera.
+    around: f32,
+}
+
+const NONE: u32 = u32::MAX;
+
+/// Buffers of a thread.
+#[derive(Debug)]
+pub(crate) struct Buffers {
+    scratch: Scratch,
+    crossings: Vec<Crossing>,
+    lights: Vec<f32>,
+    vertices: LightVertices,
+}
+
+impl Buffers {
+    pub fn new(walk: &Walk) -> Self {
+        Self {
+            scratch: Scratch::new(walk.world, walk.emitters, walk.mirrors),
+            crossings: vec![],
+            lights: vec![],
+            vertices: LightVertices::default(),
+        }
+    }
+
+    /// What is traced with.
+    pub fn stack(&mut self) -> &mut Stack {
+        &mut self.scratch.stack
+    }
+}
+
+impl ByGlass {
+    /// The glass of a scene that turns light; `None` where there is none.
+    ///
+    /// # Errors
+    /// [`RenderError::Stopped`].
+    pub fn find(walk: &Walk, centres: &Centres, stop: Stop) -> Result<Option<Self>, RenderError> {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let mut all = vec![];
+        let mut of_pane = vec![];
+        let mut of_triangle = vec![NONE; world.triangles.len()];
+        for (k, (corners, normal)) in world.panes.iter().flat_map(|p| p.triangles()).enumerate() {
+            let panes = world.panes.as_ref().expect("there is a pane");
+            let share = panes.reflectance(k);
+            of_pane.push(NONE);
+            if share > 0.0 && normal != Vec3::ZERO {
+                of_pane[k] = all.len() as u32;
+                all.push(Target {
+                    corners,
+                    normal,
+                    two_sided: panes.two_sided(k),
+                    counts: world.near(&corners),
+                    share,
+                });
+            }
+        }
+        if world.has_bodies() {
+            for (k, &corners) in world.triangles.iter().enumerate() {
+                if world.body(k as u32).is_some() && world.normals[k] != Vec3::ZERO {
+                    of_triangle[k] = all.len() as u32;
+                    all.push(Target {
+                        corners,
+                        normal: world.normals[k],
+                        two_sided: true,
+                        counts: world.counts(k),
+                        share: 1.0,
+                    });
+                }
+            }
+        }
+        if all.is_empty() || emitters.list.is_empty() || walk.max_bounces < 2 {
+            return Ok(None);
+        }
+        let targets = Targets::new(&all, emitters, stop);
+        stop.check()?;
+        let mut stack = world.bvh.stack();
+        let forward = world.camera.forward;
+        Ok(targets.map(|targets| Self {
+            targets,
+            of_pane,
+            of_triangle,
+            sees: sees(world, centres, &mut stack),
+            around: world.medium(&mut stack, Vec3::ZERO, forward),
+        }))
+    }
+
+    /// Whether a pixel gets a camera path of a pass, by a random number, and by what it is multiplied.
+    pub fn chance(&self, pixel: usize, u: f32) -> Option<f32> {
+        match self.sees[pixel] {
+            true => Some(1.0),
+            false => (u < ELSEWHERE).then_some(1.0 / ELSEWHERE),
+        }
+    }
+}
+
+/// Which pixels see glass, or have a neighbour that does: in their middles.
+fn sees(world: &World, centres: &Centres, stack: &mut Stack) -> Vec<bool> {
+    let i = &world.camera.intrinsics;
+    let (width, height) = (i.width as usize, i.height as usize);
+    let mut crossings = vec![];
+    let each = centres.hits.iter().enumerate();
+    let middle: Vec<bool> = each
+        .map(|(k, hit)| {
+            let body = hit.as_ref().and_then(|h| world.body(h.triangle));
+            let (row, col) = (k / width, k % width);
+            body.is_some() || {
+                let ray = world.camera.ray(col as f32 + 0.5, row as f32 + 0.5);
+                world.across(
+                    stack,
+                    (Vec3::ZERO, ray.normalized()),
+                    hit.as_ref(),
+                    &mut crossings,
+                );
+                crossings.iter().any(|c| c.reflects > 0.0)
+            }
+        })
+        .collect();
+    (0..width * height)
+        .map(|k| {
+            let (row, col) = (k / width, k % width);
+            let rows = row.saturating_sub(1)..(row + 2).min(height);
+            rows.into_iter().any(|r| {
+                let cols = col.saturating_sub(1)..(col + 2).min(width);
+                cols.into_iter().any(|c| middle[r * width + c])
+            })
+        })
+        .collect()
+}

@@ -1,0 +1,208 @@
+//! Camera paths by way of glass.
+
+use picofarm_scene::Vec3;
+
+use super::{
+    Buffers, ByGlass,
+    photons::Photons,
+    ray::{Carried, Point, Ray, arrive},
+};
+use crate::{
+    caustic::Splat,
+    film::Film,
+    lobes::Seen,
+    rng::Rng,
+    spectra::{ONES, Ratios, times},
+    walk::{ALL, Scratch, Walk, draw},
+};
+
+/// How often at least a pane's reflection is chosen where nothing was turned yet.
+const SEEK: f32 = 0.5;
+/// Spots that a vertex after the first is connected to at most, and light vertices that any is.
+const SPOTS: u32 = 2;
+const LIGHTS: u32 = 1;
+
+impl ByGlass {
+    /// A camera path through a point of the film, of which `weight` counts: what it finds by connecting to the spots and to the
+    /// light vertices that were laid, and among the photons.
+    pub fn look(
+        &self,
+        (walk, film, photons): (&Walk, &Film, &Photons),
+        (pixel, ray, weight): (u32, Vec3, f32),
+        rng: &mut Rng,
+        buffers: &mut Buffers,
+        out: &mut Vec<Splat>,
+    ) {
+        let (world, origin) = (walk.world, Vec3::ZERO);
+        let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
+        let mut path = Carried {
+            weight,
+            ratios: ONES,
+            length_m: 0.0,
+            bounces: 0,
+        };
+        // Whether any leg was turned, and whether all were.
+        let (mut turned, mut all) = (false, true);
+        loop {
+            let seek = if turned { 0.0 } else { SEEK };
+            let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
+            let Some(point) = arrive(world, &path, (ray, seek), rng, tools) else {
+                return;
+            };
+            let first = path.bounces == 0;
+            turned |= point.turned;
+            all &= point.turned;
+            if point.hit.surface.is_black() {
+                return;
+            }
+            if first && turned {
+                let limits = (walk.max_bounces, world);
+                photons.around(limits, &point, |splat, ratios| {
+                    add(film, (pixel, splat), || ratios, out);
+                });
+            }
+            let there = &point.path;
+            if there.bounces + 1 > walk.max_bounces
+                || there.length_m + walk.shortest_m >= walk.gate.end_m()
+            {
+                return;
+            }
+            if turned {
+                let count = if first { ALL } else { SPOTS };
+                connect((walk, film), (&point, pixel), count, rng, buffers, out);
+            }
+            if all {
+                join((walk, film), (&point, pixel), rng, buffers, out);
+            }
+            let left = there.weight / weight;
+            let survive = |of: f32| (1.5 * left * of).min(0.95);
+            let Some(onward) = point.scatter(world, survive, rng, true) else {
+                return;
+            };
+            (path, ray) = onward;
+        }
+    }
+}
+
+/// What a camera path found.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Found {
+    /// Radiance, of which the ratios are wanted beside it.
+    pub value: f32,
+    /// Optical path, metres.
+    pub path_m: f64,
+    /// Emitter.
+    pub spot: usize,
+    pub bounces: u32,
+}
+
+/// Connects a point of a camera path to `count` spots.
+fn connect(
+    (walk, film): (&Walk, &Film),
+    (point, pixel): (&Point, u32),
+    count: u32,
+    rng: &mut Rng,
+    buffers: &mut Buffers,
+    out: &mut Vec<Splat>,
+) {
+    let (world, h, path) = (walk.world, &point.hit, &point.path);
+    let Scratch {
+        stack,
+        weights,
+        plain,
+        ..
+    } = &mut buffers.scratch;
+    let of = (Seen::of(h, point.back), &h.surface);
+    walk.emitters.weights(of, plain, weights);
+    let mut each = |spot: usize, value: f32| {
+        let e = &walk.emitters.list[spot];
+        let free = world.free(stack, h.p, h.n, e.p, e.n);
+        if free > 0.0 {
+            let to = e.p - h.p;
+            let leg = world.metres(to.length()) * f64::from(point.medium);
+            let w = to.normalized();
+            let found = Found {
+                value: path.weight * value * free,
+                path_m: path.length_m + leg + e.path_m,
+                spot,
+                bounces: path.bounces + 1,
+            };
+            let ratios = || {
+                let here = times(path.ratios, world.ratios(h, point.back, w));
+                times(here, e.ratios(world, -w))
+            };
+            add(film, (pixel, found), ratios, out);
+        }
+    };
+    if count == ALL {
+        let lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
+        lit.for_each(|(spot, &w)| each(spot, w));
+    } else {
+        draw(weights, count, rng.uniform(), each);
+    }
+}
+
+/// Connects a point of a camera path to light vertices.
+fn join(
+    (walk, film): (&Walk, &Film),
+    (point, pixel): (&Point, u32),
+    rng: &mut Rng,
+    buffers: &mut Buffers,
+    out: &mut Vec<Splat>,
+) {
+    let (world, h, path) = (walk.world, &point.hit, &point.path);
+    let Buffers {
+        scratch,
+        lights,
+        vertices,
+        ..
+    } = buffers;
+    if vertices.list.is_empty() {
+        return;
+    }
+    vertices.weights(h, point.back, (lights, &mut scratch.plain));
+    draw(lights, LIGHTS, rng.uniform(), |i, value| {
+        let y = &vertices.list[i];
+        let bounces = path.bounces + y.bounces;
+        if bounces > walk.max_bounces {
+            return;
+        }
+        let free = world.free(&mut scratch.stack, h.p, h.n, y.hit.p, y.hit.n);
+        if free > 0.0 {
+            let to = y.hit.p - h.p;
+            let leg = world.metres(to.length()) * f64::from(point.medium);
+            let w = to.normalized();
+            let found = Found {
+                value: path.weight * value * free,
+                path_m: path.length_m + leg + y.path_m,
+                spot: y.spot,
+                bounces,
+            };
+            let ratios = || {
+                let here = times(path.ratios, world.ratios(h, point.back, w));
+                times(here, times(y.ratios, world.ratios(&y.hit, y.back, -w)))
+            };
+            add(film, (pixel, found), ratios, out);
+        }
+    });
+}
+
+/// Adds what was found at all wavelengths.
+fn add(
+    film: &Film,
+    (pixel, found): (u32, Found),
+    ratios: impl FnOnce() -> Ratios,
+    out: &mut Vec<Splat>,
+) {
+    let ratios = if film.spectral { ratios() } else { ONES };
+    let slot = film.slot(found.path_m) as u32;
+    let each = (0u8..).zip(ratios).take(film.wavelengths);
+    out.extend(each.map(|(wavelength, ratio)| Splat {
+        pixel,
+        slot,
+        spot: found.spot as u16,
+        wavelength,
+        value: found.value * ratio,
+        bounces: found.bounces,
+    }));
+}

@@ -1,0 +1,127 @@
+//! Light of spots that comes by glass to points which the camera sees by glass alone: no two points can be connected on such a path.
+//! Light paths leave *photons* where they end, and a camera path takes those within a disc around its own end: the density of their
+//! flux there (Jensen 1996). A disc is about as wide as the pixel is at that distance, and so is what it blurs.
+
+use std::f32::consts::PI;
+
+use picofarm_scene::Vec3;
+
+use super::{camera::Found, ray::Point};
+use crate::{
+    emitter::Emitters,
+    light_vertices::{ALONE, LightVertex},
+    spectra::{ONES, Ratios, times},
+    world::{Hit, World},
+};
+
+/// Photons further than this share of the radius off the point's plane, or whose normal has less than this cosine with its own, lie
+/// on another surface.
+const FLAT: f32 = 0.25;
+const ALIKE: f32 = 0.7;
+/// Least cosine of a direction that a surface is seen in.
+const GRAZING: f32 = 1e-3;
+
+/// The photons of a pass, by cells of space.
+#[derive(Debug)]
+pub(crate) struct Photons {
+    /// By cell, those of a cell in the order in which they were found.
+    all: Vec<([i32; 3], LightVertex)>,
+    /// Width of a cell, and widest radius, render units.
+    cell: f32,
+    /// Radius for a length of the camera's path of 1.
+    spread: f32,
+}
+
+impl Photons {
+    /// The spots, and `found` by light paths.
+    pub fn new(world: &World, emitters: &Emitters, found: Vec<LightVertex>) -> Self {
+        let i = &world.camera.intrinsics;
+        // A disc as large as a pixel at unit distance.
+        let spread = (world.sensitive * world.sensitive / (PI * i.fx * i.fy)).sqrt();
+        let cell = spread * world.diagonal;
+        let each = emitters.list.iter().enumerate();
+        let spots = each.map(|(spot, e)| LightVertex {
+            hit: Hit {
+                p: e.p,
+                n: e.n,
+                triangle: 0,
+                surface: e.surface,
+                through: 1.0,
+            },
+            back: e.back,
+            flux: 1.0,
+            ratios: ONES,
+            density: ALONE,
+            path_m: e.path_m,
+            spot,
+            bounces: 1,
+        });
+        let mut photons = Self {
+            all: vec![],
+            cell,
+            spread,
+        };
+        let all = spots.chain(found).map(|z| (photons.cell_of(z.hit.p), z));
+        photons.all = all.collect();
+        // Stable: sums are made in the order of the paths.
+        photons.all.sort_by_key(|(cell, _)| *cell);
+        photons
+    }
+
+    fn cell_of(&self, p: Vec3) -> [i32; 3] {
+        // Casting saturates.
+        [p.x, p.y, p.z].map(|x| (x / self.cell).floor() as i32)
+    }
+
+    /// Calls `each` with what every photon near a camera path's point brings, and its ratios.
+    pub(super) fn around(
+        &self,
+        (max_bounces, world): (u32, &World),
+        point: &Point,
+        mut each: impl FnMut(Found, Ratios),
+    ) {
+        let (h, path) = (&point.hit, &point.path);
+        let length = path.length_m as f32 * world.scale;
+        let radius = (self.spread * length).min(self.cell);
+        let reach = Vec3::new(radius, radius, radius);
+        let (low, high) = (self.cell_of(h.p - reach), self.cell_of(h.p + reach));
+        let cos = h.n.dot(point.back);
+        if !(radius > 0.0 && cos > GRAZING) {
+            return;
+        }
+        for x in low[0]..=high[0] {
+            for y in low[1]..=high[1] {
+                // Cells of a column follow one another.
+                let first = self.all.partition_point(|(c, _)| *c < [x, y, low[2]]);
+                let near = self.all[first..].iter();
+                for (_, z) in near.take_while(|(c, _)| *c <= [x, y, high[2]]) {
+                    let to = z.hit.p - h.p;
+                    let bounces = path.bounces - 1 + z.bounces;
+                    if to.dot(to) >= radius * radius
+                        || h.n.dot(to).abs() > FLAT * radius
+                        || h.n.dot(z.hit.n) < ALIKE
+                        || !(2..=max_bounces).contains(&bounces)
+                    {
+                        continue;
+                    }
+                    let f = z.hit.surface.scatter(h.n, z.back, point.back) / cos;
+                    let found = Found {
+                        value: path.weight * z.flux * f / (PI * radius * radius),
+                        path_m: path.length_m + z.path_m,
+                        spot: z.spot,
+                        bounces,
+                    };
+                    if found.value > 0.0 {
+                        let here = match world.is_spectral() {
+                            // A spot's surface is not among the triangles.
+                            true if z.bounces > 1 => world.ratios(&z.hit, z.back, point.back),
+                            true => world.ratios(h, z.back, point.back),
+                            false => ONES,
+                        };
+                        each(found, times(times(path.ratios, z.ratios), here));
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! Rays by way of glass, and the paths that they are legs of.
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    bvh::Stack,
+    fresnel::{Body, split},
+    glass::Crossing,
+    rng::Rng,
+    spectra::{Ratios, times},
+    world::{Hit, World, lift},
+};
+
+/// How often at least a body's reflection is chosen, where there is any.
+const REFLECT: f32 = 0.1;
+/// Turns of one leg before Russian roulette sets in, and what it keeps.
+const SURE_TURNS: u32 = 8;
+const KEEP: f32 = 0.7;
+/// A ray on a leg.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Ray {
+    /// Where it is, and the same lifted off the surface there.
+    at: Vec3,
+    from: Vec3,
+    /// Unit direction.
+    w: Vec3,
+    /// Index of refraction around it.
+    pub medium: f32,
+    /// It carries radiance, from the camera, and not flux.
+    radiance: bool,
+    /// Of this leg: what is left, optical path in metres, reflections, whether it was turned.
+    weight: f32,
+    length_m: f64,
+    reflections: u32,
+    turned: bool,
+}
+
+impl Ray {
+    pub fn new(at: Vec3, from: Vec3, w: Vec3, (medium, radiance): (f32, bool)) -> Self {
+        Self {
+            at,
+            from,
+            w,
+            medium,
+            radiance,
+            weight: 1.0,
+            length_m: 0.0,
+            reflections: 0,
+            turned: false,
+        }
+    }
+
+    fn advance(&mut self, world: &World, p: Vec3) {
+        self.length_m += world.metres((p - self.at).length()) * f64::from(self.medium);
+        self.at = p;
+    }
+
+    pub fn reflect_at(&mut self, world: &World, pane: u32) {
+        let panes = world.panes.as_ref().expect("there is a pane");
+        let (p, n) = panes.point(pane, self.from, self.w);
+        self.advance(world, p);
+        self.w = (self.w - n * (2.0 * n.dot(self.w))).normalized();
+        self.from = lift(p, n);
+        self.reflections += 1;
+        self.turned = true;
+    }
+
+    pub fn turn_at(&mut self, world: &World, hit: &Hit, body: Body, rng: &mut Rng) {
+        self.advance(world, hit.p);
+        let outside = hit.n.dot(world.normals[hit.triangle as usize]) > 0.0;
+        let (from, to) = match outside {
+            true => (1.0, body.ior),
+            false => (body.ior, 1.0),
+        };
+        let split = split(self.w, hit.n, (from, to));
+        self.turned = true;
+        let chance = match split.reflects > 0.0 {
+            true => split.reflects.max(REFLECT),
+            false => 0.0,
+        };
+        if rng.uniform() < chance {
+            self.weight *= split.reflects / chance;
+            self.w = split.reflected;
+            self.from = lift(hit.p, hit.n);
+            self.reflections += 1;
+            self.medium = from;
+            return;
+        }
+        self.weight *= (1.0 - split.reflects) / (1.0 - chance) * body.transmittance;
+        if self.radiance {
+            self.weight *= (from / to) * (from / to);
+        }
+        self.w = split.refracted;
+        self.from = lift(hit.p, -hit.n);
+        self.medium = to;
+    }
+}
+
+/// What a path has come to.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Carried {
+    /// What is left of radiance or flux, and its ratios.
+    pub weight: f32,
+    pub ratios: Ratios,
+    /// Optical path, metres.
+    pub length_m: f64,
+    pub bounces: u32,
+}
+
+/// A path at one of its surface points.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Point {
+    pub hit: Hit,
+    /// Unit direction back along the path.
+    pub back: Vec3,
+    /// Up to here, the bounce here among it.
+    pub path: Carried,
+    /// Index of refraction around it.
+    pub medium: f32,
+    /// Glass turned light on the leg that led here.
+    pub turned: bool,
+}
+
+/// Shares of light that go one way or another on a straight way.
+pub(super) struct Shares {
+    pub reflected: f32,
+    /// Beyond all panes, where there is a surface.
+    pub straight: f32,
+}
+
+impl Shares {
+    pub fn of(crossings: &[Crossing], hit: Option<&Hit>) -> Self {
+        let (mut reflected, mut reach) = (0.0, 1.0);
+        for c in crossings {
+            reflected += reach * c.reflects;
+            reach *= c.passes;
+        }
+        Self {
+            reflected,
+            straight: if hit.is_some() { reach } else { 0.0 },
+        }
+    }
+}
+
+/// The pane whose share of what is reflected `left` falls into.
+pub(super) fn pick(crossings: &[Crossing], mut left: f32) -> Option<u32> {
+    let (mut reach, mut last) = (1.0, None);
+    for c in crossings {
+        let share = reach * c.reflects;
+        if share > 0.0 {
+            last = Some(c.pane);
+            left -= share;
+            if left < 0.0 {
+                break;
+            }
+        }
+        reach *= c.passes;
+    }
+    last
+}
+
+/// Follows a ray by way of glass to the next surface that is none. Reflections by panes are chosen with the chance `seek` at
+/// least where nothing was turned yet.
+fn follow(
+    world: &World,
+    mut ray: Ray,
+    seek: f32,
+    rng: &mut Rng,
+    (stack, crossings): (&mut Stack, &mut Vec<Crossing>),
+) -> Option<(Ray, Hit)> {
+    for turn in 0.. {
+        if turn >= SURE_TURNS {
+            if rng.uniform() >= KEEP {
+                return None;
+            }
+            ray.weight /= KEEP;
+        }
+        let hit = world.ahead(stack, ray.from, ray.w, crossings);
+        let body = hit.as_ref().and_then(|h| world.body(h.triangle));
+        let shares = Shares::of(crossings, hit.as_ref());
+        let total = shares.reflected + shares.straight;
+        if total <= 0.0 || ray.weight == 0.0 {
+            return None;
+        }
+        let mut chance = shares.reflected / total;
+        let both = shares.reflected > 0.0 && shares.straight > 0.0;
+        if both && !ray.turned && body.is_none() {
+            chance = chance.max(seek);
+        }
+        if chance > 0.0 && rng.uniform() < chance {
+            ray.weight *= shares.reflected / chance;
+            let pane = pick(crossings, rng.uniform() * shares.reflected)?;
+            ray.reflect_at(world, pane);
+            continue;
+        }
+        let hit = hit?;
+        ray.weight *= shares.straight / (1.0 - chance);
+        let Some(body) = body else {
+            ray.advance(world, hit.p);
+            return Some((ray, hit));
+        };
+        ray.turn_at(world, &hit, body, rng);
+    }
+    None
+}
+
+/// Follows a ray to the next point of a path.
+pub(super) fn arrive(
+    world: &World,
+    path: &Carried,
+    (ray, seek): (Ray, f32),
+    rng: &mut Rng,
+    tools: (&mut Stack, &mut Vec<Crossing>),
+) -> Option<Point> {
+    let (ray, mut hit) = follow(world, ray, seek, rng, tools)?;
+    hit.choose_part(world, rng);
+    Some(Point {
+        hit,
+        back: -ray.w,
+        path: Carried {
+            weight: path.weight * ray.weight,
+            ratios: path.ratios,
+            length_m: path.length_m + ray.length_m,
+            bounces: path.bounces + 1 + ray.reflections,
+        },
+        medium: ray.medium,
+        turned: ray.turned,
+    })
+}
+
+impl Point {
+    /// Goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step of a
+    /// weight does.
+    pub fn scatter(
+        &self,
+        world: &World,
+        survive: impl Fn(f32) -> f32,
+        rng: &mut Rng,
+        radiance: bool,
+    ) -> Option<(Carried, Ray)> {
+        let h = &self.hit;
+        let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
+        let chance = survive(weight);
+        if chance < 1.0 && rng.uniform() >= chance {
+            return None;
+        }
+        let path = Carried {
+            weight: self.path.weight * weight / chance,
+            ratios: times(self.path.ratios, world.ratios(h, self.back, w)),
+            ..self.path
+        };
+        let from = lift(h.p, h.n);
+        Some((path, Ray::new(h.p, from, w, (self.medium, radiance))))
+    }
+}
