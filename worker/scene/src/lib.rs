@@ -5,6 +5,7 @@
 //! frame has x right, y **down** (image rows grow with y) and z forward.
 
 mod assets;
+mod body;
 mod camera;
 pub mod export;
 mod extras;

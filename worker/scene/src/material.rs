@@ -54,22 +54,27 @@ pub enum Bsdf {
         /// The parts.
         parts: Parts,
     },
-    /// Thin glass. Light goes straight on through it and **what it reflects is lost**: glass shines nowhere, is no surface of the
-    /// ground truth, and no beam makes a spot on it. A pane lets through T = `transmittance` · ½ Σ (1 − r)/(1 + r) over the two
-    /// polarisations, r Fresnel's reflectance of one face at the light's angle: unpolarised light, reflected to and fro between
-    /// the faces any number of times.
+    /// Thin glass: a pane. Light goes straight on through it, or is reflected as by a plane mirror. A pane lets through
+    /// T = τ · ½ Σ (1 − r)/(1 + r) and reflects R = ½ Σ (r + τ² r (1 − r)/(1 + r)). The sums are over the two polarisations, r is
+    /// Fresnel's reflectance of one face at the light's angle and τ the `transmittance`: unpolarised light, reflected to and fro
+    /// between the faces any number of times. Reflections count as bounces, as at near-mirrors; passing through does not count.
+    /// Thin glass is no surface of the ground truth, and no beam makes its spot on it. A beam goes on straight through, and makes a
+    /// further spot where what is reflected of it ends.
     ThinDielectric {
         /// Index of refraction against air, in [1, 4]; 1 reflects nothing.
         ior: f32,
         /// Share of the light that is not reflected which a whole pane lets through: its tint at the laser's wavelength, in [0, 1].
         transmittance: f32,
-        /// The surface is one of the two faces of a pane whose thickness the mesh has: each lets through √T. Otherwise a
-        /// surface is a whole pane.
+        /// The surface is one of the two faces of a pane whose thickness the mesh has: each lets through √T. The side of the
+        /// normal reflects R, for the whole pane; the other side reflects nothing. Otherwise a surface is a whole pane, with R on
+        /// both sides.
         face: bool,
     },
-    /// The smooth surface of a body of glass or of a liquid: light is refracted (Snell) and reflected (Fresnel, unpolarised). The
-    /// body lies behind the surface's normal, air or vacuum before it; bodies are closed and do not touch one another. A beam goes
-    /// on by refraction, and makes a further spot where what is reflected of it ends.
+    /// The smooth surface of a body of glass or of a liquid: light is refracted (Snell) and reflected (Fresnel, unpolarised, without
+    /// a tint). The body lies behind the surface's normal, air or vacuum before it. The facets of a material must be closed and
+    /// face outwards ([`Scene::validate`](crate::Scene::validate)); cavities face inwards. Bodies do not touch one another, nor lie
+    /// within one another. Reflections count as bounces, refraction does not. A body of glass is a surface of the ground truth, in
+    /// the specular mask. A beam goes on by refraction, and makes a further spot where what is reflected of it ends.
     Dielectric {
         /// Index of refraction of the body against what is around it, in [1, 4].
         ior: f32,
@@ -139,7 +144,8 @@ pub struct Material {
     pub name: String,
     /// Scattering at the laser's wavelength.
     pub bsdf: Bsdf,
-    /// Linear RGB albedo for the companion image, each in [0, 1]; of glass what it lets through.
+    /// Linear RGB albedo for the companion image, each in [0, 1]; of glass what it lets through: a pane, or each passing of the
+    /// surface of a body.
     pub rgb: [f32; 3],
     /// Scales the albedo from point to point; needs a mesh with texture coordinates.
     pub texture: Option<Arc<Texture>>,
@@ -210,6 +216,14 @@ impl Material {
     /// True for thin glass, which is no surface but lets light through.
     pub fn is_glass(&self) -> bool {
         matches!(self.bsdf, Bsdf::ThinDielectric { .. })
+    }
+
+    /// True for glass of both kinds, which has neither texture nor spectrum.
+    pub(crate) fn transmits(&self) -> bool {
+        matches!(
+            self.bsdf,
+            Bsdf::ThinDielectric { .. } | Bsdf::Dielectric { .. }
+        )
     }
 
     /// Factors of the albedo at a point of texture space: that of `rgb`, and the one of the reflectances
@@ -305,7 +319,9 @@ impl Material {
             }
             | Bsdf::Dielectric { ior, transmittance } => {
                 if !(1.0..=Self::MAX_IOR).contains(&ior) {
-                    return Err(format!("ior = {ior} lies outside [1, 4]"));
+                    return Err(format!(
+                        "ior = {ior} lies outside [1, 4]; state the index of glass over that of air"
+                    ));
                 }
                 unit("transmittance", transmittance)?;
                 if self.texture.is_some() {

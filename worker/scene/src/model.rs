@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, path::PathBuf, sync::Arc};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Affine, Camera, Laser, Mesh};
+use crate::{Affine, Camera, Laser, Mesh, body};
 
 /// A mesh placed in the world. Its index in [`Scene::objects`] is its instance id.
 #[derive(Debug, Clone)]
@@ -126,7 +126,7 @@ impl Scene {
     }
 
     /// Checks everything the renderer relies on: finite vertices, indices in range, materials within
-    /// their physical limits, orthonormal camera, unit beams.
+    /// their physical limits, bodies of glass closed and facing outwards as placed, orthonormal camera, unit beams.
     ///
     /// # Errors
     /// [`SceneError::Invalid`] naming the first offending field.
@@ -202,6 +202,9 @@ impl Scene {
                     ),
                 );
             }
+        }
+        if let Err((field, what)) = body::check(&self.objects) {
+            return bad(field, what);
         }
         if let Err((field, what)) = self.camera.check() {
             return bad(field, what);

@@ -125,7 +125,7 @@ impl Material {
 
     /// Physical limits of its spectrum; the message says what was expected.
     pub(crate) fn check_spectrum(&self) -> Result<(), String> {
-        match self.spectrum.is_empty() || !self.is_glass() {
+        match self.spectrum.is_empty() || !self.transmits() {
             true => check_points(&self.spectrum, Some(self.bsdf)),
             false => Err("spectrum: glass takes none; remove it".into()),
         }
@@ -271,9 +271,10 @@ mod tests {
             ..point(500.0, 0.5)
         };
         assert!(of(vec![specular]).contains("mixed"));
-        let mut glass = Material::glass("pane");
-        glass.spectrum = vec![point(500.0, 0.5)];
-        assert!(glass.check_spectrum().unwrap_err().contains("glass"));
+        for mut glass in [Material::glass("pane"), Material::solid_glass("ball")] {
+            glass.spectrum = vec![point(500.0, 0.5)];
+            assert!(glass.check_spectrum().unwrap_err().contains("glass"));
+        }
     }
 
     proptest! {

@@ -203,11 +203,16 @@ impl World {
 
     /// World-space unit normal of the facet hit, turned against `direction`.
     pub(crate) fn normal(&self, hit: Hit, direction: Vec3) -> Vec3 {
+        let n = self.facing(hit);
+        if n.dot(direction) > 0.0 { -n } else { n }
+    }
+
+    /// World-space unit normal of the facet hit, by the order of its corners.
+    pub(crate) fn facing(&self, hit: Hit) -> Vec3 {
         let placed = &self.placed[hit.object];
         let mesh = &placed.model.mesh;
         let [a, b, c] = mesh.triangles[hit.triangle as usize].map(|v| mesh.positions[v as usize]);
-        let n = placed.to_world.direction((b - a).cross(c - a)).normalized();
-        if n.dot(direction) > 0.0 { -n } else { n }
+        placed.to_world.direction((b - a).cross(c - a)).normalized()
     }
 }
 

@@ -1,7 +1,7 @@
 //! What a generated scene's camera and laser must see: bounded depth over the whole image, enough to
 //! look at, and every beam landing on a diffuse surface.
 
-use crate::{Camera, Intrinsics, Laser, Material, Object, Vec3, trace::World};
+use crate::{Bsdf, Camera, Intrinsics, Laser, Material, Object, Vec3, trace::World};
 
 /// Smallest z-depth of a furnished room's view, metres.
 pub const MIN_DEPTH_M: f32 = 0.5;
@@ -13,7 +13,7 @@ pub const MAX_DEPTH_M: f32 = 4.5;
 const ACCEPTED_AT: u32 = 256;
 /// Rows and columns of the coarse look before the full check.
 const COARSE: u32 = 24;
-/// Mirrors that a beam may meet before it has to land.
+/// Mirrors and surfaces of bodies of glass that a beam may meet before it has to land.
 const MAX_FOLDS: usize = 8;
 
 /// Intrinsics by which the view of an image of `width` × `height` pixels is accepted.
@@ -81,7 +81,7 @@ fn bounded(
     (near..=far).contains(&hit.t).then_some((hit.object, hit.t))
 }
 
-/// True if every beam ends on a diffuse surface, straight or folded by mirrors.
+/// True if every beam ends on a diffuse surface: straight, folded by mirrors or refracted by bodies of glass.
 pub(crate) fn beams_land(world: &World, laser: &Laser, objects: &[Object]) -> bool {
     laser
         .beams
@@ -96,17 +96,138 @@ fn lands(world: &World, mut origin: Vec3, mut direction: Vec3, objects: &[Object
         };
         let mesh = &objects[hit.object].mesh;
         let material = mesh.triangle_material[hit.triangle as usize];
-        if !mesh.materials[material as usize].is_specular() {
+        let material = &mesh.materials[material as usize];
+        if !material.is_specular() {
             return true;
         }
+        let at = origin + direction * hit.t;
         let normal = world.normal(hit, direction);
-        origin = origin + direction * hit.t + normal * 1e-4;
-        direction = direction - normal * (2.0 * direction.dot(normal));
+        let refracted = match material.bsdf {
+            Bsdf::Dielectric { ior, .. } => {
+                // Before the facet is air, behind it glass.
+                let enters = world.facing(hit).dot(direction) <= 0.0;
+                refracted(direction, normal, if enters { 1.0 / ior } else { ior })
+            }
+            _ => None,
+        };
+        (origin, direction) = match refracted {
+            Some(through) => (at - normal * 1e-4, through),
+            None => (
+                at + normal * 1e-4,
+                direction - normal * (2.0 * direction.dot(normal)),
+            ),
+        };
     }
     false
+}
+
+/// Snell's law: the unit direction behind a surface whose unit normal is turned against the unit `direction`. `ratio` is the index
+/// of refraction before the surface over that behind it. `None` where all is reflected.
+fn refracted(direction: Vec3, normal: Vec3, ratio: f32) -> Option<Vec3> {
+    let cos = -direction.dot(normal);
+    let square = 1.0 - ratio * ratio * (1.0 - cos * cos);
+    (square > 0.0)
+        .then(|| (direction * ratio + normal * (ratio * cos - square.sqrt())).normalized())
 }
 
 /// True for objects with a specular material.
 pub(crate) fn is_specular(object: &Object) -> bool {
     object.mesh.materials.iter().any(Material::is_specular)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::{Affine, Mesh, shape::Shape, trace::Model};
+
+    const GLASS: Bsdf = Bsdf::Dielectric {
+        ior: 1.5,
+        transmittance: 1.0,
+    };
+
+    fn solid(bsdf: Bsdf, build: impl FnOnce(&mut Shape, u32)) -> Mesh {
+        let mut shape = Shape::new("solid");
+        let m = shape.material(Material {
+            bsdf,
+            ..Material::diffuse("solid", [0.5; 3])
+        });
+        build(&mut shape, m);
+        shape.finish()
+    }
+
+    /// Whether a beam along +z from the origin lands.
+    fn beam_lands(meshes: Vec<Mesh>) -> bool {
+        let mut world = World::default();
+        let place = |mesh| {
+            let model = Arc::new(Model::new(mesh).expect("has triangles"));
+            world.add(model.clone(), Affine::IDENTITY);
+            Object {
+                mesh: model.mesh.clone(),
+                to_world: Affine::IDENTITY,
+                label: 0,
+                name: String::new(),
+            }
+        };
+        let objects: Vec<Object> = meshes.into_iter().map(place).collect();
+        lands(&world, Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0), &objects)
+    }
+
+    #[test]
+    fn light_is_refracted_by_snells_law_and_goes_on_as_it_came_behind_a_slab() {
+        let n = Vec3::new(0.0, 0.0, -1.0);
+        for k in 0..9 {
+            let sin = k as f32 * 0.12;
+            let came = Vec3::new(sin, 0.0, (1.0 - sin * sin).sqrt());
+            let inside = refracted(came, n, 1.0 / 1.5).expect("enters");
+            assert!((inside.x * 1.5 - sin).abs() < 1e-6, "{inside:?}");
+            let left = refracted(inside, n, 1.5).expect("leaves");
+            assert!((left - came).length() < 1e-6, "{left:?}");
+            // The critical angle has a sine of 1/1.5.
+            assert_eq!(refracted(came, n, 1.5).is_none(), sin > 1.0 / 1.5);
+        }
+    }
+
+    #[test]
+    fn beams_land_behind_a_body_of_glass_where_refraction_leads() {
+        let wall = |[lo, hi]: [f32; 2], z: f32| {
+            let diffuse = Bsdf::Diffuse { reflectance: 0.5 };
+            solid(diffuse, |s, m| {
+                s.cuboid([-9.0, lo, z], [9.0, hi, z + 0.1], m);
+            })
+        };
+        let slab = || {
+            solid(GLASS, |s, m| {
+                s.cuboid([-1.0, -1.0, 1.0], [1.0, 1.0, 1.5], m)
+            })
+        };
+        assert!(beam_lands(vec![slab(), wall([-9.0, 9.0], 3.0)]));
+        assert!(!beam_lands(vec![slab()]));
+        // A ball above the beam turns it up, towards its axis.
+        let ball = || {
+            solid(GLASS, |s, m| {
+                s.ellipsoid(Vec3::new(0.003, 0.5, 2.0), [1.0, 1.0], 64, m)
+            })
+        };
+        assert!(beam_lands(vec![ball(), wall([0.5, 9.0], 5.0)]));
+        assert!(!beam_lands(vec![ball(), wall([-9.0, 0.5], 5.0)]));
+        // A prism turns it down, by total reflection: 45° are beyond the critical angle.
+        let prism = solid(GLASS, |s, m| {
+            let (a, b, c) = ([-1.0, 1.0], [-1.0, 3.0], [1.0, 1.0]);
+            let at = |x: f32, [y, z]: [f32; 2]| Vec3::new(x, y, z);
+            let (l, r) = (-1.0, 1.0);
+            s.quad([at(l, a), at(r, a), at(r, b), at(l, b)], m);
+            s.quad([at(l, a), at(l, c), at(r, c), at(r, a)], m);
+            s.quad([at(l, b), at(r, b), at(r, c), at(l, c)], m);
+            s.quad([at(l, a), at(l, b), at(l, c), at(l, c)], m);
+            s.quad([at(r, a), at(r, c), at(r, b), at(r, b)], m);
+        });
+        crate::body::check_mesh(&prism).expect("a body");
+        let floor = solid(Bsdf::Diffuse { reflectance: 0.5 }, |s, m| {
+            s.cuboid([-9.0, -3.1, -9.0], [9.0, -3.0, 9.0], m);
+        });
+        assert!(beam_lands(vec![prism.clone(), floor]));
+        assert!(!beam_lands(vec![prism, wall([-9.0, 9.0], 5.0)]));
+    }
 }

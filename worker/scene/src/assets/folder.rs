@@ -8,7 +8,7 @@ use std::{
 use picofarm_files::{FileError, Opener};
 use sha2::{Digest, Sha256};
 
-use crate::{LABELS, Mesh, SceneError, Vec3, import};
+use crate::{LABELS, Mesh, SceneError, Vec3, body, import};
 
 use super::obj::drop_degenerate;
 
@@ -297,6 +297,7 @@ fn parse(row: &Row) -> Result<(Mesh, bool), String> {
         material.check()?;
     }
     drop_degenerate(&mut mesh);
+    body::check_mesh(&mesh)?;
     mesh.make_canonical();
     mesh.name.clone_from(&row.name);
     Ok((mesh, notes.contains_key("transparency")))

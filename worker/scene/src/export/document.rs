@@ -319,15 +319,17 @@ fn material_entry(material: &Material, textures: &mut Textures) -> MaterialEntry
 }
 
 fn glass(bsdf: Bsdf) -> Option<Glass> {
-    let Bsdf::ThinDielectric { ior, face, .. } = bsdf else {
-        return None;
+    let (ior, bounds) = match bsdf {
+        Bsdf::ThinDielectric { ior, face, .. } => (ior, face),
+        Bsdf::Dielectric { ior, .. } => (ior, true),
+        _ => return None,
     };
     Some(Glass {
         transmission: Transmission {
             transmission_factor: 1.0,
         },
         ior: Ior { ior },
-        volume: face.then_some(Volume {
+        volume: bounds.then_some(Volume {
             thickness_factor: THICKNESS_M,
         }),
     })

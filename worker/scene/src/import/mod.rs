@@ -71,8 +71,8 @@ pub fn read_scene(path: &Path) -> Result<Scene, SceneError> {
 ///
 /// Of Mitsuba 3, this is understood: sensor `perspective`; shapes `ply`, `obj`, `rectangle`, `cube`, `disk` and
 /// `sphere`; BSDFs `diffuse`, `roughconductor`, `conductor`, `twosided`, and `blendbsdf` of all these, nested
-/// too; `bitmap` textures, and spectra over wavelengths as reflectances. Beams are emitters `projector` of
-/// `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one place; a shape's category is its id up to the
+/// too; `dielectric` and `thindielectric`; `bitmap` textures, and spectra over wavelengths as reflectances. Beams are
+/// emitters `projector` of `fov` ≤ 2° (or `spot` of `cutoff_angle` ≤ 1°) that start at one place; a shape's category is its id up to the
 /// first `.`. A PLY needs camera and laser from `options`. Whatever a format holds that our scenes do not is named in
 /// the provenance's notes, under keys that start with `import.`, or refused.
 ///

@@ -190,7 +190,7 @@ impl Writer<'_> {
         }
         if written.whole {
             let what = format!(
-                "material {:?}: each face of the glass is a whole pane, which lets the square of its light through",
+                "material {:?}: each face of the glass is a whole pane in Mitsuba, so less light passes and more is reflected",
                 material.name
             );
             self.notes.push(what);

@@ -72,12 +72,16 @@ pub(crate) fn bsdf_text(
         clamped: false,
         whole: false,
     };
-    if let Bsdf::ThinDielectric {
-        ior,
-        transmittance,
-        face,
-    } = material.bsdf
-    {
+    let glass = match material.bsdf {
+        Bsdf::ThinDielectric {
+            ior,
+            transmittance,
+            face,
+        } => Some(("thindielectric", ior, transmittance, face)),
+        Bsdf::Dielectric { ior, transmittance } => Some(("dielectric", ior, transmittance, false)),
+        _ => None,
+    };
+    if let Some((kind, ior, transmittance, face)) = glass {
         let tint = colour(
             &mut out,
             "specular_transmittance",
@@ -86,10 +90,8 @@ pub(crate) fn bsdf_text(
             None,
             transmittance,
         );
-        // What it reflects is left out here as there.
         out.text = format!(
-            "<bsdf type=\"thindielectric\"{}><float name=\"int_ior\" value=\"{ior}\"/><float name=\"ext_ior\" value=\"1\"/>\
-             <rgb name=\"specular_reflectance\" value=\"0 0 0\"/>{tint}</bsdf>",
+            "<bsdf type=\"{kind}\"{}><float name=\"int_ior\" value=\"{ior}\"/><float name=\"ext_ior\" value=\"1\"/>{tint}</bsdf>",
             id_attribute(id)
         );
         out.whole = face;

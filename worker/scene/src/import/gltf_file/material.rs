@@ -126,7 +126,7 @@ impl Walk<'_> {
             .check_spectrum()
             .map_err(|what| format_error(self.path, format!("{extras}.{what}")))?;
         match standard.texture {
-            Some(_) if material.is_glass() => self.note("glass.textures", "left out"),
+            Some(_) if material.transmits() => self.note("glass.textures", "left out"),
             Some(info) if has_uv => {
                 material.texture = Some(self.texture(&info.texture(), &at)?);
             }
@@ -244,7 +244,7 @@ impl Walk<'_> {
         };
         self.note(
             "glass",
-            "thin: light goes straight on, what it reflects and scatters is left out",
+            "thin: light goes straight on or is reflected, what rough glass scatters is left out",
         );
         Some((tint, bsdf))
     }

@@ -25,7 +25,10 @@ const METALS: [(&str, [f32; 3]); 5] = [
     ("Cr", [0.550, 0.556, 0.554]),
     ("Cu", [0.955, 0.638, 0.538]),
 ];
-const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these, or thindielectric by itself";
+const SUBSET: &str = "use diffuse, roughconductor, conductor, twosided or blendbsdf of these, or dielectric or thindielectric by \
+                      itself";
+/// What exports of thin glass stated when its reflections were not rendered.
+const UNREFLECTED: &str = r#"<rgb name="specular_reflectance" value="0 0 0"/>"#;
 
 /// Mitsuba's names of media, with their indices of refraction.
 const MEDIA: [(&str, f64); 5] = [
@@ -55,7 +58,7 @@ impl Reader<'_> {
                 material,
                 to_uv: Matrix::IDENTITY,
             },
-            None if node.kind == "thindielectric" => Look {
+            None if matches!(node.kind.as_str(), "dielectric" | "thindielectric") => Look {
                 material: self.glass(node)?,
                 to_uv: Matrix::IDENTITY,
             },
@@ -96,7 +99,11 @@ impl Reader<'_> {
             two_sided: *two_sided,
             spectrum: spectrum.clone(),
         };
-        if bsdf_text(&node.id, &material, known.texture.as_ref()).text == node.text {
+        let text = match bsdf {
+            Bsdf::ThinDielectric { .. } => &node.text.replacen(UNREFLECTED, "", 1),
+            _ => &node.text,
+        };
+        if bsdf_text(&node.id, &material, known.texture.as_ref()).text == *text {
             let checked = material.check_spectrum();
             checked.map_err(|what| node.fail(format!("comment picofarm: {what}")))?;
             return Ok(Some(material));
@@ -159,7 +166,7 @@ impl Reader<'_> {
         Ok(leaf)
     }
 
-    /// Thin glass.
+    /// Glass, thin or a body.
     fn glass(&mut self, node: &Node) -> Result<Material, String> {
         self.ignored(
             node,
@@ -172,7 +179,15 @@ impl Reader<'_> {
         );
         let ior = index(node, "int_ior", "bk7")? / index(node, "ext_ior", "air")?;
         if !(1.0..=f64::from(Material::MAX_IOR)).contains(&ior) {
-            return Err(node.fail(format!("int_ior / ext_ior = {ior} lies outside [1, 4]")));
+            let hint = match node.kind.as_str() {
+                "dielectric" => {
+                    "; a cavity belongs into the mesh of the body around it, with facets that face the cavity"
+                }
+                _ => "; int_ior is that of the glass",
+            };
+            return Err(node.fail(format!(
+                "int_ior / ext_ior = {ior} lies outside [1, 4]{hint}"
+            )));
         }
         let plain = |colour: Option<Colour>, name: &str| match colour {
             Some(c) if c.texture.is_some() => {
@@ -184,19 +199,28 @@ impl Reader<'_> {
             colour => Ok(colour.unwrap_or(Colour::grey(1.0))),
         };
         let reflected = self.colour(node, "specular_reflectance")?;
-        if plain(reflected, "specular_reflectance")?.mean() > 0.0 {
-            self.note("glass", "what it reflects is left out");
+        if plain(reflected, "specular_reflectance")?.rgb != [1.0; 3] {
+            self.note(
+                "glass",
+                "specular_reflectance is not used: glass reflects what Fresnel's equations say",
+            );
         }
         let tint = self.colour(node, "specular_transmittance")?;
         let tint = plain(tint, "specular_transmittance")?;
-        let mut material = Material::glass(named(node));
-        material.rgb = tint.rgb;
-        material.bsdf = Bsdf::ThinDielectric {
-            ior: ior as f32,
-            transmittance: tint.mean(),
-            face: false,
+        let (ior, transmittance) = (ior as f32, tint.mean());
+        let bsdf = match node.kind.as_str() {
+            "dielectric" => Bsdf::Dielectric { ior, transmittance },
+            _ => Bsdf::ThinDielectric {
+                ior,
+                transmittance,
+                face: false,
+            },
         };
-        Ok(material)
+        Ok(Material {
+            rgb: tint.rgb,
+            bsdf,
+            ..Material::glass(named(node))
+        })
     }
 
     fn conductor(&mut self, node: &Node) -> Result<(Colour, f32, Distribution), String> {

@@ -26,6 +26,7 @@ const TAGS: [(&str, &[&str]); 6] = [
             "twosided",
             "blendbsdf",
             "thindielectric",
+            "dielectric",
         ],
     ),
     ("sensor", &["perspective"]),

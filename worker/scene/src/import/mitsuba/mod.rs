@@ -3,9 +3,9 @@
 //! Understood: sensor `perspective` (`fov`, `fov_axis`, `principal_point_offset_*`, film size); shapes `ply`,
 //! `obj`, `rectangle`, `cube`, `disk` and `sphere` (the last two tessellated); BSDFs `diffuse`,
 //! `roughconductor` (`material` none or a common metal), `conductor` (α = 0.001), `twosided` and `blendbsdf` of
-//! all these, nested too; `bitmap` textures; `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a
-//! reflectance; references, `<default>` parameters, and every transform. A shape without BSDF is Mitsuba's default, a
-//! one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
+//! all these, nested too; `dielectric` on closed shapes and `thindielectric`, by themselves; `bitmap` textures;
+//! `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and
+//! every transform. A shape without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
 //! Integrators, samplers and media are skipped; any other plugin is an error that names it. As in Mitsuba, `rotate`
 //! takes its axis as it is: one of another length than 1 shears.
 //!

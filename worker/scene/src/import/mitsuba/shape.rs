@@ -264,17 +264,21 @@ fn disk() -> Geometry {
     g
 }
 
-/// The unit sphere with its poles on z; u is the azimuth, v the polar angle.
+/// The unit sphere with its poles on z; u is the azimuth, v the polar angle. It is closed: each pole is one place, and where u is
+/// 1 the places are those where it is 0.
 fn sphere() -> Geometry {
     let (rows, columns) = (SPHERE_ROWS, 2 * SPHERE_ROWS);
     let mut g = Geometry::default();
     for r in 0..=rows {
         let v = r as f32 / rows as f32;
-        let (flat, z) = libm::sincosf(std::f32::consts::PI * v);
+        let (flat, z) = match r == rows {
+            true => (0.0, -1.0),
+            false => libm::sincosf(std::f32::consts::PI * v),
+        };
         for c in 0..=columns {
-            let u = c as f32 / columns as f32;
-            let (y, x) = libm::sincosf(std::f32::consts::TAU * u);
-            g.vertex([flat * x, flat * y, z], [u, v]);
+            let turn = (c % columns) as f32 / columns as f32;
+            let (y, x) = libm::sincosf(std::f32::consts::TAU * turn);
+            g.vertex([flat * x, flat * y, z], [c as f32 / columns as f32, v]);
         }
     }
     let at = |r: u32, c: u32| r * (columns + 1) + c;
