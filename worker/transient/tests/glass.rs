@@ -1,4 +1,5 @@
-//! Thin glass by what it must not change, and by closed forms; against an independent tracer in `independent.rs`.
+//! What passes thin glass, by what it must not change, and by closed forms; against an independent tracer in `independent.rs`. What it
+//! reflects is in `by_glass.rs`.
 
 mod common;
 
@@ -152,7 +153,7 @@ fn black_glass_hides_light_and_no_surface() {
         v(-2.0, -1.5, -3.0),
         v(4.0, 0.0, 0.0),
         v(0.0, 3.0, 0.0),
-        glass(1.5, 0.0),
+        glass(1.0, 0.0),
     );
     let (clear, dark) = (furnished(vec![]), furnished(vec![black]));
     let set = settings(Budget::Samples(2));
