@@ -37,7 +37,7 @@ use crate::{
 };
 
 /// Share of the pixels that see no glass which get a path of a pass.
-const ELSEWHERE: f32 = 0.125;
+const ELSEWHERE: f32 = 0.25;
 
 /// Glass as a target of light paths.
 #[derive(Debug)]

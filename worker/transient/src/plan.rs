@@ -101,9 +101,15 @@ pub(crate) fn plan(
             );
         }
     }
-    if walk.world.has_glass() {
-        approximations
-            .push("glass: light goes straight on through it; what it reflects is left out".into());
+    if walk.glass.is_some() && longest >= 2 {
+        strategies.push("glass: light and camera paths by what it reflects and refracts".into());
+        approximations.push(
+            "what the camera sees in glass by light that comes from a spot by glass, and spots seen in glass, are blurred over about a pixel"
+                .into(),
+        );
+    }
+    if walk.world.has_bodies() && settings.one_bounce {
+        approximations.push("one bounce: spots seen through bodies of glass are left out".into());
     }
     if walk.window.is_some() {
         if longest >= 3 {

@@ -87,7 +87,7 @@ impl RenderTask {
                 + if render.per_spot { spots } else { 0 }
                 + render.wavelengths_nm.others().len() as u32,
             split: false,
-            light_paths: render.strategy.caustics != Some(false) && render.max_bounces != 2,
+            light_paths: render.max_bounces != 1,
             threads,
         }
     }

@@ -16,7 +16,7 @@ const SMALL_TILE: f64 = 256.0;
 const TILE_SUMS: (f64, f64) = (3.0, 7.0);
 /// What the sums over light paths take, as a share of what sums of every bin would. They are kept of the bins that light paths come to, in
 /// twice as many bytes each: by the memory that a furnished room of 64×64 pixels took, about a fifth of the bins after 512 passes. Scenes without
-/// mirrors need none; only the scene tells.
+/// mirrors and glass need none; only the scene tells.
 pub(in crate::model) const LIGHT_PATHS: f64 = 0.25;
 
 /// What a render keeps, beside its scene.
@@ -28,7 +28,7 @@ pub struct Rendering {
     pub histograms: u32,
     /// The parts of the histogram are kept with their errors.
     pub split: bool,
-    /// Light paths may be drawn into the image, where mirrors call for them.
+    /// Light paths may be drawn into the image, where mirrors or glass call for them.
     pub light_paths: bool,
     /// Threads that render.
     pub threads: u32,

@@ -38,7 +38,7 @@ fn more_pixels_bins_or_histograms_take_more() {
     ] {
         assert!(of(&job(&more), 0) > base, "{more}");
     }
-    let without = rendering(256, r#", "strategy": {"caustics": false}"#);
+    let without = rendering(256, r#", "max_bounces": 1"#);
     assert!(of(&job(&without), 0) < base);
 }
 

@@ -62,8 +62,7 @@ fn rendering(settings: &Settings, (width, height): (u32, u32), threads: usize) -
         histograms: (1 + settings.groups.len() as u32)
             * settings.wavelengths_nm.nm().len().max(1) as u32,
         split: settings.split,
-        light_paths: settings.strategy.caustics != Some(false)
-            && settings.max_bounces.is_none_or(|most| most >= 3),
+        light_paths: settings.max_bounces.is_none_or(|most| most >= 2),
         threads: threads as u32,
     }
 }
