@@ -205,6 +205,14 @@ impl Tracer {
         None
     }
 
+    /// Whether a ray from the camera meets glass first.
+    pub fn meets_glass(&self, d: P) -> bool {
+        let hit = self.tree.hit(self.origin(), d, f64::INFINITY);
+        let limit = hit.map_or(f64::INFINITY, |h| h.t);
+        let body = hit.is_some_and(|h| matches!(h.bsdf, Bsdf::Dielectric { .. }));
+        body || self.tree.pane(self.origin(), d, limit, NONE).is_some()
+    }
+
     /// The spots of beam `k`: as the beam states it, or by following the beam. It folds at near-mirrors by exact reflection; at
     /// glass it goes on, and a part of it is reflected. What goes on comes first.
     pub fn sources(&self, k: usize) -> Vec<Source> {

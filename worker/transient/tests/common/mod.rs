@@ -5,6 +5,7 @@ pub mod bent;
 pub mod brute;
 pub mod compare;
 pub mod glass;
+pub mod glassware;
 pub mod light;
 pub mod npz;
 pub mod reference;
