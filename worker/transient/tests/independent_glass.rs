@@ -211,7 +211,7 @@ fn furnished_behind_glass() -> Scene {
     let middle = s.camera.origin + s.camera.forward * 1.2;
     let (right, down) = (s.camera.right, s.camera.down);
     s.objects.push(quad(
-        middle - right * 0.9 - down * 0.7,
+        middle - right * 0.85 - down * 0.65,
         right * 1.8 + s.camera.forward * 0.4,
         down * 1.1,
         thin(1.5, 0.8, false),
