@@ -1,7 +1,8 @@
 //! An independent tracer in f64. Light paths start at a spot, scatter as the surfaces do, and each vertex that is no
 //! near-mirror is connected to the camera. What the camera sees in near-mirrors comes from the camera's side: the glint of a
-//! spot by points drawn around its mirror image, all else by camera paths (both in [`super::seen`]). It shares no
-//! code with the renderer.
+//! spot by points drawn around its mirror image, all else by camera paths (both in [`super::seen`]). Glass is in
+//! [`super::glass`], what the camera sees by its reflection and refraction in [`super::bent`]. It shares no code with the
+//! renderer.
 
 use std::f64::consts::PI;
 
@@ -9,7 +10,8 @@ use picofarm_scene::{Bsdf, Distribution, Scene};
 
 use super::{
     brute::{Noise, P, f},
-    tree::{Tree, Vertex},
+    glass::Draw,
+    tree::{NONE, Tree, Vertex},
 };
 
 /// A mean and its standard error.
@@ -90,6 +92,51 @@ pub fn is_mirror(bsdf: Bsdf) -> bool {
     mirror(bsdf).is_some()
 }
 
+/// Which legs of a path so far are bent: reflected at glass, or refracted. A leg is the way between two vertices.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Bends {
+    pub first: bool,
+    pub any: bool,
+    /// Whether one of them is not.
+    pub straight: bool,
+}
+
+impl Bends {
+    /// After one more leg.
+    pub fn and(self, bent: bool) -> Self {
+        let none = !self.any && !self.straight;
+        Self {
+            first: if none { bent } else { self.first },
+            any: self.any || bent,
+            straight: self.straight || !bent,
+        }
+    }
+}
+
+/// Where a light path arrives: vertex, direction back, flux, bounces up to and with this one, its legs.
+#[derive(Debug, Clone, Copy)]
+pub struct Arrival {
+    pub at: Vertex,
+    pub back: P,
+    pub flux: f64,
+    pub bounces: u32,
+    pub bends: Bends,
+}
+
+/// What the camera sees of a light path's vertex, by a straight leg.
+#[derive(Debug, Clone, Copy)]
+pub struct Seen {
+    pub pixel: usize,
+    /// Three bounces and more.
+    pub more: bool,
+    /// Share of the mean.
+    pub value: f64,
+    /// Of the vertex.
+    pub bsdf: Bsdf,
+    /// The legs but that at the camera.
+    pub bends: Bends,
+}
+
 impl Tracer {
     pub fn new(scene: &Scene) -> Self {
         Self {
@@ -100,38 +147,6 @@ impl Tracer {
 
     pub fn origin(&self) -> P {
         P::from(self.scene.camera.origin)
-    }
-
-    /// The spot of beam `k`: as the beam states it, or by following the beam, by exact reflection on near-mirrors.
-    pub fn source(&self, k: usize) -> Option<Source> {
-        let beam = &self.scene.laser.beams[k];
-        if let Some(s) = beam.spot {
-            let materials = &self.scene.objects[s.object as usize].mesh.materials;
-            return Some(Source {
-                p: s.point.into(),
-                n: s.normal.into(),
-                back: P::from(s.arriving) * -1.0,
-                bsdf: materials[s.material as usize].bsdf,
-            });
-        }
-        let mut from = P::from(self.scene.laser.origin);
-        let mut through = 1.0;
-        let mut d = P::from(beam.direction).unit();
-        for _ in 0..64 {
-            let hit = self.tree.hit(from, d, f64::INFINITY)?;
-            through *= self.tree.through(from, hit.p);
-            if !is_mirror(hit.bsdf) {
-                return Some(Source {
-                    p: hit.p,
-                    n: hit.n,
-                    back: d * -1.0,
-                    bsdf: hit.bsdf.scaled(through as f32),
-                });
-            }
-            from = hit.p;
-            d = (d - hit.n * (2.0 * hit.n.dot(d))).unit();
-        }
-        None
     }
 
     /// The film position of a point, pixels; `None` outside of the image.
@@ -200,59 +215,92 @@ impl Tracer {
         let batches: Vec<[f64; 2]> = (0..BATCHES)
             .map(|_| {
                 let mut got = [0.0; 2];
-                self.carry(
-                    &source,
-                    (paths / BATCHES, LONGEST),
-                    &mut rng,
-                    |_, more, value, _| {
-                        got[usize::from(more)] += value;
-                    },
-                );
+                let all = (paths / BATCHES, LONGEST);
+                self.carry(&source, all, &mut rng, |s| {
+                    got[usize::from(s.more)] += s.value;
+                });
                 got
             })
             .collect();
         [0, 1].map(|part| Energy::of(&batches.iter().map(|b| b[part]).collect::<Vec<_>>()))
     }
 
-    /// `paths` light paths from a source, of `longest` bounces at most, their first directions stratified. Each vertex that the camera sees is told to
-    /// `add`: its pixel, whether it is the third bounce or a later one, its share of the mean, and its scattering.
+    /// Light paths from a source, as [`Tracer::arrivals`] draws them. Each vertex that the camera sees is told to `add`.
     pub fn carry(
         &self,
         source: &Source,
-        (paths, longest): (usize, u32),
+        many: (usize, u32),
         rng: &mut Noise,
-        mut add: impl FnMut(usize, bool, f64, Bsdf),
+        mut add: impl FnMut(Seen),
     ) {
-        let first = Vertex {
+        self.arrivals(source, many, Draw::LIGHT, rng, |a| {
+            if let Some((pixel, value)) = self.seen(&a.at, a.back) {
+                add(Seen {
+                    pixel,
+                    more: a.bounces > 2,
+                    value: a.flux * value,
+                    bsdf: a.at.bsdf,
+                    bends: a.bends,
+                });
+            }
+            true
+        });
+    }
+
+    /// `paths` light paths from a source, of `longest` bounces at most, their first directions stratified. `visit` is told each
+    /// vertex after the source, and says whether the path goes on.
+    pub fn arrivals(
+        &self,
+        source: &Source,
+        (paths, longest): (usize, u32),
+        draw: Draw,
+        rng: &mut Noise,
+        mut visit: impl FnMut(&Arrival) -> bool,
+    ) {
+        let at = Vertex {
             p: source.p,
             n: source.n,
             bsdf: source.bsdf,
             t: 0.0,
+            front: true,
+            triangle: NONE,
         };
         let side = (paths as f64).sqrt() as usize;
-        let unit = 1.0 / (side * side) as f64;
         for path in 0..side * side {
-            let (mut at, mut back, mut flux) = (first, source.back, unit);
+            let mut a = Arrival {
+                at,
+                back: source.back,
+                flux: 1.0 / (side * side) as f64,
+                bounces: 1,
+                bends: Bends::default(),
+            };
+            let mut index = 1.0;
             let cell = ((path % side) as f64, (path / side) as f64);
             let mut pair = [cell.0, cell.1].map(|k| (k + rng.next()) / side as f64);
-            for bounces in 2..=longest {
-                let Some((w, weight)) = scatter(&at, back, pair) else {
+            while a.bounces < longest {
+                let Some((w, weight)) = scatter(&a.at, a.back, pair) else {
                     break;
                 };
-                flux *= weight;
-                if bounces > 8 {
+                a.flux *= weight;
+                if a.bounces > 7 {
                     if rng.next() > 0.7 {
                         break;
                     }
-                    flux /= 0.7;
+                    a.flux /= 0.7;
                 }
-                let Some(next) = self.tree.hit(at.p, w, f64::INFINITY) else {
+                let Some(leg) = self.leg((a.at.p, w), index, draw, rng) else {
                     break;
                 };
-                flux *= self.tree.through(at.p, next.p);
-                (at, back) = (next, w * -1.0);
-                if let Some((pixel, value)) = self.seen(&at, back) {
-                    add(pixel, bounces > 2, flux * value, at.bsdf);
+                index = leg.index;
+                a = Arrival {
+                    at: leg.end,
+                    back: leg.d * -1.0,
+                    flux: a.flux * leg.weight,
+                    bounces: a.bounces + 1 + leg.reflections,
+                    bends: a.bends.and(leg.bent),
+                };
+                if a.bounces > longest || !visit(&a) {
+                    break;
                 }
                 pair = [rng.next(), rng.next()];
             }

@@ -1,7 +1,11 @@
 //! Helpers of the integration tests: small scenes, settings, and the reference transients.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod bent;
 pub mod brute;
+pub mod compare;
+pub mod glass;
+pub mod glassware;
 pub mod light;
 pub mod npz;
 pub mod reference;

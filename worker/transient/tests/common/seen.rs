@@ -159,7 +159,7 @@ impl Tracer {
     }
 
     /// Radiance towards `wo` by one scattering of a spot's light.
-    fn lit(&self, x: &Vertex, wo: P, source: &Source) -> f64 {
+    pub fn lit(&self, x: &Vertex, wo: P, source: &Source) -> f64 {
         let to = source.p - x.p;
         let d = to.length();
         let w = to * (1.0 / d);
@@ -194,30 +194,9 @@ impl Tracer {
         if images.is_empty() {
             return;
         }
-        let i = &self.scene.camera.intrinsics;
-        let (width, pixels) = (i.width as usize, (i.width * i.height) as usize);
-        let mut listed = vec![false; pixels];
-        for &k in likely {
-            listed[k] = true;
-        }
-        let chosen = if likely.is_empty() { 0.0 } else { 0.9 };
+        let films = Films::new(self, likely);
         for sample in 0..samples {
-            // Pixels in turn, so that each gets its share.
-            let turn = (sample as f64 + rng.next()) / samples as f64;
-            let pixel = if turn < chosen {
-                likely[(turn / chosen * likely.len() as f64) as usize]
-            } else {
-                ((turn - chosen) / (1.0 - chosen) * pixels as f64) as usize
-            };
-            let mut density = (1.0 - chosen) / pixels as f64;
-            if listed[pixel] {
-                density += chosen / likely.len() as f64;
-            }
-            let unit = 1.0 / (density * samples as f64);
-            let film = (
-                (pixel % width) as f64 + rng.next(),
-                (pixel / width) as f64 + rng.next(),
-            );
+            let (film, unit) = films.draw(sample, samples, rng);
             let d = self.ray(film);
             let Some(mut at) = self.tree.hit(self.origin(), d, f64::INFINITY) else {
                 continue;
@@ -251,6 +230,51 @@ impl Tracer {
             }
             add(self.pixel(film), got);
         }
+    }
+}
+
+/// Film positions: nine in ten in pixels of a list, the others anywhere.
+pub struct Films<'a> {
+    likely: &'a [usize],
+    listed: Vec<bool>,
+    chosen: f64,
+    width: usize,
+}
+
+impl<'a> Films<'a> {
+    pub fn new(tracer: &Tracer, likely: &'a [usize]) -> Self {
+        let i = &tracer.scene.camera.intrinsics;
+        let mut listed = vec![false; (i.width * i.height) as usize];
+        for &k in likely {
+            listed[k] = true;
+        }
+        Self {
+            likely,
+            listed,
+            chosen: if likely.is_empty() { 0.0 } else { 0.9 },
+            width: i.width as usize,
+        }
+    }
+
+    /// One of `samples` positions, and its share of the sum over the pixels of their means.
+    pub fn draw(&self, sample: usize, samples: usize, rng: &mut Noise) -> ((f64, f64), f64) {
+        let (chosen, pixels) = (self.chosen, self.listed.len() as f64);
+        // Pixels in turn, so that each gets its share.
+        let turn = (sample as f64 + rng.next()) / samples as f64;
+        let pixel = if turn < chosen {
+            self.likely[(turn / chosen * self.likely.len() as f64) as usize]
+        } else {
+            ((turn - chosen) / (1.0 - chosen) * pixels) as usize
+        };
+        let mut density = (1.0 - chosen) / pixels;
+        if self.listed[pixel] {
+            density += chosen / self.likely.len() as f64;
+        }
+        let film = (
+            (pixel % self.width) as f64 + rng.next(),
+            (pixel / self.width) as f64 + rng.next(),
+        );
+        (film, 1.0 / (density * samples as f64))
     }
 }
 

@@ -2,7 +2,7 @@
 
 use picofarm_scene::{Bsdf, Scene};
 
-use super::brute::P;
+use super::{brute::P, glass};
 
 /// Triangles in a leaf, at most.
 const LEAF: usize = 4;
@@ -23,13 +23,16 @@ struct Node {
     range: std::ops::Range<usize>,
 }
 
-/// A surface point: place, unit normal on the side it was met from, scattering there, distance.
+/// A surface point: place, unit normal on the side it was met from, scattering there, distance; whether that side is the
+/// triangle's front, and which triangle it is.
 #[derive(Debug, Clone, Copy)]
 pub struct Vertex {
     pub p: P,
     pub n: P,
     pub bsdf: Bsdf,
     pub t: f64,
+    pub front: bool,
+    pub triangle: usize,
 }
 
 /// A binary tree of boxes, split at the median, and the glass beside it.
@@ -39,18 +42,8 @@ pub struct Tree {
     panes: Vec<Triangle>,
 }
 
-/// Share of light that passes a pane: reflections to and fro between its faces summed one by one, polarisations apart.
-fn passes(ior: f64, cos: f64) -> f64 {
-    let inside = (1.0 - cos.acos().sin().powi(2) / (ior * ior)).sqrt();
-    let s = ((cos - ior * inside) / (cos + ior * inside)).powi(2);
-    let p = ((ior * cos - inside) / (ior * cos + inside)).powi(2);
-    let series = |r: f64| {
-        (0..200)
-            .map(|k| (1.0 - r).powi(2) * r.powi(2 * k))
-            .sum::<f64>()
-    };
-    0.5 * (series(s) + series(p))
-}
+/// No triangle.
+pub const NONE: usize = usize::MAX;
 
 impl Tree {
     pub fn new(scene: &Scene) -> Self {
@@ -65,15 +58,16 @@ impl Tree {
                     "textures are not for this tracer"
                 );
                 let black = Bsdf::Diffuse { reflectance: 0.0 };
-                let list = match material.bsdf {
-                    Bsdf::ThinDielectric { .. } => &mut panes,
-                    _ => &mut triangles,
+                let (list, both) = match material.bsdf {
+                    Bsdf::ThinDielectric { .. } => (&mut panes, true),
+                    Bsdf::Dielectric { .. } => (&mut triangles, true),
+                    _ => (&mut triangles, material.two_sided),
                 };
                 if n.length() > 0.0 {
                     list.push(Triangle {
                         corners,
                         normal: n.unit(),
-                        sides: match material.two_sided {
+                        sides: match both {
                             true => [material.bsdf; 2],
                             false => [material.bsdf, black],
                         },
@@ -97,21 +91,33 @@ impl Tree {
         let d = way.unit();
         let across = |pane: &&Triangle| pane.distance(a, d, way.length()).is_some();
         self.panes.iter().filter(across).fold(1.0, |all, pane| {
-            let Bsdf::ThinDielectric {
-                ior,
-                transmittance,
-                face,
-            } = pane.sides[0]
-            else {
-                panic!("a pane is of glass");
-            };
-            let whole = passes(f64::from(ior), pane.normal.dot(d).abs()) * f64::from(transmittance);
-            all * if face { whole.sqrt() } else { whole }
+            let cos = pane.normal.dot(d);
+            all * glass::pane(pane.sides[0], cos.abs(), cos <= 0.0).passes
         })
+    }
+
+    /// The first pane of thin glass along a unit direction, nearer than `limit` and other than `left`.
+    pub fn pane(&self, o: P, d: P, limit: f64, left: usize) -> Option<Vertex> {
+        let (mut nearest, mut best) = (limit, None);
+        for (k, pane) in self.panes.iter().enumerate() {
+            let k = self.triangles.len() + k;
+            if k == left {
+                continue;
+            }
+            if let Some(t) = pane.distance(o, d, nearest) {
+                (nearest, best) = (t, Some((k, pane)));
+            }
+        }
+        best.map(|(k, pane)| pane.vertex(k, (o, d), nearest))
     }
 
     /// The first surface along a unit direction, beyond 1e-11 and nearer than `limit`.
     pub fn hit(&self, o: P, d: P, limit: f64) -> Option<Vertex> {
+        self.hit_but(o, d, limit, NONE)
+    }
+
+    /// The same among the triangles other than `left`: the one that the ray leaves.
+    pub fn hit_but(&self, o: P, d: P, limit: f64, left: usize) -> Option<Vertex> {
         let (origin, inverse) = ([o.0, o.1, o.2], [1.0 / d.0, 1.0 / d.1, 1.0 / d.2]);
         let (mut nearest, mut best) = (limit, None);
         let mut stack = [0usize; 64];
@@ -129,21 +135,16 @@ impl Tree {
                 depth += 2;
                 continue;
             }
-            for triangle in &self.triangles[node.range.clone()] {
-                if let Some(t) = triangle.distance(o, d, nearest) {
-                    (nearest, best) = (t, Some(triangle));
+            for k in node.range.clone() {
+                if k == left {
+                    continue;
+                }
+                if let Some(t) = self.triangles[k].distance(o, d, nearest) {
+                    (nearest, best) = (t, Some(k));
                 }
             }
         }
-        best.map(|triangle| {
-            let front = triangle.normal.dot(d) <= 0.0;
-            Vertex {
-                p: o + d * nearest,
-                n: triangle.normal * if front { 1.0 } else { -1.0 },
-                bsdf: triangle.sides[usize::from(!front)],
-                t: nearest,
-            }
-        })
+        best.map(|k| self.triangles[k].vertex(k, (o, d), nearest))
     }
 
     /// True where nothing stands between two points.
@@ -154,6 +155,19 @@ impl Tree {
 }
 
 impl Triangle {
+    /// The point of triangle `k`, which is this one, at a distance along a ray.
+    fn vertex(&self, k: usize, (o, d): (P, P), t: f64) -> Vertex {
+        let front = self.normal.dot(d) <= 0.0;
+        Vertex {
+            p: o + d * t,
+            n: self.normal * if front { 1.0 } else { -1.0 },
+            bsdf: self.sides[usize::from(!front)],
+            t,
+            front,
+            triangle: k,
+        }
+    }
+
     /// Möller and Trumbore 1997; edges belong to both of their triangles.
     fn distance(&self, o: P, d: P, nearest: f64) -> Option<f64> {
         let v = &self.corners;

@@ -1,0 +1,154 @@
+//! What the camera sees by reflection and refraction at glass, from the camera's side: paths whose leg at the camera is bent
+//! ([`super::light::Bends`]). They are connected to spots by a straight leg; where the leg at the spot is bent too, to
+//! vertices of light paths. Paths without any straight leg are left out.
+
+use super::{
+    brute::{Noise, P, f},
+    glass::Draw,
+    light::{Arrival, Bends, LONGEST, Source, Tracer, scatter},
+    seen::Films,
+    tree::Vertex,
+};
+
+/// Which of its straight legs connects a path that is bent at both ends. Each gives the same energy.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Connects {
+    /// The one nearest to the spot: before it the light path is bent in all legs.
+    NearestToSpot,
+    /// The one nearest to the camera.
+    NearestToCamera,
+}
+
+/// What a camera path found.
+#[derive(Debug, Clone, Copy)]
+pub struct Found {
+    pub pixel: usize,
+    /// Three bounces and more.
+    pub more: bool,
+    /// The leg at the spot is bent, too.
+    pub both: bool,
+    /// Share of the mean.
+    pub value: f64,
+}
+
+impl Tracer {
+    /// Vertices of `paths` light paths, bent in their first leg, to connect camera paths to.
+    pub fn lights(
+        &self,
+        sources: &[Source],
+        paths: usize,
+        connects: Connects,
+        rng: &mut Noise,
+    ) -> Vec<Arrival> {
+        let mut all = vec![];
+        for s in sources {
+            let many = (paths / sources.len(), LONGEST);
+            self.arrivals(s, many, Draw::LIGHT.bending(), rng, |a| {
+                let on = match connects {
+                    Connects::NearestToSpot => !a.bends.straight,
+                    Connects::NearestToCamera => a.bends.first,
+                };
+                if on {
+                    all.push(*a);
+                }
+                on
+            });
+        }
+        all
+    }
+
+    /// `samples` camera paths that are bent in their first leg, nine in ten through the pixels of `likely`. `lights` are those
+    /// of [`Tracer::lights`] for the same connection.
+    pub fn past_glass(
+        &self,
+        (sources, lights, connects): (&[Source], &[Arrival], Connects),
+        likely: &[usize],
+        samples: usize,
+        rng: &mut Noise,
+        mut add: impl FnMut(Found),
+    ) {
+        let films = Films::new(self, likely);
+        for sample in 0..samples {
+            let (film, mut beta) = films.draw(sample, samples, rng);
+            let mut draw = Draw::CAMERA.bending();
+            let (mut from, mut index, mut bounces) = ((self.origin(), self.ray(film)), 1.0, 0);
+            let mut bends = Bends::default();
+            while bounces < LONGEST {
+                let Some(leg) = self.leg(from, index, draw, rng) else {
+                    break;
+                };
+                bends = bends.and(leg.bent);
+                if !bends.first {
+                    break;
+                }
+                (index, draw) = (leg.index, Draw::CAMERA);
+                beta *= leg.weight;
+                bounces += 1 + leg.reflections;
+                let (at, back) = (leg.end, leg.d * -1.0);
+                let mut found = |bounces: u32, both, value: f64| {
+                    if value > 0.0 {
+                        add(Found {
+                            pixel: self.pixel(film),
+                            more: bounces > 2,
+                            both,
+                            value,
+                        });
+                    }
+                };
+                for s in sources {
+                    found(bounces + 1, false, beta * self.lit(&at, back, s));
+                }
+                if connects == Connects::NearestToSpot || !bends.straight {
+                    // Three vertices at least.
+                    found(3, true, beta * self.joined(&at, back, lights, rng));
+                }
+                let pair = [rng.next(), rng.next()];
+                let Some((w, weight)) = scatter(&at, back, pair) else {
+                    break;
+                };
+                beta *= weight;
+                if bounces > 7 {
+                    if rng.next() > 0.7 {
+                        break;
+                    }
+                    beta /= 0.7;
+                }
+                from = (at.p, w);
+            }
+        }
+    }
+
+    /// Radiance towards `back` by light that comes straight from the vertices of light paths: one of them is drawn by what it
+    /// would bring if nothing stood between, so that pairs that nearly touch bring no more than others.
+    fn joined(&self, x: &Vertex, back: P, lights: &[Arrival], rng: &mut Noise) -> f64 {
+        let brings = |a: &Arrival| {
+            let to = a.at.p - x.p;
+            let d2 = to.dot(to);
+            let w = to * (1.0 / d2.sqrt());
+            let (c, l) = (x.n.dot(w), -a.at.n.dot(w));
+            if !(c > 0.0 && l > 0.0) {
+                return 0.0;
+            }
+            let there = a.flux * f(a.at.bsdf, a.at.n, a.back, w * -1.0);
+            f(x.bsdf, x.n, back, w) * c * l * there / d2
+        };
+        let sums: Vec<f64> = lights
+            .iter()
+            .scan(0.0, |sum, a| {
+                *sum += brings(a);
+                Some(*sum)
+            })
+            .collect();
+        let whole = sums.last().copied().unwrap_or(0.0);
+        if whole <= 0.0 {
+            return 0.0;
+        }
+        let at = whole * rng.next();
+        let one = sums.partition_point(|s| *s <= at).min(sums.len() - 1);
+        let p = lights[one].at.p;
+        match self.tree.free(x.p, p) {
+            true => whole * self.tree.through(x.p, p),
+            false => 0.0,
+        }
+    }
+}
