@@ -183,7 +183,7 @@ impl BeamRay {
 /// The share of a beam's light that glass lets through to its spot: along the beam, or in a straight line where the spot is
 /// stated elsewhere.
 fn through(world: &World, stack: &mut Stack, direction: Vec3, spot: &Spot) -> f32 {
-    if !world.has_glass() {
+    if !world.has_glass() && !world.has_bodies() {
         return 1.0;
     }
     let p = world.inward(spot.point);

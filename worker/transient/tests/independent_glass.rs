@@ -8,7 +8,7 @@ use common::{
     bent::Connects,
     brute::{Noise, P},
     compare::{BATCHES, Energies, PARTS, Sums, alike, effort, joined, regions, rendered},
-    glassware::{body, cuboid, inverted, thin},
+    glassware::{body, cuboid, inverted, thin, together},
     grey,
     light::{Energy, LONGEST, Source, Tracer, is_mirror},
     near, quad, room, scene, sphere, v,
@@ -24,19 +24,23 @@ use rayon::prelude::*;
 const PIXELS: u32 = 64;
 
 /// What bends which legs.
-const CLASSES: [&str; 4] = [
+const CLASSES: [&str; 5] = [
     "nothing bent",
     "bent, but not at the camera",
     "bent at the camera, not at the spot",
-    "bent at both",
+    "bent at both, not in between",
+    "all bent",
 ];
 
 /// `[class]` of `[region][part]`.
-type Classes = [Sums; 4];
+type Classes = [Sums; 5];
 
-/// Pixels of glass.
+/// Pixels of glass, and those of spots: laser and camera are in one place, so that glass before a spot shows the one that it makes
+/// by reflecting the beam.
 fn glassy(regions: &[usize]) -> Vec<usize> {
-    (0..regions.len()).filter(|&k| regions[k] == 2).collect()
+    let glass = (0..regions.len()).filter(|&k| regions[k] == 2);
+    let spots = (0..regions.len()).filter(|&k| regions[k] == 1);
+    glass.chain(spots).collect()
 }
 
 /// Paths that arrive at the camera by a straight leg.
@@ -71,7 +75,7 @@ fn bent(
     let lights = tracer.lights(sources, lights, connects, rng);
     let from = (sources, &lights[..], connects);
     tracer.past_glass(from, &glassy(regions), cameras, rng, |found| {
-        let class = 2 + usize::from(found.both);
+        let class = 2 + found.ends as usize;
         all[class][regions[found.pixel]][usize::from(found.more)] += found.value;
     });
 }
@@ -180,8 +184,9 @@ fn ball_and_cube() -> Scene {
 fn vessel() -> Scene {
     let mut objects = room(v(-2.0, -1.5, -4.0), v(2.0, 1.5, 1.0), &grey(0.6));
     let middle = v(-0.6, -0.4, -2.3);
-    objects.push(sphere(middle, 0.55, 3, body(1.5, 0.95)));
-    objects.push(inverted(&sphere(middle, 0.45, 3, body(1.5, 0.95))));
+    let outside = sphere(middle, 0.55, 3, body(1.5, 0.95));
+    let inside = inverted(&sphere(middle, 0.45, 3, body(1.5, 0.95)));
+    objects.push(together(&outside, &inside));
     objects.push(cuboid(
         v(0.9, 0.0, -2.6),
         v(0.7, 0.9, 0.01),

@@ -1,6 +1,9 @@
 //! What the camera sees by reflection and refraction at glass, from the camera's side: paths whose leg at the camera is bent
 //! ([`super::light::Bends`]). They are connected to spots by a straight leg; where the leg at the spot is bent too, to
-//! vertices of light paths. Paths without any straight leg are left out.
+//! vertices of light paths. Where no leg is straight, camera path and light path are taken to meet where their ends are closer than
+//! [`MEET`].
+
+use std::f64::consts::PI;
 
 use super::{
     brute::{Noise, P, f},
@@ -19,16 +22,39 @@ pub enum Connects {
     NearestToCamera,
 }
 
+/// How far apart the ends of a camera path and of a light path are at most, metres, where no leg is straight.
+const MEET: f64 = 0.03;
+
+/// Which legs of a path are bent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Ends {
+    /// The one at the camera, and not the one at the spot.
+    Camera,
+    /// Both, but not all.
+    Both,
+    /// All.
+    All,
+}
+
 /// What a camera path found.
 #[derive(Debug, Clone, Copy)]
 pub struct Found {
     pub pixel: usize,
     /// Three bounces and more.
     pub more: bool,
-    /// The leg at the spot is bent, too.
-    pub both: bool,
+    pub ends: Ends,
     /// Share of the mean.
     pub value: f64,
+}
+
+/// Radiance towards `back` by the flux of a light path that ends near by, spread over a disc.
+fn meeting(x: &Vertex, back: P, a: &Arrival) -> f64 {
+    let to = a.at.p - x.p;
+    let near = to.length() < MEET && to.dot(x.n).abs() < 1e-2 && x.n.dot(a.at.n) > 0.9;
+    match near {
+        true => a.flux * f(a.at.bsdf, a.at.n, a.back, back) / (PI * MEET * MEET),
+        false => 0.0,
+    }
 }
 
 impl Tracer {
@@ -85,22 +111,31 @@ impl Tracer {
                 beta *= leg.weight;
                 bounces += 1 + leg.reflections;
                 let (at, back) = (leg.end, leg.d * -1.0);
-                let mut found = |bounces: u32, both, value: f64| {
+                let mut found = |bounces: u32, ends, value: f64| {
                     if value > 0.0 {
                         add(Found {
                             pixel: self.pixel(film),
                             more: bounces > 2,
-                            both,
+                            ends,
                             value,
                         });
                     }
                 };
+                if bounces == 1 + leg.reflections && connects == Connects::NearestToSpot {
+                    let spots = sources.iter().map(Arrival::at_spot);
+                    for a in spots.chain(lights.iter().copied()) {
+                        let all = bounces - 1 + a.bounces;
+                        if all >= 2 {
+                            found(all, Ends::All, beta * meeting(&at, back, &a));
+                        }
+                    }
+                }
                 for s in sources {
-                    found(bounces + 1, false, beta * self.lit(&at, back, s));
+                    found(bounces + 1, Ends::Camera, beta * self.lit(&at, back, s));
                 }
                 if connects == Connects::NearestToSpot || !bends.straight {
                     // Three vertices at least.
-                    found(3, true, beta * self.joined(&at, back, lights, rng));
+                    found(3, Ends::Both, beta * self.joined(&at, back, lights, rng));
                 }
                 let pair = [rng.next(), rng.next()];
                 let Some((w, weight)) = scatter(&at, back, pair) else {

@@ -33,6 +33,15 @@ pub fn inverted(o: &Object) -> Object {
     )
 }
 
+/// Two objects of one material as one: both surfaces of a vessel.
+pub fn together(a: &Object, b: &Object) -> Object {
+    let (mut positions, mut triangles) = (a.mesh.positions.clone(), a.mesh.triangles.clone());
+    let first = positions.len() as u32;
+    positions.extend(&b.mesh.positions);
+    triangles.extend(b.mesh.triangles.iter().map(|t| t.map(|k| first + k)));
+    object("vessel", positions, triangles, a.mesh.materials[0].clone())
+}
+
 /// A box, seen from outside, turned by an angle around the vertical through its middle. One object: a body.
 pub fn cuboid(middle: Vec3, half: Vec3, angle: f32, m: Material) -> Object {
     let (s, c) = angle.sin_cos();

@@ -123,6 +123,26 @@ pub struct Arrival {
     pub bends: Bends,
 }
 
+impl Arrival {
+    /// The laser's, at a spot.
+    pub fn at_spot(s: &Source) -> Self {
+        Self {
+            at: Vertex {
+                p: s.p,
+                n: s.n,
+                bsdf: s.bsdf,
+                t: 0.0,
+                front: true,
+                triangle: NONE,
+            },
+            back: s.back,
+            flux: 1.0,
+            bounces: 1,
+            bends: Bends::default(),
+        }
+    }
+}
+
 /// What the camera sees of a light path's vertex, by a straight leg.
 #[derive(Debug, Clone, Copy)]
 pub struct Seen {
