@@ -163,7 +163,7 @@ fn light_takes_its_time_through_a_body_and_loses_what_fresnel_says() {
             bins: 2000,
         },
         max_bounces: Some(2),
-        ..settings(Budget::Samples(64))
+        ..settings(Budget::Samples(1024))
     };
     // Energy and mean path of the middle pixel.
     let middle = |ior| {

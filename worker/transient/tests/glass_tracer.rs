@@ -5,7 +5,7 @@ mod common;
 use std::f64::consts::PI;
 
 use common::{
-    bent::Connects,
+    bent::{Connects, Ends},
     brute::{Noise, P},
     compare::{BATCHES, PARTS, regions},
     glass::{Draw, fresnel, pane},
@@ -234,7 +234,13 @@ fn ends(scene: &Scene, camera: Camera, source: &Source) -> [[[Energy; 2]; 2]; 2]
             let from = (&sources[..], &lights[..], connects);
             tracer.past_glass(from, &likely, 40_000, &mut rng, |found| {
                 let part = usize::from(found.more);
-                all[1][usize::from(found.both)][part] += found.value * weigh(found.pixel);
+                let both = match found.ends {
+                    Ends::Camera => 0,
+                    Ends::Both => 1,
+                    // Found from neither side.
+                    Ends::All => return,
+                };
+                all[1][both][part] += found.value * weigh(found.pixel);
             });
             all
         })

@@ -13,9 +13,11 @@ use crate::{
 
 /// How often at least a body's reflection is chosen, where there is any.
 const REFLECT: f32 = 0.1;
-/// Turns of one leg before Russian roulette sets in, and what it keeps.
-const SURE_TURNS: u32 = 8;
-const KEEP: f32 = 0.7;
+/// Turns of one leg before Russian roulette sets in where light got lost, and at most. Roulette must not end what is reflected whole
+/// again and again: few such rays would be left, of many times the weight.
+const SURE_TURNS: u32 = 4;
+const MOST_TURNS: u32 = 400;
+
 /// A ray on a leg.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ray {
@@ -168,12 +170,12 @@ fn follow(
     rng: &mut Rng,
     (stack, crossings): (&mut Stack, &mut Vec<Crossing>),
 ) -> Option<(Ray, Hit)> {
-    for turn in 0.. {
-        if turn >= SURE_TURNS {
-            if rng.uniform() >= KEEP {
+    for turn in 0..MOST_TURNS {
+        if turn >= SURE_TURNS && ray.weight < 1.0 {
+            if rng.uniform() >= ray.weight {
                 return None;
             }
-            ray.weight /= KEEP;
+            ray.weight = 1.0;
         }
         let hit = world.ahead(stack, ray.from, ray.w, crossings);
         let body = hit.as_ref().and_then(|h| world.body(h.triangle));
