@@ -5,7 +5,8 @@
 //! bodies are black. Call the way between two surface points a *leg*, the camera's first and the spot's last, and say that it is
 //! *turned* where glass reflects or refracts light on it. Paths without a turned leg are the other techniques'; of the rest
 //!
-//! 1. those whose last leg is straight are camera paths, connected to the spots;
+//! 1. those whose last leg is straight, or turned by the reflection of one planar pane alone, are camera paths, connected to the spots
+//!    and to their [`images`];
 //! 2. the others are light paths. Read from the camera, the first straight leg joins the two: where it is the camera's own, the
 //!    light path is drawn into the image; else camera paths whose legs are all turned are connected to the light path's vertices.
 //!
@@ -18,12 +19,14 @@
 //! than light does, since only such paths bring anything.
 
 mod camera;
+mod images;
 mod light;
 mod photons;
 mod ray;
 
 use picofarm_scene::Vec3;
 
+use self::images::Images;
 pub(crate) use self::photons::Photons;
 use crate::{
     api::{RenderError, Stop},
@@ -36,8 +39,11 @@ use crate::{
     world::World,
 };
 
-/// Share of the pixels that see no glass which get a path of a pass.
+/// Share of the camera paths of pixels that see no glass which go on beyond their first point.
 const ELSEWHERE: f32 = 0.25;
+
+/// How often light paths aim at panes in which spots have images, as a share of what they send on.
+const IMAGED: f32 = 0.1;
 
 /// Glass as a target of light paths.
 #[derive(Debug)]
@@ -46,6 +52,7 @@ pub(crate) struct ByGlass {
     /// Index among the targets by pane, and by triangle; [`NONE`] for what is none.
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
+    images: Images,
     /// Row-major: the pixel or one of its neighbours sees glass.
     sees: Vec<bool>,
     /// Index of refraction around the camera.
@@ -86,12 +93,15 @@ impl ByGlass {
     /// [`RenderError::Stopped`].
     pub fn find(walk: &Walk, centres: &Centres, stop: Stop) -> Result<Option<Self>, RenderError> {
         let (world, emitters) = (walk.world, walk.emitters);
+        let images = Images::find(world);
         let mut all = vec![];
         let mut of_pane = vec![];
         let mut of_triangle = vec![NONE; world.triangles.len()];
         for (k, (corners, normal)) in world.panes.iter().flat_map(|p| p.triangles()).enumerate() {
             let panes = world.panes.as_ref().expect("there is a pane");
             let share = panes.reflectance(k);
+            // Light paths bring what else is turned on the way from there.
+            let rest = if images.has(k as u32) { IMAGED } else { 1.0 };
             of_pane.push(NONE);
             if share > 0.0 && normal != Vec3::ZERO {
                 of_pane[k] = all.len() as u32;
@@ -100,7 +110,7 @@ impl ByGlass {
                     normal,
                     two_sided: panes.two_sided(k),
                     counts: world.near(&corners),
-                    share,
+                    share: rest * share,
                 });
             }
         }
@@ -127,6 +137,7 @@ impl ByGlass {
         let forward = world.camera.forward;
         Ok(targets.map(|targets| Self {
             targets,
+            images,
             of_pane,
             of_triangle,
             sees: sees(world, centres, &mut stack),
@@ -134,11 +145,12 @@ impl ByGlass {
         }))
     }
 
-    /// Whether a pixel gets a camera path of a pass, by a random number, and by what it is multiplied.
-    pub fn chance(&self, pixel: usize, u: f32) -> Option<f32> {
-        match self.sees[pixel] {
-            true => Some(1.0),
-            false => (u < ELSEWHERE).then_some(1.0 / ELSEWHERE),
+    /// How likely the camera path of a pixel goes on beyond its first point, and whether there is one at all where it does not.
+    fn chance(&self, pixel: u32) -> f32 {
+        if self.sees[pixel as usize] {
+            1.0
+        } else {
+            ELSEWHERE
         }
     }
 }

@@ -167,6 +167,11 @@ impl Panes {
         self.glass[pane].reflects(1.0, true)
     }
 
+    /// What a triangle's front reflects at an angle with this cosine, never nothing.
+    pub fn weight(&self, pane: usize, cos: f32) -> f32 {
+        self.glass[pane].reflects(cos, true).max(1e-3)
+    }
+
     /// Whether a triangle's back reflects as its front does.
     pub fn two_sided(&self, pane: usize) -> bool {
         !self.glass[pane].face

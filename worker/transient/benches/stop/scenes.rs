@@ -184,6 +184,33 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         specular_at_least: 0,
         ..FurnishedSettings::default()
     };
+    // Panes that reflect, and bodies that refract; and the same rooms without them.
+    let mut clear = walls();
+    clear.push(sphere(v(0.9, -1.0, -2.9), 0.4, 3, grey(0.5)));
+    let mut windows = clear.clone();
+    windows.push(quad(
+        v(-1.4, -0.9, -3.9),
+        v(2.8, 0.0, 0.0),
+        v(0.0, 1.9, 0.0),
+        Material::glass("window"),
+    ));
+    windows.push(quad(
+        v(-2.0, -1.5, -2.0),
+        v(2.4, 0.0, -0.5),
+        v(0.0, 2.2, 0.0),
+        Material::glass("partition"),
+    ));
+    let mut bodies = clear.clone();
+    let liquid = Material {
+        bsdf: Bsdf::Dielectric {
+            ior: 1.33,
+            transmittance: 0.8,
+        },
+        ..Material::solid_glass("liquid")
+    };
+    let glass = Material::solid_glass("glass");
+    bodies.push(sphere(v(-0.7, -0.7, -2.4), 0.5, 3, glass));
+    bodies.push(sphere(v(0.5, 0.3, -2.8), 0.35, 3, liquid));
     let furnished = |seed| furnished::generate(seed, &furniture, &library).expect("sound settings");
 
     let mut all: Vec<(String, Scene)> = [
@@ -194,6 +221,9 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         ("glossy", scene(glossy, pixels, &BEAMS[..2])),
         ("primitive", plain),
         ("pair", scene(pair, pixels, &BEAMS)),
+        ("windows", scene(windows, pixels, &BEAMS)),
+        ("bodies", scene(bodies, pixels, &BEAMS)),
+        ("no-glass", scene(clear, pixels, &BEAMS)),
         ("furnished-5", furnished(5)),
         ("furnished-8", furnished(8)),
     ]

@@ -18,22 +18,36 @@ use crate::{
 
 /// How often at least a pane's reflection is chosen where nothing was turned yet.
 const SEEK: f32 = 0.5;
+/// Images that the first point is connected to at most, and that any other is.
+const IMAGES: (u32, u32) = (4, 1);
 /// Spots that a vertex after the first is connected to at most, and light vertices that any is.
 const SPOTS: u32 = 2;
 const LIGHTS: u32 = 1;
 
 impl ByGlass {
-    /// A camera path through a point of the film, of which `weight` counts: what it finds by connecting to the spots and to the
-    /// light vertices that were laid, and among the photons.
+    /// A camera path through a point of the film: what it finds by connecting to the spots, their images and the light vertices that
+    /// were laid, and among the photons.
     pub fn look(
         &self,
         (walk, film, photons): (&Walk, &Film, &Photons),
-        (pixel, ray, weight): (u32, Vec3, f32),
+        (pixel, ray): (u32, Vec3),
         rng: &mut Rng,
         buffers: &mut Buffers,
         out: &mut Vec<Splat>,
     ) {
         let (world, origin) = (walk.world, Vec3::ZERO);
+        let chance = self.chance(pixel);
+        // Without images there is nothing at a first point that sees no glass.
+        let (mut weight, mut goes_on) = (1.0, true);
+        if chance < 1.0 {
+            goes_on = rng.uniform() < chance;
+            if !goes_on && !self.images.any() {
+                return;
+            }
+            if !self.images.any() {
+                weight = 1.0 / chance;
+            }
+        }
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
         let mut path = Carried {
             weight,
@@ -50,8 +64,8 @@ impl ByGlass {
                 return;
             };
             let first = path.bounces == 0;
-            turned |= point.turned;
-            all &= point.turned;
+            turned |= point.turns > 0;
+            all &= point.turns > 0;
             if point.hit.surface.is_black() {
                 return;
             }
@@ -71,8 +85,18 @@ impl ByGlass {
                 let count = if first { ALL } else { SPOTS };
                 connect((walk, film), (&point, pixel), count, rng, buffers, out);
             }
+            if self.images.any() && there.bounces + 2 <= walk.max_bounces {
+                let count = if first { IMAGES.0 } else { IMAGES.1 };
+                self.images
+                    .connect(walk, &point, count, rng, buffers, |found, ratios| {
+                        add(film, (pixel, found), || ratios, out);
+                    });
+            }
             if all {
                 join((walk, film), (&point, pixel), rng, buffers, out);
+            }
+            if !goes_on {
+                return;
             }
             let left = there.weight / weight;
             let survive = |of: f32| (1.5 * left * of).min(0.95);
@@ -80,6 +104,10 @@ impl ByGlass {
                 return;
             };
             (path, ray) = onward;
+            if first && self.images.any() && chance < 1.0 {
+                path.weight /= chance;
+                weight /= chance;
+            }
         }
     }
 }

@@ -36,15 +36,20 @@ impl ByGlass {
         mut each: impl FnMut(LightVertex, bool),
     ) {
         let world = walk.world;
-        let Some((spot, mut path, mut ray)) = self.start(walk, (l, count), rng, buffers) else {
+        let Some(start) = self.start(walk, (l, count), rng, buffers) else {
             return;
         };
+        let (spot, imaged, mut path, mut ray) = start;
         let mut all = true;
         for vertex in 0.. {
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
             let Some(point) = arrive(world, &path, (ray, 0.0), rng, tools) else {
                 return;
             };
+            // Camera paths find it by the image.
+            if vertex == 0 && imaged && point.turns == 1 {
+                return;
+            }
             let there = &point.path;
             if point.hit.surface.is_black()
                 || there.bounces > walk.max_bounces
@@ -52,7 +57,7 @@ impl ByGlass {
             {
                 return;
             }
-            all &= point.turned;
+            all &= point.turns > 0;
             let z = LightVertex {
                 hit: point.hit,
                 back: point.back,
@@ -75,14 +80,15 @@ impl ByGlass {
         }
     }
 
-    /// The first leg of a light path up to its first turn: emitter, flux, and the ray there.
+    /// The first leg of a light path up to its first turn: emitter, whether it has an image in the pane that turned it, flux, and the ray
+    /// there.
     fn start(
         &self,
         walk: &Walk,
         (l, count): (u32, u32),
         rng: &mut Rng,
         buffers: &mut Buffers,
-    ) -> Option<(usize, Carried, Ray)> {
+    ) -> Option<(usize, bool, Carried, Ray)> {
         let (world, emitters) = (walk.world, walk.emitters);
         let spots = emitters.list.len();
         let plain = if self.targets.any() { count / 4 } else { count };
@@ -176,6 +182,7 @@ impl ByGlass {
             length_m: e.path_m,
             bounces: 1,
         };
-        Some((spot, path, ray))
+        let imaged = pane.is_some_and(|pane| self.images.has(pane));
+        Some((spot, imaged, path, ray))
     }
 }

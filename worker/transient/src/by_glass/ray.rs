@@ -30,11 +30,11 @@ pub(super) struct Ray {
     pub medium: f32,
     /// It carries radiance, from the camera, and not flux.
     radiance: bool,
-    /// Of this leg: what is left, optical path in metres, reflections, whether it was turned.
+    /// Of this leg: what is left, optical path in metres, reflections, turns.
     weight: f32,
     length_m: f64,
     reflections: u32,
-    turned: bool,
+    turns: u32,
 }
 
 impl Ray {
@@ -48,7 +48,7 @@ impl Ray {
             weight: 1.0,
             length_m: 0.0,
             reflections: 0,
-            turned: false,
+            turns: 0,
         }
     }
 
@@ -64,7 +64,7 @@ impl Ray {
         self.w = (self.w - n * (2.0 * n.dot(self.w))).normalized();
         self.from = lift(p, n);
         self.reflections += 1;
-        self.turned = true;
+        self.turns += 1;
     }
 
     pub fn turn_at(&mut self, world: &World, hit: &Hit, body: Body, rng: &mut Rng) {
@@ -75,7 +75,7 @@ impl Ray {
             false => (body.ior, 1.0),
         };
         let split = split(self.w, hit.n, (from, to));
-        self.turned = true;
+        self.turns += 1;
         let chance = match split.reflects > 0.0 {
             true => split.reflects.max(REFLECT),
             false => 0.0,
@@ -119,8 +119,8 @@ pub(super) struct Point {
     pub path: Carried,
     /// Index of refraction around it.
     pub medium: f32,
-    /// Glass turned light on the leg that led here.
-    pub turned: bool,
+    /// How often glass turned light on the leg that led here.
+    pub turns: u32,
 }
 
 /// Shares of light that go one way or another on a straight way.
@@ -186,7 +186,7 @@ fn follow(
         }
         let mut chance = shares.reflected / total;
         let both = shares.reflected > 0.0 && shares.straight > 0.0;
-        if both && !ray.turned && body.is_none() {
+        if both && ray.turns == 0 && body.is_none() {
             chance = chance.max(seek);
         }
         if chance > 0.0 && rng.uniform() < chance {
@@ -226,7 +226,7 @@ pub(super) fn arrive(
             bounces: path.bounces + 1 + ray.reflections,
         },
         medium: ray.medium,
-        turned: ray.turned,
+        turns: ray.turns,
     })
 }
 

@@ -210,13 +210,10 @@ impl Splats {
             let mut rng = Rng::new(frame.seed, Stream::ByGlass, u64::from(chunk), pass);
             glass.lay(walk, LAID, &mut rng, buffers);
             for pixel in chunk * CHUNK..pixels.min((chunk + 1) * CHUNK) {
-                let Some(weight) = glass.chance(pixel as usize, rng.uniform()) else {
-                    continue;
-                };
                 let place = (rng.uniform(), rng.uniform());
                 let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
                 let within = (walk, frame.film, photons);
-                glass.look(within, (pixel, ray, weight), &mut rng, buffers, found);
+                glass.look(within, (pixel, ray), &mut rng, buffers, found);
             }
         };
         joined(

@@ -1,0 +1,248 @@
+//! Mirror images of the spots in planar panes: light that a pane reflects once on its way from a spot comes straight from the image
+//! behind it. So a camera path's points connect to images as they do to spots, as far as the pane reaches and nothing stands between.
+
+use picofarm_scene::Vec3;
+
+use super::{Buffers, camera::Found, ray::Point};
+use crate::{
+    bsdf::frame,
+    emitter::Emitters,
+    glass::Panes,
+    rng::Rng,
+    spectra::{ONES, Ratios, times},
+    walk::{Walk, draw},
+    world::{World, lift},
+};
+
+/// Most planes that are kept, those of the largest area: what others reflect is found by light paths.
+const MOST: usize = 32;
+/// How far a pane may lie off its plane, render units, and how far its normal may turn, cosine.
+const FLAT: f32 = 1e-5;
+const ALIKE: f32 = 0.999_999;
+/// How far off a plane a point must be to be on one of its sides, render units.
+const OFF: f32 = 1e-4;
+
+/// Panes in one plane.
+#[derive(Debug)]
+struct Plane {
+    normal: Vec3,
+    /// Distance from the origin along `normal`.
+    offset: f32,
+    /// Two directions within it, and bounds along them.
+    u: Vec3,
+    v: Vec3,
+    low: [f32; 2],
+    high: [f32; 2],
+    area: f32,
+    /// Of its first pane, by which all are weighed.
+    pane: usize,
+}
+
+/// The planes of a scene's panes.
+#[derive(Debug, Default)]
+pub(super) struct Images {
+    planes: Vec<Plane>,
+    /// Plane of each pane, [`NONE`] for those of none that is kept.
+    of_pane: Vec<u8>,
+}
+
+const NONE: u8 = u8::MAX;
+
+impl Images {
+    pub fn find(world: &World) -> Self {
+        let Some(panes) = &world.panes else {
+            return Self::default();
+        };
+        let mut planes: Vec<(Plane, Vec<usize>)> = vec![];
+        for (pane, (corners, normal)) in panes.triangles().enumerate() {
+            if normal == Vec3::ZERO || panes.reflectance(pane) == 0.0 {
+                continue;
+            }
+            let [a, b, c] = corners;
+            let area = 0.5 * (b - a).cross(c - a).length();
+            let known = planes.iter().position(|(p, _)| {
+                let flat = |v: &Vec3| (p.normal.dot(*v) - p.offset).abs() < FLAT;
+                p.normal.dot(normal) > ALIKE && corners.iter().all(flat)
+            });
+            let k = match known {
+                Some(k) => k,
+                None if planes.len() < 4096 => {
+                    planes.push((Plane::new(normal, normal.dot(a), pane), vec![]));
+                    planes.len() - 1
+                }
+                None => continue,
+            };
+            let (plane, all) = &mut planes[k];
+            plane.area += area;
+            plane.widen(&corners);
+            all.push(pane);
+        }
+        planes.sort_by(|a, b| b.0.area.total_cmp(&a.0.area));
+        planes.truncate(MOST);
+        let mut of_pane = vec![NONE; panes.triangles().count()];
+        for (k, (_, all)) in planes.iter().enumerate() {
+            for &pane in all {
+                of_pane[pane] = k as u8;
+            }
+        }
+        Self {
+            planes: planes.into_iter().map(|(plane, _)| plane).collect(),
+            of_pane,
+        }
+    }
+
+    /// Whether there are any.
+    pub fn any(&self) -> bool {
+        !self.planes.is_empty()
+    }
+
+    /// Whether spots have images in a pane.
+    pub fn has(&self, pane: u32) -> bool {
+        self.of_pane[pane as usize] != NONE
+    }
+
+    /// Connects a point of a camera path to `count` images, drawn by what they would bring if nothing stood between.
+    pub fn connect(
+        &self,
+        walk: &Walk,
+        point: &Point,
+        count: u32,
+        rng: &mut Rng,
+        buffers: &mut Buffers,
+        mut each: impl FnMut(Found, Ratios),
+    ) {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let Some(panes) = &world.panes else { return };
+        let spots = emitters.list.len();
+        let mut weights = std::mem::take(&mut buffers.lights);
+        weights.clear();
+        for plane in &self.planes {
+            plane.weights((panes, emitters), point, &mut weights);
+        }
+        draw(&weights, count, rng.uniform(), |k, value| {
+            let (plane, spot) = (k / spots, k % spots);
+            // `value` is this image's weight over its chance.
+            let of = self.light((walk, panes), (plane, spot), point, buffers);
+            if let Some((share, found, ratios)) = of {
+                let value = point.path.weight * value * share;
+                each(Found { value, ..found }, ratios);
+            }
+        });
+        buffers.lights = weights;
+    }
+
+    /// What comes from a spot's image: as a share of its weight, and how.
+    fn light(
+        &self,
+        (walk, panes): (&Walk, &Panes),
+        (k, spot): (usize, usize),
+        point: &Point,
+        buffers: &mut Buffers,
+    ) -> Option<(f32, Found, Ratios)> {
+        let (world, h, path) = (walk.world, &point.hit, &point.path);
+        let (plane, e) = (&self.planes[k], &walk.emitters.list[spot]);
+        let from = lift(h.p, h.n);
+        // From where the ray starts: it meets the pane there.
+        let q = plane.between(from, e.p)?;
+        let to = q - from;
+        let stack = &mut buffers.scratch.stack;
+        if world.bvh.occluded(stack, from, to, 1.0) {
+            return None;
+        }
+        // A little further than the pane.
+        let beyond = from + to * (1.0 + 1.0 / 16384.0);
+        panes.crossings(stack, from, beyond, &mut buffers.crossings);
+        let at = buffers.crossings.iter();
+        let at = at.take_while(|c| usize::from(self.of_pane[c.pane as usize]) != k);
+        let (passes, before) = at.fold((1.0, 0), |(passes, n), c| (passes * c.passes, n + 1));
+        let pane = buffers.crossings.get(before)?;
+        let w = to.normalized();
+        let n = if plane.normal.dot(w) <= 0.0 {
+            plane.normal
+        } else {
+            -plane.normal
+        };
+        let reflects = pane.reflects;
+        let free = passes * reflects * world.free(stack, q, n, e.p, e.n);
+        if free == 0.0 {
+            return None;
+        }
+        let length = to.length() + (e.p - q).length();
+        let cos = plane.normal.dot(w).abs();
+        let found = Found {
+            value: 0.0,
+            path_m: path.length_m + world.metres(length) * f64::from(point.medium) + e.path_m,
+            spot,
+            bounces: path.bounces + 2,
+        };
+        let ratios = match world.is_spectral() {
+            false => ONES,
+            true => {
+                let here = times(path.ratios, world.ratios(h, point.back, w));
+                times(here, e.ratios(world, (q - e.p).normalized()))
+            }
+        };
+        Some((free / panes.weight(plane.pane, cos), found, ratios))
+    }
+}
+
+impl Plane {
+    fn new(normal: Vec3, offset: f32, pane: usize) -> Self {
+        let (u, v) = frame(normal);
+        Self {
+            normal,
+            offset,
+            u,
+            v,
+            low: [f32::INFINITY; 2],
+            high: [f32::NEG_INFINITY; 2],
+            area: 0.0,
+            pane,
+        }
+    }
+
+    fn widen(&mut self, corners: &[Vec3; 3]) {
+        for p in corners {
+            for (k, axis) in [self.u, self.v].into_iter().enumerate() {
+                self.low[k] = self.low[k].min(axis.dot(*p));
+                self.high[k] = self.high[k].max(axis.dot(*p));
+            }
+        }
+    }
+
+    /// Where light from a spot to a point is reflected, if both are on one side and that lies within the bounds.
+    fn between(&self, x: Vec3, spot: Vec3) -> Option<Vec3> {
+        let (a, b) = (
+            self.normal.dot(x) - self.offset,
+            self.normal.dot(spot) - self.offset,
+        );
+        if a.abs() < OFF || b.abs() < OFF || a * b <= 0.0 {
+            return None;
+        }
+        let image = spot - self.normal * (2.0 * b);
+        let q = x + (image - x) * (a / (a + b));
+        let within = |k: usize, axis: Vec3| {
+            let at = axis.dot(q);
+            at > self.low[k] - OFF && at < self.high[k] + OFF
+        };
+        (within(0, self.u) && within(1, self.v)).then_some(q)
+    }
+
+    /// Appends what each spot's image would bring if nothing stood between.
+    fn weights(&self, (panes, emitters): (&Panes, &Emitters), point: &Point, out: &mut Vec<f32>) {
+        let h = &point.hit;
+        for e in &emitters.list {
+            let of = || {
+                let q = self.between(h.p, e.p)?;
+                let (to, on) = (q - h.p, e.p - q);
+                let (near, far) = (to.length(), on.length());
+                let (w, back) = (to / near, -(on / far));
+                let cos = self.normal.dot(w).abs();
+                let f = h.surface.scatter(h.n, point.back, w);
+                let d = near + far;
+                Some(f * e.intensity(back) * panes.weight(self.pane, cos) / (d * d))
+            };
+            out.push(of().filter(|w| w.is_finite()).unwrap_or(0.0));
+        }
+    }
+}
