@@ -21,13 +21,17 @@
 mod camera;
 mod images;
 mod light;
+mod lit;
 mod photons;
 mod ray;
 
 use picofarm_scene::Vec3;
 
-use self::images::Images;
 pub(crate) use self::photons::Photons;
+use self::{
+    images::Images,
+    lit::{Areas, Lit},
+};
 use crate::{
     api::{RenderError, Stop},
     bvh::Stack,
@@ -53,6 +57,8 @@ pub(crate) struct ByGlass {
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
     images: Images,
+    /// Where points of [`Lit`] lie; empty without images.
+    areas: Areas,
     /// Row-major: the pixel or one of its neighbours sees glass.
     sees: Vec<bool>,
     /// Index of refraction around the camera.
@@ -68,6 +74,7 @@ pub(crate) struct Buffers {
     crossings: Vec<Crossing>,
     lights: Vec<f32>,
     vertices: LightVertices,
+    lit: Lit,
 }
 
 impl Buffers {
@@ -77,6 +84,7 @@ impl Buffers {
             crossings: vec![],
             lights: vec![],
             vertices: LightVertices::default(),
+            lit: Lit::default(),
         }
     }
 
@@ -137,6 +145,10 @@ impl ByGlass {
         let forward = world.camera.forward;
         Ok(targets.map(|targets| Self {
             targets,
+            areas: match images.any() {
+                true => Areas::of(world, stop),
+                false => Areas::default(),
+            },
             images,
             of_pane,
             of_triangle,

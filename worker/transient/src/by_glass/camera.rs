@@ -20,6 +20,8 @@ use crate::{
 const SEEK: f32 = 0.5;
 /// Images that the first point is connected to at most, and that any other is.
 const IMAGES: (u32, u32) = (4, 1);
+/// The same of points that spots light.
+const LIT: (u32, u32) = (2, 1);
 /// Spots that a vertex after the first is connected to at most, and light vertices that any is.
 const SPOTS: u32 = 2;
 const LIGHTS: u32 = 1;
@@ -57,10 +59,11 @@ impl ByGlass {
         };
         // Whether any leg was turned, and whether all were.
         let (mut turned, mut all) = (false, true);
+        let mut by_image = false;
         loop {
             let seek = if turned { 0.0 } else { SEEK };
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
-            let Some(point) = arrive(world, &path, (ray, seek), rng, tools) else {
+            let Some(point) = arrive((world, &self.images), &path, (ray, seek), rng, tools) else {
                 return;
             };
             let first = path.bounces == 0;
@@ -81,7 +84,13 @@ impl ByGlass {
             {
                 return;
             }
-            if turned {
+            // What comes by straight legs from a point that a pane's reflection led to is found by its image.
+            by_image = match (first, point.turns) {
+                (true, _) => false,
+                (false, 0) => by_image,
+                (false, _) => point.imaged && point.hit.surface.diffuse(),
+            };
+            if turned && !by_image {
                 let count = if first { ALL } else { SPOTS };
                 connect((walk, film), (&point, pixel), count, rng, buffers, out);
             }
@@ -91,6 +100,14 @@ impl ByGlass {
                     .connect(walk, &point, count, rng, buffers, |found, ratios| {
                         add(film, (pixel, found), || ratios, out);
                     });
+                let lit = std::mem::take(&mut buffers.lit);
+                let count = if first { LIT.0 } else { LIT.1 };
+                let of = (walk, &lit);
+                self.images
+                    .connect_lit(of, &point, count, rng, buffers, |found, ratios| {
+                        add(film, (pixel, found), || ratios, out);
+                    });
+                buffers.lit = lit;
             }
             if all {
                 join((walk, film), (&point, pixel), rng, buffers, out);

@@ -3,15 +3,14 @@
 
 use picofarm_scene::Vec3;
 
-use super::{Buffers, camera::Found, ray::Point};
+use super::{Buffers, camera::Found, lit::Lit, ray::Point};
 use crate::{
     bsdf::frame,
-    emitter::Emitters,
     glass::Panes,
     rng::Rng,
     spectra::{ONES, Ratios, times},
     walk::{Walk, draw},
-    world::{World, lift},
+    world::{Hit, World, lift},
 };
 
 /// Most planes that are kept, those of the largest area: what others reflect is found by light paths.
@@ -21,6 +20,9 @@ const FLAT: f32 = 1e-5;
 const ALIKE: f32 = 0.999_999;
 /// How far off a plane a point must be to be on one of its sides, render units.
 const OFF: f32 = 1e-4;
+
+/// Points that light scatters at which are looked at for one connection.
+const LOOKED_AT: usize = 8;
 
 /// Panes in one plane.
 #[derive(Debug)]
@@ -117,7 +119,9 @@ impl Images {
         let mut weights = std::mem::take(&mut buffers.lights);
         weights.clear();
         for plane in &self.planes {
-            plane.weights((panes, emitters), point, &mut weights);
+            let of = (&point.hit, point.back);
+            let each = emitters.list.iter();
+            weights.extend(each.map(|e| plane.weight(panes, of, e.p, |w| e.intensity(w))));
         }
         draw(&weights, count, rng.uniform(), |k, value| {
             let (plane, spot) = (k / spots, k % spots);
@@ -135,15 +139,101 @@ impl Images {
     fn light(
         &self,
         (walk, panes): (&Walk, &Panes),
-        (k, spot): (usize, usize),
+        (plane, spot): (usize, usize),
         point: &Point,
         buffers: &mut Buffers,
     ) -> Option<(f32, Found, Ratios)> {
-        let (world, h, path) = (walk.world, &point.hit, &point.path);
-        let (plane, e) = (&self.planes[k], &walk.emitters.list[spot]);
+        let (world, path) = (walk.world, &point.path);
+        let e = &walk.emitters.list[spot];
+        let way = self.way((world, panes), plane, point, (e.p, e.n), buffers)?;
+        let found = Found {
+            value: 0.0,
+            path_m: path.length_m + way.length_m + e.path_m,
+            spot,
+            bounces: path.bounces + 2,
+        };
+        let ratios = match world.is_spectral() {
+            false => ONES,
+            true => {
+                let here = world.ratios(&point.hit, point.back, way.w);
+                times(times(path.ratios, here), e.ratios(world, way.back))
+            }
+        };
+        Some((way.share, found, ratios))
+    }
+
+    /// Connects a point of a camera path to images of the points of `lit`, at most `count` of them: a few are looked at, and of
+    /// those some are drawn by what they would bring.
+    pub fn connect_lit(
+        &self,
+        (walk, lit): (&Walk, &Lit),
+        point: &Point,
+        count: u32,
+        rng: &mut Rng,
+        buffers: &mut Buffers,
+        mut each: impl FnMut(Found, Ratios),
+    ) {
+        let world = walk.world;
+        let (Some(panes), all) = (&world.panes, lit.list.len()) else {
+            return;
+        };
+        let some = all.min(LOOKED_AT);
+        if some == 0 {
+            return;
+        }
+        let first = ((rng.uniform() * all as f32) as usize).min(all - 1);
+        let of = |k: usize| &lit.list[(first + k) % all];
+        let mut weights = std::mem::take(&mut buffers.lights);
+        weights.clear();
+        let h = &point.hit;
+        for plane in &self.planes {
+            for k in 0..some {
+                let y = of(k);
+                let sends = |back: Vec3| y.sum * y.hit.n.dot(back).max(0.0);
+                let weight = plane.weight(panes, (h, point.back), y.hit.p, sends);
+                weights.push(weight);
+            }
+        }
+        let scale = all as f32 / some as f32;
+        draw(&weights, count, rng.uniform(), |k, value| {
+            let (plane, y) = (k / some, of(k % some));
+            let place = (y.hit.p, y.hit.n);
+            let Some(way) = self.way((world, panes), plane, point, place, buffers) else {
+                return;
+            };
+            let factor = point.path.weight * value * scale * way.share / y.sum;
+            let here = match world.is_spectral() {
+                false => ONES,
+                true => times(point.path.ratios, world.ratios(h, point.back, way.w)),
+            };
+            for a in &y.arrivals {
+                let found = Found {
+                    value: factor * a.light.value,
+                    path_m: point.path.length_m + way.length_m + a.path_m,
+                    spot: a.spot,
+                    bounces: point.path.bounces + 1 + a.bounces,
+                };
+                if found.bounces <= walk.max_bounces {
+                    each(found, times(here, a.light.ratios));
+                }
+            }
+        });
+        buffers.lights = weights;
+    }
+
+    /// The way from a point to another by a pane of a plane, where it is free.
+    fn way(
+        &self,
+        (world, panes): (&World, &Panes),
+        k: usize,
+        point: &Point,
+        (p, n): (Vec3, Vec3),
+        buffers: &mut Buffers,
+    ) -> Option<Way> {
+        let (plane, h) = (&self.planes[k], &point.hit);
         let from = lift(h.p, h.n);
         // From where the ray starts: it meets the pane there.
-        let q = plane.between(from, e.p)?;
+        let q = plane.between(from, p)?;
         let to = q - from;
         let stack = &mut buffers.scratch.stack;
         if world.bvh.occluded(stack, from, to, 1.0) {
@@ -152,38 +242,44 @@ impl Images {
         // A little further than the pane.
         let beyond = from + to * (1.0 + 1.0 / 16384.0);
         panes.crossings(stack, from, beyond, &mut buffers.crossings);
-        let at = buffers.crossings.iter();
-        let at = at.take_while(|c| usize::from(self.of_pane[c.pane as usize]) != k);
-        let (passes, before) = at.fold((1.0, 0), |(passes, n), c| (passes * c.passes, n + 1));
-        let pane = buffers.crossings.get(before)?;
-        let w = to.normalized();
-        let n = if plane.normal.dot(w) <= 0.0 {
-            plane.normal
-        } else {
-            -plane.normal
-        };
-        let reflects = pane.reflects;
-        let free = passes * reflects * world.free(stack, q, n, e.p, e.n);
-        if free == 0.0 {
+        let mut passes = 1.0;
+        let mut reflects = 0.0;
+        for c in &buffers.crossings {
+            if usize::from(self.of_pane[c.pane as usize]) == k {
+                reflects = c.reflects;
+                break;
+            }
+            passes *= c.passes;
+        }
+        if reflects == 0.0 {
             return None;
         }
-        let length = to.length() + (e.p - q).length();
+        let w = to.normalized();
+        let side = match plane.normal.dot(w) <= 0.0 {
+            true => plane.normal,
+            false => -plane.normal,
+        };
+        let free = passes * reflects * world.free(stack, q, side, p, n);
         let cos = plane.normal.dot(w).abs();
-        let found = Found {
-            value: 0.0,
-            path_m: path.length_m + world.metres(length) * f64::from(point.medium) + e.path_m,
-            spot,
-            bounces: path.bounces + 2,
-        };
-        let ratios = match world.is_spectral() {
-            false => ONES,
-            true => {
-                let here = times(path.ratios, world.ratios(h, point.back, w));
-                times(here, e.ratios(world, (q - e.p).normalized()))
-            }
-        };
-        Some((free / panes.weight(plane.pane, cos), found, ratios))
+        let length = to.length() + (p - q).length();
+        (free > 0.0).then(|| Way {
+            share: free / panes.weight(plane.pane, cos),
+            w,
+            back: (q - p).normalized(),
+            length_m: world.metres(length) * f64::from(point.medium),
+        })
     }
+}
+
+/// A free way by a pane.
+struct Way {
+    /// What passes and is reflected, as a share of what weights count with.
+    share: f32,
+    /// Unit directions from both ends.
+    w: Vec3,
+    back: Vec3,
+    /// Optical length, metres.
+    length_m: f64,
 }
 
 impl Plane {
@@ -228,21 +324,28 @@ impl Plane {
         (within(0, self.u) && within(1, self.v)).then_some(q)
     }
 
-    /// Appends what each spot's image would bring if nothing stood between.
-    fn weights(&self, (panes, emitters): (&Panes, &Emitters), point: &Point, out: &mut Vec<f32>) {
-        let h = &point.hit;
-        for e in &emitters.list {
-            let of = || {
-                let q = self.between(h.p, e.p)?;
-                let (to, on) = (q - h.p, e.p - q);
-                let (near, far) = (to.length(), on.length());
-                let (w, back) = (to / near, -(on / far));
-                let cos = self.normal.dot(w).abs();
-                let f = h.surface.scatter(h.n, point.back, w);
-                let d = near + far;
-                Some(f * e.intensity(back) * panes.weight(self.pane, cos) / (d * d))
-            };
-            out.push(of().filter(|w| w.is_finite()).unwrap_or(0.0));
+    /// What a point would get from another by the plane if nothing stood between: f · cos, what the pane reflects, what the other
+    /// `sends` in a direction, over the squared distance.
+    fn weight(
+        &self,
+        panes: &Panes,
+        (h, back): (&Hit, Vec3),
+        p: Vec3,
+        sends: impl Fn(Vec3) -> f32,
+    ) -> f32 {
+        let Some(q) = self.between(h.p, p) else {
+            return 0.0;
+        };
+        let (to, on) = (q - h.p, q - p);
+        let (near, far) = (to.length(), on.length());
+        let w = to / near;
+        let f = h.surface.scatter(h.n, back, w);
+        if f == 0.0 {
+            return 0.0;
         }
+        let reflects = panes.weight(self.pane, self.normal.dot(w).abs());
+        let d = near + far;
+        let weight = f * sends(on / far) * reflects / (d * d);
+        if weight.is_finite() { weight } else { 0.0 }
     }
 }

@@ -15,7 +15,7 @@ use crate::{
 const SURE: u32 = 3;
 
 impl ByGlass {
-    /// Makes the light vertices that camera paths are connected to, from `count` light paths.
+    /// Makes the light vertices and points that camera paths are connected to; the vertices from `count` light paths.
     pub fn lay(&self, walk: &Walk, count: u32, rng: &mut Rng, buffers: &mut Buffers) {
         let mut vertices = std::mem::take(&mut buffers.vertices);
         vertices.clear();
@@ -23,6 +23,10 @@ impl ByGlass {
             self.trace(walk, (l, count), rng, buffers, |z, _| vertices.push(z));
         }
         buffers.vertices = vertices;
+        if self.images.any() {
+            let of = (walk, &self.areas);
+            buffers.lit.lay(of, rng, &mut buffers.scratch);
+        }
     }
 
     /// Light path `l` of a batch of `count`: calls `each` with every surface point that it comes to, and whether glass turned all
@@ -43,7 +47,7 @@ impl ByGlass {
         let mut all = true;
         for vertex in 0.. {
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
-            let Some(point) = arrive(world, &path, (ray, 0.0), rng, tools) else {
+            let Some(point) = arrive((world, &self.images), &path, (ray, 0.0), rng, tools) else {
                 return;
             };
             // Camera paths find it by the image.

@@ -2,6 +2,7 @@
 
 use picofarm_scene::Vec3;
 
+use super::images::Images;
 use crate::{
     bvh::Stack,
     fresnel::{Body, split},
@@ -35,6 +36,8 @@ pub(super) struct Ray {
     length_m: f64,
     reflections: u32,
     turns: u32,
+    /// The last pane that reflected it.
+    last: Option<u32>,
 }
 
 impl Ray {
@@ -49,6 +52,7 @@ impl Ray {
             length_m: 0.0,
             reflections: 0,
             turns: 0,
+            last: None,
         }
     }
 
@@ -65,6 +69,7 @@ impl Ray {
         self.from = lift(p, n);
         self.reflections += 1;
         self.turns += 1;
+        self.last = Some(pane);
     }
 
     pub fn turn_at(&mut self, world: &World, hit: &Hit, body: Body, rng: &mut Rng) {
@@ -121,6 +126,8 @@ pub(super) struct Point {
     pub medium: f32,
     /// How often glass turned light on the leg that led here.
     pub turns: u32,
+    /// It was a single time, at a pane in which points have images.
+    pub imaged: bool,
 }
 
 /// Shares of light that go one way or another on a straight way.
@@ -208,7 +215,7 @@ fn follow(
 
 /// Follows a ray to the next point of a path.
 pub(super) fn arrive(
-    world: &World,
+    (world, images): (&World, &Images),
     path: &Carried,
     (ray, seek): (Ray, f32),
     rng: &mut Rng,
@@ -227,6 +234,7 @@ pub(super) fn arrive(
         },
         medium: ray.medium,
         turns: ray.turns,
+        imaged: ray.turns == 1 && ray.last.is_some_and(|pane| images.has(pane)),
     })
 }
 

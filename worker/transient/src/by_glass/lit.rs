@@ -1,0 +1,204 @@
+//! Points at which light scatters on its way to a pane, with all that they bring: their light from every spot, and what a walk from them
+//! finds. Their mirror images are connected to camera paths, so that a single way by a pane brings many arrivals, and none that is rare.
+//!
+//! They lie on Lambertians, half of them drawn by the scattering of the spots, half evenly over all surfaces; both ways are joined by the
+//! balance heuristic. Paths that come by an image of such a point, and by straight legs alone from there to a spot, are found in no other way.
+
+use picofarm_scene::Vec3;
+
+use crate::{
+    api::Stop,
+    lobes::Seen,
+    rng::Rng,
+    sink::{Place, Sink, Way},
+    spectra::{Light, ONES},
+    turns::Turns,
+    vertex::Vertex,
+    walk::{Scratch, Walk},
+    world::{Hit, World, lift},
+};
+
+/// How many there are at most.
+const POINTS: u32 = 128;
+
+/// Light that arrives and is scattered.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Arrival {
+    /// Optical path from the laser, metres.
+    pub path_m: f64,
+    /// Radiance that it leaves with, over the density of the point.
+    pub light: Light,
+    /// Emitter.
+    pub spot: usize,
+    /// Bounces up to and with the point.
+    pub bounces: u32,
+}
+
+/// A point.
+#[derive(Debug)]
+pub(super) struct LitPoint {
+    pub hit: Hit,
+    pub arrivals: Vec<Arrival>,
+    /// Sum of their light.
+    pub sum: f32,
+}
+
+/// The points of one stream.
+#[derive(Debug, Default)]
+pub(super) struct Lit {
+    pub list: Vec<LitPoint>,
+}
+
+/// All surfaces by area, as running sums; of triangles without light to scatter none.
+#[derive(Debug, Default)]
+pub(super) struct Areas(Vec<f64>);
+
+impl Areas {
+    pub fn of(world: &World, stop: Stop) -> Self {
+        let mut sum = 0.0;
+        let each = world.triangles.iter().enumerate().map(|(k, [a, b, c])| {
+            let surface = &world.surfaces[world.surface[k] as usize];
+            let stopped = k % 65536 == 0 && stop.asked();
+            if world.normals[k] != Vec3::ZERO && !surface.is_black() && !stopped && world.counts(k)
+            {
+                sum += f64::from(0.5 * (*b - *a).cross(*c - *a).length());
+            }
+            sum
+        });
+        Self(each.collect())
+    }
+
+    fn whole(&self) -> f64 {
+        self.0.last().copied().unwrap_or(0.0)
+    }
+
+    /// A point of a surface, on one of its sides.
+    fn draw(&self, world: &World, at: f64, rng: &mut Rng) -> Option<Hit> {
+        let at = at * self.whole();
+        let k = self.0.partition_point(|&s| s <= at);
+        let [a, b, c] = *world.triangles.get(k)?;
+        let (r, v) = (rng.uniform().sqrt(), rng.uniform());
+        let p = a * (1.0 - r) + b * (r * (1.0 - v)) + c * (r * v);
+        let n = world.normals[k];
+        let side = if rng.uniform() < 0.5 { n } else { -n };
+        Some(world.on(k as u32, p, p + side))
+    }
+}
+
+/// What a walk finds beyond a point.
+struct Arrivals<'a>(&'a mut Vec<Arrival>);
+
+impl Sink for Arrivals<'_> {
+    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, _: Way) {
+        self.0.push(Arrival {
+            path_m,
+            light,
+            spot,
+            bounces,
+        });
+    }
+
+    fn at(&mut self, _: Place) {}
+}
+
+impl Lit {
+    /// Draws the points anew.
+    pub fn lay(&mut self, (walk, areas): (&Walk, &Areas), rng: &mut Rng, scratch: &mut Scratch) {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let spots = emitters.list.len();
+        self.list.clear();
+        // Whatever stands in for light vertices and zones elsewhere is left to chance.
+        let walk = Walk {
+            lights: false,
+            caustics: None,
+            contacts: None,
+            window: None,
+            ..*walk
+        };
+        let half = POINTS / 2;
+        let turns = Turns::new(half, rng);
+        for j in 0..POINTS {
+            let hit = if j < half {
+                let e = &emitters.list[turns.choice(j, spots)];
+                let drawn = turns.direction(j, &e.surface, e.n, e.back, rng);
+                drawn.and_then(|(w, ..)| world.closest(&mut scratch.stack, lift(e.p, e.n), w))
+            } else {
+                let at = (f64::from(j - half) + f64::from(rng.uniform())) / f64::from(half);
+                areas.draw(world, at, rng)
+            };
+            let Some(mut hit) = hit else { continue };
+            hit.choose_part(world, rng);
+            if hit.surface.diffuse() && !hit.surface.is_black() {
+                let even = 0.5 * f64::from(half) / areas.whole();
+                let density = (half as f32 / spots as f32, even as f32);
+                self.list
+                    .extend(LitPoint::new(&walk, hit, density, rng, scratch));
+            }
+        }
+    }
+}
+
+impl LitPoint {
+    /// A point that was drawn with a density per area: `by_spot` times each one's own, and evenly.
+    fn new(
+        walk: &Walk,
+        hit: Hit,
+        (by_spot, even): (f32, f32),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+    ) -> Option<Self> {
+        let (world, emitters) = (walk.world, walk.emitters);
+        let mut arrivals = vec![];
+        let Scratch {
+            stack,
+            weights,
+            plain,
+            ..
+        } = &mut *scratch;
+        emitters.weights((Seen::of(&hit, hit.n), &hit.surface), plain, weights);
+        let mut density = even;
+        for (spot, (e, &weight)) in emitters.list.iter().zip(weights.iter()).enumerate() {
+            let to = hit.p - e.p;
+            let d2 = to.dot(to);
+            let w = to / d2.sqrt();
+            let pdf = e.surface.pdf(e.n, e.back, w);
+            if !(pdf > 0.0 || weight > 0.0) {
+                continue;
+            }
+            let free = world.free(stack, hit.p, hit.n, e.p, e.n);
+            if free > 0.0 {
+                density += by_spot * pdf * hit.n.dot(w).abs() / d2;
+            }
+            if free * weight > 0.0 {
+                arrivals.push(Arrival {
+                    path_m: world.metres(d2.sqrt()) + e.path_m,
+                    light: Light {
+                        value: weight * free,
+                        ratios: crate::spectra::times(
+                            world.ratios(&hit, hit.n, -w),
+                            e.ratios(world, w),
+                        ),
+                    },
+                    spot,
+                    bounces: 2,
+                });
+            }
+        }
+        let vertex = Vertex {
+            hit,
+            wo: hit.n,
+            beta: 1.0,
+            ratios: ONES,
+            length_m: 0.0,
+            bounce: 1,
+            after_mirror: false,
+            open_before: false,
+        };
+        walk.run(rng, vertex, scratch, &mut Arrivals(&mut arrivals));
+        for a in &mut arrivals {
+            a.light.value /= density;
+        }
+        let sum: f32 = arrivals.iter().map(|a| a.light.value).sum();
+        (sum > 0.0 && sum.is_finite()).then_some(Self { hit, arrivals, sum })
+    }
+}
