@@ -297,7 +297,8 @@ impl Sharing {
         a.from.clear();
         a.light.clear();
         let size = film.pixel();
-        Self::draw_lights((walk, effort), pixels.len() / size, &mut rng, scratch);
+        let count = effort.beyond * (pixels.len() / size) as f32;
+        Self::draw_lights(walk, count.max(8.0) as u32, &mut rng, scratch);
         for (k, pixel) in pixels.chunks_mut(size).enumerate() {
             let (row, col) = (
                 tile.row + k as u32 / tile.cols,

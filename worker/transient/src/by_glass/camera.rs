@@ -4,6 +4,7 @@ use picofarm_scene::Vec3;
 
 use super::{
     Buffers, ByGlass,
+    lit::Lit,
     photons::Photons,
     ray::{Carried, Point, Ray, arrive},
 };
@@ -88,7 +89,7 @@ impl ByGlass {
             by_image = match (first, point.turns) {
                 (true, _) => false,
                 (false, 0) => by_image,
-                (false, _) => point.imaged && point.hit.surface.diffuse(),
+                (false, _) => point.imaged && Lit::may_hold(walk, &point.hit),
             };
             if turned && !by_image {
                 let count = if first { ALL } else { SPOTS };

@@ -9,6 +9,7 @@ use picofarm_scene::Vec3;
 use crate::{
     api::Stop,
     lobes::Seen,
+    path_reuse::Sharing,
     rng::Rng,
     sink::{Place, Sink, Way},
     spectra::{Light, ONES},
@@ -18,8 +19,9 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// How many there are at most.
+/// How many there are at most, and light vertices that their walks are connected to.
 const POINTS: u32 = 128;
+const LIGHT_VERTICES: u32 = 64;
 
 /// Light that arrives and is scattered.
 #[derive(Debug, Clone, Copy)]
@@ -102,19 +104,29 @@ impl Sink for Arrivals<'_> {
 }
 
 impl Lit {
+    /// Whether a point would be among them: on a Lambertian, and not close beside a spot that has a zone.
+    pub fn may_hold(walk: &Walk, hit: &Hit) -> bool {
+        let near = walk.contacts.is_some_and(|c| c.near(walk.world, hit));
+        hit.surface.diffuse() && !hit.surface.is_black() && !near
+    }
+
     /// Draws the points anew.
     pub fn lay(&mut self, (walk, areas): (&Walk, &Areas), rng: &mut Rng, scratch: &mut Scratch) {
         let (world, emitters) = (walk.world, walk.emitters);
         let spots = emitters.list.len();
         self.list.clear();
-        // Whatever stands in for light vertices and zones elsewhere is left to chance.
         let walk = Walk {
-            lights: false,
-            caustics: None,
-            contacts: None,
             window: None,
             ..*walk
         };
+        Sharing::draw_lights(&walk, POINTS, rng, scratch);
+        if walk.lights {
+            let of = (world, emitters, walk.contacts);
+            let Scratch {
+                vertices, stack, ..
+            } = &mut *scratch;
+            vertices.fill(of, LIGHT_VERTICES, rng, stack);
+        }
         let half = POINTS / 2;
         let turns = Turns::new(half, rng);
         for j in 0..POINTS {
@@ -128,7 +140,7 @@ impl Lit {
             };
             let Some(mut hit) = hit else { continue };
             hit.choose_part(world, rng);
-            if hit.surface.diffuse() && !hit.surface.is_black() {
+            if Self::may_hold(&walk, &hit) {
                 let even = 0.5 * f64::from(half) / areas.whole();
                 let density = (half as f32 / spots as f32, even as f32);
                 self.list

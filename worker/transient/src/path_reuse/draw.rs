@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::{ALL_ZONES, BESIDE, BEYOND, Effort, GLOSSY, Shared, Sharing, ZONE_PATHS};
+use super::{ALL_ZONES, BESIDE, BEYOND, GLOSSY, Shared, Sharing, ZONE_PATHS};
 use crate::{
     contact::Contacts,
     ellipsoid::Patches,
@@ -17,13 +17,9 @@ use crate::{
 };
 
 impl Sharing {
-    /// Draws light vertices for this pass, those beyond near-mirrors and those in the zones of spots beside other surfaces.
-    pub(super) fn draw_lights(
-        (walk, effort): (&Walk, &Effort),
-        pixels: usize,
-        rng: &mut Rng,
-        scratch: &mut Scratch,
-    ) {
+    /// Draws light vertices for this pass, those beyond near-mirrors by `count` paths, and those in the zones of spots beside other
+    /// surfaces.
+    pub(crate) fn draw_lights(walk: &Walk, count: u32, rng: &mut Rng, scratch: &mut Scratch) {
         let Scratch {
             caustics: beyond,
             contacts: near,
@@ -34,7 +30,6 @@ impl Sharing {
         near.clear();
         let within = walk.surroundings();
         if let Some(caustics) = walk.caustics {
-            let count = (effort.beyond * pixels as f32).max(8.0) as u32;
             caustics.fill(beyond, &within, count, rng, stack);
         }
         if let Some(contacts) = walk.contacts {
