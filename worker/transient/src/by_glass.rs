@@ -44,7 +44,7 @@ use crate::{
 };
 
 /// Share of the camera paths of pixels that see no glass which go on beyond their first point.
-const ELSEWHERE: f32 = 0.25;
+const ELSEWHERE: f32 = 0.5;
 
 /// How often light paths aim at panes in which spots have images, as a share of what they send on.
 const IMAGED: f32 = 0.1;

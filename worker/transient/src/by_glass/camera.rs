@@ -10,11 +10,13 @@ use super::{
 };
 use crate::{
     caustic::Splat,
+    emitter::Emitters,
     film::Film,
-    lobes::Seen,
     rng::Rng,
-    spectra::{ONES, Ratios, times},
-    walk::{ALL, Scratch, Walk, draw},
+    sink::{Place, Sink, Way},
+    spectra::{Light, ONES, Ratios, times},
+    vertex::Vertex,
+    walk::{ALL, Walk, draw},
 };
 
 /// How often at least a pane's reflection is chosen where nothing was turned yet.
@@ -60,7 +62,6 @@ impl ByGlass {
         };
         // Whether any leg was turned, and whether all were.
         let (mut turned, mut all) = (false, true);
-        let mut by_image = false;
         loop {
             let seek = if turned { 0.0 } else { SEEK };
             let tools = (&mut buffers.scratch.stack, &mut buffers.crossings);
@@ -85,15 +86,10 @@ impl ByGlass {
             {
                 return;
             }
-            // What comes by straight legs from a point that a pane's reflection led to is found by its image.
-            by_image = match (first, point.turns) {
-                (true, _) => false,
-                (false, 0) => by_image,
-                (false, _) => point.imaged && Lit::may_hold(walk, &point.hit),
-            };
-            if turned && !by_image {
-                let count = if first { ALL } else { SPOTS };
-                connect((walk, film), (&point, pixel), count, rng, buffers, out);
+            // Straight legs alone from here to a spot; those from a point that a pane's reflection led to are found by its image.
+            let by_image = !first && point.imaged && Lit::may_hold(walk, &point.hit);
+            if point.turns > 0 && !by_image {
+                straight((walk, film), (&point, pixel), first, rng, buffers, out);
             }
             if self.images.any() && there.bounces + 2 <= walk.max_bounces {
                 let count = if first { IMAGES.0 } else { IMAGES.1 };
@@ -142,50 +138,73 @@ pub(super) struct Found {
     pub bounces: u32,
 }
 
-/// Connects a point of a camera path to `count` spots.
-fn connect(
+/// Where the splats of a walk go. Straight legs stay in one medium: those of the walk are all as much longer as its index says.
+struct Splats<'a> {
+    film: &'a Film,
+    emitters: &'a Emitters,
+    pixel: u32,
+    /// Optical path up to the walk, metres, and index of refraction around it.
+    before_m: f64,
+    medium: f64,
+    out: &'a mut Vec<Splat>,
+}
+
+impl Sink for Splats<'_> {
+    fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, _: Way) {
+        let to_spot = self.emitters.list[spot].path_m;
+        let found = Found {
+            value: light.value,
+            path_m: self.before_m + (path_m - to_spot) * self.medium + to_spot,
+            spot,
+            bounces,
+        };
+        add(self.film, (self.pixel, found), || light.ratios, self.out);
+    }
+
+    fn at(&mut self, _: Place) {}
+}
+
+/// Connects a point of a camera path to the spots and walks on from it, by straight legs alone.
+fn straight(
     (walk, film): (&Walk, &Film),
     (point, pixel): (&Point, u32),
-    count: u32,
+    first: bool,
     rng: &mut Rng,
     buffers: &mut Buffers,
     out: &mut Vec<Splat>,
 ) {
-    let (world, h, path) = (walk.world, &point.hit, &point.path);
-    let Scratch {
-        stack,
-        weights,
-        plain,
-        ..
-    } = &mut buffers.scratch;
-    let of = (Seen::of(h, point.back), &h.surface);
-    walk.emitters.weights(of, plain, weights);
-    let mut each = |spot: usize, value: f32| {
-        let e = &walk.emitters.list[spot];
-        let free = world.free(stack, h.p, h.n, e.p, e.n);
-        if free > 0.0 {
-            let to = e.p - h.p;
-            let leg = world.metres(to.length()) * f64::from(point.medium);
-            let w = to.normalized();
-            let found = Found {
-                value: path.weight * value * free,
-                path_m: path.length_m + leg + e.path_m,
-                spot,
-                bounces: path.bounces + 1,
-            };
-            let ratios = || {
-                let here = times(path.ratios, world.ratios(h, point.back, w));
-                times(here, e.ratios(world, -w))
-            };
-            add(film, (pixel, found), ratios, out);
-        }
+    let mut sink = Splats {
+        film,
+        emitters: walk.emitters,
+        pixel,
+        before_m: point.path.length_m,
+        medium: f64::from(point.medium),
+        out,
     };
-    if count == ALL {
-        let lit = weights.iter().enumerate().filter(|(_, w)| **w > 0.0);
-        lit.for_each(|(spot, &w)| each(spot, w));
-    } else {
-        draw(weights, count, rng.uniform(), each);
-    }
+    let mut hit = point.hit;
+    hit.choose_lobe(walk.world, rng);
+    let vertex = Vertex {
+        hit,
+        wo: point.back,
+        beta: point.path.weight,
+        ratios: point.path.ratios,
+        length_m: 0.0,
+        bounce: point.path.bounces,
+        after_mirror: false,
+        open_before: false,
+    };
+    // Zones leave what is close beside a spot to light paths, which do not come here.
+    let near = walk.contacts.is_some_and(|c| c.near(walk.world, &hit));
+    let walk = Walk {
+        contacts: walk.contacts.filter(|_| !near),
+        // The window is that of whole paths.
+        window: None,
+        ..*walk
+    };
+    let count = if first { ALL } else { SPOTS };
+    let scratch = &mut buffers.scratch;
+    walk.connect(rng, &vertex, None, count, scratch, &mut sink);
+    walk.run(rng, vertex, scratch, &mut sink);
 }
 
 /// Connects a point of a camera path to light vertices.

@@ -22,7 +22,7 @@ const ALIKE: f32 = 0.999_999;
 const OFF: f32 = 1e-4;
 
 /// Points that light scatters at which are looked at for one connection.
-const LOOKED_AT: usize = 8;
+const LOOKED_AT: usize = 32;
 
 /// Panes in one plane.
 #[derive(Debug)]

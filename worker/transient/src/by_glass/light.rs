@@ -2,6 +2,7 @@
 
 use super::{
     Buffers, ByGlass,
+    lit::Lit,
     ray::{Carried, Ray, Shares, arrive, pick},
 };
 use crate::{
@@ -23,6 +24,7 @@ impl ByGlass {
             self.trace(walk, (l, count), rng, buffers, |z, _| vertices.push(z));
         }
         buffers.vertices = vertices;
+        Lit::prepare(walk, rng, &mut buffers.scratch);
         if self.images.any() {
             let of = (walk, &self.areas);
             buffers.lit.lay(of, rng, &mut buffers.scratch);

@@ -110,6 +110,18 @@ impl Lit {
         hit.surface.diffuse() && !hit.surface.is_black() && !near
     }
 
+    /// Draws what walks are connected to.
+    pub fn prepare(walk: &Walk, rng: &mut Rng, scratch: &mut Scratch) {
+        Sharing::draw_lights(walk, POINTS, rng, scratch);
+        if walk.lights {
+            let of = (walk.world, walk.emitters, walk.contacts);
+            let Scratch {
+                vertices, stack, ..
+            } = scratch;
+            vertices.fill(of, LIGHT_VERTICES, rng, stack);
+        }
+    }
+
     /// Draws the points anew.
     pub fn lay(&mut self, (walk, areas): (&Walk, &Areas), rng: &mut Rng, scratch: &mut Scratch) {
         let (world, emitters) = (walk.world, walk.emitters);
@@ -119,14 +131,6 @@ impl Lit {
             window: None,
             ..*walk
         };
-        Sharing::draw_lights(&walk, POINTS, rng, scratch);
-        if walk.lights {
-            let of = (world, emitters, walk.contacts);
-            let Scratch {
-                vertices, stack, ..
-            } = &mut *scratch;
-            vertices.fill(of, LIGHT_VERTICES, rng, stack);
-        }
         let half = POINTS / 2;
         let turns = Turns::new(half, rng);
         for j in 0..POINTS {
