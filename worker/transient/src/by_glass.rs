@@ -43,8 +43,11 @@ use crate::{
     world::World,
 };
 
-/// Share of the camera paths of pixels that see no glass which go on beyond their first point.
-const ELSEWHERE: f32 = 0.5;
+/// Chances of a camera path in a pixel that sees no glass, at least, and by the share that what glass sends on has in all surfaces'
+/// area: where there is little glass it brings little. And share of those paths that go on beyond their first point.
+const ELSEWHERE: f32 = 0.125;
+const BY_AREA: f32 = 100.0;
+const ONWARD: f32 = 0.5;
 
 /// How often light paths aim at panes in which spots have images, as a share of what they send on.
 const IMAGED: f32 = 0.1;
@@ -61,6 +64,8 @@ pub(crate) struct ByGlass {
     areas: Areas,
     /// Row-major: the pixel or one of its neighbours sees glass.
     sees: Vec<bool>,
+    /// Chance of a camera path in other pixels.
+    elsewhere: f32,
     /// Index of refraction around the camera.
     around: f32,
 }
@@ -102,6 +107,8 @@ impl ByGlass {
     pub fn find(walk: &Walk, centres: &Centres, stop: Stop) -> Result<Option<Self>, RenderError> {
         let (world, emitters) = (walk.world, walk.emitters);
         let images = Images::find(world);
+        let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
+        let mut glass = 0.0;
         let mut all = vec![];
         let mut of_pane = vec![];
         let mut of_triangle = vec![NONE; world.triangles.len()];
@@ -111,6 +118,7 @@ impl ByGlass {
             // Light paths bring what else is turned on the way from there.
             let rest = if images.has(k as u32) { IMAGED } else { 1.0 };
             of_pane.push(NONE);
+            glass += share * area(corners);
             if share > 0.0 && normal != Vec3::ZERO {
                 of_pane[k] = all.len() as u32;
                 all.push(Target {
@@ -125,6 +133,7 @@ impl ByGlass {
         if world.has_bodies() {
             for (k, &corners) in world.triangles.iter().enumerate() {
                 if world.body(k as u32).is_some() && world.normals[k] != Vec3::ZERO {
+                    glass += area(corners);
                     of_triangle[k] = all.len() as u32;
                     all.push(Target {
                         corners,
@@ -139,16 +148,15 @@ impl ByGlass {
         if all.is_empty() || emitters.list.is_empty() || walk.max_bounces < 2 {
             return Ok(None);
         }
+        let areas = Areas::of(world, stop);
         let targets = Targets::new(&all, emitters, stop);
         stop.check()?;
         let mut stack = world.bvh.stack();
         let forward = world.camera.forward;
         Ok(targets.map(|targets| Self {
             targets,
-            areas: match images.any() {
-                true => Areas::of(world, stop),
-                false => Areas::default(),
-            },
+            elsewhere: (BY_AREA * glass / areas.whole() as f32).clamp(ELSEWHERE, 1.0),
+            areas,
             images,
             of_pane,
             of_triangle,
@@ -157,12 +165,11 @@ impl ByGlass {
         }))
     }
 
-    /// How likely the camera path of a pixel goes on beyond its first point, and whether there is one at all where it does not.
-    fn chance(&self, pixel: u32) -> f32 {
-        if self.sees[pixel as usize] {
-            1.0
-        } else {
-            ELSEWHERE
+    /// How likely a pixel gets a camera path in a pass, and how likely that goes on beyond its first point.
+    fn chances(&self, pixel: u32) -> (f32, f32) {
+        match self.sees[pixel as usize] {
+            true => (1.0, 1.0),
+            false => (self.elsewhere, ONWARD),
         }
     }
 }

@@ -130,8 +130,8 @@ fn a_spot_seen_in_a_window_is_as_bright_as_its_mirror_image() {
         v(6.0, 0.0, 0.0),
         Material::glass("window"),
     );
-    let s = scene(vec![wall, window], 32, &[v(0.3, -0.2, 1.0)]);
-    let set = settings(Budget::Samples(1024));
+    let s = scene(vec![wall, window], 16, &[v(0.3, -0.2, 1.0)]);
+    let set = settings(Budget::Samples(4096));
     let got = parts(&ok(&s, &set));
     // Its image is at (0.3, -0.2, -5).
     let (d2, z) = (0.3f64 * 0.3 + 0.2 * 0.2 + 25.0, 5.0);

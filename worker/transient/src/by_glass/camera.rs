@@ -41,18 +41,17 @@ impl ByGlass {
         out: &mut Vec<Splat>,
     ) {
         let (world, origin) = (walk.world, Vec3::ZERO);
-        let chance = self.chance(pixel);
+        let (begins, onward) = self.chances(pixel);
         // Without images there is nothing at a first point that sees no glass.
-        let (mut weight, mut goes_on) = (1.0, true);
-        if chance < 1.0 {
-            goes_on = rng.uniform() < chance;
-            if !goes_on && !self.images.any() {
-                return;
-            }
-            if !self.images.any() {
-                weight = 1.0 / chance;
-            }
+        let (begins, onward) = match self.images.any() {
+            true => (begins, onward),
+            false => (begins * onward, 1.0),
+        };
+        if begins < 1.0 && rng.uniform() >= begins {
+            return;
         }
+        let goes_on = onward == 1.0 || rng.uniform() < onward;
+        let mut weight = 1.0 / begins;
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
         let mut path = Carried {
             weight,
@@ -114,13 +113,13 @@ impl ByGlass {
             }
             let left = there.weight / weight;
             let survive = |of: f32| (1.5 * left * of).min(0.95);
-            let Some(onward) = point.scatter(world, survive, rng, true) else {
+            let Some(next) = point.scatter(world, survive, rng, true) else {
                 return;
             };
-            (path, ray) = onward;
-            if first && self.images.any() && chance < 1.0 {
-                path.weight /= chance;
-                weight /= chance;
+            (path, ray) = next;
+            if first {
+                path.weight /= onward;
+                weight /= onward;
             }
         }
     }

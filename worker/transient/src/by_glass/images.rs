@@ -13,16 +13,19 @@ use crate::{
     world::{Hit, World, lift},
 };
 
-/// Most planes that are kept, those of the largest area: what others reflect is found by light paths.
-const MOST: usize = 32;
+/// Most planes that are kept, those of the largest area, and least share of the whole area that one has: what others reflect is
+/// found by light paths.
+const MOST: usize = 8;
+const LEAST: f32 = 0.02;
 /// How far a pane may lie off its plane, render units, and how far its normal may turn, cosine.
 const FLAT: f32 = 1e-5;
 const ALIKE: f32 = 0.999_999;
 /// How far off a plane a point must be to be on one of its sides, render units.
 const OFF: f32 = 1e-4;
 
-/// Points that light scatters at which are looked at for one connection.
-const LOOKED_AT: usize = 32;
+/// Points that light scatters at which are looked at for one connection, in all planes together, and of one plane at least and at most.
+const LOOKED_AT: usize = 64;
+const OF_ONE: (usize, usize) = (4, 32);
 
 /// Panes in one plane.
 #[derive(Debug)]
@@ -79,6 +82,8 @@ impl Images {
             plane.widen(&corners);
             all.push(pane);
         }
+        let whole: f32 = planes.iter().map(|(p, _)| p.area).sum();
+        planes.retain(|(p, _)| p.area >= LEAST * whole);
         planes.sort_by(|a, b| b.0.area.total_cmp(&a.0.area));
         planes.truncate(MOST);
         let mut of_pane = vec![NONE; panes.triangles().count()];
@@ -177,10 +182,12 @@ impl Images {
         let (Some(panes), all) = (&world.panes, lit.list.len()) else {
             return;
         };
-        let some = all.min(LOOKED_AT);
-        if some == 0 {
+        if all == 0 || self.planes.is_empty() {
             return;
         }
+        let some = (LOOKED_AT / self.planes.len())
+            .clamp(OF_ONE.0, OF_ONE.1)
+            .min(all);
         let first = ((rng.uniform() * all as f32) as usize).min(all - 1);
         let of = |k: usize| &lit.list[(first + k) % all];
         let mut weights = std::mem::take(&mut buffers.lights);

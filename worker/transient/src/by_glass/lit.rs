@@ -70,7 +70,8 @@ impl Areas {
         Self(each.collect())
     }
 
-    fn whole(&self) -> f64 {
+    /// Of all, render units squared.
+    pub fn whole(&self) -> f64 {
         self.0.last().copied().unwrap_or(0.0)
     }
 
