@@ -98,8 +98,8 @@ impl Splats {
                 rays += self.in_zones((frame, contacts), watch, &mut all);
             }
             if let Some(glass) = sources.glass {
-                let (photons, traced) = self.from_glass((frame, glass), watch, &mut all);
-                rays += traced + self.by_glass((frame, glass, &photons), watch, &mut all);
+                let (photons, traced) = self.paths_by_glass((frame, glass), watch, &mut all);
+                rays += traced + self.look_by_glass((frame, glass, &photons), watch, &mut all);
             }
             if watch.stopped() {
                 return Err(RenderError::Stopped);
@@ -164,7 +164,7 @@ impl Splats {
     }
 
     /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
-    fn from_glass(
+    fn paths_by_glass(
         &self,
         (frame, glass): (&Frame, &ByGlass),
         watch: &Watch,
@@ -197,7 +197,7 @@ impl Splats {
     }
 
     /// A pass of camera paths by way of glass.
-    fn by_glass(
+    fn look_by_glass(
         &self,
         (frame, glass, photons): (&Frame, &ByGlass, &Photons),
         watch: &Watch,
