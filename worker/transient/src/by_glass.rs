@@ -6,7 +6,8 @@
 //! *turned* where glass reflects or refracts light on it. Paths without a turned leg are the other techniques'; of the rest
 //!
 //! 1. those whose last leg is straight, or turned by the reflection of one planar pane alone, are camera paths, connected to the spots
-//!    and to their [`images`];
+//!    and to their [`images`]; where straight legs alone lead from a spot to a Lambertian point and a pane's reflection from there to the
+//!    next, that point's image is what is connected ([`lit`]);
 //! 2. the others are light paths. Read from the camera, the first straight leg joins the two: where it is the camera's own, the
 //!    light path is drawn into the image; else camera paths whose legs are all turned are connected to the light path's vertices.
 //!
