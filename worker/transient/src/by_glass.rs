@@ -61,7 +61,7 @@ pub(crate) struct ByGlass {
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
     images: Images,
-    /// Where points of [`Lit`] lie; empty without images.
+    /// Where points of [`Lit`] lie.
     areas: Areas,
     /// Row-major: the pixel or one of its neighbours sees glass.
     sees: Vec<bool>,
