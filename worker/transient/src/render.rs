@@ -16,8 +16,7 @@ mod warn;
 use picofarm_scene::Scene;
 
 use self::{
-    draws::likely,
-    error::{Stat, passes_for},
+    error::{Errors, Stat, passes_for},
     image::{Image, Watch},
     ready::{Ready, prepare},
     splat::{Sources, Splats},
@@ -127,17 +126,18 @@ fn whole(
         let before = image.mean_passes();
         rays += image.round(frame, 0..image.tiles(), &waves, &watch)?;
         done = until;
-        let error = match &mut splats {
-            None => image.estimate(),
+        let errors = match &mut splats {
+            None => image.errors(),
             Some((sources, splats)) => {
                 let wave = match walks {
                     true => image.mean_passes() - before,
                     false => ready.splat_passes(0),
                 };
                 rays += splats.round((frame, sources), wave, &watch)?;
-                splats.estimate(frame, &image, stop)?
+                splats.errors(frame, &image, stop)?
             }
         };
+        let error = errors.estimate();
         let spent = error.samples;
         let enough = match budget {
             Budget::Error(e) => error.median_relative <= e as f32 || spent >= MAX_PASSES,
@@ -165,7 +165,7 @@ fn whole(
             break error;
         };
         let target = target as f32;
-        waves = further(&image, frame.sampling, target, error.samples, stop)?;
+        waves = further((&image, &errors), frame.sampling, target, stop)?;
     };
     let plan = ready.plan(passes);
     let splats = splats.map(|(_, splats)| splats);
@@ -183,25 +183,25 @@ fn in_time((began, left): (f64, f64), round: u32) -> u32 {
 /// image needs on average is shared out by what the tiles need themselves, within a factor of two: tiles
 /// that are easy stop early, and no tile holds up all others.
 fn further(
-    image: &Image,
+    (image, errors): (&Image, &Errors),
     sampling: &Sampling,
     target: f32,
-    spent: u32,
     stop: Stop,
 ) -> Result<Vec<u32>, RenderError> {
+    let spent = errors.samples;
     let two = |n| match stop.asked() {
         // Whatever comes out of it is not used.
         true => 0.0,
         false => sampling.variance(n),
     };
-    let target = GOAL * target / likely(&image.stats, &image.watched(), 0.5) as f32;
-    let all = passes_for(&image.stats, spent, target, (spent + 1, MAX_PASSES), two);
+    let target = GOAL * target / errors.likely(0.5) as f32;
+    let all = passes_for(&errors.stats, spent, target, (spent + 1, MAX_PASSES), two);
     let own = |(spent, stats): (u32, Vec<Stat>)| {
         let range = (all / 2, (2 * all).min(MAX_PASSES));
         let need = passes_for(&stats, spent, target, range, two);
         need.saturating_sub(spent)
     };
-    let tiles = image.by_tile().take_while(|_| !stop.asked());
+    let tiles = image.by_tile(&errors.stats).take_while(|_| !stop.asked());
     let waves: Vec<u32> = tiles.map(own).collect();
     stop.check()?;
     if waves.iter().all(|&n| n == 0) {

@@ -54,9 +54,10 @@ impl Rendering {
         tile.min(pixels) * self.slots() * sums * f64::from(self.threads.max(1))
     }
 
-    /// Sums over light paths, if they were kept of every bin: of every channel, of squares, and with alternating signs for [`Rendering::split`].
+    /// Sums over light paths, if they were kept of every bin: of every channel, of squares, with alternating signs for [`Rendering::split`], and
+    /// in one pixel of nine for draws of its error.
     pub(in crate::model) fn paths(&self) -> f64 {
-        let sums = f64::from(self.histograms) + if self.split { 2.0 } else { 1.0 };
+        let sums = f64::from(self.histograms) + if self.split { 2.5 } else { 1.5 };
         match self.light_paths {
             true => self.shape.pixels() * self.slots() * sums,
             false => 0.0,

@@ -2,8 +2,8 @@
 //!
 //! The standard error is a quadratic mean. Where one path brings light to many bins at once, a pixel errs by a few chances
 //! alone: most pixels err by less than their standard error, and few by much more. So some pixels are *watched*: they keep
-//! the sum over every eighth pass. Differences of these sums are draws of the pixel's error, with all that its bins have in
-//! common, and the median over pixels is taken of them.
+//! the sum over every eighth pass, of what the tiles find and of what light paths draw into the image. Differences of these
+//! sums are draws of the pixel's error, with all that its bins have in common, and the median over pixels is taken of them.
 
 use super::{error::Stat, region::Region};
 
@@ -17,6 +17,53 @@ const LEAST: usize = 16;
 
 /// ‖draw of a pixel's error‖² over the bins, for each draw.
 pub(super) type Draw = [f64; DRAWS];
+
+/// Sums over every eighth pass.
+pub(super) type Sums = [f32; PHASES];
+
+/// From sums over every eighth pass to draws of the error of the mean over all passes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Phases {
+    /// Of each phase's sum in a draw.
+    weights: [f64; PHASES],
+}
+
+impl Phases {
+    /// Those of so many passes; `None` where a phase has none.
+    pub fn of(passes: u32) -> Option<Self> {
+        if (passes as usize) < PHASES {
+            return None;
+        }
+        // Means over the passes of each phase. Of n passes, a phase has n/8 or one more.
+        let n = |phase: usize| (passes as usize + PHASES - 1 - phase) / PHASES;
+        let spread: f64 = (0..PHASES).map(|phase| 1.0 / n(phase) as f64).sum();
+        // A mean of all passes has 1/passes of a pass' variance.
+        let factor = (1.0 / (f64::from(passes) * spread)).sqrt();
+        Some(Self {
+            weights: std::array::from_fn(|phase| factor / n(phase) as f64),
+        })
+    }
+
+    /// The phase of a pass.
+    pub fn phase(pass: u32) -> usize {
+        pass as usize % PHASES
+    }
+
+    /// Adds a bin with such sums to a pixel's draws; `other` is a draw of what else errs in it.
+    pub fn add(&self, sums: Sums, other: f64, draw: &mut Draw) {
+        let mean = |phase: usize| f64::from(sums[phase]) * self.weights[phase];
+        let means: [f64; PHASES] = std::array::from_fn(mean);
+        for (k, square) in draw.iter_mut().enumerate() {
+            let signed = means.iter().enumerate().map(|(j, m)| sign(k, j) * m);
+            *square += (signed.sum::<f64>() + other).powi(2);
+        }
+    }
+}
+
+/// A draw from a pixel's variance alone.
+pub(super) fn of_variance(variance: f64) -> Draw {
+    [variance; DRAWS]
+}
 
 /// What the watched pixels of a tile keep.
 #[derive(Debug, Default)]
@@ -32,13 +79,16 @@ pub(super) struct Watched {
     two: Vec<f32>,
 }
 
+/// Whether pixel `k` of a region is watched.
+pub(super) fn is_watched(region: &Region, k: usize) -> bool {
+    let chosen = |i: u32| i % APART == APART / 2;
+    let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
+    chosen(region.row + row) && chosen(region.col + col)
+}
+
 /// The watched pixels of a region.
 pub(super) fn watched(region: &Region) -> impl Iterator<Item = usize> + '_ {
-    let chosen = |i: u32| i % APART == APART / 2;
-    (0..region.pixels()).filter(move |&k| {
-        let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
-        chosen(region.row + row) && chosen(region.col + col)
-    })
+    (0..region.pixels()).filter(|&k| is_watched(region, k))
 }
 
 /// How many pixels of a region are watched.
@@ -80,7 +130,7 @@ impl Watched {
     #[inline]
     pub fn add(&mut self, k: usize, pass: u32, values: &[f32]) {
         let Some(place) = self.places[k] else { return };
-        let phase = place as usize * PHASES + pass as usize % PHASES;
+        let phase = place as usize * PHASES + Phases::phase(pass);
         let sum = &mut self.sums[phase * self.slots..(phase + 1) * self.slots];
         for (sum, v) in sum.iter_mut().zip(values) {
             *sum += v;
@@ -100,33 +150,19 @@ impl Watched {
     /// `multi_variance` says by pixel of the region, stands in their place.
     pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {
         let inside = 1..self.slots.max(2) - 1;
+        let phases = Phases::of(passes);
         let pixels = self.pixels.iter().enumerate();
         let each = pixels.map(|(place, &k)| {
             let two = &self.two[place * self.slots..][..self.slots];
-            if (passes as usize) < PHASES {
-                let two: f64 = two[inside.clone()]
-                    .iter()
-                    .map(|&x| f64::from(x).powi(2))
-                    .sum();
-                return [two + multi_variance(k); DRAWS];
-            }
-            // Means over the passes of each phase. Of n passes, a phase has n/8 or one more.
-            let n = |phase: usize| (passes as usize + PHASES - 1 - phase) / PHASES;
-            let spread: f64 = (0..PHASES).map(|phase| 1.0 / n(phase) as f64).sum();
-            // A mean of all passes has 1/passes of a pass' variance.
-            let factor = (1.0 / (f64::from(passes) * spread)).sqrt();
-            let mut draw = [0.0; DRAWS];
+            let Some(phases) = &phases else {
+                let two = two[inside.clone()].iter();
+                let two: f64 = two.map(|&x| f64::from(x).powi(2)).sum();
+                return of_variance(two + multi_variance(k));
+            };
+            let mut draw = Draw::default();
             for slot in inside.clone() {
-                let mean = |phase: usize| {
-                    let at = (place * PHASES + phase) * self.slots + slot;
-                    f64::from(self.sums[at]) * (factor / n(phase) as f64)
-                };
-                let means: [f64; PHASES] = std::array::from_fn(mean);
-                let two = f64::from(two[slot]);
-                for (k, square) in draw.iter_mut().enumerate() {
-                    let signed = means.iter().enumerate().map(|(j, m)| sign(k, j) * m);
-                    *square += (signed.sum::<f64>() + two).powi(2);
-                }
+                let sum = |phase: usize| self.sums[(place * PHASES + phase) * self.slots + slot];
+                phases.add(std::array::from_fn(sum), f64::from(two[slot]), &mut draw);
             }
             draw
         });

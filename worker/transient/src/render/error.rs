@@ -221,26 +221,41 @@ impl Spread {
     }
 }
 
-/// The estimate for a whole image of that `spread` in its whole energy, after `samples` passes on average; `draws` of some
-/// pixels' errors.
-pub(super) fn estimate(
-    stats: &[Stat],
-    draws: &[(usize, Draw)],
-    spread: Spread,
-    samples: u32,
-) -> ErrorEstimate {
-    let all = sorted(stats.iter().copied());
-    let total: f64 = stats.iter().map(|s| s.total).sum();
-    ErrorEstimate {
-        median_relative: (likely(stats, draws, 0.5) * quantile(&all, 0.5)) as f32,
-        p95_relative: (likely(stats, draws, 0.95) * quantile(&all, 0.95)) as f32,
-        total_relative: if total > 0.0 {
-            (spread.variance.sqrt() / total) as f32
-        } else {
-            0.0
-        },
-        total_uncertainty: spread.uncertainty() as f32,
-        samples,
+/// The errors of a whole image.
+#[derive(Debug, Clone)]
+pub(super) struct Errors {
+    /// By pixel.
+    pub stats: Vec<Stat>,
+    /// The watched pixels, and draws of their errors.
+    pub draws: Vec<(usize, Draw)>,
+    /// Of the whole energy.
+    pub spread: Spread,
+    /// Passes on average.
+    pub samples: u32,
+}
+
+impl Errors {
+    /// By how much the `q`-quantile over pixels of the errors differs from that of the standard errors: a factor.
+    pub fn likely(&self, q: f64) -> f64 {
+        likely(&self.stats, &self.draws, q)
+    }
+
+    /// What they come to.
+    pub fn estimate(&self) -> ErrorEstimate {
+        let all = sorted(self.stats.iter().copied());
+        let total: f64 = self.stats.iter().map(|s| s.total).sum();
+        let relative = |q| (self.likely(q) * quantile(&all, q)) as f32;
+        ErrorEstimate {
+            median_relative: relative(0.5),
+            p95_relative: relative(0.95),
+            total_relative: if total > 0.0 {
+                (self.spread.variance.sqrt() / total) as f32
+            } else {
+                0.0
+            },
+            total_uncertainty: self.spread.uncertainty() as f32,
+            samples: self.samples,
+        }
     }
 }
 

@@ -13,11 +13,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     draws::{self, Draw},
-    error::{Spread, Stat, estimate},
+    error::{Errors, Spread, Stat},
     region::Region,
     tile::{Done, Frame, Order, TileRenderer},
 };
-use crate::api::{ErrorEstimate, Progress, RenderError};
+use crate::api::{Progress, RenderError};
 
 /// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
 /// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
@@ -205,33 +205,32 @@ impl Image {
     }
 
     /// Passes of each tile so far, and the sums of its pixels.
-    pub fn by_tile(&self) -> impl Iterator<Item = (u32, Vec<Stat>)> {
+    pub fn by_tile<'a>(&'a self, stats: &'a [Stat]) -> impl Iterator<Item = (u32, Vec<Stat>)> + 'a {
         self.tiles.iter().zip(&self.spent).map(|(region, &spent)| {
             let pixel = |k: u32| {
                 let (row, col) = (region.row + k / region.cols, region.col + k % region.cols);
-                self.stats[row as usize * self.width + col as usize]
+                stats[row as usize * self.width + col as usize]
             };
             (spent, (0..region.rows * region.cols).map(pixel).collect())
         })
     }
 
-    /// The watched pixels, and draws of their errors.
-    pub fn watched(&self) -> Vec<(usize, Draw)> {
+    /// The errors of what was found so far.
+    pub fn errors(&self) -> Errors {
         let tiles = self.tiles.iter().zip(&self.tile_draws);
-        let each = tiles.flat_map(|(region, draws)| {
+        let watched = tiles.flat_map(|(region, draws)| {
             draws::watched(region).zip(draws).map(move |(k, draw)| {
                 let (row, col) = (k as u32 / region.cols, k as u32 % region.cols);
                 let (row, col) = (region.row + row, region.col + col);
                 (row as usize * self.width + col as usize, *draw)
             })
         });
-        each.collect()
-    }
-
-    /// The error of what was found so far.
-    pub fn estimate(&self) -> ErrorEstimate {
-        let draws = self.watched();
-        estimate(&self.stats, &draws, self.total_spread, self.mean_passes())
+        Errors {
+            stats: self.stats.clone(),
+            draws: watched.collect(),
+            spread: self.total_spread,
+            samples: self.mean_passes(),
+        }
     }
 
     /// Everything that there is of each pixel and bin.

@@ -4,10 +4,13 @@
 //! What a pass brings waits until there is enough of it, and is then merged with the sums, pass after pass: so that the bits
 //! do not depend on when that happens, and the work for a contribution does not grow with the number of sums.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
+    draws::{Draw, Phases, Sums, is_watched, of_variance},
     error::{MULTI_REACH, Pool, pool},
     image::{Image, room},
     region::Region,
@@ -36,6 +39,8 @@ struct Block {
     all: Sparse<Moments>,
     /// Of the other channels; their slots lie one channel behind the other, as [`crate::film::Film::pixel`] has them.
     groups: Sparse<f32>,
+    /// Of channel 0, in the watched pixels.
+    watched: Sparse<Sums>,
     #[serde(skip)]
     waiting: Vec<Waiting>,
 }
@@ -71,6 +76,8 @@ pub(super) struct Found<'a> {
     values: &'a [Moments],
     /// By slot, in render units.
     variance: &'a [f32],
+    /// Σ over the gate of the variance before it is pooled, and draws of the error if the pixel is watched; both in metres².
+    own: (f64, Option<Draw>),
     /// Factors from the sums to the mean and to a draw of its error, and from render units to metres.
     mean: (f64, f64),
     noise: f64,
@@ -98,6 +105,16 @@ impl Found<'_> {
         let inside = &self.variance[1..self.variance.len() - 1];
         inside.iter().map(|v| f64::from(*v) * self.unit * self.unit)
     }
+
+    /// Σ over the bins of the gate of their variances, before they are pooled: as the tiles have it.
+    pub fn pixel_variance(&self) -> f64 {
+        self.own.0
+    }
+
+    /// Draws of the pixel's error, if it is watched.
+    pub fn draw(&self) -> Option<&Draw> {
+        self.own.1.as_ref()
+    }
 }
 
 /// The rows of a block.
@@ -123,7 +140,9 @@ impl Layer {
         self.0.len() == frame.height.div_ceil(ROWS) as usize
             && blocks.all(|(k, block)| {
                 let pixels = region(frame, k).pixels();
-                block.all.fits(pixels, 0..slots) && block.groups.fits(pixels, slots..size)
+                block.all.fits(pixels, 0..slots)
+                    && block.groups.fits(pixels, slots..size)
+                    && block.watched.fits(pixels, 0..slots)
             })
     }
 
@@ -170,7 +189,7 @@ impl Layer {
         let blocks = self.0.par_iter_mut().enumerate();
         blocks
             .filter(|(_, block)| which(block))
-            .try_for_each(|(k, block)| block.merge(frame, region(frame, k).pixels()))
+            .try_for_each(|(k, block)| block.merge(frame, &region(frame, k)))
     }
 
     /// What was found in each pixel, over `passes`; pixels of rows to which nothing came are left out.
@@ -184,10 +203,13 @@ impl Layer {
         let slots = frame.film.slots;
         let n = f64::from(passes.max(1));
         let unit = unit(frame);
+        let inside = 1..slots as u32 - 1;
+        let phases = Phases::of(passes);
+        let mut own = vec![];
         let (mut variance, mut pooling) = (vec![], Pool::default());
         for (block, sums) in self.0.iter().enumerate() {
             stop.check()?;
-            let sums = &sums.all;
+            let (watched, sums) = (&sums.watched, &sums.all);
             if sums.slots.is_empty() {
                 continue;
             }
@@ -195,21 +217,35 @@ impl Layer {
             let first = (region.row * frame.width) as usize;
             variance.clear();
             variance.resize(region.pixels() * slots, 0.0);
+            own.clear();
             for (pixel, of_pixel) in variance.chunks_mut(slots).enumerate() {
                 let (slots, values) = sums.of(pixel);
+                let mut of_gate = 0.0;
                 for (slot, [sum, square, _]) in slots.iter().zip(values) {
                     let (x, square) = (f64::from(*sum), f64::from(*square));
                     let spread = (square - x * x / n).max(0.0) / (n - 1.0).max(1.0);
                     of_pixel[*slot as usize] = (spread / n) as f32;
+                    if inside.contains(slot) {
+                        of_gate += spread / n;
+                    }
                 }
+                own.push(of_gate);
             }
             pool(&mut variance, &region, slots, MULTI_REACH, &mut pooling);
             for (pixel, variance) in variance.chunks(slots).enumerate() {
                 let (slots, values) = sums.of(pixel);
+                let draw = is_watched(&region, pixel).then(|| match &phases {
+                    Some(phases) => drawn(phases, watched.of(pixel), &inside),
+                    None => of_variance(own[pixel]),
+                });
                 let found = Found {
                     slots,
                     values,
                     variance,
+                    own: (
+                        own[pixel] * unit * unit,
+                        draw.map(|d| d.map(|square| square * unit * unit)),
+                    ),
                     mean: (unit, n),
                     // The alternating sum has n times a pass' variance, and the mean has 1/n of it.
                     noise: unit / n,
@@ -253,8 +289,9 @@ impl Layer {
 }
 
 impl Block {
-    /// Merges what waits with the sums of so many pixels.
-    fn merge(&mut self, frame: &Frame, pixels: usize) -> Result<(), RenderError> {
+    /// Merges what waits with the sums of its rows.
+    fn merge(&mut self, frame: &Frame, region: &Region) -> Result<(), RenderError> {
+        let pixels = region.pixels();
         let film = frame.film;
         let split = frame.split;
         let by_place = |w: &Waiting| (w.pixel, w.slot);
@@ -292,9 +329,29 @@ impl Block {
             }
         };
         self.all.take(pixels, &self.waiting, add)?;
+        self.waiting
+            .retain(|w| is_watched(region, w.pixel as usize));
+        self.watched.take(pixels, &self.waiting, add_phases)?;
         self.waiting.clear();
         Ok(())
     }
+}
+
+/// Adds what waits for one slot of a watched pixel.
+fn add_phases(sums: &mut Sums, group: &[Waiting]) {
+    group
+        .iter()
+        .for_each(|w| sums[Phases::phase(w.pass)] += w.value);
+}
+
+/// Draws of a watched pixel's error, in render units², from its slots inside the gate.
+fn drawn(phases: &Phases, (slots, sums): (&[u32], &[Sums]), inside: &Range<u32>) -> Draw {
+    let mut draw = Draw::default();
+    let each = slots.iter().zip(sums);
+    for (_, sums) in each.filter(|(slot, _)| inside.contains(slot)) {
+        phases.add(*sums, 0.0, &mut draw);
+    }
+    draw
 }
 
 impl<V: Copy + Default> Sparse<V> {
@@ -309,7 +366,7 @@ impl<V: Copy + Default> Sparse<V> {
         }
     }
 
-    fn fits(&self, pixels: usize, within: std::ops::Range<u32>) -> bool {
+    fn fits(&self, pixels: usize, within: Range<u32>) -> bool {
         let count = self.slots.len();
         if self.values.len() != count {
             return false;
@@ -374,10 +431,22 @@ impl<V: Copy + Default> Sparse<V> {
 mod tests {
     use proptest::prelude::*;
 
-    use super::{Sparse, Waiting};
+    use super::{Draw, Phases, Sparse, Sums, Waiting, add_phases, drawn};
+    use crate::rng::{Rng, Stream};
 
     const PIXELS: usize = 5;
     const SLOTS: usize = 7;
+
+    fn waiting(pass: u32, (pixel, slot, value): (u32, u32, f32)) -> Waiting {
+        Waiting {
+            pixel,
+            slot,
+            pass,
+            value,
+            spot: 0,
+            wavelength: 0,
+        }
+    }
 
     /// Merges `found` in pieces that end where `cuts` says.
     fn merged(found: &[Waiting], cuts: &[usize]) -> Sparse<f32> {
@@ -403,15 +472,7 @@ mod tests {
             mut cuts in prop::collection::vec(0usize..80, 0..6),
         ) {
             cuts.sort_unstable();
-            let waiting = |(pixel, slot, value)| Waiting {
-                pixel,
-                slot,
-                pass: 0,
-                value,
-                spot: 0,
-                wavelength: 0,
-            };
-            let found: Vec<Waiting> = found.into_iter().map(waiting).collect();
+            let found: Vec<Waiting> = found.into_iter().map(|w| waiting(0, w)).collect();
             let mut every = [[0.0f32; SLOTS]; PIXELS];
             for w in &found {
                 every[w.pixel as usize][w.slot as usize] += w.value;
@@ -429,6 +490,43 @@ mod tests {
                 prop_assert_eq!(&of_slot, row);
             }
         }
+    }
+
+    #[test]
+    fn draws_of_a_watched_pixel_have_the_variance_of_its_mean() {
+        // Every slot of each of eight passes: the draws hold all that there is but the mean.
+        let passes = 8;
+        let mut rng = Rng::new(1, Stream::Caustic, 0, 0);
+        let values: Vec<[f32; SLOTS]> = (0..passes)
+            .map(|_| std::array::from_fn(|_| rng.uniform()))
+            .collect();
+        let mut watched = Sparse::<Sums>::default();
+        for (pass, of_pass) in values.iter().enumerate() {
+            let found: Vec<Waiting> = (0u32..)
+                .zip(of_pass)
+                .map(|(slot, &value)| waiting(pass as u32, (2, slot, value)))
+                .collect();
+            watched.take(PIXELS, &found, add_phases).unwrap();
+        }
+        let phases = Phases::of(passes as u32).unwrap();
+        let draw = drawn(&phases, watched.of(2), &(0..SLOTS as u32));
+        let n = f64::from(passes);
+        let variance: f64 = (0..SLOTS)
+            .map(|slot| {
+                let at = || values.iter().map(|v| f64::from(v[slot]));
+                let mean = at().sum::<f64>() / n;
+                at().map(|x| (x - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))
+            })
+            .sum();
+        let mean = draw.iter().sum::<f64>() / draw.len() as f64;
+        assert!((mean / variance - 1.0).abs() < 1e-5, "{mean} {variance}");
+        // What lies outside the gate does not count, and a pixel without light has no error.
+        let inside = drawn(&phases, watched.of(2), &(1..SLOTS as u32 - 1));
+        assert!(inside.iter().sum::<f64>() < draw.iter().sum::<f64>());
+        assert_eq!(
+            drawn(&phases, watched.of(0), &(0..SLOTS as u32)),
+            Draw::default()
+        );
     }
 
     #[test]

@@ -224,10 +224,11 @@ pub fn join_parts(
             return Err(wrong("parts", "there are none; render them first".into()));
         }
         image.total();
-        let error = match &splats {
-            None => image.estimate(),
-            Some(splats) => splats.estimate(frame, &image, stop)?,
+        let errors = match &splats {
+            None => image.errors(),
+            Some(splats) => splats.errors(frame, &image, stop)?,
         };
+        let error = errors.estimate();
         let plan = ready.plan(shape.passes);
         ready.finish((image, splats), seen, (error, rays), (plan, stop))
     })

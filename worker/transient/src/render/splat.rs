@@ -1,17 +1,19 @@
 //! Light paths drawn into the image: what they bring where the camera sees their end. They cross tiles,
 //! so they are an estimate of their own beside the tiles', made of as many passes as the image's.
 
+use std::collections::HashMap;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    error::{Spread, Stat, estimate},
+    error::{Errors, Spread},
     image::{Image, Watch},
     layer::Layer,
     tile::Frame,
 };
 use crate::{
-    api::{ErrorEstimate, RenderError, Stop},
+    api::{RenderError, Stop},
     bvh::Stack,
     by_glass::{Buffers, ByGlass, Photons},
     caustic::{Caustics, Splat, splat},
@@ -237,40 +239,33 @@ impl Splats {
         Ok(())
     }
 
-    /// The error of the image with these passes.
-    pub fn estimate(
-        &self,
-        frame: &Frame,
-        image: &Image,
-        stop: Stop,
-    ) -> Result<ErrorEstimate, RenderError> {
+    /// The errors of the image with these passes.
+    pub fn errors(&self, frame: &Frame, image: &Image, stop: Stop) -> Result<Errors, RenderError> {
         let bins = frame.film.gate.bins as usize;
-        let mut stats: Vec<Stat> = image.stats.clone();
+        let mut errors = image.errors();
+        let watched = errors.draws.iter().enumerate();
+        let places: HashMap<usize, usize> = watched.map(|(k, (pixel, _))| (*pixel, k)).collect();
         for layer in [&self.two, &self.multi] {
             layer.each(frame, self.passes, stop, |pixel, found| {
                 let h = &image.transient[pixel * bins..(pixel + 1) * bins];
-                let stat = &mut stats[pixel];
+                let stat = &mut errors.stats[pixel];
                 for (bin, mean, _) in found.light() {
                     stat.norm2 += mean * (mean + 2.0 * f64::from(h[bin]));
                     stat.total += mean;
                 }
                 // Of two bounces as well: it falls with the passes as that of more does.
-                found.variance().for_each(|v| stat.multi_variance += v);
+                stat.multi_variance += found.pixel_variance();
+                if let (Some(own), Some(&k)) = (found.draw(), places.get(&pixel)) {
+                    // Errors of different paths: on average their squares add up.
+                    for (square, of_layer) in errors.draws[k].1.iter_mut().zip(own) {
+                        *square += of_layer;
+                    }
+                }
             })?;
         }
-        // Of many paths, each in a bin: what they add to a draw is what they add to its mean square.
-        let mut draws = image.watched();
-        for (pixel, draw) in &mut draws {
-            let added = stats[*pixel].multi_variance - image.stats[*pixel].multi_variance;
-            draw.iter_mut().for_each(|square| *square += added);
-        }
         let own = Spread::of(&self.all).scaled(unit(frame));
-        Ok(estimate(
-            &stats,
-            &draws,
-            image.total_spread.plus(own),
-            image.mean_passes(),
-        ))
+        errors.spread = errors.spread.plus(own);
+        Ok(errors)
     }
 
     /// Adds these passes to the finished image.
