@@ -19,6 +19,7 @@
 //! On a leg every pane in the way may reflect, and what passes goes on. Where nothing was turned yet a reflection is chosen more often
 //! than light does, since only such paths bring anything.
 
+mod aim;
 mod camera;
 mod images;
 mod light;
@@ -30,6 +31,7 @@ use picofarm_scene::Vec3;
 
 pub(crate) use self::photons::Photons;
 use self::{
+    aim::Aim,
     images::Images,
     lit::{Areas, Lit},
 };
@@ -61,6 +63,8 @@ pub(crate) struct ByGlass {
     of_pane: Vec<u32>,
     of_triangle: Vec<u32>,
     images: Images,
+    /// What camera paths aim at.
+    aim: Aim,
     /// Where points of [`Lit`] lie.
     areas: Areas,
     /// Row-major: the pixel or one of its neighbours sees glass.
@@ -110,7 +114,7 @@ impl ByGlass {
         let images = Images::find(world);
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
         let mut glass = 0.0;
-        let mut all = vec![];
+        let (mut all, mut aimed_at) = (vec![], vec![]);
         let mut of_pane = vec![];
         let mut of_triangle = vec![NONE; world.triangles.len()];
         for (k, (corners, normal)) in world.panes.iter().flat_map(|p| p.triangles()).enumerate() {
@@ -122,6 +126,9 @@ impl ByGlass {
             glass += share * area(corners);
             if share > 0.0 && normal != Vec3::ZERO {
                 of_pane[k] = all.len() as u32;
+                if !images.has(k as u32) {
+                    aimed_at.push(corners);
+                }
                 all.push(Target {
                     corners,
                     normal,
@@ -136,6 +143,7 @@ impl ByGlass {
                 if world.body(k as u32).is_some() && world.normals[k] != Vec3::ZERO {
                     glass += area(corners);
                     of_triangle[k] = all.len() as u32;
+                    aimed_at.push(corners);
                     all.push(Target {
                         corners,
                         normal: world.normals[k],
@@ -159,6 +167,7 @@ impl ByGlass {
             elsewhere: (BY_AREA * glass / areas.whole() as f32).clamp(ELSEWHERE, 1.0),
             areas,
             images,
+            aim: Aim::at(aimed_at),
             of_pane,
             of_triangle,
             sees: sees(world, centres, &mut stack),

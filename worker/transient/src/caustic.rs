@@ -31,6 +31,7 @@ use crate::{
     light_vertices::{ALONE, LightVertex, LightVertices},
     mirror_images::Mirrors,
     rng::{Rng, Stream},
+    sink::Technique,
     spectra::{Ratios, times},
     targets::{Drawn, Target, Targets},
     world::{Hit, World, lift},
@@ -81,6 +82,7 @@ pub(crate) struct Splat {
     pub value: f32,
     /// Bounces of the whole path.
     pub bounces: u32,
+    pub technique: Technique,
 }
 
 /// How many of a batch of light paths begin which way.
@@ -299,12 +301,11 @@ impl Caustics {
 /// distance d and angle θ gives I/(d² cos³θ) over the pixel's sensitive area on the film at unit distance. One for each wavelength
 /// that has channels of its own; none where the camera sees nothing of it.
 pub(crate) fn splat<'a>(
-    world: &World,
-    film: &'a Film,
-    z: &LightVertex,
+    (world, film): (&World, &'a Film),
+    (z, technique): (&LightVertex, Technique),
     stack: &mut Stack,
 ) -> impl Iterator<Item = Splat> + use<'a> {
-    let seen = seen(world, film, z, stack).into_iter();
+    let seen = seen((world, film), (z, technique), stack).into_iter();
     seen.flat_map(|(splat, ratios)| {
         (0u8..)
             .zip(ratios)
@@ -318,7 +319,11 @@ pub(crate) fn splat<'a>(
 }
 
 /// The light of all wavelengths.
-fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Option<(Splat, Ratios)> {
+fn seen(
+    (world, film): (&World, &Film),
+    (z, technique): (&LightVertex, Technique),
+    stack: &mut Stack,
+) -> Option<(Splat, Ratios)> {
     let i = &world.camera.intrinsics;
     let p = z.hit.p;
     let q = world.camera.direction_to_camera(p);
@@ -342,6 +347,7 @@ fn seen(world: &World, film: &Film, z: &LightVertex, stack: &mut Stack) -> Optio
         wavelength: 0,
         value,
         bounces: z.bounces,
+        technique,
     };
     Some((splat, times(z.ratios, world.ratios(&z.hit, z.back, -p / d))))
 }

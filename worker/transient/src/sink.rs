@@ -68,6 +68,39 @@ pub(crate) fn class_name(class: usize) -> String {
     format!("{place}, {way}")
 }
 
+/// How what is drawn into the image beside the tiles was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Technique {
+    /// By light paths by way of near-mirrors.
+    Mirrors,
+    /// By light paths in the zone of a spot.
+    Zone,
+    /// By light paths by way of glass.
+    Glass,
+    /// By camera paths by way of glass and straight legs to the spots, walks from them among those.
+    Straight,
+    /// By connecting camera paths to images of spots in panes.
+    Image,
+    /// By connecting them to images of lit points in panes.
+    LitImage,
+    /// By connecting them to the vertices of light paths by way of glass.
+    Vertex,
+    /// By the photons of such paths.
+    Photon,
+}
+
+/// Their names.
+pub(crate) const TECHNIQUES: [&str; 8] = [
+    "light path by near-mirrors",
+    "light path in a zone",
+    "light path by glass",
+    "camera path by glass, spot or lit point",
+    "camera path, image of a spot in a pane",
+    "camera path, image of a lit point in a pane",
+    "camera path by glass, light path by glass",
+    "camera path by glass, photon",
+];
+
 /// Takes what a walk finds: optical path in metres, light, spot, bounces of the whole path, and how it was found.
 pub(crate) trait Sink {
     fn add(&mut self, path_m: f64, light: Light, spot: usize, bounces: u32, way: Way);

@@ -13,7 +13,7 @@ use crate::{
     emitter::Emitters,
     film::Film,
     rng::Rng,
-    sink::{Place, Sink, Way},
+    sink::{Place, Sink, Technique, Way},
     spectra::{Light, ONES, Ratios, times},
     vertex::Vertex,
     walk::{ALL, Walk, draw},
@@ -51,10 +51,10 @@ impl ByGlass {
             return;
         }
         let goes_on = onward == 1.0 || rng.uniform() < onward;
-        let mut weight = 1.0 / begins;
+        let mut left = 1.0;
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
         let mut path = Carried {
-            weight,
+            weight: 1.0 / begins,
             ratios: ONES,
             length_m: 0.0,
             bounces: 0,
@@ -111,15 +111,13 @@ impl ByGlass {
             if !goes_on {
                 return;
             }
-            let left = there.weight / weight;
-            let survive = |of: f32| (1.5 * left * of).min(0.95);
-            let Some(next) = point.scatter(world, survive, rng, true) else {
+            let on_leg = there.weight / path.weight;
+            let Some(next) = point.seek((world, &self.aim), left * on_leg, rng) else {
                 return;
             };
-            (path, ray) = next;
+            (path, ray, left) = next;
             if first {
                 path.weight /= onward;
-                weight /= onward;
             }
         }
     }
@@ -135,6 +133,7 @@ pub(super) struct Found {
     /// Emitter.
     pub spot: usize,
     pub bounces: u32,
+    pub technique: Technique,
 }
 
 /// Where the splats of a walk go. Straight legs stay in one medium: those of the walk are all as much longer as its index says.
@@ -156,6 +155,7 @@ impl Sink for Splats<'_> {
             path_m: self.before_m + (path_m - to_spot) * self.medium + to_spot,
             spot,
             bounces,
+            technique: Technique::Straight,
         };
         add(self.film, (self.pixel, found), || light.ratios, self.out);
     }
@@ -241,6 +241,7 @@ fn join(
                 path_m: path.length_m + leg + y.path_m,
                 spot: y.spot,
                 bounces,
+                technique: Technique::Vertex,
             };
             let ratios = || {
                 let here = times(path.ratios, world.ratios(h, point.back, w));
@@ -268,5 +269,6 @@ fn add(
         wavelength,
         value: found.value * ratio,
         bounces: found.bounces,
+        technique: found.technique,
     }));
 }

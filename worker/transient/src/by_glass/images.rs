@@ -8,6 +8,7 @@ use crate::{
     bsdf::frame,
     glass::Panes,
     rng::Rng,
+    sink::Technique,
     spectra::{ONES, Ratios, times},
     walk::{Walk, draw},
     world::{Hit, World, lift},
@@ -156,6 +157,7 @@ impl Images {
             path_m: path.length_m + way.length_m + e.path_m,
             spot,
             bounces: path.bounces + 2,
+            technique: Technique::Image,
         };
         let ratios = match world.is_spectral() {
             false => ONES,
@@ -219,6 +221,7 @@ impl Images {
                     path_m: point.path.length_m + way.length_m + a.path_m,
                     spot: a.spot,
                     bounces: point.path.bounces + 1 + a.bounces,
+                    technique: Technique::LitImage,
                 };
                 if found.bounces <= walk.max_bounces {
                     each(found, times(here, a.light.ratios));

@@ -79,7 +79,7 @@ impl ByGlass {
                 true => 1.0,
                 false => weight.min(0.95),
             };
-            let Some(onward) = point.scatter(world, survive, rng, false) else {
+            let Some(onward) = point.scatter(world, survive, rng) else {
                 return;
             };
             (path, ray) = onward;

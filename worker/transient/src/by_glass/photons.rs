@@ -10,6 +10,7 @@ use super::{camera::Found, ray::Point};
 use crate::{
     emitter::Emitters,
     light_vertices::{ALONE, LightVertex},
+    sink::Technique,
     spectra::{ONES, Ratios, times},
     world::{Hit, World},
 };
@@ -110,6 +111,7 @@ impl Photons {
                         path_m: path.length_m + z.path_m,
                         spot: z.spot,
                         bounces,
+                        technique: Technique::Photon,
                     };
                     if found.value > 0.0 {
                         let here = match world.is_spectral() {

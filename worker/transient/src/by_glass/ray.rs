@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::images::Images;
+use super::{aim::Aim, images::Images};
 use crate::{
     bvh::Stack,
     fresnel::{Body, split},
@@ -18,6 +18,10 @@ const REFLECT: f32 = 0.1;
 /// again and again: few such rays would be left, of many times the weight.
 const SURE_TURNS: u32 = 4;
 const MOST_TURNS: u32 = 400;
+
+/// Chance of a camera path to go on, by what it carries, and at most.
+const STAY: f32 = 1.5;
+const MOST_STAY: f32 = 0.95;
 
 /// A ray on a leg.
 #[derive(Debug, Clone, Copy)]
@@ -239,14 +243,13 @@ pub(super) fn arrive(
 }
 
 impl Point {
-    /// Goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step of a
-    /// weight does.
+    /// Flux goes on by the surface's scattering: what the path carries then, and the ray. `survive` says with which chance a step
+    /// of a weight does.
     pub fn scatter(
         &self,
         world: &World,
         survive: impl Fn(f32) -> f32,
         rng: &mut Rng,
-        radiance: bool,
     ) -> Option<(Carried, Ray)> {
         let h = &self.hit;
         let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
@@ -254,12 +257,42 @@ impl Point {
         if chance < 1.0 && rng.uniform() >= chance {
             return None;
         }
+        Some(self.onward(world, (w, weight / chance), false))
+    }
+
+    /// Radiance goes on by the surface's scattering or to where glass is. What the path carries then, the ray, and what is left of
+    /// `left`: what it would carry by scattering alone, since how narrow the cones are says nothing of what lies in them. Roulette
+    /// goes by that.
+    pub fn seek(
+        &self,
+        (world, aim): (&World, &Aim),
+        left: f32,
+        rng: &mut Rng,
+    ) -> Option<(Carried, Ray, f32)> {
+        let h = &self.hit;
+        let (w, weight, own) = match aim.from(h) {
+            Some(cones) => cones.sample(h, self.back, rng)?,
+            None => {
+                let (w, weight, _) = h.surface.sample(h.n, self.back, rng)?;
+                (w, weight, weight)
+            }
+        };
+        let chance = (STAY * left * own).min(MOST_STAY);
+        if rng.uniform() >= chance {
+            return None;
+        }
+        let (path, ray) = self.onward(world, (w, weight / chance), true);
+        Some((path, ray, left * own / chance))
+    }
+
+    fn onward(&self, world: &World, (w, weight): (Vec3, f32), radiance: bool) -> (Carried, Ray) {
+        let h = &self.hit;
         let path = Carried {
-            weight: self.path.weight * weight / chance,
+            weight: self.path.weight * weight,
             ratios: times(self.path.ratios, world.ratios(h, self.back, w)),
             ..self.path
         };
         let from = lift(h.p, h.n);
-        Some((path, Ray::new(h.p, from, w, (self.medium, radiance))))
+        (path, Ray::new(h.p, from, w, (self.medium, radiance)))
     }
 }

@@ -20,6 +20,7 @@ use crate::{
     contact::Contacts,
     light_vertices::LightVertex,
     rng::{Rng, Stream},
+    sink::Technique,
     turns::Turns,
 };
 
@@ -53,6 +54,129 @@ impl<'a> Sources<'a> {
             contacts,
             glass,
         })
+    }
+
+    /// What a pass brings, and the rays traced for it.
+    pub fn pass(&self, frame: &Frame, pass: u32, watch: &Watch) -> (Vec<Splat>, u64) {
+        let (mut all, mut rays, at) = (vec![], 0, (pass, watch));
+        if let Some(caustics) = self.caustics {
+            rays += Self::by_mirrors((frame, caustics), at, &mut all);
+        }
+        if let Some(contacts) = self.contacts {
+            rays += Self::in_zones((frame, contacts), at, &mut all);
+        }
+        if let Some(glass) = self.glass {
+            let (photons, traced) = Self::paths_by_glass((frame, glass), at, &mut all);
+            rays += traced + Self::look_by_glass((frame, glass, &photons), at, &mut all);
+        }
+        (all, rays)
+    }
+
+    /// A pass of light paths by way of near-mirrors.
+    fn by_mirrors(
+        (frame, caustics): (&Frame, &Caustics),
+        (pass, watch): (u32, &Watch),
+        all: &mut Vec<Splat>,
+    ) -> u64 {
+        let within = frame.walk.surroundings();
+        let of = (within.world, frame.film);
+        let pixels = f64::from(frame.width) * f64::from(frame.height);
+        let count = (pixels * PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
+        let chunk = |stack: &mut Stack, chunk: u32, ends: &mut Vec<Splat>| {
+            let pass = u64::from(pass);
+            let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
+            let mut seen = vec![];
+            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
+                caustics.trace(&within, (l, count), &mut rng, stack, |z| seen.push(z));
+                let found = seen.drain(..);
+                ends.extend(found.flat_map(|z| splat(of, (&z, Technique::Mirrors), stack)));
+            }
+        };
+        side_by_side(frame, count.div_ceil(CHUNK), watch, all, chunk)
+    }
+
+    /// A pass of light paths in the zones of spots beside other surfaces.
+    fn in_zones(
+        (frame, contacts): (&Frame, &Contacts),
+        (pass, watch): (u32, &Watch),
+        all: &mut Vec<Splat>,
+    ) -> u64 {
+        let within = frame.walk.surroundings();
+        let of = (within.world, frame.film);
+        let (least, most) = ZONE_PATHS;
+        let share = frame.width * frame.height / ZONE_SHARE / contacts.count();
+        let count = share.clamp(least, most);
+        let zone = |stack: &mut Stack, zone: u32, ends: &mut Vec<Splat>| {
+            let pass = u64::from(pass);
+            let mut rng = Rng::new(frame.seed, Stream::Contact, u64::from(zone), pass);
+            let turns = Turns::new(count, &mut rng);
+            let mut seen = vec![];
+            for l in 0..count {
+                let at = (zone as usize, l, &turns);
+                contacts.trace(&within, at, &mut rng, stack, |_, z| seen.push(z));
+                let found = seen.drain(..);
+                ends.extend(found.flat_map(|z| splat(of, (&z, Technique::Zone), stack)));
+            }
+        };
+        side_by_side(frame, contacts.count(), watch, all, zone)
+    }
+
+    /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
+    fn paths_by_glass(
+        (frame, glass): (&Frame, &ByGlass),
+        (pass, watch): (u32, &Watch),
+        all: &mut Vec<Splat>,
+    ) -> (Photons, u64) {
+        let walk = &frame.walk;
+        let of = (walk.world, frame.film);
+        let pixels = f64::from(frame.width) * f64::from(frame.height);
+        let count = (pixels * GLASS_PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
+        let chunk = |buffers: &mut Buffers, chunk: u32, (ends, photons): &mut Ends| {
+            let pass = u64::from(pass);
+            let mut rng = Rng::new(frame.seed, Stream::Glass, u64::from(chunk), pass);
+            let mut seen = vec![];
+            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
+                let each = |z, turned| seen.push((z, turned));
+                glass.trace(walk, (l, count), &mut rng, buffers, each);
+                for (z, turned) in seen.drain(..) {
+                    ends.extend(splat(of, (&z, Technique::Glass), buffers.stack()));
+                    photons.extend(turned.then_some(z));
+                }
+            }
+        };
+        let (mut photons, mut rays) = (vec![], 0);
+        let chunks = with_buffers(frame, count.div_ceil(CHUNK), watch, chunk);
+        for ((ends, of_chunk), traced) in chunks {
+            all.extend(ends);
+            photons.extend(of_chunk);
+            rays += traced;
+        }
+        (Photons::new(walk.world, walk.emitters, photons), rays)
+    }
+
+    /// A pass of camera paths by way of glass.
+    fn look_by_glass(
+        (frame, glass, photons): (&Frame, &ByGlass, &Photons),
+        (pass, watch): (u32, &Watch),
+        all: &mut Vec<Splat>,
+    ) -> u64 {
+        let (walk, width) = (&frame.walk, frame.width);
+        let pixels = width * frame.height;
+        let chunk = |buffers: &mut Buffers, chunk: u32, found: &mut Vec<Splat>| {
+            let pass = u64::from(pass);
+            let mut rng = Rng::new(frame.seed, Stream::ByGlass, u64::from(chunk), pass);
+            glass.lay(walk, LAID, &mut rng, buffers);
+            for pixel in chunk * CHUNK..pixels.min((chunk + 1) * CHUNK) {
+                let place = (rng.uniform(), rng.uniform());
+                let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
+                let within = (walk, frame.film, photons);
+                glass.look(within, (pixel, ray), &mut rng, buffers, found);
+            }
+        };
+        joined(
+            with_buffers(frame, pixels.div_ceil(CHUNK), watch, chunk),
+            all,
+        )
     }
 }
 
@@ -92,17 +216,8 @@ impl Splats {
     ) -> Result<u64, RenderError> {
         let mut rays = 0;
         for _ in 0..wave {
-            let mut all = vec![];
-            if let Some(caustics) = sources.caustics {
-                rays += self.by_mirrors((frame, caustics), watch, &mut all);
-            }
-            if let Some(contacts) = sources.contacts {
-                rays += self.in_zones((frame, contacts), watch, &mut all);
-            }
-            if let Some(glass) = sources.glass {
-                let (photons, traced) = self.paths_by_glass((frame, glass), watch, &mut all);
-                rays += traced + self.look_by_glass((frame, glass, &photons), watch, &mut all);
-            }
+            let (all, traced) = sources.pass(frame, self.passes, watch);
+            rays += traced;
             if watch.stopped() {
                 return Err(RenderError::Stopped);
             }
@@ -114,114 +229,6 @@ impl Splats {
         self.two.settle(frame)?;
         self.multi.settle(frame)?;
         Ok(rays)
-    }
-
-    /// A pass of light paths by way of near-mirrors.
-    fn by_mirrors(
-        &self,
-        (frame, caustics): (&Frame, &Caustics),
-        watch: &Watch,
-        all: &mut Vec<Splat>,
-    ) -> u64 {
-        let within = frame.walk.surroundings();
-        let pixels = f64::from(frame.width) * f64::from(frame.height);
-        let count = (pixels * PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
-        let chunk = |stack: &mut Stack, chunk: u32, ends: &mut Vec<Splat>| {
-            let pass = u64::from(self.passes);
-            let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
-            let mut seen = vec![];
-            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
-                caustics.trace(&within, (l, count), &mut rng, stack, |z| seen.push(z));
-                let found = seen.drain(..);
-                ends.extend(found.flat_map(|z| splat(within.world, frame.film, &z, stack)));
-            }
-        };
-        side_by_side(frame, count.div_ceil(CHUNK), watch, all, chunk)
-    }
-
-    /// A pass of light paths in the zones of spots beside other surfaces.
-    fn in_zones(
-        &self,
-        (frame, contacts): (&Frame, &Contacts),
-        watch: &Watch,
-        all: &mut Vec<Splat>,
-    ) -> u64 {
-        let within = frame.walk.surroundings();
-        let (least, most) = ZONE_PATHS;
-        let share = frame.width * frame.height / ZONE_SHARE / contacts.count();
-        let count = share.clamp(least, most);
-        let zone = |stack: &mut Stack, zone: u32, ends: &mut Vec<Splat>| {
-            let pass = u64::from(self.passes);
-            let mut rng = Rng::new(frame.seed, Stream::Contact, u64::from(zone), pass);
-            let turns = Turns::new(count, &mut rng);
-            let mut seen = vec![];
-            for l in 0..count {
-                let at = (zone as usize, l, &turns);
-                contacts.trace(&within, at, &mut rng, stack, |_, z| seen.push(z));
-                let found = seen.drain(..);
-                ends.extend(found.flat_map(|z| splat(within.world, frame.film, &z, stack)));
-            }
-        };
-        side_by_side(frame, contacts.count(), watch, all, zone)
-    }
-
-    /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
-    fn paths_by_glass(
-        &self,
-        (frame, glass): (&Frame, &ByGlass),
-        watch: &Watch,
-        all: &mut Vec<Splat>,
-    ) -> (Photons, u64) {
-        let walk = &frame.walk;
-        let pixels = f64::from(frame.width) * f64::from(frame.height);
-        let count = (pixels * GLASS_PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
-        let chunk = |buffers: &mut Buffers, chunk: u32, (ends, photons): &mut Ends| {
-            let pass = u64::from(self.passes);
-            let mut rng = Rng::new(frame.seed, Stream::Glass, u64::from(chunk), pass);
-            let mut seen = vec![];
-            for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
-                let each = |z, turned| seen.push((z, turned));
-                glass.trace(walk, (l, count), &mut rng, buffers, each);
-                for (z, turned) in seen.drain(..) {
-                    ends.extend(splat(walk.world, frame.film, &z, buffers.stack()));
-                    photons.extend(turned.then_some(z));
-                }
-            }
-        };
-        let (mut photons, mut rays) = (vec![], 0);
-        let chunks = with_buffers(frame, count.div_ceil(CHUNK), watch, chunk);
-        for ((ends, of_chunk), traced) in chunks {
-            all.extend(ends);
-            photons.extend(of_chunk);
-            rays += traced;
-        }
-        (Photons::new(walk.world, walk.emitters, photons), rays)
-    }
-
-    /// A pass of camera paths by way of glass.
-    fn look_by_glass(
-        &self,
-        (frame, glass, photons): (&Frame, &ByGlass, &Photons),
-        watch: &Watch,
-        all: &mut Vec<Splat>,
-    ) -> u64 {
-        let (walk, width) = (&frame.walk, frame.width);
-        let pixels = width * frame.height;
-        let chunk = |buffers: &mut Buffers, chunk: u32, found: &mut Vec<Splat>| {
-            let pass = u64::from(self.passes);
-            let mut rng = Rng::new(frame.seed, Stream::ByGlass, u64::from(chunk), pass);
-            glass.lay(walk, LAID, &mut rng, buffers);
-            for pixel in chunk * CHUNK..pixels.min((chunk + 1) * CHUNK) {
-                let place = (rng.uniform(), rng.uniform());
-                let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
-                let within = (walk, frame.film, photons);
-                glass.look(within, (pixel, ray), &mut rng, buffers, found);
-            }
-        };
-        joined(
-            with_buffers(frame, pixels.div_ceil(CHUNK), watch, chunk),
-            all,
-        )
     }
 
     /// Adds one pass.

@@ -1,23 +1,28 @@
 //! Which class of paths carries the variance, from a few tiles of the image.
 
+use std::collections::HashMap;
+
 use picofarm_scene::Scene;
 use rayon::prelude::*;
 
 use super::{
     forecast::regions,
+    image::Watch,
+    layer::Layer,
     ready::prepare,
     region::Region,
+    splat::{Sources, unit},
     tile::{Frame, Order, TileRenderer},
 };
 use crate::{
     api::{RenderError, Settings, Stop, Unstopped},
     film::Film,
     path_reuse::{Sharing, Tile},
-    sink::{CLASSES, class_name},
+    sink::{CLASSES, TECHNIQUES, class_name},
     walk::Scratch,
 };
 
-/// What one class of paths brings to the part of three bounces and more.
+/// What one class of paths brings to the part of three bounces and more, or draws into the image beside the tiles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClassVariance {
     /// Where on the path, and how it was found.
@@ -30,16 +35,20 @@ pub struct ClassVariance {
     pub middle: f64,
 }
 
+/// Classes of the tiles' paths, and the techniques of what is drawn into the image.
+const ALL: usize = CLASSES + TECHNIQUES.len();
+
 /// Sums of one tile's pixels.
 struct Found {
-    /// ‖h‖² by pixel.
-    norm2: Vec<f64>,
+    region: Region,
+    /// h by pixel and bin.
+    light: Vec<f32>,
     /// Energy and variance by pixel and class.
-    classes: Vec<[(f64, f64); CLASSES]>,
+    classes: Vec<[(f64, f64); ALL]>,
 }
 
-/// Shares of the classes in energy and variance of three bounces and more, after so many passes over a few tiles; the
-/// largest variance first, classes without light left out. Runs on the caller's rayon pool.
+/// Shares of the classes in energy and variance of three bounces and more, and of all that is drawn into the image beside the
+/// tiles, after so many passes over a few tiles; the largest variance first, classes without light left out. Runs on the caller's rayon pool.
 ///
 /// # Errors
 /// Those of [`crate::render`].
@@ -58,15 +67,60 @@ pub fn variance(
             film: &film,
             ..ready.frame
         };
-        let found: Vec<Found> = regions(&ready.frame)
+        let passes = passes.max(2);
+        let mut found: Vec<Found> = regions(&ready.frame)
             .into_par_iter()
-            .map(|region| look((&ready.frame, &by_class), &region, passes.max(2)))
+            .map(|region| look((&ready.frame, &by_class), region, passes))
             .collect();
-        Ok(shares(&found))
+        drawn(&ready.frame, &mut found, passes)?;
+        Ok(shares(ready.frame.film, &found))
     })
 }
 
-fn look((frame, by_class): (&Frame, &Frame), region: &Region, passes: u32) -> Found {
+/// Adds what is drawn into the image. Light paths cross tiles, so all of it is made for the tiles looked at.
+fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderError> {
+    let Some(sources) = Sources::of(frame) else {
+        return Ok(());
+    };
+    let mut layers = TECHNIQUES.map(|_| Layer::new(frame));
+    let watch = Watch::new(&Unstopped, 0.0, 1.0);
+    for pass in 0..passes {
+        let (mut splats, _) = sources.pass(frame, u32::MAX - passes + pass, &watch);
+        splats.sort_by_key(|s| (s.technique as usize, s.pixel, s.slot));
+        for of in splats.chunk_by(|a, b| a.technique == b.technique) {
+            layers[of[0].technique as usize].add(frame, of, pass)?;
+        }
+    }
+    let bins = frame.film.slots - 2;
+    let width = frame.width;
+    let mut places = HashMap::new();
+    for (tile, found) in found.iter().enumerate() {
+        let r = &found.region;
+        for k in 0..r.pixels() {
+            let (row, col) = (r.row + k as u32 / r.cols, r.col + k as u32 % r.cols);
+            places.insert((row * width + col) as usize, (tile, k));
+        }
+    }
+    let unit = unit(frame);
+    for (technique, layer) in layers.iter_mut().enumerate() {
+        layer.settle(frame)?;
+        layer.each(frame, passes, Stop(&Unstopped), |pixel, of| {
+            let Some(&(tile, k)) = places.get(&pixel) else {
+                return;
+            };
+            let Found { light, classes, .. } = &mut found[tile];
+            let (energy, variance) = &mut classes[k][CLASSES + technique];
+            for (bin, mean, _) in of.light() {
+                light[k * bins + bin] += (mean / unit) as f32;
+                *energy += mean / unit;
+            }
+            *variance += of.pixel_variance() / (unit * unit);
+        })?;
+    }
+    Ok(())
+}
+
+fn look((frame, by_class): (&Frame, &Frame), region: Region, passes: u32) -> Found {
     let first = u32::MAX - passes;
     let order = Order {
         first,
@@ -74,15 +128,15 @@ fn look((frame, by_class): (&Frame, &Frame), region: &Region, passes: u32) -> Fo
     };
     let mut renderer = TileRenderer::new(frame);
     renderer
-        .render(frame, region, &order, &|_| true)
+        .render(frame, &region, &order, &|_| true)
         .expect("nobody stops it");
     let pixels = region.pixels();
-    let norm2 = |k| {
-        let slots = 1..frame.film.slots - 1;
-        let h = |slot| renderer.done.value(frame.film, k, 0, slot);
-        slots.map(|slot| h(slot).powi(2)).sum()
-    };
-    let norm2 = (0..pixels).map(norm2).collect();
+    let slots = 1..frame.film.slots - 1;
+    let light = (0..pixels).flat_map(|k| {
+        let h = |slot| renderer.done.value(frame.film, k, 0, slot) as f32;
+        slots.clone().map(h).collect::<Vec<f32>>()
+    });
+    let light = light.collect();
     let (walk, film, side) = (&by_class.walk, by_class.film, by_class.effort.side);
     let size = film.pixel();
     let (mut sum, mut square) = (vec![0.0f32; pixels * size], vec![0.0f32; pixels * size]);
@@ -122,30 +176,33 @@ fn look((frame, by_class): (&Frame, &Frame), region: &Region, passes: u32) -> Fo
     }
     let n = f64::from(passes);
     let pixel = |k: usize| {
-        std::array::from_fn(|class| {
+        let mut classes = [(0.0, 0.0); ALL];
+        for (class, of) in classes.iter_mut().take(CLASSES).enumerate() {
             let first = k * size + (class + 1) * film.slots;
             let slots = first + 1..first + film.slots - 1;
-            let mut of = (0.0, 0.0);
             for (&x, &x2) in sum[slots.clone()].iter().zip(&square[slots]) {
                 let (x, x2) = (f64::from(x), f64::from(x2));
                 of.0 += x / n;
                 of.1 += (x2 - x * x / n).max(0.0) / (n - 1.0) / n;
             }
-            of
-        })
+        }
+        classes
     };
     Found {
-        norm2,
+        region,
+        light,
         classes: (0..pixels).map(pixel).collect(),
     }
 }
 
-fn shares(found: &[Found]) -> Vec<ClassVariance> {
+fn shares(film: &Film, found: &[Found]) -> Vec<ClassVariance> {
+    let bins = film.slots - 2;
     // Relative squared error by pixel: of all classes, and of each.
-    let mut pixels: Vec<(f64, [f64; CLASSES])> = vec![];
-    let mut energy = [0.0; CLASSES];
+    let mut pixels: Vec<(f64, [f64; ALL])> = vec![];
+    let mut energy = [0.0; ALL];
     for tile in found {
-        for (&norm2, classes) in tile.norm2.iter().zip(&tile.classes) {
+        for (h, classes) in tile.light.chunks(bins).zip(&tile.classes) {
+            let norm2: f64 = h.iter().map(|&x| f64::from(x).powi(2)).sum();
             for (all, of) in energy.iter_mut().zip(classes) {
                 *all += of.0;
             }
@@ -157,7 +214,7 @@ fn shares(found: &[Found]) -> Vec<ClassVariance> {
     }
     pixels.sort_by(|a, b| a.0.total_cmp(&b.0));
     let of = |range: std::ops::Range<usize>| {
-        let mut sums = [0.0; CLASSES];
+        let mut sums = [0.0; ALL];
         for (_, each) in &pixels[range] {
             for (sum, x) in sums.iter_mut().zip(each) {
                 *sum += x;
@@ -171,10 +228,13 @@ fn shares(found: &[Found]) -> Vec<ClassVariance> {
         of(pixels.len() / 4..pixels.len() * 3 / 4),
     );
     let light = energy.iter().sum::<f64>().max(f64::MIN_POSITIVE);
-    let mut classes: Vec<ClassVariance> = (0..CLASSES)
+    let mut classes: Vec<ClassVariance> = (0..ALL)
         .filter(|&c| energy[c] > 0.0)
         .map(|c| ClassVariance {
-            class: class_name(c),
+            class: match c.checked_sub(CLASSES) {
+                Some(technique) => TECHNIQUES[technique].into(),
+                None => class_name(c),
+            },
             energy: energy[c] / light,
             variance: all[c],
             middle: middle[c],

@@ -1,0 +1,252 @@
+//! Where glass lies, seen from a point. A camera path that scatters finds glass by chance alone, and only what glass turns counts; so
+//! half of its directions are drawn within cones around spheres that hold the glass, joined with the surface's own scattering by the
+//! balance heuristic.
+
+use std::f32::consts::PI;
+
+use picofarm_scene::Vec3;
+
+use crate::{bsdf::frame, rng::Rng, world::Hit};
+
+/// Spheres at most, and what two together must at most have of the area of the one that they replace.
+const MOST: usize = 16;
+const PAYS: f32 = 0.7;
+/// Share of the directions that are drawn within cones.
+const SHARE: f32 = 0.5;
+/// Least square of a cone's sine, so that directions on its edge are told apart.
+const NARROW: f32 = 1e-4;
+
+/// Spheres that hold all glass but panes in which spots and lit points have images.
+#[derive(Debug, Default)]
+pub(super) struct Aim(Vec<Sphere>);
+
+#[derive(Debug, Clone, Copy)]
+struct Sphere {
+    centre: Vec3,
+    radius: f32,
+}
+
+/// Directions to a sphere.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cone {
+    axis: Vec3,
+    /// 1 − cos of its half angle: its solid angle over 2π.
+    size: f32,
+}
+
+/// The spheres as seen from a point.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Cones {
+    list: [Cone; MOST],
+    count: usize,
+    /// Sum of their sizes.
+    total: f32,
+}
+
+/// The box's sphere of some triangles.
+fn around(all: &[[Vec3; 3]]) -> (Sphere, [Vec3; 2]) {
+    let (mut low, mut high) = (all[0][0], all[0][0]);
+    for &p in all.iter().flatten() {
+        low = Vec3::new(low.x.min(p.x), low.y.min(p.y), low.z.min(p.z));
+        high = Vec3::new(high.x.max(p.x), high.y.max(p.y), high.z.max(p.z));
+    }
+    let centre = (low + high) * 0.5;
+    let square = |p: &Vec3| (*p - centre).dot(*p - centre);
+    let radius2 = all.iter().flatten().map(square).fold(0.0, f32::max);
+    let sphere = Sphere {
+        centre,
+        radius: radius2.sqrt(),
+    };
+    (sphere, [low, high])
+}
+
+/// The better of the divisions in two by the middles of a box's sides: the two, and the sum of their squared radii.
+fn divided(all: &[[Vec3; 3]]) -> Option<(f32, [Vec<[Vec3; 3]>; 2])> {
+    let (_, [low, high]) = around(all);
+    let of = |p: Vec3, axis: usize| [p.x, p.y, p.z][axis];
+    let by = |axis: usize| {
+        let middle = 1.5 * (of(low, axis) + of(high, axis));
+        let left = |t: &[Vec3; 3]| t.iter().map(|&p| of(p, axis)).sum::<f32>() < middle;
+        let (a, b): (Vec<_>, Vec<_>) = all.iter().partition(|t| left(t));
+        if a.is_empty() || b.is_empty() {
+            return None;
+        }
+        let square = around(&a).0.radius.powi(2) + around(&b).0.radius.powi(2);
+        Some((square, [a, b]))
+    };
+    let each = (0..3).filter_map(by);
+    each.min_by(|a, b| a.0.total_cmp(&b.0))
+}
+
+impl Aim {
+    /// At some triangles.
+    pub fn at(all: Vec<[Vec3; 3]>) -> Self {
+        if all.is_empty() {
+            return Self::default();
+        }
+        let mut done = vec![];
+        let mut open = vec![all];
+        while let Some(next) = open.pop() {
+            let sphere = around(&next).0;
+            let enough = open.len() + done.len() + 1 >= MOST;
+            match divided(&next).filter(|_| !enough) {
+                Some((square, two)) if square < PAYS * sphere.radius.powi(2) => open.extend(two),
+                _ => done.push(sphere),
+            }
+        }
+        Self(done)
+    }
+
+    /// Directions at it from a surface point; `None` where there are none to draw, or where the surface scatters into few.
+    pub fn from(&self, h: &Hit) -> Option<Cones> {
+        let mut cones = Cones {
+            list: [Cone::default(); MOST],
+            count: 0,
+            total: 0.0,
+        };
+        for s in &self.0 {
+            let to = s.centre - h.p;
+            let d2 = to.dot(to);
+            let square = (s.radius * s.radius / d2).max(NARROW);
+            // Within it there is no cone; below the surface nothing arrives.
+            if square >= 1.0 || h.n.dot(to) <= -s.radius {
+                continue;
+            }
+            let cone = Cone {
+                axis: to / d2.sqrt(),
+                size: square / (1.0 + (1.0 - square).sqrt()),
+            };
+            cones.list[cones.count] = cone;
+            cones.count += 1;
+            cones.total += cone.size;
+        }
+        (cones.count > 0 && !h.surface.specular()).then_some(cones)
+    }
+}
+
+impl Cones {
+    /// Draws a direction for light that leaves a surface toward `back`: direction, f·cos over the density of both ways, and f·cos
+    /// over that of the surface's own scattering.
+    pub fn sample(&self, h: &Hit, back: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
+        let w = match rng.uniform() < SHARE {
+            true => self.within(rng),
+            false => h.surface.sample(h.n, back, rng)?.0,
+        };
+        let own = h.surface.pdf(h.n, back, w);
+        let value = h.surface.scatter(h.n, back, w);
+        let density = SHARE * self.density(w) + (1.0 - SHARE) * own;
+        (own > 0.0 && value > 0.0).then(|| (w, value / density, value / own))
+    }
+
+    fn within(&self, rng: &mut Rng) -> Vec3 {
+        let mut left = rng.uniform() * self.total;
+        let cones = &self.list[..self.count];
+        let cone = cones.iter().find(|c| {
+            left -= c.size;
+            left < 0.0
+        });
+        let cone = cone.unwrap_or(&cones[self.count - 1]);
+        let below = rng.uniform() * cone.size;
+        let (t, b) = frame(cone.axis);
+        let (x, y) = rng.circle();
+        // sin² = (1 − cos)(1 + cos).
+        let sin = (below * (2.0 - below)).sqrt();
+        (cone.axis * (1.0 - below) + t * (sin * x) + b * (sin * y)).normalized()
+    }
+
+    /// Density per steradian.
+    fn density(&self, w: Vec3) -> f32 {
+        let cones = self.list[..self.count].iter();
+        let holds = |c: &&Cone| c.axis.dot(w) >= 1.0 - c.size;
+        cones.filter(holds).count() as f32 / (2.0 * PI * self.total)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f32::consts::PI;
+
+    use picofarm_scene::Vec3;
+
+    use super::{Aim, Cones};
+    use crate::rng::{Rng, Stream};
+
+    /// A tetrahedron of a size at a place.
+    fn solid(at: Vec3, size: f32) -> Vec<[Vec3; 3]> {
+        let corner = |x, y, z| at + Vec3::new(x, y, z) * size;
+        let all = [
+            corner(1.0, 1.0, 1.0),
+            corner(1.0, -1.0, -1.0),
+            corner(-1.0, 1.0, -1.0),
+            corner(-1.0, -1.0, 1.0),
+        ];
+        let without = |k: usize| [all[(k + 1) % 4], all[(k + 2) % 4], all[(k + 3) % 4]];
+        (0..4).map(without).collect()
+    }
+
+    #[test]
+    fn bodies_far_apart_get_spheres_of_their_own_and_one_body_a_single_one() {
+        assert_eq!(Aim::at(vec![]).0.len(), 0);
+        assert_eq!(Aim::at(solid(Vec3::ZERO, 1.0)).0.len(), 1);
+        let at = |k: usize| Vec3::new(5.0 * k as f32, 0.0, (k % 3) as f32);
+        let several = |count: usize| (0..count).flat_map(|k| solid(at(k), 0.3)).collect();
+        assert_eq!(Aim::at(several(3)).0.len(), 3);
+        let many = Aim::at(several(40));
+        assert!(many.0.len() <= super::MOST);
+        for p in several(40).iter().flatten() {
+            let holds = many
+                .0
+                .iter()
+                .any(|s| (*p - s.centre).length() < s.radius * 1.0001);
+            assert!(holds, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn directions_are_drawn_with_the_density_that_is_said() {
+        let aim = Aim::at(
+            [Vec3::new(0.5, 0.0, 2.0), Vec3::new(-1.0, 1.0, 1.5)]
+                .into_iter()
+                .flat_map(|at| solid(at, 0.3))
+                .collect(),
+        );
+        let cones = cones(&aim);
+        let mut rng = Rng::new(1, Stream::ByGlass, 0, 0);
+        // The mean of 1/density is the solid angle of what is covered, and of each half of it.
+        let (mut all, mut left) = (0.0, 0.0);
+        let count = 100_000;
+        for _ in 0..count {
+            let w = cones.within(&mut rng);
+            let share = 1.0 / f64::from(cones.density(w)) / f64::from(count);
+            all += share;
+            if w.x < -0.2 {
+                left += share;
+            }
+        }
+        let sizes: Vec<f32> = cones.list[..cones.count].iter().map(|c| c.size).collect();
+        let expected = 2.0 * PI * sizes.iter().sum::<f32>();
+        assert!(
+            (all / f64::from(expected) - 1.0).abs() < 1e-3,
+            "{all} {expected}"
+        );
+        let second = (0..2).find(|&k| cones.list[k].axis.x < 0.0).unwrap();
+        let expected = 2.0 * PI * sizes[second];
+        assert!(
+            (left / f64::from(expected) - 1.0).abs() < 0.02,
+            "{left} {expected}"
+        );
+    }
+
+    fn cones(aim: &Aim) -> Cones {
+        let hit = crate::world::Hit {
+            p: Vec3::ZERO,
+            n: Vec3::new(0.0, 0.0, 1.0),
+            triangle: 0,
+            surface: crate::bsdf::Surface::new(&picofarm_scene::Material::diffuse(
+                "wall", [0.5; 3],
+            )),
+            through: 1.0,
+        };
+        aim.from(&hit).unwrap()
+    }
+}
