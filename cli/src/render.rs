@@ -304,7 +304,8 @@ fn carried(asked: bool, classes: &[ClassVariance]) -> String {
     if classes.is_empty() {
         return "no paths of three bounces and more\n".to_owned();
     }
-    let mut text = "paths of three bounces and more, % of energy, of variance, and of the variance of the middle half of the pixels:\n"
+    let mut text = "paths of three bounces and more, and of two where they are drawn into the image: % of energy, of variance, and of the variance of the middle\n\
+         half of the pixels:\n"
         .to_owned();
     for c in classes {
         let [energy, variance, middle] = [c.energy, c.variance, c.middle].map(|x| 100.0 * x);

@@ -16,6 +16,8 @@
 //! where the camera sees them in glass. Each class is found in one way, so nothing is weighed and nothing counted twice. A reflection
 //! counts as a bounce, and refraction does not; a spot that the camera sees by refraction alone, one bounce, is left out.
 //!
+//! Camera paths that scatter aim at glass with half of their directions: see [`aim`].
+//!
 //! On a leg every pane in the way may reflect, and what passes goes on. Where nothing was turned yet a reflection is chosen more often
 //! than light does, since only such paths bring anything.
 
@@ -47,10 +49,9 @@ use crate::{
 };
 
 /// Chances of a camera path in a pixel that sees no glass, at least, and by the share that what glass sends on has in all surfaces'
-/// area: where there is little glass it brings little. And share of those paths that go on beyond their first point.
+/// area: where there is little glass it brings little.
 const ELSEWHERE: f32 = 0.125;
 const BY_AREA: f32 = 100.0;
-const ONWARD: f32 = 0.5;
 
 /// How often light paths aim at panes in which spots have images, as a share of what they send on.
 const IMAGED: f32 = 0.1;
@@ -175,11 +176,11 @@ impl ByGlass {
         }))
     }
 
-    /// How likely a pixel gets a camera path in a pass, and how likely that goes on beyond its first point.
-    fn chances(&self, pixel: u32) -> (f32, f32) {
+    /// How likely a pixel gets a camera path in a pass.
+    fn chance(&self, pixel: u32) -> f32 {
         match self.sees[pixel as usize] {
-            true => (1.0, 1.0),
-            false => (self.elsewhere, ONWARD),
+            true => 1.0,
+            false => self.elsewhere,
         }
     }
 }

@@ -8,9 +8,11 @@ use picofarm_scene::Vec3;
 
 use crate::{bsdf::frame, rng::Rng, world::Hit};
 
-/// Spheres at most, and what two together must at most have of the area of the one that they replace.
+/// Spheres at most, what two boxes together must at most have of the squared diagonal of the one that they divide, and slices of a box
+/// that they are made of.
 const MOST: usize = 16;
 const PAYS: f32 = 0.7;
+const SLICES: usize = 16;
 /// Share of the directions that are drawn within cones.
 const SHARE: f32 = 0.5;
 /// Least square of a cone's sine, so that directions on its edge are told apart.
@@ -43,39 +45,85 @@ pub(super) struct Cones {
     total: f32,
 }
 
-/// The box's sphere of some triangles.
-fn around(all: &[[Vec3; 3]]) -> (Sphere, [Vec3; 2]) {
-    let (mut low, mut high) = (all[0][0], all[0][0]);
-    for &p in all.iter().flatten() {
-        low = Vec3::new(low.x.min(p.x), low.y.min(p.y), low.z.min(p.z));
-        high = Vec3::new(high.x.max(p.x), high.y.max(p.y), high.z.max(p.z));
+/// A box, empty at first.
+#[derive(Debug, Clone, Copy)]
+struct Bounds([Vec3; 2]);
+
+impl Bounds {
+    const EMPTY: Self = {
+        let far = f32::INFINITY;
+        Self([Vec3::new(far, far, far), Vec3::new(-far, -far, -far)])
+    };
+
+    fn of<'a>(all: impl IntoIterator<Item = &'a Vec3>) -> Self {
+        let each = all.into_iter().map(|&p| Self([p, p]));
+        each.fold(Self::EMPTY, Self::and)
     }
+
+    fn and(self, other: Self) -> Self {
+        let ([a, b], [c, d]) = (self.0, other.0);
+        Self([
+            Vec3::new(a.x.min(c.x), a.y.min(c.y), a.z.min(c.z)),
+            Vec3::new(b.x.max(d.x), b.y.max(d.y), b.z.max(d.z)),
+        ])
+    }
+
+    /// Square of the diagonal; infinite for an empty box, which no division is made with.
+    fn square(self) -> f32 {
+        let d = self.0[1] - self.0[0];
+        d.dot(d)
+    }
+}
+
+/// The sphere of some triangles, in the middle of their box.
+fn around(all: &[[Vec3; 3]]) -> Sphere {
+    let [low, high] = Bounds::of(all.iter().flatten()).0;
     let centre = (low + high) * 0.5;
     let square = |p: &Vec3| (*p - centre).dot(*p - centre);
     let radius2 = all.iter().flatten().map(square).fold(0.0, f32::max);
-    let sphere = Sphere {
+    Sphere {
         centre,
         radius: radius2.sqrt(),
-    };
-    (sphere, [low, high])
+    }
 }
 
-/// The better of the divisions in two by the middles of a box's sides: the two, and the sum of their squared radii.
-fn divided(all: &[[Vec3; 3]]) -> Option<(f32, [Vec<[Vec3; 3]>; 2])> {
-    let (_, [low, high]) = around(all);
-    let of = |p: Vec3, axis: usize| [p.x, p.y, p.z][axis];
-    let by = |axis: usize| {
-        let middle = 1.5 * (of(low, axis) + of(high, axis));
-        let left = |t: &[Vec3; 3]| t.iter().map(|&p| of(p, axis)).sum::<f32>() < middle;
-        let (a, b): (Vec<_>, Vec<_>) = all.iter().partition(|t| left(t));
-        if a.is_empty() || b.is_empty() {
-            return None;
-        }
-        let square = around(&a).0.radius.powi(2) + around(&b).0.radius.powi(2);
-        Some((square, [a, b]))
+/// Divides triangles in two where the squared diagonals of both boxes have the least sum, among a few planes across each axis; `None`
+/// where that does not pay.
+fn divided(all: Vec<[Vec3; 3]>) -> Result<[Vec<[Vec3; 3]>; 2], Vec<[Vec3; 3]>> {
+    let coordinate = |p: Vec3, axis: usize| [p.x, p.y, p.z][axis];
+    let middle = |t: &[Vec3; 3]| (t[0] + t[1] + t[2]) / 3.0;
+    let middles: Vec<Vec3> = all.iter().map(middle).collect();
+    let [low, high] = Bounds::of(&middles).0;
+    let slice = |p: Vec3, axis: usize| {
+        let (from, to) = (coordinate(low, axis), coordinate(high, axis));
+        let at = (coordinate(p, axis) - from) / (to - from) * SLICES as f32;
+        // Casting saturates, and takes what is no number as 0.
+        (at as usize).min(SLICES - 1)
     };
-    let each = (0..3).filter_map(by);
-    each.min_by(|a, b| a.0.total_cmp(&b.0))
+    let mut best = (PAYS * Bounds::of(all.iter().flatten()).square(), 0, 0);
+    for axis in 0..3 {
+        let mut slices = [Bounds::EMPTY; SLICES];
+        for (t, &p) in all.iter().zip(&middles) {
+            let of = &mut slices[slice(p, axis)];
+            *of = of.and(Bounds::of(t));
+        }
+        for cut in 1..SLICES {
+            let join = |of: &[Bounds]| of.iter().fold(Bounds::EMPTY, |all, &one| all.and(one));
+            let sum = join(&slices[..cut]).square() + join(&slices[cut..]).square();
+            if sum < best.0 {
+                best = (sum, axis, cut);
+            }
+        }
+    }
+    let (_, axis, cut) = best;
+    if cut == 0 {
+        return Err(all);
+    }
+    let mut two = [vec![], vec![]];
+    for (t, p) in all.into_iter().zip(middles) {
+        two[usize::from(slice(p, axis) >= cut)].push(t);
+    }
+    Ok(two)
 }
 
 impl Aim {
@@ -87,11 +135,10 @@ impl Aim {
         let mut done = vec![];
         let mut open = vec![all];
         while let Some(next) = open.pop() {
-            let sphere = around(&next).0;
             let enough = open.len() + done.len() + 1 >= MOST;
-            match divided(&next).filter(|_| !enough) {
-                Some((square, two)) if square < PAYS * sphere.radius.powi(2) => open.extend(two),
-                _ => done.push(sphere),
+            match if enough { Err(next) } else { divided(next) } {
+                Ok(two) => open.extend(two),
+                Err(one) => done.push(around(&one)),
             }
         }
         Self(done)

@@ -26,7 +26,7 @@ const IMAGES: (u32, u32) = (4, 1);
 /// The same of points that spots light.
 const LIT: (u32, u32) = (2, 1);
 /// Spots that a vertex after the first is connected to at most, and light vertices that any is.
-const SPOTS: u32 = 2;
+const SPOTS: u32 = 6;
 const LIGHTS: u32 = 1;
 
 impl ByGlass {
@@ -41,20 +41,14 @@ impl ByGlass {
         out: &mut Vec<Splat>,
     ) {
         let (world, origin) = (walk.world, Vec3::ZERO);
-        let (begins, onward) = self.chances(pixel);
-        // Without images there is nothing at a first point that sees no glass.
-        let (begins, onward) = match self.images.any() {
-            true => (begins, onward),
-            false => (begins * onward, 1.0),
-        };
-        if begins < 1.0 && rng.uniform() >= begins {
+        let chance = self.chance(pixel);
+        if chance < 1.0 && rng.uniform() >= chance {
             return;
         }
-        let goes_on = onward == 1.0 || rng.uniform() < onward;
         let mut left = 1.0;
         let mut ray = Ray::new(origin, origin, ray.normalized(), (self.around, true));
         let mut path = Carried {
-            weight: 1.0 / begins,
+            weight: 1.0 / chance,
             ratios: ONES,
             length_m: 0.0,
             bounces: 0,
@@ -108,17 +102,11 @@ impl ByGlass {
             if all {
                 join((walk, film), (&point, pixel), rng, buffers, out);
             }
-            if !goes_on {
-                return;
-            }
             let on_leg = there.weight / path.weight;
             let Some(next) = point.seek((world, &self.aim), left * on_leg, rng) else {
                 return;
             };
             (path, ray, left) = next;
-            if first {
-                path.weight /= onward;
-            }
         }
     }
 }
