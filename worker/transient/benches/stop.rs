@@ -12,7 +12,7 @@ mod scenes;
 
 use common::{Quiet, settings};
 use picofarm_scene::Scene;
-use picofarm_transient::{Budget, Rendered, Settings, Wavelengths, render, variance};
+use picofarm_transient::{Budget, Rendered, Settings, Wavelengths, plan, render, variance};
 
 const BINS: usize = 637;
 
@@ -96,16 +96,28 @@ fn main() {
             wavelengths(&scene, seeds);
             continue;
         }
-        let before = cpu_seconds();
-        let first = match asked[0] > 0.0 {
-            true => run(&scene, Budget::Error(asked[0]), 0),
-            false => run(&scene, Budget::Samples(64), 0),
+        let budget = match asked[0] > 0.0 {
+            true => Budget::Error(asked[0]),
+            false => Budget::Samples(64),
         };
+        let set = Settings {
+            split: false,
+            ..settings(budget)
+        };
+        let before = cpu_seconds();
+        let planned = plan(&scene, &set).expect("the scene is sound");
+        let between = cpu_seconds();
+        let first = run(&scene, budget, 0);
         println!(
-            "{name}: {} paths at first, {:.2} CPU s, says {:.2} %",
+            "{name}: {} paths at first, {:.2} CPU s, says {:.2} %, {:.1} M rays; planned in {:.2} CPU s: {} paths, {:.2} %, {:.1} M rays",
             first.error.samples,
-            cpu_seconds() - before,
-            100.0 * first.error.median_relative
+            cpu_seconds() - between,
+            100.0 * first.error.median_relative,
+            first.rays as f64 / 1e6,
+            between - before,
+            planned.passes,
+            100.0 * planned.error,
+            planned.rays as f64 / 1e6,
         );
         for line in first
             .plan

@@ -89,7 +89,7 @@ pub fn plan(scene: &Scene, settings: &Settings) -> Result<Forecast, RenderError>
     prepare(scene, settings, Stop(&Unstopped), |ready| {
         let plan = ready.plan(ready.first_passes());
         let rays = ready.seen_rays();
-        let forecast = forecast::forecast(&ready.frame, &settings.budget, plan, rays);
+        let forecast = forecast::forecast(&ready.frame, &settings.budget, plan, rays)?;
         Ok(Forecast {
             warnings: ready.foreseen(),
             ..forecast

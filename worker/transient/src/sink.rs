@@ -89,6 +89,16 @@ pub(crate) enum Technique {
     Photon,
 }
 
+impl Technique {
+    /// Whether more light paths alone lessen its variance.
+    pub fn is_of_light_paths(self) -> bool {
+        matches!(
+            self,
+            Self::Mirrors | Self::Zone | Self::Glass | Self::Photon
+        )
+    }
+}
+
 /// Their names.
 pub(crate) const TECHNIQUES: [&str; 8] = [
     "light path by near-mirrors",

@@ -1,5 +1,7 @@
 //! What a render would take, from a few tiles of it.
 
+use std::collections::HashMap;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -7,12 +9,16 @@ use super::{
     FIRST_PASSES, GOAL, MAX_PASSES,
     draws::{Draw, likely},
     error::{Stat, median_after, passes_for, relative_median},
-    image::tile_side,
+    image::{Watch, tile_side},
+    layer::Layer,
+    ready::TWO_PASSES,
     region::Region,
+    splat::{Sources, Thin, unit},
     tile::{Done, Frame, Order, TileRenderer},
 };
 use crate::{
-    api::{Budget, Plan},
+    api::{Budget, Plan, RenderError, Stop, Unstopped},
+    caustic::Splat,
     film::Film,
 };
 
@@ -35,29 +41,41 @@ pub struct Forecast {
     pub warnings: Vec<String>,
 }
 
-/// Renders a few tiles with a few passes and scales up; `rays` are those of the ground truth.
-pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) -> Forecast {
+/// Renders a few tiles with a few passes, and light paths as far as they tell what those tiles get, and scales up; `rays` are
+/// those of the ground truth.
+///
+/// # Errors
+/// [`RenderError::Memory`].
+pub(super) fn forecast(
+    frame: &Frame,
+    budget: &Budget,
+    plan: Plan,
+    rays: u64,
+) -> Result<Forecast, RenderError> {
     let walks = frame.walk.max_bounces >= 3 && !frame.walk.emitters.list.is_empty();
     let side = |n: u32| f64::from(frame.sampling.sides(n).0);
     let all = f64::from(frame.width) * f64::from(frame.height);
     if !walks {
-        let found = look(frame, 0);
-        return Forecast {
+        let mut found = look(frame, 0);
+        let drawn_rays = drawn(frame, &mut found, TWO_PASSES)?;
+        let rays = rays + (found.rays * all) as u64;
+        return Ok(Forecast {
             plan,
             passes: 0,
             error: {
-                let stats = found.tiles.concat();
-                let likely = likely(&stats, &found.draws, 0.5);
+                let stats = found.stats();
+                let likely = likely(&stats, &found.draws(), 0.5);
                 (likely * relative_median(stats.into_iter())) as f32
             },
-            rays: rays + (found.rays * all) as u64,
+            rays: rays + drawn_rays * u64::from(TWO_PASSES),
             warnings: vec![],
-        };
+        });
     }
-    let (one, found) = (look(frame, 1), look(frame, PASSES));
+    let (one, mut found) = (look(frame, 1), look(frame, PASSES));
+    let drawn_rays = drawn(frame, &mut found, PASSES)?;
     let two = |n: u32| frame.sampling.variance(n);
-    let stats = found.tiles.concat();
-    let likely = likely(&stats, &found.draws, 0.5);
+    let stats = found.stats();
+    let likely = likely(&stats, &found.draws(), 0.5);
     let (passes, error) = match *budget {
         Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
         Budget::Error(target) => {
@@ -67,7 +85,7 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
             let n = passes_for(&stats, PASSES, GOAL * target, most, two);
             let own = (FIRST_PASSES.max(n / 2), (2 * n).min(MAX_PASSES));
             let tiles = found.tiles.iter();
-            let spent = tiles.map(|t| passes_for(t, PASSES, GOAL * target, own, two));
+            let spent = tiles.map(|t| passes_for(&t.stats, PASSES, GOAL * target, own, two));
             let mean = spent.sum::<u32>().div_ceil(found.tiles.len() as u32);
             (mean, median_after(&stats, PASSES, n, &two))
         }
@@ -78,31 +96,48 @@ pub(super) fn forecast(frame: &Frame, budget: &Budget, plan: Plan, rays: u64) ->
     let of_two = ((eight * one.rays - found.rays) / (eight * s1 - s8)).clamp(0.0, found.rays / s8);
     let of_pass = (found.rays - of_two * s8) / eight;
     let of_pixel = of_two * side(passes).powi(2) + of_pass * f64::from(passes);
-    Forecast {
+    let drawn = drawn_rays * u64::from(passes);
+    Ok(Forecast {
         plan,
         passes,
         error: (likely * error) as f32,
-        rays: rays + (of_pixel * all) as u64,
+        rays: rays + (of_pixel * all) as u64 + drawn,
         warnings: vec![],
-    }
+    })
 }
 
 /// What was found in the tiles looked at.
 struct Found {
-    /// The pixels of each.
-    tiles: Vec<Vec<Stat>>,
-    /// Draws of the errors of some of them, by their place in all tiles together.
-    draws: Vec<(usize, Draw)>,
+    regions: Vec<Region>,
+    tiles: Vec<Looked>,
     /// Rays of one pixel.
     rays: f64,
 }
 
 /// One of them.
 struct Looked {
+    /// h by pixel and bin.
+    light: Vec<f32>,
     stats: Vec<Stat>,
     /// By pixel of the tile.
     draws: Vec<(usize, Draw)>,
     rays: u64,
+}
+
+impl Found {
+    fn stats(&self) -> Vec<Stat> {
+        self.tiles.iter().flat_map(|t| &t.stats).copied().collect()
+    }
+
+    /// Draws of the errors of some pixels, by their place in all tiles together.
+    fn draws(&self) -> Vec<(usize, Draw)> {
+        let (mut draws, mut before) = (vec![], 0);
+        for tile in &self.tiles {
+            draws.extend(tile.draws.iter().map(|&(k, draw)| (before + k, draw)));
+            before += tile.stats.len();
+        }
+        draws
+    }
 }
 
 /// The tiles looked at.
@@ -140,16 +175,25 @@ fn look(frame: &Frame, passes: u32) -> Found {
         count: passes,
     };
     let found: Vec<Looked> = regions
-        .into_par_iter()
+        .par_iter()
         .map_init(
             || TileRenderer::new(frame),
             |renderer, region| {
                 renderer
-                    .render(frame, &region, &order, &|_| true)
+                    .render(frame, region, &order, &|_| true)
                     .expect("nobody stops it");
                 let stats = (0..region.pixels()).map(|k| stat(&renderer.done, frame.film, k));
                 let pixels = renderer.done.watched().iter().copied();
+                let slots = 1..frame.film.slots - 1;
+                let light = (0..region.pixels()).flat_map(|k| {
+                    let h = |slot| {
+                        let m = renderer.done.moments(frame.film, k, slot);
+                        (m.two + m.multi) as f32
+                    };
+                    slots.clone().map(h).collect::<Vec<f32>>()
+                });
                 Looked {
+                    light: light.collect(),
                     stats: stats.collect(),
                     draws: pixels.zip(renderer.done.draws()).collect(),
                     rays: renderer.done.rays,
@@ -157,16 +201,83 @@ fn look(frame: &Frame, passes: u32) -> Found {
             },
         )
         .collect();
-    let (mut draws, mut before) = (vec![], 0);
-    for tile in &found {
-        draws.extend(tile.draws.iter().map(|&(k, draw)| (before + k, draw)));
-        before += tile.stats.len();
-    }
+    let rays = found.iter().map(|f| f.rays).sum::<u64>() as f64 / pixels as f64;
     Found {
-        draws,
-        rays: found.iter().map(|f| f.rays).sum::<u64>() as f64 / pixels as f64,
-        tiles: found.into_iter().map(|f| f.stats).collect(),
+        regions,
+        tiles: found,
+        rays,
     }
+}
+
+/// Adds what is drawn into the image, as it is after so many passes; returns the rays of one of them. Light paths cross tiles, so
+/// that those looked at get as little of them as all others: fewer are made than a pass has, and their variance is scaled.
+fn drawn(frame: &Frame, found: &mut Found, after: u32) -> Result<u64, RenderError> {
+    let Some(sources) = Sources::of(frame) else {
+        return Ok(0);
+    };
+    let Found { regions, tiles, .. } = found;
+    let pixels: usize = regions.iter().map(Region::pixels).sum();
+    let whole = frame.width as usize * frame.height as usize;
+    let thin = Thin {
+        of: (whole / pixels.max(1)).max(1) as u32,
+        regions,
+    };
+    let watch = Watch::new(&Unstopped, 0.0, 1.0);
+    // What camera paths find alone, and what fewer light paths bring.
+    let mut layers = [Layer::new(frame), Layer::new(frame)];
+    let mut rays = 0;
+    for pass in 0..PASSES {
+        let of = (u32::MAX - PASSES + pass, &watch);
+        let (mut splats, traced) = sources.pass(frame, of, thin);
+        rays += traced;
+        splats.sort_by_key(|s| (s.technique.is_of_light_paths(), s.pixel, s.slot));
+        let kind = |s: &Splat| usize::from(s.technique.is_of_light_paths());
+        for part in splats.chunk_by(|a, b| kind(a) == kind(b)) {
+            layers[kind(&part[0])].add(frame, part, pass)?;
+        }
+    }
+    let places = places(frame, regions);
+    let (bins, unit) = (frame.film.slots - 2, unit(frame));
+    for (layer, of) in layers.iter_mut().zip([1, thin.of]) {
+        // The variance after so many passes, by that of these.
+        let less = f64::from(PASSES) / f64::from(of) / f64::from(after);
+        layer.settle(frame)?;
+        layer.each(frame, PASSES, Stop(&Unstopped), |pixel, of| {
+            let Some(&(tile, k)) = places.get(&pixel) else {
+                return;
+            };
+            let tile = &mut tiles[tile];
+            let stat = &mut tile.stats[k];
+            for (bin, mean, _) in of.light() {
+                let (h, mean) = (&mut tile.light[k * bins + bin], mean / unit);
+                stat.norm2 += mean * (mean + 2.0 * f64::from(*h));
+                stat.total += mean;
+                *h += mean as f32;
+            }
+            let scale = 1.0 / (unit * unit);
+            let variance = of.pixel_variance() * scale;
+            stat.norm2 -= (1.0 - less) * variance;
+            stat.multi_variance += less * variance;
+            let draw = tile.draws.iter_mut().find(|(of, _)| *of == k);
+            if let (Some(own), Some((_, draw))) = (of.draw(), draw) {
+                for (square, of_layer) in draw.iter_mut().zip(own) {
+                    *square += less * of_layer * scale;
+                }
+            }
+        })?;
+    }
+    Ok(rays * u64::from(thin.of) / u64::from(PASSES))
+}
+
+/// Tile and pixel of the tile by pixel of the image.
+pub(super) fn places(frame: &Frame, regions: &[Region]) -> HashMap<usize, (usize, usize)> {
+    let each = regions.iter().enumerate().flat_map(|(tile, r)| {
+        (0..r.pixels()).map(move |k| {
+            let (row, col) = (r.row + k as u32 / r.cols, r.col + k as u32 % r.cols);
+            ((row * frame.width + col) as usize, (tile, k))
+        })
+    });
+    each.collect()
 }
 
 /// A pixel's sums, in render units: only their ratios count.

@@ -27,7 +27,7 @@ use crate::{
 };
 
 /// Passes of light paths where no other passes are made.
-const TWO_PASSES: u32 = 64;
+pub(super) const TWO_PASSES: u32 = 64;
 /// Most point sources: arrivals name theirs in 16 bits.
 const MOST_SPOTS: usize = 1 << 16;
 /// Rows from which the rays of the ground truth are forecast.

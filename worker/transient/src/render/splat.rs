@@ -10,6 +10,7 @@ use super::{
     error::{Errors, Spread},
     image::{Image, Watch},
     layer::Layer,
+    region::Region,
     tile::Frame,
 };
 use crate::{
@@ -35,6 +36,41 @@ const CHUNK: u32 = 1024;
 const ZONE_SHARE: u32 = 4;
 const ZONE_PATHS: (u32, u32) = (256, 1024);
 
+/// What is done of a pass.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Thin<'a> {
+    /// One light path of so many.
+    pub of: u32,
+    /// Camera paths in these regions alone; none are all.
+    pub regions: &'a [Region],
+}
+
+impl Thin<'_> {
+    pub const WHOLE: Thin<'static> = Thin {
+        of: 1,
+        regions: &[],
+    };
+
+    fn share(&self) -> f64 {
+        1.0 / f64::from(self.of)
+    }
+
+    fn holds(&self, (row, col): (u32, u32)) -> bool {
+        let within = |r: &Region| {
+            (r.row..r.row + r.rows).contains(&row) && (r.col..r.col + r.cols).contains(&col)
+        };
+        self.regions.is_empty() || self.regions.iter().any(within)
+    }
+}
+
+/// A pass: its number, who may stop it, and what is done of it.
+#[derive(Clone, Copy)]
+struct At<'a> {
+    pass: u32,
+    watch: &'a Watch<'a>,
+    thin: Thin<'a>,
+}
+
 /// Where light paths come from.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sources<'a> {
@@ -57,8 +93,13 @@ impl<'a> Sources<'a> {
     }
 
     /// What a pass brings, and the rays traced for it.
-    pub fn pass(&self, frame: &Frame, pass: u32, watch: &Watch) -> (Vec<Splat>, u64) {
-        let (mut all, mut rays, at) = (vec![], 0, (pass, watch));
+    pub fn pass(
+        &self,
+        frame: &Frame,
+        (pass, watch): (u32, &Watch),
+        thin: Thin,
+    ) -> (Vec<Splat>, u64) {
+        let (mut all, mut rays, at) = (vec![], 0, At { pass, watch, thin });
         if let Some(caustics) = self.caustics {
             rays += Self::by_mirrors((frame, caustics), at, &mut all);
         }
@@ -73,17 +114,14 @@ impl<'a> Sources<'a> {
     }
 
     /// A pass of light paths by way of near-mirrors.
-    fn by_mirrors(
-        (frame, caustics): (&Frame, &Caustics),
-        (pass, watch): (u32, &Watch),
-        all: &mut Vec<Splat>,
-    ) -> u64 {
+    fn by_mirrors((frame, caustics): (&Frame, &Caustics), at: At, all: &mut Vec<Splat>) -> u64 {
         let within = frame.walk.surroundings();
         let of = (within.world, frame.film);
         let pixels = f64::from(frame.width) * f64::from(frame.height);
-        let count = (pixels * PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
+        let count =
+            (at.thin.share() * pixels * PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
         let chunk = |stack: &mut Stack, chunk: u32, ends: &mut Vec<Splat>| {
-            let pass = u64::from(pass);
+            let pass = u64::from(at.pass);
             let mut rng = Rng::new(frame.seed, Stream::Caustic, u64::from(chunk), pass);
             let mut seen = vec![];
             for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
@@ -92,22 +130,18 @@ impl<'a> Sources<'a> {
                 ends.extend(found.flat_map(|z| splat(of, (&z, Technique::Mirrors), stack)));
             }
         };
-        side_by_side(frame, count.div_ceil(CHUNK), watch, all, chunk)
+        side_by_side(frame, count.div_ceil(CHUNK), at.watch, all, chunk)
     }
 
     /// A pass of light paths in the zones of spots beside other surfaces.
-    fn in_zones(
-        (frame, contacts): (&Frame, &Contacts),
-        (pass, watch): (u32, &Watch),
-        all: &mut Vec<Splat>,
-    ) -> u64 {
+    fn in_zones((frame, contacts): (&Frame, &Contacts), at: At, all: &mut Vec<Splat>) -> u64 {
         let within = frame.walk.surroundings();
         let of = (within.world, frame.film);
         let (least, most) = ZONE_PATHS;
         let share = frame.width * frame.height / ZONE_SHARE / contacts.count();
-        let count = share.clamp(least, most);
+        let count = (share.clamp(least, most) / at.thin.of).max(1);
         let zone = |stack: &mut Stack, zone: u32, ends: &mut Vec<Splat>| {
-            let pass = u64::from(pass);
+            let pass = u64::from(at.pass);
             let mut rng = Rng::new(frame.seed, Stream::Contact, u64::from(zone), pass);
             let turns = Turns::new(count, &mut rng);
             let mut seen = vec![];
@@ -118,21 +152,22 @@ impl<'a> Sources<'a> {
                 ends.extend(found.flat_map(|z| splat(of, (&z, Technique::Zone), stack)));
             }
         };
-        side_by_side(frame, contacts.count(), watch, all, zone)
+        side_by_side(frame, contacts.count(), at.watch, all, zone)
     }
 
     /// A pass of light paths by way of glass; returns the photons that they leave, and the rays traced.
     fn paths_by_glass(
         (frame, glass): (&Frame, &ByGlass),
-        (pass, watch): (u32, &Watch),
+        at: At,
         all: &mut Vec<Splat>,
     ) -> (Photons, u64) {
         let walk = &frame.walk;
         let of = (walk.world, frame.film);
         let pixels = f64::from(frame.width) * f64::from(frame.height);
-        let count = (pixels * GLASS_PATHS).clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
+        let count = (at.thin.share() * pixels * GLASS_PATHS)
+            .clamp(f64::from(CHUNK), f64::from(1 << 22)) as u32;
         let chunk = |buffers: &mut Buffers, chunk: u32, (ends, photons): &mut Ends| {
-            let pass = u64::from(pass);
+            let pass = u64::from(at.pass);
             let mut rng = Rng::new(frame.seed, Stream::Glass, u64::from(chunk), pass);
             let mut seen = vec![];
             for l in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
@@ -145,7 +180,7 @@ impl<'a> Sources<'a> {
             }
         };
         let (mut photons, mut rays) = (vec![], 0);
-        let chunks = with_buffers(frame, count.div_ceil(CHUNK), watch, chunk);
+        let chunks = with_buffers(frame, count.div_ceil(CHUNK), at.watch, chunk);
         for ((ends, of_chunk), traced) in chunks {
             all.extend(ends);
             photons.extend(of_chunk);
@@ -157,16 +192,19 @@ impl<'a> Sources<'a> {
     /// A pass of camera paths by way of glass.
     fn look_by_glass(
         (frame, glass, photons): (&Frame, &ByGlass, &Photons),
-        (pass, watch): (u32, &Watch),
+        at: At,
         all: &mut Vec<Splat>,
     ) -> u64 {
         let (walk, width) = (&frame.walk, frame.width);
         let pixels = width * frame.height;
         let chunk = |buffers: &mut Buffers, chunk: u32, found: &mut Vec<Splat>| {
-            let pass = u64::from(pass);
+            let pass = u64::from(at.pass);
             let mut rng = Rng::new(frame.seed, Stream::ByGlass, u64::from(chunk), pass);
+            let own = chunk * CHUNK..pixels.min((chunk + 1) * CHUNK);
+            let mut own = own.filter(|p| at.thin.holds((p / width, p % width)));
+            let Some(first) = own.next() else { return };
             glass.lay(walk, LAID, &mut rng, buffers);
-            for pixel in chunk * CHUNK..pixels.min((chunk + 1) * CHUNK) {
+            for pixel in std::iter::once(first).chain(own) {
                 let place = (rng.uniform(), rng.uniform());
                 let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
                 let within = (walk, frame.film, photons);
@@ -174,7 +212,7 @@ impl<'a> Sources<'a> {
             }
         };
         joined(
-            with_buffers(frame, pixels.div_ceil(CHUNK), watch, chunk),
+            with_buffers(frame, pixels.div_ceil(CHUNK), at.watch, chunk),
             all,
         )
     }
@@ -216,7 +254,7 @@ impl Splats {
     ) -> Result<u64, RenderError> {
         let mut rays = 0;
         for _ in 0..wave {
-            let (all, traced) = sources.pass(frame, self.passes, watch);
+            let (all, traced) = sources.pass(frame, (self.passes, watch), Thin::WHOLE);
             rays += traced;
             if watch.stopped() {
                 return Err(RenderError::Stopped);

@@ -1,17 +1,15 @@
 //! Which class of paths carries the variance, from a few tiles of the image.
 
-use std::collections::HashMap;
-
 use picofarm_scene::Scene;
 use rayon::prelude::*;
 
 use super::{
-    forecast::regions,
+    forecast::{places, regions},
     image::Watch,
     layer::Layer,
     ready::prepare,
     region::Region,
-    splat::{Sources, unit},
+    splat::{Sources, Thin, unit},
     tile::{Frame, Order, TileRenderer},
 };
 use crate::{
@@ -84,23 +82,21 @@ fn drawn(frame: &Frame, found: &mut [Found], passes: u32) -> Result<(), RenderEr
     };
     let mut layers = TECHNIQUES.map(|_| Layer::new(frame));
     let watch = Watch::new(&Unstopped, 0.0, 1.0);
+    let regions: Vec<Region> = found.iter().map(|f| f.region).collect();
+    // Light paths are as many as in a render, since their variance is wanted.
+    let thin = Thin {
+        regions: &regions,
+        ..Thin::WHOLE
+    };
     for pass in 0..passes {
-        let (mut splats, _) = sources.pass(frame, u32::MAX - passes + pass, &watch);
+        let (mut splats, _) = sources.pass(frame, (u32::MAX - passes + pass, &watch), thin);
         splats.sort_by_key(|s| (s.technique as usize, s.pixel, s.slot));
         for of in splats.chunk_by(|a, b| a.technique == b.technique) {
             layers[of[0].technique as usize].add(frame, of, pass)?;
         }
     }
     let bins = frame.film.slots - 2;
-    let width = frame.width;
-    let mut places = HashMap::new();
-    for (tile, found) in found.iter().enumerate() {
-        let r = &found.region;
-        for k in 0..r.pixels() {
-            let (row, col) = (r.row + k as u32 / r.cols, r.col + k as u32 % r.cols);
-            places.insert((row * width + col) as usize, (tile, k));
-        }
-    }
+    let places = places(frame, &regions);
     let unit = unit(frame);
     for (technique, layer) in layers.iter_mut().enumerate() {
         layer.settle(frame)?;
