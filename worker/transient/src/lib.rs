@@ -2,6 +2,7 @@
 //! jobs, stores or files.
 
 mod api;
+mod beam;
 mod beam_width;
 mod bsdf;
 mod bvh;
@@ -36,8 +37,8 @@ mod walk;
 mod world;
 
 pub use api::*;
+pub use beam::trace_spots;
 pub use bvh::{Bvh, Kernel, Stack};
-pub use emitter::trace_spots;
 pub use render::{
     ClassVariance, Forecast, Part, PartOf, join_parts, plan, render, render_part, render_within,
     variance,
