@@ -112,7 +112,7 @@ impl ByGlass {
     /// [`RenderError::Stopped`].
     pub fn find(walk: &Walk, centres: &Centres, stop: Stop) -> Result<Option<Self>, RenderError> {
         let (world, emitters) = (walk.world, walk.emitters);
-        let images = Images::find(world);
+        let images = Images::find(world, stop);
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * (b - a).cross(c - a).length();
         let mut glass = 0.0;
         let (mut all, mut aimed_at) = (vec![], vec![]);

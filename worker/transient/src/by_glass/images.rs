@@ -5,6 +5,7 @@ use picofarm_scene::Vec3;
 
 use super::{Buffers, camera::Found, lit::Lit, ray::Point};
 use crate::{
+    api::Stop,
     bsdf::frame,
     glass::Panes,
     rng::Rng,
@@ -18,6 +19,8 @@ use crate::{
 /// found by light paths.
 const MOST: usize = 8;
 const LEAST: f32 = 0.02;
+/// Planes that panes are compared with at most: curved glass has one for each facet.
+const MOST_KNOWN: usize = 4096;
 /// How far a pane may lie off its plane, render units, and how far its normal may turn, cosine.
 const FLAT: f32 = 1e-5;
 const ALIKE: f32 = 0.999_999;
@@ -55,12 +58,17 @@ pub(super) struct Images {
 const NONE: u8 = u8::MAX;
 
 impl Images {
-    pub fn find(world: &World) -> Self {
+    /// The largest planes. Whoever stops it gets what must not be used.
+    pub fn find(world: &World, stop: Stop) -> Self {
         let Some(panes) = &world.panes else {
             return Self::default();
         };
         let mut planes: Vec<(Plane, Vec<usize>)> = vec![];
         for (pane, (corners, normal)) in panes.triangles().enumerate() {
+            // Each is compared with all planes so far.
+            if pane % 256 == 0 && stop.asked() {
+                break;
+            }
             if normal == Vec3::ZERO || panes.reflectance(pane) == 0.0 {
                 continue;
             }
@@ -72,7 +80,7 @@ impl Images {
             });
             let k = match known {
                 Some(k) => k,
-                None if planes.len() < 4096 => {
+                None if planes.len() < MOST_KNOWN => {
                     planes.push((Plane::new(normal, normal.dot(a), pane), vec![]));
                     planes.len() - 1
                 }
