@@ -267,8 +267,8 @@ fn sensor(args: &Reconstruct) -> Option<Sensor> {
 
 /// Refuses a render that does not fit into memory.
 fn fits_memory(settings: &CaptureSettings, scene: &Scene, threads: usize) -> Result<()> {
-    let i = &scene.camera.intrinsics;
-    picofarm_agent::check_memory(&settings.render_settings(), (i.width, i.height), threads)
+    let size = picofarm_agent::scene_size(scene);
+    picofarm_agent::check_memory(&settings.render_settings(), size, threads)
         .map_err(|e| CliError::new(Code::Resource, e))
 }
 

@@ -9,6 +9,7 @@ use std::{
     time::Instant,
 };
 
+use picofarm_agent::SceneSize;
 use picofarm_dataset::{RenderArray, write_render_group};
 use picofarm_proto::{
     model::{RenderSettings, memory::gib},
@@ -135,10 +136,8 @@ impl Order {
             })
     }
 
-    /// Width and height.
-    fn size(&self) -> (u32, u32) {
-        let i = &self.scene.camera.intrinsics;
-        (i.width, i.height)
+    fn size(&self) -> SceneSize {
+        picofarm_agent::scene_size(&self.scene)
     }
 
     /// Bytes that the render takes at most.
@@ -319,14 +318,14 @@ fn carried(asked: bool, classes: &[ClassVariance]) -> String {
 
 /// The plan of a render that the size alone decides: it does not fit, so nothing is measured for it.
 fn too_large(order: &Order, memory: u64, what: &str, output: Output) -> Result<()> {
-    let (width, height) = order.size();
+    let ((width, height), _) = order.size();
     output.result(
         &json!({
             "scene": order.scene.name, "width": width, "height": height,
             "spots": order.scene.laser.beams.len(), "gate": order.settings.gate,
             "memory_bytes": memory, "fits": false,
         }),
-        || format!("{}: does not fit: {what}\n", order.scene.name),
+        || format!("{}: does not fit: {what}\n", show::line(&order.scene.name)),
     );
     Ok(())
 }

@@ -11,7 +11,8 @@ mod run;
 #[cfg(feature = "networks")]
 pub use execute::{ImportFor, imported, infer_version, model_version, report, takes};
 pub use execute::{
-    Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version, resolve,
+    SceneSize, Submission, TaskExecutor, absolute, check_memory, render_bytes, renderer_version,
+    resolve, scene_size,
 };
 pub use execute::{export, reconstruct, repair, reprocess, split};
 pub use picofarm_session::{

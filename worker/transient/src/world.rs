@@ -169,7 +169,9 @@ impl World {
         let mut several = vec![];
         let origin = scene.camera.origin;
         let centre = wide(origin);
-        let (mut points, mut surface, mut object) = (vec![], vec![], vec![]);
+        let count: usize = scene.objects.iter().map(|o| o.mesh.triangles.len()).sum();
+        let mut points = Vec::with_capacity(count);
+        let (mut surface, mut object) = (Vec::with_capacity(count), Vec::with_capacity(count));
         // Triangles of glass, and their materials.
         let (mut panes, mut glass): (Vec<[Point; 3]>, Vec<&Material>) = (vec![], vec![]);
         let (mut surfaces, mut material, mut rgb) = (vec![], vec![], vec![]);
@@ -248,6 +250,8 @@ impl World {
         }
         let unit = |p: Point| Vec3::from(p.map(|x| (x * f64::from(scale)) as f32));
         let triangles: Vec<[Vec3; 3]> = points.iter().map(|t| t.map(unit)).collect();
+        // Before the tree is built, which takes as much again.
+        drop(points);
         let panes: Vec<[Vec3; 3]> = panes.iter().map(|t| t.map(unit)).collect();
         let normals = normals.unwrap_or_else(|| {
             let each = triangles.iter();

@@ -111,7 +111,8 @@ impl TaskKind for PartTask {
         // Cut out of the image, and written.
         let tiles = 3.0 * share * rendering.images() + rendering.tiles();
         let paths = 3.0 * LIGHT_PATHS * rendering.paths();
-        Some(BASE + rendering.shape.truth() + tiles.max(paths))
+        let kept = rendering.shape.truth() + tiles.max(paths);
+        Some(BASE + rendering.with_scene(kept))
     }
 
     fn tasks(&self) -> u64 {

@@ -71,7 +71,7 @@ impl RenderTask {
         }
     }
 
-    /// What a task keeps in memory, beside its scene.
+    /// What a task keeps in memory.
     pub(super) fn rendering(&self, threads: u32) -> Rendering {
         let render = &self.render;
         let spots = self.scenes.spots.count();
@@ -88,6 +88,7 @@ impl RenderTask {
                 + render.wavelengths_nm.others().len() as u32,
             split: false,
             light_paths: render.max_bounces != 1,
+            triangles: self.scenes.kind.triangles(),
             threads,
         }
     }

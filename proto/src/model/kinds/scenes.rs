@@ -83,7 +83,19 @@ fn is_zero(n: &u64) -> bool {
     *n == 0
 }
 
+/// Triangles of a room with furniture that is not parametric: of 27 rooms with Sweet Home 3D's, the fewest had 94,000 and the most
+/// 355,000.
+const FURNISHED: u64 = 360_000;
+
 impl SceneKind {
+    /// Triangles of a scene, as far as memory depends on them; 0 where they are few, or where only the files tell.
+    pub(super) fn triangles(&self) -> u64 {
+        match self {
+            Self::Furnished { assets, .. } if !assets.starts_with("parametric") => FURNISHED,
+            Self::Furnished { .. } | Self::Primitive { .. } | Self::Files { .. } => 0,
+        }
+    }
+
     /// The file of scene `index`, where scenes are files and this one is listed.
     pub fn file(&self, index: u64) -> Option<&SceneFile> {
         match self {

@@ -19,7 +19,13 @@ const TILE_SUMS: (f64, f64) = (3.0, 7.0);
 /// mirrors and glass need none; only the scene tells.
 pub(in crate::model) const LIGHT_PATHS: f64 = 0.25;
 
-/// What a render keeps, beside its scene.
+/// Bytes of a triangle while the tree over the scene is built, and of one that is kept while it is rendered, the scene's own among them;
+/// without those that are counted with the program. By what rooms of 90,000 to 360,000 triangles took.
+const BUILT: f64 = 750.0;
+const KEPT: f64 = 300.0;
+const COUNTED: f64 = 15e3;
+
+/// What a render keeps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rendering {
     /// The image and its gate.
@@ -30,6 +36,8 @@ pub struct Rendering {
     pub split: bool,
     /// Light paths may be drawn into the image, where mirrors or glass call for them.
     pub light_paths: bool,
+    /// Triangles of the scene; 0 where they are not known.
+    pub triangles: u64,
     /// Threads that render.
     pub threads: u32,
 }
@@ -64,16 +72,24 @@ impl Rendering {
         }
     }
 
-    /// Bytes of the render alone: program, truth, images, tiles, and light paths as far as they are counted.
+    /// What a scene takes, with what is kept beside it: the tree is built before there is anything of the image.
+    pub(in crate::model) fn with_scene(&self, rest: f64) -> f64 {
+        let triangles = (self.triangles as f64 - COUNTED).max(0.0);
+        (BUILT * triangles).max(KEPT * triangles + rest)
+    }
+
+    /// Bytes of the render alone: program, scene, truth, images, tiles, and light paths as far as they are counted.
     pub fn peak_bytes(&self) -> u64 {
-        let images = PROGRAM + self.shape.truth() + self.images();
+        let images = self.shape.truth() + self.images();
+        let rest = images + self.tiles() + LIGHT_PATHS * self.paths();
         // Casting saturates.
-        (images + self.tiles() + LIGHT_PATHS * self.paths()) as u64
+        (PROGRAM + self.with_scene(rest)) as u64
     }
 
     /// The same, or what coding the result takes if that is more, in a worker that renders one scene after another.
     pub(in crate::model) fn coded(&self) -> f64 {
-        let after = PROGRAM + self.shape.truth() + self.images() * (1.0 + CODED);
+        let after = self.shape.truth() + self.images() * (1.0 + CODED);
+        let after = PROGRAM + self.with_scene(after);
         (self.peak_bytes() as f64).max(after) + HELD * self.images() + STORE
     }
 }

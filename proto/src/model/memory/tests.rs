@@ -43,6 +43,20 @@ fn more_pixels_bins_or_histograms_take_more() {
 }
 
 #[test]
+fn rooms_with_furniture_of_many_triangles_take_more() {
+    let with = |assets: &str| {
+        let room = format!(r#""kind": "furnished", "assets": "{assets}""#);
+        let job = job(&rendering(64, "").replace(r#""kind": "primitive""#, &room));
+        of(&job, 0).unwrap()
+    };
+    let primitive = of(&job(&rendering(64, "")), 0).unwrap();
+    assert_eq!(with("parametric-1"), primitive);
+    // Of 355,000 triangles a render took 313 to 350 MB, with 70 MB of the program.
+    let more = with("sweethome3d-abc") - primitive;
+    assert!((100_000_000..300_000_000).contains(&more), "{more}");
+}
+
+#[test]
 fn stages_that_read_what_the_job_makes_are_known_and_others_are_not() {
     let reads = |source: &str| {
         format!(

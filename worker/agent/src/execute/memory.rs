@@ -2,10 +2,14 @@
 //! that is.
 
 use picofarm_dataset::DatasetSpec;
-use picofarm_proto::model::{
-    TaskSpec,
-    memory::{Known, Rendering, Shape, gib, peak_bytes},
+use picofarm_proto::{
+    model::{
+        TaskSpec,
+        memory::{Known, Rendering, Shape, gib, peak_bytes},
+    },
+    show,
 };
+use picofarm_scene::Scene;
 use picofarm_transient::Settings;
 
 use super::TaskError;
@@ -51,7 +55,20 @@ pub(super) fn check(
     )))
 }
 
-fn rendering(settings: &Settings, (width, height): (u32, u32), threads: usize) -> Rendering {
+/// Width and height of the image, and triangles of a scene.
+pub type SceneSize = ((u32, u32), usize);
+
+/// The size of a scene.
+pub fn scene_size(scene: &Scene) -> SceneSize {
+    let i = &scene.camera.intrinsics;
+    ((i.width, i.height), scene.triangle_count())
+}
+
+fn rendering(
+    settings: &Settings,
+    ((width, height), triangles): SceneSize,
+    threads: usize,
+) -> Rendering {
     Rendering {
         shape: Shape {
             height,
@@ -63,12 +80,37 @@ fn rendering(settings: &Settings, (width, height): (u32, u32), threads: usize) -
             * settings.wavelengths_nm.nm().len().max(1) as u32,
         split: settings.split,
         light_paths: settings.max_bounces.is_none_or(|most| most >= 2),
+        triangles: triangles as u64,
         threads: threads as u32,
     }
 }
 
-/// Bytes that a render of an image of `size` (width and height) takes at most.
-pub fn render_bytes(settings: &Settings, size: (u32, u32), threads: usize) -> u64 {
+/// Refuses a render that takes more than `limit_mib`, now that its scene is known; 0 = not known, which refuses nothing.
+///
+/// # Errors
+/// [`TaskError::User`] with what it takes, what there is, and what to do.
+pub(super) fn check_render(
+    settings: &Settings,
+    scene: &Scene,
+    limit_mib: u64,
+) -> Result<(), TaskError> {
+    let (size, limit) = (scene_size(scene), limit_mib << 20);
+    let needed = render_bytes(settings, size, rayon::current_num_threads());
+    if limit == 0 || needed <= limit {
+        return Ok(());
+    }
+    Err(TaskError::User(format!(
+        "scene {} has {} triangles: to render it takes about {} of memory, but tasks of this worker may take {}; run it on a larger \
+         machine, or ask for fewer triangles, pixels, bins or histograms",
+        show::line(&scene.name),
+        size.1,
+        gib(needed),
+        gib(limit),
+    )))
+}
+
+/// Bytes that a render of a scene of such a size takes at most.
+pub fn render_bytes(settings: &Settings, size: SceneSize, threads: usize) -> u64 {
     rendering(settings, size, threads).peak_bytes()
 }
 
@@ -76,16 +118,17 @@ pub fn render_bytes(settings: &Settings, size: (u32, u32), threads: usize) -> u6
 ///
 /// # Errors
 /// A message with what is needed, what is there, and what to do.
-pub fn check_memory(settings: &Settings, size: (u32, u32), threads: usize) -> Result<(), String> {
+pub fn check_memory(settings: &Settings, size: SceneSize, threads: usize) -> Result<(), String> {
     let needed = render_bytes(settings, size, threads);
     match Memory::here() {
         Some(there) if needed > there.for_tasks_mib() << 20 => Err(format!(
-            "{} histograms of {}x{} pixels x {} bins take about {} of memory, but there is {there}; ask for fewer of \
-             them, or for fewer pixels or bins",
+            "{} histograms of {}x{} pixels x {} bins of {} triangles take about {} of memory, but there is {there}; ask for \
+             fewer of them, or for fewer pixels or bins",
             rendering(settings, size, threads).histograms + if settings.split { 6 } else { 0 },
-            size.0,
-            size.1,
+            size.0.0,
+            size.0.1,
             settings.gate.bins,
+            size.1,
             gib(needed),
         )),
         _ => Ok(()),
@@ -94,14 +137,16 @@ pub fn check_memory(settings: &Settings, size: (u32, u32), threads: usize) -> Re
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use picofarm_proto::model::JobSpec;
+    use picofarm_scene::primitive::{self, PrimitiveSettings};
     use picofarm_transient::{Budget, Gate, Strategy, Wavelengths};
 
     use super::*;
 
-    #[test]
-    fn a_render_that_no_machine_holds_is_refused_with_what_it_takes() {
-        let mut settings = Settings {
+    fn settings() -> Settings {
+        Settings {
             gate: Gate {
                 start_m: 1.0,
                 bin_width_m: 0.0384,
@@ -117,13 +162,41 @@ mod tests {
             beam: None,
             fill_factor: 1.0,
             wavelengths_nm: Wavelengths::NONE,
+        }
+    }
+
+    #[test]
+    fn a_scene_of_too_many_triangles_is_refused_once_it_is_known() {
+        let small = PrimitiveSettings {
+            width: 8,
+            height: 8,
+            ..PrimitiveSettings::default()
         };
-        assert_eq!(check_memory(&settings, (16, 16), 2), Ok(()));
+        let mut scene = primitive::generate(1, &small).unwrap();
+        assert!(check_render(&settings(), &scene, 1024).is_ok());
+        let mesh = Arc::make_mut(&mut scene.objects[0].mesh);
+        mesh.triangles.resize(2_000_000, [0, 1, 2]);
+        mesh.triangle_material.resize(2_000_000, 0);
+        let refused = check_render(&settings(), &scene, 1024).unwrap_err();
+        let refused = refused.to_string();
+        assert!(
+            refused.contains("triangles: to render it takes about 1."),
+            "{refused}"
+        );
+        assert!(refused.contains("may take 1.0 GiB"), "{refused}");
+        assert!(check_render(&settings(), &scene, 0).is_ok());
+        assert!(check_render(&settings(), &scene, 4096).is_ok());
+    }
+
+    #[test]
+    fn a_render_that_no_machine_holds_is_refused_with_what_it_takes() {
+        let mut settings = settings();
+        assert_eq!(check_memory(&settings, ((16, 16), 12), 2), Ok(()));
         settings.groups = (0..100).map(|beam| vec![beam]).collect();
-        let bytes = render_bytes(&settings, (256, 256), 1) as f64;
+        let bytes = render_bytes(&settings, ((256, 256), 12), 1) as f64;
         assert!((16.8e9..30e9).contains(&bytes), "{bytes}");
         if Memory::here().is_some() {
-            let refused = check_memory(&settings, (16_384, 16_384), 1).unwrap_err();
+            let refused = check_memory(&settings, ((16_384, 16_384), 12), 1).unwrap_err();
             assert!(
                 refused.contains("101 histograms of 16384x16384"),
                 "{refused}"

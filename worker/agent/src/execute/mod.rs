@@ -32,5 +32,5 @@ pub use kinds::{
     report,
     train::{ImportFor, imported, model_version, takes},
 };
-pub use memory::{check_memory, render_bytes};
+pub use memory::{SceneSize, check_memory, render_bytes, scene_size};
 pub use submission::{Submission, absolute};

@@ -17,7 +17,9 @@ use picofarm_proto::{
     model::{RenderTask, TaskSpec, memory::Known},
     trace,
 };
+use picofarm_scene::Scene;
 use picofarm_session::{Backoff, memory_mib, random};
+use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::{debug_span, warn};
@@ -74,6 +76,12 @@ impl Stores {
             networks: Vec::new(),
         };
         memory::check(&task, &known, self.memory_mib)
+    }
+
+    /// Refuses a render that takes more memory than tasks may take here, now that its scene is known: what a task of scene files takes
+    /// is not known before.
+    pub(super) fn check_render(&self, settings: &Settings, scene: &Scene) -> Result<(), TaskError> {
+        memory::check_render(settings, scene, self.memory_mib)
     }
 
     /// What reaches stores, for threads other than the executor's.

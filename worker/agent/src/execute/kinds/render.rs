@@ -60,12 +60,13 @@ impl RunTask for RenderTask {
             });
         }
         recipe::note(stores, &dataset, task, control)?;
-        let render = |scene: &Scene, settings: &Settings| match spec.parts {
-            1 => picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render),
-            _ => {
+        let render = |scene: &Scene, settings: &Settings| {
+            stores.check_render(settings, scene)?;
+            if spec.parts > 1 {
                 let parts = Parts::new(stores, &dataset, spec, task.index, key);
-                parts.join(scene, settings, control)
+                return parts.join(scene, settings, control);
             }
+            picofarm_transient::render(scene, settings, &Watched(control)).map_err(of_render)
         };
         let encoded = make_by(&dataset, with, spec, task.index, &key, render)?;
         control.at((1.0 + RENDER_SHARE) / 2.0);
