@@ -53,7 +53,7 @@ fn rooms_with_furniture_of_many_triangles_take_more() {
     assert_eq!(with("parametric-1"), primitive);
     // Of 355,000 triangles a render took 313 to 350 MB, with 70 MB of the program.
     let more = with("sweethome3d-abc") - primitive;
-    assert!((100_000_000..300_000_000).contains(&more), "{more}");
+    assert!((200_000_000..400_000_000).contains(&more), "{more}");
 }
 
 #[test]

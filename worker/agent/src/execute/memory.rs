@@ -122,8 +122,8 @@ pub fn check_memory(settings: &Settings, size: SceneSize, threads: usize) -> Res
     let needed = render_bytes(settings, size, threads);
     match Memory::here() {
         Some(there) if needed > there.for_tasks_mib() << 20 => Err(format!(
-            "{} histograms of {}x{} pixels x {} bins of {} triangles take about {} of memory, but there is {there}; ask for \
-             fewer of them, or for fewer pixels or bins",
+            "{} histograms of {}x{} pixels x {} bins, and a scene of {} triangles, take about {} of memory, but there is {there}; \
+             ask for fewer of any",
             rendering(settings, size, threads).histograms + if settings.split { 6 } else { 0 },
             size.0.0,
             size.0.1,
