@@ -8,15 +8,17 @@
 //! 1. read from the spot, one or more specular events s₁ … sⱼ are followed by another surface point z;
 //! 2. it is not the case that j = 1, s₁ lies on a planar mirror that [`crate::mirror_images`] knows and the spot is
 //!    Lambertian: those have images to aim at;
-//! 3. z, or a later point that is no near-mirror's, is what the camera sees directly, or the event before it (read from
-//!    the camera) is not specular.
+//! 3. z, or a later point that is no near-mirror's, is what the camera sees directly; or the event before it (read from
+//!    the camera) is not specular; or the camera sees it by way of near-mirrors alone, of which the last is not much smoother than s₁
+//!    ([`pays_below`]).
 //!
 //! Light paths cover that class and nothing else. Let z be the first point of which 3 holds: it is drawn into the image
 //! where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for every other point. A light path goes on
 //! from z by the surface's own scattering, and ends unless it meets a near-mirror: a caustic that diffuse surfaces see by
 //! way of a near-mirror is covered as well. [`crate::walk`] leaves out just these: [`crate::vertex::Vertex::open`] carries
-//! condition 3 along a camera path. What is left to chance are caustics that the camera sees through near-mirrors, up to
-//! the last caustic of the path.
+//! condition 3 along a camera path. A near-mirror that the camera sees connects to z by its own narrow lobe: many light vertices are
+//! looked at from many camera paths, so that some lie within it. What is left to chance is light that comes to the camera by near-mirrors
+//! alone, and caustics that it sees in much smoother ones.
 //!
 //! The first leg goes to a point on a near-mirror, chosen by its unshadowed light, or along the spot's own
 //! scattering, joined by the balance heuristic.
@@ -39,6 +41,10 @@ use crate::{
 
 /// Events before Russian roulette sets in.
 const SURE: u32 = 3;
+/// How much smoother than the first near-mirror of a light path the one may be in which the camera sees its end. Chance finds such
+/// light, from the camera, more seldom the smoother the first one is; connecting, the smoother the other one. But thousands
+/// of pairs are looked at there.
+const SMOOTHER: f32 = 16.0;
 /// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
 const PROBE: u32 = 4096;
 const PAYS: f64 = 1e-3;
@@ -100,6 +106,13 @@ struct Start {
     flux: f32,
     ratios: Ratios,
     path_m: f64,
+}
+
+/// Roughness that the first near-mirror of light paths must be below for them to pay where the camera sees their end in a
+/// near-mirror of roughness `alpha`.
+#[inline]
+pub(crate) fn pays_below(alpha: f32) -> f32 {
+    SMOOTHER * alpha
 }
 
 impl Caustics {
@@ -164,6 +177,7 @@ impl Caustics {
             mut path_m,
         } = start;
         let images = within.emitters.columns.strength[spot] > 0.0;
+        let alpha = hit.surface.alpha();
         let aimed_at = images && within.mirrors.of(hit.triangle).is_some();
         // The spot and the first event.
         let (mut bounces, mut ended) = (2, false);
@@ -210,6 +224,7 @@ impl Caustics {
                 path_m,
                 spot,
                 bounces,
+                alpha,
             });
         }
     }

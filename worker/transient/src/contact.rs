@@ -159,6 +159,8 @@ impl Contacts {
         let (mut from, mut at, mut path_m) = (e.p, within.emitters.lifted[spot], e.path_m);
         // Within the zones, and what the vertex before was.
         let (mut inside, mut specular) = (true, false);
+        // Roughness of the first near-mirror that it went by.
+        let mut alpha = 0.0;
         for bounces in 2..=within.max_bounces {
             let Some(mut hit) = world.closest(stack, at, w) else {
                 return;
@@ -191,6 +193,7 @@ impl Contacts {
                     path_m,
                     spot,
                     bounces,
+                    alpha,
                 };
                 each(end, vertex);
             }
@@ -207,6 +210,9 @@ impl Contacts {
             flux *= weight;
             ratios = times(ratios, world.ratios(&hit, -w, next));
             specular = hit.surface.specular();
+            if specular && alpha == 0.0 {
+                alpha = hit.surface.alpha();
+            }
             (from, at, w) = (hit.p, lift(hit.p, hit.n), next);
         }
     }

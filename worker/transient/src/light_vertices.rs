@@ -35,6 +35,8 @@ pub(crate) struct LightVertex {
     pub spot: usize,
     /// Bounces up to and with this vertex, counted from the spot as the first.
     pub bounces: u32,
+    /// Roughness of the first near-mirror by whose lobe the light came; 0 where it came by none.
+    pub alpha: f32,
 }
 
 /// Density of a light vertex that nothing else finds: its share in MIS is 1 to the last bit.
@@ -98,6 +100,7 @@ impl LightVertices {
                 path_m: e.path_m + world.metres(d2.sqrt()),
                 spot,
                 bounces: 2,
+                alpha: 0.0,
             });
         }
     }

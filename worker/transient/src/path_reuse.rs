@@ -19,7 +19,7 @@ mod spectral;
 
 use self::{
     arrivals::Lengths,
-    draw::{gather_point, only_mirrors},
+    draw::{Share, gather_point, only_mirrors},
     gloss::Gloss,
 };
 use std::f32::consts::PI;
@@ -72,6 +72,9 @@ pub(crate) struct Effort {
 const MIRROR_PATHS: u32 = 16;
 /// Light vertices beyond near-mirrors that a gather point is connected to at most.
 const BEYOND: u32 = 2;
+/// The same of a near-mirror that the camera sees, and how many of a pixel's camera paths there are to one that is connected.
+const SHOWN: u32 = 2;
+const SHOWING: u32 = 4;
 /// Light paths of a pass in all zones beside spots, and at least and at most in one.
 const ALL_ZONES: u32 = 64;
 const ZONE_PATHS: (u32, u32) = (4, 16);
@@ -315,16 +318,22 @@ impl Sharing {
                 true => MIRROR_PATHS,
                 false => 1,
             };
-            let share = 1.0 / paths as f32;
+            let share = |j: u32| Share {
+                spots: 1.0 / paths as f32,
+                beyond: match j % SHOWING {
+                    0 => 1.0 / paths.div_ceil(SHOWING) as f32,
+                    _ => 0.0,
+                },
+            };
             for j in 1..paths {
                 // Spread over the pixel beside the first (Roberts 2018).
                 let at = |start: f32, step: f32| (start + j as f32 * step).fract();
                 let at = (at(x, 0.754_877_7), at(y, 0.569_840_3));
                 let ray = walk.world.camera_ray((row, col), at);
-                only_mirrors(walk, &mut rng, ray, share, scratch, &mut sink);
+                only_mirrors(walk, &mut rng, ray, share(j), scratch, &mut sink);
             }
             let ray = walk.world.camera_ray((row, col), (x, y));
-            if let Some(v) = gather_point(walk, &mut rng, ray, share, scratch, &mut sink) {
+            if let Some(v) = gather_point(walk, &mut rng, ray, share(0), scratch, &mut sink) {
                 self.gathers.push((v, k));
             }
         }

@@ -86,7 +86,8 @@ pub(crate) fn plan(
                 "light paths: caustics from curved near-mirrors and from several in a row".into(),
             );
             approximations.push(
-                "caustics that the camera sees in a near-mirror are unbiased but noisy".into(),
+                "light by several near-mirrors alone, and caustics seen in a much smoother one, are unbiased but noisy"
+                    .into(),
             );
         } else if curved {
             approximations.push(format!(

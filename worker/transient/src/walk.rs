@@ -263,8 +263,7 @@ impl Walk<'_> {
             ratios: times(v.ratios, self.world.ratios(&h, v.wo, w)),
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
-            after_mirror: h.surface.specular(),
-            open_before: v.open(),
+            place: v.next(),
         };
         Some((step, next))
     }

@@ -173,6 +173,57 @@ fn mixes_and_rows_of_mirrors_are_parted_without_a_rest() {
     );
 }
 
+/// A room whose caustics lie behind the camera, and what it sees them in, which hides most of the rest.
+fn looking_back(mirror: Object, ball: f32) -> Scene {
+    let thrower = sphere(v(0.7, -0.5, -0.3), 0.3, 3, Material::mirror("ball", ball));
+    furnished(vec![mirror, thrower], 8)
+}
+
+fn pane(material: Material) -> Object {
+    quad(
+        v(-0.6, -0.4, -1.1),
+        v(1.2, 0.0, 0.1),
+        v(0.0, 0.8, 0.0),
+        material,
+    )
+}
+
+#[test]
+fn caustics_that_the_camera_sees_in_near_mirrors_are_found_in_one_way() {
+    let plane = pane(Material::mirror("plane", 0.08));
+    same("plane", &looking_back(plane, 0.08), (192, 32), None, 0.03);
+    let plane = pane(mixed(0.1, 0.7));
+    same("mix", &looking_back(plane, 0.1), (192, 32), None, 0.03);
+    let globe = |alpha| sphere(v(0.0, 0.0, -2.1), 1.0, 3, Material::mirror("globe", alpha));
+    let s = looking_back(globe(0.08), 0.05);
+    same("globe", &s, (384, 32), Some(4), 0.03);
+    // So much smoother that chance finds its caustics.
+    let plane = pane(Material::mirror("plane", 0.005));
+    same("smoother", &looking_back(plane, 0.1), (192, 64), None, 0.03);
+    // Two in a row.
+    let mut s = looking_back(pane(Material::mirror("plane", 0.08)), 0.08);
+    s.objects.push(quad(
+        v(-1.2, -0.9, 0.49),
+        v(0.0, 1.7, 0.0),
+        v(2.4, 0.0, 0.0),
+        mixed(0.08, 0.6),
+    ));
+    same("two", &s, (384, 32), None, 0.03);
+}
+
+#[test]
+fn caustics_that_the_camera_sees_in_a_near_mirror_are_far_less_noisy_than_by_chance() {
+    let s = looking_back(pane(Material::mirror("plane", 0.02)), 0.03);
+    let off = over_seeds(&s, 12, |seed| with(Some(false), 256, seed), pixels);
+    let on = over_seeds(&s, 12, |seed| with(None, 32, seed), pixels);
+    let (off, on) = (sum(&off), sum(&on));
+    let factor = off.1 / on.1 * 256.0 / 32.0;
+    println!("off {off:?} on {on:?} factor {factor:.0}");
+    assert!(factor > 20.0);
+    let error = ((off.1 + on.1) / 12.0).sqrt();
+    assert!((off.0 - on.0).abs() < 5.0 * error, "{off:?} {on:?}");
+}
+
 #[test]
 fn a_glossy_receiver_and_a_spot_on_a_mirror_are_covered() {
     let glossy = Material {

@@ -69,6 +69,7 @@ impl ByGlass {
                 back: point.back,
                 flux: there.weight,
                 ratios: there.ratios,
+                alpha: 0.0,
                 density: ALONE,
                 path_m: there.length_m,
                 spot,

@@ -14,7 +14,7 @@ use crate::{
     sink::{Place, Sink, Way},
     spectra::{Light, ONES},
     turns::Turns,
-    vertex::Vertex,
+    vertex::{self, Vertex},
     walk::{Scratch, Walk},
     world::{Hit, World, lift},
 };
@@ -208,8 +208,7 @@ impl LitPoint {
             ratios: ONES,
             length_m: 0.0,
             bounce: 1,
-            after_mirror: false,
-            open_before: false,
+            place: vertex::Place::ELSEWHERE,
         };
         walk.run(rng, vertex, scratch, &mut Arrivals(&mut arrivals));
         for a in &mut arrivals {

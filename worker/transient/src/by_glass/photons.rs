@@ -52,6 +52,7 @@ impl Photons {
             back: e.back,
             flux: 1.0,
             ratios: ONES,
+            alpha: 0.0,
             density: ALONE,
             path_m: e.path_m,
             spot,

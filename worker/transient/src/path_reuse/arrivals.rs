@@ -13,7 +13,7 @@ use crate::{
     rng::Rng,
     sink::{Place, Sink, Way},
     spectra::{Light, ONES, times},
-    vertex::Vertex,
+    vertex::{self, Vertex},
     walk::{Scratch, Walk},
     world::{Hit, lift},
 };
@@ -125,8 +125,7 @@ impl Sharing {
                 ratios: ONES,
                 length_m: nearest,
                 bounce,
-                after_mirror: false,
-                open_before: false,
+                place: vertex::Place::ELSEWHERE,
             };
             let walk_on = |rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
                 sink.factor = 1.0 / effort.walks.max(1) as f32;

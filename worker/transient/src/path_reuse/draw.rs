@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::{ALL_ZONES, BESIDE, BEYOND, GLOSSY, Shared, Sharing, ZONE_PATHS};
+use super::{ALL_ZONES, BESIDE, BEYOND, GLOSSY, SHOWN, Shared, Sharing, ZONE_PATHS};
 use crate::{
     contact::Contacts,
     ellipsoid::Patches,
@@ -11,7 +11,7 @@ use crate::{
     sink::{PixelSink, Place, Sink, Way},
     spectra::{Light, ONES, times},
     turns::Turns,
-    vertex::Vertex,
+    vertex::{self, Vertex},
     walk::{ALL, Lights, Scratch, Walk},
     world::lift,
 };
@@ -236,13 +236,38 @@ impl Sharing {
     }
 }
 
+/// What share one of a pixel's camera paths has in what near-mirrors bring.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Share {
+    /// In light from the spots and their zones.
+    pub spots: f32,
+    /// In light from points beyond other near-mirrors; 0 where it is not looked for.
+    pub beyond: f32,
+}
+
+/// Connects a near-mirror to light vertices beyond others.
+fn show(
+    walk: &Walk,
+    rng: &mut Rng,
+    vertex: &Vertex,
+    share: Share,
+    scratch: &mut Scratch,
+    sink: &mut PixelSink,
+) {
+    if share.beyond > 0.0 {
+        sink.factor = share.beyond;
+        walk.light(rng, vertex, Lights::Beyond, SHOWN, scratch, sink);
+        sink.factor = share.spots;
+    }
+}
+
 /// Follows a camera ray through near-mirrors to the first other surface. What the spots send to vertices
 /// past the first goes to `sink`; to near-mirrors this path finds `share` of it.
 pub(super) fn gather_point(
     walk: &Walk,
     rng: &mut Rng,
     ray: Vec3,
-    share: f32,
+    share: Share,
     scratch: &mut Scratch,
     sink: &mut PixelSink,
 ) -> Option<Vertex> {
@@ -251,7 +276,7 @@ pub(super) fn gather_point(
         vertex.hit.choose_lobe(walk.world, rng);
         if vertex.bounce > 1 {
             sink.factor = if vertex.hit.surface.specular() {
-                share
+                share.spots
             } else {
                 1.0
             };
@@ -263,8 +288,9 @@ pub(super) fn gather_point(
         if !vertex.hit.surface.specular() {
             return Some(vertex);
         }
-        sink.factor = share;
+        sink.factor = share.spots;
         walk.light(rng, &vertex, Lights::Contact, BESIDE, scratch, sink);
+        show(walk, rng, &vertex, share, scratch, sink);
         let roulette = vertex.bounce > 1;
         (_, vertex) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack)?;
     }
@@ -276,14 +302,14 @@ pub(super) fn only_mirrors(
     walk: &Walk,
     rng: &mut Rng,
     ray: Vec3,
-    share: f32,
+    share: Share,
     scratch: &mut Scratch,
     sink: &mut PixelSink,
 ) {
     let Some(mut vertex) = first(walk, ray, scratch) else {
         return;
     };
-    sink.factor = share;
+    sink.factor = share.spots;
     loop {
         vertex.hit.choose_lobe(walk.world, rng);
         if !vertex.hit.surface.specular() {
@@ -296,6 +322,7 @@ pub(super) fn only_mirrors(
             return;
         }
         walk.light(rng, &vertex, Lights::Contact, BESIDE, scratch, sink);
+        show(walk, rng, &vertex, share, scratch, sink);
         let roulette = vertex.bounce > 1;
         let Some((_, next)) = walk.step(rng, &vertex, 0.0, roulette, &mut scratch.stack) else {
             return;
@@ -316,7 +343,6 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         ratios: ONES,
         length_m: world.metres(range),
         bounce: 1,
-        after_mirror: false,
-        open_before: false,
+        place: vertex::Place::FIRST,
     })
 }

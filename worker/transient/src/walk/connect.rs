@@ -6,6 +6,7 @@ use picofarm_scene::Vec3;
 
 use super::{ALL, Lights, Scratch, Step, Walk};
 use crate::{
+    caustic,
     contact::Contacts,
     light_vertices,
     lobes::Seen,
@@ -32,7 +33,8 @@ impl Walk<'_> {
             return;
         }
         let planar = self.mirrors.of(h.triangle).is_some() && step.is_some();
-        let caustic = self.caustics.is_some() && h.surface.specular() && v.open();
+        let caustic =
+            self.caustics.is_some() && h.surface.specular() && v.open() > h.surface.alpha();
         if caustic && !planar {
             return;
         }
@@ -213,7 +215,7 @@ impl Walk<'_> {
     }
 
     /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
-    /// those in zones.
+    /// those in zones, and where the camera sees it by near-mirrors alone to those beyond others that pay there.
     pub fn light(
         &self,
         rng: &mut Rng,
@@ -245,7 +247,7 @@ impl Walk<'_> {
             Lights::Contact => {
                 // Near vertices are walked to within the zones, and light paths go on by way of near-mirrors.
                 let theirs = |c: &Contacts| match h.surface.specular() {
-                    true => v.open(),
+                    true => v.open() > h.surface.alpha(),
                     false => c.near(self.world, h),
                 };
                 !vertices.list.is_empty() && !self.contacts.is_some_and(theirs)
@@ -258,6 +260,12 @@ impl Walk<'_> {
             vertices.glossy_weights(h, v.wo, lights);
         } else {
             vertices.weights(h, v.wo, (lights, plain));
+        }
+        if which == Lights::Beyond && h.surface.specular() {
+            let below = caustic::pays_below(h.surface.alpha());
+            for (w, y) in lights.iter_mut().zip(&vertices.list) {
+                *w = if y.alpha < below { *w } else { 0.0 };
+            }
         }
         if let Some(window) = &self.window {
             for (w, y) in lights.iter_mut().zip(&vertices.list) {
