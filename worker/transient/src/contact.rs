@@ -10,7 +10,7 @@
 //! drawn into the image where the camera sees it, and is a light vertex ([`crate::light_vertices`]) for camera vertices that
 //! are not near. Where the run ends on a near-mirror, they go on as [`crate::caustic`] says, to a point z behind it that is
 //! drawn or connected likewise; what such paths do not cover (no point as in condition 3 there, so that
-//! [`crate::vertex::Vertex::open`] is false) is found by connecting v to the near-mirror itself. [`crate::walk`] and the
+//! [`crate::vertex::Vertex::open`] is not above the near-mirror's roughness) is found by connecting v to the near-mirror itself. [`crate::walk`] and the
 //! strata of two bounces leave out the light that comes from a spot to its own zone. Energy is carried from vertex to vertex
 //! and never divided by a distance within a zone: it is kept at any d.
 //!

@@ -18,13 +18,13 @@ pub(crate) struct Vertex {
     pub length_m: f64,
     /// Bounces up to and with this vertex.
     pub bounce: u32,
-    /// Where it lies on the path.
-    pub place: Place,
+    /// How the camera sees it.
+    pub sight: Sight,
 }
 
-/// Where a vertex lies on a path from the camera, as far as light paths ([`crate::caustic`]) are concerned.
+/// How the camera sees a vertex of its path, as far as light paths ([`crate::caustic`]) are concerned.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Place {
+pub(crate) struct Sight {
     /// Roughness of the near-mirror before it; infinite where none is.
     before: f32,
     /// Only near-mirrors lie between the camera and it.
@@ -33,7 +33,7 @@ pub(crate) struct Place {
     open_before: f32,
 }
 
-impl Place {
+impl Sight {
     /// What the camera sees.
     pub const FIRST: Self = Self {
         by_mirrors: true,
@@ -53,11 +53,11 @@ impl Vertex {
     /// that pay there.
     #[inline]
     pub fn open(&self) -> f32 {
-        let Place {
+        let Sight {
             before,
             by_mirrors,
             open_before,
-        } = self.place;
+        } = self.sight;
         if self.hit.surface.specular() {
             open_before
         } else if before == f32::INFINITY {
@@ -69,16 +69,16 @@ impl Vertex {
         }
     }
 
-    /// The place of what follows it.
+    /// How it sees what follows.
     #[inline]
-    pub fn next(&self) -> Place {
+    pub fn next(&self) -> Sight {
         let specular = self.hit.surface.specular();
-        Place {
+        Sight {
             before: match specular {
                 true => self.hit.surface.alpha(),
                 false => f32::INFINITY,
             },
-            by_mirrors: self.place.by_mirrors && specular,
+            by_mirrors: self.sight.by_mirrors && specular,
             open_before: self.open(),
         }
     }

@@ -263,7 +263,7 @@ impl Walk<'_> {
             ratios: times(v.ratios, self.world.ratios(&h, v.wo, w)),
             length_m: v.length_m + self.world.metres((hit.p - h.p).length()),
             bounce: v.bounce + 1,
-            place: v.next(),
+            sight: v.next(),
         };
         Some((step, next))
     }

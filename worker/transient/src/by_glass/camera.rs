@@ -15,7 +15,7 @@ use crate::{
     rng::Rng,
     sink::{Place, Sink, Technique, Way},
     spectra::{Light, ONES, Ratios, times},
-    vertex::{self, Vertex},
+    vertex::{Sight, Vertex},
     walk::{ALL, Walk, draw},
 };
 
@@ -177,7 +177,7 @@ fn straight(
         ratios: point.path.ratios,
         length_m: 0.0,
         bounce: point.path.bounces,
-        place: vertex::Place::ELSEWHERE,
+        sight: Sight::ELSEWHERE,
     };
     // Zones leave what is close beside a spot to light paths, which do not come here.
     let near = walk.contacts.is_some_and(|c| c.near(walk.world, &hit));

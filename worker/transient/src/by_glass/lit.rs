@@ -14,7 +14,7 @@ use crate::{
     sink::{Place, Sink, Way},
     spectra::{Light, ONES},
     turns::Turns,
-    vertex::{self, Vertex},
+    vertex::{Sight, Vertex},
     walk::{Scratch, Walk},
     world::{Hit, World, lift},
 };
@@ -208,7 +208,7 @@ impl LitPoint {
             ratios: ONES,
             length_m: 0.0,
             bounce: 1,
-            place: vertex::Place::ELSEWHERE,
+            sight: Sight::ELSEWHERE,
         };
         walk.run(rng, vertex, scratch, &mut Arrivals(&mut arrivals));
         for a in &mut arrivals {

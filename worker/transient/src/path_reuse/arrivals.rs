@@ -13,7 +13,7 @@ use crate::{
     rng::Rng,
     sink::{Place, Sink, Way},
     spectra::{Light, ONES, times},
-    vertex::{self, Vertex},
+    vertex::{Sight, Vertex},
     walk::{Scratch, Walk},
     world::{Hit, lift},
 };
@@ -125,7 +125,7 @@ impl Sharing {
                 ratios: ONES,
                 length_m: nearest,
                 bounce,
-                place: vertex::Place::ELSEWHERE,
+                sight: Sight::ELSEWHERE,
             };
             let walk_on = |rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
                 sink.factor = 1.0 / effort.walks.max(1) as f32;

@@ -11,7 +11,7 @@ use crate::{
     sink::{PixelSink, Place, Sink, Way},
     spectra::{Light, ONES, times},
     turns::Turns,
-    vertex::{self, Vertex},
+    vertex::{Sight, Vertex},
     walk::{ALL, Lights, Scratch, Walk},
     world::lift,
 };
@@ -343,6 +343,6 @@ fn first(walk: &Walk, ray: Vec3, scratch: &mut Scratch) -> Option<Vertex> {
         ratios: ONES,
         length_m: world.metres(range),
         bounce: 1,
-        place: vertex::Place::FIRST,
+        sight: Sight::FIRST,
     })
 }
