@@ -16,11 +16,13 @@ mod arrivals;
 mod draw;
 mod gloss;
 mod spectral;
+mod spread;
+mod weigh;
 
 use self::{
-    arrivals::Lengths,
     draw::{Share, gather_point, only_mirrors},
     gloss::Gloss,
+    weigh::Lengths,
 };
 use std::f32::consts::PI;
 

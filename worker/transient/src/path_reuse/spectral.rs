@@ -3,7 +3,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::{Shared, Sharing, arrivals::floor};
+use super::{Shared, Sharing, spread::floor};
 use crate::{
     bsdf::Surface,
     film::Film,

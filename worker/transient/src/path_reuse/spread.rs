@@ -1,0 +1,152 @@
+//! Carrying what arrives at the shared vertices to the pixels.
+
+use super::Sharing;
+use crate::{
+    film::Film,
+    lanes::{SIDE, Wide, widest},
+    spectra::{Light, ONES},
+    walk::Walk,
+};
+
+impl Sharing {
+    /// Carries the arrivals to the pixels.
+    pub(super) fn spread(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        if film.spectral {
+            return self.spread_spectral((walk, film), pixels);
+        }
+        widest(Spread {
+            sharing: self,
+            walk,
+            film,
+            pixels,
+        });
+    }
+
+    #[inline(always)]
+    fn spread_wide(&self, (walk, film): (&Walk, &Film), pixels: &mut [f32]) {
+        let count = self.gathers.len();
+        let size = film.pixel();
+        let last = film.slots as f32 - 1.0;
+        let lowest = self.lowest();
+        let bounded = walk.max_bounces < u32::MAX;
+        // Every second arrival is summed here: a sum that waits for the one just before it in the same slot takes several
+        // times as long.
+        let mut second = vec![0.0f32; film.slots];
+        let mut sent = vec![];
+        for (i, (v, k)) in self.gathers.iter().enumerate() {
+            let pixel = &mut pixels[k * size..(k + 1) * size];
+            let deeper = v.bounce - lowest;
+            for (y, row) in self
+                .shared
+                .iter()
+                .zip(self.weight.chunks(count).zip(self.offset.chunks(count)))
+            {
+                let (weight, offset) = (row.0[i], row.1[i] + 1.0);
+                if weight == 0.0 {
+                    continue;
+                }
+                let range = y.first..y.end;
+                let a = &self.arrivals;
+                let bins = &a.bins[range.clone()];
+                let values = match &y.rough {
+                    None => &a.value[range.clone()],
+                    Some(surface) => {
+                        let to = (v.hit.p - y.hit.p).normalized();
+                        self.gloss.send(y, surface, to, &mut sent);
+                        &sent
+                    }
+                };
+                if film.channels == 1 && !bounded {
+                    let first = &mut pixel[..film.slots];
+                    let (many, few) = bins.as_chunks::<SIDE>();
+                    let (values, last_values) = values.as_chunks::<SIDE>();
+                    // Slots and values side by side.
+                    for (bins, values) in many.iter().zip(values) {
+                        let (mut slots, mut found) = ([0u32; SIDE], [0.0f32; SIDE]);
+                        for (slot, b) in slots.iter_mut().zip(bins) {
+                            *slot = floor(b + offset, last);
+                        }
+                        for (found, v) in found.iter_mut().zip(values) {
+                            *found = weight * v;
+                        }
+                        for k in (0..SIDE).step_by(2) {
+                            first[slots[k] as usize] += found[k];
+                            second[slots[k + 1] as usize] += found[k + 1];
+                        }
+                    }
+                    for (k, (b, v)) in few.iter().zip(last_values).enumerate() {
+                        let sums = if k % 2 == 0 { &mut *first } else { &mut second };
+                        sums[floor(b + offset, last) as usize] += weight * v;
+                    }
+                    continue;
+                }
+                let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
+                let each = bins.iter().zip(values).zip(rest);
+                // In the same order as above: groups of spots change no bit.
+                for (k, ((&b, &value), (&spot, &bounces))) in each.enumerate() {
+                    if u32::from(bounces) + deeper > walk.max_bounces {
+                        continue;
+                    }
+                    let slot = floor(b + offset, last) as usize;
+                    let light = Light {
+                        value: weight * value,
+                        ratios: ONES,
+                    };
+                    let first = if k % 2 == 0 {
+                        &mut pixel[slot]
+                    } else {
+                        &mut second[slot]
+                    };
+                    *first += light.value;
+                    film.add_to_groups(pixel, slot, &light, usize::from(spot));
+                }
+            }
+            for (sum, second) in pixel.iter_mut().zip(&mut second) {
+                *sum += std::mem::take(second);
+            }
+        }
+    }
+}
+
+/// [`Sharing::spread`].
+struct Spread<'a> {
+    sharing: &'a Sharing,
+    walk: &'a Walk<'a>,
+    film: &'a Film,
+    pixels: &'a mut [f32],
+}
+
+impl Wide for Spread<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let of = (self.walk, self.film);
+        self.sharing.spread_wide(of, self.pixels);
+    }
+}
+
+/// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
+/// bits, without the checks of a cast. (An x within rounding of an integer may fall to either side.)
+#[inline(always)]
+pub(super) fn floor(x: f32, last: f32) -> u32 {
+    let half = x.max(0.5).min(last + 0.5) - 0.5;
+    (half + 8_388_608.0).to_bits() & 0x007f_ffff
+}
+
+#[cfg(test)]
+mod tests {
+    use super::floor;
+
+    #[test]
+    fn slots_are_whole_parts_within_their_range() {
+        for k in 0..4000u32 {
+            for part in [0.01, 0.3, 0.5, 0.7, 0.99] {
+                assert_eq!(floor(k as f32 + part, 638.0), k.min(638));
+            }
+        }
+        assert_eq!(floor(-7.5, 638.0), 0);
+        assert_eq!(floor(f32::INFINITY, 638.0), 638);
+        assert_eq!(floor(1_048_577.5, 1_048_577.0), 1_048_577);
+    }
+}

@@ -1,0 +1,200 @@
+//! What the gather points take of light from each shared vertex.
+
+use std::f32::consts::PI;
+
+use picofarm_scene::Vec3;
+
+use super::Sharing;
+use crate::{
+    emitter::Columns,
+    film::Film,
+    lanes::{self, Wide, widest},
+    vertex::Vertex,
+    walk::{Scratch, Walk},
+    world::lift,
+};
+
+impl Sharing {
+    /// Weighs every pair of shared vertex and gather point.
+    pub(super) fn connect(
+        &mut self,
+        (walk, film): (&Walk, &Film),
+        drawn: u32,
+        scratch: &mut Scratch,
+    ) {
+        let count = self.gathers.len();
+        self.weight.clear();
+        self.offset.clear();
+        self.weight.resize(count * self.shared.len(), 0.0);
+        self.offset.resize(count * self.shared.len(), 0.0);
+        let share = drawn as f32 / count as f32;
+        self.lengths.lay((walk, film), &self.gathers);
+        let rows = self
+            .weight
+            .chunks_mut(count)
+            .zip(self.offset.chunks_mut(count));
+        for (y, (weight, offset)) in self.shared.iter().zip(rows) {
+            if walk.window.is_some() && y.first == y.end {
+                continue;
+            }
+            let h = &y.hit;
+            self.columns.irradiance(h.p, h.n, weight);
+            for &i in &self.glossy {
+                let x = &self.gathers[i].0.hit;
+                let to = x.p - h.p;
+                let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
+                weight[i] = if seen { 1.0 } else { 0.0 };
+            }
+            self.ends.clear();
+            self.ends_of.clear();
+            for (i, (w, (v, _))) in weight.iter().zip(&self.gathers).enumerate() {
+                if *w > 0.0 {
+                    self.ends.push(lift(v.hit.p, v.hit.n));
+                    self.ends_of.push(i);
+                }
+            }
+            self.blocked.resize(self.ends.len(), false);
+            walk.world.bvh.occluded_bundle(
+                &mut scratch.stack,
+                lift(h.p, h.n),
+                &self.ends,
+                &mut self.blocked,
+            );
+            for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+                if blocked {
+                    weight[i] = 0.0;
+                }
+            }
+            let mut density = 0.0;
+            self.apart.clear();
+            self.scattered.resize(self.glossy.len(), 0.0);
+            self.drawn.resize(self.glossy.len(), 0.0);
+            let (scattered, drawn) = (&mut self.scattered, &mut self.drawn);
+            self.lobes.toward((h.p, h.n), scattered, drawn);
+            for ((&i, &value), &pdf) in self.glossy.iter().zip(&*scattered).zip(&*drawn) {
+                if weight[i] == 0.0 {
+                    continue;
+                }
+                let v = &self.gathers[i].0;
+                let x = &v.hit;
+                let (mut value, mut pdf) = (value, pdf);
+                if !x.surface.ggx() {
+                    let to = h.p - x.p;
+                    let d2 = to.dot(to);
+                    let w_in = to / d2.sqrt();
+                    let cos = h.n.dot(w_in).abs() / d2;
+                    pdf = x.surface.pdf(x.n, v.wo, w_in) * cos;
+                    value = x.surface.scatter(x.n, v.wo, w_in) * cos;
+                }
+                density += pdf;
+                self.apart.push((i, v.beta * value));
+                weight[i] = 0.0;
+            }
+            density += self.lengths.weigh(&self.columns, h.p, weight, offset);
+            for &(i, value) in &self.apart {
+                weight[i] = value;
+            }
+            let density = density * share + y.light;
+            let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
+            for w in weight.iter_mut() {
+                *w *= inverse;
+            }
+            if walk.world.has_glass() {
+                let from = lift(h.p, h.n);
+                for (&i, &to) in self.ends_of.iter().zip(&self.ends) {
+                    if weight[i] > 0.0 {
+                        weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// What the gather points do with light of a direction, side by side.
+#[derive(Debug, Default)]
+pub(super) struct Lengths {
+    /// Albedo/π times the weight of the camera path; of surfaces that are not Lambertian anything.
+    factor: Vec<f32>,
+    /// Optical path from the camera less the gate's start, in bins.
+    bins: Vec<f64>,
+    /// Bins in a render unit.
+    per_unit: f64,
+}
+
+impl Lengths {
+    pub fn lay(&mut self, (walk, film): (&Walk, &Film), gathers: &[(Vertex, usize)]) {
+        let per_metre = 1.0 / film.gate.bin_width_m;
+        self.per_unit = walk.world.metres(1.0) * per_metre;
+        self.factor.clear();
+        self.bins.clear();
+        for (v, _) in gathers {
+            self.factor.push(v.beta * v.hit.surface.lambertian());
+            self.bins.push((v.length_m - film.gate.start_m) * per_metre);
+        }
+    }
+
+    /// Turns the irradiances that a shared vertex in `y` casts on Lambertian gather points into what they send to the
+    /// camera, and finds the optical paths by way of it, in bins. Returns the density of drawing the vertex from them. No
+    /// branches, and sums side by side: the compiler works on several at once.
+    pub fn weigh(&self, columns: &Columns, y: Vec3, weight: &mut [f32], offset: &mut [f32]) -> f32 {
+        widest(Weigh {
+            lengths: self,
+            columns,
+            y,
+            weight,
+            offset,
+        })
+    }
+
+    #[inline(always)]
+    fn weigh_wide(
+        &self,
+        columns: &Columns,
+        y: Vec3,
+        weight: &mut [f32],
+        offset: &mut [f32],
+    ) -> f32 {
+        let count = weight.len();
+        let (px, py, pz) = (
+            &columns.px[..count],
+            &columns.py[..count],
+            &columns.pz[..count],
+        );
+        let (factor, bins) = (&self.factor[..count], &self.bins[..count]);
+        let sum = lanes::sum(weight);
+        let offset = &mut offset[..count];
+        for i in 0..count {
+            let (dx, dy, dz) = (y.x - px[i], y.y - py[i], y.z - pz[i]);
+            let d = (dx * dx + dy * dy + dz * dz).sqrt();
+            offset[i] = (bins[i] + f64::from(d) * self.per_unit) as f32;
+            weight[i] *= factor[i];
+        }
+        sum / PI
+    }
+}
+
+/// [`Lengths::weigh`].
+struct Weigh<'a> {
+    lengths: &'a Lengths,
+    columns: &'a Columns,
+    y: Vec3,
+    weight: &'a mut [f32],
+    offset: &'a mut [f32],
+}
+
+impl Wide for Weigh<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn run(self) -> f32 {
+        let Self {
+            lengths,
+            columns,
+            y,
+            weight,
+            offset,
+        } = self;
+        lengths.weigh_wide(columns, y, weight, offset)
+    }
+}
