@@ -10,9 +10,12 @@ use crate::{
     sink::{Place, Sink, Way},
     spectra::{Light, ONES, times},
     vertex::{Sight, Vertex},
-    walk::{Scratch, Walk},
+    walk::{Scratch, Walk, draw},
     world::{Hit, lift},
 };
+
+/// Walks from a shared vertex at least and at most, on average.
+const WALKS: (f32, f32) = (0.2, 6.0);
 
 /// Which spots' light is carried on from a vertex. A rough one weighs each arrival for each pixel, so that of many spots
 /// some are drawn by contribution (systematic sampling), each with its share of the sum.
@@ -51,171 +54,166 @@ impl Carry {
 }
 
 impl Sharing {
-    /// Optical path to the nearest gather point, metres: where arrivals' lengths are counted from.
-    fn nearest_m(&self) -> f64 {
-        let lengths = self.gathers.iter().map(|(v, _)| v.length_m);
-        lengths.fold(f64::INFINITY, f64::min)
-    }
-
-    /// Fewest bounces up to a gather point.
-    pub(super) fn lowest(&self) -> u32 {
-        let bounces = self.gathers.iter().map(|(v, _)| v.bounce);
-        bounces.min().unwrap_or(1)
-    }
-
-    /// Finds what arrives at every shared vertex: from all spots directly, from beyond by walks.
+    /// Finds what arrives at a shared vertex: from all spots directly, from beyond by walks. `drawn` are the candidates drawn from
+    /// spots, `density` that of drawing this one from gather points, where they are weighed.
+    ///
+    /// There are as many walks as the gather points take of what they bring: the root of the sum of squares of the weights, of
+    /// which 1 is that of a vertex whose light all of them take alike. Light for a rough vertex is drawn by how it scatters to a
+    /// gather point that is drawn by the same weights.
     pub(super) fn light_up(
         &mut self,
         (walk, film, effort): (&Walk, &Film, &Effort),
-        drawn: u32,
+        (at, drawn, density): (usize, u32, Option<f32>),
         rng: &mut Rng,
         scratch: &mut Scratch,
     ) {
         let emitters = walk.emitters;
         let per_metre = 1.0 / film.gate.bin_width_m;
-        let nearest = self.nearest_m();
-        let bounce = self.lowest() + 1;
-        let share = drawn as f32 / emitters.list.len() as f32;
-        let gathers = &self.gathers;
-        for y in &mut self.shared {
-            y.first = self.arrivals.bins.len();
-            y.end = y.first;
-            let h = &y.hit;
-            let window = walk
-                .window
-                .map(|w| self.shells.window(walk.world, &w, h.p, nearest));
-            let walk = &Walk { window, ..*walk };
-            if !walk.in_time(h.p, nearest) {
-                continue;
-            }
-            let guide = y.rough.and_then(|surface| {
-                let at = (rng.uniform() * gathers.len() as f32) as usize;
-                let to = gathers[at.min(gathers.len() - 1)].0.hit.p - h.p;
-                (h.n.dot(to) > 0.0).then(|| Guide {
-                    surface: surface.guide(),
-                    n: h.n,
-                    to: to.normalized(),
-                })
-            });
-            let (seen_as, wo) = guide.map_or((h.surface, h.n), |g| (g.surface, g.to));
-            let mut sink = ArrivalSink {
-                list: &mut self.arrivals,
-                base_m: nearest,
-                per_metre,
-                factor: 1.0,
-                film,
-                place: Place::Shared,
-                guide,
-                share: 1.0,
-                from: h.n,
-                left: false,
-            };
-            let mut density = 0.0;
-            let vertex = Vertex {
-                hit: Hit {
-                    surface: seen_as,
-                    ..*h
-                },
-                wo,
-                beta: 1.0,
-                ratios: ONES,
-                length_m: nearest,
-                bounce,
-                sight: Sight::ELSEWHERE,
-            };
-            let walk_on = |rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
-                sink.factor = 1.0 / effort.walks.max(1) as f32;
-                sink.at(Place::Walk);
-                for _ in 0..effort.walks {
-                    sink.left = false;
-                    walk.run(rng, vertex, scratch, sink);
-                }
-                sink.factor = 1.0;
-                sink.at(Place::Shared);
-                sink.left = false;
-            };
-            if walk.window.is_some() {
-                walk_on(rng, &mut sink, scratch);
-            }
-            let of = (Seen::of(h, wo), &seen_as);
-            emitters.weights(of, &mut scratch.plain, &mut scratch.weights);
-            walk.leave_to_zones(h, &mut scratch.weights);
-            if sink.list.bins.len() == y.first
-                && !walk.any_in_window(h.p, nearest, &scratch.weights)
-            {
-                continue;
-            }
-            self.ends.clear();
-            self.ends_of.clear();
-            for (spot, &w) in scratch.weights.iter().enumerate() {
-                if w > 0.0 {
-                    self.ends.push(emitters.lifted[spot]);
-                    self.ends_of.push(spot);
-                }
-            }
-            self.blocked.resize(self.ends.len(), false);
-            walk.world.bvh.occluded_bundle(
-                &mut scratch.stack,
-                lift(h.p, h.n),
-                &self.ends,
-                &mut self.blocked,
-            );
-            let mut lit = self.ends_of.iter().zip(&self.blocked);
-            let lit = lit.by_ref().filter(|(_, blocked)| !**blocked);
-            let lit: Vec<usize> = lit.map(|(&spot, _)| spot).collect();
-            // The densities below are of what is drawn: with glass in the way as without.
-            let mut through = vec![];
-            if walk.world.has_glass() {
-                let from = lift(h.p, h.n);
-                let share = |spot: &usize| {
-                    let to = emitters.lifted[*spot];
-                    walk.world.glass(&mut scratch.stack, from, to)
-                };
-                through = lit.iter().map(share).collect();
-            }
-            let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
-            for (k, &spot) in lit.iter().enumerate() {
-                let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
-                {
-                    let to = h.p - e.p;
-                    let d2 = to.dot(to);
-                    let d = d2.sqrt();
-                    let strength = emitters.columns.strength[spot];
-                    density += if strength > 0.0 && guide.is_none() {
-                        w / (strength * h.surface.lambertian() * PI)
-                    } else {
-                        let out = to / d;
-                        e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
-                    };
-                    let path = nearest + walk.world.metres(d) + e.path_m;
-                    let through = through.get(k).copied().unwrap_or(1.0);
-                    let carried = carry.share(w) * through;
-                    if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
-                        let back = to * (-1.0 / d);
-                        let light = Light {
-                            value: carried,
-                            ratios: match film.spectral {
-                                false => ONES,
-                                true => {
-                                    let here = walk.world.ratios(h, h.n, back);
-                                    times(here, e.ratios(walk.world, -back))
-                                }
-                            },
-                        };
-                        sink.toward(back);
-                        sink.add(path, light, spot, bounce + 1, Way::Spot);
-                    }
-                }
-            }
-            y.light = density * share;
-            if let Some(patches) = walk.patches {
-                y.light += self.shells.density((walk.world, patches), h);
-            }
-            if walk.window.is_none() {
-                walk_on(rng, &mut sink, scratch);
-            }
-            y.end = sink.list.bins.len();
+        let (count, total) = (self.gathers.len(), self.shared.len());
+        let (nearest, bounce) = (self.nearest_m, self.lowest + 1);
+        let row = &self.weight[at * count..(at + 1) * count];
+        let y = &mut self.shared[at];
+        let h = &y.hit;
+        let window = walk
+            .window
+            .map(|w| self.shells.window(walk.world, &w, h.p, nearest));
+        let walk = &Walk { window, ..*walk };
+        if !walk.in_time(h.p, nearest) {
+            return;
         }
+        let to = y.rough.and_then(|_| {
+            let u = rng.uniform();
+            let mut at = (u * count as f32) as usize;
+            if density.is_some() {
+                draw(row, 1, u, |i, _| at = i);
+            }
+            let to = self.gathers[at.min(count - 1)].0.hit.p - h.p;
+            (h.n.dot(to) > 0.0).then(|| to.normalized())
+        });
+        let guide = to.zip(y.rough).map(|(to, surface)| Guide {
+            surface: surface.guide(),
+            n: h.n,
+            to,
+        });
+        let (seen_as, wo) = guide.map_or((h.surface, h.n), |g| (g.surface, g.to));
+        let mut sink = ArrivalSink {
+            list: &mut self.arrivals,
+            base_m: nearest,
+            per_metre,
+            factor: 1.0,
+            film,
+            place: Place::Shared,
+            guide,
+            share: 1.0,
+            from: h.n,
+            left: false,
+        };
+        let mut from_spots = 0.0;
+        let vertex = Vertex {
+            hit: Hit {
+                surface: seen_as,
+                ..*h
+            },
+            wo,
+            beta: 1.0,
+            ratios: ONES,
+            length_m: nearest,
+            bounce,
+            sight: Sight::ELSEWHERE,
+        };
+        let walk_on = |often: f32, rng: &mut Rng, sink: &mut ArrivalSink, scratch: &mut Scratch| {
+            sink.factor = 1.0 / often;
+            sink.at(Place::Walk);
+            for _ in 0..(often + rng.uniform()) as u32 {
+                sink.left = false;
+                walk.run(rng, vertex, scratch, sink);
+            }
+        };
+        if density.is_none() {
+            walk_on(1.0, rng, &mut sink, scratch);
+            sink.factor = 1.0;
+            sink.at(Place::Shared);
+            sink.left = false;
+        }
+        let of = (Seen::of(h, wo), &seen_as);
+        emitters.weights(of, &mut scratch.plain, &mut scratch.weights);
+        walk.leave_to_zones(h, &mut scratch.weights);
+        if sink.list.bins.len() == y.first && !walk.any_in_window(h.p, nearest, &scratch.weights) {
+            return;
+        }
+        self.ends.clear();
+        self.ends_of.clear();
+        for (spot, &w) in scratch.weights.iter().enumerate() {
+            if w > 0.0 {
+                self.ends.push(emitters.lifted[spot]);
+                self.ends_of.push(spot);
+            }
+        }
+        self.blocked.resize(self.ends.len(), false);
+        walk.world.bvh.occluded_bundle(
+            &mut scratch.stack,
+            lift(h.p, h.n),
+            &self.ends,
+            &mut self.blocked,
+        );
+        let mut lit = self.ends_of.iter().zip(&self.blocked);
+        let lit = lit.by_ref().filter(|(_, blocked)| !**blocked);
+        let lit: Vec<usize> = lit.map(|(&spot, _)| spot).collect();
+        // The densities below are of what is drawn: with glass in the way as without.
+        let mut through = vec![];
+        if walk.world.has_glass() {
+            let from = lift(h.p, h.n);
+            let share = |spot: &usize| {
+                let to = emitters.lifted[*spot];
+                walk.world.glass(&mut scratch.stack, from, to)
+            };
+            through = lit.iter().map(share).collect();
+        }
+        let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
+        for (k, &spot) in lit.iter().enumerate() {
+            let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
+            {
+                let to = h.p - e.p;
+                let d2 = to.dot(to);
+                let d = d2.sqrt();
+                let strength = emitters.columns.strength[spot];
+                from_spots += if strength > 0.0 && guide.is_none() {
+                    w / (strength * h.surface.lambertian() * PI)
+                } else {
+                    let out = to / d;
+                    e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
+                };
+                let path = nearest + walk.world.metres(d) + e.path_m;
+                let through = through.get(k).copied().unwrap_or(1.0);
+                let carried = carry.share(w) * through;
+                if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
+                    let back = to * (-1.0 / d);
+                    let light = Light {
+                        value: carried,
+                        ratios: match film.spectral {
+                            false => ONES,
+                            true => {
+                                let here = walk.world.ratios(h, h.n, back);
+                                times(here, e.ratios(walk.world, -back))
+                            }
+                        },
+                    };
+                    sink.toward(back);
+                    sink.add(path, light, spot, bounce + 1, Way::Spot);
+                }
+            }
+        }
+        y.light = from_spots * drawn as f32 / emitters.list.len() as f32;
+        if let Some(patches) = walk.patches {
+            y.light += self.shells.density((walk.world, patches), h);
+        }
+        if let Some(density) = density {
+            let square: f32 = row.iter().map(|w| w * w).sum();
+            let taken = y.counts * square.sqrt() / (density + y.light);
+            let often = effort.walks * taken * total as f32 / (count as f32).sqrt();
+            walk_on(often.clamp(WALKS.0, WALKS.1), rng, &mut sink, scratch);
+        }
+        y.end = sink.list.bins.len();
     }
 }
 

@@ -130,17 +130,19 @@ impl Sharing {
 
     /// Draws vertices by the scattering of gather points in turn: `count` of which those that can be shared are, and `extra`
     /// more for those that cannot. They are walked on for their own pixel, which is where most of the variance is, and
-    /// costs little beside what is shared.
+    /// costs little beside what is shared. That is done for one of `times` of the `count`; the others are candidates for shared
+    /// vertices and nothing else.
     pub(super) fn draw_from_camera(
         &mut self,
         (walk, film): (&Walk, &Film),
-        (count, extra): (u32, u32),
+        (count, times, extra): (u32, u32, u32),
         rng: &mut Rng,
         scratch: &mut Scratch,
         pixels: &mut [f32],
     ) {
         let size = film.pixel();
         let points = self.gathers.len();
+        let alone = count / times + extra;
         let all = [Turns::new(count, rng), Turns::new(extra.max(1), rng)];
         for j in 0..count + extra {
             let shares = j < count;
@@ -149,6 +151,7 @@ impl Sharing {
                 false => (&all[1], j - count),
             };
             let at = turns.choice(j, points);
+            let whole = !shares || j % times == 0;
             let (vertex, k) = self.gathers[at];
             if !walk.goes_on(&vertex) {
                 continue;
@@ -156,11 +159,14 @@ impl Sharing {
             let mut sink = PixelSink {
                 film,
                 pixel: &mut pixels[k * size..(k + 1) * size],
-                factor: points as f32 / (count + extra) as f32,
+                factor: points as f32 / alone as f32,
                 place: Place::Gather,
             };
-            let aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
-            walk.light(rng, &vertex, Lights::Glossy, GLOSSY, scratch, &mut sink);
+            let mut aims = 0.0;
+            if whole {
+                aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
+                walk.light(rng, &vertex, Lights::Glossy, GLOSSY, scratch, &mut sink);
+            }
             let h = &vertex.hit;
             let Some(drawn) = turns.direction(j, &h.surface, h.n, vertex.wo, rng) else {
                 continue;
@@ -173,13 +179,15 @@ impl Sharing {
             if next.hit.surface.is_black() {
                 continue;
             }
-            if !next.hit.surface.is_shared() {
+            if next.hit.surface.is_shared() {
+                if shares {
+                    self.shared.extend(Shared::new(next.hit));
+                }
+            } else if whole {
                 sink.at(Place::Alone);
                 walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
                 sink.at(Place::AloneWalk);
                 walk.run(rng, next, scratch, &mut sink);
-            } else if shares {
-                self.shared.extend(Shared::new(next.hit));
             }
         }
     }

@@ -85,7 +85,7 @@ impl Sharing {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
-        let lowest = self.lowest();
+        let lowest = self.lowest;
         let bounded = walk.max_bounces < u32::MAX;
         let grouped = film.channels > film.wavelengths;
         let a = &self.arrivals;

@@ -27,7 +27,7 @@ impl Sharing {
         let count = self.gathers.len();
         let size = film.pixel();
         let last = film.slots as f32 - 1.0;
-        let lowest = self.lowest();
+        let lowest = self.lowest;
         let bounded = walk.max_bounces < u32::MAX;
         // Every second arrival is summed here: a sum that waits for the one just before it in the same slot takes several
         // times as long.

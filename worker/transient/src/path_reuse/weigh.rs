@@ -4,22 +4,28 @@ use std::f32::consts::PI;
 
 use picofarm_scene::Vec3;
 
-use super::Sharing;
+use super::{Effort, Sharing};
 use crate::{
     emitter::Columns,
     film::Film,
     lanes::{self, Wide, widest},
+    rng::Rng,
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::lift,
 };
 
 impl Sharing {
-    /// Weighs every pair of shared vertex and gather point.
+    /// Weighs every pair of shared vertex and gather point, and finds what arrives at the vertices. `drawn` are the candidates drawn
+    /// from gather points and from spots.
+    ///
+    /// What arrives is looked for in proportion to what the gather points take of it. Not so with a narrow gate: there few
+    /// vertices have arrivals in its window, and only those are weighed.
     pub(super) fn connect(
         &mut self,
-        (walk, film): (&Walk, &Film),
-        drawn: u32,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        drawn: (u32, u32),
+        rng: &mut Rng,
         scratch: &mut Scratch,
     ) {
         let count = self.gathers.len();
@@ -27,87 +33,113 @@ impl Sharing {
         self.offset.clear();
         self.weight.resize(count * self.shared.len(), 0.0);
         self.offset.resize(count * self.shared.len(), 0.0);
-        let share = drawn as f32 / count as f32;
         self.lengths.lay((walk, film), &self.gathers);
-        let rows = self
-            .weight
-            .chunks_mut(count)
-            .zip(self.offset.chunks_mut(count));
-        for (y, (weight, offset)) in self.shared.iter().zip(rows) {
-            if walk.window.is_some() && y.first == y.end {
-                continue;
-            }
-            let h = &y.hit;
-            self.columns.irradiance(h.p, h.n, weight);
-            for &i in &self.glossy {
-                let x = &self.gathers[i].0.hit;
-                let to = x.p - h.p;
-                let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
-                weight[i] = if seen { 1.0 } else { 0.0 };
-            }
-            self.ends.clear();
-            self.ends_of.clear();
-            for (i, (w, (v, _))) in weight.iter().zip(&self.gathers).enumerate() {
-                if *w > 0.0 {
-                    self.ends.push(lift(v.hit.p, v.hit.n));
-                    self.ends_of.push(i);
-                }
-            }
-            self.blocked.resize(self.ends.len(), false);
-            walk.world.bvh.occluded_bundle(
-                &mut scratch.stack,
-                lift(h.p, h.n),
-                &self.ends,
-                &mut self.blocked,
-            );
-            for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
-                if blocked {
-                    weight[i] = 0.0;
-                }
-            }
-            let mut density = 0.0;
-            self.apart.clear();
-            self.scattered.resize(self.glossy.len(), 0.0);
-            self.drawn.resize(self.glossy.len(), 0.0);
-            let (scattered, drawn) = (&mut self.scattered, &mut self.drawn);
-            self.lobes.toward((h.p, h.n), scattered, drawn);
-            for ((&i, &value), &pdf) in self.glossy.iter().zip(&*scattered).zip(&*drawn) {
-                if weight[i] == 0.0 {
+        let share = drawn.0 as f32 / count as f32;
+        let of = (walk, film, effort);
+        for at in 0..self.shared.len() {
+            let first = self.arrivals.bins.len();
+            self.shared[at].first = first;
+            self.shared[at].end = first;
+            if walk.window.is_some() {
+                self.light_up(of, (at, drawn.1, None), rng, scratch);
+                if self.shared[at].end == first {
                     continue;
                 }
-                let v = &self.gathers[i].0;
-                let x = &v.hit;
-                let (mut value, mut pdf) = (value, pdf);
-                if !x.surface.ggx() {
-                    let to = h.p - x.p;
-                    let d2 = to.dot(to);
-                    let w_in = to / d2.sqrt();
-                    let cos = h.n.dot(w_in).abs() / d2;
-                    pdf = x.surface.pdf(x.n, v.wo, w_in) * cos;
-                    value = x.surface.scatter(x.n, v.wo, w_in) * cos;
+            }
+            let density = share * self.weigh(walk, at, scratch);
+            let row = at * count..(at + 1) * count;
+            if walk.window.is_none() {
+                if self.weight[row.clone()].iter().all(|&w| w == 0.0) {
+                    continue;
                 }
-                density += pdf;
-                self.apart.push((i, v.beta * value));
-                weight[i] = 0.0;
+                self.light_up(of, (at, drawn.1, Some(density)), rng, scratch);
             }
-            density += self.lengths.weigh(&self.columns, h.p, weight, offset);
-            for &(i, value) in &self.apart {
-                weight[i] = value;
-            }
-            let density = density * share + y.light;
-            let inverse = if density > 0.0 { 1.0 / density } else { 0.0 };
-            for w in weight.iter_mut() {
+            let y = &self.shared[at];
+            let density = density + y.light;
+            let inverse = if density > 0.0 {
+                y.counts / density
+            } else {
+                0.0
+            };
+            for w in &mut self.weight[row] {
                 *w *= inverse;
             }
-            if walk.world.has_glass() {
-                let from = lift(h.p, h.n);
-                for (&i, &to) in self.ends_of.iter().zip(&self.ends) {
-                    if weight[i] > 0.0 {
-                        weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
-                    }
+        }
+    }
+
+    /// Writes what each gather point takes of light that a shared vertex sends to it. Returns the density of drawing the vertex
+    /// from one of them.
+    fn weigh(&mut self, walk: &Walk, at: usize, scratch: &mut Scratch) -> f32 {
+        let count = self.gathers.len();
+        let y = &self.shared[at];
+        let weight = &mut self.weight[at * count..(at + 1) * count];
+        let offset = &mut self.offset[at * count..(at + 1) * count];
+        let h = &y.hit;
+        self.columns.irradiance(h.p, h.n, weight);
+        for &i in &self.glossy {
+            let x = &self.gathers[i].0.hit;
+            let to = x.p - h.p;
+            let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
+            weight[i] = if seen { 1.0 } else { 0.0 };
+        }
+        self.ends.clear();
+        self.ends_of.clear();
+        for (i, (w, (v, _))) in weight.iter().zip(&self.gathers).enumerate() {
+            if *w > 0.0 {
+                self.ends.push(lift(v.hit.p, v.hit.n));
+                self.ends_of.push(i);
+            }
+        }
+        self.blocked.resize(self.ends.len(), false);
+        walk.world.bvh.occluded_bundle(
+            &mut scratch.stack,
+            lift(h.p, h.n),
+            &self.ends,
+            &mut self.blocked,
+        );
+        for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+            if blocked {
+                weight[i] = 0.0;
+            }
+        }
+        let mut density = 0.0;
+        self.apart.clear();
+        self.scattered.resize(self.glossy.len(), 0.0);
+        self.drawn.resize(self.glossy.len(), 0.0);
+        let (scattered, drawn) = (&mut self.scattered, &mut self.drawn);
+        self.lobes.toward((h.p, h.n), scattered, drawn);
+        for ((&i, &value), &pdf) in self.glossy.iter().zip(&*scattered).zip(&*drawn) {
+            if weight[i] == 0.0 {
+                continue;
+            }
+            let v = &self.gathers[i].0;
+            let x = &v.hit;
+            let (mut value, mut pdf) = (value, pdf);
+            if !x.surface.ggx() {
+                let to = h.p - x.p;
+                let d2 = to.dot(to);
+                let w_in = to / d2.sqrt();
+                let cos = h.n.dot(w_in).abs() / d2;
+                pdf = x.surface.pdf(x.n, v.wo, w_in) * cos;
+                value = x.surface.scatter(x.n, v.wo, w_in) * cos;
+            }
+            density += pdf;
+            self.apart.push((i, v.beta * value));
+            weight[i] = 0.0;
+        }
+        density += self.lengths.weigh(&self.columns, h.p, weight, offset);
+        for &(i, value) in &self.apart {
+            weight[i] = value;
+        }
+        if walk.world.has_glass() {
+            let from = lift(h.p, h.n);
+            for (&i, &to) in self.ends_of.iter().zip(&self.ends) {
+                if weight[i] > 0.0 {
+                    weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
                 }
             }
         }
+        density
     }
 }
 
