@@ -45,9 +45,11 @@ const SURE: u32 = 3;
 /// light, from the camera, more seldom the smoother the first one is; connecting, the smoother the other one. But thousands
 /// of pairs are looked at there.
 const SMOOTHER: f32 = 16.0;
-/// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay.
+/// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay. In a furnished room where it is
+/// 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a mirror on the wall, 2 mm deep) chance found a path that brought 0.7 % of the image's
+/// light to one pixel; light paths cost 2 % of the time there. With 1.4·10⁻⁴ no such path was met.
 const PROBE: u32 = 4096;
-const PAYS: f64 = 1e-3;
+const PAYS: f64 = 3e-4;
 
 /// What light paths are traced in.
 #[derive(Debug, Clone, Copy)]
