@@ -5,7 +5,10 @@ use std::f32::consts::PI;
 
 use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
 
-use crate::{lobes::Lobe, rng::Rng};
+use crate::{
+    lobes::{Lobe, beckmann_masking, exp_minus},
+    rng::Rng,
+};
 
 /// How a surface scatters: the kinds that the renderer knows. A new kind is a variant here, its density, pdf and draw in this
 /// file, and a variant of [`Bsdf`]; the rest of the renderer asks a [`Surface`] what it can do and knows no kind.
@@ -362,31 +365,36 @@ impl Surface {
         self.strength * d * self.masking(ci) * self.masking(co) / (4.0 * ci) + self.base * co
     }
 
-    /// How it scatters light from a direction with cosine `c`, for many directions side by side; `None` for Beckmann conductors,
-    /// and nothing from beneath.
+    /// How it scatters light from a direction with cosine `c`, for many directions side by side; nothing from beneath.
     #[inline]
-    pub fn lobe_from(&self, c: f32) -> Option<Lobe> {
+    pub fn lobe_from(&self, c: f32) -> Lobe {
         let lit = c > 0.0 && !self.is_black();
         let alpha2 = self.alpha * self.alpha;
         match self.kind {
-            Kind::Several => None,
-            Kind::Conductor | Kind::Mixed if !self.ggx() => None,
-            _ if !lit => Some(Lobe::BLACK),
-            Kind::Lambertian => Some(Lobe {
+            Kind::Several => Lobe::BLACK,
+            _ if !lit => Lobe::BLACK,
+            Kind::Lambertian => Lobe {
                 lambertian: self.strength,
                 lambertian_pdf: 1.0 / PI,
                 ..Lobe::BLACK
-            }),
+            },
             Kind::Conductor | Kind::Mixed => {
                 let share = if self.is_mixed() { self.share() } else { 1.0 };
                 let seen = self.leaving(c) / (4.0 * PI * alpha2);
-                Some(Lobe {
+                Lobe {
                     conductor: self.strength * seen,
                     lambertian: self.base,
                     alpha2,
-                    conductor_pdf: share * seen,
+                    conductor_pdf: share
+                        * match self.ggx() {
+                            true => seen,
+                            // All facets are drawn, those that it does not see as well: cos/(4·i·h) of the half vector is
+                            // missing.
+                            false => 1.0 / (2.0 * PI * alpha2),
+                        },
                     lambertian_pdf: (1.0 - share) / PI,
-                })
+                    beckmann: if self.ggx() { 0.0 } else { 1.0 },
+                }
             }
         }
     }
@@ -418,11 +426,9 @@ impl Surface {
     pub fn lobe_beckmann(&self, square: f32, along2: f32) -> f32 {
         let across2 = (square - along2).max(0.0);
         let x = across2 / (along2 * self.alpha * self.alpha);
-        if x.is_nan() || x > 80.0 {
-            return 0.0;
-        }
         let cos2 = along2 / square;
-        libm::expf(-x) / (cos2 * cos2)
+        let lobe = exp_minus(x) / (cos2 * cos2);
+        if lobe > 0.0 { lobe } else { 0.0 }
     }
 
     /// [`Surface::scatter`] of a mix by its parts: the Lambertian one's, and the conductor's.
@@ -524,12 +530,12 @@ impl Surface {
             };
         }
         let x = s2 / (c2 * a2);
-        // e^-80 is beneath everything that f32 can add to anything.
-        if c <= 0.0 || x > 80.0 {
+        let e = exp_minus(x);
+        if c <= 0.0 || e == 0.0 {
             return 0.0;
         }
         let cos2 = c2 / (c2 + s2);
-        libm::expf(-x) / (PI * a2 * cos2 * cos2)
+        e / (PI * a2 * cos2 * cos2)
     }
 
     /// G1: Smith's for GGX, Walter's rational approximation for Beckmann.
@@ -540,12 +546,7 @@ impl Surface {
         if self.ggx() {
             return 2.0 / (1.0 + (1.0 + slope * slope).sqrt());
         }
-        let a = 1.0 / slope;
-        if a < 1.6 {
-            (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a)
-        } else {
-            1.0
-        }
+        beckmann_masking(1.0 / slope)
     }
 }
 

@@ -386,29 +386,17 @@ impl Emitters {
         buffer: &mut Vec<f32>,
         out: &mut [f32],
     ) {
-        let Seen { p: x, n, i: wo } = place;
-        if !(surface.diffuse() && self.glossy.is_empty()) && self.lobes.complete() {
-            buffer.resize(range.len(), 0.0);
-            let own = &mut out[range.clone()];
-            let of = (&place, surface);
-            if self.lobes.between(range.clone(), of, own, buffer).is_some() {
-                return;
-            }
-        }
-        if surface.diffuse() {
-            let own = &mut out[range.clone()];
+        let Seen { p: x, n, .. } = place;
+        let own = &mut out[range.clone()];
+        if surface.diffuse() && self.glossy.is_empty() {
             self.columns.irradiance_from(range.start, x, n, own);
             for w in own {
                 *w *= surface.lambertian();
             }
-            for &i in self.glossy.iter().filter(|i| range.contains(i)) {
-                out[i] = self.weight(i, x, n, wo, surface);
-            }
-        } else {
-            for i in range {
-                out[i] = self.weight(i, x, n, wo, surface);
-            }
+            return;
         }
+        buffer.resize(range.len(), 0.0);
+        self.lobes.between(range, (&place, surface), own, buffer);
     }
 
     /// The same for one source.

@@ -130,19 +130,7 @@ impl LightVertices {
     pub fn weights(&self, x: &Hit, wo: Vec3, (out, plain): (&mut Vec<f32>, &mut Vec<f32>)) {
         out.clear();
         out.resize(self.list.len(), 0.0);
-        let all_lambertian = x.surface.diffuse() && self.glossy.is_empty();
-        if !all_lambertian && self.lobes.complete() {
-            plain.resize(out.len(), 0.0);
-            let (place, all) = (Seen::of(x, wo), 0..out.len());
-            let weighed = self.lobes.between(all, (&place, &x.surface), out, plain);
-            if weighed.is_some() {
-                for ((w, y), plain) in out.iter_mut().zip(&self.list).zip(plain) {
-                    *w *= y.flux * y.density / (y.density + *plain);
-                }
-                return;
-            }
-        }
-        if x.surface.diffuse() {
+        if x.surface.diffuse() && self.glossy.is_empty() {
             self.columns.irradiance(x.p, x.n, out);
             for ((w, y), &s) in out.iter_mut().zip(&self.list).zip(&self.columns.strength) {
                 // irradiance / strength = cos cos / d²: the density of BSDF sampling times π.
@@ -154,13 +142,13 @@ impl LightVertices {
                     0.0
                 };
             }
-            for &i in &self.glossy {
-                out[i] = self.weight(i, x, wo);
-            }
-        } else {
-            for (i, w) in out.iter_mut().enumerate() {
-                *w = self.weight(i, x, wo);
-            }
+            return;
+        }
+        plain.resize(out.len(), 0.0);
+        let (place, all) = (Seen::of(x, wo), 0..out.len());
+        self.lobes.between(all, (&place, &x.surface), out, plain);
+        for ((w, y), plain) in out.iter_mut().zip(&self.list).zip(plain) {
+            *w *= y.flux * y.density / (y.density + *plain);
         }
     }
 

@@ -1,7 +1,6 @@
 //! Scattering of many surface points side by side: each with a direction of its own that stays, towards or from one point.
 //!
-//! GGX conductors, Lambertians and mixes of both; Beckmann's exponential is not worked out side by side: such surfaces are black
-//! here, and who asks weighs them one by one.
+//! GGX and Beckmann conductors, Lambertians and mixes of both. Where none is Beckmann, nothing of it is worked out.
 
 use std::ops::Range;
 
@@ -16,16 +15,18 @@ use crate::{
 /// How a surface point scatters light from a direction that stays.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Lobe {
-    /// f · cos / (D·π·α²·G₁) of the conductor; the other direction's D and G₁ are missing.
+    /// f · cos / (D·π·α²·G₁) of the conductor; D and the other direction's G₁ are missing.
     pub conductor: f32,
     /// ρ/π of the Lambertian part.
     pub lambertian: f32,
     /// α².
     pub alpha2: f32,
-    /// Density of a draw from the conductor, without D.
+    /// Density of a draw from the conductor, without D; of a Beckmann conductor without the half vector's part, either.
     pub conductor_pdf: f32,
     /// Density of a draw from the Lambertian part, without the cosine.
     pub lambertian_pdf: f32,
+    /// 1 of a Beckmann conductor, 0 of all else.
+    pub beckmann: f32,
 }
 
 impl Lobe {
@@ -36,11 +37,13 @@ impl Lobe {
         alpha2: 1.0,
         conductor_pdf: 0.0,
         lambertian_pdf: 0.0,
+        beckmann: 0.0,
     };
 
     /// f·cos of the direction `w`, and the density per steradian of drawing it. `n` is the normal, `i` the direction that stays.
+    /// `BECKMANN`: it may be a Beckmann conductor.
     #[inline(always)]
-    fn scatter(&self, n: [f32; 3], i: [f32; 3], w: [f32; 3]) -> (f32, f32) {
+    fn scatter<const BECKMANN: bool>(&self, n: [f32; 3], i: [f32; 3], w: [f32; 3]) -> (f32, f32) {
         let co = dot(n, w);
         let s = [i[0] + w[0], i[1] + w[1], i[2] + w[2]];
         let c = dot(n, s);
@@ -53,14 +56,60 @@ impl Lobe {
         let (along2, across2) = (c * c, dot(x, x));
         // Never 0/0: opposite directions have no sum.
         let t = (along2 + across2) / (along2 + across2 / self.alpha2 + f32::MIN_POSITIVE);
-        let d = t * t;
+        let mut d = t * t;
         let tan2 = (1.0 - co * co).max(0.0) / (co * co);
-        let g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
+        let mut g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
+        let mut d_pdf = d;
+        if BECKMANN && self.beckmann > 0.0 {
+            let square = along2 + across2;
+            let cos2 = along2 / square;
+            let x = across2 / (along2 * self.alpha2);
+            d = exp_minus(x) / (cos2 * cos2);
+            d_pdf = d * c / square;
+            g = beckmann_masking(1.0 / (self.alpha2 * tan2).sqrt());
+        }
         let f = self.lambertian * co + self.conductor * d * g;
-        let pdf = self.lambertian_pdf * co + self.conductor_pdf * d;
+        let pdf = self.lambertian_pdf * co + self.conductor_pdf * d_pdf;
         let lit = co > 0.0;
         (if lit { f } else { 0.0 }, if lit { pdf } else { 0.0 })
     }
+}
+
+/// Walter's rational approximation of G₁ by 1/(α·tan θ).
+#[inline(always)]
+pub(crate) fn beckmann_masking(a: f32) -> f32 {
+    let rational = (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a);
+    if a < 1.6 { rational } else { 1.0 }
+}
+
+/// e⁻ˣ for x ≥ 0, to 10⁻⁷ of it; 0 from 80 on, beneath everything that f32 can add to anything, and where x is no number. Without
+/// branches, and the same bits on any machine.
+#[inline(always)]
+pub(crate) fn exp_minus(x: f32) -> f32 {
+    // Adding 1.5·2²³ leaves the nearest integer in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    // ln 2 in two parts, the first with few bits.
+    const LN_2: (f32, f32) = (0.693_359_4, -2.121_944_4e-4);
+    let near = x < 80.0;
+    let y = if near { -x } else { 0.0 };
+    let shifted = y * std::f32::consts::LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    let r = (y - n * LN_2.0) - n * LN_2.1;
+    let p = 1.0 / 5040.0;
+    let p = p * r + 1.0 / 720.0;
+    let p = p * r + 1.0 / 120.0;
+    let p = p * r + 1.0 / 24.0;
+    let p = p * r + 1.0 / 6.0;
+    let p = p * r + 0.5;
+    let p = p * r + 1.0;
+    let p = p * r + 1.0;
+    let power = shifted
+        .to_bits()
+        .wrapping_sub(ROUND.to_bits())
+        .wrapping_add(127)
+        << 23;
+    let e = p * f32::from_bits(power);
+    if near { e } else { 0.0 }
 }
 
 #[inline(always)]
@@ -100,8 +149,9 @@ pub(crate) struct Lobes {
     alpha2: Vec<f32>,
     conductor_pdf: Vec<f32>,
     lambertian_pdf: Vec<f32>,
-    /// How many have a Beckmann conductor.
-    beckmann: usize,
+    beckmann: Vec<f32>,
+    /// One has a Beckmann conductor.
+    any_beckmann: bool,
 }
 
 impl Lobes {
@@ -114,10 +164,11 @@ impl Lobes {
             &mut self.alpha2,
             &mut self.conductor_pdf,
             &mut self.lambertian_pdf,
+            &mut self.beckmann,
         ] {
             column.clear();
         }
-        self.beckmann = 0;
+        self.any_beckmann = false;
     }
 
     pub fn push(&mut self, place: &Seen, surface: &Surface) {
@@ -131,18 +182,13 @@ impl Lobes {
             }
         }
         let lobe = surface.lobe_from(place.n.dot(place.i));
-        self.beckmann += usize::from(lobe.is_none());
-        let lobe = lobe.unwrap_or(Lobe::BLACK);
+        self.any_beckmann |= lobe.beckmann > 0.0;
+        self.beckmann.push(lobe.beckmann);
         self.conductor.push(lobe.conductor);
         self.lambertian.push(lobe.lambertian);
         self.alpha2.push(lobe.alpha2);
         self.conductor_pdf.push(lobe.conductor_pdf);
         self.lambertian_pdf.push(lobe.lambertian_pdf);
-    }
-
-    /// Whether all scatter here as they do: none has a Beckmann conductor.
-    pub fn complete(&self) -> bool {
-        self.beckmann == 0
     }
 
     /// What each scatters towards the point `q` with normal `nq`, and the density of drawing it, both per area there.
@@ -157,15 +203,15 @@ impl Lobes {
     }
 
     /// What a point sends on of what those of a range send to it, f_x cos_x f_y cos_y / d², and the density per area at
-    /// each of them with which the point draws it. `None` where it has a Beckmann conductor.
+    /// each of them with which the point draws it.
     pub fn between(
         &self,
         range: Range<usize>,
         (place, surface): (&Seen, &Surface),
         value: &mut [f32],
         pdf: &mut [f32],
-    ) -> Option<()> {
-        let lobe = surface.lobe_from(place.n.dot(place.i))?;
+    ) {
+        let lobe = surface.lobe_from(place.n.dot(place.i));
         widest(Between {
             lobes: self,
             range,
@@ -174,7 +220,6 @@ impl Lobes {
             value,
             pdf,
         });
-        Some(())
     }
 }
 
@@ -188,6 +233,7 @@ struct Columns<'a> {
     alpha2: &'a [f32],
     conductor_pdf: &'a [f32],
     lambertian_pdf: &'a [f32],
+    beckmann: &'a [f32],
 }
 
 impl<'a> Columns<'a> {
@@ -204,6 +250,7 @@ impl<'a> Columns<'a> {
             alpha2: of(&lobes.alpha2),
             conductor_pdf: of(&lobes.conductor_pdf),
             lambertian_pdf: of(&lobes.lambertian_pdf),
+            beckmann: of(&lobes.beckmann),
         }
     }
 
@@ -215,6 +262,7 @@ impl<'a> Columns<'a> {
             alpha2: self.alpha2[k],
             conductor_pdf: self.conductor_pdf[k],
             lambertian_pdf: self.lambertian_pdf[k],
+            beckmann: self.beckmann[k],
         }
     }
 }
@@ -238,6 +286,16 @@ impl Wide for Toward<'_> {
 
     #[inline(always)]
     fn run(self) {
+        match self.lobes.any_beckmann {
+            false => self.all::<false>(),
+            true => self.all::<true>(),
+        }
+    }
+}
+
+impl Toward<'_> {
+    #[inline(always)]
+    fn all<const BECKMANN: bool>(self) {
         let count = self.value.len();
         let c = Columns::of(self.lobes, 0, count);
         let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
@@ -248,7 +306,7 @@ impl Wide for Toward<'_> {
             let d2 = dot(to, to);
             let scale = 1.0 / d2.sqrt();
             let w = [to[0] * scale, to[1] * scale, to[2] * scale];
-            let (f, density) = c.lobe(k).scatter(at(&c.n, k), at(&c.i, k), w);
+            let (f, density) = c.lobe(k).scatter::<BECKMANN>(at(&c.n, k), at(&c.i, k), w);
             let turn = dot(nq, w).abs() / d2;
             // In one place with it there is no direction.
             value[k] = if f > 0.0 { f * turn } else { 0.0 };
@@ -272,6 +330,16 @@ impl Wide for Between<'_> {
 
     #[inline(always)]
     fn run(self) {
+        match self.lobes.any_beckmann || self.lobe.beckmann > 0.0 {
+            false => self.all::<false>(),
+            true => self.all::<true>(),
+        }
+    }
+}
+
+impl Between<'_> {
+    #[inline(always)]
+    fn all<const BECKMANN: bool>(self) {
         let count = self.range.len();
         let c = Columns::of(self.lobes, self.range.start, count);
         let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
@@ -283,10 +351,10 @@ impl Wide for Between<'_> {
             let d2 = dot(to, to);
             let scale = 1.0 / d2.sqrt();
             let w = [to[0] * scale, to[1] * scale, to[2] * scale];
-            let (here, density) = lobe.scatter(n, i, w);
+            let (here, density) = lobe.scatter::<BECKMANN>(n, i, w);
             let back = [-w[0], -w[1], -w[2]];
             let ny = at(&c.n, k);
-            let (there, _) = c.lobe(k).scatter(ny, at(&c.i, k), back);
+            let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, at(&c.i, k), back);
             let (f, turn) = (here * there, dot(ny, w).abs() / d2);
             // In one place with it there is no direction.
             value[k] = if f > 0.0 { f / d2 } else { 0.0 };
@@ -313,8 +381,12 @@ mod tests {
     }
 
     fn surface() -> impl Strategy<Value = Surface> {
-        (0.02f32..0.9, 0.0f32..1.0, 0u8..3).prop_map(|(alpha, weight, kind)| {
-            let distribution = Distribution::Ggx;
+        (0.02f32..0.9, 0.0f32..1.0, 0u8..3, any::<bool>()).prop_map(|(alpha, weight, kind, ggx)| {
+            let distribution = if ggx {
+                Distribution::Ggx
+            } else {
+                Distribution::Beckmann
+            };
             let bsdf = match kind {
                 0 => Bsdf::Diffuse { reflectance: 0.7 },
                 1 => Bsdf::RoughConductor {
@@ -351,7 +423,6 @@ mod tests {
             for (p, n, i, s) in &all {
                 lobes.push(&Seen { p: *p * 3.0, n: *n, i: *i }, s);
             }
-            prop_assert!(lobes.complete());
             let (mut value, mut pdf) = (vec![0.0; all.len()], vec![0.0; all.len()]);
             lobes.toward((x, n), &mut value, &mut pdf);
             for (k, (p, np, ip, s)) in all.iter().enumerate() {
@@ -362,7 +433,7 @@ mod tests {
                 prop_assert!(near(pdf[k], s.pdf(*np, *ip, w) * turn));
             }
             let place = Seen { p: x, n, i };
-            lobes.between(0..all.len(), (&place, &own), &mut value, &mut pdf).unwrap();
+            lobes.between(0..all.len(), (&place, &own), &mut value, &mut pdf);
             for (k, (p, np, ip, s)) in all.iter().enumerate() {
                 let to = *p * 3.0 - x;
                 let (d2, w) = (to.dot(to), to.normalized());
@@ -394,9 +465,7 @@ mod tests {
                 lobes.toward((q, n), &mut value, &mut pdf);
                 assert_eq!((value, pdf), ([0.0], [0.0]), "{i:?} {q:?}");
                 let at = Seen { p: q, n: -n, i: -n };
-                lobes
-                    .between(0..1, (&at, &rough), &mut value, &mut pdf)
-                    .unwrap();
+                lobes.between(0..1, (&at, &rough), &mut value, &mut pdf);
                 assert_eq!(value, [0.0], "{i:?} {q:?}");
                 assert!(pdf[0].is_finite());
             }
@@ -404,35 +473,19 @@ mod tests {
     }
 
     #[test]
-    fn beckmann_conductors_are_left_to_others() {
-        let mut lobes = Lobes::default();
-        let (p, n) = (Vec3::ZERO, Vec3::new(0.0, 0.0, 1.0));
-        let beckmann = Surface::new(&Material {
-            bsdf: Bsdf::RoughConductor {
-                alpha: 0.3,
-                distribution: Distribution::Beckmann,
-                reflectance: 1.0,
-            },
-            ..Material::diffuse("any", [0.5; 3])
-        });
-        let place = Seen { p, n, i: n };
-        lobes.push(&place, &beckmann);
-        assert!(!lobes.complete());
-        let (mut value, mut pdf) = ([1.0], [1.0]);
-        assert!(
-            lobes
-                .between(0..1, (&place, &beckmann), &mut value, &mut pdf)
-                .is_none()
-        );
-        lobes.toward((n, n), &mut value, &mut pdf);
-        assert_eq!(value, [0.0]);
+    fn the_exponential_is_right_to_the_last_digits() {
+        for k in 0..80_000 {
+            let x = k as f32 / 1000.0;
+            let (found, right) = (f64::from(exp_minus(x)), (-f64::from(x)).exp());
+            assert!((found / right - 1.0).abs() < 1e-7, "{x}: {found} {right}");
+        }
+        assert_eq!(exp_minus(0.0), 1.0);
+        assert_eq!([80.0, f32::INFINITY, f32::NAN].map(exp_minus), [0.0; 3]);
     }
 
     #[test]
     fn the_constants_are_those_of_a_lambertian() {
-        let lobe = Surface::new(&Material::diffuse("half", [0.5; 3]))
-            .lobe_from(0.3)
-            .unwrap();
+        let lobe = Surface::new(&Material::diffuse("half", [0.5; 3])).lobe_from(0.3);
         assert_eq!((lobe.conductor, lobe.conductor_pdf), (0.0, 0.0));
         assert_eq!(lobe.lambertian_pdf, 1.0 / PI);
         assert_eq!(lobe.lambertian, 0.5 / PI);

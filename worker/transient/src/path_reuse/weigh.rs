@@ -113,16 +113,6 @@ impl Sharing {
                 continue;
             }
             let v = &self.gathers[i].0;
-            let x = &v.hit;
-            let (mut value, mut pdf) = (value, pdf);
-            if !x.surface.ggx() {
-                let to = h.p - x.p;
-                let d2 = to.dot(to);
-                let w_in = to / d2.sqrt();
-                let cos = h.n.dot(w_in).abs() / d2;
-                pdf = x.surface.pdf(x.n, v.wo, w_in) * cos;
-                value = x.surface.scatter(x.n, v.wo, w_in) * cos;
-            }
             density += pdf;
             self.apart.push((i, v.beta * value));
             weight[i] = 0.0;
