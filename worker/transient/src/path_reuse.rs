@@ -6,9 +6,9 @@
 //! vertices from the light side as in Segovia et al., EGSR 2006). They are chosen among several times as
 //! many candidates, by the direct light that each is likely to bring. A shared vertex sends out its direct
 //! light from all spots, found exactly, and what random walks bring, more of them where the gather points
-//! take more of it: one shadow ray carries a whole list of arrivals to a pixel. All ways of drawing a shared vertex are joined by the balance heuristic
-//! with visibility in the densities, so both 1/d² singularities, at the gather point and at the spot, stay
-//! bounded.
+//! take more of it: one shadow ray carries a whole list of arrivals to a pixel. All ways of drawing a
+//! shared vertex are joined by the balance heuristic with visibility in the densities, so both 1/d²
+//! singularities, at the gather point and at the spot, stay bounded.
 //!
 //! What only one pixel can see, namely light by way of a near-mirror or a glossy surface, is walked for
 //! that pixel alone.

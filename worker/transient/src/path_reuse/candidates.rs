@@ -183,16 +183,70 @@ impl Sharing {
         for w in &mut c.worth {
             *w += rest;
         }
-        c.counts.clear();
-        c.counts.resize(c.worth.len(), 0.0);
-        let (worth, counts) = (&c.worth, &mut c.counts);
-        draw(worth, kept, rng.uniform(), |k, share| {
-            counts[k] = share / worth[k];
-        });
+        count(&c.worth, (kept, rng.uniform()), &mut c.counts);
         let mut counts = c.counts.iter();
         self.shared.retain_mut(|y| {
             y.counts = counts.next().copied().unwrap_or(0.0);
             y.counts > 0.0
         });
+    }
+}
+
+/// Keeps `kept` candidates in proportion to their worth and writes for how many each counts, 0 for those that are dropped. All are
+/// kept where the worths have no sum to speak of: nothing may be dropped that is not made up for.
+fn count(worth: &[f32], (kept, u): (u32, f32), counts: &mut Vec<f32>) {
+    counts.clear();
+    counts.resize(worth.len(), 0.0);
+    let mut any = false;
+    draw(worth, kept, u, |k, share| {
+        counts[k] = share / worth[k];
+        any = true;
+    });
+    if !any {
+        counts.fill(1.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::count;
+
+    proptest! {
+        #[test]
+        fn every_candidate_counts_for_one_on_average(
+            worth in prop::collection::vec(0.01f32..10.0, 2..60), kept in 1u32..20,
+        ) {
+            const STEPS: usize = 4000;
+            let (mut sums, mut counts) = (vec![0.0f64; worth.len()], vec![]);
+            for k in 0..STEPS {
+                count(&worth, (kept, (k as f32 + 0.5) / STEPS as f32), &mut counts);
+                prop_assert!(counts.iter().filter(|&&c| c > 0.0).count() <= kept as usize + 1);
+                for (sum, c) in sums.iter_mut().zip(&counts) {
+                    *sum += f64::from(*c) / STEPS as f64;
+                }
+            }
+            // A count is a step of the sum over the candidate's own part of it, and one of STEPS is known no better.
+            let step = worth.iter().sum::<f32>() / kept as f32;
+            for (sum, w) in sums.iter().zip(&worth) {
+                let grain = 2.0 * f64::from(step / w) / STEPS as f64 + 1e-3;
+                prop_assert!((sum - 1.0).abs() < grain, "{sum} of {w}");
+            }
+        }
+    }
+
+    #[test]
+    fn none_is_dropped_where_worths_have_no_sum() {
+        for worth in [
+            [0.0; 3],
+            [1e-35; 3],
+            [f32::MAX; 3],
+            [f32::INFINITY, 1.0, 1.0],
+        ] {
+            let mut counts = vec![];
+            count(&worth, (2, 0.5), &mut counts);
+            assert_eq!(counts, [1.0; 3], "{worth:?}");
+        }
     }
 }
