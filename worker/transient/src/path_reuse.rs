@@ -17,6 +17,7 @@ mod arrivals;
 mod candidates;
 mod draw;
 mod gloss;
+mod segments;
 mod spectral;
 mod spread;
 mod weigh;
@@ -25,6 +26,7 @@ use self::{
     candidates::Candidates,
     draw::{Share, gather_point, only_mirrors},
     gloss::Gloss,
+    segments::Segments,
     weigh::Lengths,
 };
 use std::f32::consts::PI;
@@ -282,10 +284,8 @@ pub(crate) struct Sharing {
     candidates: Candidates,
     arrivals: Arrivals,
     gloss: Gloss,
-    /// Segments of one shared vertex: where they end, of what, and whether something is in the way.
-    ends: Vec<Vec3>,
-    ends_of: Vec<usize>,
-    blocked: Vec<bool>,
+    /// Those of one shared vertex.
+    segments: Segments,
     lengths: Lengths,
     /// How the gather points of `glossy` scatter to the camera, and what of one shared vertex.
     lobes: Lobes,

@@ -236,6 +236,12 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         (format!("{name}-lambertian"), lambertian(rough))
     });
     all.extend(twins);
+    // Mitsuba's default distribution in place of GGX.
+    let sharp = ["coated", "glossy"].map(|name| {
+        let (_, ggx) = all.iter().find(|(of, _)| of == name).expect("it is one");
+        (format!("beckmann-{name}"), beckmann(ggx))
+    });
+    all.extend(sharp);
     // The same rooms with walls of other materials.
     let walls = [
         ("walls-mixed-0.01", mixed(0.01, 0.5)),
@@ -259,6 +265,24 @@ fn lambertian(scene: &Scene) -> Scene {
     });
     for m in materials.filter(|m| !m.is_specular()) {
         *m = grey(albedo(&m.bsdf));
+    }
+    scene
+}
+
+/// A scene with Beckmann's distribution for every conductor and mix.
+fn beckmann(scene: &Scene) -> Scene {
+    let mut scene = scene.clone();
+    let materials = scene.objects.iter_mut().flat_map(|o| {
+        let mesh = std::sync::Arc::make_mut(&mut o.mesh);
+        &mut mesh.materials
+    });
+    for m in materials {
+        match &mut m.bsdf {
+            Bsdf::RoughConductor { distribution, .. } | Bsdf::Mixed { distribution, .. } => {
+                *distribution = Distribution::Beckmann;
+            }
+            _ => {}
+        }
     }
     scene
 }

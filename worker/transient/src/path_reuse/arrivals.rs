@@ -141,28 +141,19 @@ impl Sharing {
         if sink.list.bins.len() == y.first && !walk.any_in_window(h.p, nearest, &scratch.weights) {
             return;
         }
-        self.ends.clear();
-        self.ends_of.clear();
+        self.segments.clear();
         for (spot, &w) in scratch.weights.iter().enumerate() {
             if w > 0.0 {
-                self.ends.push(emitters.lifted[spot]);
-                self.ends_of.push(spot);
+                self.segments.push(spot, emitters.lifted[spot]);
             }
         }
-        self.blocked.resize(self.ends.len(), false);
-        walk.world.bvh.occluded_bundle(
-            &mut scratch.stack,
-            lift(h.p, h.n),
-            &self.ends,
-            &mut self.blocked,
-        );
-        let mut lit = self.ends_of.iter().zip(&self.blocked);
-        let lit = lit.by_ref().filter(|(_, blocked)| !**blocked);
-        let lit: Vec<usize> = lit.map(|(&spot, _)| spot).collect();
+        let from = lift(h.p, h.n);
+        self.segments.trace(walk.world, &mut scratch.stack, from);
+        let lit = self.segments.found().filter(|&(_, blocked)| !blocked);
+        let lit: Vec<usize> = lit.map(|(spot, _)| spot).collect();
         // The densities below are of what is drawn: with glass in the way as without.
         let mut through = vec![];
         if walk.world.has_glass() {
-            let from = lift(h.p, h.n);
             let share = |spot: &usize| {
                 let to = emitters.lifted[*spot];
                 walk.world.glass(&mut scratch.stack, from, to)
@@ -172,35 +163,33 @@ impl Sharing {
         let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
         for (k, &spot) in lit.iter().enumerate() {
             let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
-            {
-                let to = h.p - e.p;
-                let d2 = to.dot(to);
-                let d = d2.sqrt();
-                let strength = emitters.columns.strength[spot];
-                from_spots += if strength > 0.0 && guide.is_none() {
-                    w / (strength * h.surface.lambertian() * PI)
-                } else {
-                    let out = to / d;
-                    e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
+            let to = h.p - e.p;
+            let d2 = to.dot(to);
+            let d = d2.sqrt();
+            let strength = emitters.columns.strength[spot];
+            from_spots += if strength > 0.0 && guide.is_none() {
+                w / (strength * h.surface.lambertian() * PI)
+            } else {
+                let out = to / d;
+                e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
+            };
+            let path = nearest + walk.world.metres(d) + e.path_m;
+            let through = through.get(k).copied().unwrap_or(1.0);
+            let carried = carry.share(w) * through;
+            if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
+                let back = to * (-1.0 / d);
+                let light = Light {
+                    value: carried,
+                    ratios: match film.spectral {
+                        false => ONES,
+                        true => {
+                            let here = walk.world.ratios(h, h.n, back);
+                            times(here, e.ratios(walk.world, -back))
+                        }
+                    },
                 };
-                let path = nearest + walk.world.metres(d) + e.path_m;
-                let through = through.get(k).copied().unwrap_or(1.0);
-                let carried = carry.share(w) * through;
-                if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
-                    let back = to * (-1.0 / d);
-                    let light = Light {
-                        value: carried,
-                        ratios: match film.spectral {
-                            false => ONES,
-                            true => {
-                                let here = walk.world.ratios(h, h.n, back);
-                                times(here, e.ratios(walk.world, -back))
-                            }
-                        },
-                    };
-                    sink.toward(back);
-                    sink.add(path, light, spot, bounce + 1, Way::Spot);
-                }
+                sink.toward(back);
+                sink.add(path, light, spot, bounce + 1, Way::Spot);
             }
         }
         y.light = from_spots * drawn as f32 / emitters.list.len() as f32;

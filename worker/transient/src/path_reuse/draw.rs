@@ -82,8 +82,7 @@ impl Sharing {
         self.weight.clear();
         self.weight.resize(self.gathers.len(), 0.0);
         for y in &near.list {
-            self.ends.clear();
-            self.ends_of.clear();
+            self.segments.clear();
             for (i, (v, _)) in self.gathers.iter().enumerate().filter(|&(i, _)| far[i]) {
                 let bounces = v.bounce + y.bounces;
                 let to = y.hit.p - v.hit.p;
@@ -93,16 +92,12 @@ impl Sharing {
                     * y.hit.surface.scatter(y.hit.n, y.back, -w);
                 if value > 0.0 && bounces <= walk.max_bounces {
                     self.weight[i] = v.beta * y.flux * value / d2;
-                    self.ends.push(lift(v.hit.p, v.hit.n));
-                    self.ends_of.push(i);
+                    self.segments.push(i, lift(v.hit.p, v.hit.n));
                 }
             }
-            self.blocked.resize(self.ends.len(), false);
             let from = lift(y.hit.p, y.hit.n);
-            walk.world
-                .bvh
-                .occluded_bundle(stack, from, &self.ends, &mut self.blocked);
-            for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+            self.segments.trace(walk.world, stack, from);
+            for (i, blocked) in self.segments.found() {
                 let (v, k) = &self.gathers[i];
                 let leg = walk.world.metres((y.hit.p - v.hit.p).length());
                 let path = v.length_m + leg + y.path_m;

@@ -82,22 +82,15 @@ impl Sharing {
             let seen = h.n.dot(to) > 0.0 && x.n.dot(to) < 0.0;
             weight[i] = if seen { 1.0 } else { 0.0 };
         }
-        self.ends.clear();
-        self.ends_of.clear();
+        self.segments.clear();
         for (i, (w, (v, _))) in weight.iter().zip(&self.gathers).enumerate() {
             if *w > 0.0 {
-                self.ends.push(lift(v.hit.p, v.hit.n));
-                self.ends_of.push(i);
+                self.segments.push(i, lift(v.hit.p, v.hit.n));
             }
         }
-        self.blocked.resize(self.ends.len(), false);
-        walk.world.bvh.occluded_bundle(
-            &mut scratch.stack,
-            lift(h.p, h.n),
-            &self.ends,
-            &mut self.blocked,
-        );
-        for (&i, &blocked) in self.ends_of.iter().zip(&self.blocked) {
+        let from = lift(h.p, h.n);
+        self.segments.trace(walk.world, &mut scratch.stack, from);
+        for (i, blocked) in self.segments.found() {
             if blocked {
                 weight[i] = 0.0;
             }
@@ -122,8 +115,7 @@ impl Sharing {
             weight[i] = value;
         }
         if walk.world.has_glass() {
-            let from = lift(h.p, h.n);
-            for (&i, &to) in self.ends_of.iter().zip(&self.ends) {
+            for (i, to) in self.segments.iter() {
                 if weight[i] > 0.0 {
                     weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
                 }
