@@ -47,7 +47,7 @@ const SURE: u32 = 3;
 const SMOOTHER: f32 = 16.0;
 /// Paths of the probe, and the share of the spots' power that must come by near-mirrors to pay. In a furnished room where it is
 /// 8·10⁻⁴ to 1.6·10⁻³ (the upper edge of a mirror on the wall, 2 mm deep) chance found a path that brought 0.7 % of the image's
-/// light to one pixel; light paths cost 2 % of the time there. With 1.4·10⁻⁴ no such path was met.
+/// light to one pixel; light paths cost 2 % of the time there at 64×64 and 10 % at 24×24. With 1.4·10⁻⁴ no such path was met.
 const PROBE: u32 = 4096;
 const PAYS: f64 = 3e-4;
 
