@@ -1,6 +1,8 @@
 //! Scattering: Lambertian, rough conductor (Beckmann or GGX; Walter et al., EGSR 2007) and the mix of
 //! both, for two directions on the same side of a facet.
 
+mod beckmann;
+
 use std::f32::consts::PI;
 
 use picofarm_scene::{Bsdf, Distribution, Material, Vec3};
@@ -380,18 +382,11 @@ impl Surface {
             },
             Kind::Conductor | Kind::Mixed => {
                 let share = if self.is_mixed() { self.share() } else { 1.0 };
-                let seen = self.leaving(c) / (4.0 * PI * alpha2);
                 Lobe {
-                    conductor: self.strength * seen,
+                    conductor: self.strength * self.leaving(c) / (4.0 * PI * alpha2),
                     lambertian: self.base,
                     alpha2,
-                    conductor_pdf: share
-                        * match self.ggx() {
-                            true => seen,
-                            // All facets are drawn, those that it does not see as well: cos/(4·i·h) of the half vector is
-                            // missing.
-                            false => 1.0 / (2.0 * PI * alpha2),
-                        },
+                    conductor_pdf: share * self.seen(c) / (4.0 * PI * alpha2),
                     lambertian_pdf: (1.0 - share) / PI,
                     beckmann: if self.ggx() { 0.0 } else { 1.0 },
                 }
@@ -410,6 +405,16 @@ impl Surface {
     pub fn leaving(&self, c: f32) -> f32 {
         let leaving = self.masking(c) / c;
         if leaving.is_finite() { leaving } else { 0.0 }
+    }
+
+    /// G₁ over the cosine `c` by which facets are drawn that a direction sees: Smith's of either distribution, to the last digits, as
+    /// draws follow it.
+    #[inline]
+    fn seen(&self, c: f32) -> f32 {
+        match self.ggx() {
+            true => self.leaving(c),
+            false => beckmann::seen(self.alpha, c),
+        }
     }
 
     /// See [`Surface::arriving`]: D·π·α² of GGX by the squares of the sum of both directions and of its part along the normal. For
@@ -464,12 +469,10 @@ impl Surface {
     fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
-        let h = if self.ggx() {
-            visible_ggx(self.alpha, [t.dot(i), b.dot(i), ci], rng)
-        } else {
-            let (x, y) = rng.circle();
-            let slope = self.alpha * (-libm::logf(1.0 - rng.uniform())).sqrt();
-            [slope * x, slope * y, 1.0]
+        let seen_from = [t.dot(i), b.dot(i), ci];
+        let h = match self.ggx() {
+            true => visible_ggx(self.alpha, seen_from, rng),
+            false => beckmann::visible(self.alpha, seen_from, rng),
         };
         let h = (t * h[0] + b * h[1] + n * h[2]).normalized();
         let ih = i.dot(h);
@@ -477,17 +480,18 @@ impl Surface {
             return None;
         }
         let o = (h * (2.0 * ih) - i).normalized();
-        let (co, ch) = (n.dot(o), n.dot(h));
+        let co = n.dot(o);
         if !(ci > 0.0 && co > 0.0) {
             return None;
         }
-        let d = self.density(n, i + o);
-        if self.ggx() {
-            let pdf = self.masking(ci) * d / (4.0 * ci);
-            return Some((o, self.strength * self.masking(co), pdf));
-        }
-        let weight = self.strength * self.masking(ci) * self.masking(co) * ih / (ci * ch);
-        Some((o, weight, d * ch / (4.0 * ih)))
+        let seen = self.seen(ci);
+        // 1 but for what Walter's approximation is off.
+        let approximated = match self.ggx() {
+            true => 1.0,
+            false => self.leaving(ci) / seen,
+        };
+        let weight = self.strength * approximated * self.masking(co);
+        Some((o, weight, 0.25 * seen * self.density(n, i + o)))
     }
 
     /// Density per steradian with which [`Surface::sample`] draws `o`.
@@ -500,13 +504,7 @@ impl Surface {
         if self.diffuse() {
             return co / PI;
         }
-        let d = self.density(n, i + o);
-        let conductor = if self.ggx() {
-            self.masking(ci) * d / (4.0 * ci)
-        } else {
-            let h = (i + o).normalized();
-            d * n.dot(h) / (4.0 * i.dot(h))
-        };
+        let conductor = 0.25 * self.seen(ci) * self.density(n, i + o);
         if !self.is_mixed() {
             return conductor;
         }
@@ -561,7 +559,7 @@ fn cosine(n: Vec3, rng: &mut Rng) -> Option<(Vec3, f32)> {
     (c > 0.0).then_some((o, c))
 }
 
-/// A half vector of GGX among those that `i` sees, in the facet's frame and of any length (Heitz, JCGT
+/// A half vector of GGX among those that `i` sees, in the surface's frame and of any length (Heitz, JCGT
 /// 2018): its weights never exceed 1, however rough or grazing.
 #[inline]
 fn visible_ggx(alpha: f32, i: [f32; 3], rng: &mut Rng) -> [f32; 3] {

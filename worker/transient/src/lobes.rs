@@ -21,7 +21,7 @@ pub(crate) struct Lobe {
     pub lambertian: f32,
     /// α².
     pub alpha2: f32,
-    /// Density of a draw from the conductor, without D; of a Beckmann conductor without the half vector's part, either.
+    /// Density of a draw from the conductor / (D·π·α²).
     pub conductor_pdf: f32,
     /// Density of a draw from the Lambertian part, without the cosine.
     pub lambertian_pdf: f32,
@@ -59,17 +59,15 @@ impl Lobe {
         let mut d = t * t;
         let tan2 = (1.0 - co * co).max(0.0) / (co * co);
         let mut g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
-        let mut d_pdf = d;
         if BECKMANN && self.beckmann > 0.0 {
             let square = along2 + across2;
             let cos2 = along2 / square;
             let x = across2 / (along2 * self.alpha2);
             d = exp_minus(x) / (cos2 * cos2);
-            d_pdf = d * c / square;
             g = beckmann_masking(1.0 / (self.alpha2 * tan2).sqrt());
         }
         let f = self.lambertian * co + self.conductor * d * g;
-        let pdf = self.lambertian_pdf * co + self.conductor_pdf * d_pdf;
+        let pdf = self.lambertian_pdf * co + self.conductor_pdf * d;
         let lit = co > 0.0;
         (if lit { f } else { 0.0 }, if lit { pdf } else { 0.0 })
     }
