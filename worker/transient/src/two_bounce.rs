@@ -156,7 +156,9 @@ impl Strata {
                 if h.through != 1.0 {
                     all.iter_mut().for_each(|w| *w *= h.through);
                 }
-                walk.leave_to_zones(&h, all);
+                if let Some(contacts) = walk.contacts {
+                    contacts.leave_out_of_two(world, &h, all);
+                }
                 walk.keep_in_window(h.p, world.metres(range), all);
                 for (out, w) in weights.iter_mut().zip(&all[own]) {
                     *out = w * rays as f32;

@@ -129,7 +129,10 @@ mod tests {
                 let mean = moments(f64::from(a), of) / all;
                 let square = moments(f64::from(a), |x| of(x).powi(2)) / all;
                 let error = ((square - mean * mean) / f64::from(n)).sqrt();
-                assert!((found - mean).abs() < 4.0 * error, "{a} {k}: {found} {mean}");
+                assert!(
+                    (found - mean).abs() < 4.0 * error,
+                    "{a} {k}: {found} {mean}"
+                );
             }
             let (within, beyond) = counts(a);
             assert!((f64::from(within + beyond) / all - 1.0).abs() < 1e-5, "{a}");
@@ -152,7 +155,10 @@ mod tests {
                 let tan = (1.0 - c * c).sqrt() / c;
                 let walter = crate::lobes::beckmann_masking(1.0 / (alpha * tan)) / c;
                 let found = seen(alpha, c);
-                assert!((found / walter - 1.0).abs() < 4e-3, "{alpha} {c}: {found} {walter}");
+                assert!(
+                    (found / walter - 1.0).abs() < 4e-3,
+                    "{alpha} {c}: {found} {walter}"
+                );
             }
         }
         assert_eq!(seen(0.3, 0.0), 0.0);

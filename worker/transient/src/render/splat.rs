@@ -18,7 +18,7 @@ use crate::{
     bvh::Stack,
     by_glass::{Buffers, ByGlass, Photons},
     caustic::{Caustics, Splat, splat},
-    contact::Contacts,
+    contact::{Contacts, End},
     light_vertices::LightVertex,
     rng::{Rng, Stream},
     sink::Technique,
@@ -147,7 +147,11 @@ impl<'a> Sources<'a> {
             let mut seen = vec![];
             for l in 0..count {
                 let at = (zone as usize, l, &turns);
-                contacts.trace(&within, at, &mut rng, stack, |_, z| seen.push(z));
+                contacts.trace(&within, at, &mut rng, stack, |end, z| {
+                    if end == End::Beyond || contacts.draws(&z) {
+                        seen.push(z);
+                    }
+                });
                 let found = seen.drain(..);
                 ends.extend(found.flat_map(|z| splat(of, (&z, Technique::Zone), stack)));
             }
