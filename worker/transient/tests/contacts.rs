@@ -68,7 +68,7 @@ fn beside_wall(objects: Vec<Object>, d: f64) -> (Scene, Start) {
 
 #[test]
 fn a_spot_beside_a_wall_has_the_energy_of_an_independent_tracer_at_any_distance() {
-    for d in [1e-9, 1e-4, 1e-2, 6e-2] {
+    for d in [1e-9, 1e-4, 1e-2, 6e-2, 0.15, 0.3] {
         let (s, start) = beside_wall(grey_room(), d);
         agrees(&format!("{d:e} m from the wall"), &s, start, PATHS);
     }
