@@ -351,7 +351,7 @@ impl Surface {
     }
 
     /// f · cos(n, o) for unit directions `i` and `o`, both leaving the surface.
-    #[inline]
+    #[inline(always)]
     pub fn scatter(&self, n: Vec3, i: Vec3, o: Vec3) -> f32 {
         let (ci, co) = (n.dot(i), n.dot(o));
         if !(ci > 0.0 && co > 0.0) || self.is_black() {
@@ -360,6 +360,12 @@ impl Surface {
         if self.diffuse() {
             return self.strength * co;
         }
+        self.scatter_rough(n, i, o, (ci, co))
+    }
+
+    /// The same of what is not Lambertian, with the cosines of both.
+    #[inline]
+    fn scatter_rough(&self, n: Vec3, i: Vec3, o: Vec3, (ci, co): (f32, f32)) -> f32 {
         let d = self.density(n, i + o);
         if d == 0.0 {
             return self.base * co;
@@ -382,11 +388,16 @@ impl Surface {
             },
             Kind::Conductor | Kind::Mixed => {
                 let share = if self.is_mixed() { self.share() } else { 1.0 };
+                let (leaving, turn) = (self.leaving(c), 1.0 / (4.0 * PI * alpha2));
+                let seen = match self.ggx() {
+                    true => leaving,
+                    false => beckmann::seen(self.alpha, c),
+                };
                 Lobe {
-                    conductor: self.strength * self.leaving(c) / (4.0 * PI * alpha2),
+                    conductor: self.strength * leaving * turn,
                     lambertian: self.base,
                     alpha2,
-                    conductor_pdf: share * self.seen(c) / (4.0 * PI * alpha2),
+                    conductor_pdf: share * seen * turn,
                     lambertian_pdf: (1.0 - share) / PI,
                     beckmann: if self.ggx() { 0.0 } else { 1.0 },
                 }
@@ -403,7 +414,10 @@ impl Surface {
 
     /// G₁ over the cosine `c`, above the surface; see [`Surface::arriving`].
     pub fn leaving(&self, c: f32) -> f32 {
-        let leaving = self.masking(c) / c;
+        let leaving = match self.ggx() {
+            true => 2.0 / self.edge(c),
+            false => self.masking(c) / c,
+        };
         if leaving.is_finite() { leaving } else { 0.0 }
     }
 
@@ -421,8 +435,8 @@ impl Surface {
     /// lobes wide enough that their difference does not cancel.
     #[inline(always)]
     pub fn lobe_ggx(&self, square: f32, along2: f32) -> f32 {
-        let across2 = (square - along2).max(0.0);
-        let t = square / (along2 + across2 / (self.alpha * self.alpha) + f32::MIN_POSITIVE);
+        let (across2, a2) = ((square - along2).max(0.0), self.alpha * self.alpha);
+        let t = square * a2 / (along2 * a2 + across2 + f32::MIN_POSITIVE);
         t * t
     }
 
@@ -539,12 +553,18 @@ impl Surface {
     /// G1: Smith's for GGX, Walter's rational approximation for Beckmann.
     #[inline]
     fn masking(&self, c: f32) -> f32 {
-        let tan = (1.0 - c * c).max(0.0).sqrt() / c;
-        let slope = self.alpha * tan;
         if self.ggx() {
-            return 2.0 / (1.0 + (1.0 + slope * slope).sqrt());
+            return 2.0 * c / self.edge(c);
         }
-        beckmann_masking(1.0 / slope)
+        let tan = (1.0 - c * c).max(0.0).sqrt() / c;
+        beckmann_masking(1.0 / (self.alpha * tan))
+    }
+
+    /// 2cos / G1 of GGX.
+    #[inline(always)]
+    fn edge(&self, c: f32) -> f32 {
+        let c2 = c * c;
+        c + (c2 + self.alpha * self.alpha * (1.0 - c2).max(0.0)).sqrt()
     }
 }
 

@@ -48,7 +48,7 @@ const MUCH: f32 = 1.0 / 32.0;
 /// the spot throws there by coming close to it, and by chance where a near-mirror comes before: most of the variance of rooms with
 /// a spot 10 cm from a box.
 const NEAR: f32 = 1.0 / 12.0;
-/// Of more spots than this each has so small a share in the light that fewer zones are better (25 spots in furnished rooms: with
+/// Of more spots (places of sources) than this each has so small a share in the light that fewer zones are better (25 spots in furnished rooms: with
 /// as many zones as for 5 error² × CPU time is 1.05 to 1.3 of what it is without those).
 const FEW: f32 = 5.0;
 /// The same for zones in which light of two bounces is left to light paths too.
@@ -97,7 +97,7 @@ impl Contacts {
     pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
         let mut stack = world.bvh.stack();
         let mut zones = vec![];
-        let near = (NEAR * FEW / emitters.list.len() as f32).clamp(CLOSE, NEAR);
+        let near = (NEAR * FEW / places(emitters) as f32).clamp(CLOSE, NEAR);
         for (spot, e) in emitters.list.iter().enumerate() {
             if e.surface.has_mirror() || e.surface.is_black() {
                 continue;
@@ -267,6 +267,13 @@ impl Contacts {
             }
         }
     }
+}
+
+/// How many places the sources have: those of a surface of several parts share one.
+fn places(emitters: &Emitters) -> usize {
+    let all = emitters.list.iter().enumerate();
+    let new = all.filter(|(i, e)| !emitters.list[..*i].iter().any(|before| before.p == e.p));
+    new.count()
 }
 
 /// Where a light path from a zone may end.

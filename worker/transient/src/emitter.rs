@@ -11,7 +11,7 @@ use crate::{
     bsdf::Surface,
     bvh::Stack,
     contact,
-    lanes::{Wide, widest},
+    lanes::{Column, SIDE, Wide, put, widest},
     lobes::{Lobes, Seen},
     spectra::{ONES, Ratios, times},
     world::{World, lift},
@@ -102,14 +102,14 @@ impl Emitter {
 /// Point sources side by side, for loops over all of them.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Columns {
-    pub px: Vec<f32>,
-    pub py: Vec<f32>,
-    pub pz: Vec<f32>,
-    pub nx: Vec<f32>,
-    pub ny: Vec<f32>,
-    pub nz: Vec<f32>,
+    pub px: Column,
+    pub py: Column,
+    pub pz: Column,
+    pub nx: Column,
+    pub ny: Column,
+    pub nz: Column,
     /// Lambertian strength ρ/π; 0 where the source is not Lambertian.
-    pub strength: Vec<f32>,
+    pub strength: Column,
 }
 
 impl Columns {
@@ -179,18 +179,25 @@ impl<'a> Wide for Irradiance<'a> {
             out,
         } = self;
         let count = out.len();
-        let of = |column: &'a [f32]| &column[first..first + count];
+        let of = |column: &'a Column| &column.groups(first, count)[..count.div_ceil(SIDE)];
         let (px, py, pz) = (of(&c.px), of(&c.py), of(&c.pz));
         let (nx, ny, nz) = (of(&c.nx), of(&c.ny), of(&c.nz));
         let strength = of(&c.strength);
-        for i in 0..count {
-            let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
-            let d2 = dx * dx + dy * dy + dz * dz;
-            let cx = n.x * dx + n.y * dy + n.z * dz;
-            let cs = -(nx[i] * dx + ny[i] * dy + nz[i] * dz);
-            let lit = (cx > 0.0) & (cs > 0.0);
-            let value = strength[i] * cx * cs / (d2 * d2);
-            out[i] = if lit { value } else { 0.0 };
+        for group in 0..count.div_ceil(SIDE) {
+            let (px, py, pz) = (&px[group], &py[group], &pz[group]);
+            let (nx, ny, nz) = (&nx[group], &ny[group], &nz[group]);
+            let strength = &strength[group];
+            let mut found = [0.0; SIDE];
+            for i in 0..SIDE {
+                let (dx, dy, dz) = (px[i] - x.x, py[i] - x.y, pz[i] - x.z);
+                let d2 = dx * dx + dy * dy + dz * dz;
+                let cx = n.x * dx + n.y * dy + n.z * dz;
+                let cs = -(nx[i] * dx + ny[i] * dy + nz[i] * dz);
+                let lit = (cx > 0.0) & (cs > 0.0);
+                let value = strength[i] * cx * cs / (d2 * d2);
+                found[i] = if lit { value } else { 0.0 };
+            }
+            put(out, group, &found);
         }
     }
 }

@@ -1,5 +1,10 @@
 //! Loops over many things side by side, with the longest registers that the machine has. Products and sums stay apart, so that
-//! the bits are the same with any: the compiler's own registers, eight lanes or sixteen.
+//! the bits are the same with any: the compiler's own registers, or eight lanes.
+//!
+//! Many loops are over five spots or twenty light vertices. A compiler does what is left of a loop after its last full register one
+//! by one, which took most of their time. So columns are kept in whole groups ([`Column`]), and loops work on those.
+
+use std::ops::Deref;
 
 use pulp::{Arch, Simd, WithSimd};
 
@@ -32,6 +37,64 @@ pub(crate) fn widest<T: Wide>(this: T) -> T::Output {
 /// How many numbers a sum is made of side by side: the same on every machine, since the order is part of the bits.
 pub(crate) const SIDE: usize = 8;
 
+/// Numbers in groups of [`SIDE`], with zeros behind them, so that a loop may begin at any of them and read whole groups.
+#[derive(Debug, Default, Clone)]
+pub(crate) struct Column {
+    groups: Vec<[f32; SIDE]>,
+    len: usize,
+}
+
+impl Column {
+    pub fn clear(&mut self) {
+        self.groups.clear();
+        self.len = 0;
+    }
+
+    pub fn push(&mut self, x: f32) {
+        let at = self.len / SIDE;
+        // The last one may be the first of a group that is read.
+        self.groups.resize(at + 2, [0.0; SIDE]);
+        self.groups[at][self.len % SIDE] = x;
+        self.len += 1;
+    }
+
+    /// `count` numbers from the `first` on, in whole groups.
+    #[inline(always)]
+    pub fn groups(&self, first: usize, count: usize) -> &[[f32; SIDE]] {
+        let all = self.groups.as_flattened();
+        let (groups, _) = all[first..][..count.next_multiple_of(SIDE)].as_chunks();
+        groups
+    }
+}
+
+impl Deref for Column {
+    type Target = [f32];
+
+    #[inline(always)]
+    fn deref(&self) -> &[f32] {
+        &self.groups.as_flattened()[..self.len]
+    }
+}
+
+/// Writes a group to where it belongs: all of it, or as much as there is room for.
+#[inline(always)]
+pub(crate) fn put(out: &mut [f32], group: usize, found: &[f32; SIDE]) {
+    let out = &mut out[group * SIDE..];
+    match out.first_chunk_mut::<SIDE>() {
+        Some(whole) => *whole = *found,
+        // Without a call for a few numbers.
+        None => {
+            let (room, mut at) = (out.len(), 0);
+            for part in [4, 2, 1] {
+                if room & part != 0 {
+                    out[at..at + part].copy_from_slice(&found[at..at + part]);
+                    at += part;
+                }
+            }
+        }
+    }
+}
+
 /// The sum of many numbers, eight partial sums first.
 #[inline(always)]
 pub(crate) fn sum(all: &[f32]) -> f32 {
@@ -52,4 +115,36 @@ pub(crate) fn sum(all: &[f32]) -> f32 {
         sums[3] + sums[7],
     ];
     (pairs[0] + pairs[2]) + (pairs[1] + pairs[3])
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::{Column, SIDE, put};
+
+    proptest! {
+        #[test]
+        fn groups_hold_the_numbers_from_any_on_and_are_put_back_as_they_were(
+            all in prop::collection::vec(1.0f32..2.0, 0..40), first in 0usize..40, count in 0usize..40,
+        ) {
+            let mut column = Column::default();
+            for round in 0..2 {
+                column.clear();
+                // The second time there are fewer, over what was there.
+                let all = &all[..all.len() / (round + 1)];
+                all.iter().for_each(|&x| column.push(x));
+                prop_assert_eq!(&*column, all);
+                let first = first.min(all.len());
+                let count = count.min(all.len() - first);
+                let groups = column.groups(first, count);
+                prop_assert_eq!(groups.len(), count.div_ceil(SIDE));
+                let mut back = vec![0.0; count];
+                for (k, group) in groups.iter().enumerate() {
+                    put(&mut back, k, group);
+                }
+                prop_assert_eq!(&back[..], &all[first..first + count]);
+            }
+        }
+    }
 }

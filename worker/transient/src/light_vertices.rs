@@ -132,7 +132,7 @@ impl LightVertices {
         out.resize(self.list.len(), 0.0);
         if x.surface.diffuse() && self.glossy.is_empty() {
             self.columns.irradiance(x.p, x.n, out);
-            for ((w, y), &s) in out.iter_mut().zip(&self.list).zip(&self.columns.strength) {
+            for ((w, y), &s) in out.iter_mut().zip(&self.list).zip(&*self.columns.strength) {
                 // irradiance / strength = cos cos / d²: the density of BSDF sampling times π.
                 let plain = *w / (s * PI);
                 let share = y.density / (y.density + plain);

@@ -8,7 +8,7 @@ use picofarm_scene::Vec3;
 
 use crate::{
     bsdf::Surface,
-    lanes::{Wide, widest},
+    lanes::{Column, SIDE, Wide, put, widest},
     world::Hit,
 };
 
@@ -54,19 +54,22 @@ impl Lobe {
             n[0] * s[1] - n[1] * s[0],
         ];
         let (along2, across2) = (c * c, dot(x, x));
-        // Never 0/0: opposite directions have no sum.
-        let t = (along2 + across2) / (along2 + across2 / self.alpha2 + f32::MIN_POSITIVE);
-        let mut d = t * t;
-        let tan2 = (1.0 - co * co).max(0.0) / (co * co);
-        let mut g = 2.0 / (1.0 + (1.0 + self.alpha2 * tan2).sqrt());
+        // Both times α²: GGX's D·π·α² is (part / whole)², and its G₁ is 2cos / (cos + root). One division for both. Opposite
+        // directions have no sum, and divide by no 0.
+        let part = (along2 + across2) * self.alpha2;
+        let whole = along2 * self.alpha2 + across2 + 1e-16;
+        let edge = co + (co * co + self.alpha2 * (1.0 - co * co).max(0.0)).sqrt();
+        let once = part * part / (whole * whole * edge);
+        let (mut d, mut dg) = (once * edge, once * (2.0 * co));
         if BECKMANN && self.beckmann > 0.0 {
             let square = along2 + across2;
             let cos2 = along2 / square;
             let x = across2 / (along2 * self.alpha2);
             d = exp_minus(x) / (cos2 * cos2);
-            g = beckmann_masking(1.0 / (self.alpha2 * tan2).sqrt());
+            let tan2 = (1.0 - co * co).max(0.0) / (co * co);
+            dg = d * beckmann_masking(1.0 / (self.alpha2 * tan2).sqrt());
         }
-        let f = self.lambertian * co + self.conductor * d * g;
+        let f = self.lambertian * co + self.conductor * dg;
         let pdf = self.lambertian_pdf * co + self.conductor_pdf * d;
         let lit = co > 0.0;
         (if lit { f } else { 0.0 }, if lit { pdf } else { 0.0 })
@@ -139,15 +142,15 @@ impl Seen {
 /// Many of them.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Lobes {
-    p: [Vec<f32>; 3],
-    n: [Vec<f32>; 3],
-    i: [Vec<f32>; 3],
-    conductor: Vec<f32>,
-    lambertian: Vec<f32>,
-    alpha2: Vec<f32>,
-    conductor_pdf: Vec<f32>,
-    lambertian_pdf: Vec<f32>,
-    beckmann: Vec<f32>,
+    p: [Column; 3],
+    n: [Column; 3],
+    i: [Column; 3],
+    conductor: Column,
+    lambertian: Column,
+    alpha2: Column,
+    conductor_pdf: Column,
+    lambertian_pdf: Column,
+    beckmann: Column,
     /// One has a Beckmann conductor.
     any_beckmann: bool,
 }
@@ -155,7 +158,7 @@ pub(crate) struct Lobes {
 impl Lobes {
     pub fn clear(&mut self) {
         let columns = self.p.iter_mut().chain(&mut self.n).chain(&mut self.i);
-        columns.for_each(Vec::clear);
+        columns.for_each(Column::clear);
         for column in [
             &mut self.conductor,
             &mut self.lambertian,
@@ -221,24 +224,38 @@ impl Lobes {
     }
 }
 
-/// Columns of a range, all of one length.
-struct Columns<'a> {
-    p: [&'a [f32]; 3],
-    n: [&'a [f32]; 3],
-    i: [&'a [f32]; 3],
-    conductor: &'a [f32],
-    lambertian: &'a [f32],
-    alpha2: &'a [f32],
-    conductor_pdf: &'a [f32],
-    lambertian_pdf: &'a [f32],
-    beckmann: &'a [f32],
+/// One group of [`SIDE`] of them.
+struct Group<'a> {
+    p: [&'a [f32; SIDE]; 3],
+    n: [&'a [f32; SIDE]; 3],
+    i: [&'a [f32; SIDE]; 3],
+    conductor: &'a [f32; SIDE],
+    lambertian: &'a [f32; SIDE],
+    alpha2: &'a [f32; SIDE],
+    conductor_pdf: &'a [f32; SIDE],
+    lambertian_pdf: &'a [f32; SIDE],
+    beckmann: &'a [f32; SIDE],
 }
 
-impl<'a> Columns<'a> {
+/// Groups of a range, of each column as many.
+struct Groups<'a> {
+    p: [&'a [[f32; SIDE]]; 3],
+    n: [&'a [[f32; SIDE]]; 3],
+    i: [&'a [[f32; SIDE]]; 3],
+    conductor: &'a [[f32; SIDE]],
+    lambertian: &'a [[f32; SIDE]],
+    alpha2: &'a [[f32; SIDE]],
+    conductor_pdf: &'a [[f32; SIDE]],
+    lambertian_pdf: &'a [[f32; SIDE]],
+    beckmann: &'a [[f32; SIDE]],
+}
+
+impl<'a> Groups<'a> {
     #[inline(always)]
     fn of(lobes: &'a Lobes, first: usize, count: usize) -> Self {
-        let of = |column: &'a [f32]| &column[first..][..count];
-        let each = |columns: &'a [Vec<f32>; 3]| [of(&columns[0]), of(&columns[1]), of(&columns[2])];
+        let groups = count.div_ceil(SIDE);
+        let of = |column: &'a Column| &column.groups(first, count)[..groups];
+        let each = |columns: &'a [Column; 3]| [of(&columns[0]), of(&columns[1]), of(&columns[2])];
         Self {
             p: each(&lobes.p),
             n: each(&lobes.n),
@@ -253,6 +270,25 @@ impl<'a> Columns<'a> {
     }
 
     #[inline(always)]
+    fn group(&self, k: usize) -> Group<'a> {
+        let of =
+            |columns: &[&'a [[f32; SIDE]]; 3]| [&columns[0][k], &columns[1][k], &columns[2][k]];
+        Group {
+            p: of(&self.p),
+            n: of(&self.n),
+            i: of(&self.i),
+            conductor: &self.conductor[k],
+            lambertian: &self.lambertian[k],
+            alpha2: &self.alpha2[k],
+            conductor_pdf: &self.conductor_pdf[k],
+            lambertian_pdf: &self.lambertian_pdf[k],
+            beckmann: &self.beckmann[k],
+        }
+    }
+}
+
+impl Group<'_> {
+    #[inline(always)]
     fn lobe(&self, k: usize) -> Lobe {
         Lobe {
             conductor: self.conductor[k],
@@ -266,7 +302,7 @@ impl<'a> Columns<'a> {
 }
 
 #[inline(always)]
-fn at(columns: &[&[f32]; 3], k: usize) -> [f32; 3] {
+fn at(columns: &[&[f32; SIDE]; 3], k: usize) -> [f32; 3] {
     [columns[0][k], columns[1][k], columns[2][k]]
 }
 
@@ -295,20 +331,25 @@ impl Toward<'_> {
     #[inline(always)]
     fn all<const BECKMANN: bool>(self) {
         let count = self.value.len();
-        let c = Columns::of(self.lobes, 0, count);
-        let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
+        let groups = Groups::of(self.lobes, 0, count);
         let (q, nq) = (array(self.q), array(self.nq));
-        for k in 0..count {
-            let p = at(&c.p, k);
-            let to = [q[0] - p[0], q[1] - p[1], q[2] - p[2]];
-            let d2 = dot(to, to);
-            let scale = 1.0 / d2.sqrt();
-            let w = [to[0] * scale, to[1] * scale, to[2] * scale];
-            let (f, density) = c.lobe(k).scatter::<BECKMANN>(at(&c.n, k), at(&c.i, k), w);
-            let turn = dot(nq, w).abs() / d2;
-            // In one place with it there is no direction.
-            value[k] = if f > 0.0 { f * turn } else { 0.0 };
-            pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
+        for group in 0..count.div_ceil(SIDE) {
+            let c = groups.group(group);
+            let (mut value, mut pdf) = ([0.0; SIDE], [0.0; SIDE]);
+            for k in 0..SIDE {
+                let p = at(&c.p, k);
+                let to = [q[0] - p[0], q[1] - p[1], q[2] - p[2]];
+                let d2 = dot(to, to);
+                let scale = 1.0 / d2.sqrt();
+                let w = [to[0] * scale, to[1] * scale, to[2] * scale];
+                let (f, density) = c.lobe(k).scatter::<BECKMANN>(at(&c.n, k), at(&c.i, k), w);
+                let turn = dot(nq, w).abs() * (scale * scale);
+                // In one place with it there is no direction.
+                value[k] = if f > 0.0 { f * turn } else { 0.0 };
+                pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
+            }
+            put(self.value, group, &value);
+            put(self.pdf, group, &pdf);
         }
     }
 }
@@ -339,24 +380,31 @@ impl Between<'_> {
     #[inline(always)]
     fn all<const BECKMANN: bool>(self) {
         let count = self.range.len();
-        let c = Columns::of(self.lobes, self.range.start, count);
-        let (value, pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
+        let groups = Groups::of(self.lobes, self.range.start, count);
+        let (out, out_pdf) = (&mut self.value[..count], &mut self.pdf[..count]);
         let Seen { p: x, n, i } = self.place;
         let (x, n, i, lobe) = (array(x), array(n), array(i), self.lobe);
-        for k in 0..count {
-            let p = at(&c.p, k);
-            let to = [p[0] - x[0], p[1] - x[1], p[2] - x[2]];
-            let d2 = dot(to, to);
-            let scale = 1.0 / d2.sqrt();
-            let w = [to[0] * scale, to[1] * scale, to[2] * scale];
-            let (here, density) = lobe.scatter::<BECKMANN>(n, i, w);
-            let back = [-w[0], -w[1], -w[2]];
-            let ny = at(&c.n, k);
-            let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, at(&c.i, k), back);
-            let (f, turn) = (here * there, dot(ny, w).abs() / d2);
-            // In one place with it there is no direction.
-            value[k] = if f > 0.0 { f / d2 } else { 0.0 };
-            pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
+        for group in 0..count.div_ceil(SIDE) {
+            let c = groups.group(group);
+            let (mut value, mut pdf) = ([0.0; SIDE], [0.0; SIDE]);
+            for k in 0..SIDE {
+                let p = at(&c.p, k);
+                let to = [p[0] - x[0], p[1] - x[1], p[2] - x[2]];
+                let d2 = dot(to, to);
+                let scale = 1.0 / d2.sqrt();
+                let w = [to[0] * scale, to[1] * scale, to[2] * scale];
+                let (here, density) = lobe.scatter::<BECKMANN>(n, i, w);
+                let back = [-w[0], -w[1], -w[2]];
+                let ny = at(&c.n, k);
+                let (there, _) = c.lobe(k).scatter::<BECKMANN>(ny, at(&c.i, k), back);
+                let less = scale * scale;
+                let (f, turn) = (here * there, dot(ny, w).abs() * less);
+                // In one place with it there is no direction.
+                value[k] = if f > 0.0 { f * less } else { 0.0 };
+                pdf[k] = if density > 0.0 { density * turn } else { 0.0 };
+            }
+            put(out, group, &value);
+            put(out_pdf, group, &pdf);
         }
     }
 }

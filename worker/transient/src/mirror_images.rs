@@ -286,7 +286,7 @@ impl Mirror {
         let surface = &world.surfaces[plane.surface as usize];
         let mut images = Columns::default();
         let mut height = vec![];
-        for (e, &strength) in emitters.list.iter().zip(&emitters.columns.strength) {
+        for (e, &strength) in emitters.list.iter().zip(&*emitters.columns.strength) {
             let h = n.dot(e.p) - plane.offset;
             height.push(h);
             images.push(e.p - n * (2.0 * h), e.n - n * (2.0 * n.dot(e.n)), strength);

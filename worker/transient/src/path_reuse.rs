@@ -38,10 +38,12 @@ use crate::{
     ellipsoid::Shells,
     emitter::Columns,
     film::Film,
+    lanes::SIDE,
     lobes::{Lobes, Seen},
     rng::{Rng, Stream},
     sink::{PixelSink, Place, Sink, Way},
-    spectra::{Light, Ratios},
+    spectra::{Light, ONES, Ratios},
+    turns::place,
     vertex::Vertex,
     walk::{Scratch, Walk},
     world::Hit,
@@ -188,7 +190,8 @@ impl Shared {
     }
 }
 
-/// What arrives at a shared vertex and goes on, per unit solid angle, to every side.
+/// What arrives at shared vertices and goes on, per unit solid angle, to every side. Those of a vertex begin with a group of [`SIDE`],
+/// and behind its last one lies nothing up to the end of a group.
 #[derive(Debug, Default)]
 struct Arrivals {
     /// Optical path from the laser, in bins.
@@ -201,6 +204,31 @@ struct Arrivals {
     from: Vec<Vec3>,
     /// Value by wavelength; empty where there are not several.
     light: Vec<Ratios>,
+}
+
+impl Arrivals {
+    fn clear(&mut self) {
+        self.bins.clear();
+        self.value.clear();
+        self.spot.clear();
+        self.bounces.clear();
+        self.from.clear();
+        self.light.clear();
+    }
+
+    /// Fills the last group up; returns how many there are.
+    fn fill_up(&mut self) -> usize {
+        let whole = self.bins.len().next_multiple_of(SIDE);
+        self.bins.resize(whole, 0.0);
+        self.value.resize(whole, 0.0);
+        self.spot.resize(whole, 0);
+        self.bounces.resize(whole, 0);
+        self.from.resize(whole, Vec3::ZERO);
+        if !self.light.is_empty() {
+            self.light.resize(whole, [0.0; ONES.len()]);
+        }
+        whole
+    }
 }
 
 /// Adds arrivals; lengths counted from `base_m`.
@@ -314,13 +342,7 @@ impl Sharing {
         let mut rng = Rng::new(tile.seed, Stream::Paths, first, tile.pass);
         self.gathers.clear();
         self.shared.clear();
-        let a = &mut self.arrivals;
-        a.bins.clear();
-        a.value.clear();
-        a.spot.clear();
-        a.bounces.clear();
-        a.from.clear();
-        a.light.clear();
+        self.arrivals.clear();
         let size = film.pixel();
         let count = effort.beyond * (pixels.len() / size) as f32;
         Self::draw_lights(walk, count.max(8.0) as u32, &mut rng, scratch);
@@ -335,11 +357,13 @@ impl Sharing {
                 factor: 1.0,
                 place: Place::Mirror,
             };
-            let (x, y) = (rng.uniform(), rng.uniform());
-            let paths = match tile.mirrors[row as usize * tile.width as usize + col as usize] {
+            let index = u64::from(row) * u64::from(tile.width) + u64::from(col);
+            let paths = match tile.mirrors[index as usize] {
                 true => MIRROR_PATHS,
                 false => 1,
             };
+            let first = tile.pass * u64::from(paths);
+            let place = |j: u32| place(tile.seed, index, first + u64::from(j));
             let share = |j: u32| Share {
                 spots: 1.0 / paths as f32,
                 beyond: match j % SHOWING {
@@ -348,13 +372,10 @@ impl Sharing {
                 },
             };
             for j in 1..paths {
-                // Spread over the pixel beside the first (Roberts 2018).
-                let at = |start: f32, step: f32| (start + j as f32 * step).fract();
-                let at = (at(x, 0.754_877_7), at(y, 0.569_840_3));
-                let ray = walk.world.camera_ray((row, col), at);
+                let ray = walk.world.camera_ray((row, col), place(j));
                 only_mirrors(walk, &mut rng, ray, share(j), scratch, &mut sink);
             }
-            let ray = walk.world.camera_ray((row, col), (x, y));
+            let ray = walk.world.camera_ray((row, col), place(0));
             if let Some(v) = gather_point(walk, &mut rng, ray, share(0), scratch, &mut sink) {
                 self.gathers.push((v, k));
             }

@@ -26,6 +26,8 @@ pub(crate) enum Stream {
     /// Light paths by way of glass, and camera paths.
     Glass = 8,
     ByGlass = 9,
+    /// Where in a pixel its camera paths begin.
+    Place = 10,
     /// How far camera and light reach.
     Extent = 6,
 }
@@ -54,7 +56,7 @@ impl Rng {
     }
 
     #[inline(always)]
-    fn next_u32(&mut self) -> u32 {
+    pub fn next_u32(&mut self) -> u32 {
         let s = self.state;
         self.state = s
             .wrapping_mul(6_364_136_223_846_793_005)

@@ -6,7 +6,7 @@ use picofarm_scene::Vec3;
 
 use crate::{
     bsdf::{Surface, frame},
-    rng::Rng,
+    rng::{Rng, Stream},
 };
 
 /// Evenly spread draws: choices in strict turn, directions by the R₂ sequence (Roberts 2018), both from
@@ -14,8 +14,26 @@ use crate::{
 pub(crate) struct Turns {
     count: f32,
     start: f32,
-    u: f32,
-    v: f32,
+    at: (u32, u32),
+}
+
+/// Point `k` of the R₂ sequence (Roberts 2018) in the unit square, from a start in units of 2⁻³².
+#[inline]
+fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
+    // 1/g and 1/g² in units of 2⁻⁶⁴, g³ = g + 1.
+    const STEPS: (u64, u64) = (0xc13f_a9a9_02a6_328f, 0x91e1_0da5_c79e_7b1d);
+    let turn = |start: u32, step: u64| {
+        let at = (u64::from(start) << 32).wrapping_add(k.wrapping_mul(step));
+        (at >> 40) as f32 * (1.0 / 16_777_216.0)
+    };
+    (turn(start.0, STEPS.0), turn(start.1, STEPS.1))
+}
+
+/// Where in a pixel its camera path `k` begins, over all passes: spread evenly, as much of the light in a bin depends on it.
+#[inline]
+pub(crate) fn place(seed: u64, pixel: u64, k: u64) -> (f32, f32) {
+    let mut rng = Rng::new(seed, Stream::Place, pixel, 0);
+    r2((rng.next_u32(), rng.next_u32()), k)
 }
 
 impl Turns {
@@ -23,8 +41,7 @@ impl Turns {
         Self {
             count: count as f32,
             start: rng.uniform(),
-            u: rng.uniform(),
-            v: rng.uniform(),
+            at: (rng.next_u32(), rng.next_u32()),
         }
     }
 
@@ -51,14 +68,7 @@ impl Turns {
         if !surface.diffuse() {
             return surface.sample(n, wo, rng);
         }
-        let turn = |start: f32, step: f64| {
-            let at = f64::from(start) + f64::from(j) * step;
-            (at - at.floor()) as f32
-        };
-        let (u, v) = (
-            turn(self.u, 0.754_877_666_246_69),
-            turn(self.v, 0.569_840_290_998_05),
-        );
+        let (u, v) = r2(self.at, u64::from(j));
         // Cosine-distributed: uniform on the disc beneath (Malley's method).
         let angle = std::f32::consts::TAU * v;
         let (r, z) = (u.sqrt(), (1.0 - u).max(0.0).sqrt());

@@ -47,21 +47,24 @@ impl Sharing {
                 }
                 let range = y.first..y.end;
                 let a = &self.arrivals;
-                let bins = &a.bins[range.clone()];
+                // In whole groups; behind the last arrival nothing comes.
+                let groups = y.first..y.end.next_multiple_of(SIDE);
                 let values = match &y.rough {
-                    None => &a.value[range.clone()],
+                    None => &a.value[groups.clone()],
                     Some(surface) => {
-                        let to = (v.hit.p - y.hit.p).normalized();
+                        let to = v.hit.p - y.hit.p;
+                        let to = to * (1.0 / to.length());
                         self.gloss.send(y, surface, to, &mut sent);
                         &sent
                     }
                 };
                 if film.channels == 1 && !bounded {
                     let first = &mut pixel[..film.slots];
-                    let (many, few) = bins.as_chunks::<SIDE>();
-                    let (values, last_values) = values.as_chunks::<SIDE>();
+                    let (bins, _) = a.bins[groups].as_chunks::<SIDE>();
+                    let (values, _) = values.as_chunks::<SIDE>();
+                    let mut left = range.len();
                     // Slots and values side by side.
-                    for (bins, values) in many.iter().zip(values) {
+                    for (bins, values) in bins.iter().zip(values) {
                         let (mut slots, mut found) = ([0u32; SIDE], [0.0f32; SIDE]);
                         for (slot, b) in slots.iter_mut().zip(bins) {
                             *slot = floor(b + offset, last);
@@ -69,19 +72,23 @@ impl Sharing {
                         for (found, v) in found.iter_mut().zip(values) {
                             *found = weight * v;
                         }
-                        for k in (0..SIDE).step_by(2) {
-                            first[slots[k] as usize] += found[k];
-                            second[slots[k + 1] as usize] += found[k + 1];
+                        if left >= SIDE {
+                            for k in (0..SIDE).step_by(2) {
+                                first[slots[k] as usize] += found[k];
+                                second[slots[k + 1] as usize] += found[k + 1];
+                            }
+                            left -= SIDE;
+                            continue;
                         }
-                    }
-                    for (k, (b, v)) in few.iter().zip(last_values).enumerate() {
-                        let sums = if k % 2 == 0 { &mut *first } else { &mut second };
-                        sums[floor(b + offset, last) as usize] += weight * v;
+                        for k in 0..left {
+                            let sums = if k % 2 == 0 { &mut *first } else { &mut second };
+                            sums[slots[k] as usize] += found[k];
+                        }
                     }
                     continue;
                 }
                 let rest = a.spot[range.clone()].iter().zip(&a.bounces[range]);
-                let each = bins.iter().zip(values).zip(rest);
+                let each = a.bins[y.first..y.end].iter().zip(values).zip(rest);
                 // In the same order as above: groups of spots change no bit.
                 for (k, ((&b, &value), (&spot, &bounces))) in each.enumerate() {
                     if u32::from(bounces) + deeper > walk.max_bounces {

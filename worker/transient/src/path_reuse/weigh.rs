@@ -37,7 +37,7 @@ impl Sharing {
         let share = drawn.0 as f32 / count as f32;
         let of = (walk, film, effort);
         for at in 0..self.shared.len() {
-            let first = self.arrivals.bins.len();
+            let first = self.arrivals.fill_up();
             self.shared[at].first = first;
             self.shared[at].end = first;
             if walk.window.is_some() {
@@ -65,6 +65,7 @@ impl Sharing {
                 *w *= inverse;
             }
         }
+        self.arrivals.fill_up();
     }
 
     /// Writes what each gather point takes of light that a shared vertex sends to it. Returns the density of drawing the vertex

@@ -22,7 +22,7 @@ use crate::{
     light_vertices::LightVertex,
     rng::{Rng, Stream},
     sink::Technique,
-    turns::Turns,
+    turns::{Turns, place},
 };
 
 /// Light paths by way of near-mirrors of a pass for each pixel.
@@ -209,7 +209,7 @@ impl<'a> Sources<'a> {
             let Some(first) = own.next() else { return };
             glass.lay(walk, LAID, &mut rng, buffers);
             for pixel in std::iter::once(first).chain(own) {
-                let place = (rng.uniform(), rng.uniform());
+                let place = place(frame.seed, u64::from(pixel), pass);
                 let ray = walk.world.camera_ray((pixel / width, pixel % width), place);
                 let within = (walk, frame.film, photons);
                 glass.look(within, (pixel, ray), &mut rng, buffers, found);

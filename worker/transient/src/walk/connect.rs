@@ -122,7 +122,7 @@ impl Walk<'_> {
             // Both Lambertian: weight = strength · f · cos cos / d², and the light vertex' density is
             // share(cos / π) · cos / d².
             let light = light_vertices::share(self.emitters, 1.0 / (PI * h.surface.lambertian()));
-            for (w, &s) in weights.iter_mut().zip(strength) {
+            for (w, &s) in weights.iter_mut().zip(&**strength) {
                 let weighed = *w * plain / (plain + light * *w / s);
                 *w = if s > 0.0 { weighed } else { *w };
             }
