@@ -79,3 +79,37 @@ impl Turns {
         (c > 0.0).then_some((w, surface.lambertian() * PI, c / PI))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::place;
+
+    proptest! {
+        #[test]
+        fn places_of_a_pixel_are_spread_evenly_from_any_pass_on(
+            seed in any::<u64>(), pixel in 0u64..1 << 24, first in 0u64..1 << 40,
+        ) {
+            const COUNT: u64 = 256;
+            let mut cells = [[0u32; 4]; 4];
+            let (mut rows, mut columns) = ([0i32; 16], [0i32; 16]);
+            for k in first..first + COUNT {
+                let (x, y) = place(seed, pixel, k);
+                prop_assert!((0.0..1.0).contains(&x) && (0.0..1.0).contains(&y));
+                cells[(4.0 * y) as usize][(4.0 * x) as usize] += 1;
+                rows[(16.0 * y) as usize] += 1;
+                columns[(16.0 * x) as usize] += 1;
+            }
+            // Sixteen each. Random numbers would be off by more than three in a third of the 32 rows and columns.
+            prop_assert!(cells.as_flattened().iter().all(|c| (11..=22).contains(c)), "{cells:?}");
+            prop_assert!(rows.iter().chain(&columns).all(|c| (c - 16).abs() <= 3), "{rows:?} {columns:?}");
+        }
+    }
+
+    #[test]
+    fn pixels_and_seeds_begin_elsewhere() {
+        let all = [(1, 0), (1, 1), (2, 0)].map(|(seed, pixel)| place(seed, pixel, 0));
+        assert!(all[0] != all[1] && all[0] != all[2] && all[1] != all[2]);
+    }
+}
