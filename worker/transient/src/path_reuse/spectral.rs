@@ -106,7 +106,8 @@ impl Sharing {
                 if weight == 0.0 {
                     continue;
                 }
-                let to = (v.hit.p - y.hit.p).normalized();
+                let to = v.hit.p - y.hit.p;
+                let to = to * (1.0 / to.length());
                 let seen = joined(&v.hit.surface, &here, (v.hit.n, v.wo, -to));
                 let weight = times([weight; ONES.len()], times(v.ratios, seen));
                 let range = y.first..y.end;
