@@ -391,7 +391,7 @@ impl Surface {
                 let (leaving, turn) = (self.leaving(c), 1.0 / (4.0 * PI * alpha2));
                 let seen = match self.ggx() {
                     true => leaving,
-                    false => beckmann::seen(self.alpha, c),
+                    false => self.seen(c),
                 };
                 Lobe {
                     conductor: self.strength * leaving * turn,

@@ -18,6 +18,8 @@
 //! Where a beam meets an edge exactly, rounding decides on which side of the other wall the spot lies. Such a spot is moved
 //! along its own surface ([`clear`]) until it is [`CLEARANCE`] away from the other one.
 
+use std::collections::HashSet;
+
 use picofarm_scene::Vec3;
 
 use crate::{
@@ -48,8 +50,8 @@ const MUCH: f32 = 1.0 / 32.0;
 /// the spot throws there by coming close to it, and by chance where a near-mirror comes before: most of the variance of rooms with
 /// a spot 10 cm from a box.
 const NEAR: f32 = 1.0 / 12.0;
-/// Of more spots (places of sources) than this each has so small a share in the light that fewer zones are better (25 spots in furnished rooms: with
-/// as many zones as for 5 error² × CPU time is 1.05 to 1.3 of what it is without those).
+/// Of more spots than this each has so small a share in the light that fewer zones are better (25 spots in furnished rooms: with
+/// as many zones as for 5 error² × CPU time is 1.05 to 1.3 of what it is without those). Spots are counted by their places.
 const FEW: f32 = 5.0;
 /// The same for zones in which light of two bounces is left to light paths too.
 const CLOSE: f32 = 1.0 / 64.0;
@@ -97,7 +99,8 @@ impl Contacts {
     pub fn find(world: &World, emitters: &Emitters) -> Option<Self> {
         let mut stack = world.bvh.stack();
         let mut zones = vec![];
-        let near = (NEAR * FEW / places(emitters) as f32).clamp(CLOSE, NEAR);
+        let near =
+            (NEAR * FEW / places(emitters.list.iter().map(|e| e.p)) as f32).clamp(CLOSE, NEAR);
         for (spot, e) in emitters.list.iter().enumerate() {
             if e.surface.has_mirror() || e.surface.is_black() {
                 continue;
@@ -119,9 +122,14 @@ impl Contacts {
         })
     }
 
-    /// How many spots have a zone.
+    /// How many zones there are: one for each source that has one.
     pub fn count(&self) -> u32 {
         self.zones.len() as u32
+    }
+
+    /// How many spots have one, those of surfaces of several parts counted once.
+    pub fn spots(&self) -> usize {
+        places(self.zones.iter().map(|z| z.centre))
     }
 
     fn plain(&self, world: &World, h: &Hit) -> bool {
@@ -269,11 +277,10 @@ impl Contacts {
     }
 }
 
-/// How many places the sources have: those of a surface of several parts share one.
-fn places(emitters: &Emitters) -> usize {
-    let all = emitters.list.iter().enumerate();
-    let new = all.filter(|(i, e)| !emitters.list[..*i].iter().any(|before| before.p == e.p));
-    new.count()
+/// How many places sources have: those of a surface of several parts share one.
+fn places(sources: impl Iterator<Item = Vec3>) -> usize {
+    let bits = |p: Vec3| [p.x, p.y, p.z].map(f32::to_bits);
+    sources.map(bits).collect::<HashSet<_>>().len()
 }
 
 /// Where a light path from a zone may end.

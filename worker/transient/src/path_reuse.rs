@@ -362,8 +362,11 @@ impl Sharing {
                 true => MIRROR_PATHS,
                 false => 1,
             };
-            let first = tile.pass * u64::from(paths);
-            let place = |j: u32| place(tile.seed, index, first + u64::from(j));
+            let begin = |j: u32| {
+                let path = tile.pass * u64::from(paths) + u64::from(j);
+                walk.world
+                    .camera_ray((row, col), place(tile.seed, index, path))
+            };
             let share = |j: u32| Share {
                 spots: 1.0 / paths as f32,
                 beyond: match j % SHOWING {
@@ -372,11 +375,9 @@ impl Sharing {
                 },
             };
             for j in 1..paths {
-                let ray = walk.world.camera_ray((row, col), place(j));
-                only_mirrors(walk, &mut rng, ray, share(j), scratch, &mut sink);
+                only_mirrors(walk, &mut rng, begin(j), share(j), scratch, &mut sink);
             }
-            let ray = walk.world.camera_ray((row, col), place(0));
-            if let Some(v) = gather_point(walk, &mut rng, ray, share(0), scratch, &mut sink) {
+            if let Some(v) = gather_point(walk, &mut rng, begin(0), share(0), scratch, &mut sink) {
                 self.gathers.push((v, k));
             }
         }

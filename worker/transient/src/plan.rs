@@ -67,7 +67,7 @@ pub(crate) fn plan(
     if let Some(contacts) = walk.contacts {
         strategies.push(format!(
             "light paths: {} spots close beside other surfaces",
-            contacts.count()
+            contacts.spots()
         ));
     }
     if longest >= 3 {

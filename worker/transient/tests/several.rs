@@ -319,3 +319,20 @@ fn what_is_black_of_several_parts_brings_nothing_and_harms_nothing() {
     };
     assert_eq!(energy(&ok(&behind, &front).transient), 0.0);
 }
+
+#[test]
+fn spots_on_walls_of_several_parts_count_once() {
+    let beside = |name: &str| {
+        let all = scenes::all(8);
+        let (_, s) = all.iter().find(|(of, _)| of == name).unwrap();
+        let strategies = ok(s, &settings(Budget::Samples(1))).plan.strategies;
+        let mut beside = strategies
+            .into_iter()
+            .filter(|s| s.contains("beside other"));
+        beside.next().unwrap()
+    };
+    let expected = "light paths: 5 spots close beside other surfaces";
+    assert_eq!(beside("parts-lambertian"), expected);
+    // Each of the same spots is two sources there. Counted apart the zones would reach half as far, and three spots have one.
+    assert_eq!(beside("parts"), expected);
+}

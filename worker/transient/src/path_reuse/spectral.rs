@@ -3,7 +3,10 @@
 
 use picofarm_scene::Vec3;
 
-use super::{Shared, Sharing, spread::floor};
+use super::{
+    Shared, Sharing,
+    spread::{floor, toward},
+};
 use crate::{
     bsdf::Surface,
     film::Film,
@@ -106,8 +109,7 @@ impl Sharing {
                 if weight == 0.0 {
                     continue;
                 }
-                let to = v.hit.p - y.hit.p;
-                let to = to * (1.0 / to.length());
+                let to = toward(y, v);
                 let seen = joined(&v.hit.surface, &here, (v.hit.n, v.wo, -to));
                 let weight = times([weight; ONES.len()], times(v.ratios, seen));
                 let range = y.first..y.end;

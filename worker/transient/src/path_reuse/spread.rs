@@ -1,10 +1,13 @@
 //! Carrying what arrives at the shared vertices to the pixels.
 
-use super::Sharing;
+use picofarm_scene::Vec3;
+
+use super::{Shared, Sharing};
 use crate::{
     film::Film,
     lanes::{SIDE, Wide, widest},
     spectra::{Light, ONES},
+    vertex::Vertex,
     walk::Walk,
 };
 
@@ -52,9 +55,7 @@ impl Sharing {
                 let values = match &y.rough {
                     None => &a.value[groups.clone()],
                     Some(surface) => {
-                        let to = v.hit.p - y.hit.p;
-                        let to = to * (1.0 / to.length());
-                        self.gloss.send(y, surface, to, &mut sent);
+                        self.gloss.send(y, surface, toward(y, v), &mut sent);
                         &sent
                     }
                 };
@@ -78,11 +79,11 @@ impl Sharing {
                                 second[slots[k + 1] as usize] += found[k + 1];
                             }
                             left -= SIDE;
-                            continue;
-                        }
-                        for k in 0..left {
-                            let sums = if k % 2 == 0 { &mut *first } else { &mut second };
-                            sums[slots[k] as usize] += found[k];
+                        } else {
+                            for k in 0..left {
+                                let sums = if k % 2 == 0 { &mut *first } else { &mut second };
+                                sums[slots[k] as usize] += found[k];
+                            }
                         }
                     }
                     continue;
@@ -131,6 +132,13 @@ impl Wide for Spread<'_> {
         let of = (self.walk, self.film);
         self.sharing.spread_wide(of, self.pixels);
     }
+}
+
+/// Unit direction from a shared vertex to a gather point: the same bits for one wavelength and for several.
+#[inline(always)]
+pub(super) fn toward(y: &Shared, v: &Vertex) -> Vec3 {
+    let to = v.hit.p - y.hit.p;
+    to * (1.0 / to.length())
 }
 
 /// ⌊x⌋ within 0..=last, for last < 2²². Half an ulp of 2²³ is ½: adding it leaves the integer in the low
