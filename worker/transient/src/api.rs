@@ -6,7 +6,7 @@ pub use picofarm_settings::{BeamWidth, Budget, Gate, Strategy, Wavelengths};
 use serde::{Deserialize, Serialize};
 
 /// Version of the rendered values: part of every task key. Change it whenever any output bit may change.
-pub const RENDERER_VERSION: &str = "transient-16";
+pub const RENDERER_VERSION: &str = "transient-17";
 
 /// Settings of one render.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -200,7 +200,7 @@ pub struct ErrorEstimate {
     /// bright path holds the variance.
     #[serde(default)]
     pub total_uncertainty: f32,
-    /// Camera paths per pixel used, on average over the pixels.
+    /// Camera paths of each pixel.
     pub samples: u32,
 }
 

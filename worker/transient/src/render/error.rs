@@ -230,7 +230,7 @@ pub(super) struct Errors {
     pub draws: Vec<(usize, Draw)>,
     /// Of the whole energy.
     pub spread: Spread,
-    /// Passes on average.
+    /// Passes.
     pub samples: u32,
 }
 
@@ -287,9 +287,18 @@ pub(super) fn passes_for(
     (least, most): (u32, u32),
     two: impl Fn(u32) -> f64,
 ) -> u32 {
-    let mut n = least;
-    while n < most && median_after(stats, passes, n, &two) > f64::from(target) {
-        n = (n + (n / 8).max(1)).min(most);
+    let enough = |n| median_after(stats, passes, n, &two) <= f64::from(target);
+    let (mut below, mut n) = (least, least);
+    while n < most && !enough(n) {
+        below = n + 1;
+        n = n.saturating_mul(2).min(most);
+    }
+    while below < n {
+        let middle = below + (n - below) / 2;
+        match enough(middle) {
+            true => n = middle,
+            false => below = middle + 1,
+        }
     }
     n
 }

@@ -31,7 +31,7 @@ const PASSES: u32 = 8;
 pub struct Forecast {
     /// What the renderer decides for the scene.
     pub plan: Plan,
-    /// Passes (camera paths per pixel) on average over the pixels; 0 where no walk is needed.
+    /// Passes (camera paths of each pixel); 0 where no walk is needed.
     pub passes: u32,
     /// Median per-pixel relative error that they come to; see [`crate::ErrorEstimate`].
     pub error: f32,
@@ -80,14 +80,9 @@ pub(super) fn forecast(
         Budget::Samples(n) => (n, median_after(&stats, PASSES, n, &two)),
         Budget::Error(target) => {
             let target = (target / likely) as f32;
-            // As `further` shares them out.
-            let most = (FIRST_PASSES, MAX_PASSES);
-            let n = passes_for(&stats, PASSES, GOAL * target, most, two);
-            let own = (FIRST_PASSES.max(n / 2), (2 * n).min(MAX_PASSES));
-            let tiles = found.tiles.iter();
-            let spent = tiles.map(|t| passes_for(&t.stats, PASSES, GOAL * target, own, two));
-            let mean = spent.sum::<u32>().div_ceil(found.tiles.len() as u32);
-            (mean, median_after(&stats, PASSES, n, &two))
+            let range = (FIRST_PASSES, MAX_PASSES);
+            let n = passes_for(&stats, PASSES, GOAL * target, range, two);
+            (n, median_after(&stats, PASSES, n, &two))
         }
     };
     // Rays of a pixel: two bounces take side² times something, and each pass takes the same.

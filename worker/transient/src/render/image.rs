@@ -49,8 +49,8 @@ pub(super) struct Image {
     /// Energy outside the gate.
     pub overflow: f64,
     tiles: Vec<Region>,
-    /// Passes of each tile.
-    spent: Vec<u32>,
+    /// Passes over every tile so far.
+    pub passes: u32,
     tile_spread: Vec<Spread>,
     tile_overflow: Vec<f64>,
     /// Draws of the errors of each tile's watched pixels.
@@ -65,8 +65,10 @@ pub(super) struct Slice {
     /// The planes of [`Image::planes`], pixels in the order of the tiles.
     planes: Vec<Vec<f32>>,
     stats: Vec<Stat>,
-    /// Passes, spread, overflow and draws of errors of each tile.
-    tiles: Vec<(u32, Spread, f64, Vec<Draw>)>,
+    /// Spread, overflow and draws of errors of each tile.
+    tiles: Vec<(Spread, f64, Vec<Draw>)>,
+    /// Passes over them.
+    passes: u32,
 }
 
 /// Tells the caller how far the render is and hears whether to stop.
@@ -189,7 +191,7 @@ impl Image {
             stats: vec![Stat::default(); pixels],
             total_spread: Spread::default(),
             overflow: 0.0,
-            spent: vec![0; tiles.len()],
+            passes: 0,
             tile_spread: vec![Spread::default(); tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
             tile_draws: vec![vec![]; tiles.len()],
@@ -202,17 +204,6 @@ impl Image {
     /// How many tiles there are.
     pub fn tiles(&self) -> usize {
         self.tiles.len()
-    }
-
-    /// Passes of each tile so far, and the sums of its pixels.
-    pub fn by_tile<'a>(&'a self, stats: &'a [Stat]) -> impl Iterator<Item = (u32, Vec<Stat>)> + 'a {
-        self.tiles.iter().zip(&self.spent).map(|(region, &spent)| {
-            let pixel = |k: u32| {
-                let (row, col) = (region.row + k / region.cols, region.col + k % region.cols);
-                stats[row as usize * self.width + col as usize]
-            };
-            (spent, (0..region.rows * region.cols).map(pixel).collect())
-        })
     }
 
     /// The errors of what was found so far.
@@ -229,7 +220,7 @@ impl Image {
             stats: self.stats.clone(),
             draws: watched.collect(),
             spread: self.total_spread,
-            samples: self.mean_passes(),
+            samples: self.passes,
         }
     }
 
@@ -275,17 +266,13 @@ impl Image {
             .flat_map(|&(first, count)| &self.stats[first..first + count]);
         let tile = |t: usize| {
             let draws = self.tile_draws[t].clone();
-            (
-                self.spent[t],
-                self.tile_spread[t],
-                self.tile_overflow[t],
-                draws,
-            )
+            (self.tile_spread[t], self.tile_overflow[t], draws)
         };
         Slice {
             planes,
             stats: stats.copied().collect(),
             tiles: range.map(tile).collect(),
+            passes: self.passes,
         }
     }
 
@@ -294,7 +281,7 @@ impl Image {
         let (runs, bins) = (self.runs(range.clone()), self.bins);
         let pixels: usize = runs.iter().map(|(_, count)| count).sum();
         let mut tiles = self.tiles[range.clone()].iter().zip(&slice.tiles);
-        let watched = tiles.all(|(region, of)| of.3.len() == draws::count(region));
+        let watched = tiles.all(|(region, of)| of.2.len() == draws::count(region));
         let planes = self.planes();
         if slice.tiles.len() != range.len()
             || !watched
@@ -317,8 +304,8 @@ impl Image {
             self.stats[first..first + count].copy_from_slice(run);
             from = rest;
         }
-        for (t, (spent, spread, overflow, draws)) in range.zip(&slice.tiles) {
-            self.spent[t] = *spent;
+        self.passes = slice.passes;
+        for (t, (spread, overflow, draws)) in range.zip(&slice.tiles) {
             self.tile_spread[t] = *spread;
             self.tile_overflow[t] = *overflow;
             self.tile_draws[t].clone_from(draws);
@@ -326,25 +313,20 @@ impl Image {
         true
     }
 
-    /// Passes of a tile on average.
-    pub fn mean_passes(&self) -> u32 {
-        let pixels: u64 = self.tiles.iter().map(|t| t.pixels() as u64).sum();
-        let spent = self.tiles.iter().zip(&self.spent);
-        let all: u64 = spent.map(|(t, &n)| t.pixels() as u64 * u64::from(n)).sum();
-        all.div_ceil(pixels.max(1)) as u32
-    }
-
-    /// More passes over a range of the tiles, as many as `waves` says for each. Returns the rays traced.
+    /// `wave` more passes over a range of the tiles. Returns the rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
         range: Range<usize>,
-        waves: &[u32],
+        wave: u32,
         watch: &Watch,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
-        let spent = self.spent.clone();
         let count = range.len();
+        let order = Order {
+            first: self.passes,
+            count: wave,
+        };
         let image = Mutex::new(&mut *self);
         // As many as threads, for the whole round: their buffers are large, and new memory is dear.
         let idle: Mutex<Vec<TileRenderer>> = Mutex::default();
@@ -354,13 +336,6 @@ impl Image {
                 if watch.stopped.load(Ordering::Relaxed) {
                     return None;
                 }
-                if waves[t] == 0 && spent[t] > 0 {
-                    return Some(0);
-                }
-                let order = Order {
-                    first: spent[t],
-                    count: waves[t],
-                };
                 let known = lock(&idle).pop();
                 let mut renderer = known.unwrap_or_else(|| TileRenderer::new(frame));
                 renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
@@ -375,6 +350,7 @@ impl Image {
         for r in rays {
             all += r.ok_or(RenderError::Stopped)?;
         }
+        self.passes += wave;
         self.total();
         Ok(all)
     }
@@ -389,7 +365,7 @@ impl Image {
     /// Joins a tile's new passes to its earlier ones, each weighed by its passes.
     fn join(&mut self, frame: &Frame, t: usize, done: &Done) {
         let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
-        let spent = f64::from(self.spent[t]);
+        let spent = f64::from(self.passes);
         let new = if spent == 0.0 {
             1.0
         } else {
@@ -453,6 +429,5 @@ impl Image {
         let before = self.tile_spread[t].scaled(a);
         self.tile_spread[t] = before.plus(done.total_spread().scaled(unit * b));
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
-        self.spent[t] += done.passes;
     }
 }

@@ -142,8 +142,7 @@ pub fn render_part(
         let (found, rays) = if index < of {
             let mut image = Image::new(frame)?;
             let range = which.range(image.tiles());
-            let waves = vec![shape.passes; image.tiles()];
-            let rays = image.round(frame, range.clone(), &waves, &watch)?;
+            let rays = image.round(frame, range.clone(), shape.passes, &watch)?;
             (Found::Tiles(image.take(range)), rays)
         } else if let Some(sources) = Sources::of(frame) {
             let mut splats = Splats::new(frame);
