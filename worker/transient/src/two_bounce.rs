@@ -63,10 +63,10 @@ impl Sampling {
     }
 
     /// Strata a side (even) in ordinary pixels and where a narrow lobe may be seen. They grow with the
-    /// passes so that neither part of the histogram is much noisier than the other; `passes` = 0
-    /// is a render of two bounces only.
+    /// passes so that neither part of the histogram is much noisier than the other, and are those of eight where there are fewer:
+    /// they cost little beside them. `passes` = 0 is a render of two bounces only.
     pub fn sides(&self, passes: u32) -> (u32, u32) {
-        let passes = if passes == 0 { 64 } else { passes };
+        let passes = if passes == 0 { 64 } else { passes.max(8) };
         let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
         let side = 2 * (0.5 * side).round().clamp(1.0, 16.0) as u32;
         (side, (4 * side).min(64))
@@ -77,6 +77,13 @@ impl Sampling {
     pub fn variance(&self, passes: u32) -> f64 {
         let side = f64::from(self.sides(passes).0);
         1.0 / (side * side * side)
+    }
+
+    /// The same after a round of `wave` passes, where it was `before` after so many passes of earlier rounds: each round has
+    /// strata of its own, and weighs as many as it has passes.
+    pub fn joined(&self, (passes, before): (u32, f64), wave: u32) -> f64 {
+        let share = f64::from(wave) / f64::from((passes + wave).max(1));
+        before * (1.0 - share).powi(2) + self.variance(wave) * share.powi(2)
     }
 }
 

@@ -232,6 +232,8 @@ pub(super) struct Errors {
     pub spread: Spread,
     /// Passes.
     pub samples: u32,
+    /// What the two-bounce variance is in proportion to.
+    pub two_unit: f64,
 }
 
 impl Errors {

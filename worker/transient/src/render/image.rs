@@ -51,6 +51,8 @@ pub(super) struct Image {
     tiles: Vec<Region>,
     /// Passes over every tile so far.
     pub passes: u32,
+    /// What the two-bounce variance is in proportion to after them, see [`crate::two_bounce::Sampling::variance`].
+    two_unit: f64,
     tile_spread: Vec<Spread>,
     tile_overflow: Vec<f64>,
     /// Draws of the errors of each tile's watched pixels.
@@ -192,6 +194,7 @@ impl Image {
             total_spread: Spread::default(),
             overflow: 0.0,
             passes: 0,
+            two_unit: 0.0,
             tile_spread: vec![Spread::default(); tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
             tile_draws: vec![vec![]; tiles.len()],
@@ -221,6 +224,7 @@ impl Image {
             draws: watched.collect(),
             spread: self.total_spread,
             samples: self.passes,
+            two_unit: self.two_unit,
         }
     }
 
@@ -350,6 +354,7 @@ impl Image {
         for r in rays {
             all += r.ok_or(RenderError::Stopped)?;
         }
+        self.two_unit = frame.sampling.joined((self.passes, self.two_unit), wave);
         self.passes += wave;
         self.total();
         Ok(all)
