@@ -77,7 +77,12 @@ def spectrum(value):
 def bsdf(b):
     if b["type"] == "diffuse":
         return {"type": "diffuse", "reflectance": spectrum(b["reflectance"])}
-    return {"type": "roughconductor", "distribution": b["distribution"], "alpha": b["alpha"], "material": "none"}
+    conductor = {"type": "roughconductor", "distribution": b["distribution"], "alpha": b["alpha"], "material": "none",
+                 "specular_reflectance": spectrum(b.get("fresnel", 1))}
+    if b["type"] == "mixed":
+        lambertian = {"type": "diffuse", "reflectance": spectrum(b["reflectance"])}
+        return {"type": "blendbsdf", "weight": b["weight"], "first": lambertian, "second": conductor}
+    return conductor
 
 
 def mesh(m):

@@ -147,6 +147,32 @@ fn reference_json(bsdf: &str, vertex: &str) -> String {
 }
 
 #[test]
+fn reference_scenes_may_have_conductors_and_mixes() {
+    let folder = Folder::new();
+    let read = |bsdf: &str| {
+        let path = folder.file("scene.json", reference_json(bsdf, "-1"));
+        let scene = read_scene(&path).expect("reads");
+        scene.objects[0].mesh.materials[0].bsdf
+    };
+    let conductor = r#"{"type":"roughconductor","distribution":"ggx","alpha":0.1,"fresnel":0.8}"#;
+    let expected = Bsdf::RoughConductor {
+        alpha: 0.1,
+        distribution: Distribution::Ggx,
+        reflectance: 0.8,
+    };
+    assert_eq!(read(conductor), expected);
+    let mixed = r#"{"type":"mixed","distribution":"beckmann","alpha":0.2,"fresnel":0.9,"reflectance":0.5,"weight":0.25}"#;
+    let expected = Bsdf::Mixed {
+        reflectance: 0.5,
+        alpha: 0.2,
+        distribution: Distribution::Beckmann,
+        specular_reflectance: 0.9,
+        weight: 0.25,
+    };
+    assert_eq!(read(mixed), expected);
+}
+
+#[test]
 fn malformed_reference_scenes_are_refused_by_field() {
     let folder = Folder::new();
     let good = r#"{"type":"diffuse","reflectance":0.5}"#;
@@ -160,10 +186,16 @@ fn malformed_reference_scenes_are_refused_by_field() {
             "bsdf.type: \"dielectric\" is not known",
         ),
         (
-            "ggx.json",
-            r#"{"type":"roughconductor","distribution":"ggx","alpha":0.1}"#,
+            "phong.json",
+            r#"{"type":"roughconductor","distribution":"phong","alpha":0.1}"#,
             "-1",
-            "bsdf.distribution: \"ggx\"",
+            "bsdf.distribution: \"phong\"",
+        ),
+        (
+            "weight.json",
+            r#"{"type":"mixed","distribution":"ggx","alpha":0.1,"reflectance":0.5}"#,
+            "-1",
+            "bsdf.weight: missing",
         ),
         (
             "alpha.json",

@@ -2,11 +2,13 @@
 //! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
 //! ERROR 0 renders numbers of passes instead: error by pixel and of the whole image, CPU seconds, slope and merit. With a
 //! negative ERROR it prints which class of paths carries the variance; `wavelengths` in its place compares three wavelengths in one
-//! pass with each alone. With a folder in `STOP_TRUTHS`, truths are kept there and used again, so that two versions are compared with the same one.
+//! pass with each alone, and `json` prints the scene for tests/peers. With a folder in `STOP_TRUTHS`, truths are kept there and used again, so that two versions are compared with the same one.
 
 #[path = "../tests/common/mod.rs"]
 #[allow(unused, reason = "a bench uses its own part")]
 mod common;
+#[path = "stop/reference.rs"]
+mod reference;
 #[path = "stop/scenes.rs"]
 mod scenes;
 
@@ -89,6 +91,14 @@ fn main() {
             .first()
             .is_some_and(|a| a != "all" && !name.contains(a.as_str()))
         {
+            continue;
+        }
+        if args.get(3).is_some_and(|a| a == "json") {
+            let rendered = run(&scene, Budget::Samples(1), 0);
+            match reference::json(&name, &scene, &rendered) {
+                Ok(json) => println!("{json}"),
+                Err(what) => eprintln!("{name}: {what}"),
+            }
             continue;
         }
         if args.get(3).is_some_and(|a| a == "wavelengths") {

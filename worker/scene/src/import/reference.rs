@@ -61,6 +61,7 @@ struct FileBsdf {
     distribution: Option<String>,
     alpha: Option<f32>,
     fresnel: Option<f32>,
+    weight: Option<f32>,
 }
 
 /// Reads a reference scene. Its image has 64×64 pixels until resized; every mesh is an object and a
@@ -203,32 +204,46 @@ fn mesh(file: &FileMesh) -> Result<Mesh, String> {
 
 fn material(name: &str, file: &FileBsdf) -> Result<Material, String> {
     let needs = |field: &str| format!("bsdf.{field}: missing; a {} needs it", file.r#type);
+    let reflectance = || file.reflectance.ok_or_else(|| needs("reflectance"));
+    let alpha = || file.alpha.ok_or_else(|| needs("alpha"));
+    let distribution = || match file.distribution.as_deref() {
+        Some("beckmann") => Ok(Distribution::Beckmann),
+        Some("ggx") => Ok(Distribution::Ggx),
+        other => Err(format!(
+            "bsdf.distribution: {} is not known; use \"beckmann\" or \"ggx\"",
+            other.map_or("none".into(), |d| format!("{d:?}"))
+        )),
+    };
+    let fresnel = file.fresnel.unwrap_or(1.0);
     let (bsdf, grey) = match file.r#type.as_str() {
         "diffuse" => {
-            let reflectance = file.reflectance.ok_or_else(|| needs("reflectance"))?;
+            let reflectance = reflectance()?;
             (Bsdf::Diffuse { reflectance }, reflectance)
         }
         "roughconductor" => {
-            match file.distribution.as_deref() {
-                Some("beckmann") => {}
-                other => {
-                    return Err(format!(
-                        "bsdf.distribution: {} is not known; use \"beckmann\"",
-                        other.map_or("none".into(), |d| format!("{d:?}"))
-                    ));
-                }
-            }
-            let reflectance = file.fresnel.unwrap_or(1.0);
             let bsdf = Bsdf::RoughConductor {
-                alpha: file.alpha.ok_or_else(|| needs("alpha"))?,
-                distribution: Distribution::Beckmann,
-                reflectance,
+                distribution: distribution()?,
+                alpha: alpha()?,
+                reflectance: fresnel,
             };
-            (bsdf, reflectance)
+            (bsdf, fresnel)
+        }
+        // A Lambertian, and beside it `weight` of a rough conductor.
+        "mixed" => {
+            let (reflectance, weight) =
+                (reflectance()?, file.weight.ok_or_else(|| needs("weight"))?);
+            let bsdf = Bsdf::Mixed {
+                reflectance,
+                distribution: distribution()?,
+                alpha: alpha()?,
+                specular_reflectance: fresnel,
+                weight,
+            };
+            (bsdf, (1.0 - weight) * reflectance + weight * fresnel)
         }
         other => {
             return Err(format!(
-                "bsdf.type: {other:?} is not known; use \"diffuse\" or \"roughconductor\""
+                "bsdf.type: {other:?} is not known; use \"diffuse\", \"roughconductor\" or \"mixed\""
             ));
         }
     };
