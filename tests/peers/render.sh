@@ -28,7 +28,7 @@ for scene in "$@"; do
   fi
 done
 if [ -z "${PICOFARM:-}" ]; then
-  (cd "$root" && cargo build --release --locked >&2)
+  (cd "$root" && cargo build --release --locked --features bench >&2)
   PICOFARM=${CARGO_TARGET_DIR:-$root/target}/release/picofarm
 fi
 

@@ -242,3 +242,24 @@ impl Strata {
         count as u32
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Sampling;
+
+    #[test]
+    fn rounds_of_strata_join_by_their_passes() {
+        let sampling = Sampling {
+            base: 4.0,
+            refined: vec![],
+        };
+        let one = sampling.joined((0, 0.0), 64);
+        assert_eq!(one, sampling.variance(64));
+        let two = sampling.joined((64, one), 64);
+        assert!((two / one - 0.5).abs() < 1e-12, "{two} {one}");
+        // A few passes more bring few strata, which weigh little.
+        let more = sampling.joined((64, one), 4);
+        assert!(more < one, "{more} {one}");
+        assert_eq!(sampling.sides(1), sampling.sides(8));
+    }
+}

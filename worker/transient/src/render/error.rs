@@ -309,7 +309,7 @@ pub(super) fn passes_for(
 mod tests {
     use proptest::prelude::*;
 
-    use super::{FLOOR, OWN, Pool, Region, pool};
+    use super::{FLOOR, OWN, Pool, Region, Stat, median_after, passes_for, pool};
 
     /// The definition, a bin at a time.
     fn plain(v: &[f32], (rows, cols, slots): (usize, usize, usize), reach: usize) -> Vec<f32> {
@@ -337,6 +337,27 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn the_fewest_passes_that_reach_an_error_are_found(
+            pixels in prop::collection::vec((0.1f64..10.0, 0.001f64..5.0, 0.001f64..5.0), 1..40),
+            (passes, target) in (4u32..40, 0.02f32..0.6),
+        ) {
+            let stat = |&(norm2, two_variance, multi_variance): &(f64, f64, f64)| Stat {
+                norm2: norm2 + two_variance + multi_variance,
+                two_variance,
+                multi_variance,
+                total: 1.0,
+            };
+            let stats: Vec<Stat> = pixels.iter().map(stat).collect();
+            let two = |n: u32| f64::from(n).powf(-1.2);
+            let least = passes + 1;
+            let n = passes_for(&stats, passes, target, (least, 1 << 16), two);
+            let after = |n| median_after(&stats, passes, n, &two);
+            let target = f64::from(target);
+            prop_assert!(after(n) <= target || n == 1 << 16);
+            prop_assert!(n == least || after(n - 1) > target);
+        }
+
         #[test]
         fn pooled_variances_are_half_their_neighbours_mean(
             (rows, cols, slots) in (1usize..5, 1usize..5, 3usize..20),
