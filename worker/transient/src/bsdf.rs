@@ -483,6 +483,10 @@ impl Surface {
     fn sample_conductor(&self, n: Vec3, i: Vec3, rng: &mut Rng) -> Option<(Vec3, f32, f32)> {
         let (t, b) = frame(n);
         let ci = n.dot(i);
+        // Of a direction beneath the surface no facet is seen: to draw one would take without end.
+        if !(ci > 0.0) {
+            return None;
+        }
         let seen_from = [t.dot(i), b.dot(i), ci];
         let h = match self.ggx() {
             true => visible_ggx(self.alpha, seen_from, rng),
@@ -495,7 +499,7 @@ impl Surface {
         }
         let o = (h * (2.0 * ih) - i).normalized();
         let co = n.dot(o);
-        if !(ci > 0.0 && co > 0.0) {
+        if !(co > 0.0) {
             return None;
         }
         let seen = self.seen(ci);

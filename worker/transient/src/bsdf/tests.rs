@@ -268,3 +268,21 @@ fn rough_surfaces_scatter_alike_by_factors_of_each_direction() {
     }
     assert!(compared > 2000);
 }
+
+#[test]
+fn from_beneath_a_conductor_nothing_is_drawn() {
+    let (n, _) = normal_and_incident(0.0);
+    let (t, _) = frame(n);
+    for alpha in ALPHAS {
+        for d in [Distribution::Beckmann, Distribution::Ggx] {
+            let s = conductor(alpha, d);
+            for depth in [-1e-6f32, -1e-3, -0.1, -0.7, -1.0, f32::NAN] {
+                let i = n * depth + t * (1.0 - depth * depth).sqrt();
+                for seed in 0..20 {
+                    let mut rng = Rng::new(seed, Stream::Paths, 0, 0);
+                    assert_eq!(s.sample(n, i, &mut rng), None, "{alpha} {d:?} {depth}");
+                }
+            }
+        }
+    }
+}
