@@ -484,7 +484,7 @@ impl Surface {
         let (t, b) = frame(n);
         let ci = n.dot(i);
         // Of a direction beneath the surface no facet is seen: to draw one would take without end.
-        if !(ci > 0.0) {
+        if ci <= 0.0 || ci.is_nan() {
             return None;
         }
         let seen_from = [t.dot(i), b.dot(i), ci];
@@ -499,7 +499,7 @@ impl Surface {
         }
         let o = (h * (2.0 * ih) - i).normalized();
         let co = n.dot(o);
-        if !(co > 0.0) {
+        if co <= 0.0 || co.is_nan() {
             return None;
         }
         let seen = self.seen(ci);
