@@ -1,6 +1,6 @@
 //! Whether the error that a render states, and stops by, is its true one, on scenes that are hard to sample:
 //! `cargo bench -p picofarm-transient --bench stop [SCENE [SEEDS [PIXELS [ERROR...]]]]`.
-//! ERROR 0 renders numbers of passes instead: error by pixel and of the whole image, CPU seconds, slope and merit. With a
+//! SCENE is a scene's name, or a part of several scenes' names. ERROR 0 renders numbers of passes instead: error by pixel and of the whole image, CPU seconds, slope and merit. With a
 //! negative ERROR it prints which class of paths carries the variance; `wavelengths` in its place compares three wavelengths in one
 //! pass with each alone, and `json` prints the scene for tests/peers. With a folder in `STOP_TRUTHS`, truths are kept there and used again, so that two versions are compared with the same one.
 
@@ -86,18 +86,26 @@ fn main() {
     if asked.is_empty() {
         asked.push(0.1);
     }
-    for (name, scene) in scenes::all(pixels) {
-        if args
-            .first()
-            .is_some_and(|a| a != "all" && !name.contains(a.as_str()))
-        {
+    let all = scenes::all(pixels);
+    let asked_for = args.first().map_or("all", String::as_str);
+    let whole = all.iter().any(|(name, _)| name == asked_for);
+    for (name, scene) in all {
+        let wanted = match (asked_for, whole) {
+            ("all", _) => true,
+            (part, false) => name.contains(part),
+            (_, true) => name == asked_for,
+        };
+        if !wanted {
             continue;
         }
         if args.get(3).is_some_and(|a| a == "json") {
             let rendered = run(&scene, Budget::Samples(1), 0);
             match reference::json(&name, &scene, &rendered) {
                 Ok(json) => println!("{json}"),
-                Err(what) => eprintln!("{name}: {what}"),
+                Err(what) => {
+                    eprintln!("{name}: {what}");
+                    std::process::exit(1);
+                }
             }
             continue;
         }

@@ -172,7 +172,7 @@ fn in_time((began, left): (f64, f64), round: u32) -> u32 {
 }
 
 /// How many more passes the median error of the image needs to reach `target`. All tiles get as many: to give those with larger
-/// errors more, up to twice as many, took a fifth to a half more time to the same median, and as long to the same 95th percentile.
+/// errors more, up to twice as many, took up to a half more time to the same median, and as long to the same 95th percentile.
 fn further(
     errors: &Errors,
     sampling: &Sampling,

@@ -1,6 +1,6 @@
 //! A scene as the reference scenes' JSON (`picofarm_scene::read_reference_json`), which tests/peers renders with others.
 
-use picofarm_scene::{Bsdf, Distribution, Scene, Vec3};
+use picofarm_scene::{Bsdf, Distribution, Material, Mesh, Scene, Vec3};
 use picofarm_transient::Rendered;
 use serde_json::{Value, json};
 
@@ -20,7 +20,7 @@ pub fn json(name: &str, scene: &Scene, rendered: &Rendered) -> Result<Value, Str
             let points = o.mesh.positions.iter().map(|&p| o.to_world.point(p));
             let vertices: Vec<f32> = points.flat_map(|p| [p.x, p.y, p.z]).collect();
             Ok(json!({
-                "name": o.name, "bsdf": bsdf(&o.mesh.materials[0].bsdf)?, "vertices": vertices,
+                "name": o.name, "bsdf": material(&o.mesh)?, "vertices": vertices,
                 "faces": o.mesh.triangles.concat(),
             }))
         })
@@ -32,7 +32,7 @@ pub fn json(name: &str, scene: &Scene, rendered: &Rendered) -> Result<Value, Str
             let cos_i = s.normal.dot(s.arriving).abs();
             Ok(json!({
                 "dir": array(s.arriving), "p": array(s.point), "n": array(s.normal), "laser_dist": s.path_m, "cos_i": cos_i,
-                "mesh_index": s.object, "bsdf": bsdf(&of.mesh.materials[0].bsdf)?,
+                "mesh_index": s.object, "bsdf": material(&of.mesh)?,
             }))
         })
         .collect();
@@ -49,6 +49,23 @@ pub fn json(name: &str, scene: &Scene, rendered: &Rendered) -> Result<Value, Str
 
 fn array(v: Vec3) -> [f32; 3] {
     [v.x, v.y, v.z]
+}
+
+/// That of a mesh, which may have one alone.
+fn material(mesh: &Mesh) -> Result<Value, String> {
+    match &mesh.materials[..] {
+        [
+            Material {
+                bsdf,
+                texture: None,
+                ..
+            },
+        ] => self::bsdf(bsdf),
+        _ => Err(format!(
+            "{}: several materials or a texture, which the format has not",
+            mesh.name
+        )),
+    }
 }
 
 fn bsdf(of: &Bsdf) -> Result<Value, String> {
