@@ -1,5 +1,5 @@
 //! Loops over many things side by side, with the longest registers that the machine has. Products and sums stay apart, so that
-//! the bits are the same with any: the compiler's own registers, or eight lanes.
+//! the bits are the same with any: those of AVX-512, of AVX2, or what every machine of its kind has.
 //!
 //! Many loops are over five spots or twenty light vertices. A compiler does what is left of a loop after its last full register one
 //! by one, which took most of their time. So columns are kept in whole groups ([`Column`]), and loops work on those.
