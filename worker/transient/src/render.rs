@@ -36,6 +36,8 @@ const MAX_PASSES: u32 = 1 << 16;
 /// Passes of its first round, enough for an error estimate that means something: with 8 large images of many spots came to 6 to
 /// 9 % where 10 % were asked for.
 const FIRST_PASSES: u32 = 4;
+/// Least passes of a later one: how far a single pass is off nothing tells.
+const LEAST_ROUND: u32 = 2;
 /// Share of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
 /// How much longer than all before it a round of a render that is bound in time may be: each tells how long the next will take.
@@ -147,10 +149,11 @@ fn whole(
                 Budget::Samples(n) => n - spent,
             };
             let next = in_time((began, left()), wave).min(GROWTH * spent).min(most);
-            if next == 0 {
+            if next < LEAST_ROUND.min(most) {
                 break error;
             }
-            wave = next;
+            // Nor is a last one left over.
+            wave = if most - next == 1 { most } else { next };
             continue;
         }
         let Budget::Error(target) = budget else {
@@ -187,7 +190,7 @@ fn further(
         false => sampling.joined((spent, errors.two_unit), n - spent),
     };
     let target = GOAL * target / errors.likely(0.5) as f32;
-    let range = (spent + 1, MAX_PASSES);
+    let range = ((spent + LEAST_ROUND).min(MAX_PASSES), MAX_PASSES);
     let all = passes_for(&errors.stats, spent, target, range, two);
     stop.check()?;
     Ok(all - spent)

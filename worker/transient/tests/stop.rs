@@ -137,3 +137,36 @@ fn a_render_bound_in_time_ends_sooner_where_its_error_or_its_samples_are_reached
     assert!(r.error.median_relative <= 0.3, "{:?}", r.error);
     assert!(r.error.samples < 1000, "{:?}", r.error);
 }
+
+#[test]
+fn the_last_round_of_a_render_to_an_error_leaves_the_error_as_well_known_as_a_single_one() {
+    let library = AssetLibrary::find("parametric", &[]).unwrap();
+    let room = FurnishedSettings {
+        spots: Spots::Grid(16),
+        width: 24,
+        height: 24,
+        ..FurnishedSettings::default()
+    };
+    let scene = furnished::generate(8, &room, &library).unwrap();
+    let wide = |budget| Settings {
+        strategy: Strategy::default(),
+        ..settings(budget)
+    };
+    let mut ends = vec![];
+    for k in 0..40 {
+        let error = |budget| {
+            let found = render(&scene, &wide(budget), &Asked::until(u64::MAX));
+            found.unwrap().error
+        };
+        let r = error(Budget::Error(0.06 + 0.0025 * f64::from(k)));
+        ends.push(r.samples);
+        let single = error(Budget::Samples(r.samples));
+        let (pixels, whole) = (
+            r.median_relative / single.median_relative,
+            r.total_relative / single.total_relative,
+        );
+        assert!(pixels < 1.15 && whole < 1.3, "{r:?}: {pixels} {whole}");
+    }
+    ends.dedup();
+    assert!(ends.len() > 6, "{ends:?}");
+}
