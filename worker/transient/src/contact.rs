@@ -277,6 +277,11 @@ impl Contacts {
     }
 }
 
+/// Whether there are so many spots that each has a small share in the light.
+pub(crate) fn many(emitters: &Emitters) -> bool {
+    places(emitters.list.iter().map(|e| e.p)) as f32 > FEW
+}
+
 /// How many places sources have: those of a surface of several parts share one.
 fn places(sources: impl Iterator<Item = Vec3>) -> usize {
     let bits = |p: Vec3| [p.x, p.y, p.z].map(f32::to_bits);

@@ -23,6 +23,7 @@ mod one_bounce;
 mod path_reuse;
 mod photo;
 mod plan;
+mod reflectors;
 mod render;
 mod rng;
 pub mod sensor;

@@ -16,6 +16,7 @@
 mod arrivals;
 mod candidates;
 mod draw;
+mod effort;
 mod gloss;
 mod segments;
 mod spectral;
@@ -29,6 +30,9 @@ use self::{
     segments::Segments,
     weigh::Lengths,
 };
+
+pub(crate) use self::effort::{Effort, NARROW_TILE, WIDE_TILE};
+
 use std::f32::consts::PI;
 
 use picofarm_scene::Vec3;
@@ -40,6 +44,7 @@ use crate::{
     film::Film,
     lanes::SIDE,
     lobes::{Lobes, Seen},
+    reflectors::Aiming,
     rng::{Rng, Stream},
     sink::{PixelSink, Place, Sink, Way},
     spectra::{Light, ONES, Ratios},
@@ -48,35 +53,6 @@ use crate::{
     walk::{Scratch, Walk},
     world::Hit,
 };
-
-/// Sides in pixels of the tiles that share vertices. On furnished rooms at 256×256 with 25 spots wide ones take 0.44 of the
-/// CPU time to the same error of a pixel, half of it to that of a sum over 4×4 pixels, as much to that of 32×32 and 2.1
-/// times as much to that of the whole image, which is small: all pixels of a tile err by the same vertices.
-pub(crate) const WIDE_TILE: u32 = 32;
-pub(crate) const NARROW_TILE: u32 = 8;
-
-/// How much a pass does.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Effort {
-    /// Side of a tile in pixels.
-    pub side: u32,
-    /// Candidates for each shared vertex.
-    pub candidates: u32,
-    /// Shared vertices drawn from gather points, for each pixel.
-    pub camera: f32,
-    /// How many more vertices are drawn from gather points, for each of those, for what cannot be shared.
-    pub extra: u32,
-    /// Shared vertices drawn from spots, for each pixel.
-    pub light: f32,
-    /// Shared vertices drawn in a narrow gate's shells, for each pixel.
-    pub shell: f32,
-    /// Walks from a shared vertex whose light all gather points take alike, on average.
-    pub walks: f32,
-    /// Light vertices that walks of one pass connect to.
-    pub light_vertices: u32,
-    /// Light paths by way of near-mirrors, for each pixel, where there are any.
-    pub beyond: f32,
-}
 
 /// Camera paths of a pass by way of near-mirrors alone, where a pixel sees one: few of them meet a narrow lobe that a spot
 /// lights, and a single one in a pass made that light a rare event of many times the image's error.
@@ -95,41 +71,6 @@ const BESIDE: u32 = 2;
 const GLOSSY: u32 = 2;
 /// Spots whose light at a rough vertex is carried to the pixels, at most: drawn by contribution.
 const ROUGH_SPOTS: usize = 32;
-
-/// How many more vertices are drawn where some cannot be shared (0, 1, 3 and 7 tried on rooms with such surfaces).
-const EXTRA: u32 = 3;
-
-/// Candidates for each shared vertex. Error² × CPU time of a pixel with 4 of them, and walks by weight, over that with one of each:
-/// 0.7 to 0.85 in furnished rooms with 4 spots, 0.73 to 1.03 in rooms with near-mirrors (24×24); 2 and 8 are no better, and with 25
-/// spots at 256×256 it is 0.9 to 1.1.
-const CANDIDATES: u32 = 4;
-
-impl Effort {
-    /// The effort for tiles of `side` pixels. A vertex costs as much to make in a wide tile as in a narrow one, and serves
-    /// more pixels there: so wide tiles draw fewer of them for each pixel, and every pixel has more of them all the same.
-    /// The numbers minimise error² × CPU time on furnished rooms with 4 and 25 spots, where the optimum is flat: twice as
-    /// many vertices or walks cost within 10 %. `narrow` is the gate; `narrow_lobes`: the scene has surfaces whose vertices
-    /// are not shared.
-    pub fn new(side: u32, narrow: bool, narrow_lobes: bool) -> Self {
-        let wide = side > NARROW_TILE;
-        Self {
-            side,
-            // The window of a narrow gate is where its vertices are chosen by.
-            candidates: if narrow { 1 } else { CANDIDATES },
-            camera: if wide { 0.5 } else { 1.0 },
-            extra: match (narrow_lobes, wide) {
-                (false, _) => 0,
-                (true, false) => EXTRA,
-                (true, true) => 2 * EXTRA + 1,
-            },
-            light: if wide { 0.25 } else { 0.5 },
-            shell: if narrow { 1.0 } else { 0.0 },
-            walks: 0.8,
-            light_vertices: if wide { 64 } else { 16 },
-            beyond: 1.0,
-        }
-    }
-}
 
 /// A vertex that all gather points of a tile share.
 #[derive(Debug, Clone, Copy)]
@@ -311,6 +252,7 @@ pub(crate) struct Sharing {
     glossy: Vec<usize>,
     shared: Vec<Shared>,
     candidates: Candidates,
+    aiming: Aiming,
     arrivals: Arrivals,
     gloss: Gloss,
     /// Those of one shared vertex.
@@ -400,8 +342,11 @@ impl Sharing {
         let (camera, light) = (drawn(effort.camera), drawn(effort.light));
         let extra = camera * effort.extra;
         let (camera, light) = (camera * times, light * times);
-        let of_camera = (camera, times, extra);
-        self.draw_from_camera((walk, film), of_camera, &mut rng, scratch, pixels);
+        let alone = camera / times + extra;
+        let aims = self.aim((walk, effort), alone, count);
+        let on = (walk, film, effort);
+        self.draw_from_camera(on, (camera, times, extra), &mut rng, scratch, pixels);
+        self.draw_from_mirrors(on, (aims, alone), &mut rng, scratch, pixels);
         self.draw_from_spots(walk, light, &mut rng, scratch);
         if let Some(patches) = walk.patches {
             self.draw_in_shells((walk, patches), drawn(effort.shell), &mut rng);
@@ -413,6 +358,19 @@ impl Sharing {
         self.connect((walk, film, effort), (camera, light), &mut rng, scratch);
         self.gloss.lay(&self.shared, &self.arrivals);
         self.spread((walk, film), pixels);
+    }
+
+    /// Weighs the near-mirrors that this tile's `pixels` gather points aim at; returns how often they do, beside `alone` directions
+    /// drawn by their scattering.
+    fn aim(&mut self, (walk, effort): (&Walk, &Effort), alone: u32, pixels: f32) -> u32 {
+        self.aiming.clear();
+        let Some(all) = walk.reflectors else { return 0 };
+        let aims = (effort.aims * pixels).ceil();
+        let points = self.gathers.iter().map(|(v, _)| (v.hit.p, v.hit.n));
+        match self.aiming.weigh(all, aims / alone as f32, points) {
+            true => aims as u32,
+            false => 0,
+        }
     }
 
     /// Lays the gather points out in columns.

@@ -190,7 +190,7 @@ fn straight(
     let count = if first { ALL } else { SPOTS };
     let scratch = &mut buffers.scratch;
     walk.connect(rng, &vertex, None, count, scratch, &mut sink);
-    walk.run(rng, vertex, scratch, &mut sink);
+    walk.run(rng, (vertex, crate::walk::SPOTS), scratch, &mut sink);
 }
 
 /// Connects a point of a camera path to light vertices.

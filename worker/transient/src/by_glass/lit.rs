@@ -210,7 +210,8 @@ impl LitPoint {
             bounce: 1,
             sight: Sight::ELSEWHERE,
         };
-        walk.run(rng, vertex, scratch, &mut Arrivals(&mut arrivals));
+        let on = (vertex, crate::walk::SPOTS);
+        walk.run(rng, on, scratch, &mut Arrivals(&mut arrivals));
         for a in &mut arrivals {
             a.light.value /= density;
         }

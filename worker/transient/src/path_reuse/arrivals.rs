@@ -126,7 +126,7 @@ impl Sharing {
             sink.at(Place::Walk);
             for _ in 0..(often + rng.uniform()) as u32 {
                 sink.left = false;
-                walk.run(rng, vertex, scratch, sink);
+                walk.run(rng, (vertex, effort.spots.0), scratch, sink);
             }
         };
         if density.is_none() {

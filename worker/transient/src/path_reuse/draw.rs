@@ -2,7 +2,7 @@
 
 use picofarm_scene::Vec3;
 
-use super::{ALL_ZONES, BESIDE, BEYOND, GLOSSY, SHOWN, Shared, Sharing, ZONE_PATHS};
+use super::{ALL_ZONES, BESIDE, BEYOND, Effort, GLOSSY, SHOWN, Shared, Sharing, ZONE_PATHS};
 use crate::{
     contact::Contacts,
     ellipsoid::Patches,
@@ -12,7 +12,7 @@ use crate::{
     spectra::{Light, ONES, times},
     turns::Turns,
     vertex::{Sight, Vertex},
-    walk::{ALL, Lights, Scratch, Walk},
+    walk::{ALL, Lights, Scratch, Step, Walk},
     world::lift,
 };
 
@@ -129,7 +129,7 @@ impl Sharing {
     /// vertices and nothing else.
     pub(super) fn draw_from_camera(
         &mut self,
-        (walk, film): (&Walk, &Film),
+        (walk, film, effort): (&Walk, &Film, &Effort),
         (count, times, extra): (u32, u32, u32),
         rng: &mut Rng,
         scratch: &mut Scratch,
@@ -159,14 +159,15 @@ impl Sharing {
             };
             let mut aims = 0.0;
             if whole {
-                aims = walk.aim(rng, &vertex, 1.0, scratch, &mut sink);
+                let images = (1.0, Some(&self.aiming));
+                aims = walk.aim(rng, &vertex, images, scratch, &mut sink);
                 walk.light(rng, &vertex, Lights::Glossy, GLOSSY, scratch, &mut sink);
             }
             let h = &vertex.hit;
             let Some(drawn) = turns.direction(j, &h.surface, h.n, vertex.wo, rng) else {
                 continue;
             };
-            let Some((step, mut next)) = walk.follow(&vertex, drawn, aims, &mut scratch.stack)
+            let Some((mut step, mut next)) = walk.follow(&vertex, drawn, aims, &mut scratch.stack)
             else {
                 continue;
             };
@@ -179,11 +180,77 @@ impl Sharing {
                     self.shared.extend(Shared::new(next.hit));
                 }
             } else if whole {
-                sink.at(Place::Alone);
-                walk.connect(rng, &next, Some(&step), ALL, scratch, &mut sink);
-                sink.at(Place::AloneWalk);
-                walk.run(rng, next, scratch, &mut sink);
+                if next.hit.surface.specular() {
+                    let plain = step.pdf;
+                    step.pdf += walk.aims(Some(&self.aiming), h.p, &next.hit);
+                    sink.factor *= plain / step.pdf;
+                }
+                go_on_alone((walk, effort), (step, next), rng, scratch, &mut sink);
             }
+        }
+    }
+
+    /// Aims at near-mirrors from gather points in turn, `count` times, beside `alone` directions drawn by their scattering. What is met is walked on for
+    /// its own pixel.
+    pub(super) fn draw_from_mirrors(
+        &mut self,
+        (walk, film, effort): (&Walk, &Film, &Effort),
+        (count, alone): (u32, u32),
+        rng: &mut Rng,
+        scratch: &mut Scratch,
+        pixels: &mut [f32],
+    ) {
+        let Some(all) = walk.reflectors.filter(|_| count > 0) else {
+            return;
+        };
+        let size = film.pixel();
+        let points = self.gathers.len();
+        let turns = Turns::new(count, rng);
+        // As gather points aim at images.
+        let images = if walk.mirrors.list.is_empty() {
+            0.0
+        } else {
+            1.0
+        };
+        for j in 0..count {
+            let (vertex, k) = self.gathers[turns.choice(j, points)];
+            if !walk.goes_on(&vertex) {
+                continue;
+            }
+            let h = &vertex.hit;
+            let Some((triangle, p)) = self.aiming.draw(all, rng) else {
+                continue;
+            };
+            let w = (p - lift(h.p, h.n)).normalized();
+            let (value, plain) = (
+                h.surface.scatter(h.n, vertex.wo, w),
+                h.surface.pdf(h.n, vertex.wo, w),
+            );
+            if !(value > 0.0 && plain > 0.0) {
+                continue;
+            }
+            // The vertex as if it had been drawn by scattering: by that weight walks live or die.
+            let drawn = (w, value / plain, plain);
+            let Some((mut step, mut next)) =
+                walk.follow(&vertex, drawn, images, &mut scratch.stack)
+            else {
+                continue;
+            };
+            if next.hit.triangle != triangle {
+                continue;
+            }
+            next.hit.choose_lobe(walk.world, rng);
+            if !next.hit.surface.specular() || next.hit.surface.is_black() {
+                continue;
+            }
+            step.pdf += self.aiming.density(all, h.p, &next.hit);
+            let mut sink = PixelSink {
+                film,
+                pixel: &mut pixels[k * size..(k + 1) * size],
+                factor: points as f32 / alone as f32 * plain / step.pdf,
+                place: Place::Gather,
+            };
+            go_on_alone((walk, effort), (step, next), rng, scratch, &mut sink);
         }
     }
 
@@ -246,6 +313,20 @@ pub(super) struct Share {
     pub spots: f32,
     /// In light from points beyond other near-mirrors; 0 where it is not looked for.
     pub beyond: f32,
+}
+
+/// Connects what one pixel sees to the spots, and walks on from it.
+fn go_on_alone(
+    (walk, effort): (&Walk, &Effort),
+    (step, vertex): (Step, Vertex),
+    rng: &mut Rng,
+    scratch: &mut Scratch,
+    sink: &mut PixelSink,
+) {
+    sink.at(Place::Alone);
+    walk.connect(rng, &vertex, Some(&step), ALL, scratch, sink);
+    sink.at(Place::AloneWalk);
+    walk.run(rng, (vertex, effort.spots.1), scratch, sink);
 }
 
 /// Connects a near-mirror to light vertices beyond others.

@@ -12,7 +12,7 @@ use crate::{
     beam::find_spots,
     by_glass::ByGlass,
     caustic::Caustics,
-    contact::Contacts,
+    contact::{self, Contacts},
     ellipsoid::{self, Patches, Window},
     emitter::Emitters,
     film::Film,
@@ -21,6 +21,7 @@ use crate::{
     path_reuse::{Effort, NARROW_TILE, WIDE_TILE},
     photo,
     plan::plan as decide,
+    reflectors::Reflectors,
     truth::{self, Centres},
     two_bounce::Sampling,
     walk::Walk,
@@ -110,6 +111,7 @@ pub(super) fn prepare<R>(
         max_bounces: settings.max_bounces.unwrap_or(u32::MAX),
         lights: strategy.light_vertices.unwrap_or(true),
         caustics: None,
+        reflectors: None,
         glass: None,
         contacts: None,
         window: narrow.then(|| Window::new(&settings.gate)),
@@ -128,6 +130,10 @@ pub(super) fn prepare<R>(
     };
     stop.check()?;
     walk.caustics = caustics.as_ref();
+    // Few spots light few bins: what pixels share errs as much there as what each finds alone. So it does in a narrow gate.
+    let many = contact::many(emitters) && !narrow;
+    let reflectors = many.then(|| Reflectors::find(&world)).flatten();
+    walk.reflectors = reflectors.as_ref();
     let contacts = match walk.max_bounces {
         0 | 1 => None,
         _ => Contacts::find(&world, emitters),
@@ -145,6 +151,7 @@ pub(super) fn prepare<R>(
                 .unwrap_or(if narrow { NARROW_TILE } else { WIDE_TILE }),
             narrow,
             world.has_narrow_lobes(),
+            walk.reflectors.is_some(),
         ),
         seed: settings.seed,
         width: scene.camera.intrinsics.width,

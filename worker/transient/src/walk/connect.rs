@@ -10,6 +10,7 @@ use crate::{
     contact::Contacts,
     light_vertices,
     lobes::Seen,
+    reflectors::Aiming,
     rng::Rng,
     sink::{Sink, Way},
     spectra::{Light, ONES, Ratios, times},
@@ -141,12 +142,12 @@ impl Walk<'_> {
     }
 
     /// Looks for a spot's image in a planar mirror, `often` times on average (at most once). Returns that
-    /// number, 0 without mirrors, for MIS.
+    /// number, 0 without mirrors, for MIS. `aiming`: the vertex aims at near-mirrors as well.
     pub fn aim(
         &self,
         rng: &mut Rng,
         v: &Vertex,
-        often: f32,
+        (often, aiming): (f32, Option<&Aiming>),
         scratch: &mut Scratch,
         sink: &mut impl Sink,
     ) -> f32 {
@@ -154,7 +155,7 @@ impl Walk<'_> {
             return 0.0;
         }
         if often == 1.0 || rng.uniform() < often {
-            self.aim_once(rng, v, often, scratch, sink);
+            self.aim_once(rng, v, (often, aiming), scratch, sink);
         }
         often
     }
@@ -163,7 +164,7 @@ impl Walk<'_> {
         &self,
         rng: &mut Rng,
         v: &Vertex,
-        often: f32,
+        (often, aiming): (f32, Option<&Aiming>),
         scratch: &mut Scratch,
         sink: &mut impl Sink,
     ) {
@@ -200,7 +201,7 @@ impl Walk<'_> {
             return;
         }
         let aimed = often * aim.chance * self.mirrors.pdf(aim.mirror, aim.spot, h.p, m.p);
-        let plain = h.surface.pdf(h.n, v.wo, w);
+        let plain = h.surface.pdf(h.n, v.wo, w) + self.aims(aiming, h.p, &m);
         let mirror = Hit { surface: near, ..m };
         let light = Light {
             value: v.beta * value * free / (aimed + plain),
@@ -212,6 +213,13 @@ impl Walk<'_> {
         };
         sink.toward(w);
         sink.add(path, light, aim.spot, v.bounce + 2, Way::Image);
+    }
+
+    /// Aims at near-mirrors per steradian from `x` towards `m`, for one direction drawn by scattering.
+    #[inline]
+    pub fn aims(&self, aiming: Option<&Aiming>, x: Vec3, m: &Hit) -> f32 {
+        let both = self.reflectors.zip(aiming);
+        both.map_or(0.0, |(all, aiming)| aiming.density(all, x, m))
     }
 
     /// Connects a vertex to `count` light vertices of some kind, drawn by unshadowed contribution; a near-mirror's only to
