@@ -156,8 +156,9 @@ fn rooms_with_tinted_panes_have_the_energy_of_an_independent_tracer() {
         v(0.0, 2.2, 0.0),
         glass(0.65, false),
     ));
+    // Not on the floor itself: of glass in one plane with a wall neither side can say which is in front.
     s.objects.extend(room(
-        v(-1.6, -1.5, -3.6),
+        v(-1.6, -1.49, -3.6),
         v(-0.9, -0.6, -2.9),
         &glass(0.8, true),
     ));
