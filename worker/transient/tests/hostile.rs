@@ -210,7 +210,8 @@ fn beams(objects: usize) -> impl Draw<Value = Vec<Beam>> {
     let beam = (unit(), proptest::option::weighted(0.3, spot));
     proptest::collection::vec(
         beam.prop_map(|(direction, spot)| Beam { direction, spot }),
-        0..5,
+        // More than five begin another way of finding light.
+        0..12,
     )
 }
 
