@@ -1,14 +1,14 @@
 //! The whole image's energy by exactly two bounces and by three and more, against an independent tracer in f64: furnished
 //! rooms among the scenes, spots beside and in near-mirrors; pixels that hold a spot and pixels that see a near-mirror by
 //! themselves. `PICOFARM_EFFORT=32 cargo test --release -p picofarm-transient --test independent -- --nocapture` measures
-//! with 32 times the paths: what docs/accuracy.md says.
+//! with 32 times the paths: what docs/accuracy.md says. `PICOFARM_RUN=1` and so on are runs with other seeds.
 
 mod common;
 
 use common::{
     beam_to,
     brute::Noise,
-    compare::{BATCHES, Energies, Sums, alike, effort, joined, regions, rendered},
+    compare::{BATCHES, Energies, Sums, alike, effort, joined, regions, rendered, run},
     grey,
     light::{LONGEST, Source, Tracer, is_mirror},
     quad, room, scene, sphere, v,
@@ -29,7 +29,7 @@ fn traced(tracer: &Tracer, sources: &[Source], regions: &[usize], effort: usize)
     let batches: Vec<Sums> = (0..BATCHES)
         .into_par_iter()
         .map(|batch| {
-            let mut rng = Noise(1_000 + batch);
+            let mut rng = Noise(1_000 + BATCHES * run() + batch);
             let mut sums = Sums::default();
             for s in sources {
                 let share = effort * 5_000 / sources.len();

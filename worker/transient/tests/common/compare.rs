@@ -19,8 +19,18 @@ pub type Sums = [[f64; 2]; 3];
 pub type Energies = [[Energy; 2]; 3];
 
 pub fn effort() -> usize {
-    let text = std::env::var("PICOFARM_EFFORT").unwrap_or_else(|_| "1".into());
-    text.parse().expect("PICOFARM_EFFORT is a whole number")
+    whole("PICOFARM_EFFORT", "1") as usize
+}
+
+/// Which of many runs that know nothing of each other this is.
+pub fn run() -> u64 {
+    whole("PICOFARM_RUN", "0")
+}
+
+fn whole(name: &str, default: &str) -> u64 {
+    let text = std::env::var(name).unwrap_or_else(|_| default.into());
+    text.parse()
+        .unwrap_or_else(|_| panic!("{name} is a whole number"))
 }
 
 pub fn joined(batches: &[Sums]) -> Energies {
@@ -64,13 +74,13 @@ pub fn rendered(scene: &Scene, regions: &[usize], effort: usize) -> Energies {
     let batches: Vec<Sums> = (0..BATCHES)
         .map(|seed| {
             let set = Settings {
-                seed,
+                seed: BATCHES * run() + seed,
                 gate: Gate {
                     start_m: 0.0,
                     bin_width_m: 1.0,
                     bins: 400,
                 },
-                ..settings(Budget::Samples(6 * (effort as f64).sqrt() as u32))
+                ..settings(Budget::Samples(6 * effort as u32))
             };
             let r = ok(scene, &set);
             let split = r.split.expect("a split was asked for");
