@@ -150,6 +150,28 @@ impl Panes {
         self.shares(stack, a, b)[0]
     }
 
+    /// [`Panes::through`] from one point to many: calls `each` with the index of every way that glass crosses, and its share.
+    pub fn through_bundle(
+        &self,
+        stack: &mut Stack,
+        from: Vec3,
+        to: &[Vec3],
+        mut each: impl FnMut(usize, f32),
+    ) {
+        self.bvh.deepen(stack);
+        let mut crossed = std::mem::take(&mut stack.crossed);
+        crossed.resize(to.len(), false);
+        self.bvh.occluded_bundle(stack, from, to, &mut crossed);
+        for (k, _) in crossed.iter().enumerate().filter(|(_, crossed)| **crossed) {
+            let mut share = 1.0;
+            self.across(stack, from, to[k] - from, |glass, _, along| {
+                share *= glass.through(along.abs())[0];
+            });
+            each(k, share);
+        }
+        stack.crossed = crossed;
+    }
+
     /// Shares of red, green and blue light that pass on the straight way from `a` to `b`.
     pub fn tint(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 3] {
         let [_, r, g, b] = self.shares(stack, a, b);
@@ -210,11 +232,21 @@ impl Panes {
     }
 
     /// Calls `each` for every pane across a way, with its triangle and the way's direction along its normal.
-    fn each(&self, stack: &mut Stack, a: Vec3, way: Vec3, mut each: impl FnMut(&Glass, u32, f32)) {
+    fn each(&self, stack: &mut Stack, a: Vec3, way: Vec3, each: impl FnMut(&Glass, u32, f32)) {
         self.bvh.deepen(stack);
-        if !self.bvh.occluded(stack, a, way, 1.0) {
-            return;
+        if self.bvh.occluded(stack, a, way, 1.0) {
+            self.across(stack, a, way, each);
         }
+    }
+
+    /// The same of a way that glass is known to cross.
+    fn across(
+        &self,
+        stack: &mut Stack,
+        a: Vec3,
+        way: Vec3,
+        mut each: impl FnMut(&Glass, u32, f32),
+    ) {
         let length = way.length();
         let mut met = std::mem::take(&mut stack.met);
         self.bvh.all(stack, (a, way, 1.0), &mut met);

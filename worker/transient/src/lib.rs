@@ -26,6 +26,7 @@ mod plan;
 mod reflectors;
 mod render;
 mod rng;
+mod segments;
 pub mod sensor;
 mod sink;
 mod spectra;

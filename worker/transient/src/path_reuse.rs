@@ -18,7 +18,6 @@ mod candidates;
 mod draw;
 mod effort;
 mod gloss;
-mod segments;
 mod spectral;
 mod spread;
 mod weigh;
@@ -27,7 +26,6 @@ use self::{
     candidates::Candidates,
     draw::{Share, gather_point, only_mirrors},
     gloss::Gloss,
-    segments::Segments,
     weigh::Lengths,
 };
 
@@ -46,6 +44,7 @@ use crate::{
     lobes::{Lobes, Seen},
     reflectors::Aiming,
     rng::{Rng, Stream},
+    segments::Segments,
     sink::{PixelSink, Place, Sink, Way},
     spectra::{Light, ONES, Ratios},
     turns::place,

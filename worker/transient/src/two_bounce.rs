@@ -9,6 +9,7 @@ use crate::{
     film::{Blocks, Film},
     lobes::Seen,
     rng::Rng,
+    segments::Segments,
     spectra::{Light, ONES, times},
     truth::Centres,
     walk::{Scratch, Walk},
@@ -98,9 +99,7 @@ pub(crate) struct Strata {
     weights: Vec<f32>,
     /// Which of its strata each block samples twice; those samples come after all others.
     twice: Vec<u32>,
-    ends: Vec<Vec3>,
-    ends_of: Vec<usize>,
-    blocked: Vec<bool>,
+    segments: Segments,
     /// `[sample][spot]`: slot, and value where the spot is seen.
     found: Vec<(u32, f32)>,
 }
@@ -179,30 +178,20 @@ impl Strata {
         for (of_ray, range) in emitters.rays.iter().enumerate() {
             let samples = ((of_ray + rays - first) % rays..samples).step_by(rays);
             for (k, spot) in range.clone().enumerate() {
-                self.ends.clear();
-                self.ends_of.clear();
+                self.segments.clear();
                 for sample in samples.clone() {
                     if self.weights[sample * spots + k] > 0.0 {
-                        self.ends.push(self.lifted[sample]);
-                        self.ends_of.push(sample);
+                        self.segments.push(sample, self.lifted[sample]);
                     }
                 }
-                self.blocked.resize(self.ends.len(), false);
-                world.bvh.occluded_bundle(
-                    &mut scratch.stack,
-                    emitters.lifted[spot],
-                    &self.ends,
-                    &mut self.blocked,
-                );
+                let from = emitters.lifted[spot];
+                self.segments.trace(world, &mut scratch.stack, from);
                 let e = &emitters.list[spot];
-                for (&sample, &blocked) in self.ends_of.iter().zip(&self.blocked) {
-                    let hit = self.hits[sample].as_ref().filter(|_| !blocked);
-                    if let Some(h) = hit {
+                for (sample, through) in self.segments.found() {
+                    if let (Some(h), Some(through)) = (&self.hits[sample], through) {
                         let leg = world.metres((e.p - h.p).length());
                         let slot = film.slot(e.path_m + leg + self.range_m[sample]);
                         let at = sample * spots + k;
-                        let (a, b) = (emitters.lifted[spot], self.lifted[sample]);
-                        let through = world.glass(&mut scratch.stack, a, b);
                         self.found[at] = (slot as u32, self.weights[at] * through);
                     }
                 }

@@ -415,6 +415,20 @@ impl World {
         }
     }
 
+    /// The same from one point to many: calls `each` with the index of every way that glass crosses, and its share.
+    #[inline(always)]
+    pub fn glass_bundle(
+        &self,
+        stack: &mut Stack,
+        from: Vec3,
+        to: &[Vec3],
+        each: impl FnMut(usize, f32),
+    ) {
+        if let Some(panes) = &self.panes {
+            panes.through_bundle(stack, from, to, each);
+        }
+    }
+
     /// The same of red, green and blue.
     pub fn tint(&self, stack: &mut Stack, a: Vec3, b: Vec3) -> [f32; 3] {
         match &self.panes {

@@ -87,6 +87,8 @@ pub struct Stack {
     bundle: Box<bundle::Scratch>,
     /// What a segment meets of glass.
     pub(crate) met: Vec<(f32, u32)>,
+    /// Which of a bundle's segments glass crosses.
+    pub(crate) crossed: Vec<bool>,
     /// Rays traced with this stack.
     pub rays: u64,
 }
@@ -131,6 +133,7 @@ impl Bvh {
             entries: vec![(0, 0.0); deepest],
             masks: vec![0; deepest],
             met: vec![],
+            crossed: vec![],
             bundle: Box::new(bundle::Scratch::new()),
             rays: 0,
         }

@@ -96,6 +96,26 @@ proptest! {
     }
 }
 
+proptest! {
+    #[test]
+    fn a_bundle_passes_as_each_way_of_it_does(
+        triangles in prop::collection::vec([corner(), corner(), corner()], 1..40),
+        from in corner(),
+        to in prop::collection::vec(corner(), 0..150),
+    ) {
+        let materials: Vec<Material> = (0..triangles.len())
+            .map(|k| pane(1.5, 0.3 + 0.6 * (k as f32 / 40.0), k % 3 == 0))
+            .collect();
+        let panes = built(&triangles, &materials);
+        let (mut alone, mut together) = (panes.bvh.stack(), panes.bvh.stack());
+        let expected: Vec<f32> = to.iter().map(|&to| panes.through(&mut alone, from, to)).collect();
+        let mut found = vec![1.0; to.len()];
+        panes.through_bundle(&mut together, from, &to, |k, share| found[k] = share);
+        prop_assert_eq!(found, expected);
+        prop_assert_eq!(together.rays, alone.rays);
+    }
+}
+
 #[test]
 fn an_edge_between_two_triangles_is_met_once() {
     let at = |x: f32, y: f32| Vec3::new(x, y, 1.0);

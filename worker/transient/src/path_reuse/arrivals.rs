@@ -27,8 +27,9 @@ struct Carry {
 }
 
 impl Carry {
-    fn new(rough: bool, lit: &[usize], weights: &[f32], rng: &mut Rng) -> Self {
-        let total: f32 = lit.iter().map(|&spot| weights[spot]).sum();
+    /// `lit` are the spots that are seen, with the share of their light that glass lets through.
+    fn new(rough: bool, lit: &[(usize, f32)], weights: &[f32], rng: &mut Rng) -> Self {
+        let total: f32 = lit.iter().map(|&(spot, _)| weights[spot]).sum();
         let step = total / ROUGH_SPOTS as f32;
         let drawn = rough && lit.len() > ROUGH_SPOTS && step > 1e-30 && step.is_finite();
         Self {
@@ -149,19 +150,12 @@ impl Sharing {
         }
         let from = lift(h.p, h.n);
         self.segments.trace(walk.world, &mut scratch.stack, from);
-        let lit = self.segments.found().filter(|&(_, blocked)| !blocked);
-        let lit: Vec<usize> = lit.map(|(spot, _)| spot).collect();
-        // The densities below are of what is drawn: with glass in the way as without.
-        let mut through = vec![];
-        if walk.world.has_glass() {
-            let share = |spot: &usize| {
-                let to = emitters.lifted[*spot];
-                walk.world.glass(&mut scratch.stack, from, to)
-            };
-            through = lit.iter().map(share).collect();
-        }
+        let lit = self.segments.found();
+        let lit = lit.filter_map(|(spot, through)| Some((spot, through?)));
+        let lit: Vec<(usize, f32)> = lit.collect();
         let mut carry = Carry::new(y.rough.is_some(), &lit, &scratch.weights, rng);
-        for (k, &spot) in lit.iter().enumerate() {
+        // The densities are of what is drawn: with glass in the way as without.
+        for (spot, through) in lit {
             let (e, w) = (&emitters.list[spot], scratch.weights[spot]);
             let to = h.p - e.p;
             let d2 = to.dot(to);
@@ -174,7 +168,6 @@ impl Sharing {
                 e.surface.pdf(e.n, e.back, out) * h.n.dot(out).abs() / d2
             };
             let path = nearest + walk.world.metres(d) + e.path_m;
-            let through = through.get(k).copied().unwrap_or(1.0);
             let carried = carry.share(w) * through;
             if carried > 0.0 && walk.window.is_none_or(|w| w.holds(path)) {
                 let back = to * (-1.0 / d);
@@ -215,21 +208,22 @@ mod tests {
     fn each_spot_is_carried_with_its_own_weight_on_average() {
         const SPOTS: usize = 100;
         let weights: Vec<f32> = (0..SPOTS).map(|k| (1 + k * k % 17) as f32).collect();
-        let lit: Vec<usize> = (0..SPOTS).filter(|k| k % 4 != 1).collect();
+        let lit = (0..SPOTS).filter(|k| k % 4 != 1).map(|k| (k, 1.0));
+        let lit: Vec<(usize, f32)> = lit.collect();
         assert!(lit.len() > super::ROUGH_SPOTS);
         let mut rng = Rng::new(1, Stream::Paths, 2, 3);
         let (mut sums, n) = ([0.0f64; SPOTS], 20_000);
         for _ in 0..n {
             let mut carry = Carry::new(true, &lit, &weights, &mut rng);
             let mut carried = 0;
-            for &spot in &lit {
+            for &(spot, _) in &lit {
                 let share = carry.share(weights[spot]);
                 carried += u32::from(share > 0.0);
                 sums[spot] += f64::from(share) / f64::from(n);
             }
             assert!(carried <= super::ROUGH_SPOTS as u32 + 1);
         }
-        for &spot in &lit {
+        for &(spot, _) in &lit {
             let miss = sums[spot] / f64::from(weights[spot]) - 1.0;
             assert!(miss.abs() < 0.06, "spot {spot}: {miss}");
         }

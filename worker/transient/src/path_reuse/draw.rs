@@ -97,14 +97,14 @@ impl Sharing {
             }
             let from = lift(y.hit.p, y.hit.n);
             self.segments.trace(walk.world, stack, from);
-            for (i, blocked) in self.segments.found() {
+            for (i, through) in self.segments.found() {
+                let Some(through) = through else { continue };
                 let (v, k) = &self.gathers[i];
                 let leg = walk.world.metres((y.hit.p - v.hit.p).length());
                 let path = v.length_m + leg + y.path_m;
-                if !blocked && walk.window.is_none_or(|w| w.holds(path)) {
+                if walk.window.is_none_or(|w| w.holds(path)) {
                     let pixel = &mut pixels[k * size..(k + 1) * size];
                     let spot = film.tag(y.spot, Place::Gather, Way::Zone);
-                    let through = walk.world.glass(stack, from, lift(v.hit.p, v.hit.n));
                     let light = Light {
                         value: self.weight[i] * through,
                         ratios: match film.spectral {

@@ -91,8 +91,8 @@ impl Sharing {
         }
         let from = lift(h.p, h.n);
         self.segments.trace(walk.world, &mut scratch.stack, from);
-        for (i, blocked) in self.segments.found() {
-            if blocked {
+        for (i, through) in self.segments.found() {
+            if through.is_none() {
                 weight[i] = 0.0;
             }
         }
@@ -116,10 +116,8 @@ impl Sharing {
             weight[i] = value;
         }
         if walk.world.has_glass() {
-            for (i, to) in self.segments.iter() {
-                if weight[i] > 0.0 {
-                    weight[i] *= walk.world.glass(&mut scratch.stack, from, to);
-                }
+            for (i, through) in self.segments.found() {
+                weight[i] *= through.unwrap_or(0.0);
             }
         }
         density
