@@ -16,6 +16,20 @@ use crate::{
     world::{Hit, World, lift},
 };
 
+/// How strata a side grow with the width of pixels where that is small. 6×6 for 4×4 at 256×256 (8 to 24 passes): error² × CPU time
+/// 0.70 to 0.92 in furnished rooms of 1 to 25 spots, 1.05 with 100.
+const NARROW_PIXELS: f32 = 0.1;
+
+/// Strata a side beside 16 camera paths in pixels so wide at unit distance: eight where that is 1/32 (64 pixels over 90°). Wider pixels
+/// straddle more bins: more strata, as the root of the width. In narrower ones a spot's light is in a bin or two, which is no
+/// easier: nearly as many.
+fn strata(pixel: f32) -> f32 {
+    match pixel * 128.0 {
+        wide if wide >= 4.0 => 4.0 * wide.sqrt(),
+        narrow => 8.0 * libm::powf(narrow / 4.0, NARROW_PIXELS),
+    }
+}
+
 /// How finely pixels are sampled.
 #[derive(Debug, Clone)]
 pub(crate) struct Sampling {
@@ -29,10 +43,7 @@ pub(crate) struct Sampling {
 impl Sampling {
     pub fn plan(world: &World, emitters: &Emitters, centres: &Centres, stop: Stop) -> Self {
         let i = world.camera.intrinsics;
-        // 4×4 where a pixel is 1/128 wide at unit distance (256 pixels over 90°), finer as the root of
-        // its width: wider pixels straddle more bins.
-        let pixel = world.sensitive / i.fx.min(i.fy);
-        let base = 4.0 * (pixel * 128.0).sqrt();
+        let base = strata(world.sensitive / i.fx.min(i.fy));
         let narrow = |k: usize| {
             centres.hits[k].as_ref().is_some_and(|h| {
                 h.surface.specular()
@@ -234,7 +245,25 @@ impl Strata {
 
 #[cfg(test)]
 mod tests {
-    use super::Sampling;
+    use super::{Sampling, strata};
+
+    #[test]
+    fn wide_pixels_have_more_strata_and_narrow_ones_nearly_as_many() {
+        let of = |pixels: f32| strata(2.0 / pixels);
+        assert_eq!((of(16.0), of(64.0)), (16.0, 8.0));
+        // No step between the two laws.
+        assert!((of(64.1) / 8.0 - 1.0).abs() < 1e-3);
+        let base = of(256.0);
+        let sides = |n| {
+            Sampling {
+                base,
+                refined: vec![],
+            }
+            .sides(n)
+            .0
+        };
+        assert_eq!((sides(4), sides(8), sides(24)), (6, 6, 8));
+    }
 
     #[test]
     fn rounds_of_strata_join_by_their_passes() {

@@ -118,6 +118,10 @@ pub(super) fn shut_out(variance: &mut [f32], slots: usize) {
     }
 }
 
+/// The power of the passes that the variance of the 3+ part falls with in the median over pixels, stated or true: after few passes most
+/// pixels have not met what is rare and bright. From 4 to 64 passes it was −0.84 to −0.92 in rooms of 1 to 100 spots.
+const FALL: f64 = 0.87;
+
 /// A pixel's sums for the error estimate.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Stat {
@@ -263,7 +267,7 @@ impl Errors {
 
 /// The median standard error after `n` passes of pixels that stand as `stats` says after `passes`.
 pub(super) fn median_after(stats: &[Stat], passes: u32, n: u32, two: &impl Fn(u32) -> f64) -> f64 {
-    let scale = f64::from(passes) / f64::from(n);
+    let scale = libm::pow(f64::from(passes) / f64::from(n), FALL);
     let then = stats.iter().map(|s| {
         // As `sorted` would find it after n passes: the measured norm loses the variance of now.
         let now = s.two_variance + s.multi_variance;
