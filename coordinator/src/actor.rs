@@ -13,8 +13,8 @@ use picofarm_catalog::{Catalog, CatalogError, Changes, Job, Settled};
 use picofarm_proto::{
     ids::{JobId, LeaseRef, StageRef},
     model::{
-        Failure, FailureKind, Finished, JobPlan, JobState, SpecError, TaskLog, TaskProgress,
-        WorkerHello,
+        Failure, FailureKind, Finished, JobPlan, JobSpec, JobState, SpecError, TaskLog,
+        TaskProgress, WorkerHello,
     },
 };
 use tokio::{
@@ -27,7 +27,9 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings},
+    core::{
+        Core, Fits, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings,
+    },
     health::Health,
     metrics::{Metrics, Tally},
     sessions::{Sessions, Waiting},
@@ -105,6 +107,8 @@ pub(crate) enum Command {
     Drain(String, Reply<u32>),
     Retry(JobId, Reply<u64>),
     Workers(Reply<u32>),
+    /// Which connected workers could run a job that is planned.
+    Fits(Arc<JobSpec>, Reply<Fits>),
     /// What the instance knows, without asking the catalog.
     Look(Reply<Look>),
     LookAt {
@@ -439,6 +443,9 @@ impl Life<'_> {
                 Command::Workers(reply) => {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
+                Command::Fits(spec, reply) => {
+                    let _ = reply.send(Ok(self.core.fits(&spec)));
+                }
                 Command::Look(reply) => {
                     let _ = reply.send(Ok(self.core.look()));
                 }
@@ -677,6 +684,7 @@ fn refuse(command: Command, error: &str) {
         Command::Drain(_, reply) => no(reply, error),
         Command::Retry(_, reply) => no(reply, error),
         Command::Workers(reply) => no(reply, error),
+        Command::Fits(_, reply) => no(reply, error),
         Command::Look(reply) => no(reply, error),
         Command::LookAt { reply, .. } => no(reply, error),
     }

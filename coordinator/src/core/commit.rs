@@ -182,6 +182,7 @@ impl Core {
             let timing = &mut self.sets[set].timing;
             timing.tasks += 1;
             timing.seconds += report.seconds;
+            timing.bytes += report.bytes as f64;
             EventKind::Committed
         };
         let about = About::default()

@@ -9,6 +9,7 @@ mod claims;
 mod commit;
 mod dispatch;
 mod facts;
+mod fits;
 mod jobs;
 mod leases;
 mod load;
@@ -40,6 +41,7 @@ use tail::Double;
 
 pub(crate) use commit::OutputHint;
 pub(crate) use facts::{JobLook, Look};
+pub(crate) use fits::{Fit, Fits};
 pub(crate) use jobs::{
     Learnt, Overlay, Prepared, Timings, may_force, place_is_free, prepare, recorded_status,
     stands_for,

@@ -6,6 +6,7 @@
 
 mod check;
 mod draft;
+mod foresee;
 mod judge;
 mod look;
 mod report;
@@ -13,11 +14,12 @@ mod report;
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, StageRecord, Submission,
+    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, ResultSet, Run, StageRecord,
+    Submission,
 };
 use picofarm_proto::{
     ids::JobId,
-    model::{JobPlan, JobState},
+    model::{JobPlan, JobState, SpecError},
 };
 use tokio::sync::{Mutex, mpsc};
 use uuid::Uuid;
@@ -101,7 +103,52 @@ impl Submissions {
 
     /// What submitting would do.
     pub(crate) async fn plan(&self, draft: &Arc<Draft>, by: &Caller) -> Result<JobPlan, Refusal> {
+        self.in_time(draft)?;
         Ok(self.consider(draft, by).await?.plan)
+    }
+
+    /// Refuses a deadline that has passed, because the job would be cancelled at once.
+    fn in_time(&self, draft: &Draft) -> Result<(), Refusal> {
+        let limits = &draft.spec.limits;
+        let deadline = limits.deadline_ms().map_err(Refusal::Spec)?;
+        if deadline.is_some_and(|at| at <= self.clock.now_ms()) {
+            let what = format!(
+                "{:?} is in the past, so the job would be cancelled at once; give a later time, or remove it",
+                limits.deadline
+            );
+            return Err(Refusal::Spec(SpecError::new("limits.deadline", what)));
+        }
+        Ok(())
+    }
+
+    /// Adds warnings and estimates to a plan.
+    async fn foresee(
+        &self,
+        draft: &Draft,
+        plan: &mut JobPlan,
+        recent: &[Job],
+    ) -> Result<(), Refusal> {
+        let (reply, answer) = tokio::sync::oneshot::channel();
+        let ask = Command::Fits(Arc::clone(&draft.spec), reply);
+        let gone = || Refusal::NotNow("the coordinator is stopping; try again".into());
+        self.commands.send(ask).await.map_err(|_| gone())?;
+        let fits = answer.await.map_err(|_| gone())??;
+        let stages = draft.spec.stages.iter().zip(&fits.stages);
+        for (planned, (stage, fit)) in plan.stages.iter_mut().zip(stages) {
+            planned.workers = fit.able;
+            if planned.run == 0 {
+                continue;
+            }
+            let mut measured = Vec::new();
+            for other in foresee::similar(stage, recent) {
+                let timing = self.catalog.timing(&ResultSet::of(other)).await;
+                measured.push((other, timing.map_err(broken)?));
+            }
+            (planned.task_seconds, planned.task_bytes, planned.measured) =
+                foresee::estimate(stage, fit, &measured);
+        }
+        plan.warnings = foresee::warnings(&draft.spec, plan, &fits);
+        Ok(())
     }
 
     /// Records a job, unless there is one that stands for it. `most`: jobs that the caller may have that have not ended.
@@ -112,6 +159,7 @@ impl Submissions {
         most: u64,
         again: bool,
     ) -> Result<Submitted, Refusal> {
+        self.in_time(draft)?;
         for _ in 0..ATTEMPTS {
             let considered = self.consider(draft, by).await?;
             let latest = considered.latest.as_ref();
@@ -164,7 +212,9 @@ impl Submissions {
             .heavy(draft, move |it, draft| async move {
                 let catalog = Arc::clone(&it.catalog);
                 let recent = catalog.recent(RECENT, &sight).await.map_err(broken)?;
-                Ok((report::plan(&draft, &findings, existing, &recent), findings))
+                let mut plan = report::plan(&draft, &findings, existing, &recent);
+                it.foresee(&draft, &mut plan, &recent).await?;
+                Ok((plan, findings))
             })
             .await?;
         Ok(Considered {

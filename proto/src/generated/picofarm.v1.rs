@@ -180,8 +180,19 @@ pub struct JobPlan {
     pub existing_job: ::prost::alloc::string::String,
     #[prost(message, repeated, tag = "7")]
     pub stages: ::prost::alloc::vec::Vec<StagePlan>,
+    /// Settings that are probably not meant, and stages that no connected worker can run; in words.
+    #[prost(string, repeated, tag = "8")]
+    pub warnings: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+/// An estimated quantity: at least and at most.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Estimate {
+    #[prost(double, tag = "1")]
+    pub low: f64,
+    #[prost(double, tag = "2")]
+    pub high: f64,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StagePlan {
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
@@ -199,6 +210,18 @@ pub struct StagePlan {
     /// About how much memory each task takes; 0 = not known.
     #[prost(uint64, tag = "7")]
     pub memory_bytes: u64,
+    /// Connected workers that can run its tasks.
+    #[prost(uint32, tag = "8")]
+    pub workers: u32,
+    /// Seconds that one task takes on one of them; absent = not known.
+    #[prost(message, optional, tag = "9")]
+    pub task_seconds: ::core::option::Option<Estimate>,
+    /// Bytes that one task stores; absent = not known.
+    #[prost(message, optional, tag = "10")]
+    pub task_bytes: ::core::option::Option<Estimate>,
+    /// Whether the estimates come from tasks that this farm has run.
+    #[prost(bool, tag = "11")]
+    pub measured: bool,
 }
 /// One line of a job's history.
 #[derive(Clone, PartialEq, ::prost::Message)]

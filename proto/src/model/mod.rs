@@ -54,8 +54,8 @@ pub use scale::scaled;
 pub use spec_error::SpecError;
 pub use stage::StageSpec;
 pub use status::{
-    Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan, StageState,
-    StageStatus, TaskCounts,
+    Estimate, Event, EventKind, JobPlan, JobState, JobStatus, JobSummary, RunningTask, StagePlan,
+    StageState, StageStatus, TaskCounts,
 };
 pub use stop::{Halving, Median, Stop};
 pub use trial::Trial;

@@ -134,6 +134,8 @@ pub struct Timing {
     pub tasks: u64,
     /// Sum of their seconds.
     pub seconds: f64,
+    /// Sum of their bytes.
+    pub bytes: f64,
 }
 
 impl Timing {

@@ -69,7 +69,8 @@ macro_rules! job_queries {
 
             pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
                 let row = sqlx::query(
-                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds \
+                    "SELECT count(*) AS timed, CAST(coalesce(sum(seconds), 0) AS DOUBLE PRECISION) AS seconds, \
+                     CAST(coalesce(sum(bytes), 0) AS DOUBLE PRECISION) AS bytes \
                      FROM output WHERE NOT adopted AND result_set = \
                      (SELECT key FROM result_set WHERE store = $1 AND dataset = $2 AND stage_key = $3)",
                 )
@@ -85,6 +86,7 @@ macro_rules! job_queries {
                 Ok(Timing {
                     tasks: uint(row, "timed")?,
                     seconds: row.try_get("seconds")?,
+                    bytes: row.try_get("bytes")?,
                 })
             }
 

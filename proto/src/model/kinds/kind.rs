@@ -68,6 +68,11 @@ pub trait TaskKind: fmt::Debug + Send + Sync {
         Ok(())
     }
 
+    /// Settings that can be used but are probably not meant, in words that name the field. They are warnings of a plan.
+    fn remarks(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Everything that shapes its results but their number: what the key of its stage hashes.
     fn shaping(&self) -> Value;
 

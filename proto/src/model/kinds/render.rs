@@ -151,6 +151,10 @@ impl TaskKind for RenderTask {
         self.output.check()
     }
 
+    fn remarks(&self) -> Vec<String> {
+        self.render.remarks(&self.scenes.kind)
+    }
+
     /// File scenes count by content and position, not by path; the place where results go does not count, nor the number
     /// of parts.
     fn shaping(&self) -> Value {
