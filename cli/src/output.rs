@@ -187,14 +187,18 @@ pub fn table(rows: &[Vec<String>]) -> String {
         .collect()
 }
 
-/// "1.5 s", "2 min 05 s", "3 h 10 min".
+/// "1.5 s", "2 min 05 s", "3 h 10 min", "42 days", "more than 1,000 years".
 pub fn duration(seconds: f64) -> String {
+    const DAY: u64 = 86_400;
+    const THOUSAND_YEARS: u64 = 365_250 * DAY;
     let s = seconds.max(0.0);
     let whole = s.round() as u64;
     match whole {
         0..=59 => format!("{s:.1} s"),
         60..=3599 => format!("{} min {:02} s", whole / 60, whole % 60),
-        _ => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+        3600..864_000 => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+        864_000..THOUSAND_YEARS => format!("{} days", whole / DAY),
+        _ => "more than 1,000 years".to_owned(),
     }
 }
 
@@ -226,6 +230,8 @@ mod tests {
         assert_eq!(duration(1.54), "1.5 s");
         assert_eq!(duration(125.0), "2 min 05 s");
         assert_eq!(duration(11_400.0), "3 h 10 min");
+        assert_eq!(duration(864_000.0), "10 days");
+        assert_eq!(duration(1e15), "more than 1,000 years");
     }
 
     #[test]

@@ -127,7 +127,11 @@ fn unplaceable(fit: &Fit, fits: &Fits) -> Option<String> {
                 .to_owned()
         }
         n => format!(
-            "none of the {n} connected workers can run its tasks{others}: {}",
+            "{}{others}: {}",
+            match n {
+                1 => "the only connected worker cannot run its tasks".to_owned(),
+                n => format!("none of the {n} connected workers can run its tasks"),
+            },
             match fit.refusals.is_empty() {
                 true => "all of them are ending".to_owned(),
                 false => fit.refusals.join("; "),

@@ -416,3 +416,53 @@ async fn a_drained_worker_hears_it_and_gets_nothing_more() {
     let unknown = farm.jobs.drain_worker(drain).await.unwrap_err();
     assert_eq!(unknown.code(), tonic::Code::NotFound);
 }
+
+#[tokio::test]
+async fn a_deadline_in_the_past_is_refused_by_plan_and_submission() {
+    let mut farm = Farm::start().await;
+    let mut late = spec(3);
+    // The clock of these tests begins 1,000 s after 1970.
+    late.limits.deadline = "1970-01-01T00:10:00Z".into();
+    let submit = wire::SubmitJobRequest {
+        spec: Some(late.clone().into()),
+        again: false,
+    };
+    let refused = farm.jobs.submit_job(submit).await.unwrap_err();
+    let plan = wire::PlanJobRequest {
+        spec: Some(late.into()),
+    };
+    for status in [refused, farm.jobs.plan_job(plan).await.unwrap_err()] {
+        assert_eq!(status.code(), tonic::Code::InvalidArgument, "{status:?}");
+        let said = status.message();
+        assert!(
+            said.contains("limits.deadline") && said.contains("is in the past"),
+            "{said}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_plan_warns_of_what_no_connected_worker_has_and_estimates_from_earlier_tasks() {
+    let mut farm = Farm::start().await;
+    let mut big = spec(2);
+    big.stages[0].resources.cores = 1000;
+    let plan = farm.plan(&big).await;
+    assert!(
+        plan.warnings[0].contains("no worker is connected"),
+        "{plan:?}"
+    );
+    let job = farm.submit(&spec(2)).await.job_id;
+    let mut worker = farm.worker().await;
+    let lease = worker.lease().await;
+    for task in lease.lo..lease.hi {
+        assert!(worker.done(&lease, task).await.accepted);
+    }
+    let plan = farm.plan(&big).await;
+    assert!(plan.warnings[0].contains("1000 cores"), "{plan:?}");
+    let plan = farm.plan(&named("more", 200)).await;
+    assert!(plan.warnings.is_empty(), "{plan:?}");
+    let stage = &plan.stages[0];
+    assert_eq!(stage.workers, 1);
+    assert!(stage.measured && stage.task_seconds.is_some(), "{stage:?}");
+    drop((worker, job));
+}

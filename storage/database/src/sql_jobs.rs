@@ -79,12 +79,8 @@ macro_rules! job_queries {
                 .bind(&set.stage_key.0[..])
                 .fetch_one(c)
                 .await?;
-                timing_of(&row)
-            }
-
-            fn timing_of(row: &DbRow) -> Result<Timing> {
                 Ok(Timing {
-                    tasks: uint(row, "timed")?,
+                    tasks: uint(&row, "timed")?,
                     seconds: row.try_get("seconds")?,
                     bytes: row.try_get("bytes")?,
                 })
@@ -110,7 +106,12 @@ macro_rules! job_queries {
                 Ok(Some(JobRecord {
                     job: job(&row)?,
                     stages,
-                    timing: timing_of(&row)?,
+                    timing: Timing {
+                        tasks: uint(&row, "timed")?,
+                        seconds: row.try_get("seconds")?,
+                        // A job's record keeps no bytes; the outputs have them.
+                        bytes: 0.0,
+                    },
                 }))
             }
 

@@ -202,8 +202,7 @@ impl RenderSettings {
             && error < SMALL_ERROR
         {
             remarks.push(format!(
-                "render.error = {} %: takes about {:.0e} paths a pixel, {:.0e} times the work of 10 %",
-                error * 100.0,
+                "render.error = {error}: takes about {:.0e} paths a pixel, {:.0e} times the work of 0.1",
                 8.0 * (0.1 / error).powi(2),
                 (0.1 / error).powi(2)
             ));
