@@ -136,6 +136,11 @@ impl TaskKind for RenderTask {
                         `picofarm scene plan` tells how many that would be";
             return Err(SpecError::new("parts", what));
         }
+        if self.output.profile == "counts-u16" {
+            let what = "\"counts-u16\" stores whole photon counts, and a render has none; use \"sqrt-u16\", or detect \
+                        photons in a reprocess stage";
+            return Err(SpecError::new("output.profile", what));
+        }
         if let [smallest, ..] = self.render.subsets[..]
             && self.scenes.spots != Spots::Grid(100)
         {
