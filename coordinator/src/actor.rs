@@ -29,6 +29,7 @@ use crate::{
     clock::Clock,
     core::{Core, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings},
     health::Health,
+    memory::{Memory, kept_cost},
     metrics::{Metrics, Tally},
     sessions::{Sessions, Waiting},
     trace,
@@ -139,6 +140,7 @@ pub(crate) struct Actor {
     pub metrics: Arc<Metrics>,
     pub health: Arc<Health>,
     pub stop: CancellationToken,
+    pub memory: Arc<Memory>,
     pub aside: Arc<dyn Aside>,
 }
 
@@ -171,6 +173,8 @@ struct Life<'a> {
     commits: Vec<Span>,
     /// By the clock that counts stalls and suspends: when that was looked at last.
     looked_ms: i64,
+    /// Memory that the specs of jobs take that have not ended.
+    kept: HashMap<JobId, u64>,
     /// Jobs that are being read, and since when.
     learning: HashMap<JobId, Instant>,
     /// Reports about which a store is being asked.
@@ -216,6 +220,8 @@ impl Actor {
         }
         tracing::debug!(instance = %snapshot.instance, jobs = snapshot.jobs.len(),
             ranges = snapshot.owned.ranges.len(), "an instance begins");
+        let jobs = snapshot.jobs.iter();
+        let kept = jobs.map(|job| (job.id, kept_cost(&job.spec))).collect();
         let core = Core::load(
             snapshot,
             &timings,
@@ -223,16 +229,19 @@ impl Actor {
             Box::new(Uuid::now_v7),
             self.clock.now_ms(),
         );
-        Ok(Life {
+        let life = Life {
             actor: self,
             core,
+            kept,
             sessions: Sessions::default(),
             tally: Tally::default(),
             commits: Vec::new(),
             looked_ms: self.clock.passed_ms(),
             learning: HashMap::new(),
             disputes: 0,
-        })
+        };
+        life.note_kept();
+        Ok(life)
     }
 }
 
@@ -340,6 +349,8 @@ impl Life<'_> {
         self.actor.health.beat();
         let now = self.now();
         let unknown = self.core.hear(news, now);
+        self.kept.retain(|job, _| self.core.knows(*job));
+        self.note_kept();
         let begun = |at: &mut Instant| at.elapsed() < READ_AGAIN;
         self.learning
             .retain(|job, at| unknown.contains(job) && begun(at));
@@ -356,9 +367,16 @@ impl Life<'_> {
     fn learn(&mut self, learnt: Learnt) {
         self.learning.remove(&learnt.job.id);
         if !self.core.knows(learnt.job.id) {
+            self.kept.insert(learnt.job.id, learnt.kept);
             self.core
                 .add_job(&learnt.job, learnt.stages, &learnt.timings);
+            self.note_kept();
         }
+    }
+
+    /// Says how much memory the specs of jobs take that have not ended.
+    fn note_kept(&self) {
+        self.actor.memory.keep_jobs(self.kept.values().sum());
     }
 
     fn now(&self) -> i64 {

@@ -15,6 +15,7 @@ use crate::{
     auth::METHODS,
     connections::Counts,
     core::{Say, SessionId},
+    memory::Used,
 };
 
 const SECONDS: &[f64] = &[
@@ -204,7 +205,13 @@ impl Metrics {
     }
 
     /// The text that Prometheus reads. `gauges` is missing where the catalog cannot be read.
-    pub(crate) fn page(&self, gauges: Option<Gauges>, connections: Counts, ready: bool) -> String {
+    pub(crate) fn page(
+        &self,
+        gauges: Option<Gauges>,
+        connections: Counts,
+        memory: Used,
+        ready: bool,
+    ) -> String {
         let mut page = Page(String::with_capacity(16 << 10));
         page.family(
             "build_info",
@@ -222,6 +229,7 @@ impl Metrics {
             page.gauges(&gauges);
         }
         page.connections(connections);
+        page.memory(memory);
         self.counters(&mut page);
         self.histograms(&mut page);
         page.0
@@ -331,6 +339,39 @@ impl Page {
             "counter",
             "Connections closed before their first request, to make room for others.",
             counts.displaced,
+        );
+    }
+
+    fn memory(&mut self, used: Used) {
+        self.one(
+            "request_memory_bytes",
+            "gauge",
+            "Memory that requests and answers are charged with.",
+            used.requests,
+        );
+        self.one(
+            "request_memory_most_bytes",
+            "gauge",
+            "The most memory that requests and answers were charged with since the start.",
+            used.most,
+        );
+        self.one(
+            "request_memory_limit_bytes",
+            "gauge",
+            "Memory that requests and answers may take now: less with more connections and jobs.",
+            used.allowed,
+        );
+        self.one(
+            "job_memory_bytes",
+            "gauge",
+            "Memory that the specs of jobs are charged with that have not ended.",
+            used.jobs,
+        );
+        self.one(
+            "requests_refused_total",
+            "counter",
+            "Requests and worker's messages refused for lack of memory.",
+            used.refused,
         );
     }
 

@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 /// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, of which one machine has all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-struct Group([u8; 8]);
+pub(crate) struct Group([u8; 8]);
 
 impl From<IpAddr> for Group {
     fn from(address: IpAddr) -> Self {
@@ -35,6 +35,8 @@ pub(crate) struct Doors(Mutex<State>);
 struct State {
     all: usize,
     per_address: usize,
+    /// Connections without a request at a time.
+    silent: usize,
     next: u64,
     open: BTreeMap<u64, (Group, CancellationToken)>,
     of: HashMap<Group, usize>,
@@ -65,11 +67,12 @@ pub(crate) enum Full {
 }
 
 impl Doors {
-    /// So many places, and so many of one address.
-    pub(crate) fn new(all: usize, per_address: usize) -> Self {
+    /// So many places, so many of one address, and so many for connections that have not sent a request.
+    pub(crate) fn new(all: usize, per_address: usize, silent: usize) -> Self {
         Self(Mutex::new(State {
             all,
             per_address,
+            silent: silent.max(1),
             next: 0,
             open: BTreeMap::new(),
             of: HashMap::new(),
@@ -106,7 +109,7 @@ impl Doors {
             let oldest = mine.and_then(|ids| ids.first().copied());
             state.make_room(oldest, Full::Address)?;
         }
-        if state.open.len() >= state.all {
+        if state.open.len() >= state.all || state.waiting.len() >= state.silent {
             let oldest = state.waiting.first().copied();
             state.make_room(oldest, Full::All)?;
         }
@@ -202,6 +205,16 @@ struct Use {
 }
 
 impl Place {
+    /// Its number, unique among the connections of these doors.
+    pub(crate) fn id(&self) -> u64 {
+        self.id
+    }
+
+    /// Ends the connection.
+    pub(crate) fn hang_up(&self) {
+        self.closed.cancel();
+    }
+
     /// A request was let in; it is open until the value is dropped.
     pub(crate) fn stream(self: &Arc<Self>) -> Stream {
         let first = {
@@ -237,7 +250,7 @@ impl Place {
         };
         tokio::select! {
             why = late => why,
-            () = self.closed.cancelled() => "others wait for its place, and it has sent no request",
+            () = self.closed.cancelled() => "others wait for its place and it has sent no request, or it takes no answer",
         }
     }
 
@@ -279,7 +292,7 @@ mod tests {
     use super::*;
 
     fn doors(all: usize, per_address: usize) -> Arc<Doors> {
-        Arc::new(Doors::new(all, per_address))
+        Arc::new(Doors::new(all, per_address, all))
     }
 
     fn ip(text: &str) -> IpAddr {

@@ -111,6 +111,13 @@ pub(crate) struct Peer {
     pub(super) place: Arc<Place>,
 }
 
+impl Peer {
+    /// Its place among the connections.
+    pub(crate) fn place(&self) -> Arc<Place> {
+        Arc::clone(&self.place)
+    }
+}
+
 impl Connection {
     /// `None` where TLS did not come about in time.
     async fn begin(

@@ -158,6 +158,8 @@ pub(crate) struct Learnt {
     pub stages: Vec<StageRecord>,
     /// Of its result sets.
     pub timings: Timings,
+    /// Memory that its spec takes.
+    pub kept: u64,
 }
 
 /// What this instance adds to what the catalog knows of jobs.

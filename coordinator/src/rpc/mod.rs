@@ -7,7 +7,7 @@ mod rights;
 
 use std::sync::Arc;
 
-use picofarm_catalog::{Catalog, CatalogError};
+use picofarm_catalog::{Catalog, CatalogError, Specs};
 use picofarm_proto::{
     convert::ConvertError,
     ids::JobId,
@@ -24,6 +24,7 @@ use crate::{
     clock::Clock,
     core::recorded_status,
     lanes::Lanes,
+    memory::{Account, stored_cost},
     submission::Submissions,
 };
 
@@ -82,9 +83,16 @@ impl Link {
     }
 
     /// A job as people see it.
-    pub(crate) async fn status(&self, id: JobId) -> Result<JobStatus, Status> {
-        let recorded = self
-            .read(move |catalog| async move { Ok(catalog.job(id).await?.map(recorded_status)) });
+    pub(crate) async fn status(&self, account: &Account, id: JobId) -> Result<JobStatus, Status> {
+        let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
+        let bytes = bytes.map_err(|e| Status::unavailable(e.to_string()))?;
+        let what = "reading the job's spec";
+        let charge = account.charge(what, stored_cost(bytes)).await?;
+        let recorded = self.read(move |catalog| async move {
+            // For as long as the spec is in memory, also where nobody waits for it any more.
+            let _charge = charge;
+            Ok(catalog.job(id).await?.map(recorded_status))
+        });
         let mut status = recorded
             .await?
             .ok_or_else(|| refused(Refusal::NoSuchJob(id)))?;
@@ -123,6 +131,12 @@ fn caller<T>(request: &Request<T>) -> Caller {
     caller
         .expect("the guard stands before every service")
         .clone()
+}
+
+/// Whose memory a request takes.
+fn account<T>(request: &Request<T>) -> Account {
+    let account = request.extensions().get::<Account>();
+    account.expect("each request is charged").clone()
 }
 
 /// An error as an answer. It may repeat what was sent, and an answer's words are a header, which must not be long.

@@ -13,7 +13,7 @@ mod report;
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, StageRecord, Submission,
+    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, Specs, StageRecord, Submission,
 };
 use picofarm_proto::{
     ids::JobId,
@@ -28,6 +28,7 @@ use crate::{
     clock::Clock,
     core::{Learnt, Prepared, Timings, may_force, place_is_free, prepare, stands_for},
     lanes::Lanes,
+    memory::{Charge, Memory, kept_cost},
     stored::{Found, Stored},
 };
 use check::Findings;
@@ -50,6 +51,7 @@ pub(crate) struct Submissions {
     clock: Clock,
     /// What callers see of others' jobs.
     visibility: Visibility,
+    memory: Arc<Memory>,
     /// Held while a job is counted against its user's quota and recorded.
     turn: Arc<Mutex<()>>,
 }
@@ -87,6 +89,7 @@ impl Submissions {
         commands: mpsc::Sender<Command>,
         clock: Clock,
         visibility: Visibility,
+        memory: Arc<Memory>,
     ) -> Self {
         Self {
             catalog,
@@ -95,6 +98,7 @@ impl Submissions {
             commands,
             clock,
             visibility,
+            memory,
             turn: Arc::default(),
         }
     }
@@ -163,6 +167,7 @@ impl Submissions {
         let (plan, findings) = self
             .heavy(draft, move |it, draft| async move {
                 let catalog = Arc::clone(&it.catalog);
+                let _charge = it.charge(&draft, Specs::Recent(RECENT, &sight)).await?;
                 let recent = catalog.recent(RECENT, &sight).await.map_err(broken)?;
                 Ok((report::plan(&draft, &findings, existing, &recent), findings))
             })
@@ -175,6 +180,12 @@ impl Submissions {
         })
     }
 
+    /// Takes memory for these specs until the value is dropped.
+    async fn charge(&self, draft: &Draft, specs: Specs<'_>) -> Result<Option<Charge>, Refusal> {
+        let bytes = self.catalog.spec_bytes(specs).await.map_err(broken)?;
+        draft.charge(bytes).await.map_err(Refusal::TooMany)
+    }
+
     /// What the catalog holds of it.
     async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
         let catalog = &self.catalog;
@@ -184,6 +195,8 @@ impl Submissions {
             let set = &record.set;
             let writes = stage.task.writes().is_some();
             if writes || stage.force {
+                let at = Specs::At(&set.store, &set.dataset);
+                let _charge = self.charge(draft, at).await?;
                 let others = catalog.jobs_at(&set.store, &set.dataset).await;
                 let others = others.map_err(broken)?;
                 if writes {
@@ -197,7 +210,9 @@ impl Submissions {
             recorded.push(catalog.recorded(set, record.tasks).await.map_err(broken)?);
         }
         let circle = self.visibility.circle(by, &draft.spec);
-        let latest = catalog.job_with(&draft.identity(&circle)).await;
+        let identity = draft.identity(&circle);
+        let _charge = self.charge(draft, Specs::With(&identity)).await?;
+        let latest = catalog.job_with(&identity).await;
         let latest = latest.map_err(broken)?;
         Ok(Facts {
             recorded,
@@ -261,6 +276,7 @@ impl Submissions {
                      some to end, or cancel some"
                 )));
             }
+            it.memory.room_for_job(draft.kept).map_err(Refusal::TooMany)?;
             let counts: Vec<Vec<Run>> = findings.iter().map(|f| f.counts.clone()).collect();
             let mut make_id = Uuid::now_v7;
             let prepared = prepare(&draft, owner, &circle, &counts, &mut make_id, it.clock.now_ms());
@@ -326,6 +342,7 @@ impl Submissions {
         // A job without anything to run has ended by now.
         let state = self.catalog.state(job.id).await.map_err(broken)?;
         let learnt = Learnt {
+            kept: kept_cost(&job.spec),
             job,
             stages,
             timings,

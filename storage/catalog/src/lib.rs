@@ -55,6 +55,19 @@ pub trait CatalogSource: fmt::Display + fmt::Debug + Send + Sync {
     async fn open(&self, holder: &str) -> Result<Arc<dyn Catalog>, CatalogError>;
 }
 
+/// Whose specs are to be read.
+#[derive(Debug, Clone, Copy)]
+pub enum Specs<'a> {
+    /// One job's: [`Catalog::job`].
+    Job(JobId),
+    /// That of the latest job with a spec hash: [`Catalog::job_with`].
+    With(&'a str),
+    /// Those of jobs that write into a data set (store, name): [`Catalog::jobs_at`].
+    At(&'a str, &'a str),
+    /// Those of the latest jobs that a reader may see: [`Catalog::recent`].
+    Recent(u32, &'a Sight),
+}
+
 /// Durable memory of coordinators. All methods may be called concurrently; each is one transaction.
 ///
 /// # Errors
@@ -164,6 +177,10 @@ pub trait Catalog: Rights {
 
     /// A job and how far it is.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
+
+    /// Bytes of the specs that a read would bring into memory, as they are stored: cheap, so that a reader can be refused
+    /// before they are read.
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError>;
 
     /// Tasks of all active jobs by state, in one go.
     async fn active_tasks(&self) -> Result<TaskCounts, CatalogError>;

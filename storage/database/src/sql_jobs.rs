@@ -1,6 +1,18 @@
 //! The queries about jobs and stages, for one database: `job_queries!(SqliteConnection, SqliteRow)` makes a module
 //! `job_query` beside `query` (see [`crate::sql`]).
 
+/// The jobs with a stage in the data set `$2` of the store `$1` that are active or have written something.
+macro_rules! at {
+    () => {
+        "key IN (SELECT stage.job FROM stage \
+           JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2 \
+           AND (stage.done > 0 OR EXISTS (SELECT 1 FROM job AS live WHERE live.key = stage.job AND live.state = 0) \
+             OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
+               AND task_range.state IN (2, 3))))"
+    };
+}
+pub(crate) use at;
+
 macro_rules! job_queries {
     ($connection:ty, $row:ty) => {
         pub(crate) mod job_query {
@@ -13,8 +25,8 @@ macro_rules! job_queries {
             use sqlx::Row;
 
             use super::query::{exception, marks, stage_of, uint};
-            use picofarm_catalog::{Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight};
-            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}};
+            use picofarm_catalog::{Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight, Specs};
+            use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}, sql_jobs::at};
 
             type Connection = $connection;
             type DbRow = $row;
@@ -343,7 +355,7 @@ macro_rules! job_queries {
             }
 
             /// Size of the specs of the latest jobs together, at most: they are in memory at once.
-            const RECENT_BYTES: i64 = 64 << 20;
+            const RECENT_BYTES: i64 = 16 << 20;
 
             /// The latest jobs, whatever became of them, the last first.
             pub(crate) async fn recent(c: &mut Connection, most: u32, sight: &Sight) -> Result<Vec<Job>> {
@@ -365,16 +377,53 @@ macro_rules! job_queries {
                 rows.iter().map(job).collect()
             }
 
+            pub(crate) async fn spec_bytes(c: &mut Connection, specs: Specs<'_>) -> Result<u64> {
+                let bytes: Option<i64> = match specs {
+                    Specs::Job(id) => {
+                        sqlx::query_scalar("SELECT CAST(octet_length(spec) AS BIGINT) FROM job WHERE id = $1")
+                            .bind(id.uuid())
+                            .fetch_optional(c)
+                            .await?
+                    }
+                    Specs::With(hash) => {
+                        sqlx::query_scalar(
+                            "SELECT CAST(octet_length(spec) AS BIGINT) FROM job WHERE spec_hash = $1 \
+                             ORDER BY key DESC LIMIT 1",
+                        )
+                        .bind(hash)
+                        .fetch_optional(c)
+                        .await?
+                    }
+                    Specs::At(store, dataset) => {
+                        let text = concat!(
+                            "SELECT CAST(coalesce(sum(octet_length(spec)), 0) AS BIGINT) FROM job WHERE ",
+                            at!()
+                        );
+                        let sum = sqlx::query_scalar(text).bind(store).bind(dataset);
+                        sum.fetch_optional(c).await?
+                    }
+                    Specs::Recent(most, sight) => {
+                        let [all, user, projects] = crate::seen::columns(sight);
+                        let text = concat!(
+                            "SELECT CAST(coalesce(sum(octet_length(spec)), 0) AS BIGINT) FROM (SELECT spec FROM job WHERE ",
+                            seen!("$2", "$3", "$4"),
+                            " ORDER BY key DESC LIMIT $1) AS latest"
+                        );
+                        let sum = sqlx::query_scalar(text)
+                            .bind(i64::from(most))
+                            .bind(all)
+                            .bind(user)
+                            .bind(projects);
+                        let sum: Option<i64> = sum.fetch_optional(c).await?;
+                        sum.map(|sum| sum.min(RECENT_BYTES))
+                    }
+                };
+                Ok(bytes.and_then(|n| u64::try_from(n).ok()).unwrap_or(0))
+            }
+
             /// Jobs with a stage in a data set that is active or has written something.
             pub(crate) async fn jobs_at(c: &mut Connection, store: &str, dataset: &str) -> Result<Vec<Job>> {
-                let rows = sqlx::query(
-                    "SELECT * FROM job WHERE key IN (SELECT stage.job FROM stage \
-                       JOIN result_set ON result_set.key = stage.result_set WHERE store = $1 AND dataset = $2 \
-                       AND (stage.done > 0 OR EXISTS (SELECT 1 FROM job AS live WHERE live.key = stage.job AND live.state = 0) \
-                         OR EXISTS (SELECT 1 FROM task_range WHERE task_range.stage = stage.key \
-                           AND task_range.state IN (2, 3)))) \
-                     ORDER BY key DESC",
-                )
+                let rows = sqlx::query(concat!("SELECT * FROM job WHERE ", at!(), " ORDER BY key DESC"))
                 .bind(store)
                 .bind(dataset)
                 .fetch_all(c)

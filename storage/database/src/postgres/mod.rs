@@ -32,7 +32,7 @@ use uuid::Uuid;
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Range, RangeState, Recorded, ResultSet, Run, Settled,
-    Sight, Snapshot, Submission, TaskRecord, Timing, Want,
+    Sight, Snapshot, Specs, Submission, TaskRecord, Timing, Want,
 };
 
 use hints::Hints;
@@ -366,6 +366,13 @@ impl Catalog for PostgresCatalog {
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
         job_query::record(&mut c, id)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::spec_bytes(&mut c, specs)
             .await
             .map_err(|e| self.failed(e))
     }

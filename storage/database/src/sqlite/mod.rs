@@ -36,7 +36,7 @@ use crate::{lock::CatalogLock, migrations};
 use picofarm_catalog::{
     Catalog, CatalogError, Changes, Claim, EventQuery, Forgotten, Gone, Holdups, Job, JobQuery,
     JobRecord, News, Outcome, Owned, Page, Recorded, ResultSet, Run, Settled, Sight, Snapshot,
-    Submission, TaskRecord, Timing, Want,
+    Specs, Submission, TaskRecord, Timing, Want,
 };
 
 crate::sql::queries!(sqlx::SqliteConnection, super::SqliteRow);
@@ -343,6 +343,13 @@ impl Catalog for SqliteCatalog {
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError> {
         let mut c = self.reader().await?;
         job_query::record(&mut c, id)
+            .await
+            .map_err(|e| self.failed(e))
+    }
+
+    async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {
+        let mut c = self.reader().await?;
+        job_query::spec_bytes(&mut c, specs)
             .await
             .map_err(|e| self.failed(e))
     }
