@@ -4,7 +4,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use picofarm_agent::{AgentConfig, AgentError, Memory};
 use picofarm_coordinator::{
-    Connections, CoordinatorConfig, CoordinatorError, Running, Stored,
+    Connections, CoordinatorConfig, CoordinatorError, MemoryBounds, Running, Stored,
     auth::{Access, Quotas, TlsFiles},
     serve,
 };
@@ -32,6 +32,8 @@ pub struct Guarded {
     access: Access,
     quotas: Quotas,
     connections: Connections,
+    /// Of the process, MiB.
+    memory_mib: Option<u64>,
     /// How long the audit log is kept.
     audit_days: Option<u32>,
 }
@@ -61,6 +63,7 @@ impl Guarded {
                 per_address: args.max_connections_per_address,
                 ..Connections::default()
             },
+            memory_mib: args.memory_mib,
             audit_days: Some(args.audit_days),
         }
     }
@@ -135,6 +138,19 @@ pub fn agent_error(error: &AgentError) -> CliError {
     }
 }
 
+/// The most memory that a coordinator takes where nobody says how much it may.
+const COORDINATOR_MIB: u64 = 4096;
+
+/// The memory of a coordinator's process: as asked, or the limit that it runs under. More than that limit is no help: the
+/// system would end the process.
+fn memory(asked_mib: Option<u64>) -> MemoryBounds {
+    let here = Memory::here().map_or(u64::MAX, |memory| memory.bytes);
+    let most = asked_mib.unwrap_or(COORDINATOR_MIB) << 20;
+    MemoryBounds {
+        process: most.min(here),
+    }
+}
+
 /// A running coordinator.
 pub struct Coordinator {
     running: Running,
@@ -164,6 +180,7 @@ impl Coordinator {
         config.access = guarded.access;
         config.quotas = guarded.quotas;
         config.connections = guarded.connections;
+        config.memory = memory(guarded.memory_mib);
         if let Some(days) = guarded.audit_days {
             config.audit_for = Duration::from_secs(u64::from(days) * 86_400);
         }

@@ -24,7 +24,7 @@ use crate::{
     connections::{Connections, Streams, accept, follow_certificates, raise_open_files},
     core::Settings,
     forget,
-    health::Health,
+    health::{self, Health},
     http::{self, Kept, Pages},
     lanes::Lanes,
     memory::{Charging, Memory, MemoryBounds},
@@ -227,7 +227,8 @@ async fn start(
     let doors = Arc::new(doors);
     let memory = Arc::new(Memory::new(config.memory, Arc::clone(&doors)));
     let (all, per_address) = doors.bounds();
-    tracing::info!(all, per_address, "connections at most");
+    let mib = config.memory.process >> 20;
+    tracing::info!(mib, all, per_address, "memory and connections at most");
     let (audit, writer) = Audit::new(config.clock.clone());
     let gate = Gate::new(&config.access, &audit, shutdown.clone())?;
     let (listener, address) = listen(config.listen).await?;
@@ -244,6 +245,8 @@ async fn start(
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
     let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
+    let writes = health::try_writes(Arc::clone(&health), Arc::clone(&catalog), shutdown.clone());
+    tokio::spawn(writes);
     let lanes = Lanes::new(shutdown.clone());
     let submissions = Submissions::new(
         Arc::clone(&catalog),

@@ -67,6 +67,10 @@ pub struct Guard {
     /// Connections of one address at a time, at most; of IPv6, one /64 network [default: three quarters of all]
     #[arg(long, value_name = "N", value_parser = super::ranges::at_least_one)]
     pub max_connections_per_address: Option<usize>,
+    /// Memory that this process may use, MiB: what requests, jobs and connections may take follows from it [default: the
+    /// limit of its control group or of the machine, 4096 at most]
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(128..=1 << 30), env = "PICOFARM_MEMORY_MIB")]
+    pub memory_mib: Option<u64>,
 }
 
 /// What can be done with the token file.

@@ -23,7 +23,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::{Link, caller, invalid};
+use super::{Link, beats::Beats, caller, invalid};
 use crate::{
     VERSION,
     actor::{Command, FromWorker},
@@ -36,6 +36,10 @@ use crate::{
 const HELLO: Duration = Duration::from_secs(20);
 /// Messages that may wait for a worker; one that reads none of them is let go.
 const OUTBOX: usize = 16_384;
+
+/// Heartbeats of a session that may wait for the actor, and how often it is looked whether it has come to them.
+const BEATS: u32 = 4;
+const PAUSE: Duration = Duration::from_millis(20);
 
 pub(crate) struct FarmService {
     link: Link,
@@ -143,9 +147,17 @@ async fn run(
     if link.commands.send(open).await.is_err() {
         return;
     }
+    let beats = Beats::new(link.lease_ms);
+    let listener = Listener {
+        link: &link,
+        session,
+        waiting: &waiting,
+        beats: &beats,
+        out: &out,
+    };
     let end = tokio::select! {
-        end = listen(&link, session, &waiting, &mut input) => end,
-        end = speak(&mut said, &out) => end,
+        end = listener.listen(&mut input) => end,
+        end = speak(&mut said, &out, &beats) => end,
         revoked = caller.revoked() => Err(revoked),
         () = link.stop.cancelled() => Err(Status::unavailable("the coordinator is stopping; reconnect")),
     };
@@ -184,33 +196,68 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
     WorkerHello::try_from(hello).map_err(invalid)
 }
 
-/// Passes on what the worker says, until it ends its side.
-async fn listen(
-    link: &Link,
+/// Where a session listens to its worker.
+struct Listener<'a> {
+    link: &'a Link,
     session: SessionId,
-    waiting: &Waiting,
-    input: &mut Streaming<wire::SessionRequest>,
-) -> Result<(), Status> {
-    loop {
-        let Some(request) = input.message().await? else {
-            return Ok(());
-        };
-        let said = match checked(request).map_err(invalid)? {
-            Ok(said) => said,
-            Err(why) => {
-                tracing::warn!(session, "a worker's log lines cannot be used: {why}");
+    waiting: &'a Waiting,
+    beats: &'a Beats,
+    out: &'a Out,
+}
+
+impl Listener<'_> {
+    /// Passes on what the worker says, until it ends its side.
+    async fn listen(&self, input: &mut Streaming<wire::SessionRequest>) -> Result<(), Status> {
+        loop {
+            let Some(request) = input.message().await? else {
+                return Ok(());
+            };
+            let said = match checked(request).map_err(invalid)? {
+                Ok(said) => said,
+                Err(why) => {
+                    let session = self.session;
+                    tracing::warn!(session, "a worker's log lines cannot be used: {why}");
+                    continue;
+                }
+            };
+            if let FromWorker::Heartbeat(leases, _) = &said
+                && !self.beat(leases).await?
+            {
                 continue;
             }
-        };
-        if matches!(said, FromWorker::Heartbeat(..)) {
-            waiting.arrived();
+            if matches!(said, FromWorker::Credit(0)) {
+                self.beats.withdraw();
+            }
+            let command = Command::Worker(self.session, said);
+            if self.link.commands.send(command).await.is_err() {
+                return Err(Status::unavailable(
+                    "the coordinator is stopping; reconnect",
+                ));
+            }
         }
-        let command = Command::Worker(session, said);
-        if link.commands.send(command).await.is_err() {
-            return Err(Status::unavailable(
-                "the coordinator is stopping; reconnect",
-            ));
+    }
+
+    /// Answers a heartbeat, if that can be done without the actor; `false` where the actor need not hear of it, because it
+    /// has not come to the one before.
+    async fn beat(&self, leases: &[LeaseRef]) -> Result<bool, Status> {
+        let answered = self.beats.answer(leases);
+        if let Some(leases) = &answered {
+            let renewed = To::Renewed(wire::Renewed {
+                leases: leases.iter().copied().map(Into::into).collect(),
+                ttl_ms: self.link.lease_ms,
+            });
+            send(self.out, renewed).await?;
+            if self.waiting.count() > 0 {
+                return Ok(false);
+            }
         }
+        // They are in memory together, and a worker sends the next one when it likes.
+        while self.waiting.count() >= BEATS {
+            tokio::time::sleep(PAUSE).await;
+        }
+        self.beats.tell(answered);
+        self.waiting.arrived();
+        Ok(true)
     }
 }
 
@@ -277,45 +324,51 @@ fn checked(
 }
 
 /// Tells the worker what the actor says, until the actor lets it go.
-async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out) -> Result<(), Status> {
+async fn speak(said: &mut mpsc::Receiver<Say>, out: &Out, beats: &Beats) -> Result<(), Status> {
     while let Some(say) = said.recv().await {
-        let message = match say {
-            Say::Lease(lease) => To::Lease((*lease).into()),
-            Say::Acknowledge {
-                lease,
-                index,
-                accepted,
-                reason,
-            } => To::Acknowledge(wire::Acknowledge {
-                lease: Some(lease.into()),
-                index,
-                accepted,
-                reason,
-            }),
-            Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
-                leases: leases.into_iter().map(Into::into).collect(),
-                ttl_ms,
-            }),
-            Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
-                lease: Some(lease.into()),
-                reason,
-            }),
-            Say::Trim { lease, hi } => To::Trim(wire::Trim {
-                lease: Some(lease.into()),
-                hi,
-            }),
-            Say::Drain => To::Drain(wire::Drain {}),
-            Say::Replaced => {
-                return Err(Status::aborted(
-                    "a newer session of this worker id took over; if that is another worker, give each its own id",
-                ));
-            }
-        };
-        send(out, message).await?;
+        for say in beats.hear(say) {
+            send(out, message(say)?).await?;
+        }
     }
     Err(Status::unavailable(
         "the coordinator let this session go; reconnect",
     ))
+}
+
+/// What the actor says, on the wire.
+fn message(say: Say) -> Result<To, Status> {
+    Ok(match say {
+        Say::Lease(lease) => To::Lease((*lease).into()),
+        Say::Acknowledge {
+            lease,
+            index,
+            accepted,
+            reason,
+        } => To::Acknowledge(wire::Acknowledge {
+            lease: Some(lease.into()),
+            index,
+            accepted,
+            reason,
+        }),
+        Say::Renewed { leases, ttl_ms } => To::Renewed(wire::Renewed {
+            leases: leases.into_iter().map(Into::into).collect(),
+            ttl_ms,
+        }),
+        Say::Revoke { lease, reason } => To::Revoke(wire::Revoke {
+            lease: Some(lease.into()),
+            reason,
+        }),
+        Say::Trim { lease, hi } => To::Trim(wire::Trim {
+            lease: Some(lease.into()),
+            hi,
+        }),
+        Say::Drain => To::Drain(wire::Drain {}),
+        Say::Replaced => {
+            return Err(Status::aborted(
+                "a newer session of this worker id took over; if that is another worker, give each its own id",
+            ));
+        }
+    })
 }
 
 async fn send(out: &Out, message: To) -> Result<(), Status> {

@@ -1,5 +1,6 @@
 //! The gRPC services. Protobuf types stay in here; behind it is the checked model.
 
+mod beats;
 mod farm;
 mod jobs;
 mod look;

@@ -178,6 +178,13 @@ pub trait Catalog: Rights {
     /// A job and how far it is.
     async fn job(&self, id: JobId) -> Result<Option<JobRecord>, CatalogError>;
 
+    /// Writes some ten pages for good or takes them back, to see that there is room: on a full disk the smallest writes may
+    /// still succeed, and those of a submission or a commit do not.
+    ///
+    /// # Errors
+    /// The catalog cannot be written.
+    async fn try_room(&self) -> Result<(), CatalogError>;
+
     /// Bytes of the specs that a read would bring into memory, as they are stored: cheap, so that a reader can be refused
     /// before they are read.
     async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError>;

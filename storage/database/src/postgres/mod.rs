@@ -178,6 +178,7 @@ impl Catalog for PostgresCatalog {
         let snapshot = async {
             let mut connection = self.pool.acquire().await?;
             let mut tx = connection.begin().await?;
+            instance::try_room(&mut tx).await?;
             instance::found(&mut tx, instance, former, &self.name, INSTANCE_SECONDS).await?;
             let ranges = instance::take_lost(&mut tx, instance).await?;
             let snapshot = Snapshot {
@@ -368,6 +369,16 @@ impl Catalog for PostgresCatalog {
         job_query::record(&mut c, id)
             .await
             .map_err(|e| self.failed(e))
+    }
+
+    async fn try_room(&self) -> Result<(), CatalogError> {
+        let mut connection = self.reader().await?;
+        let tried = async {
+            let mut tx = connection.begin().await?;
+            instance::try_room(&mut tx).await?;
+            tx.rollback().await
+        };
+        tried.await.map_err(|e| self.failed(e))
     }
 
     async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {

@@ -347,6 +347,10 @@ impl Catalog for SqliteCatalog {
             .map_err(|e| self.failed(e))
     }
 
+    async fn try_room(&self) -> Result<(), CatalogError> {
+        self.write(async |c, _| Ok(write::try_room(c).await?)).await
+    }
+
     async fn spec_bytes(&self, specs: Specs<'_>) -> Result<u64, CatalogError> {
         let mut c = self.reader().await?;
         job_query::spec_bytes(&mut c, specs)

@@ -31,6 +31,18 @@ pub(super) async fn found(
     Ok(())
 }
 
+/// Bytes that are written while a life lasts, to see that there is room.
+const SOME_ROOM: i64 = 64 << 10;
+
+/// Writes a page for each 4 KiB of it anew.
+pub(super) async fn try_room(c: &mut SqliteConnection) -> std::result::Result<(), sqlx::Error> {
+    sqlx::query("UPDATE life SET room = zeroblob(?) WHERE key = 1")
+        .bind(SOME_ROOM)
+        .execute(c)
+        .await?;
+    Ok(())
+}
+
 /// The ranges in this instance's hands.
 pub(super) async fn owned(
     c: &mut SqliteConnection,
