@@ -1,6 +1,7 @@
 //! The vocabulary of the farm and its wire: typed ids, the checked model of jobs, and the generated
 //! protobuf types with their conversions. No I/O.
 
+pub mod codec;
 pub mod convert;
 pub mod ids;
 pub mod key;

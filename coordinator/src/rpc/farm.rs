@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use futures::Stream;
+use futures::{Stream, TryStreamExt};
 use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
@@ -82,7 +82,8 @@ impl Drop for Counted {
     }
 }
 
-type Out = mpsc::Sender<Result<wire::SessionResponse, Status>>;
+/// Boxed: a channel has room for 32 from the start.
+type Out = mpsc::Sender<Result<Box<wire::SessionResponse>, Status>>;
 
 #[tonic::async_trait]
 impl Farm for FarmService {
@@ -102,7 +103,8 @@ impl Farm for FarmService {
             drop(counted);
         });
         // At once: a client may wait for this before it says hello.
-        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+        let stream = ReceiverStream::new(stream).map_ok(|response| *response);
+        Ok(Response::new(Box::pin(stream)))
     }
 }
 
@@ -375,7 +377,7 @@ async fn send(out: &Out, message: To) -> Result<(), Status> {
     let response = wire::SessionResponse {
         message: Some(message),
     };
-    out.send(Ok(response))
+    out.send(Ok(Box::new(response)))
         .await
         .map_err(|_| Status::cancelled("the worker is gone"))
 }
