@@ -16,6 +16,15 @@ use crate::core::Say;
 const SILENCE: Duration = Duration::from_secs(60);
 const LEASES: u32 = 4;
 
+/// A lease that the actor said is live.
+#[derive(Debug, Clone, Copy)]
+struct Live {
+    /// How many heartbeats the actor had been told of when it said so last.
+    told: u64,
+    /// Tasks whose reports were not answered; `None` = not known, and the next answer may be the last.
+    left: Option<u64>,
+}
+
 /// What one session knows of its leases.
 #[derive(Debug)]
 pub(super) struct Beats {
@@ -25,8 +34,7 @@ pub(super) struct Beats {
 
 #[derive(Debug)]
 struct State {
-    /// Live leases, each with the number of heartbeats that the actor had been told of when it said so last.
-    live: HashMap<LeaseRef, u64>,
+    live: HashMap<LeaseRef, Live>,
     /// Heartbeats that the actor was told of.
     told: u64,
     /// Those that it has not answered, with what was answered here.
@@ -84,7 +92,9 @@ impl Beats {
         match &say {
             Say::Lease(lease) => {
                 let told = state.told;
-                state.live.insert(lease.lease, told);
+                let tasks = (lease.hi - lease.lo).saturating_sub(lease.skip.len() as u64);
+                let left = Some(tasks);
+                state.live.insert(lease.lease, Live { told, left });
             }
             Say::Revoke { lease, .. } => {
                 state.live.remove(lease);
@@ -95,7 +105,22 @@ impl Beats {
                     return instead.unwrap_or_else(|| vec![say]);
                 }
             }
-            Say::Acknowledge { .. } | Say::Trim { .. } | Say::Drain | Say::Replaced => {}
+            Say::Acknowledge { lease, .. } => {
+                let live = state.live.get_mut(lease);
+                let left = live.map(|live| {
+                    live.left = live.left.map(|left| left.saturating_sub(1));
+                    live.left.unwrap_or(0)
+                });
+                if left == Some(0) {
+                    state.live.remove(lease);
+                }
+            }
+            Say::Trim { lease, .. } => {
+                if let Some(live) = state.live.get_mut(lease) {
+                    live.left = None;
+                }
+            }
+            Say::Drain | Say::Replaced => {}
         }
         vec![say]
     }
@@ -126,9 +151,11 @@ impl State {
             lost.map(revoke).collect()
         });
         // Those granted since the heartbeat was sent are not among its leases.
-        self.live.retain(|_, at| *at >= told);
+        self.live
+            .retain(|lease, live| live.told >= told || leases.contains(lease));
         for lease in leases {
-            self.live.insert(*lease, told);
+            let live = self.live.entry(*lease);
+            live.or_insert(Live { told, left: None }).told = told;
         }
         instead
     }
@@ -174,6 +201,22 @@ mod tests {
             "the actor knows better: {heard:?}"
         );
         assert_eq!(beats.answer(&[a]), None);
+    }
+
+    #[test]
+    fn a_lease_whose_last_report_was_answered_is_not_prolonged() {
+        let beats = Beats::new(1_000);
+        let a = lease(1);
+        beats.tell(None);
+        beats.hear(renewed(&[a]));
+        assert_eq!(beats.answer(&[a]), Some(vec![a]));
+        beats.hear(Say::Acknowledge {
+            lease: a,
+            index: 0,
+            accepted: true,
+            reason: String::new(),
+        });
+        assert_eq!(beats.answer(&[a]), None, "how many are left is not known");
     }
 
     #[test]

@@ -243,23 +243,25 @@ impl Listener<'_> {
     /// has not come to the one before.
     async fn beat(&self, leases: &[LeaseRef]) -> Result<bool, Status> {
         let answered = self.beats.answer(leases);
-        if let Some(leases) = &answered {
+        let behind = self.waiting.count() > 0;
+        // They are in memory together, and a worker sends the next one when it likes.
+        while answered.is_none() && self.waiting.count() >= BEATS {
+            tokio::time::sleep(PAUSE).await;
+        }
+        let pass_on = answered.is_none() || !behind;
+        if pass_on {
+            // Before the answer: from then on no lease of this session runs out until the actor has come to it.
+            self.waiting.arrived();
+            self.beats.tell(answered.clone());
+        }
+        if let Some(leases) = answered {
             let renewed = To::Renewed(wire::Renewed {
-                leases: leases.iter().copied().map(Into::into).collect(),
+                leases: leases.into_iter().map(Into::into).collect(),
                 ttl_ms: self.link.lease_ms,
             });
             send(self.out, renewed).await?;
-            if self.waiting.count() > 0 {
-                return Ok(false);
-            }
         }
-        // They are in memory together, and a worker sends the next one when it likes.
-        while self.waiting.count() >= BEATS {
-            tokio::time::sleep(PAUSE).await;
-        }
-        self.beats.tell(answered);
-        self.waiting.arrived();
-        Ok(true)
+        Ok(pass_on)
     }
 }
 

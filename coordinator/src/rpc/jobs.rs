@@ -3,7 +3,7 @@
 use std::{pin::Pin, sync::Arc, time::Duration};
 
 use futures::Stream;
-use picofarm_catalog::{AuditQuery, CatalogError, EventQuery, JobQuery, Sight};
+use picofarm_catalog::{AuditQuery, EventQuery, JobQuery, Sight};
 use picofarm_proto::{
     PROTOCOL,
     convert::ConvertError,
@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-use super::{Link, account, caller, invalid, look, refused};
+use super::{Link, account, broken, caller, invalid, look, refused};
 use crate::{
     VERSION,
     actor::{Command, Submitted},
@@ -145,13 +145,6 @@ fn listing(request: wire::ListJobsRequest, sight: Sight) -> Result<JobQuery, Sta
         user: filter(request.user, "user")?,
         find: filter(request.find, "find")?,
     })
-}
-
-fn broken(error: CatalogError) -> Status {
-    match error {
-        CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),
-        error => Status::unavailable(bounds::message(&error.to_string())),
-    }
 }
 
 fn draft(

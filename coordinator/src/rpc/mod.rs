@@ -80,13 +80,13 @@ impl Link {
     {
         let catalog = Arc::clone(&self.catalog);
         let read = self.lanes.read(move || work(catalog)).await;
-        read.map_err(|e| Status::unavailable(e.to_string()))
+        read.map_err(broken)
     }
 
     /// A job as people see it.
     pub(crate) async fn status(&self, account: &Account, id: JobId) -> Result<JobStatus, Status> {
         let bytes = self.catalog.spec_bytes(Specs::Job(id)).await;
-        let bytes = bytes.map_err(|e| Status::unavailable(e.to_string()))?;
+        let bytes = bytes.map_err(broken)?;
         let what = "reading the job's spec";
         let charge = account.charge(what, stored_cost(bytes)).await?;
         let recorded = self.read(move |catalog| async move {
@@ -106,7 +106,7 @@ impl Link {
     pub(crate) async fn state(&self, id: JobId) -> Result<JobState, Status> {
         let state = self.catalog.state(id).await;
         state
-            .map_err(|e| Status::unavailable(e.to_string()))?
+            .map_err(broken)?
             .ok_or_else(|| refused(Refusal::NoSuchJob(id)))
     }
 }
@@ -123,6 +123,14 @@ pub(crate) fn refused(why: Refusal) -> Status {
         Refusal::TooMany(why) => Status::resource_exhausted(why),
         Refusal::NotNow(why) => Status::failed_precondition(why),
         Refusal::Catalog(why) => Status::unavailable(why),
+    }
+}
+
+/// Why the catalog could not be read, as a caller hears it: what it refuses for its content is the caller's error.
+fn broken(error: CatalogError) -> Status {
+    match error {
+        CatalogError::Refused { what, .. } => Status::invalid_argument(bounds::message(&what)),
+        error => Status::unavailable(bounds::message(&error.to_string())),
     }
 }
 

@@ -394,7 +394,8 @@ impl Worker {
         }
     }
 
-    pub async fn report(&mut self, lease: &Lease, index: u64, manifest: &str) -> wire::Acknowledge {
+    /// Reports a task and waits for no answer.
+    pub async fn say_done(&mut self, lease: &Lease, index: u64, manifest: &str) {
         let done = wire::TaskDone {
             lease: Some(lease.lease.into()),
             index,
@@ -406,6 +407,10 @@ impl Worker {
             traceparent: String::new(),
         };
         self.say(Say::Done(done)).await;
+    }
+
+    pub async fn report(&mut self, lease: &Lease, index: u64, manifest: &str) -> wire::Acknowledge {
+        self.say_done(lease, index, manifest).await;
         self.acknowledged().await
     }
 

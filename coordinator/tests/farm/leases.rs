@@ -1,5 +1,6 @@
 //! Fencing: whoever lost a lease changes nothing any more, whoever still has it loses nothing.
 
+use picofarm_database::{CatalogPlace, testing::hold_writes};
 use picofarm_proto::{
     ids::Incarnation,
     model::JobState,
@@ -7,7 +8,7 @@ use picofarm_proto::{
 };
 use uuid::Uuid;
 
-use crate::harness::{Farm, LEASE_MS, hello, manifest, spec};
+use crate::harness::{Farm, LEASE_MS, catalog_of, hello, manifest, spec};
 
 #[tokio::test]
 async fn a_report_after_expiry_is_refused() {
@@ -49,6 +50,25 @@ async fn a_heartbeat_keeps_a_lease() {
     }
     assert!(worker.done(&lease, 0).await.accepted);
     assert!(worker.beat(&[&lease], None).await.is_empty());
+}
+
+#[tokio::test]
+async fn a_heartbeat_does_not_wait_for_the_catalog() {
+    let mut farm = Farm::start().await;
+    farm.submit(&spec(3)).await;
+    let mut worker = farm.worker().await;
+    let lease = worker.lease().await;
+    let CatalogPlace::Sqlite(path) = catalog_of(&farm) else {
+        panic!("this farm's catalog is a file");
+    };
+    let held = hold_writes(&path).await;
+    // What the actor now waits for.
+    worker.say_done(&lease, lease.lo, &manifest(lease.lo)).await;
+    for _ in 0..5 {
+        assert_eq!(worker.beat(&[&lease], None).await, [lease.lease.into()]);
+    }
+    drop(held);
+    assert!(worker.acknowledged().await.accepted);
 }
 
 #[tokio::test]
