@@ -1,6 +1,7 @@
 //! What connections may do to a coordinator: hundreds that say nothing, slow ones, idle ones; and certificates that change
 //! while it runs.
 
+mod memory;
 mod pages;
 mod tls;
 
