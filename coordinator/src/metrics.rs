@@ -370,7 +370,7 @@ impl Page {
         self.one(
             "requests_refused_total",
             "counter",
-            "Requests and worker's messages refused for lack of memory.",
+            "Requests and workers' messages refused for lack of memory.",
             used.refused,
         );
     }
