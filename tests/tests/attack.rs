@@ -96,7 +96,9 @@ impl Rude {
                     self.frame(SETTINGS, 1, 0, &[])?;
                 }
                 PING if flags == 0 => self.frame(PING, 1, 0, &payload)?,
-                RESET => drop(self.streams.remove(&stream)),
+                RESET => {
+                    self.streams.remove(&stream);
+                }
                 WINDOW => {
                     let more: [u8; 4] = payload.try_into().ok()?;
                     let more = i64::from(u32::from_be_bytes(more));

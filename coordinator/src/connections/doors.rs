@@ -10,6 +10,10 @@ use std::{
 
 use tokio_util::sync::CancellationToken;
 
+/// How long a full waiting room is left alone, for each connection more; and how often it is looked at meanwhile.
+const CROWDED: Duration = Duration::from_millis(20);
+const ASK_AGAIN: Duration = Duration::from_millis(2);
+
 /// Addresses that count as one: an IPv4 address, or a /64 network of IPv6, of which one machine has all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Group([u8; 8]);
@@ -39,6 +43,8 @@ struct State {
     silent: usize,
     next: u64,
     open: BTreeMap<u64, (Group, CancellationToken)>,
+    /// When the latest came that had to take the place of one without a request.
+    crowded: Option<Instant>,
     of: HashMap<Group, usize>,
     /// Those that wait for their first request, the oldest first; of all, and of each group.
     waiting: BTreeSet<u64>,
@@ -75,6 +81,7 @@ impl Doors {
             silent: silent.max(1),
             next: 0,
             open: BTreeMap::new(),
+            crowded: None,
             of: HashMap::new(),
             waiting: BTreeSet::new(),
             waiting_of: HashMap::new(),
@@ -89,6 +96,23 @@ impl Doors {
             open: state.open.len() as u64,
             ..state.counts
         }
+    }
+
+    /// How long the next connection had better wait: where there are many without a request, those that are about to send
+    /// theirs get some time before they are displaced.
+    pub(crate) fn patience(&self) -> Duration {
+        let mut state = self.lock();
+        if state.waiting.len() < state.silent {
+            state.crowded = None;
+            return Duration::ZERO;
+        }
+        let since = state.crowded.get_or_insert_with(Instant::now).elapsed();
+        if since < CROWDED {
+            return ASK_AGAIN;
+        }
+        // For this one; the next waits for its own time.
+        state.crowded = None;
+        Duration::ZERO
     }
 
     /// Places of all, and of one address.
@@ -339,6 +363,20 @@ mod tests {
         let _third = doors.enter(ip("10.0.0.1")).unwrap();
         assert!(evicted(&first), "it is silent, and of the same address");
         assert!(!mine.iter().any(evicted));
+    }
+
+    #[test]
+    fn few_may_be_without_a_request_and_they_have_time_to_send_it() {
+        let doors = Arc::new(Doors::new(9, 9, 2));
+        let first = doors.enter(ip("10.0.0.1")).unwrap();
+        let second = doors.enter(ip("10.0.0.2")).unwrap();
+        assert_eq!(doors.patience(), ASK_AGAIN);
+        let _request = second.place().stream();
+        assert_eq!(doors.patience(), Duration::ZERO);
+        let third = doors.enter(ip("10.0.0.3")).unwrap();
+        assert!(!evicted(&first) && !evicted(&third));
+        let _fourth = doors.enter(ip("10.0.0.4")).unwrap();
+        assert_eq!([&first, &second, &third].map(evicted), [true, false, false]);
     }
 
     #[test]

@@ -62,6 +62,13 @@ pub(crate) fn accept(
                     continue;
                 }
             };
+            loop {
+                let wait = doors.patience();
+                if wait.is_zero() {
+                    break;
+                }
+                tokio::time::sleep(wait).await;
+            }
             let held = match doors.enter(address.ip()) {
                 Ok(held) => held,
                 Err(why) => {

@@ -29,8 +29,9 @@ const MIB: u64 = 1 << 20;
 const DEFAULT: u64 = 2048 * MIB;
 /// What a worker's connection with its session takes.
 const CONNECTION: u64 = 36 << 10;
-/// The most that a connection without a request takes: half of a TLS handshake, or half of a request's headers.
-const SILENT: u64 = 64 << 10;
+/// The most that a connection takes on which no request was let in: half of a TLS handshake or of a request's headers, or a
+/// hundred refusals that it does not take.
+const SILENT: u64 = 128 << 10;
 /// How long a charge waits for others to end.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// A message in hand takes its length twice: as it came, and as it is decoded.

@@ -2,7 +2,7 @@
 
 use std::{pin::Pin, sync::Arc, time::Duration};
 
-use futures::Stream;
+use futures::{Stream, TryStreamExt};
 use picofarm_catalog::{AuditQuery, EventQuery, JobQuery, Sight};
 use picofarm_proto::{
     PROTOCOL,
@@ -11,6 +11,7 @@ use picofarm_proto::{
     model::{Act, JobSpec, JobState, StageSpec, bounds},
     wire::{self, jobs_server::Jobs},
 };
+use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
@@ -274,7 +275,9 @@ impl Jobs for JobsService {
         let (sender, stream) = mpsc::channel(1);
         let link = self.link.clone();
         tokio::spawn(watch_while_allowed(link, caller, account, id, sender));
-        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+        // Charged until it is encoded, and as a part of the answer from then on.
+        let stream = ReceiverStream::new(stream).map_ok(|(response, _charge)| response);
+        Ok(Response::new(Box::pin(stream)))
     }
 
     async fn cancel_job(
@@ -462,13 +465,16 @@ impl Jobs for JobsService {
     }
 }
 
+/// What a watcher hears, with its charge.
+type Watched = Result<(wire::WatchJobResponse, Charge), Status>;
+
 /// Watches until the caller's token is revoked.
 async fn watch_while_allowed(
     link: Link,
     caller: Caller,
     account: Account,
     id: JobId,
-    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
+    sender: mpsc::Sender<Watched>,
 ) {
     let revoked = tokio::select! {
         () = watch(link, account, id, sender.clone()) => return,
@@ -478,12 +484,7 @@ async fn watch_while_allowed(
 }
 
 /// Reports at once and after each change, until the job ends or nobody listens.
-async fn watch(
-    mut link: Link,
-    account: Account,
-    id: JobId,
-    sender: mpsc::Sender<Result<wire::WatchJobResponse, Status>>,
-) {
+async fn watch(mut link: Link, account: Account, id: JobId, sender: mpsc::Sender<Watched>) {
     let mut last = None;
     loop {
         link.revision.mark_unchanged();
@@ -497,11 +498,13 @@ async fn watch(
         let over = status.state != JobState::Active;
         if last.as_ref() != Some(&status) {
             let job = Some(status.clone().into());
-            if sender
-                .send(Ok(wire::WatchJobResponse { job }))
-                .await
-                .is_err()
-            {
+            let response = wire::WatchJobResponse { job };
+            // This one, and the last one to compare it with.
+            let bytes = 2 * response.encoded_len() as u64;
+            let charged = account.charge("the job's status", bytes).await;
+            let over = charged.is_err();
+            let heard = charged.map(|charge| (response, charge));
+            if sender.send(heard).await.is_err() || over {
                 return;
             }
             last = Some(status);
