@@ -61,14 +61,15 @@ impl Beats {
         }
     }
 
-    /// The answer to a heartbeat for these leases, if all of them are known to be live. Answers keep their order: there is
-    /// none while the actor owes one.
+    /// The answer to a heartbeat for these leases, if there are any and all of them are known to be live. Answers keep their
+    /// order: there is none while the actor owes one.
     pub(super) fn answer(&self, leases: &[LeaseRef]) -> Option<Vec<LeaseRef>> {
         let state = self.lock();
         let known = leases.iter().all(|lease| state.live.contains_key(lease));
         let owed = state.open.iter().any(|(_, answered)| answered.is_none());
         let heard = state.heard.elapsed() < self.silence;
-        (known && heard && !owed && state.withdrawn.is_none()).then(|| leases.to_vec())
+        let free = !owed && state.withdrawn.is_none();
+        (known && heard && free && !leases.is_empty()).then(|| leases.to_vec())
     }
 
     /// The worker has taken back what it asked for.

@@ -267,6 +267,7 @@ async fn a_lost_worker_is_charged_to_the_task_it_had_in_hand() {
     let in_hand = lease.hi - 1;
     assert!(in_hand > lease.lo);
     worker.beat(&[&lease], Some(in_hand)).await;
+    worker.beat(&[], None).await;
     let running = farm.status(&job).await.running;
     assert_eq!((running.len(), running[0].index), (1, in_hand));
     drop(worker);

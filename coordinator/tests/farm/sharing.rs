@@ -212,6 +212,7 @@ async fn of_a_held_job_a_worker_keeps_the_task_in_hand_alone() {
     assert!(held.len() > 1 && held[0].hi > held[0].lo + 1, "{held:?}");
     let leases: Vec<&Lease> = held.iter().collect();
     worker.beat(&leases, Some(held[0].lo)).await;
+    worker.beat(&[], None).await;
     let pause = wire::PauseJobRequest {
         job_id: job.clone(),
     };
@@ -274,6 +275,7 @@ async fn a_task_that_takes_far_too_long_runs_a_second_time_and_the_first_result_
     assert!(slow.done(&first, first.lo).await.accepted);
     let last = slow.lease().await;
     slow.beat(&[&last], Some(last.lo)).await;
+    slow.beat(&[], None).await;
     let mut idle = Worker::connect(farm.address(), hello("idle"))
         .await
         .unwrap();
@@ -307,6 +309,7 @@ async fn a_double_ends_with_the_task_and_costs_it_nothing() {
     assert!(slow.done(&first, first.lo).await.accepted);
     let last = slow.lease().await;
     slow.beat(&[&last], Some(last.lo)).await;
+    slow.beat(&[], None).await;
     farm.pass(15_000);
     let mut clumsy = Worker::connect(farm.address(), hello("clumsy"))
         .await
