@@ -17,8 +17,9 @@ const ALIVE: Duration = Duration::from_secs(30);
 /// The catalog is thought gone when it has not answered for so long.
 const READY: Duration = Duration::from_secs(10);
 
-/// How often it is tried whether the catalog can be written, and how long that may take.
+/// How often it is tried whether the catalog can be written, and how long that may take; how soon after a failure.
 const TRY: Duration = Duration::from_secs(10);
+const TRY_AGAIN: Duration = Duration::from_secs(1);
 /// The catalog is thought full or stuck when no write has succeeded for so long.
 const WRITTEN: Duration = Duration::from_secs(30);
 
@@ -165,16 +166,23 @@ pub(crate) async fn try_writes(
     stop: CancellationToken,
 ) {
     loop {
-        match tokio::time::timeout(TRY, catalog.try_room()).await {
-            Ok(Ok(())) => health.wrote(),
-            Ok(Err(error)) => health.full(error.brief(), &error.to_string()),
-            Err(_) => health.full(
-                "the catalog takes no writes",
-                "a small write took over 10 s",
-            ),
-        }
+        let wait = match tokio::time::timeout(TRY, catalog.try_room()).await {
+            Ok(Ok(())) => {
+                health.wrote();
+                TRY
+            }
+            Ok(Err(error)) => {
+                health.full(error.brief(), &error.to_string());
+                TRY_AGAIN
+            }
+            Err(_) => {
+                let why = "a small write took over 10 s";
+                health.full("the catalog takes no writes", why);
+                TRY_AGAIN
+            }
+        };
         tokio::select! {
-            () = tokio::time::sleep(TRY) => {}
+            () = tokio::time::sleep(wait) => {}
             () = stop.cancelled() => return,
         }
     }
