@@ -8,8 +8,9 @@ use std::{
     time::{Duration, Instant},
 };
 
+use picofarm_proto::wire::{self, jobs_client::JobsClient};
 use picofarm_tests::{
-    Cli, Process, Scratch,
+    Cli, Job, Process, Scratch,
     http::{get, sample},
     wait::until,
 };
@@ -316,6 +317,28 @@ fn halves(address: &str, connections: usize) {
     std::thread::sleep(Duration::from_secs(1));
 }
 
+/// Makes a history whose lists are long: a job that is held and goes on again and again.
+fn history(scratch: &Scratch, target: &Target, lines: usize) {
+    let url = format!("http://{}", target.address);
+    let cli = Cli::new(scratch.path()).with("PICOFARM_COORDINATOR", &url);
+    let file = scratch.join("job.toml");
+    Job::quick(&scratch.join("store"), 4).write(&file);
+    let answer = cli.json(&["job", "submit", &file.display().to_string()]);
+    let id = answer["job"].as_str().expect("a job").to_owned();
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    runtime.block_on(async {
+        let mut jobs = JobsClient::connect(url).await.expect("it listens");
+        for _ in 0..lines / 2 {
+            let job_id = id.clone();
+            let held = jobs.pause_job(wire::PauseJobRequest { job_id }).await;
+            held.expect("it is active");
+            let job_id = id.clone();
+            let goes_on = jobs.resume_job(wire::ResumeJobRequest { job_id }).await;
+            goes_on.expect("it is held");
+        }
+    });
+}
+
 /// All attacks with so many connections; the resident size in MiB after each, at most.
 fn attack(target: &Target, connections: usize) -> Vec<(&'static str, u64)> {
     let address = &*target.address;
@@ -346,6 +369,7 @@ fn a_caller_without_a_token_does_not_exhaust_a_small_coordinator() {
     });
     let streams = rude.settings.iter().find(|(name, _)| *name == 3);
     assert_eq!(streams, Some(&(3, 100)), "MAX_CONCURRENT_STREAMS");
+    history(&scratch, &target, 400);
     let worst = attack(&target, 4);
     let (_, most) = target.resident();
     assert!(most < mib, "{most} MiB of {mib}: {worst:?}");
@@ -368,6 +392,7 @@ fn worst_resident_size_by_memory() {
         let scratch = Scratch::new("attack");
         let cli = Cli::new(scratch.path());
         let target = Target::start(&cli, mib);
+        history(&scratch, &target, 1_000);
         let worst = attack(&target, 24);
         println!("{mib} MiB: worst resident size in MiB after each attack: {worst:?}");
         assert!(target.resident().1 < mib);
