@@ -102,6 +102,7 @@ async fn a_request_for_a_list_that_makes_no_sense_is_refused_by_its_field() {
 }
 
 #[tokio::test]
+#[allow(clippy::needless_update, reason = "some requests have one field alone")]
 async fn each_text_of_each_call_is_checked_before_the_catalog_sees_it() {
     for mut farm in Farm::start_on_each().await {
         let jobs = &mut farm.jobs;
