@@ -1,6 +1,7 @@
 //! How the actor does, and how with its catalog: what `/healthz` and `/readyz` tell. Read without asking the actor.
 
 use std::{
+    collections::BTreeMap,
     fmt,
     sync::{
         Mutex,
@@ -17,6 +18,8 @@ const READY: Duration = Duration::from_secs(10);
 /// How the actor does, and how with its catalog.
 pub(crate) struct Health {
     catalog: Mutex<State>,
+    /// Files by which callers are judged and that cannot be used, with the reason.
+    access: Mutex<BTreeMap<&'static str, String>>,
     began: Instant,
     /// When its loop turned last, milliseconds after `began`.
     turned: AtomicU64,
@@ -26,6 +29,7 @@ impl Default for Health {
     fn default() -> Self {
         Self {
             catalog: Mutex::default(),
+            access: Mutex::default(),
             began: Instant::now(),
             turned: AtomicU64::new(0),
         }
@@ -79,11 +83,30 @@ impl Health {
         self.lock().fault = Some((brief, why.to_owned()));
     }
 
+    /// A file by which callers are judged cannot be used (`Some`, with the reason), or can be used again.
+    pub(crate) fn access(&self, file: &'static str, why: Option<String>) {
+        let mut access = self.access.lock().expect("no panic while locked");
+        match why {
+            Some(why) => access.insert(file, why),
+            None => access.remove(file),
+        };
+    }
+
     /// Whether jobs and reports can be taken.
     ///
     /// # Errors
     /// Why not.
     pub(crate) fn ready(&self) -> Result<(), Unready> {
+        let access = self.access.lock().expect("no panic while locked");
+        if let Some((file, why)) = access.first_key_value() {
+            return Err(Unready {
+                what: format!(
+                    "{file} cannot be used; every caller is refused until this is repaired"
+                ),
+                detail: Some(why.clone()),
+            });
+        }
+        drop(access);
         let state = self.lock();
         if let Some((brief, why)) = &state.fault {
             return Err(Unready {

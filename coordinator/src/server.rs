@@ -218,7 +218,13 @@ async fn start(
     let (all, per_address) = doors.bounds();
     tracing::info!(all, per_address, "connections at most");
     let (audit, writer) = Audit::new(config.clock.clone());
-    let gate = Gate::new(&config.access, &audit, shutdown.clone())?;
+    let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
+    let (gate, judge) = Gate::new(
+        &config.access,
+        &audit,
+        Arc::clone(&health),
+        shutdown.clone(),
+    )?;
     let (listener, address) = listen(config.listen).await?;
     let endpoint = match config.http {
         Some(address) => Some(listen(address).await?),
@@ -232,7 +238,6 @@ async fn start(
     let writer = tokio::spawn(writer);
     let (commands, queue) = mpsc::channel(QUEUE);
     let (revision, seen) = watch::channel(0);
-    let (metrics, health) = (Arc::new(Metrics::default()), Arc::new(Health::default()));
     let lanes = Lanes::new(shutdown.clone());
     let submissions = Submissions::new(
         Arc::clone(&catalog),
@@ -292,8 +297,9 @@ async fn start(
         tokio::spawn(forget::run(catalog, clock, age, shutdown.clone()));
     }
     let actor = tokio::spawn(actor.run(queue));
-    let tls = tls
-        .map(|(files, loaded)| follow_certificates(files, loaded, audit.clone(), shutdown.clone()));
+    let tls = tls.map(|(files, loaded)| {
+        follow_certificates(files, loaded, judge, audit.clone(), shutdown.clone())
+    });
     let connections = accept(listener, doors, config.connections, tls, shutdown.clone());
     let server = Server::builder()
         .http2_max_header_list_size(Some(MAX_HEADERS_BYTES))

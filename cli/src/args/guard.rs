@@ -1,9 +1,9 @@
 //! Options that say who may use a coordinator, and how much.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, time::SystemTime};
 
 use clap::{Args, Subcommand};
-use picofarm_coordinator::auth::{Role, Visibility};
+use picofarm_coordinator::auth::{Expiry, Role, Visibility};
 
 /// TLS, tokens and limits of a coordinator.
 #[derive(Args)]
@@ -86,21 +86,29 @@ pub enum Token {
         /// Projects all of whose jobs it may cancel, pause, resume and retry
         #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
         maintainer: Vec<String>,
+        /// When it expires: a time from now (90d, 12h), a date (2027-03-01, its beginning in UTC), or e.g.
+        /// 2027-03-01T08:00:00Z [default: never]
+        #[arg(long, value_name = "TIME", value_parser = expiry)]
+        expires: Option<Expiry>,
         #[command(flatten)]
         file: TokenFile,
     },
-    /// List who has access
+    /// List who has access, and until when
     List {
         #[command(flatten)]
         file: TokenFile,
     },
-    /// Take someone's access away; running coordinators notice within seconds
+    /// Take someone's access away, and ask the coordinators that --coordinator names whether they refuse it now
     Revoke {
         /// Whose
         name: String,
         #[command(flatten)]
         file: TokenFile,
     },
+}
+
+fn expiry(text: &str) -> Result<Expiry, String> {
+    Expiry::parse(text, SystemTime::now())
 }
 
 /// Where tokens are kept.

@@ -14,6 +14,7 @@ use super::failed;
 use crate::{
     args::DatasetImport,
     error::{CliError, Code, Result, io},
+    files,
     output::{Meter, Output, bytes, duration},
     roles, signals,
 };
@@ -174,7 +175,7 @@ fn refused(error: ImportError) -> CliError {
 
 /// Names of scenes, one a line. The paper's list has a header, and names archives.
 fn names(file: &Path) -> Result<Vec<String>> {
-    let text = std::fs::read_to_string(file).map_err(|e| io(file.display(), &e))?;
+    let text = files::read_text(file, files::LISTS)?;
     let names = text
         .lines()
         .map(str::trim)

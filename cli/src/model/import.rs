@@ -1,6 +1,6 @@
 //! `picofarm model import`: a network that was trained elsewhere, as a model of a store.
 
-use std::{fs, path::Path};
+use std::path::Path;
 
 use picofarm_agent::{ImportFor, imported};
 use serde_json::json;
@@ -8,7 +8,8 @@ use serde_json::json;
 use super::open;
 use crate::{
     dataset::{self, failed},
-    error::{CliError, Result, io},
+    error::{CliError, Result},
+    files,
     output::{Output, bytes},
 };
 
@@ -29,13 +30,13 @@ pub(super) async fn run(
         return Err(CliError::input(what).hint("render one, or choose another --dataset"));
     };
     let scene = rooms.manifest(first).await.map_err(failed)?;
-    let text = fs::read_to_string(settings).map_err(|e| io(settings.display(), &e))?;
+    let text = files::read_text(settings, files::SETTINGS)?;
     let table: toml::Table = toml::from_str(&text)
         .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
     let mut wanted = serde_json::to_value(table)
         .map_err(|e| CliError::input(format!("{}: {e}", settings.display())))?;
     wanted["model"] = json!(name);
-    let weights = fs::read(file).map_err(|e| io(file.display(), &e))?;
+    let weights = files::read(file, files::WEIGHTS)?;
     let called = file.file_name().unwrap_or_default().to_string_lossy();
     let of = ImportFor {
         dataset,

@@ -27,6 +27,7 @@ use crate::{
     args::{Extend, MoreTrials, Sampler, SweepRun},
     client::Client,
     error::{CliError, Result, io},
+    files,
     follow::{Show, follow, verdict},
     jobfile,
     model::open,
@@ -158,7 +159,7 @@ async fn extend(
     let values: Vec<Values> = tried.into_iter().map(|t| t.values).collect();
     let values: Vec<Values> = values.into_iter().chain(proposed.iter().cloned()).collect();
     let promote = promote.map_or_else(|| format!("{name}-{total}"), str::to_owned);
-    let before = std::fs::read_to_string(file).map_err(|e| io(file.display(), &e))?;
+    let before = files::read_text(file, files::LISTS)?;
     let after = with_values(&before, &stage, &values, &promote).map_err(named)?;
     let out = match out {
         Some(out) => same_folder(file, out)?,
@@ -215,7 +216,7 @@ impl NewFile {
         match self.0.persist_noclobber(out) {
             Ok(_) => Ok(true),
             Err(e) if e.error.kind() == std::io::ErrorKind::AlreadyExists => {
-                Ok(std::fs::read(out)? == ours)
+                Ok(files::read(out, files::LISTS).is_ok_and(|theirs| theirs == ours))
             }
             Err(e) => Err(e.error),
         }

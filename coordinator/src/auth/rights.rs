@@ -167,7 +167,9 @@ mod tests {
         Caller {
             name: name.into(),
             roles: roles.clone(),
-            tokens: None,
+            until: None,
+            authorities: 0,
+            trust: None,
             entry: Some(Arc::new(Entry {
                 name: name.into(),
                 roles,
