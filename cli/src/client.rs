@@ -22,14 +22,15 @@ use tonic::{
 
 use crate::error::{CliError, Code, Result};
 
-/// How long a coordinator may take to complete a connection, and to give its first answer if there is another to ask.
+/// How long a coordinator may take to complete a connection, and to give its first answer if there
+/// is another to ask.
 const CONNECT: Duration = Duration::from_secs(5);
 /// How long the last coordinator of a list may take for its first answer.
 const LAST: Duration = Duration::from_secs(15);
 /// How long a call may take that reads or steers.
 const ANSWER: Duration = Duration::from_secs(60);
-/// How long planning or submitting may take: a large job is compared with what its stores have. Meanwhile pings tell
-/// whether the coordinator lives.
+/// How long planning or submitting may take: a large job is compared with what its stores have.
+/// Meanwhile pings tell whether the coordinator lives.
 const SUBMIT: Duration = Duration::from_secs(15 * 60);
 /// How often a connection is pinged, and how long the answer may take.
 const PING: Duration = Duration::from_secs(10);
@@ -118,8 +119,9 @@ impl Client {
         Self::connect(&self.urls, &self.access).await
     }
 
-    /// The answer to a call within a time. If a coordinator is silent and there are others, the first of them that answers
-    /// is asked and used from then on: every call has the same effect once and twice.
+    /// The answer to a call within a time. If a coordinator is silent and there are others, the
+    /// first of them that answers is asked and used from then on: every call has the same effect
+    /// once and twice.
     async fn ask<T, F>(&mut self, within: Duration, call: impl Fn(Jobs) -> F) -> Result<T>
     where
         F: Future<Output = std::result::Result<Response<T>, Status>>,
@@ -540,8 +542,8 @@ async fn connect_to(url: &str, access: &Access, within: Duration) -> Result<Jobs
     };
     let mut jobs = JobsClient::with_interceptor(channel, target.bearer.clone())
         .max_decoding_message_size(64 << 20);
-    // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only when it is spoken:
-    // the first call tells.
+    // A client certificate is refused only after the handshake, and plain HTTP by a TLS port only
+    // when it is spoken: the first call tells.
     let first = jobs.get_server_info(wire::GetServerInfoRequest {});
     match tokio::time::timeout(within, first).await {
         Ok(Err(status)) if lost_connection(&status) => Err(no_connection(&target, &status).await),
@@ -592,8 +594,8 @@ pub enum Standing {
     Unknown(String),
 }
 
-/// Asks the coordinator at `url` whether a proof is accepted: `proof` is the SHA-256 of a token, or the name in a client
-/// certificate, with the scheme before it.
+/// Asks the coordinator at `url` whether a proof is accepted: `proof` is the SHA-256 of a token, or
+/// the name in a client certificate, with the scheme before it.
 pub async fn standing(url: &str, access: &Access, proof: &str) -> Standing {
     let words = |no: NoAnswer| no.silence().unwrap_or_else(|refused| refused).message;
     // The question is not the caller's: its own token stays here.

@@ -1,5 +1,5 @@
-//! Files that a person names: regular files only, of at most a size. A pipe, a device or a folder is refused by its name
-//! rather than waited for or read for ever.
+//! Files that a person names: regular files only, of at most a size. A pipe, a device or a folder
+//! is refused by its name rather than waited for or read for ever.
 
 use std::path::Path;
 

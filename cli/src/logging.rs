@@ -1,7 +1,8 @@
 //! Log lines on stderr, written by a thread of their own.
 //!
-//! Whoever reads stderr may stop reading: a pipe that is full would hold up every thread that logs. So lines wait in a queue
-//! with a bound. A line that finds no room is dropped and counted, and the next line that does says how many were dropped.
+//! Whoever reads stderr may stop reading: a pipe that is full would hold up every thread that logs.
+//! So lines wait in a queue with a bound. A line that finds no room is dropped and counted, and the
+//! next line that does says how many were dropped.
 
 use std::{
     collections::VecDeque,

@@ -28,7 +28,8 @@ pub fn print(bytes: &[u8]) {
 /// Whether everything that was printed has reached stdout.
 ///
 /// # Errors
-/// Something has not, e.g. because the disk is full. A closed pipe (`| head`) is not an error worth a message.
+/// Something has not, e.g. because the disk is full. A closed pipe (`| head`) is not an error worth
+/// a message.
 pub fn printed() -> Result<()> {
     match UNPRINTED.get() {
         Some(error) if error.kind() != ErrorKind::BrokenPipe => Err(unprinted(error)),

@@ -1,6 +1,7 @@
-//! SIGINT, SIGTERM and SIGHUP: the first asks for an orderly end, the second ends the process at once. A SIGTERM right after
-//! another is the same one: schedulers send it to the process and to its group. A SIGHUP never ends the process at once: it
-//! comes from a terminal that closes, which may send it several times.
+//! SIGINT, SIGTERM and SIGHUP: the first asks for an orderly end, the second ends the process at
+//! once. A SIGTERM right after another is the same one: schedulers send it to the process and to
+//! its group. A SIGHUP never ends the process at once: it comes from a terminal that closes, which
+//! may send it several times.
 
 use std::time::{Duration, Instant};
 

@@ -28,7 +28,8 @@ const PAUSE: Duration = Duration::from_millis(500);
 /// Runs one of the commands.
 ///
 /// # Errors
-/// The token file cannot be used, a name is taken, there is no such name, or a coordinator still accepts a revoked token.
+/// The token file cannot be used, a name is taken, there is no such name, or a coordinator still
+/// accepts a revoked token.
 pub async fn run(command: Token, resolved: &Resolved, output: Output) -> Result<()> {
     match command {
         Token::Create {

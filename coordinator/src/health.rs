@@ -83,7 +83,8 @@ impl Health {
         self.lock().fault = Some((brief, why.to_owned()));
     }
 
-    /// A file by which callers are judged cannot be used (`Some`, with the reason), or can be used again.
+    /// A file by which callers are judged cannot be used (`Some`, with the reason), or can be used
+    /// again.
     pub(crate) fn access(&self, file: &'static str, why: Option<String>) {
         let mut access = self.access.lock().expect("no panic while locked");
         match why {

@@ -86,8 +86,8 @@ pub enum Token {
         /// Projects all of whose jobs it may cancel, pause, resume and retry
         #[arg(long, value_name = "PROJECTS", value_delimiter = ',')]
         maintainer: Vec<String>,
-        /// When it expires: a time from now (90d, 12h), a date (2027-03-01, its beginning in UTC), or e.g.
-        /// 2027-03-01T08:00:00Z [default: never]
+        /// When it expires: a time from now (90d, 12h), a date (2027-03-01, its beginning in UTC),
+        /// or e.g. 2027-03-01T08:00:00Z [default: never]
         #[arg(long, value_name = "TIME", value_parser = expiry)]
         expires: Option<Expiry>,
         #[command(flatten)]
@@ -98,7 +98,8 @@ pub enum Token {
         #[command(flatten)]
         file: TokenFile,
     },
-    /// Take someone's access away, and ask the coordinators that --coordinator names whether they refuse it now
+    /// Take someone's access away, and ask the coordinators that --coordinator names whether they
+    /// refuse it now
     Revoke {
         /// Whose
         name: String,

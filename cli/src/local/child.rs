@@ -167,7 +167,8 @@ fn listen(stop: CancellationToken) -> Result<()> {
     Ok(())
 }
 
-/// Ctrl-C in a terminal, or its closing, reaches the parent, too, which says what is to be done. A SIGTERM may be meant for this process
+/// Ctrl-C in a terminal, or its closing, reaches the parent, too, which says what is to be done. A
+/// SIGTERM may be meant for this process
 /// alone.
 fn heed_signals(stop: CancellationToken) -> Result<()> {
     let refused =

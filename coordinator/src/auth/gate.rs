@@ -76,7 +76,8 @@ impl Gate {
         Ok((Self { asks, trust }, judge))
     }
 
-    /// Who it is, on a connection that began when the client certificate authorities had changed `authorities` times.
+    /// Who it is, on a connection that began when the client certificate authorities had changed
+    /// `authorities` times.
     ///
     /// # Errors
     /// UNAUTHENTICATED, with what to do; UNAVAILABLE while nobody can be judged.
@@ -194,8 +195,9 @@ fn by_certificate_alone(certificate: Option<&Described>) -> Result<Caller, Statu
     })
 }
 
-/// Reads the token file again and again. A file that cannot be used for a moment changes nothing, so that a slip of an
-/// editor does not stop the farm; after [`GRACE`] every caller is refused until it can be used again.
+/// Reads the token file again and again. A file that cannot be used for a moment changes nothing,
+/// so that a slip of an editor does not stop the farm; after [`GRACE`] every caller is refused
+/// until it can be used again.
 async fn follow(path: PathBuf, judge: Judge, audit: Audit, stop: CancellationToken) {
     let (mut reader, mut trouble) = (Reader::default(), Trouble::default());
     loop {

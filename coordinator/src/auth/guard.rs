@@ -31,9 +31,9 @@ impl Guard {
         }
     }
 
-    /// The answer to the question whether a proof is accepted, if this is one: the header `authorization` has the
-    /// SHA-256 of a token, or the name in a client certificate. Anyone may ask, because neither is a proof; nobody is let
-    /// in by it, and nothing but the header is read.
+    /// The answer to the question whether a proof is accepted, if this is one: the header
+    /// `authorization` has the SHA-256 of a token, or the name in a client certificate. Anyone may
+    /// ask, because neither is a proof; nobody is let in by it, and nothing but the header is read.
     fn asked(&self, headers: &http::HeaderMap) -> Option<Status> {
         let text = headers.get(http::header::AUTHORIZATION)?.to_str().ok()?;
         let (scheme, proof) = text.split_once(' ')?;
@@ -78,10 +78,12 @@ impl Guard {
     }
 }
 
-/// The header by which a question whether a proof is accepted is answered: `yes` or `no`. The message has the reason.
+/// The header by which a question whether a proof is accepted is answered: `yes` or `no`. The
+/// message has the reason.
 pub const ACCEPTED: &str = "picofarm-accepted";
 
-/// What stands before the SHA-256 of a token in the header `authorization`, to ask whether that token is accepted.
+/// What stands before the SHA-256 of a token in the header `authorization`, to ask whether that
+/// token is accepted.
 pub const BY_DIGEST: &str = "Sha256";
 /// What stands before the name in a client certificate, to ask the same.
 pub const BY_CERTIFICATE: &str = "Certificate";

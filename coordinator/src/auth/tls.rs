@@ -92,7 +92,8 @@ impl TlsFiles {
         })
     }
 
-    /// Whether the client certificate authorities are those of this digest. `false` also if they cannot be read.
+    /// Whether the client certificate authorities are those of this digest. `false` also if they
+    /// cannot be read.
     pub(crate) fn has_authorities(&self, digest: &[u8; 32]) -> bool {
         self.client_ca.as_ref().is_none_or(|path| {
             certificates(path)

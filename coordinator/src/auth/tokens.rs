@@ -85,10 +85,12 @@ impl Tokens {
         Self::parse(&read_text(path, LARGEST)?).map_err(|what| invalid(path, what))
     }
 
-    /// Changes the file while no other process does. Owner, group, mode and access list stay as they are.
+    /// Changes the file while no other process does. Owner, group, mode and access list stay as
+    /// they are.
     ///
     /// # Errors
-    /// [`TokenError`]: the file cannot be used or replaced, or the error of `change`, in words. Nothing is changed then.
+    /// [`TokenError`]: the file cannot be used or replaced, or the error of `change`, in words.
+    /// Nothing is changed then.
     pub fn edit<T>(
         path: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, String>,
@@ -217,8 +219,8 @@ impl Tokens {
         found
     }
 
-    /// Makes a token for a new caller and adds it, with the projects that it is a member and a maintainer of. It never
-    /// expires.
+    /// Makes a token for a new caller and adds it, with the projects that it is a member and a
+    /// maintainer of. It never expires.
     ///
     /// # Errors
     /// The name is taken or not plain, a project's name is not plain, or there are no roles; in words.

@@ -1,7 +1,8 @@
 //! What callers are judged by: the token file and the client certificate authorities, as last read.
 //!
-//! Both files are read again every second. While one of them cannot be used, nobody can say who was revoked in it, so after
-//! a short grace every caller is refused: UNAVAILABLE, because the caller is not at fault and workers come back.
+//! Both files are read again every second. While one of them cannot be used, nobody can say who was
+//! revoked in it, so after a short grace every caller is refused: UNAVAILABLE, because the caller
+//! is not at fault and workers come back.
 
 use std::{
     sync::Arc,
@@ -14,7 +15,8 @@ use tonic::Status;
 use super::tokens::{Entry, Tokens};
 use crate::health::Health;
 
-/// How long a file may be unusable before every caller is refused. Editors and `kubectl` replace files in several steps.
+/// How long a file may be unusable before every caller is refused. Editors and `kubectl` replace
+/// files in several steps.
 pub(crate) const GRACE: Duration = Duration::from_secs(5);
 
 /// A file that callers are judged by.
@@ -54,7 +56,8 @@ impl Trust {
         }
     }
 
-    /// Refuses everybody while a file cannot be used, and connections from before a change of the authorities.
+    /// Refuses everybody while a file cannot be used, and connections from before a change of the
+    /// authorities.
     pub(super) fn judge_connection(&self, authorities: u64) -> Result<(), Status> {
         let sources = [Source::Tokens, Source::Authorities];
         if let Some(source) = sources.into_iter().find(|s| self.faults[*s as usize]) {
@@ -179,7 +182,8 @@ impl<T> Default for Reader<T> {
 }
 
 impl<T: Send + 'static> Reader<T> {
-    /// What `read` returns, or `None` if it takes longer than the grace. The next call waits for the same reading.
+    /// What `read` returns, or `None` if it takes longer than the grace. The next call waits for
+    /// the same reading.
     pub(crate) async fn read(&mut self, read: impl FnOnce() -> T + Send + 'static) -> Option<T> {
         let reading = self
             .0

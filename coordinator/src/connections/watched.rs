@@ -68,10 +68,11 @@ pub(crate) struct Certificates {
 
 /// The present certificates, of files that are read again until `stop`.
 ///
-/// An own certificate that cannot be used changes nothing, because it lets nobody in; the log says so. Connections keep
-/// the certificates that they began with. Client certificate authorities that have changed and are not in force let in
-/// somebody who may have been revoked: if they cannot be used within [`GRACE`], every caller is refused. When they have
-/// changed, callers on older connections are refused, and come back with a certificate that is judged anew.
+/// An own certificate that cannot be used changes nothing, because it lets nobody in; the log says
+/// so. Connections keep the certificates that they began with. Client certificate authorities that
+/// have changed and are not in force let in somebody who may have been revoked: if they cannot be
+/// used within [`GRACE`], every caller is refused. When they have changed, callers on older
+/// connections are refused, and come back with a certificate that is judged anew.
 pub(crate) fn follow(
     files: TlsFiles,
     loaded: Loaded,

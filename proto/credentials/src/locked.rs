@@ -1,7 +1,8 @@
 //! Changing a file that other processes read and change.
 //!
-//! One process at a time has the lock, which is on the file itself. The file is replaced in one step by a file with the
-//! same owner, group, mode and access list, so a reader sees the old content or the new, and can read both.
+//! One process at a time has the lock, which is on the file itself. The file is replaced in one
+//! step by a file with the same owner, group, mode and access list, so a reader sees the old
+//! content or the new, and can read both.
 
 use std::{
     ffi::OsString,
@@ -44,13 +45,14 @@ impl LockedFile {
     /// Waits for the lock of an existing file.
     ///
     /// # Errors
-    /// The file cannot be opened, is open to everyone, or another process keeps its lock for ten seconds.
+    /// The file cannot be opened, is open to everyone, or another process keeps its lock for ten
+    /// seconds.
     pub fn open(path: &Path) -> Result<Self, CredentialError> {
         Self::wait(path, false)
     }
 
-    /// Waits for the lock of a file, which is made for its owner alone if there is none. A new file that is not
-    /// replaced is removed again.
+    /// Waits for the lock of a file, which is made for its owner alone if there is none. A new file
+    /// that is not replaced is removed again.
     ///
     /// # Errors
     /// As [`Self::open`]; the file or its folder cannot be made.
@@ -133,11 +135,12 @@ impl LockedFile {
         read_at_most(&self.file, &self.place, most)
     }
 
-    /// Replaces the file in one step and gives the lock back. The new file has the old one's owner, group, mode and
-    /// extended attributes, which include its access list.
+    /// Replaces the file in one step and gives the lock back. The new file has the old one's owner,
+    /// group, mode and extended attributes, which include its access list.
     ///
     /// # Errors
-    /// The new file cannot be written, or this user may not give it what the old one has. The old file stays then.
+    /// The new file cannot be written, or this user may not give it what the old one has. The old
+    /// file stays then.
     pub fn replace(mut self, content: &[u8]) -> Result<(), CredentialError> {
         let failed = |e: io::Error| CredentialError::write(&self.place, e);
         let folder = self.place.parent().unwrap_or(Path::new("/"));
