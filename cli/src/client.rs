@@ -126,12 +126,14 @@ impl Client {
     where
         F: Future<Output = std::result::Result<Response<T>, Status>>,
     {
+        let others = self.urls.split(',').map(str::trim);
+        let others: Vec<_> = others.filter(|url| *url != self.url).collect();
         let mut silent = match answer(within, call(self.jobs.clone())).await {
             Ok(reply) => return Ok(reply),
+            Err(NoAnswer::Unavailable(error)) if others.is_empty() => return Err(error),
             Err(error) => vec![(self.url.as_str(), error.silence()?)],
         };
-        let others: Vec<_> = self.urls.split(',').map(str::trim).collect();
-        for url in others.into_iter().filter(|url| *url != self.url) {
+        for url in others {
             let jobs = match connect_to(url, &self.access, CONNECT).await {
                 Ok(jobs) => jobs,
                 Err(error) => {
@@ -435,6 +437,8 @@ pub struct Workers {
 enum NoAnswer {
     /// It refused: another one would do the same.
     Refused(CliError),
+    /// It, or the connection to it, reported that it cannot answer; another one may.
+    Unavailable(CliError),
     /// It was silent or away; another one may answer.
     Silent(CliError),
 }
@@ -451,7 +455,7 @@ impl NoAnswer {
     fn silence(self) -> Result<CliError> {
         match self {
             Self::Refused(error) => Err(error),
-            Self::Silent(error) => Ok(error),
+            Self::Unavailable(error) | Self::Silent(error) => Ok(error),
         }
     }
 }
@@ -464,7 +468,7 @@ async fn answer<T>(
     match tokio::time::timeout(within, call).await {
         Ok(Ok(reply)) => Ok(reply.into_inner()),
         Ok(Err(status)) if lost_connection(&status) || status.code() == Grpc::Unavailable => {
-            Err(NoAnswer::Silent(refused(&status)))
+            Err(NoAnswer::Unavailable(refused(&status)))
         }
         Ok(Err(status)) => Err(NoAnswer::Refused(refused(&status))),
         Err(_) => Err(NoAnswer::silent(
@@ -507,12 +511,14 @@ async fn first_that_answers<'a>(urls: &[&'a str], access: &Access) -> Result<(Jo
             false => CONNECT,
         };
         match connect_to(url, access, within).await {
-            Ok(jobs) => return Ok((jobs, url)),
-            Err(NoAnswer::Silent(error)) => silent.push((*url, error)),
-            // A wrong setting for one coordinator does not stop another from answering.
-            Err(NoAnswer::Refused(error)) => {
-                wrong.get_or_insert(error);
-            }
+            Ok(jobs) => return Ok((jobs, *url)),
+            Err(no) => match no.silence() {
+                Ok(error) => silent.push((*url, error)),
+                // A wrong setting for one coordinator does not stop another from answering.
+                Err(error) => {
+                    wrong.get_or_insert(error);
+                }
+            },
         }
     }
     let Some(wrong) = wrong else {
@@ -649,5 +655,38 @@ impl Watch {
                 .map_err(unreadable),
             Err(status) => Err(refused(&status)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_coordinator_that_takes_connections_and_never_answers_is_left() {
+        let mute = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let mute = format!("http://{}", mute.local_addr().unwrap());
+        let soon = Duration::from_millis(100);
+        let Err(no) = connect_to(&mute, &Access::default(), soon).await else {
+            panic!("nobody answers");
+        };
+        let said = no.silence().map(|error| error.message).unwrap();
+        assert!(
+            said.contains("took the connection and did not answer"),
+            "{said}"
+        );
+        let never = std::future::pending::<std::result::Result<Response<()>, Status>>();
+        let Err(no) = answer(soon, never).await else {
+            panic!("nobody answers");
+        };
+        let silent = [
+            ("http://a", no.silence().unwrap()),
+            ("http://b", CliError::input("x")),
+        ];
+        let error = none_answers(&silent);
+        assert_eq!(error.code, Code::Coordinator);
+        let said =
+            "no coordinator answers at http://a (it did not answer within 0 s), http://b (x)";
+        assert_eq!(error.message, said);
     }
 }
