@@ -217,7 +217,7 @@ fn files_that_never_end_are_refused_by_name() {
     for args in [
         &["job", "plan", "/dev/zero"][..],
         &["job", "submit", "/dev"],
-        &["sweep", "extend", "/dev/zero"],
+        &["sweep", "extend", "/dev/zero", "--trials", "2"],
         &["job", "list", "--token-file", "/dev/zero"],
         &[
             "job",

@@ -49,7 +49,8 @@ impl Secret {
     /// The file cannot be read, is empty, or is open to everyone on the machine.
     pub fn read(path: &Path) -> Result<Self, CredentialError> {
         private(path)?;
-        let text = read_text(path, LARGEST_SECRET)?;
+        // It may come from a pipe, e.g. of a program that keeps secrets.
+        let text = text(path, read_bytes(path, LARGEST_SECRET)?)?;
         let line = text.lines().next().unwrap_or_default().trim();
         if line.is_empty() {
             return Err(CredentialError::unusable(
@@ -162,12 +163,23 @@ pub fn read_bytes(path: &Path, most: u64) -> Result<Vec<u8>, CredentialError> {
     read_at_most(&file, path, most)
 }
 
-/// Reads a text file of at most `most` bytes.
+/// Reads a regular text file of at most `most` bytes. A pipe is not waited for.
 ///
 /// # Errors
-/// The file cannot be read, is larger, or is not UTF-8.
+/// The file cannot be read, is not a regular file, is larger, or is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> Result<String, CredentialError> {
-    String::from_utf8(read_bytes(path, most)?)
+    let metadata = std::fs::metadata(path).map_err(|e| CredentialError::read(path, e))?;
+    if !metadata.is_file() {
+        return Err(CredentialError::unusable(
+            path,
+            "is not a regular file; give the path of one",
+        ));
+    }
+    text(path, read_bytes(path, most)?)
+}
+
+fn text(path: &Path, bytes: Vec<u8>) -> Result<String, CredentialError> {
+    String::from_utf8(bytes)
         .map_err(|_| CredentialError::unusable(path, "is not a text file; expected UTF-8"))
 }
 
