@@ -150,16 +150,15 @@ fn a_coordinator_that_does_not_answer_is_left_for_the_next() {
     for process in all {
         process.end().ok();
     }
+    farm.coordinator().signal(Signal::Stop);
+    let frozen = farm.cli().start("frozen", &["job", "list"]);
+    let asked = farm.cli().start("frozen", &["job", "submit", "job.toml"]);
     let silent = "it took the connection and did not answer";
     alone
         .end()
         .fails(4, &["no coordinator answers", &mute, silent]);
     gone.end()
         .fails(4, &[&mute, silent, "http://127.0.0.1:1 (", "refused"]);
-
-    farm.coordinator().signal(Signal::Stop);
-    let frozen = farm.cli().start("frozen", &["job", "list"]);
-    let asked = farm.cli().start("frozen", &["job", "submit", "job.toml"]);
     frozen
         .end()
         .fails(4, &["no coordinator answers", &good, silent]);
