@@ -44,13 +44,6 @@ impl Caller {
         }
     }
 
-    pub(super) fn expired(&self, until: Expiry) -> Status {
-        Status::unauthenticated(format!(
-            "the token or certificate of {:?} expired at {until}; ask for a new one",
-            self.name
-        ))
-    }
-
     /// Pends for as long as the caller has the proof and the roles it came with.
     pub async fn revoked(&self) -> Status {
         let Some(trust) = &self.trust else {
@@ -69,6 +62,13 @@ impl Caller {
             refused = self.refused(trust.clone()) => refused,
             expired = expired => expired,
         }
+    }
+
+    pub(super) fn expired(&self, until: Expiry) -> Status {
+        Status::unauthenticated(format!(
+            "the token or certificate of {:?} expired at {until}; ask for a new one",
+            self.name
+        ))
     }
 
     async fn refused(&self, mut trust: watch::Receiver<Trust>) -> Status {
