@@ -175,6 +175,7 @@ mod tests {
                 roles,
                 sha256: None,
                 certificate: Some("c".into()),
+                expires: None,
                 member: texts(member),
                 maintainer: texts(maintainer),
             })),
