@@ -65,7 +65,8 @@ pub use scenes::snapshot::{Difference, Pinned, Snapshot};
 pub use scenes::summary::Summary;
 pub use store::objects::publish_files;
 pub use store::{
-    Bandwidth, PROBE_WITHIN, Writable, check_location, check_writable, limit_bandwidth,
-    local_ground, open_store, probe,
+    Bandwidth, PROBE_WITHIN, Writable, check_identity, check_location, check_writable,
+    expect_identity, identify_store, limit_bandwidth, local_ground, open_store, probe,
+    store_identity,
 };
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

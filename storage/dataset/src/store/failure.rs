@@ -5,12 +5,19 @@ use std::io;
 use object_store::Error;
 
 use super::account::Failure;
+use super::identity::Mismatch;
 use super::service::Service;
 
 impl Failure {
     /// The account of an error of any store; of an object store's with its service.
     pub(crate) fn of(error: &Error, service: Option<Service>) -> Self {
         let chain = chain(error);
+        if let Some(mismatch) = Mismatch::among(&chain) {
+            return Self {
+                account: mismatch.to_string(),
+                hint: None,
+            };
+        }
         #[cfg(feature = "clouds")]
         if let Some(failure) =
             super::clouds::failure::failure(&chain, service.unwrap_or(Service::S3))

@@ -5,6 +5,8 @@ mod bandwidth;
 #[cfg(feature = "clouds")]
 mod clouds;
 pub(crate) mod failure;
+mod guard;
+pub(crate) mod identity;
 mod local;
 pub(crate) mod many;
 pub(crate) mod objects;
@@ -22,6 +24,7 @@ use object_store::path::Path;
 use crate::error::DatasetError;
 
 pub use bandwidth::{Bandwidth, limit_bandwidth};
+pub use identity::{check_identity, expect_identity, identify_store, store_identity};
 pub(crate) use local::{leftovers, probe_leftovers};
 pub(crate) use probe::PROBE;
 pub use probe::{PROBE_WITHIN, probe};
