@@ -28,7 +28,7 @@ use crate::{
     follow::{Show, follow},
     jobfile, listing,
     output::Output,
-    reach,
+    reach::{self, Identity},
     settings::Settings,
     tail,
 };
@@ -37,7 +37,7 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
     if let Job::Init { file, kind } = &command {
         return init(file.as_deref(), *kind, output);
     }
-    let spec = match &command {
+    let mut spec = match &command {
         Job::Plan { file, scale } => {
             Some(jobfile::read_counted(file, scale.as_deref(), &settings.assets).await?)
         }
@@ -54,8 +54,20 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
         }
         _ => None,
     };
-    if let Some(spec) = &spec {
+    if let Some(spec) = &mut spec {
         reach::warn_of_stores(spec, output).await;
+        let submits = matches!(
+            command,
+            Job::Submit {
+                only_failed: false,
+                ..
+            }
+        );
+        let identity = match submits {
+            true => Identity::Create,
+            false => Identity::Read,
+        };
+        reach::identify(spec, identity, output).await;
     }
     let mut client = Client::connect(&settings.coordinator, &settings.access()?).await?;
     match command {

@@ -31,6 +31,7 @@ use crate::{
     jobfile,
     model::open,
     output::{Output, table},
+    reach::{self, Identity},
     settings::Settings,
 };
 
@@ -77,7 +78,8 @@ pub async fn rounds(args: SweepRun, settings: &Settings, output: Output) -> Resu
     let mut files = Vec::new();
     for round in 0..=rounds {
         let (file, scale) = (&more.file, more.scale.as_deref());
-        let spec = jobfile::read_counted(file, scale, &settings.assets).await?;
+        let mut spec = jobfile::read_counted(file, scale, &settings.assets).await?;
+        reach::identify(&mut spec, Identity::Create, output).await;
         let job = client.submit(spec, false).await?.job;
         output.say(format!("round {round}: {}, job {job}", file.display()));
         let status = follow(&mut client, job, output, Show::Progress).await?;

@@ -131,6 +131,10 @@ impl TryFrom<wire::Lease> for Lease {
                 what: format!("{}..{} holds no task", w.lo, w.hi),
             });
         }
+        let mut stage = super::job::stage(w.stage)?;
+        if !w.stores.is_empty() {
+            stage.stores = w.stores.into_iter().collect();
+        }
         Ok(Lease {
             lease: lease_ref(w.lease)?,
             job: parse(&w.job_id, "lease.job_id")?,
@@ -138,7 +142,7 @@ impl TryFrom<wire::Lease> for Lease {
             hi: w.hi,
             skip: w.skip,
             ttl_ms: w.ttl_ms,
-            stage: super::job::stage(w.stage)?,
+            stage,
             ordinal: w.ordinal,
             key: StageKey::parse(&w.stage_key).ok_or(ConvertError::Invalid {
                 field: "lease.stage_key",
@@ -150,8 +154,9 @@ impl TryFrom<wire::Lease> for Lease {
 }
 
 impl From<Lease> for wire::Lease {
-    fn from(m: Lease) -> Self {
+    fn from(mut m: Lease) -> Self {
         wire::Lease {
+            stores: std::mem::take(&mut m.stage.stores).into_iter().collect(),
             lease: Some(m.lease.into()),
             job_id: m.job.to_string(),
             lo: m.lo,

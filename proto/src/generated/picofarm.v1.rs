@@ -581,7 +581,7 @@ pub struct LeaseRef {
     pub epoch: u64,
 }
 /// Tasks lo ≤ i \< hi of a stage, less those already done.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Lease {
     #[prost(message, optional, tag = "1")]
     pub lease: ::core::option::Option<LeaseRef>,
@@ -608,6 +608,12 @@ pub struct Lease {
     /// Where it belongs in a trace (W3C Trace Context); empty = nowhere.
     #[prost(string, tag = "10")]
     pub traceparent: ::prost::alloc::string::String,
+    /// The identities of the stage's stores by their places; not in `stage`, whose fields older workers would refuse.
+    #[prost(map = "string, string", tag = "11")]
+    pub stores: ::std::collections::HashMap<
+        ::prost::alloc::string::String,
+        ::prost::alloc::string::String,
+    >,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Heartbeat {

@@ -258,7 +258,7 @@ impl Agent {
     fn work(&mut self, now: Instant) {
         if let Some(task) = self.assignments.begin(now) {
             info!(job = %task.job, task = task.index, "task starts");
-            let control = Arc::new(Control::default());
+            let control = Arc::new(Control::expecting(&task.spec.stores));
             self.control = Some(control.clone());
             let span = info_span!(target: trace::TARGET, "task", job = %task.job, stage = &*task.spec.name,
                 task = task.index);

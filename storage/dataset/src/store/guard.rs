@@ -173,7 +173,9 @@ mod tests {
         assert_eq!(identify_store(&*store, &prefix).await.unwrap(), identity);
         let guarded = expect_identity(store, &prefix, identity);
         let object = prefix.clone().join("set").join("object");
-        objects::create(&*guarded, &object, "here".into()).await.unwrap();
+        objects::create(&*guarded, &object, "here".into())
+            .await
+            .unwrap();
 
         // Another empty folder, one that is gone, and one that is another store.
         let gone = other.path().join("gone");
@@ -186,7 +188,9 @@ mod tests {
             (&*foreign, "has the store identity"),
         ] {
             let (store, prefix) = place(folder);
-            check_identity(&*store, &prefix, identity).await.unwrap_err();
+            check_identity(&*store, &prefix, identity)
+                .await
+                .unwrap_err();
             let guarded = expect_identity(store, &prefix, identity);
             let object = prefix.clone().join("set").join("object");
             let put = objects::create(&*guarded, &object, "lost".into()).await;
@@ -196,7 +200,10 @@ mod tests {
             for error in [put.unwrap_err(), read.unwrap_err()] {
                 let text = error.to_string();
                 let named = text.contains(&folder.display().to_string());
-                assert!(text.contains(words) && named && !text.contains("Generic"), "{text}");
+                assert!(
+                    text.contains(words) && named && !text.contains("Generic"),
+                    "{text}"
+                );
             }
         }
         assert!(!gone.exists(), "the store's folder was made");

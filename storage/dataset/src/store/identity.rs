@@ -68,7 +68,9 @@ fn parse(bytes: &[u8]) -> Option<Uuid> {
 fn damaged(store: &dyn ObjectStore, prefix: &Path) -> DatasetError {
     DatasetError::Damaged {
         object: objects::shown(store, &key(prefix)),
-        what: format!("expected the store's identity, JSON with a UUID in {FIELD:?}; put it back from a copy"),
+        what: format!(
+            "expected the store's identity, JSON with a UUID in {FIELD:?}; put it back from a copy"
+        ),
     }
 }
 
@@ -92,10 +94,7 @@ pub async fn store_identity(
 ///
 /// # Errors
 /// As [`store_identity`].
-pub async fn identify_store(
-    store: &dyn ObjectStore,
-    prefix: &Path,
-) -> Result<Uuid, DatasetError> {
+pub async fn identify_store(store: &dyn ObjectStore, prefix: &Path) -> Result<Uuid, DatasetError> {
     if let Some(identity) = store_identity(store, prefix).await? {
         return Ok(identity);
     }
@@ -139,10 +138,7 @@ pub(super) async fn check(
     expected: Uuid,
 ) -> Result<(), Error> {
     let (place, ask) = match objects::folder(store, prefix) {
-        Some(folder) => (
-            format!("the folder {}", folder.display()),
-            "is it mounted?",
-        ),
+        Some(folder) => (format!("the folder {}", folder.display()), "is it mounted?"),
         None => (
             objects::shown(store, prefix),
             "is this the right bucket, and are its objects all there?",
@@ -159,11 +155,13 @@ pub(super) async fn check(
     match parse(&bytes) {
         Some(found) if found == expected => Ok(()),
         Some(found) => {
-            let what = format!("{place} has the store identity {found}; expected {expected}; {ask}");
+            let what =
+                format!("{place} has the store identity {found}; expected {expected}; {ask}");
             Err(Mismatch(what).into())
         }
         None => {
-            let what = format!("{place} has a store identity that cannot be read; expected {expected}");
+            let what =
+                format!("{place} has a store identity that cannot be read; expected {expected}");
             Err(Mismatch(what).into())
         }
     }

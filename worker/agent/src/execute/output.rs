@@ -10,7 +10,7 @@ use std::{
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
-    open_store, probe,
+    check_identity, expect_identity, open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -23,11 +23,14 @@ use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
 use tracing::{debug_span, warn};
+use uuid::Uuid;
 
 use super::{Control, TaskError, memory};
 
 /// A store and the prefix in it.
 type Place = (Arc<dyn ObjectStore>, Path);
+/// A store's place, and the identity that is expected of it.
+type StoreName = (String, Option<Uuid>);
 
 /// How long what is finished is held at least for a store that does not take it.
 const LEAST_PATIENCE: Duration = Duration::from_secs(3);
@@ -38,9 +41,9 @@ const STOP_LOOK: Duration = Duration::from_millis(50);
 pub(super) struct Stores {
     runtime: Handle,
     /// Opened stores that passed the probe, by location: their connections are kept from task to task.
-    probed: Mutex<BTreeMap<String, Place>>,
+    probed: Mutex<BTreeMap<StoreName, Place>>,
     /// Opened stores that are only read, by location.
-    sources: Mutex<BTreeMap<String, Place>>,
+    sources: Mutex<BTreeMap<StoreName, Place>>,
     /// How long a rendered scene is held at most for a store that does not take it.
     patience: Duration,
     /// Memory that tasks may take, MiB; 0 = not known.
@@ -128,7 +131,7 @@ impl Stores {
         dataset: &str,
         control: &Control,
     ) -> Result<Dataset, TaskError> {
-        let (store, prefix) = self.source(location)?;
+        let (store, prefix) = self.source(location, control)?;
         self.wait(control, Dataset::open(store, prefix.join(dataset)))
     }
 
@@ -137,20 +140,34 @@ impl Stores {
     pub(super) fn source_models(
         &self,
         location: &str,
+        control: &Control,
     ) -> Result<picofarm_dataset::Models, TaskError> {
-        let (store, prefix) = self.source(location)?;
+        let (store, prefix) = self.source(location, control)?;
         Ok(picofarm_dataset::Models::new(store, &prefix))
     }
 
     /// A place to read from.
-    pub(super) fn source(&self, location: &str) -> Result<Place, TaskError> {
+    pub(super) fn source(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let name = named(location, control)?;
         let known = || self.sources.lock().expect("no panic while locked");
-        if let Some(place) = known().get(location) {
+        if let Some(place) = known().get(&name) {
             return Ok(place.clone());
         }
-        let place = open_store(location).map_err(of_dataset)?;
-        known().insert(location.to_owned(), place.clone());
+        let place = opened(&name)?;
+        known().insert(name, place.clone());
         Ok(place)
+    }
+
+    /// Checks the stores of a task that must have an identity: before it works with them, and before what it has done counts.
+    /// A store that is mounted between counts as one that is not.
+    pub(super) fn check_identities(&self, control: &Control) -> Result<(), TaskError> {
+        for location in control.identified() {
+            let (store, prefix) = self.source(location, control)?;
+            if let (_, Some(identity)) = named(location, control)? {
+                self.wait(control, check_identity(&*store, &prefix, identity))?;
+            }
+        }
+        Ok(())
     }
 
     /// Stores a recipe where there is none yet. It is looked for with every scene: who deletes a data set while this worker
@@ -169,13 +186,14 @@ impl Stores {
 
     /// A place to write to. The first use of a location proves that its store is safe.
     pub(super) fn probed(&self, location: &str, control: &Control) -> Result<Place, TaskError> {
+        let name = named(location, control)?;
         let known = || self.probed.lock().expect("no panic while locked");
-        if let Some(place) = known().get(location) {
+        if let Some(place) = known().get(&name) {
             return Ok(place.clone());
         }
-        let (store, prefix) = open_store(location).map_err(of_dataset)?;
+        let (store, prefix) = opened(&name)?;
         self.wait(control, probe(&*store, &prefix, PROBE_WITHIN))?;
-        known().insert(location.to_owned(), (store.clone(), prefix.clone()));
+        known().insert(name, (store.clone(), prefix.clone()));
         Ok((store, prefix))
     }
 
@@ -288,6 +306,25 @@ impl Stores {
             }
         }
     }
+}
+
+/// A store's place with the identity that a task expects there.
+fn named(location: &str, control: &Control) -> Result<StoreName, TaskError> {
+    let identity = control.identity(location).map(Uuid::parse_str);
+    let identity = identity.transpose().map_err(|e| {
+        TaskError::User(format!(
+            "stores: the identity of {location}: {e}; submit the job again"
+        ))
+    })?;
+    Ok((location.to_owned(), identity))
+}
+
+fn opened((location, identity): &StoreName) -> Result<Place, TaskError> {
+    let (store, prefix) = open_store(location).map_err(of_dataset)?;
+    Ok(match identity {
+        Some(identity) => (expect_identity(store, &prefix, *identity), prefix),
+        None => (store, prefix),
+    })
 }
 
 /// The data set that a job's settings describe.

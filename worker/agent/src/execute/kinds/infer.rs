@@ -63,7 +63,7 @@ impl RunTask for InferTask {
         stores.fits(TaskSpec::Infer(task.clone()), Some(dataset.spec()))?;
         let found = source_manifest(stores, &dataset, index, control)?;
         let models = stores
-            .source_models(&place.store)
+            .source_models(&place.store, control)
             .map_err(|e| at("source.store", e))?;
         let panel = Panel::of(stores, &models, &dataset, (task, &found), control)?;
         truth::check(
