@@ -24,6 +24,16 @@ impl Failure {
         {
             return failure;
         }
+        #[cfg(feature = "clouds")]
+        if let Some(broken) = chain
+            .iter()
+            .find_map(|e| e.downcast_ref::<super::steady::Broken>())
+        {
+            return Self {
+                account: broken.to_string(),
+                hint: Some("check the network and the proxies before the store"),
+            };
+        }
         #[cfg(not(feature = "clouds"))]
         let _ = service;
         let io = chain.last().and_then(|e| e.downcast_ref::<io::Error>());
@@ -43,6 +53,14 @@ pub(crate) fn no_bucket(error: &Error) -> bool {
         let _ = error;
         false
     }
+}
+
+/// Whether a request or its answer broke off, or arrived otherwise than it was sent.
+#[cfg(feature = "clouds")]
+pub(super) fn breaks_off(error: &Error) -> bool {
+    let chain = chain(error);
+    chain.iter().any(|e| e.is::<super::steady::Broken>())
+        || super::clouds::failure::breaks_off(&chain)
 }
 
 fn chain(error: &Error) -> Vec<&(dyn std::error::Error + 'static)> {

@@ -13,6 +13,8 @@ pub(crate) mod objects;
 mod place;
 mod probe;
 pub(crate) mod service;
+#[cfg(feature = "clouds")]
+mod steady;
 mod writable;
 
 use std::sync::Arc;
