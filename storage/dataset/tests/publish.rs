@@ -206,6 +206,38 @@ async fn racing_publishers_of_the_same_task_all_succeed_and_of_different_ones_co
 }
 
 #[tokio::test]
+async fn what_broken_puts_have_left_is_replaced_when_the_scene_is_published_again() {
+    let spec = spec(Profile::default());
+    let (store, dataset) = in_memory(&spec).await;
+    let scene = Scene::new(&spec, 1);
+    let publish = async || dataset.publish(1, &scene.record(), &provenance()).await;
+    let manifest = publish().await.unwrap();
+    let at = |key: &str| Path::from(format!("{}/{key}", dataset.prefix()));
+    let file = at("manifests/1.json");
+    for object in &manifest.objects {
+        let path = at(&object.key);
+        let whole = store.get(&path).await.unwrap().bytes().await.unwrap();
+        let mut flipped = whole.to_vec();
+        flipped[whole.len() / 2] ^= 0x10;
+        for broken in [flipped, whole[..whole.len() / 2].to_vec(), Vec::new()] {
+            // With the manifest that proves what was there, and before there was one.
+            for published in [true, false] {
+                if !published {
+                    store.delete(&file).await.unwrap();
+                }
+                store.put(&path, broken.clone().into()).await.unwrap();
+                assert_eq!(publish().await.unwrap(), manifest, "{}", object.key);
+                let now = store.get(&path).await.unwrap().bytes().await.unwrap();
+                assert_eq!(now, whole, "{}", object.key);
+            }
+        }
+    }
+    store.put(&file, "{".into()).await.unwrap();
+    assert_eq!(publish().await.unwrap(), manifest);
+    assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+}
+
+#[tokio::test]
 async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
     let folder = tempfile::tempdir().unwrap();
     let location = folder.path().to_str().unwrap();
