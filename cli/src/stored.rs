@@ -11,13 +11,14 @@ use futures::future::BoxFuture;
 use object_store::{ObjectStore, path::Path};
 use picofarm_agent::StorePrefixes;
 use picofarm_coordinator::{Found, Stored};
-use picofarm_dataset::{DatasetError, Held, Holdings, PartName, open_store};
+use picofarm_dataset::{DatasetError, Held, Holdings, PartName, check_identity, open_store};
 use picofarm_proto::{
     key::task_key,
     model::{StageSpec, kinds::Manifest},
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio_util::task::AbortOnDropHandle;
+use uuid::Uuid;
 
 use crate::error::{CliError, Code, Result};
 
@@ -204,7 +205,13 @@ impl Stored for StoreReader {
             let (location, question) = Question::of(stage, results)?;
             let (store, prefix) = self.open(&location)?;
             let folder = !location.contains("://") || location.starts_with("file:");
+            let identity = stage.stores.get(location.trim_end_matches('/'));
+            let identity = identity.and_then(|text| Uuid::try_parse(text).ok());
             let asked = async move {
+                // Where this machine has not mounted it, everything would seem to be gone.
+                if let Some(identity) = identity {
+                    check_identity(&*store, &prefix, identity).await?;
+                }
                 let thorough = |task: u64| folder || task.is_multiple_of(ONE_IN);
                 let holdings = Holdings::new(store, prefix);
                 question.ask(&holdings, thorough).await
@@ -279,6 +286,19 @@ mod tests {
             assert!(why.contains("--check-stores"), "{store}: {why}");
         }
         assert!(StoreReader::below(&["relative".into()]).is_err());
+    }
+
+    #[tokio::test]
+    async fn a_folder_that_is_not_mounted_here_is_not_taken_for_an_empty_store() {
+        let folder = tempfile::tempdir().unwrap();
+        let reader = StoreReader::anywhere().unwrap();
+        let place = folder.path().display().to_string();
+        let mut at = stage(&place);
+        let results = [(0, [0; 32])];
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
+        at.stores.insert(place, Uuid::nil().to_string());
+        let why = reader.look(&at, &results).await.unwrap_err();
+        assert!(why.contains("no store identity"), "{why}");
     }
 
     #[tokio::test]

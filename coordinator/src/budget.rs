@@ -57,8 +57,8 @@ pub fn charge(
                 exception: before.cloned(),
             };
         }
-        // Its store's own wait decides.
-        FailureKind::Store => {
+        // Its store's own wait decides, and of what is damaged the caller, who counts the tries.
+        FailureKind::Store | FailureKind::Damaged => {
             return Verdict {
                 retry_at_ms: Some(now_ms + 1),
                 exception: before.cloned(),

@@ -232,7 +232,7 @@ proptest! {
     }
 
     #[test]
-    fn budgets_are_separate_and_interruptions_free(kinds in prop::collection::vec(0..4u8, 0..30)) {
+    fn budgets_are_separate_and_interruptions_free(kinds in prop::collection::vec(0..5u8, 0..30)) {
         let limits = Limits { max_failures: 3, max_crashes: 2, ..Limits::default() };
         let backoff = Backoff::default();
         let fresh = || picofarm_catalog::Exception {
@@ -240,11 +240,11 @@ proptest! {
         };
         let (mut record, mut failures, mut crashes) = (None, 0, 0);
         for kind in kinds {
-            let kind = [FailureKind::User, FailureKind::Crash, FailureKind::Interrupted, FailureKind::Store][usize::from(kind)];
+            let kind = [FailureKind::User, FailureKind::Crash, FailureKind::Interrupted, FailureKind::Store, FailureKind::Damaged][usize::from(kind)];
             failures += u32::from(kind == FailureKind::User);
             crashes += u32::from(kind == FailureKind::Crash);
             let verdict = charge(record.as_ref(), fresh(), kind, "x", &limits, &backoff, 100);
-            let free = matches!(kind, FailureKind::Interrupted | FailureKind::Store);
+            let free = matches!(kind, FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged);
             let dead = !free && (failures >= 3 || crashes >= 2);
             prop_assert_eq!(verdict.retry_at_ms.is_none(), dead);
             prop_assert!(verdict.retry_at_ms.is_none_or(|at| at > 100));

@@ -112,7 +112,9 @@ impl Tally {
         match kind {
             FailureKind::User => self.user += 1,
             FailureKind::Crash => self.crash += 1,
-            FailureKind::Interrupted | FailureKind::Store => self.interrupted += 1,
+            FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged => {
+                self.interrupted += 1;
+            }
         }
     }
 

@@ -273,6 +273,7 @@ fn say() -> impl Strategy<Value = wire::SessionRequest> {
                 index,
                 kind,
                 message,
+                damaged: index % 2 == 0,
             })
         });
     let release = (lease(), ".{0,20}")

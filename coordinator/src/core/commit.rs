@@ -158,6 +158,7 @@ impl Core {
     ) {
         let task = report.index;
         let set = self.stages[&id].set;
+        self.away.mended((id, task));
         if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
         {
             entry.blocklist.succeeded(*worker);

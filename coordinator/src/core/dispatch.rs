@@ -124,7 +124,7 @@ impl Core {
         let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
         // A task that may run for days holds up no other.
-        let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
+        let alone = self.away.is_try(&store, worker) || entry.spec(id).task.resumes();
         let count = match alone {
             true => 1,
             false => self.lease_size(entry, able, run.hi - run.lo),
@@ -152,7 +152,7 @@ impl Core {
         who.leases.insert(granted.id);
         who.quarantined = granted.crashes > 0;
         self.leases.insert(granted.id, id);
-        self.away.begun(&store, granted.id);
+        self.away.begun(&store, worker, granted.id);
         self.load.begun(granted.id, &entry.job, worker);
         let lease = Lease {
             lease: granted.lease(),

@@ -300,7 +300,7 @@ impl Core {
             // It goes on from where it was saved, so losing workers again and again is no sign that it never ends.
             backoff.most_ms = backoff.first_ms;
         }
-        let verdict = budget::charge(
+        let mut verdict = budget::charge(
             entry.exceptions.get(&task),
             fresh,
             kind,
@@ -312,6 +312,12 @@ impl Core {
         if let RangeState::Leased(lease) = &range.state {
             match kind {
                 FailureKind::Interrupted => {}
+                FailureKind::Damaged => {
+                    let wait = self
+                        .away
+                        .damaged((range.stage, task), &self.settings.backoff);
+                    verdict.retry_at_ms = Some(now_ms + wait);
+                }
                 FailureKind::Store => {
                     let store = store_of(&entry.spec(range.stage).task);
                     let backoff = &self.settings.backoff;
@@ -340,7 +346,12 @@ impl Core {
         );
         let kind = match verdict.retry_at_ms {
             // Free: the task was given back, nothing is wrong with it.
-            Some(_) if matches!(kind, FailureKind::Interrupted | FailureKind::Store) => {
+            Some(_)
+                if matches!(
+                    kind,
+                    FailureKind::Interrupted | FailureKind::Store | FailureKind::Damaged
+                ) =>
+            {
                 EventKind::Released
             }
             Some(_) => EventKind::Failed,

@@ -419,6 +419,7 @@ impl Worker {
             index,
             kind: kind.into(),
             message: "no such mesh".into(),
+            damaged: false,
         }))
         .await;
         assert!(self.acknowledged().await.accepted);

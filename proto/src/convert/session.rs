@@ -236,6 +236,7 @@ impl TryFrom<wire::TaskFailed> for Failure {
             wire::FailureKind::User => FailureKind::User,
             wire::FailureKind::Crash => FailureKind::Crash,
             wire::FailureKind::Interrupted => FailureKind::Interrupted,
+            wire::FailureKind::Store if w.damaged => FailureKind::Damaged,
             wire::FailureKind::Store => FailureKind::Store,
             wire::FailureKind::Unspecified => {
                 return Err(ConvertError::Missing {
@@ -258,7 +259,7 @@ impl From<Failure> for wire::TaskFailed {
             FailureKind::User => wire::FailureKind::User,
             FailureKind::Crash => wire::FailureKind::Crash,
             FailureKind::Interrupted => wire::FailureKind::Interrupted,
-            FailureKind::Store => wire::FailureKind::Store,
+            FailureKind::Store | FailureKind::Damaged => wire::FailureKind::Store,
         };
         wire::TaskFailed {
             lease: Some(m.lease.into()),
@@ -266,6 +267,7 @@ impl From<Failure> for wire::TaskFailed {
             kind: kind.into(),
             // Longer than a message may be, it would end the session each time it is sent.
             message: bounds::message(&m.message),
+            damaged: m.kind == FailureKind::Damaged,
         }
     }
 }

@@ -677,6 +677,9 @@ pub struct TaskFailed {
     pub kind: i32,
     #[prost(string, tag = "4")]
     pub message: ::prost::alloc::string::String,
+    /// With FAILURE_KIND_STORE: the store answers, but an object in it is damaged. Only the task waits.
+    #[prost(bool, tag = "5")]
+    pub damaged: bool,
 }
 /// Answers TaskDone, TaskFailed and Release.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

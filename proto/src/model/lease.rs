@@ -105,6 +105,8 @@ pub enum FailureKind {
     Interrupted,
     /// The store cannot be reached or written: free, and all that use it wait.
     Store,
+    /// The store answers, but an object in it is damaged or missing: free, and the task waits until it is repaired.
+    Damaged,
 }
 
 /// A failed task as the worker reports it.

@@ -504,6 +504,10 @@ impl Agent {
                 self.summary.failed += 1;
                 warn!(%job, task, why, "the task waits for its store; the worker takes other work");
             }
+            Err(TaskError::Damaged(why)) => {
+                self.summary.failed += 1;
+                warn!(%job, task, why, "the task waits until what it reads is repaired");
+            }
             Err(error) => {
                 self.summary.failed += 1;
                 error!(%job, task, seconds, %error, "task failed");

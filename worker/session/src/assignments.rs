@@ -324,6 +324,7 @@ impl Assignments {
                     TaskError::Crash(_) => FailureKind::Crash,
                     TaskError::Interrupted(_) | TaskError::Stopped => FailureKind::Interrupted,
                     TaskError::Store(_) => FailureKind::Store,
+                    TaskError::Damaged(_) => FailureKind::Damaged,
                 },
                 message: error.to_string(),
             })),

@@ -62,6 +62,9 @@ pub enum TaskError {
     /// Nothing is wrong with the task: its store cannot be reached, or takes nothing.
     #[error("{0}")]
     Store(String),
+    /// Nothing is wrong with the task: its store answers, but an object in it is damaged or missing.
+    #[error("{0}")]
+    Damaged(String),
     /// [`Control::stop`] was called.
     #[error("stopped on request")]
     Stopped,

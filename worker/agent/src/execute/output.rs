@@ -121,7 +121,11 @@ impl Stores {
     ) -> Result<Dataset, TaskError> {
         let (store, prefix) = self.probed(location, control)?;
         let prefix = prefix.join(dataset);
-        self.wait(control, Dataset::create_or_open(store, prefix, spec))
+        self.wait_for(
+            control,
+            Dataset::create_or_open(store, prefix, spec),
+            of_open,
+        )
     }
 
     /// Opens a data set to read; creates nothing, and asks of its store nothing but reading.
@@ -132,7 +136,7 @@ impl Stores {
         control: &Control,
     ) -> Result<Dataset, TaskError> {
         let (store, prefix) = self.source(location, control)?;
-        self.wait(control, Dataset::open(store, prefix.join(dataset)))
+        self.wait_for(control, Dataset::open(store, prefix.join(dataset)), of_open)
     }
 
     /// The models of a store, to read only; asks of it nothing else.
@@ -351,6 +355,14 @@ pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
     hex::encode(Sha256::digest(manifest.to_bytes()))
 }
 
+/// The same where it is opened: what is there may be no data set of ours at all.
+fn of_open(error: DatasetError) -> TaskError {
+    match of_dataset(error) {
+        TaskError::Damaged(text) => TaskError::User(text),
+        other => other,
+    }
+}
+
 /// Who is to blame for a data set's error.
 pub(super) fn of_dataset(error: DatasetError) -> TaskError {
     let text = error.to_string();
@@ -359,6 +371,8 @@ pub(super) fn of_dataset(error: DatasetError) -> TaskError {
         DatasetError::Store { .. }
         | DatasetError::StoreSettings { .. }
         | DatasetError::Io { .. } => TaskError::Store(text),
+        // Repeated reading has not helped. To run the task elsewhere may, and repairing the store does.
+        DatasetError::Damaged { .. } => TaskError::Damaged(text),
         DatasetError::Codec { .. } => TaskError::Crash(text),
         _ => TaskError::User(text),
     }
