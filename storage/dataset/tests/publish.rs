@@ -234,6 +234,8 @@ async fn what_broken_puts_have_left_is_replaced_when_the_scene_is_published_agai
     }
     store.put(&file, "{".into()).await.unwrap();
     assert_eq!(publish().await.unwrap(), manifest);
+    // Where somebody names its folder as a store, that has an identity.
+    identify_store(&*store, dataset.prefix()).await.unwrap();
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
 }
 
