@@ -418,8 +418,8 @@ mod tests {
         let (none, no, bytes) = (Fault::None, Fault::Forbidden, Fault::Bytes);
         for faults in [
             &[no, none][..],
-            &[bytes, none],
-            &[no, bytes, no, none, none],
+            &[bytes, none, none, none, none],
+            &[no, bytes, none, none, none],
         ] {
             let store = store(faults);
             for k in 0..20 {
