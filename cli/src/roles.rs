@@ -126,7 +126,7 @@ pub fn agent_error(error: &AgentError) -> CliError {
                 .iter()
                 .any(|word| text.contains(word))
             {
-                ended.hint("compare `picofarm --version` on both machines and install the same one")
+                ended.hint("compare `picofarm --version` on both machines; upgrade coordinators first, then their workers")
             } else {
                 ended
             }

@@ -11,7 +11,7 @@ use std::{
 
 use futures::Stream;
 use picofarm_proto::{
-    PROTOCOL,
+    PROTOCOL, compatibility,
     convert::ConvertError,
     ids::LeaseRef,
     model::{WorkerHello, bounds},
@@ -173,14 +173,15 @@ async fn greeting(input: &mut Streaming<wire::SessionRequest>) -> Result<WorkerH
             "the first message of a session must be hello",
         ));
     };
-    if hello.protocol != PROTOCOL || hello.version != VERSION {
-        return Err(Status::failed_precondition(format!(
-            "worker {} is picofarm {} (protocol {}), the coordinator is picofarm {VERSION} (protocol {PROTOCOL}); install the same version on both",
+    compatibility::serves(VERSION, &hello.version, hello.protocol).map_err(|why| {
+        Status::failed_precondition(format!(
+            "worker {} is picofarm version {} (protocol {}), the coordinator is picofarm version {VERSION} (protocol \
+             {PROTOCOL}): {why}",
             bounds::quoted(&hello.name),
             bounds::cut(&hello.version, bounds::NAME_BYTES),
             hello.protocol
-        )));
-    }
+        ))
+    })?;
     WorkerHello::try_from(hello).map_err(invalid)
 }
 

@@ -23,7 +23,6 @@ use picofarm_proto::{
 };
 use sqlx::{
     ConnectOptions, Connection, SqliteConnection, SqlitePool,
-    migrate::MigrateError,
     pool::PoolConnection,
     sqlite::{
         SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteRow, SqliteSynchronous,
@@ -158,26 +157,44 @@ impl SqliteCatalog {
 }
 
 async fn migrate(path: &Path, connection: &mut SqliteConnection) -> Result<(), CatalogError> {
-    let known = migrations::latest(&migrations::SQLITE);
+    upgrade_former(connection)
+        .await
+        .map_err(|e| errors::classify(path, e))?;
     migrations::SQLITE
         .run_direct(None, connection, false)
         .await
-        .map_err(|error| match error {
-            MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _) => {
-                CatalogError::Newer {
-                    place: path.display().to_string(),
-                    found,
-                    known,
-                }
-            }
-            MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => {
+        .map_err(|error| {
+            let place = path.display().to_string();
+            migrations::failed(place, &migrations::SQLITE, error, |e| {
                 errors::classify(path, e)
-            }
-            other => CatalogError::Unusable {
-                place: path.display().to_string(),
-                what: format!("its schema is not this program's ({other})"),
-            },
+            })
         })
+}
+
+/// Upgrades a catalog whose first step was written before steps were append-only.
+async fn upgrade_former(connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
+    let mut tx = connection.begin().await?;
+    let tables: i64 =
+        sqlx::query_scalar("SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'")
+            .fetch_one(&mut *tx)
+            .await?;
+    if tables == 0 {
+        return tx.rollback().await;
+    }
+    let checksum: Option<Vec<u8>> =
+        sqlx::query_scalar("SELECT checksum FROM _sqlx_migrations WHERE version = 1")
+            .fetch_optional(&mut *tx)
+            .await?;
+    let former = &migrations::SQLITE_FORMER;
+    if !checksum.is_some_and(|checksum| former.matches(&checksum)) {
+        return tx.rollback().await;
+    }
+    sqlx::raw_sql(former.upgrade).execute(&mut *tx).await?;
+    sqlx::query("UPDATE _sqlx_migrations SET checksum = ? WHERE version = 1")
+        .bind(migrations::first_checksum(&migrations::SQLITE))
+        .execute(&mut *tx)
+        .await?;
+    tx.commit().await
 }
 
 #[async_trait]
