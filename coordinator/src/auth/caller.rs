@@ -35,6 +35,11 @@ impl Caller {
         }
     }
 
+    /// Whether no proof was asked of it: such callers cannot be told apart.
+    pub(crate) fn is_anyone(&self) -> bool {
+        self.tokens.is_none() && self.entry.is_none() && *self.name == *ANYONE
+    }
+
     /// Pends for as long as the caller has the proof and the roles it came with.
     pub async fn revoked(&self) -> Status {
         let (Some(tokens), Some(entry)) = (&self.tokens, &self.entry) else {

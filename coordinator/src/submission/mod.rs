@@ -8,12 +8,14 @@ mod check;
 mod draft;
 mod judge;
 mod look;
+mod places;
 mod report;
 
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Gone, Job, Outcome, Owner, Recorded, Run, StageRecord, Submission,
+    Catalog, CatalogError, Gone, Job, Outcome, OwnedPlace, Owner, Recorded, Run, StageRecord,
+    Submission,
 };
 use picofarm_proto::{
     ids::JobId,
@@ -59,6 +61,8 @@ struct Facts {
     /// By stage.
     recorded: Vec<Vec<Recorded>>,
     latest: Option<Latest>,
+    /// Normal forms of others' places that the caller may write into.
+    permitted: Vec<String>,
 }
 
 /// The latest job with the same spec.
@@ -77,6 +81,8 @@ struct Considered {
     lost: bool,
     /// By stage.
     findings: Vec<Findings>,
+    /// Normal forms of others' places that the caller may write into.
+    permitted: Vec<String>,
 }
 
 impl Submissions {
@@ -148,7 +154,11 @@ impl Submissions {
                 |it, draft| async move { it.facts(&draft, &whose).await },
             )
             .await?;
-        let Facts { recorded, latest } = facts;
+        let Facts {
+            recorded,
+            latest,
+            permitted,
+        } = facts;
         let until = look::deadline();
         let mut findings = Vec::with_capacity(recorded.len());
         for (position, recorded) in recorded.into_iter().enumerate() {
@@ -172,6 +182,7 @@ impl Submissions {
             latest,
             lost,
             findings,
+            permitted,
         })
     }
 
@@ -179,6 +190,7 @@ impl Submissions {
     async fn facts(&self, draft: &Draft, by: &Caller) -> Result<Facts, Refusal> {
         let catalog = &self.catalog;
         let sight = by.sight(self.visibility);
+        let permitted = self.permitted(draft, by).await?;
         let mut recorded = Vec::with_capacity(draft.stages().len());
         for (stage, record) in draft.spec.stages.iter().zip(draft.stages()) {
             let set = &record.set;
@@ -206,7 +218,35 @@ impl Submissions {
                 id: job.id,
                 state: job.state,
             }),
+            permitted,
         })
+    }
+
+    /// Checks that the caller may write into every place that the job names. Returns others' places among them.
+    async fn permitted(&self, draft: &Draft, by: &Caller) -> Result<Vec<String>, Refusal> {
+        let sight = by.sight(self.visibility);
+        let owner = Owner {
+            user: by.name.to_string(),
+            project: draft.spec.project.clone(),
+        };
+        let mut permitted = Vec::new();
+        for (position, mine) in places::written(&draft.spec.stages, draft.stages(), &owner) {
+            let (stage, record) = (&draft.spec.stages[position], &draft.stages()[position]);
+            let near = self.catalog.owned_near(&mine.place).await.map_err(broken)?;
+            for (other, may_write) in places::of_others(&mine, &near, by) {
+                if !may_write {
+                    // The same results may be reused, but none added.
+                    let theirs = self.catalog.largest_stage(&record.set, &other.owner.user);
+                    let theirs = theirs.await.map_err(broken)?;
+                    if other.place != mine.place || record.tasks > theirs {
+                        let why = places::refused(stage, &mine, other, &sight);
+                        return Err(Refusal::Denied(draft.spec.at(stage, why).to_string()));
+                    }
+                }
+                permitted.push(other.place.clone());
+            }
+        }
+        Ok(permitted)
     }
 
     /// Asks the store of a stage about its recorded outputs.
@@ -252,7 +292,8 @@ impl Submissions {
             .latest
             .filter(|_| considered.lost)
             .map(|job| job.id);
-        let findings = considered.findings;
+        let (findings, permitted) = (considered.findings, considered.permitted);
+        let anyone = by.is_anyone();
         let recorded = self.heavy(draft, move |it, draft| async move {
             let _turn = it.turn.lock().await;
             if it.catalog.jobs_of(&owner).await.map_err(broken)? >= most {
@@ -266,7 +307,14 @@ impl Submissions {
             let prepared = prepare(&draft, owner, &circle, &counts, &mut make_id, it.clock.now_ms());
             let dropped = findings.iter().zip(draft.stages());
             let gone: Vec<Gone> = dropped.flat_map(|(f, stage)| f.dropped(&stage.set)).collect();
-            it.commit(prepared, &gone, instead_of).await
+            let owner = Owner::from(&prepared.job);
+            // Without tokens, everybody is the same caller, and owns nothing.
+            let places = match anyone {
+                true => Vec::new(),
+                false => places::written(&draft.spec.stages, &prepared.stages, &owner),
+            };
+            let places: Vec<OwnedPlace> = places.into_iter().map(|(_, place)| place).collect();
+            it.commit(prepared, &gone, instead_of, (&places, &permitted)).await
         });
         let Some(job) = recorded.await? else {
             return Ok(None);
@@ -283,6 +331,7 @@ impl Submissions {
         prepared: Prepared,
         gone: &[Gone],
         instead_of: Option<JobId>,
+        (places, permitted): (&[OwnedPlace], &[String]),
     ) -> Result<Option<JobId>, Refusal> {
         let Prepared {
             job,
@@ -293,6 +342,8 @@ impl Submissions {
         let submission = Submission {
             gone,
             instead_of,
+            places,
+            permitted,
             ..Submission::new(&job, &stages, &ranges, &events)
         };
         match self.catalog.record(&submission).await {

@@ -2,6 +2,7 @@
 
 pub mod audit;
 pub mod bounds;
+mod destination;
 pub mod domain;
 pub mod explain;
 pub mod file;
@@ -25,6 +26,7 @@ mod texts;
 pub mod trial;
 
 pub use audit::{Act, AuditEntry, Outcome};
+pub use destination::{Destination, Place};
 pub use domain::{Domain, Interval};
 // What jobs share with data sets, the renderer and the networks.
 pub use explain::{ConnectedWorker, Made, Reason, TaskExplanation, TaskOutput, TaskState};

@@ -41,7 +41,7 @@ pub use job::{Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timi
 pub use listing::{Forgotten, JobQuery, Page};
 pub use range::{LeaseState, Mark, Range, RangeState, Run};
 pub use refused::{Culprit, Row, culprits, verdict};
-pub use rights::{AuditQuery, NewAudit, Owner, Rights, Sight};
+pub use rights::{AuditQuery, NewAudit, OwnedPlace, Owner, Rights, Sight};
 pub use submission::{Gone, Outcome, Recorded, Submission};
 pub use task::{Exception, Output, TaskRecord};
 

@@ -28,6 +28,7 @@ const SQLITE_STEPS: &[Step] = steps!("sqlite":
     2 "0002_stages",
     3 "0003_listing",
     4 "0004_rights",
+    5 "0005_places",
 );
 #[cfg(feature = "postgres")]
 const POSTGRES_STEPS: &[Step] = steps!("postgres":
@@ -35,6 +36,7 @@ const POSTGRES_STEPS: &[Step] = steps!("postgres":
     2 "0002_stages",
     3 "0003_listing",
     4 "0004_rights",
+    5 "0005_places",
 );
 
 /// For SQLite.

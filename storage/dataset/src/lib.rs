@@ -63,6 +63,7 @@ pub use scenes::parts::PartName;
 pub use scenes::read::Stored;
 pub use scenes::snapshot::{Difference, Pinned, Snapshot};
 pub use scenes::summary::Summary;
+pub use store::folder::check_own_folder;
 pub use store::objects::publish_files;
 pub use store::{
     Bandwidth, PROBE_WITHIN, Writable, check_location, check_writable, limit_bandwidth,

@@ -11,6 +11,7 @@ use super::{
 use crate::{
     key::hash::StageKey,
     model::{
+        destination::Destination,
         memory::{Known, LIGHT_PATHS, Rendering, Shape},
         places::OutputSettings,
         spec_error::{SpecError, within},
@@ -163,6 +164,10 @@ impl TaskKind for RenderTask {
             "render": self.render,
             "profile": self.output.profile,
         })
+    }
+
+    fn destination(&self) -> Destination<'_> {
+        Destination::output(&self.output)
     }
 
     fn results(&self) -> Results<'_> {

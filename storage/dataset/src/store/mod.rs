@@ -5,6 +5,7 @@ mod bandwidth;
 #[cfg(feature = "clouds")]
 mod clouds;
 pub(crate) mod failure;
+pub(crate) mod folder;
 mod local;
 pub(crate) mod many;
 pub(crate) mod objects;

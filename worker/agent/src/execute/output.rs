@@ -2,7 +2,7 @@
 //! patience. Says who is to blame when the store does not play along.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
@@ -10,7 +10,7 @@ use std::{
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
-    open_store, probe,
+    check_own_folder, open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
@@ -39,6 +39,8 @@ pub(super) struct Stores {
     runtime: Handle,
     /// Opened stores that passed the probe, by location: their connections are kept from task to task.
     probed: Mutex<BTreeMap<String, Place>>,
+    /// Folders that were found to be empty or of the kind that writes there.
+    own_folders: Mutex<BTreeSet<String>>,
     /// Opened stores that are only read, by location.
     sources: Mutex<BTreeMap<String, Place>>,
     /// How long a rendered scene is held at most for a store that does not take it.
@@ -52,6 +54,7 @@ impl Stores {
         Self {
             runtime,
             probed: Mutex::default(),
+            own_folders: Mutex::default(),
             sources: Mutex::default(),
             patience,
             memory_mib: memory_mib(),
@@ -176,6 +179,22 @@ impl Stores {
         let (store, prefix) = open_store(location).map_err(of_dataset)?;
         self.wait(control, probe(&*store, &prefix, PROBE_WITHIN))?;
         known().insert(location.to_owned(), (store.clone(), prefix.clone()));
+        Ok((store, prefix))
+    }
+
+    /// The same for a folder that a field names, and in which every name must satisfy `is_own`. It is looked at once.
+    pub(super) fn probed_own(
+        &self,
+        (field, location): (&str, &str),
+        is_own: impl Fn(&str) -> bool,
+        control: &Control,
+    ) -> Result<Place, TaskError> {
+        let (store, prefix) = self.probed(location, control)?;
+        let known = || self.own_folders.lock().expect("no panic while locked");
+        if !known().contains(location) {
+            self.wait(control, check_own_folder(&*store, &prefix, field, is_own))?;
+            known().insert(location.to_owned());
+        }
         Ok((store, prefix))
     }
 
