@@ -106,7 +106,7 @@ impl Link {
 pub(crate) fn refused(why: Refusal) -> Status {
     match why {
         Refusal::NoSuchJob(id) => no_such_job(id),
-        Refusal::Denied(why) => Status::permission_denied(why),
+        Refusal::Denied(why) => Status::permission_denied(bounds::message(&why)),
         Refusal::Spec(why) => Status::invalid_argument(bounds::message(&why.to_string())),
         Refusal::Content(why) => Status::invalid_argument(bounds::message(&format!(
             "the catalog cannot hold this: {why}"
