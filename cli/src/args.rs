@@ -269,11 +269,11 @@ pub struct Coordinator {
     /// Forget jobs this many days after their end, with their history; results stay in their stores [default: never]
     #[arg(long, value_name = "DAYS", value_parser = ranges::days)]
     pub forget_after_days: Option<f64>,
-    /// Look into stores below this path or URL before results that are recorded as done count for another job (give it
-    /// again for more) [default: into none; workers look before they run]
+    /// Verify results in stores below this path or URL (give it again for more), or in none [default: in folders of this
+    /// machine; no host is asked]
     #[arg(
         long,
-        value_name = "URL",
+        value_name = "URL|none",
         env = "PICOFARM_CHECK_STORES",
         value_delimiter = ' '
     )]

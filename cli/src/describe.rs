@@ -88,6 +88,17 @@ pub fn state(status: &JobStatus) -> String {
     }
 }
 
+/// A line about results that the coordinator has not found in their store.
+pub fn unverified(s: &JobStatus) -> String {
+    match s.unverified {
+        0 => String::new(),
+        n => format!(
+            "  {n} results are reported by workers and not verified in their store by the coordinator (`picofarm job plan` \
+             with the same job file says why)\n"
+        ),
+    }
+}
+
 pub fn describe(s: &JobStatus) -> String {
     let mut text = format!(
         "job {} \"{}\": {}\n  {}\n",
@@ -96,6 +107,7 @@ pub fn describe(s: &JobStatus) -> String {
         state(s),
         counts(s)
     );
+    text += &unverified(s);
     if let Some(mean) = s.mean_task_seconds {
         text += &format!("  {} a task on average\n", duration(mean));
     }

@@ -167,6 +167,7 @@ mod tests {
             mean_task_seconds: None,
             running: Vec::new(),
             workers: 1,
+            unverified: 0,
         }
     }
 

@@ -225,10 +225,7 @@ pub async fn coordinator(args: args::Coordinator, output: Output) -> Result<()> 
     let forget_after = args
         .forget_after_days
         .map(|days| Duration::from_secs_f64(days * 86_400.0));
-    let stored = match args.check_stores.is_empty() {
-        true => None,
-        false => Some(StoreReader::below(&args.check_stores)?),
-    };
+    let stored = StoreReader::asked_for(&args.check_stores)?;
     let stop = signals::stop_on_signal()?;
     let lease = Duration::from_secs_f64(args.lease_s);
     let guarded = Guarded::of(&args.guard);

@@ -27,7 +27,10 @@ use uuid::Uuid;
 
 use crate::{
     clock::Clock,
-    core::{Core, JobLook, Learnt, Look, OutputHint, Overlay, Say, SessionId, Settings, Timings},
+    core::{
+        Core, JobLook, Learnt, Look, OutputHint, Overlay, Reported, Say, SessionId, Settings,
+        Timings,
+    },
     health::Health,
     metrics::{Metrics, Tally},
     sessions::{Sessions, Waiting},
@@ -82,9 +85,15 @@ pub(crate) enum Command {
         waiting: Waiting,
     },
     Worker(SessionId, FromWorker),
-    /// A report about which a store was asked. In words, where what was recorded instead of it is not in the store: that
-    /// record is no more.
-    Judged(SessionId, Finished, Option<String>),
+    /// Reports whose store was looked into.
+    Verified {
+        store: String,
+        reports: Vec<(Reported, Verdict)>,
+        /// The store turned out to be another one than that of the workers.
+        blind: bool,
+    },
+    /// A report of another result than the recorded one, and what became of that record.
+    Judged(SessionId, Finished, Ruling),
     /// The catalog has failed to write beside the actor: a new life begins, as when it fails to write here.
     Broken(CatalogError),
     /// A job that was recorded, if it is active; otherwise there is only something to look at.
@@ -113,6 +122,28 @@ pub(crate) enum Command {
         task: Option<u64>,
         reply: Reply<JobLook>,
     },
+}
+
+/// Which of two results of a task counts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Ruling {
+    /// The reported one: the record of the other is gone. In words.
+    Overruled(String),
+    /// The recorded one.
+    Stands,
+    /// That cannot be found out from here.
+    Unknown,
+}
+
+/// Whether a store holds what was reported.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// It does.
+    Held,
+    /// That cannot be found out from here.
+    Unknown,
+    /// It does not: why the report is refused.
+    Contradicted(String),
 }
 
 /// What a worker says in its session.
@@ -149,6 +180,12 @@ pub(crate) trait Aside: Send + Sync {
     /// Asks the store whether a report or what is recorded instead is right: [`Command::Judged`]. `false` where no store can
     /// be asked; then nothing comes.
     fn judge(&self, session: SessionId, report: &Finished, dispute: Dispute) -> bool;
+    /// Drops what is recorded instead of a report on which two workers agree: [`Command::Judged`].
+    fn replace(&self, session: SessionId, report: &Finished, dispute: Dispute);
+    /// Whether any store can be looked into.
+    fn looks(&self) -> bool;
+    /// Looks for reported results in their store: [`Command::Verified`].
+    fn verify(&self, store: String, reports: Vec<Reported>);
 }
 
 /// A report of another manifest than the one that is recorded.
@@ -175,6 +212,8 @@ struct Life<'a> {
     learning: HashMap<JobId, Instant>,
     /// Reports about which a store is being asked.
     disputes: usize,
+    /// Stores that are being looked into, and the reports that wait until that is done.
+    looking: HashMap<String, Vec<Reported>>,
 }
 
 impl Actor {
@@ -232,6 +271,7 @@ impl Actor {
             looked_ms: self.clock.passed_ms(),
             learning: HashMap::new(),
             disputes: 0,
+            looking: HashMap::new(),
         })
     }
 }
@@ -367,15 +407,20 @@ impl Life<'_> {
 
     async fn handle(&mut self, batch: &mut Vec<Command>) -> Result<(), CatalogError> {
         // What the catalog holds for the tasks reported, in one go.
-        let asked: Vec<(StageRef, u64)> = batch
-            .iter()
-            .filter_map(|command| match command {
-                Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
-                    Some((self.core.stage_of(report)?, report.index))
-                }
-                _ => None,
-            })
+        let reports = batch.iter().flat_map(|command| match command {
+            Command::Worker(_, FromWorker::Done(report)) | Command::Judged(_, report, _) => {
+                vec![report]
+            }
+            Command::Verified { reports, .. } => reports
+                .iter()
+                .map(|(reported, _)| &reported.report)
+                .collect(),
+            _ => Vec::new(),
+        });
+        let asked: Vec<(StageRef, u64)> = reports
+            .filter_map(|report| Some((self.core.stage_of(report)?, report.index)))
             .collect();
+        let mut new: HashMap<String, Vec<Reported>> = HashMap::new();
         let found = self.actor.catalog.manifests(&asked).await?;
         let known: Known = asked.into_iter().zip(found).collect();
         for command in batch.drain(..) {
@@ -395,16 +440,35 @@ impl Life<'_> {
                     self.core.hello(session, hello, now);
                 }
                 Command::Worker(session, FromWorker::Done(report)) => {
-                    if !self.disputed(session, &report, &known) {
-                        self.done(session, &report, &known);
+                    let looks = self.actor.aside.looks();
+                    match self.core.reported(session, &report).filter(|_| looks) {
+                        _ if self.disputed(session, &report, &known) => {}
+                        Some(reported) => {
+                            let reports = new.entry(reported.store.clone()).or_default();
+                            reports.push(reported);
+                        }
+                        None => self.done(session, &report, &known, false),
                     }
                 }
-                Command::Judged(session, report, note) => {
+                Command::Verified {
+                    store,
+                    reports,
+                    blind,
+                } => {
+                    self.verified(&store, reports, blind, &known);
+                }
+                Command::Judged(session, report, ruling) => {
                     self.disputes = self.disputes.saturating_sub(1);
-                    if let Some(note) = note {
-                        self.core.alarm(session, &report, note, self.now());
+                    match ruling {
+                        Ruling::Unknown if self.outvoted(session, &report, &known) => {}
+                        Ruling::Overruled(note) => {
+                            self.core.overruled(session, &report, note, self.now());
+                            self.done(session, &report, &known, false);
+                        }
+                        Ruling::Stands | Ruling::Unknown => {
+                            self.done(session, &report, &known, false);
+                        }
                     }
-                    self.done(session, &report, &known);
                 }
                 Command::Worker(session, said) => self.worker_said(session, said),
                 Command::Broken(error) => return Err(error),
@@ -456,31 +520,95 @@ impl Life<'_> {
                 }
             }
         }
+        for (store, reports) in new {
+            self.look_for(store, reports);
+        }
         Ok(())
+    }
+
+    /// Has reported results looked for in their store: one look at a time, since the next one takes what has come meanwhile.
+    fn look_for(&mut self, store: String, reports: Vec<Reported>) {
+        match self.looking.entry(store) {
+            Entry::Occupied(mut waiting) => waiting.get_mut().extend(reports),
+            Entry::Vacant(entry) if !reports.is_empty() => {
+                self.actor.aside.verify(entry.key().clone(), reports);
+                entry.insert(Vec::new());
+            }
+            Entry::Vacant(_) => {}
+        }
+    }
+
+    /// Commits or refuses reports whose store was looked into.
+    fn verified(
+        &mut self,
+        store: &str,
+        reports: Vec<(Reported, Verdict)>,
+        blind: bool,
+        known: &Known,
+    ) {
+        if blind {
+            self.core.forgive(store);
+        }
+        for (
+            Reported {
+                session, report, ..
+            },
+            verdict,
+        ) in reports
+        {
+            match verdict {
+                Verdict::Contradicted(why) => {
+                    self.core.contradicted(session, &report, &why, self.now());
+                }
+                _ if self.disputed(session, &report, known) => {}
+                verdict => self.done(session, &report, known, verdict == Verdict::Held),
+            }
+        }
+        if let Some(waiting) = self.looking.remove(store) {
+            self.look_for(store.to_owned(), waiting);
+        }
+    }
+
+    /// Whether this report is the second of another result than the recorded one: then the record gives way, and the report
+    /// is answered after that.
+    fn outvoted(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
+        let Some(dispute) = self.dispute(report, known) else {
+            return false;
+        };
+        let outvoted = self.core.outvoted(session, report);
+        if outvoted {
+            self.disputes += 1;
+            self.actor.aside.replace(session, report, dispute);
+        }
+        outvoted
     }
 
     /// Whether a store is asked before this report is answered: another manifest is recorded, and who came first is no
     /// reason to believe it.
     fn disputed(&mut self, session: SessionId, report: &Finished, known: &Known) -> bool {
-        let dispute = self.core.stage_of(report).and_then(|stage| {
-            let recorded = known.get(&(stage, report.index)).copied().flatten()?;
-            let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
-            (!same).then_some(Dispute { stage, recorded })
-        });
-        let Some(dispute) = dispute else {
+        let Some(dispute) = self.dispute(report, known) else {
             return false;
         };
         let asked = self.disputes < DISPUTES && self.actor.aside.judge(session, report, dispute);
         self.disputes += usize::from(asked);
-        asked
+        asked || self.outvoted(session, report, known)
     }
 
-    fn done(&mut self, session: SessionId, report: &Finished, known: &Known) {
+    /// The record that a report contradicts.
+    fn dispute(&self, report: &Finished, known: &Known) -> Option<Dispute> {
+        let stage = self.core.stage_of(report)?;
+        let recorded = known.get(&(stage, report.index)).copied().flatten()?;
+        let same = hex::encode(recorded).eq_ignore_ascii_case(&report.manifest_sha256);
+        (!same).then_some(Dispute { stage, recorded })
+    }
+
+    fn done(&mut self, session: SessionId, report: &Finished, known: &Known, checked: bool) {
         self.commits.extend(trace::commit(report));
         let stage = self.core.stage_of(report);
         let hint = stage.and_then(|stage| known.get(&(stage, report.index)).copied().flatten());
         let now = self.now();
-        self.core.finished(session, report, OutputHint(hint), now);
+        self.core
+            .finished(session, report, OutputHint(hint), checked, now);
     }
 
     fn worker_said(&mut self, session: SessionId, said: FromWorker) {
@@ -669,7 +797,11 @@ fn refuse(command: Command, error: &str) {
     }
     match command {
         // Dropping a session's sender ends it.
-        Command::Open { .. } | Command::Worker(..) | Command::Judged(..) | Command::Broken(_) => {}
+        Command::Open { .. }
+        | Command::Worker(..)
+        | Command::Verified { .. }
+        | Command::Judged(..)
+        | Command::Broken(_) => {}
         Command::Learn(_, reply) | Command::Cancel { reply, .. } | Command::Pause { reply, .. } => {
             no(reply, error)
         }

@@ -15,6 +15,9 @@ pub enum Found {
     Gone,
     /// Something else.
     Differs,
+    /// Nothing, because this machine has no folder at the store's place. Whether results were deleted, or only workers reach
+    /// the store, cannot be told.
+    NoFolder,
 }
 
 /// Looks into stores. Its caller bounds how long it waits and how many ask at a time.

@@ -6,7 +6,7 @@ use serde_json::json;
 use super::finish::finish;
 use crate::{
     client::{Client, Submitted},
-    describe::{counts, describe_plan, state},
+    describe::{counts, describe_plan, state, unverified},
     error::Result,
     follow::{Show, follow, verdict},
     output::Output,
@@ -64,7 +64,11 @@ pub async fn answer(
         || match &there {
             Some(status) => {
                 let state = state(status);
-                format!("job {job} was there already: {state}; {}\n", counts(status))
+                let unverified = unverified(status);
+                format!(
+                    "job {job} was there already: {state}; {}\n{unverified}",
+                    counts(status)
+                )
             }
             None if existed => format!("job {job} was there already\n"),
             None => format!("job {job}\n{}", describe_plan(&plan)),

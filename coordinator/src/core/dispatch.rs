@@ -78,6 +78,9 @@ impl Core {
         worker: WorkerId,
         now_ms: i64,
     ) -> Result<(), String> {
+        if let Some(why) = self.doubts.blocked(worker) {
+            return Err(why.to_owned());
+        }
         let entry = &self.stages[&id];
         entry.suits(id, &self.workers[&worker].abilities)?;
         let store = store_of(&entry.spec(id).task);

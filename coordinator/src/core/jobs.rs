@@ -198,6 +198,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
         job,
         stages,
         timing,
+        unverified,
     } = record;
     let stages = job.spec.stages.iter().zip(stages);
     JobStatus {
@@ -230,6 +231,7 @@ pub(crate) fn recorded_status(record: JobRecord) -> JobStatus {
         mean_task_seconds: timing.mean(),
         running: Vec::new(),
         workers: 0,
+        unverified,
     }
 }
 

@@ -274,7 +274,7 @@ impl Core {
     }
 
     /// One task fails and leaves its lease.
-    fn leave(
+    pub(super) fn leave(
         &mut self,
         range: &Range,
         task: u64,

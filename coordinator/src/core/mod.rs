@@ -8,6 +8,7 @@ mod blocklist;
 mod claims;
 mod commit;
 mod dispatch;
+mod doubt;
 mod facts;
 mod jobs;
 mod leases;
@@ -39,6 +40,7 @@ use load::Load;
 use tail::Double;
 
 pub(crate) use commit::OutputHint;
+pub(crate) use doubt::Reported;
 pub(crate) use facts::{JobLook, Look};
 pub(crate) use jobs::{
     Learnt, Overlay, Prepared, Timings, may_force, place_is_free, prepare, recorded_status,
@@ -213,6 +215,8 @@ pub(crate) struct Core {
     help_at_ms: i64,
     /// Stores that tasks wait for.
     away: stores::Stores,
+    /// Workers that are not believed, and doubtful results.
+    doubts: doubt::Doubts,
     /// Connections that break before this time, Unix milliseconds, broke by a stall of the coordinator's own.
     graced_until_ms: i64,
     /// What workers were charged with when their connection broke, for the case that they live.
@@ -259,6 +263,7 @@ impl Core {
             doubles: BTreeMap::new(),
             help_at_ms: 0,
             away: stores::Stores::default(),
+            doubts: doubt::Doubts::default(),
             graced_until_ms: 0,
             charged: HashMap::new(),
             progress: BTreeMap::new(),

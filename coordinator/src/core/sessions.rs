@@ -17,6 +17,7 @@ impl Core {
         self.names.insert(id, hello.name.clone());
         self.doubles.retain(|_, double| double.worker != id);
         self.refund(id, hello.incarnation);
+        self.doubts.restarted(id, hello.incarnation);
         self.changes.workers.insert(
             id,
             Worker {

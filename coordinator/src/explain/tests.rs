@@ -390,6 +390,7 @@ fn a_finished_task_says_who_made_it() {
         seconds: 2.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     };
     let mut facts = task_facts(RangeState::Done { reused: true });
     facts.record.output = Some(output);

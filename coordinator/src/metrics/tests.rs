@@ -89,6 +89,7 @@ fn what_fails_without_a_report_was_lost_with_its_worker() {
         seconds: 2.0,
         epoch: Epoch(1),
         adopted,
+        checked: false,
     };
     let changes = Changes {
         events: [

@@ -10,6 +10,7 @@ mod judge;
 mod look;
 mod places;
 mod report;
+mod verify;
 
 use std::sync::Arc;
 
@@ -52,6 +53,8 @@ pub(crate) struct Submissions {
     clock: Clock,
     /// What callers see of others' jobs.
     visibility: Visibility,
+    /// What is known of whether the stores here are those of the workers.
+    evidence: verify::Evidence,
     /// Held while a job is counted against its user's quota and recorded.
     turn: Arc<Mutex<()>>,
 }
@@ -101,6 +104,7 @@ impl Submissions {
             commands,
             clock,
             visibility,
+            evidence: Arc::default(),
             turn: Arc::default(),
         }
     }
@@ -170,11 +174,18 @@ impl Submissions {
             job.state == JobState::Done && lost.any(|lost| lost)
         });
         let existing = latest.as_ref().map(|job| job.id);
+        let stands = !lost
+            && latest
+                .as_ref()
+                .is_some_and(|job| job.state == JobState::Done);
         let (plan, findings) = self
             .heavy(draft, move |it, draft| async move {
                 let catalog = Arc::clone(&it.catalog);
                 let recent = catalog.recent(RECENT, &sight).await.map_err(broken)?;
-                Ok((report::plan(&draft, &findings, existing, &recent), findings))
+                Ok((
+                    report::plan(&draft, &findings, (existing, stands), &recent),
+                    findings,
+                ))
             })
             .await?;
         Ok(Considered {
@@ -260,13 +271,17 @@ impl Submissions {
         let (stage, set) = (&draft.spec.stages[position], &draft.stages()[position].set);
         let chosen = check::choose(&recorded, &draft.hash);
         let some: Vec<Recorded> = chosen.iter().map(|i| recorded[*i]).collect();
-        let (mut found, mut why) = self.stores.look(stage, set, &some, until).await;
+        let (mut found, mut why) = self.stores.look(stage, &set.store, &some, until).await;
         if why.is_none() && check::suspicious(&recorded, &found) {
             let passed = recorded.iter().filter(|o| !found.contains_key(&o.task));
             let passed: Vec<Recorded> = passed.copied().collect();
-            let (more, stopped) = self.stores.look(stage, set, &passed, until).await;
+            let (more, stopped) = self.stores.look(stage, &set.store, &passed, until).await;
             found.extend(more);
             why = stopped;
+        }
+        if let Some(another) = self.sees_another_disk(set.store.trim_end_matches('/')) {
+            found.retain(|_, found| *found == Found::Equal);
+            why = Some(another);
         }
         let is_new = |o: &&Recorded| !o.checked && found.get(&o.task) == Some(&Found::Equal);
         let new: Vec<Recorded> = recorded.iter().filter(is_new).copied().collect();

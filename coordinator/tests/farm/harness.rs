@@ -47,6 +47,8 @@ pub struct FakeStore {
     pub closed: Mutex<Option<String>>,
     /// It never answers.
     pub hangs: AtomicBool,
+    /// This machine has no such folder.
+    pub absent: AtomicBool,
     /// How many results it was asked about.
     pub asked: AtomicUsize,
 }
@@ -74,6 +76,9 @@ impl Stored for FakeStore {
             }
             if let Some(why) = &*self.closed.lock().unwrap() {
                 return Err(why.clone());
+            }
+            if self.absent.load(Ordering::SeqCst) {
+                return Ok(vec![Found::NoFolder; results.len()]);
             }
             self.asked.fetch_add(results.len(), Ordering::SeqCst);
             let instead = self.instead.lock().unwrap();

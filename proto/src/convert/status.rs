@@ -145,6 +145,7 @@ impl From<JobStatus> for wire::JobStatus {
                 .map(|(n, r)| running(r, n < bounds::RUNNING))
                 .collect(),
             workers: m.workers,
+            unverified: m.unverified,
         }
     }
 }
@@ -183,6 +184,7 @@ impl TryFrom<wire::JobStatus> for JobStatus {
                 })
                 .collect(),
             workers: w.workers,
+            unverified: w.unverified,
         })
     }
 }

@@ -89,6 +89,9 @@ pub struct JobStatus {
     pub user: ::prost::alloc::string::String,
     #[prost(message, repeated, tag = "13")]
     pub stages: ::prost::alloc::vec::Vec<StageStatus>,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    #[prost(uint64, tag = "20")]
+    pub unverified: u64,
 }
 /// A job as a list shows it.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

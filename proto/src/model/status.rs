@@ -127,6 +127,8 @@ pub struct JobStatus {
     pub running: Vec<RunningTask>,
     /// Workers connected to the coordinator.
     pub workers: u32,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    pub unverified: u64,
 }
 
 /// A job as a list shows it, without what it is made of.

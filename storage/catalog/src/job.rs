@@ -82,6 +82,8 @@ pub struct JobRecord {
     pub stages: Vec<StageCounts>,
     /// How long its tasks took.
     pub timing: Timing,
+    /// Results that workers have reported and that the coordinator has not found in their store.
+    pub unverified: u64,
 }
 
 /// Where a stage stands.

@@ -21,6 +21,8 @@ pub struct Output {
     pub epoch: Epoch,
     /// Found in the store and not computed.
     pub adopted: bool,
+    /// The store was found to hold this manifest.
+    pub checked: bool,
 }
 
 /// A task that failed at least once.

@@ -29,6 +29,7 @@ const SQLITE_STEPS: &[Step] = steps!("sqlite":
     3 "0003_listing",
     4 "0004_rights",
     5 "0005_places",
+    6 "0006_unchecked",
 );
 #[cfg(feature = "postgres")]
 const POSTGRES_STEPS: &[Step] = steps!("postgres":
@@ -37,6 +38,7 @@ const POSTGRES_STEPS: &[Step] = steps!("postgres":
     3 "0003_listing",
     4 "0004_rights",
     5 "0005_places",
+    6 "0006_unchecked",
 );
 
 /// For SQLite.

@@ -501,6 +501,7 @@ macro_rules! queries {
                         seconds: row.try_get("seconds")?,
                         epoch: Epoch(uint(&row, "epoch")?),
                         adopted: row.try_get("adopted")?,
+                        checked: row.try_get("checked")?,
                     })
                 });
                 Ok(TaskRecord {

@@ -109,7 +109,21 @@ macro_rules! job_queries {
                     job: job(&row)?,
                     stages,
                     timing: timing_of(&row)?,
+                    unverified: unverified(c, key).await?,
                 }))
+            }
+
+            /// Results of a job that its store was not found to hold.
+            async fn unverified(c: &mut Connection, key: i64) -> Result<u64> {
+                let row = sqlx::query(
+                    "SELECT count(*) AS results FROM stage JOIN output ON output.result_set = stage.result_set \
+                     AND output.task < stage.tasks WHERE stage.job = $1 AND output.checked = $2",
+                )
+                .bind(key)
+                .bind(false)
+                .fetch_one(c)
+                .await?;
+                uint(&row, "results")
             }
 
             /// The stages of a job that has ended, whose counts are final.

@@ -89,6 +89,7 @@ fn output(task: u64) -> Output {
         seconds: 1.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     }
 }
 
@@ -474,6 +475,7 @@ async fn what_holds_tasks_up_and_what_became_of_one_can_be_asked(catalog: &dyn C
         seconds: 1.5,
         epoch: Epoch(4),
         adopted: false,
+        checked: false,
     };
     changes.outputs.push(output.clone());
     catalog.commit(&changes).await.unwrap();

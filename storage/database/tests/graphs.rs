@@ -202,6 +202,7 @@ async fn forgotten_jobs_leave_their_outputs(catalog: &dyn Catalog) {
         seconds: 1.5,
         epoch: Epoch(1),
         adopted: false,
+        checked: false,
     };
     let changes = Changes {
         outputs: vec![output],

@@ -350,7 +350,7 @@ impl World {
         };
         instance
             .core
-            .finished(session, &report, OutputHint(hint), self.now);
+            .finished(session, &report, OutputHint(hint), false, self.now);
         let said = self.flush(h).await;
         let accepted = said
             .iter()

@@ -124,9 +124,9 @@ async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<(
         sets.push(writer.keys(output.stage).await?.result_set);
     }
     let written = sqlx::query(
-        "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) \
+        "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted, checked) \
          SELECT * FROM UNNEST($1::BIGINT[], $2::BIGINT[], $3::BYTEA[], $4::BIGINT[], $5::DOUBLE PRECISION[], \
-         $6::BIGINT[], $7::BOOLEAN[]) ON CONFLICT DO NOTHING",
+         $6::BIGINT[], $7::BOOLEAN[], $8::BOOLEAN[]) ON CONFLICT DO NOTHING",
     )
     .bind(sets)
     .bind(outputs.iter().map(|o| int(o.task)).collect::<Vec<_>>())
@@ -140,6 +140,7 @@ async fn insert_outputs(writer: &mut Writer<'_>, outputs: &[Output]) -> Result<(
     .bind(outputs.iter().map(|o| o.seconds).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| int(o.epoch.0)).collect::<Vec<_>>())
     .bind(outputs.iter().map(|o| o.adopted).collect::<Vec<_>>())
+    .bind(outputs.iter().map(|o| o.checked).collect::<Vec<_>>())
     .execute(&mut *writer.c)
     .await?
     .rows_affected();

@@ -119,7 +119,7 @@ async fn insert_outputs(
             sets.push(keys.of(c, output.stage).await?.result_set);
         }
         let mut insert = QueryBuilder::<Sqlite>::new(
-            "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted) ",
+            "INSERT INTO output (result_set, task, manifest, bytes, seconds, epoch, adopted, checked) ",
         );
         insert.push_values(chunk.iter().zip(sets), |mut row, (output, set)| {
             row.push_bind(set)
@@ -128,7 +128,8 @@ async fn insert_outputs(
                 .push_bind(int(output.bytes))
                 .push_bind(output.seconds)
                 .push_bind(int(output.epoch.0))
-                .push_bind(output.adopted);
+                .push_bind(output.adopted)
+                .push_bind(output.checked);
         });
         insert.push(" ON CONFLICT DO NOTHING");
         let written = insert.build().execute(&mut *c).await?.rows_affected();
