@@ -242,3 +242,43 @@ async fn files_left_by_a_killed_local_put_disturb_nobody_and_are_found() {
     assert!(!torn.exists());
     assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
 }
+
+/// A manifest of scene 0 that was made up, with its checksum.
+fn made_up(true_manifest: &Manifest) -> Manifest {
+    let mut made_up = true_manifest.clone();
+    for object in &mut made_up.objects {
+        object.sha256 = "ab".repeat(32);
+    }
+    made_up.sealed()
+}
+
+#[tokio::test]
+async fn a_made_up_manifest_gives_way_to_the_scene_and_a_true_one_does_not() {
+    for with_objects in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let (store, prefix) = open_store(folder.path().to_str().unwrap()).unwrap();
+        let spec = spec(Profile::default());
+        let dataset = Dataset::create_or_open(store, prefix, &spec).await.unwrap();
+        let encode = |seed| {
+            let scene = Scene::new(&spec, seed);
+            dataset.encode(0, &scene.record(), &provenance()).unwrap()
+        };
+        let honest = dataset.publish_encoded(encode(1)).await.unwrap();
+        let manifest = folder.path().join("manifests/0.json");
+        std::fs::write(&manifest, made_up(&honest).to_bytes()).unwrap();
+        for object in honest.objects.iter().filter(|_| !with_objects) {
+            std::fs::remove_file(folder.path().join(&object.key)).unwrap();
+        }
+        let conflict = dataset.publish_encoded(encode(1)).await.unwrap_err();
+        assert!(
+            matches!(conflict, DatasetError::Conflict { .. }),
+            "{conflict}"
+        );
+        let replaced = dataset.replace_unfounded(encode(1)).await.unwrap().unwrap();
+        assert_eq!(replaced, honest);
+        assert!(dataset.verify(VerifyMode::Full).await.unwrap().is_sound());
+        // Another result of the same scene does not replace one that is whole.
+        assert_eq!(dataset.replace_unfounded(encode(2)).await.unwrap(), None);
+        assert_eq!(dataset.published(0).await.unwrap(), Some(honest));
+    }
+}

@@ -268,7 +268,14 @@ impl Stores {
     ) -> Result<Manifest, TaskError> {
         let _in = debug_span!(target: trace::TARGET, "publish").entered();
         self.patiently(control, async || {
-            dataset.publish_encoded(scene.clone()).await
+            match dataset.publish_encoded(scene.clone()).await {
+                Err(conflict @ DatasetError::Conflict { .. }) => {
+                    // A manifest that somebody made up must not hold the scene for ever.
+                    let replaced = dataset.replace_unfounded(scene.clone()).await?;
+                    replaced.ok_or(conflict)
+                }
+                published => published,
+            }
         })
     }
 
