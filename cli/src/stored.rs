@@ -259,7 +259,7 @@ impl Stored for StoreReader {
                     && let Some(folder) = &folder
                     && let Ok(false) = tokio::fs::try_exists(folder).await
                 {
-                    return Ok(vec![Found::NoFolder; count]);
+                    return Ok::<Vec<Found>, DatasetError>(vec![Found::NoFolder; count]);
                 }
                 let holdings = Holdings::new(store, prefix);
                 let held = question.ask(&holdings, thorough).await?;
