@@ -87,7 +87,7 @@ impl Farm {
             "--catalog",
             &self.catalog,
         ];
-        let args = [&args[..], &["--listen", &listen, "--lease-s", &lease]].concat();
+        let args = [&args[..], &["--listen", &listen, "--lease-s", &lease], more].concat();
         let mut process = self.cli.start("coordinator", &args);
         let line = process.first_line();
         let document: Value = serde_json::from_str(&line).expect("the first line is JSON");
