@@ -90,7 +90,8 @@ impl Core {
         })
     }
 
-    /// A report's store does not hold what was reported: the task runs again, and the worker gets no more tasks.
+    /// A report's store does not hold what was reported: the task runs again, and the worker gets no more tasks. If the worker
+    /// only found the result there, that is a failure of the task: the result may be damaged.
     pub(crate) fn contradicted(
         &mut self,
         session: SessionId,
@@ -106,11 +107,17 @@ impl Core {
             && let Ok(range) = self.held_to_do(session, report.lease, report.index, now_ms)
         {
             let (range, name) = (range.clone(), self.name_of(worker));
-            let kind = FailureKind::Interrupted;
+            let kind = match report.adopted {
+                true => FailureKind::User,
+                false => FailureKind::Interrupted,
+            };
             self.leave(&range, report.index, kind, why, &name, now_ms);
             self.perhaps_over(range.stage, now_ms);
         }
         self.acknowledge(session, report.lease, report.index, Err(why.to_owned()));
+        if report.adopted {
+            return;
+        }
         let store = self.stage_of(report).map(|stage| {
             let entry = &self.stages[&stage];
             store_of(&entry.spec(stage).task).to_owned()

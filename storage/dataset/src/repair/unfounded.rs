@@ -5,6 +5,7 @@
 
 use crate::error::DatasetError;
 use crate::layout::manifest::{Manifest, sha256_hex};
+use crate::repair::held::SMALL;
 use crate::scenes::dataset::Dataset;
 use crate::scenes::encode::EncodedScene;
 use crate::store::objects;
@@ -43,6 +44,14 @@ impl Dataset {
         }
         self.replace(&path, manifest.to_bytes().into()).await?;
         Ok(Some(manifest))
+    }
+
+    /// Whether the objects of a scene have the bytes that its manifest names. Larger scenes are not read, and pass.
+    ///
+    /// # Errors
+    /// [`DatasetError::Store`].
+    pub async fn agrees(&self, manifest: &Manifest) -> Result<bool, DatasetError> {
+        Ok(manifest.total_bytes() > SMALL || self.is_founded(manifest).await?)
     }
 
     /// Whether every object that a manifest names has the bytes that it names.

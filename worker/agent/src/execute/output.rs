@@ -256,6 +256,13 @@ impl Stores {
                 manifest.provenance.task_key
             )));
         }
+        if !self.wait(control, dataset.agrees(&manifest))? {
+            warn!(
+                task = index,
+                "a published scene has other bytes than its manifest names; it is made again to repair it"
+            );
+            return Ok(None);
+        }
         Ok(Some(manifest))
     }
 
