@@ -259,7 +259,12 @@ impl Stored for StoreReader {
                     && let Some(folder) = &folder
                     && let Ok(false) = tokio::fs::try_exists(folder).await
                 {
-                    return Ok::<Vec<Found>, DatasetError>(vec![Found::NoFolder; count]);
+                    let around = folder.parent().unwrap_or(folder);
+                    let found = match tokio::fs::try_exists(around).await {
+                        Ok(true) => Found::NoStore,
+                        _ => Found::NoFolder,
+                    };
+                    return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
                 }
                 let holdings = Holdings::new(store, prefix);
                 let held = question.ask(&holdings, thorough).await?;
@@ -344,6 +349,8 @@ mod tests {
         let at = stage(&place.path().display().to_string());
         assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::Gone]));
         let at = stage(&format!("file://{}/absent", place.path().display()));
+        assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoStore]));
+        let at = stage(&format!("file://{}/absent/too", place.path().display()));
         assert_eq!(reader.look(&at, &results).await, Ok(vec![Found::NoFolder]));
         for store in ["s3://bucket/a", "http://169.254.169.254/latest"] {
             let why = reader.look(&stage(store), &results).await.unwrap_err();

@@ -83,6 +83,8 @@ pub(crate) enum Command {
         say: mpsc::Sender<Say>,
         /// Heartbeats of the session that wait here to be handled.
         waiting: Waiting,
+        /// The worker is on the coordinator's machine.
+        here: bool,
     },
     Worker(SessionId, FromWorker),
     /// Reports whose store was looked into.
@@ -430,6 +432,7 @@ impl Life<'_> {
                     hello,
                     say,
                     waiting,
+                    here,
                 } => {
                     // The worker brings its leases along, from whichever coordinator.
                     self.flush().await?;
@@ -438,6 +441,7 @@ impl Life<'_> {
                     self.core.receive(owned, now);
                     self.sessions.open(session, say, waiting);
                     self.core.hello(session, hello, now);
+                    self.core.is_here(session, here);
                 }
                 Command::Worker(session, FromWorker::Done(report)) => {
                     let looks = self.actor.aside.looks();
@@ -640,6 +644,7 @@ impl Life<'_> {
             FromWorker::Closed => {
                 self.sessions.close(session);
                 self.core.closed(session, now);
+                self.core.is_here(session, false);
             }
         }
     }

@@ -94,6 +94,10 @@ impl<S> Layer<S> for Guard {
     }
 }
 
+/// Whether a request comes from the coordinator's own machine.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SameMachine(pub bool);
+
 /// A service behind a [`Guard`].
 #[derive(Clone)]
 pub(crate) struct Guarded<S> {
@@ -116,7 +120,10 @@ where
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
         match self.guard.check(&request) {
             Ok(caller) => {
+                let here = request.extensions().get::<Peer>();
+                let here = here.is_some_and(|peer| peer.address.ip().to_canonical().is_loopback());
                 request.extensions_mut().insert(caller);
+                request.extensions_mut().insert(SameMachine(here));
                 Either::Left(self.inner.call(request))
             }
             Err(status) => {

@@ -14,7 +14,7 @@ mod tokens;
 pub use access::Access;
 pub use caller::Caller;
 pub(crate) use gate::Gate;
-pub(crate) use guard::Guard;
+pub(crate) use guard::{Guard, SameMachine};
 pub use quota::Quotas;
 pub(crate) use quota::{Throttle, WorkerIds};
 pub use rights::Visibility;

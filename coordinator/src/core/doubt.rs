@@ -1,7 +1,10 @@
 //! Reports that their store contradicts, and results on which workers do not agree. A worker that reported what is not there
 //! gets no more tasks until it is restarted.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
@@ -24,6 +27,8 @@ pub(crate) struct Reported {
     pub stage: StageRef,
     pub job: Arc<JobSpec>,
     pub store: String,
+    /// The worker is on the coordinator's machine, so both have the same folders.
+    pub here: bool,
     pub report: Finished,
 }
 
@@ -31,6 +36,8 @@ pub(crate) struct Reported {
 #[derive(Debug, Default)]
 pub(super) struct Doubts {
     blocked: BTreeMap<WorkerId, Blocked>,
+    /// Sessions of workers on the coordinator's machine.
+    here: BTreeSet<SessionId>,
     /// Who reported a result that was committed without a look into its store, by set and task.
     reporters: BTreeMap<(usize, u64), WorkerId>,
     /// What workers reported instead of such a result.
@@ -86,8 +93,17 @@ impl Core {
             stage,
             job: Arc::clone(&entry.job.spec),
             store: store_of(&entry.spec(stage).task).to_owned(),
+            here: self.doubts.here.contains(&session),
             report: report.clone(),
         })
+    }
+
+    /// Notes whether a session's worker is on the coordinator's machine.
+    pub(crate) fn is_here(&mut self, session: SessionId, here: bool) {
+        match here {
+            true => self.doubts.here.insert(session),
+            false => self.doubts.here.remove(&session),
+        };
     }
 
     /// A report's store does not hold what was reported: the task runs again, and the worker gets no more tasks. If the worker

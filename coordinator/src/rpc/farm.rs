@@ -27,7 +27,7 @@ use super::{Link, caller, invalid};
 use crate::{
     VERSION,
     actor::{Command, FromWorker},
-    auth::{Caller, Quotas, WorkerIds},
+    auth::{Caller, Quotas, SameMachine, WorkerIds},
     core::{Say, SessionId},
     sessions::Waiting,
 };
@@ -93,8 +93,18 @@ impl Farm for FarmService {
         let (out, stream) = mpsc::channel(16);
         let (link, ids) = (self.link.clone(), Arc::clone(&self.ids));
         let caller = caller(&request);
+        let here = request.extensions().get::<SameMachine>();
+        let here = here.is_some_and(|same| same.0);
         tokio::spawn(async move {
-            run(link, session, caller, ids, request.into_inner(), out).await;
+            run(
+                link,
+                (session, here),
+                caller,
+                ids,
+                request.into_inner(),
+                out,
+            )
+            .await;
             drop(counted);
         });
         // At once: a client may wait for this before it says hello.
@@ -104,7 +114,7 @@ impl Farm for FarmService {
 
 async fn run(
     link: Link,
-    session: SessionId,
+    (session, here): (SessionId, bool),
     caller: Caller,
     ids: Arc<WorkerIds>,
     mut input: Streaming<wire::SessionRequest>,
@@ -139,6 +149,7 @@ async fn run(
         hello,
         say,
         waiting: waiting.clone(),
+        here,
     };
     if link.commands.send(open).await.is_err() {
         return;

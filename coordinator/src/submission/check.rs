@@ -131,7 +131,7 @@ pub(crate) fn judge(
         why,
         ..Findings::default()
     };
-    let absent = |f: &Found| *f == Found::NoFolder;
+    let absent = |f: &Found| matches!(f, Found::NoFolder | Found::NoStore);
     if findings.why.is_none()
         && recorded
             .iter()
@@ -142,8 +142,8 @@ pub(crate) fn judge(
     for output in recorded {
         match found.get(&output.task) {
             // It was found in this folder before.
-            Some(Found::NoFolder) if output.checked => findings.gone.push(*output),
-            Some(Found::NoFolder) => findings.unseen += 1,
+            Some(Found::NoFolder | Found::NoStore) if output.checked => findings.gone.push(*output),
+            Some(Found::NoFolder | Found::NoStore) => findings.unseen += 1,
             Some(Found::Gone) => findings.gone.push(*output),
             Some(Found::Differs) => findings.differ.push(*output),
             None if !output.checked => findings.unseen += 1,

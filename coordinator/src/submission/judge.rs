@@ -148,7 +148,7 @@ impl Submissions {
         match found.get(&task)? {
             Found::Equal => Some(true),
             Found::Gone | Found::Differs => Some(false),
-            Found::NoFolder => None,
+            Found::NoFolder | Found::NoStore => None,
         }
     }
 }

@@ -1,7 +1,8 @@
 //! Looks for reported results in their stores before they are committed.
 //!
 //! A report is only refused if this coordinator surely sees the store that the worker writes to: it found another result
-//! there before and still finds it, or a single worker contradicts a store whose folder exists here. If it finds nothing of
+//! there before and still finds it, or a single worker contradicts a store whose folder exists here (or, if the worker is on
+//! this machine, whose folder should). If it finds nothing of
 //! what two workers report, it takes itself for the one that sees another disk, and commits the results as unverified.
 
 use std::{
@@ -66,7 +67,10 @@ impl Submissions {
                         });
                         Verdict::Held
                     }
-                    None | Some(Found::NoFolder) => Verdict::Unknown,
+                    Some(Found::NoStore) if reported.here => {
+                        self.missing(store, &reported, "holds no such result").await
+                    }
+                    None | Some(Found::NoFolder | Found::NoStore) => Verdict::Unknown,
                     Some(Found::Gone) => {
                         self.missing(store, &reported, "holds no such result").await
                     }
@@ -74,8 +78,8 @@ impl Submissions {
                         self.missing(store, &reported, "holds another result").await
                     }
                 };
-                blind |= verdict == Verdict::Unknown
-                    && matches!(found, Some(Found::Gone | Found::Differs));
+                let looked = matches!(found, Some(Found::Gone | Found::Differs | Found::NoStore));
+                blind |= verdict == Verdict::Unknown && looked;
                 verdicts.push((reported, verdict));
             }
         }
