@@ -144,6 +144,7 @@ fn folder(location: &str) -> Option<PathBuf> {
 type Results = Vec<(u64, [u8; 32])>;
 
 /// What a store is asked, as its data set or model knows it.
+#[derive(Clone)]
 enum Question {
     Scenes(String, Results),
     Parts(String, Vec<PartName>),
@@ -254,7 +255,8 @@ impl Stored for StoreReader {
             let may_be_absent = matches!(self.allowed, Allowed::Folders);
             let count = results.len();
             let asked = async move {
-                let thorough = |task: u64| folder.is_some() || task.is_multiple_of(ONE_IN);
+                let local = folder.is_some();
+                let thorough = move |task: u64| local || task.is_multiple_of(ONE_IN);
                 if may_be_absent
                     && let Some(folder) = &folder
                     && let Ok(false) = tokio::fs::try_exists(folder).await
@@ -267,7 +269,15 @@ impl Stored for StoreReader {
                     return Ok::<Vec<Found>, DatasetError>(vec![found; count]);
                 }
                 let holdings = Holdings::new(store, prefix);
-                let held = question.ask(&holdings, thorough).await?;
+                let mut held = question.clone().ask(&holdings, thorough).await?;
+                if let (Some(folder), Question::Scenes(dataset, _)) = (&folder, &question)
+                    && held.contains(&Held::Gone)
+                {
+                    // A network's file system remembers for a while that a file was missing. Opening its folder makes it
+                    // ask the server again; whether it can be opened does not matter.
+                    let _ = tokio::fs::read_dir(folder.join(dataset).join("manifests")).await;
+                    held = question.ask(&holdings, thorough).await?;
+                }
                 let found = held.into_iter().map(|held| match held {
                     Held::Equal => Found::Equal,
                     Held::Gone => Found::Gone,

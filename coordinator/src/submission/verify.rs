@@ -2,8 +2,8 @@
 //!
 //! A report is only refused if this coordinator surely sees the store that the worker writes to: it found another result
 //! there before and still finds it, or a single worker contradicts a store whose folder exists here (or, if the worker is on
-//! this machine, whose folder should). If it finds nothing of
-//! what two workers report, it takes itself for the one that sees another disk, and commits the results as unverified.
+//! this machine, whose folder should). If it finds nothing of what two workers report, it takes itself for the one that sees
+//! another disk, and commits the results as unverified.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -44,12 +44,17 @@ impl Submissions {
         store: &str,
         reports: Vec<Reported>,
     ) -> (Vec<(Reported, Verdict)>, bool) {
-        let mut by_stage: BTreeMap<StageRef, Vec<Reported>> = BTreeMap::new();
+        // Two reports of one task are two questions.
+        let mut questions: BTreeMap<(StageRef, usize), Vec<Reported>> = BTreeMap::new();
+        let mut seen = HashMap::new();
         for reported in reports {
-            by_stage.entry(reported.stage).or_default().push(reported);
+            let stage = reported.stage;
+            let nth = seen.entry((stage, reported.report.index)).or_insert(0);
+            questions.entry((stage, *nth)).or_default().push(reported);
+            *nth += 1;
         }
         let (mut verdicts, mut blind) = (Vec::new(), false);
-        for reports in by_stage.into_values() {
+        for reports in questions.into_values() {
             let mut found = self.find(store, &reports).await;
             if found
                 .iter()
