@@ -83,7 +83,11 @@ impl Submissions {
                         self.missing(store, &reported, "holds another result").await
                     }
                 };
-                let looked = matches!(found, Some(Found::Gone | Found::Differs | Found::NoStore));
+                let looked = match found {
+                    Some(Found::Gone | Found::Differs) => true,
+                    Some(Found::NoStore) => reported.here,
+                    _ => false,
+                };
                 blind |= verdict == Verdict::Unknown && looked;
                 verdicts.push((reported, verdict));
             }
