@@ -302,8 +302,9 @@ mod tests {
         assert_eq!(held, [Held::Other], "an object has other bytes");
         let empty = br#"{"objects": []}"#;
         put(&store, "s/d/manifests/2.json", empty).await;
-        let held = holdings.scenes("d", &[(2, digest(empty))], |_| false);
-        assert_eq!(held.await.unwrap(), [Held::Other], "it names nothing");
+        let asked = [(2, digest(empty))];
+        let held = holdings.scenes("d", &asked, |_| false).await.unwrap();
+        assert_eq!(held, [Held::Other], "it names nothing");
     }
 
     #[tokio::test]
