@@ -40,6 +40,7 @@ async fn a_worker_that_reports_what_is_not_there_is_refused_and_gets_no_more_tas
         assert_eq!((status.state, status.tasks.pending), (JobState::Active, 2));
         assert_eq!(alarms(&mut farm, &job).await.len(), 1);
         liar.credit(1).await;
+        farm.pass(20_000);
         farm.stored.instead.lock().unwrap().clear();
         let mut honest = farm.connect(hello("bea")).await.unwrap();
         let status = honest.work(&mut farm, &job).await;
@@ -65,6 +66,7 @@ async fn a_coordinator_that_finds_nothing_of_two_workers_sees_another_disk() {
         let mut second = farm.connect(hello("bea")).await.unwrap();
         let lease = first.lease().await;
         assert!(!first.done(&lease, lease.lo).await.accepted);
+        farm.pass(20_000);
         let status = second.work(&mut farm, &job).await;
         assert_eq!((status.state, status.unverified), (JobState::Done, 2));
         // The first one is believed again.
