@@ -38,6 +38,8 @@ use crate::{
 const BATCH: usize = 4096;
 /// How long to wait before trying a catalog again that failed.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
+/// Claims in one turn at most; what is left waits for the next.
+const ROUNDS: usize = 8;
 /// How often the catalog hears that this instance lives, and is asked for news.
 const BEAT: Duration = Duration::from_secs(1);
 /// Least time between two beats, whatever the hints.
@@ -291,10 +293,20 @@ impl Life<'_> {
                     () = tokio::time::sleep(due) => continue,
                 }
             }
-            self.supply().await?;
-            self.core.dispatch(self.now());
-            self.flush().await?;
+            self.serve().await?;
         }
+    }
+
+    /// Claims and grants until nothing more can be granted now: what a claim did not bring is another job's turn.
+    async fn serve(&mut self) -> Result<(), CatalogError> {
+        for _ in 0..ROUNDS {
+            let claimed = self.supply().await?;
+            self.core.dispatch(self.now());
+            if !claimed {
+                break;
+            }
+        }
+        self.flush().await
     }
 
     /// A stall of this process (a suspended machine, a stopped debugger, a catalog that does not answer) is no worker's
@@ -316,11 +328,11 @@ impl Life<'_> {
         self.flush().await
     }
 
-    /// Claims what connected workers could run.
-    async fn supply(&mut self) -> Result<(), CatalogError> {
+    /// Claims what connected workers could run; `false` where nothing is to be claimed.
+    async fn supply(&mut self) -> Result<bool, CatalogError> {
         let wants = self.core.wants(self.now());
         if wants.is_empty() {
-            return Ok(());
+            return Ok(false);
         }
         // What is noted so far first: the catalog must know this instance's ranges as they are.
         self.flush().await?;
@@ -329,14 +341,15 @@ impl Life<'_> {
         for (want, claim) in wants.iter().zip(claims) {
             self.core.claimed(want.stage, claim, now);
         }
-        Ok(())
+        Ok(true)
     }
 
     /// Tells the catalog that this instance lives, and hears what is new.
     async fn beat(&mut self) -> Result<(), CatalogError> {
         self.core.give_back();
         self.flush().await?;
-        let news = self.actor.catalog.beat(self.core.connected()).await?;
+        let connected = self.core.connected();
+        let news = self.actor.catalog.beat(connected, self.now()).await?;
         self.actor.health.beat();
         let now = self.now();
         let unknown = self.core.hear(news, now);

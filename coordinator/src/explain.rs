@@ -25,6 +25,8 @@ pub struct Candidate {
     pub lacks_memory: Option<(u64, u64)>,
     /// It asks for work.
     pub idle: bool,
+    /// There is a task that it can be granted now, or may be.
+    pub gets: bool,
     /// It holds a range that crashed others, and gets nothing else.
     pub quarantined: bool,
     /// It holds leases and was not heard of for so many milliseconds, longer than it should be.
@@ -376,7 +378,8 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
         );
         return reason("silent", ready, words);
     }
-    let idle = able.iter().filter(|c| c.idle && !c.quarantined).count();
+    let asks = |c: &&&Candidate| c.idle && !c.quarantined;
+    let idle = able.iter().filter(asks).filter(|c| c.gets).count();
     if idle > 0 {
         let words = format!(
             "{tasks} about to be leased: {} for work",
@@ -387,6 +390,12 @@ fn unleased(facts: &JobFacts, ready: u64) -> Reason {
             }
         );
         return reason("starting", ready, words);
+    }
+    if able.iter().any(|c| asks(&c)) {
+        let words = format!(
+            "{tasks} wait for a worker with nothing else in hand: workers were lost while they ran them{others}"
+        );
+        return reason("suspects", ready, words);
     }
     let ahead = facts.ahead.len() as u64 + facts.unseen;
     if ahead > 0 {

@@ -81,7 +81,11 @@ proptest! {
                     let lo = a % (2 * total);
                     let except = [Run { lo, hi: lo + b % 5 }];
                     let among = (lo..except[0].hi.min(total)).filter(|t| table[*t as usize] == Task::Pending);
-                    prop_assert_eq!(stage.pending_among(&except), among.count() as u64);
+                    let (plain, suspects) = stage.ready(i64::MAX, &except);
+                    let among = among.count() as u64;
+                    prop_assert_eq!(plain + suspects + among, stage.pending_tasks());
+                    prop_assert_eq!(stage.front(i64::MAX, false, &except).is_some(), plain > 0);
+                    prop_assert_eq!(stage.front(i64::MAX, true, &except).is_some(), plain + suspects > 0);
                     let Some((front, run)) = stage.front(i64::MAX, flag, &except) else { continue };
                     let front = front.clone();
                     prop_assert!(front.lo <= run.lo && run.lo < run.hi && run.hi <= front.hi);

@@ -18,7 +18,7 @@ impl Core {
         let waiting: Vec<StageRef> = self
             .stages
             .iter()
-            .filter(|(_, e)| e.waits())
+            .filter(|(_, e)| e.waits(now_ms))
             .map(|(id, _)| *id)
             .collect();
         for stage in &waiting {
@@ -35,7 +35,7 @@ impl Core {
         }
         let mut waiting: Vec<(StageRef, u64)> = waiting
             .into_iter()
-            .filter(|stage| self.stages[stage].stage.pending_tasks() > 0)
+            .filter(|stage| !self.ready_here(*stage, now_ms).is_none())
             .map(|stage| (stage, self.able(stage, now_ms)))
             .collect();
         // In rounds, so that the first worker does not take everything; and in order of rank, which each grant changes.
@@ -127,7 +127,7 @@ impl Core {
         let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
         let count = match alone {
             true => 1,
-            false => self.lease_size(entry, able, run.hi - run.lo),
+            false => self.lease_size(entry, able, run.hi - run.lo, now_ms),
         };
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");

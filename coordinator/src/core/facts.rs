@@ -108,13 +108,12 @@ impl Core {
         task: Option<u64>,
         now_ms: i64,
     ) -> JobLook {
-        let waits = |e: &StageEntry| e.waits() && (e.stage.pending_tasks() > 0 || e.free > Some(0));
+        let waits = |e: &StageEntry| e.waits(now_ms);
         let first = |is: &dyn Fn(&StageEntry) -> bool| {
             let mut of_job = self.stages.iter().filter(|(id, _)| id.job == job);
             of_job.find(|(_, e)| is(e)).map(|(id, _)| id.stage)
         };
-        // Of a stage that has just begun it is not known yet how much waits.
-        let stage = stage.or_else(|| first(&waits).or_else(|| first(&StageEntry::waits)));
+        let stage = stage.or_else(|| first(&waits).or_else(|| first(&StageEntry::has_pending)));
         let here = StageRef {
             job,
             stage: stage.unwrap_or(0),
@@ -140,6 +139,7 @@ impl Core {
                     &worker.abilities,
                 ),
                 idle: worker.credits > 0,
+                gets: !self.ready_for(here, *id, now_ms).is_none(),
                 quarantined: worker.quarantined,
                 silent_ms: self.silent_ms(worker, now_ms),
             })

@@ -13,6 +13,7 @@ mod jobs;
 mod leases;
 mod load;
 mod log;
+mod ready;
 mod refused;
 mod sessions;
 mod shared;
@@ -24,7 +25,7 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use picofarm_catalog::{
-    Changes, Exception, Job, NewEvent, ResultSet, Run, Settled, Snapshot, StageRecord, Timing,
+    Changes, Exception, Free, Job, NewEvent, ResultSet, Run, Settled, Snapshot, StageRecord, Timing,
 };
 use picofarm_proto::{
     ids::{Incarnation, JobId, LeaseRef, RangeId, StageRef, WorkerId},
@@ -106,7 +107,7 @@ struct StageEntry {
     /// Of tasks that were ever in hand.
     exceptions: BTreeMap<u64, Exception>,
     /// Pending tasks that are nobody's, as last heard; `None` = ask.
-    free: Option<u64>,
+    free: Option<Free>,
     /// The catalog is not asked for tasks before this time: it had none to give just now.
     ask_at_ms: i64,
     /// Why no connected worker may run it, as last reported.
@@ -128,11 +129,6 @@ impl StageEntry {
     /// Why not, in words.
     fn suits(&self, id: StageRef, worker: &Abilities) -> Result<(), String> {
         place::may_run(self.spec(id), &self.known, worker)
-    }
-
-    /// Whether it has or may have tasks to be given out now.
-    fn waits(&self) -> bool {
-        !self.job.paused && (self.stage.pending_tasks() > 0 || self.free != Some(0))
     }
 }
 

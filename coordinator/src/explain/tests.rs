@@ -47,6 +47,7 @@ fn able(name: &str) -> Candidate {
         may_run: Ok(()),
         lacks_memory: None,
         idle: false,
+        gets: true,
         quarantined: false,
         silent_ms: None,
     }

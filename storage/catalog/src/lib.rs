@@ -36,7 +36,7 @@ use picofarm_proto::{
 pub use changes::Changes;
 pub use error::CatalogError;
 pub use event::{EventQuery, NewEvent};
-pub use instance::{Claim, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
+pub use instance::{Claim, Free, JobEnd, News, Owned, Settled, Snapshot, Want, Worker};
 pub use job::{Holdups, Job, JobRecord, ResultSet, StageCounts, StageRecord, Timing};
 pub use listing::{Forgotten, JobQuery, Page};
 pub use range::{LeaseState, Mark, Range, RangeState, Run};
@@ -65,11 +65,12 @@ pub trait Catalog: Rights {
     /// that are lost.
     async fn load(&self) -> Result<Snapshot, CatalogError>;
 
-    /// Says that the instance lives and has this many workers connected; to be called about once a second.
+    /// Says that the instance lives and has this many workers connected; to be called about once a second. What may run is
+    /// told of `now_ms`.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`] when it was thought lost; a new life must begin.
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError>;
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError>;
 
     /// Returns when another instance may have changed something: a hint to beat early. Safe to cancel.
     async fn changed(&self);

@@ -451,6 +451,8 @@ macro_rules! queries {
                     task: uint(row, "task")?,
                     failures: small(row, "failures")?,
                     crashes: small(row, "crashes")?,
+                    interruptions: small(row, "interruptions")?,
+                    longest_ms: uint(row, "longest_ms")?,
                     dead: row.try_get("dead")?,
                     last_error: row.try_get("last_error")?,
                 })

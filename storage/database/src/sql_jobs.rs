@@ -13,7 +13,7 @@ macro_rules! job_queries {
             use sqlx::Row;
 
             use super::query::{exception, marks, stage_of, uint};
-            use picofarm_catalog::{Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight};
+            use picofarm_catalog::{Free, Holdups, Job, JobEnd, JobRecord, Mark, NewEvent, ResultSet, Settled, StageCounts, Timing, Sight};
             use crate::{graph::{self, Node}, seen::seen, sql::{self, bad, int}};
 
             type Connection = $connection;
@@ -53,18 +53,45 @@ macro_rules! job_queries {
             }
 
             /// Pending tasks of open stages of active jobs that are nobody's.
-            pub(crate) async fn free(c: &mut Connection) -> Result<BTreeMap<StageRef, u64>> {
-                let rows = sqlx::query(
-                    "SELECT job.id AS job_id, stage.ordinal, CAST(sum(hi - lo) AS BIGINT) AS tasks FROM task_range \
+            pub(crate) async fn free(c: &mut Connection, now_ms: i64) -> Result<BTreeMap<StageRef, Free>> {
+                let rows = sqlx::query(concat!(
+                    "SELECT job.id AS job_id, stage.ordinal, ",
+                    $crate::sql_jobs::free_columns!("$1"),
+                    " FROM task_range \
                      JOIN stage ON stage.key = task_range.stage JOIN job ON job.key = stage.job \
                      WHERE task_range.state = 0 AND owner IS NULL AND stage.state = 1 AND job.state = 0 \
                      GROUP BY job.id, stage.ordinal",
-                )
+                ))
+                .bind(now_ms)
                 .fetch_all(c)
                 .await?;
                 rows.iter()
-                    .map(|row| Ok((stage_of(row)?, uint(row, "tasks")?)))
+                    .map(|row| Ok((stage_of(row)?, free_of(row)?)))
                     .collect()
+            }
+
+            /// What is nobody's of one stage.
+            pub(crate) async fn free_of_stage(c: &mut Connection, key: i64, now_ms: i64) -> Result<Free> {
+                let row = sqlx::query(concat!(
+                    "SELECT ",
+                    $crate::sql_jobs::free_columns!("$2"),
+                    " FROM task_range JOIN stage ON stage.key = task_range.stage \
+                     WHERE stage = $1 AND task_range.state = 0 AND owner IS NULL AND stage.state = 1",
+                ))
+                .bind(key)
+                .bind(now_ms)
+                .fetch_one(c)
+                .await?;
+                free_of(&row)
+            }
+
+            fn free_of(row: &DbRow) -> Result<Free> {
+                Ok(Free {
+                    ready: uint(row, "ready")?,
+                    suspects: uint(row, "suspects")?,
+                    later: uint(row, "later")?,
+                    next_ms: row.try_get("next_ms")?,
+                })
             }
 
             pub(crate) async fn timing(c: &mut Connection, set: &ResultSet) -> Result<Timing> {
@@ -417,4 +444,19 @@ macro_rules! job_queries {
     };
 }
 
+/// The columns of a [`Free`](picofarm_catalog::Free), at the time of a parameter.
+macro_rules! free_columns {
+    ($now:literal) => {
+        concat!(
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ", $now, " AND crashes = 0 THEN hi - lo ELSE 0 END), 0) \
+             AS BIGINT) AS ready, ",
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ", $now, " AND crashes > 0 THEN hi - lo ELSE 0 END), 0) \
+             AS BIGINT) AS suspects, ",
+            "CAST(coalesce(sum(CASE WHEN not_before_ms > ", $now, " THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS later, ",
+            "min(CASE WHEN not_before_ms > ", $now, " THEN not_before_ms END) AS next_ms",
+        )
+    };
+}
+
+pub(crate) use free_columns;
 pub(crate) use job_queries;

@@ -24,6 +24,8 @@ use super::super::{Core, OutputHint, Say, Settings, Timings, prepare, stands_for
 use crate::{budget::Backoff, submission::Draft};
 
 pub(super) const TASKS: u64 = 12;
+/// As the actor's.
+const ROUNDS: usize = 8;
 const WORKERS: u8 = 3;
 pub(super) const SETTINGS: Settings = Settings {
     lease_ms: 1_000,
@@ -290,7 +292,7 @@ impl World {
         self.instances[h].core.give_back();
         self.flush(h).await;
         let connected = self.instances[h].core.connected();
-        let news = self.instances[h].catalog.beat(connected).await;
+        let news = self.instances[h].catalog.beat(connected, self.now).await;
         let Some(news) = self.or_reload(h, news).await else {
             return;
         };
@@ -492,18 +494,24 @@ impl World {
     /// One turn of an instance's actor.
     async fn step(&mut self, h: usize) {
         self.instances[h].core.expire(self.now);
-        let wants = self.instances[h].core.wants(self.now);
-        if !wants.is_empty() {
-            self.flush(h).await;
-            let claims = self.instances[h].catalog.claim(&wants).await;
-            let Some(claims) = self.or_reload(h, claims).await else {
-                return;
-            };
-            for (want, claim) in wants.iter().zip(claims) {
-                self.instances[h].core.claimed(want.stage, claim, self.now);
+        for _ in 0..ROUNDS {
+            let wants = self.instances[h].core.wants(self.now);
+            let claimed = !wants.is_empty();
+            if claimed {
+                self.flush(h).await;
+                let claims = self.instances[h].catalog.claim(&wants).await;
+                let Some(claims) = self.or_reload(h, claims).await else {
+                    return;
+                };
+                for (want, claim) in wants.iter().zip(claims) {
+                    self.instances[h].core.claimed(want.stage, claim, self.now);
+                }
+            }
+            self.instances[h].core.dispatch(self.now);
+            if !claimed {
+                break;
             }
         }
-        self.instances[h].core.dispatch(self.now);
         self.flush(h).await;
     }
 

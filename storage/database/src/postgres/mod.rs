@@ -197,7 +197,7 @@ impl Catalog for PostgresCatalog {
         Ok(snapshot)
     }
 
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError> {
         let instance = self.instance()?;
         let news = async {
             let mut connection = self.pool.acquire().await?;
@@ -211,7 +211,7 @@ impl Catalog for PostgresCatalog {
                 active: job_query::active(&mut tx).await?,
                 busy: instance::busy(&mut tx, instance).await?,
                 shared: instance::shared(&mut tx, instance).await?,
-                free: job_query::free(&mut tx).await?,
+                free: job_query::free(&mut tx, now_ms).await?,
                 taken: Owned {
                     exceptions: query::exceptions(&mut tx, &taken).await?,
                     ranges: taken,

@@ -34,14 +34,17 @@ pub(super) async fn write_rows(writer: &mut Writer<'_>, changes: &Changes) -> Re
 async fn put_exception(writer: &mut Writer<'_>, exception: &Exception) -> Result<()> {
     let stage = writer.keys(exception.stage).await?.stage;
     sqlx::query(
-        "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES ($1, $2, $3, $4, $5, $6) \
+        "INSERT INTO exception (stage, task, failures, crashes, interruptions, longest_ms, dead, last_error) \
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8) \
          ON CONFLICT (stage, task) DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
-         dead = excluded.dead, last_error = excluded.last_error",
+         interruptions = excluded.interruptions, longest_ms = excluded.longest_ms, dead = excluded.dead, last_error = excluded.last_error",
     )
     .bind(stage)
     .bind(int(exception.task))
     .bind(i64::from(exception.failures))
     .bind(i64::from(exception.crashes))
+    .bind(i64::from(exception.interruptions))
+    .bind(int(exception.longest_ms))
     .bind(exception.dead)
     .bind(&exception.last_error)
     .execute(&mut *writer.c)

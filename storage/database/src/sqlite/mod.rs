@@ -206,7 +206,7 @@ impl Catalog for SqliteCatalog {
         read.await.map_err(|e| self.failed(e))
     }
 
-    async fn beat(&self, workers: u32) -> Result<News, CatalogError> {
+    async fn beat(&self, workers: u32, now_ms: i64) -> Result<News, CatalogError> {
         {
             let writer = self.writer.lock().await;
             let writer = writer.as_ref().ok_or(CatalogError::Closed)?;
@@ -218,7 +218,7 @@ impl Catalog for SqliteCatalog {
                 active: job_query::active(&mut c).await?,
                 busy: BTreeMap::new(),
                 shared: BTreeMap::new(),
-                free: job_query::free(&mut c).await?,
+                free: job_query::free(&mut c, now_ms).await?,
                 taken: Owned::default(),
                 leased: None,
                 instances: 1,

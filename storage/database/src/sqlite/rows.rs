@@ -22,14 +22,17 @@ pub(super) async fn write_rows(
     for exception in changes.exceptions.values() {
         let stage = keys.of(c, exception.stage).await?.stage;
         sqlx::query(
-            "INSERT INTO exception (stage, task, failures, crashes, dead, last_error) VALUES (?, ?, ?, ?, ?, ?) \
+            "INSERT INTO exception (stage, task, failures, crashes, interruptions, longest_ms, dead, last_error) \
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?) \
              ON CONFLICT DO UPDATE SET failures = excluded.failures, crashes = excluded.crashes, \
-             dead = excluded.dead, last_error = excluded.last_error",
+             interruptions = excluded.interruptions, longest_ms = excluded.longest_ms, dead = excluded.dead, last_error = excluded.last_error",
         )
         .bind(stage)
         .bind(int(exception.task))
         .bind(exception.failures)
         .bind(exception.crashes)
+        .bind(exception.interruptions)
+        .bind(int(exception.longest_ms))
         .bind(exception.dead)
         .bind(&exception.last_error)
         .execute(&mut *c)
