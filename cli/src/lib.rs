@@ -14,6 +14,7 @@ pub mod dataset;
 mod demo;
 mod describe;
 mod doctor;
+pub mod ends;
 pub mod error;
 mod explain;
 pub mod follow;

@@ -1,6 +1,10 @@
 //! `picofarm coordinator` and `picofarm worker`: one role in one process.
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    net::SocketAddr,
+    sync::Arc,
+    time::{Duration, SystemTime},
+};
 
 use picofarm_agent::{AgentConfig, AgentError, Memory};
 use picofarm_coordinator::{
@@ -13,7 +17,7 @@ use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
 use crate::{
-    args,
+    args, ends,
     error::{CliError, Code, Result},
     output::Output,
     settings::Settings,
@@ -280,6 +284,7 @@ pub async fn worker(args: args::Worker, settings: &Settings, output: Output) -> 
         peers: args.peers,
         labels: args.label,
         exit_idle: args.exit_idle_s.map(Duration::from_secs),
+        ends_at: ends::ends_at(args.end_at, SystemTime::now())?,
         asset_dirs: vec![settings.assets.clone()],
         access: settings.access()?,
         store_prefixes: args.store_prefix,

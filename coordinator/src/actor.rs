@@ -120,7 +120,8 @@ pub(crate) enum Command {
 /// What a worker says in its session.
 pub(crate) enum FromWorker {
     Credit(u32),
-    Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>),
+    /// With the milliseconds until the worker must end, where that is known.
+    Heartbeat(Vec<LeaseRef>, Vec<TaskProgress>, Option<u64>),
     Done(Finished),
     Failed(Failure),
     /// A report on this task that says what cannot be: why.
@@ -453,7 +454,7 @@ impl Life<'_> {
                     let _ = reply.send(Ok(self.core.everywhere()));
                 }
                 Command::Look(reply) => {
-                    let _ = reply.send(Ok(self.core.look()));
+                    let _ = reply.send(Ok(self.core.look(self.now())));
                 }
                 Command::LookAt {
                     job,
@@ -500,8 +501,9 @@ impl Life<'_> {
         let now = self.now();
         match said {
             FromWorker::Credit(n) => self.core.credit(session, n),
-            FromWorker::Heartbeat(leases, progress) => {
+            FromWorker::Heartbeat(leases, progress, ends_in_ms) => {
                 self.sessions.heard(session);
+                self.core.ends(session, ends_in_ms, now);
                 self.core.heartbeat(session, &leases, &progress, now);
             }
             FromWorker::Done(_) => unreachable!("handled with what the catalog holds"),

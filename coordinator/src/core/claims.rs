@@ -26,7 +26,12 @@ impl Core {
             self.workers
                 .iter()
                 .filter(|(_, worker)| worker.hungry())
-                .map(|(id, worker)| (*id, worker.credits, worker.leases.is_empty())),
+                .map(|(id, worker)| Asks {
+                    id: *id,
+                    credits: worker.credits,
+                    empty_handed: worker.leases.is_empty(),
+                    ends: worker.ends_ms.is_some(),
+                }),
         );
         // Mostly everyone is at work: then nothing need be looked at.
         if hungry.credits == 0 {
@@ -73,6 +78,11 @@ impl Core {
                     all.contains(&worker.id) || (all.len() as u64) < self.load.room(job.id, most)
                 });
             if worker.credits == 0 || !room || self.may_run(id, worker.id, now_ms).is_err() {
+                demand.next += 1;
+                continue;
+            }
+            // What there is of the stage may be too long for this worker.
+            if worker.ends && self.ready_for(id, worker.id, now_ms).is_none() {
                 demand.next += 1;
                 continue;
             }
@@ -192,7 +202,7 @@ impl Core {
     pub(crate) fn receive(&mut self, owned: Owned, now_ms: i64) {
         for exception in owned.exceptions {
             if let Some(entry) = self.stages.get_mut(&exception.stage) {
-                entry.exceptions.insert(exception.task, exception);
+                entry.note(exception);
             }
         }
         for range in owned.ranges {
@@ -311,15 +321,12 @@ struct Asks {
     id: WorkerId,
     credits: u32,
     empty_handed: bool,
+    /// It must end at a time that is known.
+    ends: bool,
 }
 
 impl Hungry {
-    fn new(workers: impl Iterator<Item = (WorkerId, u32, bool)>) -> Self {
-        let workers = workers.map(|(id, credits, empty_handed)| Asks {
-            id,
-            credits,
-            empty_handed,
-        });
+    fn new(workers: impl Iterator<Item = Asks>) -> Self {
         let workers: Vec<Asks> = workers.collect();
         Self {
             credits: workers.iter().map(|w| u64::from(w.credits)).sum(),

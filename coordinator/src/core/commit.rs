@@ -161,6 +161,7 @@ impl Core {
         if let (Some(worker), Some(entry)) = (self.sessions.get(&session), self.stages.get_mut(&id))
         {
             entry.blocklist.succeeded(*worker);
+            self.sick.succeeded(*worker);
             let task = &entry.spec(id).task;
             if !report.adopted {
                 self.away.worked(store_of(task), *worker);

@@ -9,7 +9,18 @@ use picofarm_proto::{
 };
 
 use super::{About, Core, Say, stores::store_of};
-use crate::transition::RangeEvent;
+use crate::{explain::span, transition::RangeEvent};
+
+/// Workers other than one that may run a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Others {
+    /// There are some, on which its tasks do not fail.
+    Good,
+    /// There are some, and its tasks fail on all of them too.
+    Failed,
+    /// There is none.
+    None,
+}
 
 impl Core {
     /// Grants whatever is in hand and can be granted now.
@@ -88,24 +99,58 @@ impl Core {
                 "limits.max_workers = {most}, and so many work on the job"
             ));
         }
-        match entry.blocklist.avoids(worker, now_ms) {
-            Some(ms) if self.another(id, worker, now_ms) => Err(format!(
-                "tasks of the stage failed on it one after another; it is passed over for another {} min",
-                ms / 60_000 + 1
+        if let Err((needs, left)) = self.has_time(id, worker, now_ms) {
+            return Err(format!(
+                "a task is taken to need {}, and the worker ends in {}",
+                span(needs),
+                span(left)
+            ));
+        }
+        if let Some(ms) = self.sick.rests(worker, now_ms) {
+            return Err(format!(
+                "it failed, or gave back, one lease after another; it gets no tasks for another {}",
+                span(ms)
+            ));
+        }
+        match self.passed_over(id, worker, now_ms) {
+            Some(ms) => Err(format!(
+                "tasks of the stage failed on it one after another; it is passed over for another {}",
+                span(ms)
             )),
-            _ => Ok(()),
+            None => Ok(()),
         }
     }
 
-    /// Whether a worker other than this one may run a stage, and has not failed at it.
-    fn another(&self, id: StageRef, than: WorkerId, now_ms: i64) -> bool {
+    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer, milliseconds. Where they fail
+    /// on every worker, the tasks are to blame, and no worker is passed over.
+    pub(super) fn passed_over(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
+        let blocklist = &self.stages[&id].blocklist;
+        let ms = blocklist.avoids(worker, now_ms)?;
+        match self.others(id, worker, now_ms) {
+            Others::Good => Some(ms),
+            Others::Failed => None,
+            Others::None => blocklist.avoids_alone(worker, now_ms),
+        }
+    }
+
+    /// What there is of workers other than this one that may run a stage.
+    pub(super) fn others(&self, id: StageRef, than: WorkerId, now_ms: i64) -> Others {
         let entry = &self.stages[&id];
-        self.workers.iter().any(|(worker, w)| {
-            *worker != than
+        let others = self.workers.iter().filter(|(worker, w)| {
+            **worker != than
                 && !w.drains
-                && entry.blocklist.avoids(*worker, now_ms).is_none()
+                && self.sick.rests(**worker, now_ms).is_none()
                 && entry.suits(id, &w.abilities).is_ok()
-        })
+                && self.has_time(id, **worker, now_ms).is_ok()
+        });
+        let mut found = Others::None;
+        for (worker, _) in others {
+            if !entry.blocklist.doubts(*worker) {
+                return Others::Good;
+            }
+            found = Others::Failed;
+        }
+        found
     }
 
     /// Grants one lease of a stage to a worker, if both can; `able` workers may run it.
@@ -116,18 +161,23 @@ impl Core {
             return false;
         }
         // A range under suspicion runs alone on its worker, so that it cannot draw others into its crash.
-        let others = self.done_for_others(id);
+        let others = self.not_for(id, worker, now_ms);
         let suspects = who.leases.is_empty();
         let Some((range, run)) = entry.stage.front(now_ms, suspects, &others) else {
             return false;
         };
         let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
-        // A task that may run for days holds up no other.
-        let alone = self.away.is_try(&store) || entry.spec(id).task.resumes();
+        // A task that may run for days holds up no other; and what fails on this worker shall be one.
+        let alone = self.away.is_try(&store)
+            || entry.spec(id).task.resumes()
+            || entry.blocklist.doubts(worker)
+            || self.sick.is_try(worker);
         let count = match alone {
             true => 1,
-            false => self.lease_size(entry, able, run.hi - run.lo, now_ms),
+            false => self
+                .lease_size(entry, able, run.hi - run.lo, now_ms)
+                .min(self.most_that_fit(id, worker, now_ms)),
         };
         let entry = self.stages.get_mut(&id).expect("looked up above");
         let who = self.workers.get_mut(&worker).expect("looked up above");

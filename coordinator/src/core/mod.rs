@@ -8,7 +8,9 @@ mod blocklist;
 mod claims;
 mod commit;
 mod dispatch;
+mod ends;
 mod facts;
+mod failures;
 mod jobs;
 mod leases;
 mod load;
@@ -17,6 +19,7 @@ mod ready;
 mod refused;
 mod sessions;
 mod shared;
+mod sick;
 mod stores;
 mod tail;
 #[cfg(test)]
@@ -106,6 +109,8 @@ struct StageEntry {
     stage: Stage,
     /// Of tasks that were ever in hand.
     exceptions: BTreeMap<u64, Exception>,
+    /// Of these the longest attempt that did not end, milliseconds.
+    longest_ms: u64,
     /// Pending tasks that are nobody's, as last heard; `None` = ask.
     free: Option<Free>,
     /// The catalog is not asked for tasks before this time: it had none to give just now.
@@ -121,6 +126,12 @@ struct StageEntry {
 impl StageEntry {
     fn spec(&self, id: StageRef) -> &StageSpec {
         &self.job.spec.stages[id.stage as usize]
+    }
+
+    /// Takes note of a task's failures.
+    fn note(&mut self, exception: Exception) {
+        self.longest_ms = self.longest_ms.max(exception.longest_ms);
+        self.exceptions.insert(exception.task, exception);
     }
 
     /// Whether a worker has what its tasks need.
@@ -149,6 +160,8 @@ struct WorkerEntry {
     since_ms: i64,
     /// When it was last heard of.
     heard_ms: i64,
+    /// When it must end, where that is known.
+    ends_ms: Option<i64>,
     abilities: Abilities,
     credits: u32,
     leases: BTreeSet<RangeId>,
@@ -168,6 +181,8 @@ impl WorkerEntry {
 #[derive(Debug, Clone)]
 struct Progress {
     fraction: f32,
+    /// As first reported: that of what was saved by an earlier attempt.
+    first: Option<f32>,
     /// What it is at, in its worker's words.
     at: TaskAt,
     since_ms: i64,
@@ -180,6 +195,7 @@ impl Progress {
     fn since(since_ms: i64) -> Self {
         Self {
             fraction: 0.0,
+            first: None,
             at: TaskAt::default(),
             since_ms,
             log: LogAllowance::default(),
@@ -209,6 +225,8 @@ pub(crate) struct Core {
     help_at_ms: i64,
     /// Stores that tasks wait for.
     away: stores::Stores,
+    /// Workers on which nothing goes well.
+    sick: sick::Sick,
     /// Connections that break before this time, Unix milliseconds, broke by a stall of the coordinator's own.
     graced_until_ms: i64,
     /// What workers were charged with when their connection broke, for the case that they live.
@@ -255,6 +273,7 @@ impl Core {
             doubles: BTreeMap::new(),
             help_at_ms: 0,
             away: stores::Stores::default(),
+            sick: sick::Sick::default(),
             graced_until_ms: 0,
             charged: HashMap::new(),
             progress: BTreeMap::new(),
@@ -306,6 +325,7 @@ impl Core {
                     set,
                     stage: Stage::default(),
                     exceptions: BTreeMap::new(),
+                    longest_ms: 0,
                     free: None,
                     ask_at_ms: 0,
                     waiting: None,

@@ -1,7 +1,7 @@
 //! Which tasks can be granted now. Whatever claims, grants or tells of work asks here, so that tasks that cannot run now (their
 //! retry is not due, their store is away, every worker that is free is passed over) never pass for work that is there.
 
-use picofarm_catalog::Free;
+use picofarm_catalog::{Free, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
 use super::{Core, StageEntry};
@@ -83,17 +83,27 @@ impl StageEntry {
 impl Core {
     /// Tasks of a stage in hand that can be granted now.
     pub(super) fn ready_here(&self, id: StageRef, now_ms: i64) -> Ready {
+        self.ready_but(id, &self.done_for_others(id), now_ms)
+    }
+
+    /// The same without these tasks.
+    fn ready_but(&self, id: StageRef, except: &[Run], now_ms: i64) -> Ready {
         let entry = &self.stages[&id];
         if entry.job.paused || !entry.stage.is_due(now_ms) {
             return Ready::default();
         }
-        let others = self.done_for_others(id);
-        let (plain, suspects) = entry.stage.ready(now_ms, &others);
+        let (plain, suspects) = entry.stage.ready(now_ms, except);
         Ready {
             plain,
             suspects,
             unknown: false,
         }
+    }
+
+    /// Tasks of all stages that can be granted now, if there are workers for them.
+    pub(super) fn ready_now(&self, now_ms: i64) -> u64 {
+        let stages = self.stages.keys();
+        stages.map(|id| self.ready(*id, now_ms).known()).sum()
     }
 
     /// Tasks of a stage that can be granted now, if there is a worker for them.
@@ -108,6 +118,8 @@ impl Core {
         if who.quarantined || who.drains || self.may_run(id, worker, now_ms).is_err() {
             return Ready::default();
         }
-        self.ready(id, now_ms).to_worker(who.leases.is_empty())
+        let here = self.ready_but(id, &self.not_for(id, worker, now_ms), now_ms);
+        let claimable = self.stages[&id].claimable(now_ms);
+        here.and(claimable).to_worker(who.leases.is_empty())
     }
 }

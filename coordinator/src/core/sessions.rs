@@ -54,6 +54,7 @@ impl Core {
                 version: hello.version,
                 since_ms: now_ms,
                 heard_ms: now_ms,
+                ends_ms: super::ends::at(hello.ends_in_ms, now_ms),
                 abilities: hello.abilities,
                 credits: 0,
                 leases: Default::default(),

@@ -32,6 +32,8 @@ fn facts() -> JobFacts {
         },
         candidates: vec![able("a")],
         shared: 0,
+        suspects: 0,
+        deadline: None,
         ahead: vec![],
         unseen: 0,
         elsewhere: 0,
@@ -48,6 +50,7 @@ fn able(name: &str) -> Candidate {
         lacks_memory: None,
         idle: false,
         gets: true,
+        lacks_time: None,
         quarantined: false,
         silent_ms: None,
     }
@@ -59,6 +62,8 @@ fn failed(task: u64, dead: bool) -> Exception {
         task,
         failures: 2,
         crashes: 1,
+        interruptions: 0,
+        longest_ms: 0,
         dead,
         last_error: "no light in the scene".into(),
     }

@@ -251,6 +251,7 @@ fn checked(
                 .into_iter()
                 .map(TryInto::try_into)
                 .collect::<Result<_, _>>()?,
+            (beat.ends_in_ms > 0).then_some(beat.ends_in_ms),
         ),
         Some(From::Done(done)) => {
             let (about, index) = (done.lease.clone(), done.index);

@@ -3,7 +3,7 @@
 use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{Event, EventKind},
+    model::{Event, EventKind, JobState, JobStatus},
     wire,
 };
 use tonic::Status;
@@ -59,6 +59,7 @@ pub(super) async fn explain(
     let JobLook {
         candidates,
         shared,
+        suspects,
         ahead,
         elsewhere,
         running,
@@ -75,6 +76,8 @@ pub(super) async fn explain(
             .await?,
         candidates,
         shared,
+        suspects,
+        deadline: passed_deadline(&status),
         ahead,
         unseen,
         elsewhere,
@@ -111,6 +114,14 @@ pub(super) async fn explain(
         reasons: reasons.into_iter().map(Into::into).collect(),
         task: explained.map(Into::into),
     })
+}
+
+/// The deadline of a job that was stopped by it, as in its file.
+fn passed_deadline(status: &JobStatus) -> Option<String> {
+    let limits = &status.spec.limits;
+    let deadline = limits.deadline_ms().ok().flatten()?;
+    let passed = status.state == JobState::Cancelled && status.ended_at_ms? >= deadline;
+    passed.then(|| limits.deadline.clone())
 }
 
 /// Of these jobs those that may be seen, and the number of the others.

@@ -302,6 +302,7 @@ pub fn hello(name: &str) -> WorkerHello {
         protocol: PROTOCOL,
         held: Vec::new(),
         ended: String::new(),
+        ends_in_ms: None,
         abilities: Abilities {
             kinds: ["render", "reprocess"]
                 .map(|kind| (kind.to_owned(), "r1".to_owned()))
@@ -446,6 +447,7 @@ impl Worker {
                 })
                 .into_iter()
                 .collect(),
+            ends_in_ms: 0,
         }))
         .await;
         match self.hear().await.unwrap() {

@@ -77,6 +77,7 @@ impl TryFrom<wire::Hello> for WorkerHello {
                 .map(LeaseRef::try_from)
                 .collect::<Result<_, _>>()?,
             ended: ended(&w.ended),
+            ends_in_ms: (w.ends_in_ms > 0).then_some(w.ends_in_ms),
             abilities: Abilities {
                 kinds: kinds(w.kinds)?,
                 assets: at_most(w.assets, bounds::LIST, "hello.assets")?
@@ -111,6 +112,7 @@ impl From<WorkerHello> for wire::Hello {
             protocol: m.protocol,
             held: m.held.into_iter().map(Into::into).collect(),
             ended: m.ended,
+            ends_in_ms: m.ends_in_ms.unwrap_or(0),
             kinds: m.abilities.kinds.into_iter().collect(),
             assets: m.abilities.assets,
             cores: m.abilities.cores,

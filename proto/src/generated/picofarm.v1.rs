@@ -421,6 +421,11 @@ pub struct TaskExplanation {
     /// Its history, oldest first.
     #[prost(message, repeated, tag = "11")]
     pub events: ::prost::alloc::vec::Vec<Event>,
+    /// Attempts that a worker gave back half-way.
+    #[prost(uint32, tag = "12")]
+    pub interruptions: u32,
+    #[prost(uint32, tag = "13")]
+    pub max_interruptions: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TaskOutput {
@@ -467,6 +472,9 @@ pub struct ConnectedWorker {
     /// It is on probation with a range that crashed others, and gets nothing else.
     #[prost(bool, tag = "9")]
     pub quarantined: bool,
+    /// For people: why it gets nothing, or when it ends; empty = nothing to say.
+    #[prost(string, tag = "10")]
+    pub note: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
@@ -556,6 +564,9 @@ pub struct Hello {
     /// How the process of this worker before this one ended, where its parent knows; at most 256 bytes, empty = not known.
     #[prost(string, tag = "13")]
     pub ended: ::prost::alloc::string::String,
+    /// Milliseconds from the sending of this message until the worker must end, e.g. with its Slurm job; 0 = not known.
+    #[prost(uint64, tag = "14")]
+    pub ends_in_ms: u64,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Welcome {
@@ -615,6 +626,9 @@ pub struct Heartbeat {
     pub leases: ::prost::alloc::vec::Vec<LeaseRef>,
     #[prost(message, repeated, tag = "2")]
     pub progress: ::prost::alloc::vec::Vec<TaskProgress>,
+    /// As in Hello.
+    #[prost(uint64, tag = "3")]
+    pub ends_in_ms: u64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TaskProgress {
@@ -743,7 +757,7 @@ pub enum FailureKind {
     User = 1,
     /// The executor panicked or ran out of a resource.
     Crash = 2,
-    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Free.
+    /// Nothing is wrong with the task: shutdown, or the machine's trouble. Counts as an interruption.
     Interrupted = 3,
     /// Nothing is wrong with the task: its store cannot be reached or written. Free; the store is tried again later.
     Store = 4,

@@ -21,9 +21,11 @@ macro_rules! steps {
     };
 }
 
-const SQLITE_STEPS: &[Step] = steps!("sqlite": 1 "init", 2 "stages", 3 "listing", 4 "rights", 8 "interruptions");
+const SQLITE_STEPS: &[Step] =
+    steps!("sqlite": 1 "init", 2 "stages", 3 "listing", 4 "rights", 8 "interruptions");
 #[cfg(feature = "postgres")]
-const POSTGRES_STEPS: &[Step] = steps!("postgres": 1 "init", 2 "stages", 3 "listing", 4 "rights", 8 "interruptions");
+const POSTGRES_STEPS: &[Step] =
+    steps!("postgres": 1 "init", 2 "stages", 3 "listing", 4 "rights", 8 "interruptions");
 
 /// For SQLite.
 pub(crate) static SQLITE: LazyLock<Migrator> = LazyLock::new(|| migrator(SQLITE_STEPS));

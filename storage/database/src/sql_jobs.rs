@@ -425,7 +425,7 @@ macro_rules! job_queries {
                 let failed = sqlx::query(
                     "SELECT exception.*, job.id AS job_id, stage.ordinal FROM exception \
                      JOIN stage ON stage.key = exception.stage JOIN job ON job.key = stage.job \
-                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes DESC, task LIMIT 5",
+                     WHERE job.id = $1 ORDER BY dead DESC, failures + crashes + interruptions DESC, task LIMIT 5",
                 )
                 .bind(job.uuid())
                 .fetch_all(c)
@@ -448,12 +448,20 @@ macro_rules! job_queries {
 macro_rules! free_columns {
     ($now:literal) => {
         concat!(
-            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ", $now, " AND crashes = 0 THEN hi - lo ELSE 0 END), 0) \
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ",
+            $now,
+            " AND crashes = 0 THEN hi - lo ELSE 0 END), 0) \
              AS BIGINT) AS ready, ",
-            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ", $now, " AND crashes > 0 THEN hi - lo ELSE 0 END), 0) \
+            "CAST(coalesce(sum(CASE WHEN not_before_ms <= ",
+            $now,
+            " AND crashes > 0 THEN hi - lo ELSE 0 END), 0) \
              AS BIGINT) AS suspects, ",
-            "CAST(coalesce(sum(CASE WHEN not_before_ms > ", $now, " THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS later, ",
-            "min(CASE WHEN not_before_ms > ", $now, " THEN not_before_ms END) AS next_ms",
+            "CAST(coalesce(sum(CASE WHEN not_before_ms > ",
+            $now,
+            " THEN hi - lo ELSE 0 END), 0) AS BIGINT) AS later, ",
+            "min(CASE WHEN not_before_ms > ",
+            $now,
+            " THEN not_before_ms END) AS next_ms",
         )
     };
 }

@@ -707,7 +707,14 @@ async fn a_worker_takes_its_leases_along_and_the_former_instance_learns_of_it() 
     let mut changes = Changes::default();
     changes.put(lease.clone());
     a.commit(&changes).await.unwrap();
-    assert!(a.beat(1, 100).await.unwrap().leased.unwrap().contains(&lease.id));
+    assert!(
+        a.beat(1, 100)
+            .await
+            .unwrap()
+            .leased
+            .unwrap()
+            .contains(&lease.id)
+    );
     assert_eq!(
         b.adopt(worker().id).await.unwrap().ranges,
         std::slice::from_ref(&lease)

@@ -316,6 +316,7 @@ impl World {
             protocol: PROTOCOL,
             held: worker.leases.iter().map(|l| l.lease).collect(),
             ended: String::new(),
+            ends_in_ms: None,
             abilities: Abilities {
                 kinds: ["render", "reprocess"]
                     .map(|kind| (kind.to_owned(), "r".to_owned()))
