@@ -258,6 +258,7 @@ impl Pages {
     async fn read_gauges(&self) -> Option<Gauges> {
         let look = self.link.ask(Command::Look).await.ok()?;
         Some(Gauges {
+            ready: look.ready,
             jobs: look.jobs.len() as u64,
             workers: look.workers.len() as u64,
             instances: u64::from(look.instances),

@@ -158,6 +158,8 @@ impl Tally {
 pub(crate) struct Gauges {
     /// Tasks of the active jobs, together.
     pub tasks: TaskCounts,
+    /// Tasks that could be leased now.
+    pub ready: u64,
     pub jobs: u64,
     pub workers: u64,
     pub instances: u64,
@@ -379,6 +381,13 @@ impl Page {
             "gauge",
             "Tasks that wait for workers: what to scale workers by. Of the whole farm.",
             tasks.pending,
+        );
+        self.one(
+            "tasks_ready",
+            "gauge",
+            "Tasks that could be leased now; those that wait after a failure are not among them. Of the whole farm, \
+             without what other coordinators have claimed.",
+            gauges.ready,
         );
         self.one(
             "jobs_active",

@@ -38,9 +38,14 @@ fn line(s: &JobStatus) -> String {
             "  it has ended with dead tasks ({counts}): submitting runs nothing; `picofarm job retry {id}` runs those again, \
              and `--again` makes a new job of it\n"
         ),
-        JobState::Cancelled => {
-            format!("  it was cancelled ({counts}): submitting runs nothing unless with --again\n")
-        }
+        JobState::Cancelled => match s.passed_deadline() {
+            Some(deadline) => format!(
+                "  its deadline passed ({counts}): submitting runs nothing until limits.deadline = {deadline:?} is later, or left out\n"
+            ),
+            None => format!(
+                "  it was cancelled ({counts}): submitting runs nothing unless with --again\n"
+            ),
+        },
     }
 }
 

@@ -51,7 +51,7 @@ impl Core {
             while taken && hungry.credits > 0 {
                 taken = false;
                 for demand in &mut demands {
-                    taken |= self.take(demand, &mut hungry, now_ms);
+                    taken |= self.give_one(demand, &mut hungry, now_ms);
                 }
             }
             wants.extend(demands.iter().filter_map(|d| self.want(d, now_ms)));
@@ -64,7 +64,7 @@ impl Core {
 
     /// Gives a stage one lease more, of whichever of the hungry workers may run it next; `false` where none may, or nothing is
     /// left.
-    fn take(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
+    fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
         let id = demand.stage;
         let job = &self.stages[&id].job;
         let most = job.spec.limits.max_workers;
@@ -257,6 +257,7 @@ impl Core {
 
     /// What the catalog tells from time to time. Returns the active jobs that are not known yet.
     pub(crate) fn hear(&mut self, news: News, now_ms: i64) -> Vec<JobId> {
+        self.sick.tidy(now_ms);
         self.instances = news.instances.max(1);
         self.elsewhere = news.workers.saturating_sub(self.connected());
         let over: Vec<JobId> = self

@@ -112,7 +112,17 @@ impl Core {
                 span(ms)
             ));
         }
+        if self.sick.is_try(worker) && !self.workers[&worker].leases.is_empty() {
+            return Err(
+                "it failed, or gave back, one lease after another; one task is trying it now"
+                    .into(),
+            );
+        }
         match self.passed_over(id, worker, now_ms) {
+            Some(0) => Err(
+                "tasks of the stage failed on it one after another; one task is trying it now"
+                    .into(),
+            ),
             Some(ms) => Err(format!(
                 "tasks of the stage failed on it one after another; it is passed over for another {}",
                 span(ms)
@@ -121,16 +131,24 @@ impl Core {
         }
     }
 
-    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer, milliseconds. Where they fail
-    /// on every worker, the tasks are to blame, and no worker is passed over.
+    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer, milliseconds, and 0 while one
+    /// of them is a try. Where they fail on every worker, the tasks are to blame, and no worker is passed over.
     pub(super) fn passed_over(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let blocklist = &self.stages[&id].blocklist;
-        let ms = blocklist.avoids(worker, now_ms)?;
-        match self.others(id, worker, now_ms) {
-            Others::Good => Some(ms),
-            Others::Failed => None,
-            Others::None => blocklist.avoids_alone(worker, now_ms),
+        if !blocklist.doubts(worker) {
+            return None;
         }
+        let left = match self.others(id, worker, now_ms) {
+            Others::Good => blocklist.avoids(worker, now_ms),
+            Others::None => blocklist.avoids_alone(worker, now_ms),
+            Others::Failed => return None,
+        };
+        let mut leases = self.workers.get(&worker)?.leases.iter();
+        left.or_else(|| {
+            leases
+                .any(|lease| self.leases.get(lease) == Some(&id))
+                .then_some(0)
+        })
     }
 
     /// What there is of workers other than this one that may run a stage.
@@ -139,6 +157,7 @@ impl Core {
         let others = self.workers.iter().filter(|(worker, w)| {
             **worker != than
                 && !w.drains
+                && now_ms - w.heard_ms <= i64::from(self.settings.lease_ms)
                 && self.sick.rests(**worker, now_ms).is_none()
                 && entry.suits(id, &w.abilities).is_ok()
                 && self.has_time(id, **worker, now_ms).is_ok()

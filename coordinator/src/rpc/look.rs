@@ -3,7 +3,7 @@
 use picofarm_catalog::{EventQuery, Owner, ResultSet, Sight};
 use picofarm_proto::{
     ids::{JobId, StageRef},
-    model::{Event, EventKind, JobState, JobStatus},
+    model::{Event, EventKind},
     wire,
 };
 use tonic::Status;
@@ -77,7 +77,7 @@ pub(super) async fn explain(
         candidates,
         shared,
         suspects,
-        deadline: passed_deadline(&status),
+        deadline: status.passed_deadline().map(str::to_owned),
         ahead,
         unseen,
         elsewhere,
@@ -114,14 +114,6 @@ pub(super) async fn explain(
         reasons: reasons.into_iter().map(Into::into).collect(),
         task: explained.map(Into::into),
     })
-}
-
-/// The deadline of a job that was stopped by it, as in its file.
-fn passed_deadline(status: &JobStatus) -> Option<String> {
-    let limits = &status.spec.limits;
-    let deadline = limits.deadline_ms().ok().flatten()?;
-    let passed = status.state == JobState::Cancelled && status.ended_at_ms? >= deadline;
-    passed.then(|| limits.deadline.clone())
 }
 
 /// Of these jobs those that may be seen, and the number of the others.

@@ -129,6 +129,16 @@ pub struct JobStatus {
     pub workers: u32,
 }
 
+impl JobStatus {
+    /// The deadline that stopped the job, as in its file.
+    pub fn passed_deadline(&self) -> Option<&str> {
+        let limits = &self.spec.limits;
+        let deadline = limits.deadline_ms().ok().flatten()?;
+        let passed = self.state == JobState::Cancelled && self.ended_at_ms? >= deadline;
+        passed.then_some(&*limits.deadline)
+    }
+}
+
 /// A job as a list shows it, without what it is made of.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct JobSummary {
