@@ -158,3 +158,21 @@ fn a_task_that_is_interrupted_again_and_again_is_given_up() {
         world.close().await;
     });
 }
+
+#[test]
+fn a_frozen_worker_is_silent_after_its_lease_too() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let mut world = World::on_sqlite(folder.path()).await;
+        world.connect(0, 0).await;
+        world.act(&Op::Credit(0)).await;
+        world.act(&Op::Pass(SETTINGS.lease_ms as u16 * 3)).await;
+        let core = &world.instances[0].core;
+        assert!(core.leases.is_empty(), "its lease has run out");
+        let silent = Some(i64::from(SETTINGS.lease_ms) * 3);
+        assert_eq!(world.candidate(0).silent_ms, silent);
+        let note = &core.look(world.now).workers[0].note;
+        assert!(note.starts_with("not heard of for 3 s"), "{note}");
+        world.close().await;
+    });
+}
