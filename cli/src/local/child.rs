@@ -138,7 +138,7 @@ async fn work(order: Order) -> Result<()> {
         peers: "127.0.0.1".into(),
         labels: Vec::new(),
         exit_idle: None,
-        ends_at: None,
+        ends_at: crate::ends::ends_at(None, std::time::SystemTime::now())?,
         asset_dirs: vec![order.settings.assets],
         access,
         store_prefixes: Vec::new(),

@@ -329,6 +329,7 @@ impl Core {
     pub(crate) fn retried(&mut self, job: JobId) {
         for (_, entry) in self.stages.iter_mut().filter(|(id, _)| id.job == job) {
             entry.exceptions.clear();
+            entry.longest_ms = 0;
             entry.free = None;
         }
     }
