@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use picofarm_catalog::{
-    Catalog, CatalogError, Changes, EventQuery, Exception, Job, JobQuery, LeaseState, Mark,
+    Catalog, CatalogError, Changes, EventQuery, Exception, Free, Job, JobQuery, LeaseState, Mark,
     NewEvent, Output, Range, RangeState, Recorded, ResultSet, Run, Settled, Sight, Want, Worker,
 };
 use picofarm_database::{PostgresCatalog, SqliteCatalog, testing};
