@@ -353,9 +353,9 @@ pub struct Worker {
     /// End after this many seconds without work [default: never]
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=1_000_000_000))]
     pub exit_idle_s: Option<u64>,
-    /// Stop work then and give the rest back: a time such as 2026-12-01T18:00:00Z, or a duration such as 3h 50m. The coordinator
-    /// grants only what the worker can finish by then [default: a minute before the end of the Slurm job (SLURM_JOB_END_TIME);
-    /// otherwise never]
+    /// Stop work then and give the rest back: a time such as 2026-12-01T18:00:00Z, or a duration
+    /// such as 3h 50m. The coordinator grants only what the worker can finish by then [default: a
+    /// minute before the end of the Slurm job (SLURM_JOB_END_TIME); otherwise never]
     #[arg(long, value_name = "TIME|DURATION", env = "PICOFARM_END_AT", value_parser = crate::ends::parse)]
     pub end_at: Option<crate::ends::EndAt>,
     /// Touch only what lies in this path or URL (give it again for more) [default: anything]

@@ -298,7 +298,8 @@ impl Life<'_> {
         }
     }
 
-    /// Claims and grants until nothing more can be granted now: what a claim did not bring is another job's turn.
+    /// Claims and grants until nothing more can be granted now: what a claim did not bring is
+    /// another job's turn.
     async fn serve(&mut self) -> Result<(), CatalogError> {
         for _ in 0..ROUNDS {
             let claimed = self.supply().await?;

@@ -1,4 +1,5 @@
-//! How often a task is tried: failures of its own, losses of its worker and interruptions have separate budgets.
+//! How often a task is tried: failures of its own, losses of its worker and interruptions have
+//! separate budgets.
 
 use picofarm_catalog::Exception;
 use picofarm_proto::{
@@ -52,7 +53,8 @@ pub struct Attempt<'a> {
     pub message: &'a str,
     /// How long it took, as far as is known, milliseconds.
     pub ms: u64,
-    /// It is the task's to answer for: neither its worker's, nor did it come further than the one before.
+    /// It is the task's to answer for: neither its worker's, nor did it come further than the one
+    /// before.
     pub counts: bool,
     /// The task need not wait the first time: its worker gave the whole lease back.
     pub at_once: bool,
@@ -72,7 +74,8 @@ pub fn fresh(stage: StageRef, task: u64) -> Exception {
     }
 }
 
-/// Charges an attempt to a task's budgets. `before` is its record so far, `fresh` one without failures.
+/// Charges an attempt to a task's budgets. `before` is its record so far, `fresh` one without
+/// failures.
 pub fn charge(
     before: Option<&Exception>,
     fresh: Exception,

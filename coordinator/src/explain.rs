@@ -68,7 +68,8 @@ pub struct JobFacts {
     pub candidates: Vec<Candidate>,
     /// Tasks that workers have in hand for other jobs with the same outputs.
     pub shared: u64,
-    /// Tasks that wait for a worker with nothing else in hand: workers were lost while they ran them.
+    /// Tasks that wait for a worker with nothing else in hand: workers were lost while they ran
+    /// them.
     pub suspects: u64,
     /// The deadline that stopped the job, as in its file.
     pub deadline: Option<String>,

@@ -157,8 +157,8 @@ impl Stage {
         self.queue.first().is_some_and(|(at, _)| *at <= now_ms)
     }
 
-    /// Pending tasks that may go at this time, outside `except` (ascending, disjoint): those that nobody suspects, and those
-    /// with which workers were lost.
+    /// Pending tasks that may go at this time, outside `except` (ascending, disjoint): those that
+    /// nobody suspects, and those with which workers were lost.
     pub fn ready(&self, now_ms: i64, except: &[Run]) -> (u64, u64) {
         let due = self.queue.iter().take_while(|(at, _)| *at <= now_ms);
         let (mut plain, mut suspects) = (0, 0);

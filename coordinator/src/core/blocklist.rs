@@ -1,5 +1,6 @@
-//! Workers on which one task of a stage after another fails: a full disk, a broken driver. Such a worker gets no more of
-//! that stage for a while, and for ever longer, as long as others may run it; and its failures are not the tasks'.
+//! Workers on which one task of a stage after another fails: a full disk, a broken driver. Such a
+//! worker gets no more of that stage for a while, and for ever longer, as long as others may run
+//! it; and its failures are not the tasks'.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +14,8 @@ const TASKS: usize = 3;
 const AVOID_MS: u32 = 600_000;
 /// It is passed over this many times as long as a task waits after a failure.
 const LONGER: u32 = 4;
-/// The only worker of a stage is passed over for at most this many times as long: its tasks may be as much to blame.
+/// The only worker of a stage is passed over for at most this many times as long: its tasks may be
+/// as much to blame.
 const ALONE: i64 = 5;
 
 /// The workers on which tasks of one stage failed.
@@ -87,7 +89,8 @@ impl Blocklist {
         (left > 0).then_some(left)
     }
 
-    /// The tasks that failed on a worker before it was passed over, with what they were charged with: once.
+    /// The tasks that failed on a worker before it was passed over, with what they were charged
+    /// with: once.
     pub(super) fn take_charged(&mut self, worker: WorkerId) -> Vec<(u64, FailureKind)> {
         let Some(row) = self.0.get_mut(&worker) else {
             return Vec::new();

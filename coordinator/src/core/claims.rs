@@ -18,9 +18,10 @@ const AHEAD: u64 = 8;
 const ASK_AGAIN_MS: i64 = 100;
 
 impl Core {
-    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one priority share: each in its
-    /// turn is given a lease, until nobody asks for more. Those of lower priority get what the others cannot use: tasks that
-    /// cannot run now, or on none of the workers that ask, keep no worker from other jobs.
+    /// The pending tasks that connected workers could run now and that are not in hand. Jobs of one
+    /// priority share: each in its turn is given a lease, until nobody asks for more. Those of
+    /// lower priority get what the others cannot use: tasks that cannot run now, or on none of the
+    /// workers that ask, keep no worker from other jobs.
     pub(crate) fn wants(&self, now_ms: i64) -> Vec<Want> {
         let mut hungry = Hungry::new(
             self.workers
@@ -62,8 +63,8 @@ impl Core {
         wants
     }
 
-    /// Gives a stage one lease more, of whichever of the hungry workers may run it next; `false` where none may, or nothing is
-    /// left.
+    /// Gives a stage one lease more, of whichever of the hungry workers may run it next; `false`
+    /// where none may, or nothing is left.
     fn give_one(&self, demand: &mut Demand, hungry: &mut Hungry, now_ms: i64) -> bool {
         let id = demand.stage;
         let job = &self.stages[&id].job;

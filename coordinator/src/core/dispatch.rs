@@ -131,8 +131,9 @@ impl Core {
         }
     }
 
-    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer, milliseconds, and 0 while one
-    /// of them is a try. Where they fail on every worker, the tasks are to blame, and no worker is passed over.
+    /// Whether a worker gets no task of a stage because they fail on it; then for how much longer,
+    /// milliseconds, and 0 while one of them is a try. Where they fail on every worker, the tasks
+    /// are to blame, and no worker is passed over.
     pub(super) fn passed_over(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let blocklist = &self.stages[&id].blocklist;
         if !blocklist.doubts(worker) {
@@ -187,7 +188,8 @@ impl Core {
         };
         let range = range.clone();
         let store = store_of(&entry.spec(id).task).to_owned();
-        // A task that may run for days holds up no other; and what fails on this worker shall be one.
+        // A task that may run for days holds up no other; and what fails on this worker shall be
+        // one.
         let alone = self.away.is_try(&store)
             || entry.spec(id).task.resumes()
             || entry.blocklist.doubts(worker)

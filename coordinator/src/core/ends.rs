@@ -1,12 +1,13 @@
-//! Workers that must end at a time that is known: with their Slurm job, or as they were told. They are given what they can
-//! finish by then, as far as it is known how long tasks take.
+//! Workers that must end at a time that is known: with their Slurm job, or as they were told. They
+//! are given what they can finish by then, as far as it is known how long tasks take.
 
 use picofarm_catalog::{Mark, RangeState, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};
 
 use super::{Core, SessionId};
 
-/// A task is taken to need this many times the mean of its like, and of the longest attempt at it that did not end.
+/// A task is taken to need this many times the mean of its like, and of the longest attempt at it
+/// that did not end.
 const MARGIN: f64 = 1.25;
 
 /// How long a task is taken to need that took so long.
@@ -41,8 +42,8 @@ impl Core {
         Some(left.saturating_sub(busy as i64))
     }
 
-    /// What a task of a stage is taken to need, milliseconds; `None` where that is not known, or where a task goes on from where
-    /// it was saved.
+    /// What a task of a stage is taken to need, milliseconds; `None` where that is not known, or
+    /// where a task goes on from where it was saved.
     fn needs_ms(&self, id: StageRef) -> Option<i64> {
         let entry = &self.stages[&id];
         if entry.spec(id).task.resumes() {
@@ -71,7 +72,8 @@ impl Core {
         }
     }
 
-    /// Tasks of a stage that took longer than a worker has left, and did not end: ascending, disjoint.
+    /// Tasks of a stage that took longer than a worker has left, and did not end: ascending,
+    /// disjoint.
     fn too_long(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Vec<Run> {
         let entry = &self.stages[&id];
         let Some(left) = self.time_left(worker, now_ms) else {
@@ -108,7 +110,8 @@ impl Core {
         }
     }
 
-    /// Whether it is for want of time that a worker gets no task of a stage; then what one is taken to need, milliseconds.
+    /// Whether it is for want of time that a worker gets no task of a stage; then what one is taken
+    /// to need, milliseconds.
     pub(super) fn lacks_time(&self, id: StageRef, worker: WorkerId, now_ms: i64) -> Option<i64> {
         let entry = &self.stages[&id];
         let abilities = &self.workers.get(&worker)?.abilities;

@@ -16,7 +16,8 @@ use crate::{
 pub(crate) struct Look {
     /// Active jobs, in the order in which they get workers.
     pub jobs: Vec<JobId>,
-    /// Tasks that could be leased now, if there were workers: those of nobody's and those in hand here.
+    /// Tasks that could be leased now, if there were workers: those of nobody's and those in hand
+    /// here.
     pub ready: u64,
     /// Workers connected here.
     pub workers: Vec<ConnectedWorker>,
@@ -80,8 +81,8 @@ impl Core {
         }
     }
 
-    /// For how long a worker was not heard of, where that is longer than it should be: it sends a sign of life every sixth of a
-    /// lease, whether it has one or not.
+    /// For how long a worker was not heard of, where that is longer than it should be: it sends a
+    /// sign of life every sixth of a lease, whether it has one or not.
     fn silent_ms(&self, worker: &WorkerEntry, now_ms: i64) -> Option<i64> {
         let silent = now_ms - worker.heard_ms;
         let long = silent > i64::from(self.settings.lease_ms) / 2;

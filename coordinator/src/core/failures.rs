@@ -1,4 +1,5 @@
-//! Attempts that do not end well: whom they are put down to, what they cost the task and the worker.
+//! Attempts that do not end well: whom they are put down to, what they cost the task and the
+//! worker.
 
 use picofarm_catalog::{Range, RangeState};
 use picofarm_proto::{
@@ -148,8 +149,8 @@ impl Core {
         self.sick.failed(worker, trouble, others, &backoff, now_ms);
     }
 
-    /// What tasks of a stage were charged with on a worker is the worker's. (A task that was given up by that stays so; `retry`
-    /// is for that.)
+    /// What tasks of a stage were charged with on a worker is the worker's. (A task that was given
+    /// up by that stays so; `retry` is for that.)
     fn take_charges_back(&mut self, id: StageRef, worker: WorkerId) {
         let entry = self.stages.get_mut(&id).expect("a lease has a stage");
         for (task, kind) in entry.blocklist.take_charged(worker) {
@@ -175,7 +176,8 @@ impl Core {
             .expect("a lease has a stage");
         let mut backoff = self.settings.backoff;
         if attempt.kind == FailureKind::Crash && entry.spec(range.stage).task.resumes() {
-            // It goes on from where it was saved, so losing workers again and again is no sign that it never ends.
+            // It goes on from where it was saved, so losing workers again and again is no sign that
+            // it never ends.
             backoff.most_ms = backoff.first_ms;
         }
         let verdict = budget::charge(
@@ -221,7 +223,8 @@ impl Core {
         self.close(&range, false);
     }
 
-    /// Takes from a session's worker what it would not be given now: of a stage that fails on it, or all where nothing goes well.
+    /// Takes from a session's worker what it would not be given now: of a stage that fails on it,
+    /// or all where nothing goes well.
     pub(super) fn take_back_all(&mut self, session: SessionId, stage: StageRef, now_ms: i64) {
         let Some(worker) = self.sessions.get(&session).copied() else {
             return;

@@ -70,7 +70,8 @@ impl Core {
         self.acknowledge(session, lease, index, Err(refusal));
     }
 
-    /// Takes a lease back that the worker gives up of itself: an interruption of the tasks that it had begun.
+    /// Takes a lease back that the worker gives up of itself: an interruption of the tasks that it
+    /// had begun.
     pub(crate) fn released(
         &mut self,
         session: SessionId,

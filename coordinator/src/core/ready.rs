@@ -1,5 +1,6 @@
-//! Which tasks can be granted now. Whatever claims, grants or tells of work asks here, so that tasks that cannot run now (their
-//! retry is not due, their store is away, every worker that is free is passed over) never pass for work that is there.
+//! Which tasks can be granted now. Whatever claims, grants or tells of work asks here, so that
+//! tasks that cannot run now (their retry is not due, their store is away, every worker that is
+//! free is passed over) never pass for work that is there.
 
 use picofarm_catalog::{Free, Run};
 use picofarm_proto::ids::{StageRef, WorkerId};

@@ -1,5 +1,6 @@
-//! Workers that fail, or give back, whatever they get: a full disk, a wrong mount, a machine about to end. Such a worker rests
-//! ever longer, whatever the kind of its failures, until something goes well on it.
+//! Workers that fail, or give back, whatever they get: a full disk, a wrong mount, a machine about
+//! to end. Such a worker rests ever longer, whatever the kind of its failures, until something goes
+//! well on it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,7 +10,8 @@ use crate::budget::Backoff;
 
 /// Leases given back in a row that cost nothing: a worker that ends gives back all it has.
 const FREE: u32 = 3;
-/// Stages and stores that fail on a worker, and nothing goes well between, until the worker is to blame.
+/// Stages and stores that fail on a worker, and nothing goes well between, until the worker is to
+/// blame.
 const SUBJECTS: usize = 3;
 /// After so long without trouble the count begins again, milliseconds.
 const FORGET_MS: i64 = 300_000;

@@ -26,8 +26,9 @@ pub struct Limits {
     pub max_failures: u32,
     /// Losses of the worker while it ran the task before it is dead.
     pub max_crashes: u32,
-    /// Attempts that a worker gave back half-way (it was told to end, or its machine was in trouble) before the task is dead. An
-    /// attempt at a task that goes on from where it was saved does not count where it came further.
+    /// Attempts that a worker gave back half-way (it was told to end, or its machine was in
+    /// trouble) before the task is dead. An attempt at a task that goes on from where it was saved
+    /// does not count where it came further.
     #[serde(skip_serializing_if = "is_usual")]
     pub max_interruptions: u32,
     /// Workers that may run the job at a time; 0 = as many as there are.

@@ -65,8 +65,8 @@ pub trait Catalog: Rights {
     /// that are lost.
     async fn load(&self) -> Result<Snapshot, CatalogError>;
 
-    /// Says that the instance lives and has this many workers connected; to be called about once a second. What may run is
-    /// told of `now_ms`.
+    /// Says that the instance lives and has this many workers connected; to be called about once a
+    /// second. What may run is told of `now_ms`.
     ///
     /// # Errors
     /// [`CatalogError::Fenced`] when it was thought lost; a new life must begin.

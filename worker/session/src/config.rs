@@ -37,8 +37,8 @@ pub struct AgentConfig {
     pub labels: Vec<String>,
     /// The worker ends when it has had nothing to do for so long, while connected; `None` = never.
     pub exit_idle: Option<Duration>,
-    /// The worker stops work then, as at a signal; it tells the coordinator, which grants what it can finish by then. `None` =
-    /// not known.
+    /// The worker stops work then, as at a signal; it tells the coordinator, which grants what it
+    /// can finish by then. `None` = not known.
     pub ends_at: Option<SystemTime>,
     /// Folders to look in for furniture, besides the usual ones.
     pub asset_dirs: Vec<PathBuf>,

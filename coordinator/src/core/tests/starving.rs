@@ -32,7 +32,8 @@ const WAYS: [&str; 6] = [
 ];
 
 impl World {
-    /// The law: where a worker asks for work and a pending task could run on it, it has been leased.
+    /// The law: where a worker asks for work and a pending task could run on it, it has been
+    /// leased.
     async fn check_nobody_starves(&self) {
         let instance = &self.instances[0];
         let core = &instance.core;
