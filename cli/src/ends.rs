@@ -4,7 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use crate::error::{CliError, Result};
 
-/// The end of the Slurm job, Unix seconds, as Slurm itself says it.
+/// The end of the Slurm job, Unix seconds, as Slurm gives it.
 const SLURM: &str = "SLURM_JOB_END_TIME";
 /// So long before the end of the Slurm job a worker stops, as `--signal=B:TERM@60` would have it.
 const BEFORE: Duration = Duration::from_secs(60);

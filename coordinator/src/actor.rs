@@ -38,7 +38,7 @@ use crate::{
 const BATCH: usize = 4096;
 /// How long to wait before trying a catalog again that failed.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
-/// Claims in one turn at most; what is left waits for the next.
+/// Claims in one turn at most; the rest waits for the next turn.
 const ROUNDS: usize = 8;
 /// How often the catalog hears that this instance lives, and is asked for news.
 const BEAT: Duration = Duration::from_secs(1);

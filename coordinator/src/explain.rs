@@ -32,7 +32,7 @@ pub struct Candidate {
     pub gets: bool,
     /// It holds a range that crashed others, and gets nothing else.
     pub quarantined: bool,
-    /// It was not heard of for so many milliseconds, longer than it should be.
+    /// Milliseconds since it was last heard of, where that is longer than it should be.
     pub silent_ms: Option<i64>,
 }
 

@@ -52,7 +52,7 @@ impl Blocklist {
             row.tasks.entry(task).or_insert(kind);
         }
         row.last_ms = now_ms;
-        // What was under way on it when it failed says the same of the same time.
+        // Tasks that ran on it at that time fail too, which counts once.
         if row.tasks.len() >= TASKS && now_ms >= row.until_ms.min(row.alone_until_ms) {
             let longer = Backoff {
                 first_ms: backoff.first_ms.saturating_mul(LONGER),

@@ -125,7 +125,7 @@ impl Core {
         }
     }
 
-    /// What is to be claimed for a demand beyond what is in hand.
+    /// The tasks to claim for a demand, beyond those in hand.
     fn want(&self, demand: &Demand, now_ms: i64) -> Option<Want> {
         let supply = demand.supply.as_ref().filter(|_| demand.leases > 0)?;
         let entry = &self.stages[&demand.stage];

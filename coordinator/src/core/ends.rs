@@ -17,7 +17,7 @@ fn with_margin(ms: f64) -> i64 {
 }
 
 impl Core {
-    /// A worker says in how many milliseconds it must end.
+    /// A worker reports in how many milliseconds it must end.
     pub(crate) fn ends(&mut self, session: SessionId, ends_in_ms: Option<u64>, now_ms: i64) {
         if let Some(worker) = self.sessions.get(&session)
             && let Some(entry) = self.workers.get_mut(worker)
@@ -132,7 +132,7 @@ impl Core {
     }
 }
 
-/// The time at which a worker must end that says so in milliseconds from now.
+/// The time at which a worker must end, from the milliseconds that it reports.
 pub(super) fn at(ends_in_ms: Option<u64>, now_ms: i64) -> Option<i64> {
     let ms = i64::try_from(ends_in_ms?).unwrap_or(i64::MAX);
     Some(now_ms.saturating_add(ms))

@@ -69,7 +69,7 @@ impl StageEntry {
         }
     }
 
-    /// Whether it has or may have tasks that can be granted now, to whichever worker.
+    /// Whether it has or may have tasks that can be granted now, to any worker.
     pub(super) fn waits(&self, now_ms: i64) -> bool {
         !self.job.paused && (self.stage.is_due(now_ms) || !self.claimable(now_ms).is_none())
     }

@@ -65,7 +65,7 @@ impl Sick {
             // Where it is the only one, its tasks may be as much to blame.
             others && row.subjects.len() >= SUBJECTS
         };
-        // What was under way on it when it failed says the same of the same time.
+        // Tasks that ran on it at that time fail too, which counts once.
         if blamed && now_ms >= row.until_ms {
             row.tries = row.tries.saturating_add(1);
             row.until_ms = now_ms + backoff.after(row.tries);

@@ -9,7 +9,7 @@ use super::{
 
 /// Most tasks in one job.
 pub const MAX_TASKS: u64 = 100_000_000;
-/// Interruptions of a task before it is given up, unless the job says otherwise.
+/// Default of `max_interruptions`.
 const MAX_INTERRUPTIONS: u32 = 20;
 /// Most stages in one job.
 pub const MAX_STAGES: usize = 1_000;

@@ -83,7 +83,7 @@ pub struct Claim {
     pub owned: Owned,
     /// Tasks of them whose outputs exist already, as maximal runs in ascending order.
     pub existing: Vec<Run>,
-    /// What is nobody's still.
+    /// The tasks that are still nobody's.
     pub left: Free,
 }
 

@@ -70,7 +70,7 @@ macro_rules! job_queries {
                     .collect()
             }
 
-            /// What is nobody's of one stage.
+            /// The tasks of one stage that are nobody's.
             pub(crate) async fn free_of_stage(c: &mut Connection, key: i64, now_ms: i64) -> Result<Free> {
                 let row = sqlx::query(concat!(
                     "SELECT ",

@@ -12,7 +12,7 @@ use super::{
     world::{Op, World},
 };
 
-/// A job of one stage. What is in its way is said by its settings.
+/// A job of one stage. Its settings hold it up.
 fn job(name: &str, priority: i32, settings: &str) -> JobSpec {
     let text = format!(
         r#"{{"name": "{name}", "priority": {priority}, "scenes": {{"kind": "primitive", "count": 8}},

@@ -107,7 +107,7 @@ pub(super) struct FakeWorker {
     /// The instance and the session there.
     pub(super) session: Option<(usize, u64)>,
     incarnation: u128,
-    /// It must end, and says so.
+    /// When it must end, as it reports.
     pub(super) ends_in_ms: Option<u64>,
     /// Latest first.
     pub(super) leases: Vec<Lease>,
