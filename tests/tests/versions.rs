@@ -30,6 +30,7 @@ fn hello(version: &str, protocol: u32) -> wire::Hello {
         cores: 1,
         held: Vec::new(),
         ended: String::new(),
+        ends_in_ms: 0,
         kinds: [("render".to_owned(), "transient-0".to_owned())].into(),
         assets: Vec::new(),
         memory_mib: 0,
