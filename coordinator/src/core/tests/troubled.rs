@@ -140,6 +140,8 @@ fn a_task_that_is_interrupted_again_and_again_is_given_up() {
             .await;
         let mut attempts = 0;
         for w in (0..3).cycle().take(60) {
+            // Longer than a task waits at most.
+            world.act(&Op::Pass(200)).await;
             world.connect(w, 0).await;
             world.act(&Op::Credit(w)).await;
             attempts += u32::from(!world.workers[usize::from(w)].leases.is_empty());
