@@ -500,5 +500,20 @@ fn write(out: &Path, order: &Order, r: &Rendered, beside: &[Beside]) -> Result<(
         attributes["wavelengths_nm"] = json!(wavelengths);
     }
     let attributes = attributes.as_object().expect("written as an object");
+    for array in arrays.iter().filter(|array| array.name != "depth") {
+        if let Some(at) = array.data.iter().position(|x| !x.is_finite()) {
+            let (x, bins) = (array.data[at], r.gate.bins as usize);
+            let what = format!(
+                "scene {:?}: {} is {x} at pixel {}, bin {}; nothing was written",
+                scene.name,
+                array.name,
+                at / bins,
+                at % bins
+            );
+            return Err(CliError::new(Code::Failed, what).hint(
+                "the renderer is at fault: report it with the scene, or try another --seed",
+            ));
+        }
+    }
     write_render_group(out, &arrays, attributes).map_err(|e| CliError::new(Code::Resource, e))
 }

@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path};
 
-use picofarm_agent::{ImportFor, imported};
+use picofarm_agent::{ImportFor, NotImported, imported};
 use serde_json::json;
 
 use super::open;
@@ -43,11 +43,9 @@ pub(super) async fn run(
         scene: &scene,
     };
     let new = imported(&weights, wanted, of, &called).map_err(|what| {
+        let hint = hint(&what);
         let what = format!("{} as {}: {what}", file.display(), settings.display());
-        CliError::input(what).hint(
-            "the file must hold the tensors of the network that the settings describe, by PyTorch's names; `picofarm model export` \
-             of a model of such a network shows which they are",
-        )
+        CliError::input(what).hint(hint)
     })?;
     let published = models.publish(new, false).await.map_err(failed)?;
     let manifest = &published.manifest;
@@ -62,4 +60,23 @@ pub(super) async fn run(
         )
     });
     Ok(())
+}
+
+/// How each kind of refusal is mended.
+fn hint(refused: &NotImported) -> &'static str {
+    match refused {
+        NotImported::Settings(_) => {
+            "correct the settings file; its fields are those of `train` in a job file, which `picofarm job init --kind train` writes"
+        }
+        NotImported::File(_) => {
+            "save the weights again, in PyTorch: safetensors.torch.save_file(network.state_dict(), \"network.safetensors\")"
+        }
+        NotImported::Tensors(_) => {
+            "the file must hold the tensors of the network that the settings describe, by PyTorch's names; `picofarm model export` \
+             of a model of such a network shows which they are"
+        }
+        NotImported::Values(_) => {
+            "take an earlier checkpoint of the training, or convert the weights again: a conversion to F16 overflows above 65504"
+        }
+    }
 }
