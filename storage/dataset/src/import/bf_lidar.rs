@@ -12,7 +12,7 @@ mod two_bounce;
 
 use std::path::{Path, PathBuf};
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use picofarm_files::Opener;
 
@@ -296,9 +296,13 @@ pub(super) fn read(
     scene.judge_beams(true);
     // They are counts.
     scene.scale = Some(1.0);
-    scene.check = Value::Array(checks);
     scene.missing.extend([
         "depth", "range", "specular", "normal", "instance", "label", "rgb", "camera",
     ]);
+    if !scene.two_bounce.is_empty() && !options.unchecked {
+        let found = super::paths::check(&scene, &item.folder)?;
+        checks.push(json!({"two_bounce_paths": found}));
+    }
+    scene.check = Value::Array(checks);
     Ok(scene)
 }
