@@ -3,6 +3,7 @@
 mod dark;
 mod finish;
 mod submit;
+mod verdicts;
 
 use std::{
     path::{Path, PathBuf},
@@ -61,9 +62,13 @@ pub async fn run(command: Job, settings: &Settings, output: Output) -> Result<()
     match command {
         Job::Init { .. } => Ok(()),
         Job::Plan { .. } => {
-            let plan = client.plan(spec.expect("read above")).await?;
+            let spec = spec.expect("read above");
+            let plan = client.plan(spec.clone()).await?;
             let twin = submit::twin(&mut client, &plan).await;
             output.result(&plan, || describe_plan(&plan) + &twin);
+            for line in reach::there(&spec, &plan).await {
+                output.warn(format!("note: {line}"));
+            }
             Ok(())
         }
         Job::Submit {
