@@ -3,14 +3,14 @@
 use std::{path::Path, sync::Arc, time::Instant};
 
 use picofarm_dataset::{
-    Dataset, PROBE_WITHIN, Profile,
+    Dataset, PROBE_WITHIN, Profile, Verdict,
     import::{ImportError, Source, import_scene},
     open_store, probe,
 };
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 
-use super::failed;
+use super::{failed, predictions::summed};
 use crate::{
     args::DatasetImport,
     error::{CliError, Code, Result, io},
@@ -63,21 +63,25 @@ pub async fn run(args: DatasetImport, output: Output) -> Result<()> {
     }
     meter.finish();
     let seconds = start.elapsed().as_secs_f64();
+    let verdict = summed(done.verdicts.into_iter());
     let facts = json!({
         "source": args.source, "target": args.target, "format": work.source.format().name(), "scenes": scenes,
         "imported": done.imported, "found": done.found, "bytes_read": done.read, "bytes": done.written,
-        "seconds": seconds,
+        "seconds": seconds, "verdict": verdict,
     });
     output.result(&facts, || {
         format!(
-            "{}: {} scenes imported from {}, {} found finished; {} read, {} written in {}",
+            "{}: {} scenes imported from {}, {} found finished; {} read, {} written in {}{}",
             args.target,
             done.imported,
             work.source.format().name(),
             done.found,
             bytes(done.read),
             bytes(done.written),
-            duration(seconds)
+            duration(seconds),
+            verdict
+                .as_ref()
+                .map_or_else(String::new, |v| format!("\n{}", v.text))
         )
     });
     Ok(())
@@ -91,6 +95,8 @@ struct Done {
     written: u64,
     /// Quantities reported as missing.
     named: Vec<&'static str>,
+    /// By scene, how well its files agree.
+    verdicts: Vec<(u64, Verdict)>,
 }
 
 struct Work {
@@ -140,6 +146,8 @@ impl Work {
             ));
             done.named.extend(scene.missing.iter());
         }
+        done.verdicts
+            .push((index, Verdict::of_import(&scene.check)));
         done.read += scene.files.iter().map(|f| f.bytes).sum::<u64>();
         let (source, pool, dataset) =
             (self.source.clone(), self.pool.clone(), self.dataset.clone());

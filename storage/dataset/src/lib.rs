@@ -18,6 +18,7 @@ mod repair;
 mod reports;
 mod scenes;
 mod store;
+mod verdict;
 mod verify;
 
 /// What a program says that was built without the feature `formats`, and how to get one with it.
@@ -68,4 +69,5 @@ pub use store::{
     Bandwidth, PROBE_WITHIN, Writable, check_location, check_writable, limit_bandwidth,
     local_ground, open_store, probe,
 };
+pub use verdict::{GUESS, Verdict};
 pub use verify::{Fault, Problem, Verification, VerifyMode, VerifyOptions, Watch};

@@ -10,11 +10,11 @@ use std::{
 use object_store::{ObjectStore, path::Path};
 use picofarm_dataset::{
     Dataset, DatasetError, DatasetSpec, EncodedScene, Manifest, PROBE_WITHIN, Profile, Subsets,
-    open_store, probe,
+    Verdict, open_store, probe,
 };
 use picofarm_proto::{
     key::TaskKey,
-    model::{RenderTask, TaskSpec, memory::Known},
+    model::{RenderTask, TaskSpec, log::VERDICT, memory::Known},
     trace,
 };
 use picofarm_scene::Scene;
@@ -22,7 +22,7 @@ use picofarm_session::{Backoff, memory_mib, random};
 use picofarm_transient::Settings;
 use sha2::{Digest, Sha256};
 use tokio::runtime::Handle;
-use tracing::{debug_span, warn};
+use tracing::{debug_span, info, warn};
 
 use super::{Control, TaskError, memory};
 
@@ -312,6 +312,15 @@ pub(super) fn dataset_spec(spec: &RenderTask) -> Result<DatasetSpec, TaskError> 
 /// SHA-256 of a manifest's bytes as they lie in the store, hexadecimal.
 pub(super) fn manifest_sha256(manifest: &Manifest) -> String {
     hex::encode(Sha256::digest(manifest.to_bytes()))
+}
+
+/// Tells in the task's log what a result is worth; `job watch` shows it when the job ends.
+pub(super) fn saying(verdict: &Verdict, of: &str) {
+    let text = &verdict.text;
+    match verdict.doubtful {
+        true => warn!("{VERDICT}{of}: {text}"),
+        false => info!("{VERDICT}{of}: {text}"),
+    }
 }
 
 /// Who is to blame for a data set's error.
