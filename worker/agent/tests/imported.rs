@@ -161,14 +161,14 @@ async fn a_negative_variance_is_refused_by_its_name() {
     let (mut named, _) = weights::read(&foreign(&place, "m").await).unwrap();
     let variance = named.keys().find(|name| name.ends_with("running_var"));
     let variance = variance.expect("it normalises").clone();
-    named.get_mut(&variance).unwrap().1[1] = -0.25;
+    named.get_mut(&variance).unwrap().1[0] = -0.25;
     let odd = weights::write(&named, &BTreeMap::new());
     let settings = json!({"target": "tof", "model": "i", "net": {"width": 2, "levels": 2}});
     let refused = rooms.import(&odd, settings).unwrap_err();
     assert!(matches!(refused, NotImported::Values(_)), "{refused:?}");
     let (refused, part) = (refused.to_string(), variance.trim_start_matches("module."));
     assert!(
-        refused.contains(part) && refused.contains("-0.25 (value 1)"),
+        refused.contains(part) && refused.contains("-0.25 (value 0)"),
         "{refused}"
     );
 }
