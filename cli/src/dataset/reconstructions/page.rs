@@ -246,6 +246,7 @@ mod tests {
             spots: Some([16, 16]),
             image: Some([512, 512]),
             figures: BTreeMap::from([("l1_m", figure)]),
+            verdict: None,
             as_published,
             extremes: vec![Extreme {
                 rank: "best",
