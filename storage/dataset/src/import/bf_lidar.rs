@@ -12,7 +12,7 @@ mod two_bounce;
 
 use std::path::{Path, PathBuf};
 
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use picofarm_files::Opener;
 
@@ -301,7 +301,9 @@ pub(super) fn read(
     ]);
     if !scene.two_bounce.is_empty() && !options.unchecked {
         let found = super::paths::check(&scene, &item.folder)?;
-        checks.push(json!({"two_bounce_paths": found}));
+        if let Some(Value::Object(given)) = checks.last_mut() {
+            given.insert("two_bounce_paths".into(), found);
+        }
     }
     scene.check = Value::Array(checks);
     Ok(scene)
