@@ -143,7 +143,7 @@ impl Refusal {
             Self::Format(what) => format_error(path, what),
             Self::NoLaser => SceneError::NoLaser {
                 path: path.to_path_buf(),
-                hint: "add <emitter type=\"projector\"> with fov 0.1 and to_world for each beam, or state a grid \
+                hint: "it has no beam; add <emitter type=\"projector\"> with fov 0.1 and to_world for each beam, or state a grid \
                        on import",
             },
         }

@@ -148,13 +148,14 @@ pub(super) const FILM: Properties = with(
     &[],
 );
 pub(super) const PROJECTOR: Properties = with(
-    &["to_world", "fov"],
-    &["irradiance", "scale", "fov_axis", "sampling_weight"],
+    // The power of a beam is not read.
+    &["to_world", "fov", "irradiance", "scale"],
+    &["fov_axis", "sampling_weight"],
     &[],
 );
 pub(super) const SPOT: Properties = with(
-    &["to_world", "cutoff_angle"],
-    &["intensity", "beam_width", "texture", "sampling_weight"],
+    &["to_world", "cutoff_angle", "intensity"],
+    &["beam_width", "texture", "sampling_weight"],
     &[],
 );
 

@@ -179,6 +179,14 @@ impl Reader<'_> {
         let Some(&(origin, _, _)) = beams.first() else {
             return Ok(None);
         };
+        let powers = ["irradiance", "intensity", "scale"];
+        let states_power = |n: &Node| powers.iter().any(|p| n.parameters.contains_key(*p));
+        if beams.iter().any(|(_, _, node)| states_power(node)) {
+            self.note(
+                "beams",
+                "of unit energy each, whatever power the file states",
+            );
+        }
         let reach = 1e-5 * (1.0 + origin.length());
         if let Some((other, _, node)) = beams
             .iter()

@@ -201,6 +201,12 @@ impl Ply {
             if length < 3 {
                 skipped += 1;
             }
+            let finite = |v: u32| self.positions[v as usize].iter().all(|x| x.is_finite());
+            if let Some(v) = corners.iter().find(|v| !finite(**v)) {
+                return Err(format!(
+                    "element face row {k}: vertex {v} is not finite; repair the mesh"
+                ));
+            }
             places.clear();
             places.extend(corners.iter().map(|v| self.positions[*v as usize]));
             parts.clear();
