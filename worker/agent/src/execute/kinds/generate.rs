@@ -12,7 +12,7 @@ use tracing::info;
 use crate::execute::{Context, Control, Output, RunTask, Submission, Task, TaskError, scenes};
 
 /// Version of the files that are written of a scene.
-const FILES_VERSION: &str = "scene-files-1";
+const FILES_VERSION: &str = "scene-files-2";
 
 /// Everything of this program that decides a scene file's bytes.
 pub fn generator_version() -> String {
