@@ -12,7 +12,10 @@ mod ply;
 pub(crate) mod polygon;
 mod reference;
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use picofarm_files::{FileError, Opener};
 
@@ -191,6 +194,18 @@ fn shortened(mut message: String) -> String {
         message.push('…');
     }
     message
+}
+
+/// Most notes on a file.
+const MAX_NOTES: usize = 256;
+
+/// Adds a note. Keys and texts may have names of the file in them, and a file may have any number of these.
+fn add_note(notes: &mut BTreeMap<String, String>, key: &str, what: String) {
+    let key: String = key.chars().take(2 * MAX_QUOTE).collect();
+    match notes.len() < MAX_NOTES || notes.contains_key(&key) {
+        true => notes.insert(key, shortened(what)),
+        false => notes.insert("more".into(), "there are too many notes to list".into()),
+    };
 }
 
 /// Text of a file in quotes, cut where it is long.

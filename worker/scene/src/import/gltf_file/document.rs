@@ -66,7 +66,8 @@ fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
     let mut value: serde_json::Value = serde_json::from_slice(text).ok()?;
     let root = value.as_object_mut()?;
     root.remove("animations");
-    for scene in root.get_mut("scenes")?.as_array_mut()? {
+    let scenes = root.get_mut("scenes").and_then(|s| s.as_array_mut());
+    for scene in scenes.into_iter().flatten() {
         let nodes = scene.as_object_mut()?.entry("nodes");
         nodes.or_insert_with(|| serde_json::Value::Array(Vec::new()));
     }

@@ -9,8 +9,9 @@ use crate::{
     Bsdf, Distribution, Material, SceneError, SpectrumPoint, Texture, Wrap,
     extras::{MaterialExtras, StatedSpectrum, metallic_roughness},
     import::{
+        add_note,
         buffers::{Buffers, buffer_file, data_uri},
-        format_error, image, read_file, shortened,
+        format_error, image, read_file,
     },
 };
 
@@ -54,7 +55,7 @@ struct Standard<'a> {
 
 impl Walk<'_> {
     pub(super) fn note(&mut self, key: &str, what: impl Into<String>) {
-        self.notes.insert(key.into(), shortened(what.into()));
+        add_note(&mut self.notes, key, what.into());
     }
 
     /// Notes what a document has that no scene of ours does.

@@ -55,9 +55,10 @@ pub(super) fn read(
     }
     let labels = ours.as_ref().map_or_else(Vec::new, |e| e.labels.clone());
     let mut walk = Walk::new((path, files), &document, &buffers, &facts)?;
-    for label in labels {
-        walk.label(&label);
+    for (k, label) in labels.iter().enumerate() {
+        walk.known_labels.entry(label.clone()).or_insert(k);
     }
+    walk.labels = labels;
     if ours.is_none() && options.camera.is_none() {
         walk.move_to_camera(&root);
     }

@@ -46,7 +46,7 @@ use crate::{
     export::mitsuba::text::Extras,
 };
 
-use super::{ImportOptions, Opener, far, format_error, image::Images, of_file, quoted, shortened};
+use super::{ImportOptions, Opener, add_note, far, format_error, image::Images, of_file, quoted};
 use blend::Leaf;
 use bsdf::Look;
 use node::{Child, Node};
@@ -203,7 +203,7 @@ impl<'a> Reader<'a> {
     }
 
     fn note(&mut self, key: &str, what: impl Into<String>) {
-        self.notes.insert(key.into(), shortened(what.into()));
+        add_note(&mut self.notes, key, what.into());
     }
 
     /// A transform to the scene's coordinates.

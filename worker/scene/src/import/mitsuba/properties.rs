@@ -9,6 +9,8 @@ use crate::import::quoted;
 
 /// Names that differ by at most this many letters are taken for one another in hints.
 const NEAR: usize = 3;
+/// Longer names are none of ours.
+const MAX_COMPARED: usize = 64;
 
 /// The properties of a plugin.
 #[derive(Debug, Clone, Copy)]
@@ -202,12 +204,12 @@ impl Reader<'_> {
 
 fn unused(node: &Node, name: &str, known: &Properties) -> String {
     let place = node.places.get(name).map(|p| format!(" ({p})"));
-    let all = known.used.iter().chain(known.harmless);
-    let distance = |other: &&str| strsim::damerau_levenshtein(other, &super::old::name(name));
-    // Long names are none of ours, and comparing takes the product of both lengths.
+    let words = super::old::name(name);
+    // Comparing takes the product of both lengths.
+    let short = words.len() <= MAX_COMPARED;
+    let all = known.used.iter().chain(known.harmless).filter(|_| short);
     let near = all
-        .map(|other| (distance(&other), *other))
-        .filter(|_| name.len() < 64)
+        .map(|other| (strsim::damerau_levenshtein(other, &words), *other))
         .min()
         .filter(|(distance, other)| *distance <= NEAR.min(other.len() / 2));
     let hint = match near {
