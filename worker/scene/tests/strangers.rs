@@ -200,6 +200,13 @@ fn meshes_in_ply() {
             Refused("element tristrips: is not supported"),
         ),
         (
+            "edge-on",
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+             element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n0 1 0\n0 1 1\n3 0 1 2\n"
+                .into(),
+            Refused("edge-on as seen from +z"),
+        ),
+        (
             "no faces",
             ply("", 0.0).replace("element face 1\n", "element face 0\n"),
             Refused("no point cloud"),

@@ -20,6 +20,8 @@ const GREY: f32 = 0.5;
 const FRAME_PIXELS: u32 = 256;
 const FRAME_FOV_DEG: f32 = 60.0;
 
+/// A mesh that shows less than this share of its area to a camera is edge-on.
+const EDGE_ON: f64 = 1e-3;
 /// Elements with geometry that is not read, which a mesh must not lose in silence.
 const UNREAD_SURFACES: [&str; 2] = ["tristrips", "range_grid"];
 
@@ -95,6 +97,13 @@ pub(super) fn read(
              `picofarm scene export FILE --frame --out scene.glb` put both in front of it",
         ));
     };
+    if options.camera.is_none() && is_edge_on(&mesh) {
+        return Err(format_error(
+            path,
+            "is edge-on as seen from +z, where --frame puts the camera: turn the mesh, or place it in a glTF or Mitsuba \
+             scene with a camera",
+        ));
+    }
     notes.insert("import.units".into(), "not stated; metres assumed".into());
     Ok(Scene {
         name: name.clone().into_owned(),
@@ -113,6 +122,18 @@ pub(super) fn read(
             ..Provenance::default()
         },
     })
+}
+
+/// True for a mesh that a camera on its +z side sees as a line.
+fn is_edge_on(mesh: &Mesh) -> bool {
+    let (mut seen, mut whole) = (0.0, 0.0);
+    for t in &mesh.triangles {
+        let [a, b, c] = t.map(|v| mesh.positions[v as usize]);
+        let normal = (b - a).cross(c - a);
+        seen += f64::from(normal.z.abs());
+        whole += f64::from(normal.length());
+    }
+    seen <= EDGE_ON * whole
 }
 
 /// A camera in front (towards +z) of a mesh that sees all of it.
