@@ -10,17 +10,16 @@ const LOSS: f64 = 1e-5;
 
 /// Centre and diagonal of the box around points; `None` without any, and for points that are not finite.
 pub(super) fn centre(points: &[[f64; 3]]) -> Option<([f64; 3], f64)> {
-    let first = *points.first()?;
-    let (mut lo, mut hi) = (first, first);
-    for p in points {
-        for k in 0..3 {
-            (lo[k], hi[k]) = (lo[k].min(p[k]), hi[k].max(p[k]));
-        }
-    }
-    let centre = std::array::from_fn(|k| 0.5 * lo[k] + 0.5 * hi[k]);
-    let square: f64 = (0..3).map(|k| (hi[k] - lo[k]).powi(2)).sum();
+    let side = |k: usize| {
+        let ends = (f64::INFINITY, f64::NEG_INFINITY);
+        let all = points.iter().map(|p| p[k]);
+        all.fold(ends, |(lo, hi), x| (lo.min(x), hi.max(x)))
+    };
+    let sides = [0, 1, 2].map(side);
+    let centre = sides.map(|(lo, hi)| 0.5 * lo + 0.5 * hi);
+    let square: f64 = sides.iter().map(|(lo, hi)| (hi - lo) * (hi - lo)).sum();
     let finite = points.iter().flatten().all(|x| x.is_finite());
-    (finite && square.is_finite()).then(|| (centre, square.sqrt()))
+    (!points.is_empty() && finite && square.is_finite()).then(|| (centre, square.sqrt()))
 }
 
 /// True where a thing of this size at this place loses too much by rounding.
