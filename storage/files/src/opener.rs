@@ -9,7 +9,8 @@ use std::{
 
 use crate::{FileError, read_bounded};
 
-/// Longest name of a file, bytes: no system opens longer ones, and finding where a path leads takes time for each part.
+/// Longest name of a file, bytes: no system opens longer ones, and finding where a path leads
+/// takes time for each part.
 const MAX_NAME: usize = 4096;
 
 /// Opens files that lie below the folders it was given, wherever links lead; regular files only.
@@ -39,7 +40,8 @@ impl Opener {
     /// The path that a file in `folder` means by `name`.
     ///
     /// # Errors
-    /// [`FileError::Name`] for URLs, for names with a backslash or a NUL, and for names of more than 4096 bytes.
+    /// [`FileError::Name`] for URLs, for names with a backslash or a NUL, and for names of more
+    /// than 4096 bytes.
     pub fn named(folder: &Path, name: &str) -> Result<PathBuf, FileError> {
         let why = if name.len() > MAX_NAME {
             "it is longer than 4096 bytes"

@@ -104,7 +104,8 @@ fn parse(archive: &Archive, item: &Item) -> Result<Loaded, String> {
     Ok(loaded)
 }
 
-/// The polygons of a part as triangles; one whose edges cross is a fan, because models of a library are not corrected.
+/// The polygons of a part as triangles. A polygon whose edges cross becomes a fan, because models of
+/// a library are not corrected.
 fn triangles(part: &tobj::Mesh) -> Vec<[u32; 3]> {
     if part.face_arities.is_empty() {
         return part.indices.as_chunks::<3>().0.to_vec();

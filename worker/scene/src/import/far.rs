@@ -1,5 +1,6 @@
-//! Coordinates far from the origin: files state them in double precision, scenes have them in single precision. A mesh or
-//! a scene is moved to the origin before it is rounded, wherever rounding would show.
+//! Coordinates far from the origin: files state them in double precision, scenes have them in
+//! single precision. A mesh or a scene is moved to the origin before it is rounded, wherever
+//! rounding would show.
 
 use crate::Vec3;
 
@@ -8,7 +9,8 @@ const LOSS_M: f64 = 3e-5;
 /// The same as a share of the size of a mesh.
 const LOSS: f64 = 1e-5;
 
-/// Centre and diagonal of the box around points; `None` without any, and for points that are not finite.
+/// Centre and diagonal of the box around points; `None` without any, and for points that are not
+/// finite.
 pub(super) fn centre(points: &[[f64; 3]]) -> Option<([f64; 3], f64)> {
     let side = |k: usize| {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
@@ -34,7 +36,8 @@ pub(super) fn relative(points: &[[f64; 3]], origin: [f64; 3]) -> Vec<Vec3> {
     points.iter().map(place).collect()
 }
 
-/// Points in a frame around their centre, where rounding would show otherwise; and the origin of that frame.
+/// Points in a frame around their centre, where rounding would show otherwise; and the origin of
+/// that frame.
 pub(super) fn local(points: &[[f64; 3]]) -> (Vec<Vec3>, [f64; 3]) {
     let origin = match centre(points) {
         Some((centre, size)) if is_lossy(centre, size) => centre,

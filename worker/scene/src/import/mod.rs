@@ -199,7 +199,8 @@ fn shortened(mut message: String) -> String {
 /// Most notes on a file.
 const MAX_NOTES: usize = 256;
 
-/// Adds a note. Keys and texts may have names of the file in them, and a file may have any number of these.
+/// Adds a note. Keys and texts may have names of the file in them, and a file may have any number
+/// of these.
 fn add_note(notes: &mut BTreeMap<String, String>, key: &str, what: String) {
     let key: String = key.chars().take(2 * MAX_QUOTE).collect();
     match notes.len() < MAX_NOTES || notes.contains_key(&key) {

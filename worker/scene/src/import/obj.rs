@@ -57,7 +57,8 @@ struct Statements {
     degenerate: usize,
 }
 
-/// Reads a whole file; the message names the line and quotes nothing: the file may be something else.
+/// Reads a whole file; the message names the line and quotes nothing: the file may be something
+/// else.
 pub(super) fn parse(bytes: &[u8]) -> Result<Obj, String> {
     let mut all = Statements::default();
     let mut lines = Lines {

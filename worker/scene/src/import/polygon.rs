@@ -2,7 +2,8 @@
 
 use earcut::Earcut;
 
-/// Most corners of a polygon that is not convex: looking for crossing edges takes their square at worst.
+/// Most corners of a polygon that is not convex: looking for crossing edges takes their square at
+/// worst.
 const MAX_CONCAVE: usize = 1 << 14;
 /// A polygon whose corners leave its plane by more than this share of its size is not flat.
 const FLAT: f64 = 1e-3;
@@ -21,8 +22,8 @@ pub(crate) struct Triangulation {
 }
 
 impl Triangulation {
-    /// Adds the triangles of a polygon, as indices of corners, to `out`. Convex polygons become fans around their first
-    /// corner; triangles stay as they are.
+    /// Adds the triangles of a polygon, as indices of corners, to `out`. Convex polygons become fans
+    /// around their first corner; triangles stay as they are.
     ///
     /// # Errors
     /// A polygon whose edges cross, or a concave one with too many corners.
@@ -196,8 +197,8 @@ fn area(flat: &[[f64; 2]], [a, b, c]: [u32; 3]) -> f64 {
     turn(flat[a as usize], flat[b as usize], flat[c as usize])
 }
 
-/// True where a fan around the first corner covers the polygon once: no corner turns back, and all corners lie within
-/// half a turn as seen from the first.
+/// True where a fan around the first corner covers the polygon once: no corner turns back, and all
+/// corners lie within half a turn as seen from the first.
 fn is_convex(flat: &[[f64; 2]]) -> bool {
     let n = flat.len();
     let size = flat.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
@@ -290,7 +291,8 @@ mod tests {
         );
         every_start(&[[0., 0.], [2., 0.], [0.5, 0.5], [0., 2.]], 1.0);
         every_start(&[[0., 0.], [1., 0.], [1., 1.], [0., 1.]], 1.0);
-        // Corners on a side, and a slit that goes in and comes out again (a hole joined to the rim).
+        // Corners on a side, and a slit that goes in and comes out again (a hole joined to the
+        // rim).
         every_start(&[[0., 0.], [1., 0.], [2., 0.], [2., 2.], [0., 2.]], 4.0);
         let hole = [
             [0., 0.],

@@ -1,4 +1,5 @@
-//! Meshes in their rest pose: morph targets at their default weights, skins with their joints where the nodes put them.
+//! Meshes in their rest pose: morph targets at their default weights, skins with their joints where
+//! the nodes put them.
 
 use gltf::{
     Accessor, Semantic,

@@ -1,5 +1,5 @@
-//! The JSON of a glTF file, with what is legal in glTF and refused by the `gltf` crate put right, and what is not read
-//! left out.
+//! The JSON of a glTF file, with what is legal in glTF and refused by the `gltf` crate put right,
+//! and what is not read left out.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +11,8 @@ use serde::Deserialize;
 
 use crate::import::quoted;
 
-/// Extensions that a file may require: those that are read, and looks that are noted where they are not.
+/// Extensions that a file may require: those that are read, and looks that are noted where they are
+/// not.
 const REQUIRED: [&str; 5] = [
     "KHR_texture_transform",
     "KHR_lights_punctual",
@@ -59,7 +60,8 @@ pub(in crate::import) fn parse(bytes: &[u8]) -> Result<Parsed, String> {
     Ok(Parsed { root, blob, facts })
 }
 
-/// The file without animations, which may have parts that the crate does not know, and with a list of nodes in every scene.
+/// The file without animations, which may have parts that the crate does not know, and with a list
+/// of nodes in every scene.
 fn mended(bytes: &[u8]) -> Option<(json::Root, Option<Vec<u8>>)> {
     let glb = gltf::Glb::from_slice(bytes).ok();
     let text = glb.as_ref().map_or(bytes, |glb| &glb.json);
@@ -163,7 +165,8 @@ fn has_animations(bytes: &[u8]) -> bool {
     serde_json::from_slice::<Root>(&text(bytes)).is_ok_and(|r| !r.animations.is_empty())
 }
 
-/// Where nodes lie in their parents, with all digits: the crate keeps single precision. Empty if a node has no such numbers.
+/// Where nodes lie in their parents, with all digits: the crate keeps single precision. Empty if a
+/// node has no such numbers.
 fn translations(bytes: &[u8]) -> Vec<Option<[f64; 3]>> {
     #[derive(Deserialize)]
     struct Root {

@@ -94,8 +94,8 @@ impl Walk<'_> {
         }
     }
 
-    /// A material as ours; `has_uv` says whether the mesh brings the texture coordinates it asks for, `tint` is the colour of
-    /// its vertices.
+    /// A material as ours. `has_uv` is true if the mesh has the texture coordinates that the material
+    /// asks for; `tint` is the colour of its vertices.
     pub(super) fn material(
         &mut self,
         file: &gltf::Material<'_>,
@@ -151,7 +151,7 @@ impl Walk<'_> {
         Ok(material)
     }
 
-    /// True for a texture that has no image at all. One with an image of a format that is not read is another thing.
+    /// True for a texture without any image. A texture with an image of an unread format has one.
     fn is_sourceless(&self, texture: &gltf::Texture<'_>) -> bool {
         self.facts.sourceless.contains(&texture.index())
             && texture.extensions().is_none_or(|all| all.is_empty())

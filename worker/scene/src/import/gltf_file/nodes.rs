@@ -59,7 +59,8 @@ pub(super) fn is_hidden(node: &Node<'_>) -> bool {
 }
 
 impl Walk<'_> {
-    /// A node's extras. What is none of ours is ignored: labels and numbers of other programs have other types.
+    /// A node's extras. What is none of ours is ignored: labels and numbers of other programs have
+    /// other types.
     pub(super) fn extras(&mut self, node: &Node<'_>) -> Result<NodeExtras, SceneError> {
         #[derive(Deserialize)]
         struct Laser {

@@ -6,10 +6,11 @@
 //! all these, nested too; `dielectric` on closed shapes and `thindielectric`, by themselves; `bitmap` textures;
 //! `spectrum` with values by wavelength (`450:0.2, 905:0.7`) as a reflectance; references, `<default>` parameters, and
 //! every transform. A shape without BSDF is Mitsuba's default, a one-sided diffuse of 0.5. Facets are flat: vertex normals are not used.
-//! Integrators, samplers and media are skipped with a note; any other plugin is an error that names it. As in Mitsuba,
-//! every property of a plugin must be used: any other is an error, unless it changes neither geometry nor light. Files
-//! of versions before 2 may have the names of their time (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` takes its axis
-//! as it is: one of another length than 1 shears.
+//! Integrators, samplers and media are skipped with a note; any other plugin is an error that names
+//! it. As in Mitsuba, every property of a plugin must be used: any other is an error, unless it
+//! changes neither geometry nor light. Files of versions before 2 may have the names of their time
+//! (`toWorld`, `fovAxis`). As in Mitsuba, `rotate` takes its axis as it is: one of another length
+//! than 1 shears.
 //!
 //! **The laser.** Mitsuba has no collimated emitter. As mitransient's users do, a beam is an emitter `projector`
 //! with `fov` ≤ 2° or `spot` with `cutoff_angle` ≤ 1°, along +z of its `to_world`; several make a grid, and all

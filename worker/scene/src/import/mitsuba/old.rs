@@ -1,4 +1,5 @@
-//! Files of Mitsuba before version 2, with the names of today: what Mitsuba itself does when it reads them.
+//! Files of Mitsuba before version 2, with the names of today: what Mitsuba itself does when it
+//! reads them.
 
 use crate::import::quoted;
 

@@ -1,5 +1,5 @@
-//! Which properties each plugin has. As in Mitsuba, a property that nothing uses is an error: what a file states must not
-//! get lost in silence.
+//! Which properties each plugin has. As in Mitsuba, a property that nothing uses is an error: what
+//! a file states must not get lost in silence.
 
 use super::{
     Reader,

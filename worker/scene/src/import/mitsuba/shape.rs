@@ -20,8 +20,8 @@ pub(super) struct Geometry {
     pub(super) positions: Vec<Vec3>,
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Where the origin of `positions` lies in the file's coordinates: files far from theirs are moved before they are
-    /// rounded.
+    /// The origin of `positions` in the file's coordinates. A mesh far from its origin is moved
+    /// before it is rounded.
     pub(super) origin: [f64; 3],
     /// Keys and texts of notes.
     notes: BTreeMap<String, String>,

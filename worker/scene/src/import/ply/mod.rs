@@ -153,7 +153,8 @@ fn frame(mesh: &Mesh) -> Option<Camera> {
     Some(camera)
 }
 
-/// Reads a whole file; the message names the element and quotes nothing: the file may be something else.
+/// Reads a whole file; the message names the element and quotes nothing: the file may be something
+/// else.
 pub(super) fn parse(bytes: &[u8]) -> Result<Ply, String> {
     if !is_ply(bytes) {
         return Err("is not PLY: its first line is not `ply`".into());
@@ -249,7 +250,8 @@ impl Ply {
         Ok(())
     }
 
-    /// Vertices that no face has are no part of the surface, and must not decide where a camera stands.
+    /// Vertices that no face has are no part of the surface, and must not decide where a camera
+    /// stands.
     fn drop_stray_vertices(&mut self) {
         let mut places = vec![u32::MAX; self.positions.len()];
         for v in self.triangles.iter().flatten() {
