@@ -146,6 +146,16 @@ impl Watched {
         }
     }
 
+    /// ‖draw of the two-bounce part's error‖² by watched pixel.
+    pub fn two_draws(&self) -> Vec<f64> {
+        let inside = 1..self.slots.max(2) - 1;
+        let each = self.two.chunks(self.slots).map(|two| {
+            let two = two[inside.clone()].iter();
+            two.map(|&x| f64::from(x).powi(2)).sum()
+        });
+        each.collect()
+    }
+
     /// Draws of the watched pixels' errors after so many passes. With fewer than eight of them the 3+ part's variance, which
     /// `multi_variance` says by pixel of the region, stands in their place.
     pub fn draws(&self, passes: u32, multi_variance: impl Fn(usize) -> f64) -> Vec<Draw> {

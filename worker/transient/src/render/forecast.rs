@@ -168,6 +168,7 @@ fn look(frame: &Frame, passes: u32) -> Found {
     let order = Order {
         first: u32::MAX - PASSES,
         count: passes,
+        two: true,
     };
     let found: Vec<Looked> = regions
         .par_iter()

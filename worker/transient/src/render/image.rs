@@ -57,8 +57,63 @@ pub(super) struct Image {
     tile_overflow: Vec<f64>,
     /// Draws of the errors of each tile's watched pixels.
     tile_draws: Vec<Vec<Draw>>,
+    /// Of two bounces alone, by tile: the light, where later rounds may need it, variance of the energy, and ‖draw‖².
+    tile_two: Vec<OfTwo>,
     width: usize,
     bins: usize,
+}
+
+/// What of a tile's two-bounce part is kept apart.
+#[derive(Debug, Clone, Default)]
+struct OfTwo {
+    light: Vec<(u32, f32)>,
+    total_variance: f64,
+    draws: Vec<f64>,
+}
+
+/// What a round does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Round {
+    /// Passes.
+    pub passes: u32,
+    /// It samples the two-bounce part as well. Else that stays what it is.
+    pub two: bool,
+    /// Later ones may leave the two-bounce part as it is.
+    pub keeps: bool,
+}
+
+impl OfTwo {
+    /// Joins the light of another round: `a` times what there is, and `b` times that.
+    fn join(&mut self, a: f32, b: f32, new: Vec<(u32, f32)>) {
+        if a == 0.0 {
+            self.light = new;
+            return;
+        }
+        let old = std::mem::take(&mut self.light);
+        let scaled = |list: Vec<(u32, f32)>, factor: f32| {
+            list.into_iter().map(move |(at, v)| (at, factor * v))
+        };
+        self.light = scaled(old, a).chain(scaled(new, b)).collect();
+        self.light.sort_by_key(|(at, _)| *at);
+        self.light.dedup_by(|next, kept| {
+            let same = next.0 == kept.0;
+            if same {
+                kept.1 += next.1;
+            }
+            same
+        });
+    }
+}
+
+impl From<u32> for Round {
+    /// The only round of a render.
+    fn from(passes: u32) -> Self {
+        Self {
+            passes,
+            two: true,
+            keeps: false,
+        }
+    }
 }
 
 /// A range of tiles taken out of an image.
@@ -198,6 +253,7 @@ impl Image {
             tile_spread: vec![Spread::default(); tiles.len()],
             tile_overflow: vec![0.0; tiles.len()],
             tile_draws: vec![vec![]; tiles.len()],
+            tile_two: vec![OfTwo::default(); tiles.len()],
             tiles,
             width: width as usize,
             bins,
@@ -317,19 +373,20 @@ impl Image {
         true
     }
 
-    /// `wave` more passes over a range of the tiles. Returns the rays traced.
+    /// One more round over a range of the tiles. Returns the rays traced.
     pub fn round(
         &mut self,
         frame: &Frame,
         range: Range<usize>,
-        wave: u32,
+        round: Round,
         watch: &Watch,
     ) -> Result<u64, RenderError> {
         let tiles = self.tiles.clone();
         let count = range.len();
         let order = Order {
             first: self.passes,
-            count: wave,
+            count: round.passes,
+            two: round.two,
         };
         let image = Mutex::new(&mut *self);
         // As many as threads, for the whole round: their buffers are large, and new memory is dear.
@@ -343,7 +400,7 @@ impl Image {
                 let known = lock(&idle).pop();
                 let mut renderer = known.unwrap_or_else(|| TileRenderer::new(frame));
                 renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
-                lock(&image).join(frame, t, &renderer.done);
+                lock(&image).join(frame, t, round, &mut renderer.done);
                 watch.tiles.fetch_add(1, Ordering::Relaxed);
                 let rays = renderer.done.rays;
                 lock(&idle).push(renderer);
@@ -354,8 +411,11 @@ impl Image {
         for r in rays {
             all += r.ok_or(RenderError::Stopped)?;
         }
-        self.two_unit = frame.sampling.joined((self.passes, self.two_unit), wave);
-        self.passes += wave;
+        if round.two {
+            let before = (self.passes, self.two_unit);
+            self.two_unit = frame.sampling.joined(before, round.passes);
+        }
+        self.passes += round.passes;
         self.total();
         Ok(all)
     }
@@ -368,7 +428,11 @@ impl Image {
     }
 
     /// Joins a tile's new passes to its earlier ones, each weighed by its passes.
-    fn join(&mut self, frame: &Frame, t: usize, done: &Done) {
+    fn join(&mut self, frame: &Frame, t: usize, round: Round, done: &mut Done) {
+        if !round.two {
+            done.put_two(&self.tile_two[t].light);
+        }
+        let done = &*done;
         let (film, region, bins) = (frame.film, self.tiles[t], self.bins);
         let spent = f64::from(self.passes);
         let new = if spent == 0.0 {
@@ -381,6 +445,9 @@ impl Image {
         let unit = f64::from(frame.walk.world.scale) * f64::from(frame.walk.world.scale);
         let unit2 = unit * unit;
         let blend = |old: f64, x: f64| old * a * a + x * b * b;
+        // A single pass does not tell how far it is off; those before it do.
+        let alone = done.passes == 1 && !round.two;
+        let blend_multi = |old: f64, x: f64| if alone { old * a } else { blend(old, x) };
         for k in 0..region.pixels() {
             let row = region.row as usize + k / region.cols as usize;
             let col = region.col as usize + k % region.cols as usize;
@@ -400,12 +467,20 @@ impl Image {
                         let old = f64::from(old);
                         blend(old * old, x * unit2).sqrt() as f32
                     };
-                    s.two[at] = mean(s.two[at], m.two);
-                    s.two_se[at] = error(s.two_se[at], m.two_variance);
-                    s.two_noise[at] = mean(s.two_noise[at], done.two_noise(film, k, bin + 1));
+                    if round.two {
+                        s.two[at] = mean(s.two[at], m.two);
+                        s.two_se[at] = error(s.two_se[at], m.two_variance);
+                        s.two_noise[at] = mean(s.two_noise[at], done.two_noise(film, k, bin + 1));
+                    }
                     s.multi[at] = mean(s.multi[at], m.multi);
-                    s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
-                    s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
+                    if alone {
+                        let less = a.sqrt() as f32;
+                        s.multi_noise[at] *= less;
+                        s.multi_se[at] *= less;
+                    } else {
+                        s.multi_noise[at] = mean(s.multi_noise[at], done.noise(film, k, bin + 1));
+                        s.multi_se[at] = error(s.multi_se[at], m.multi_variance);
+                    }
                 }
             }
             for (g, group) in self.groups.iter_mut().enumerate() {
@@ -418,21 +493,48 @@ impl Image {
             (stat.two_variance, stat.multi_variance) = done.pixel_variance(k);
             let old = self.stats[pixel];
             self.stats[pixel] = Stat {
-                two_variance: blend(old.two_variance, stat.two_variance * unit2),
-                multi_variance: blend(old.multi_variance, stat.multi_variance * unit2),
+                two_variance: match round.two {
+                    true => blend(old.two_variance, stat.two_variance * unit2),
+                    false => old.two_variance,
+                },
+                multi_variance: blend_multi(old.multi_variance, stat.multi_variance * unit2),
                 ..stat
             };
         }
         // Errors of rounds are independent: on average their squares add up.
         let draws = &mut self.tile_draws[t];
         draws.resize(draws::count(&region), Draw::default());
-        for (old, new) in draws.iter_mut().zip(done.draws()) {
+        let two = &mut self.tile_two[t];
+        two.draws.resize(draws.len(), 0.0);
+        let of_two = two.draws.iter().copied();
+        for ((old, new), of_two) in draws.iter_mut().zip(done.draws()).zip(of_two) {
+            // Of two bounces what there was stays, where no more was sampled.
+            let stays = if round.two { 0.0 } else { of_two };
             for (old, new) in old.iter_mut().zip(new) {
-                *old = blend(*old, new * unit2);
+                *old = match alone {
+                    true => stays * (1.0 - a) + *old * a,
+                    false => stays * (1.0 - a * a) + blend(*old, new * unit2),
+                };
             }
         }
-        let before = self.tile_spread[t].scaled(a);
-        self.tile_spread[t] = before.plus(done.total_spread().scaled(unit * b));
+        let stays = if round.two { 0.0 } else { two.total_variance };
+        let mut before = self.tile_spread[t];
+        before.variance = (before.variance - stays).max(0.0);
+        let mut joined = match alone {
+            true => before.scaled(a.sqrt()),
+            false => before.scaled(a).plus(done.total_spread().scaled(unit * b)),
+        };
+        joined.variance += stays;
+        self.tile_spread[t] = joined;
+        if round.two {
+            two.total_variance = blend(two.total_variance, done.two_total_variance() * unit2);
+            for (old, new) in two.draws.iter_mut().zip(done.two_draws()) {
+                *old = blend(*old, new * unit2);
+            }
+            if round.keeps {
+                two.join(a as f32, b as f32, done.take_two());
+            }
+        }
         self.tile_overflow[t] = self.tile_overflow[t] * a + done.overflow(film) * unit * b;
     }
 }

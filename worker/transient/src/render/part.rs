@@ -142,7 +142,7 @@ pub fn render_part(
         let (found, rays) = if index < of {
             let mut image = Image::new(frame)?;
             let range = which.range(image.tiles());
-            let rays = image.round(frame, range.clone(), shape.passes, &watch)?;
+            let rays = image.round(frame, range.clone(), shape.passes.into(), &watch)?;
             (Found::Tiles(image.take(range)), rays)
         } else if let Some(sources) = Sources::of(frame) {
             let mut splats = Splats::new(frame);

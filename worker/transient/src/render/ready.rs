@@ -3,7 +3,7 @@
 
 use picofarm_scene::{Scene, Spot};
 
-use super::{FIRST_PASSES, MAX_PASSES, image::Image, splat::Splats, tile::Frame, warn};
+use super::{FIRST_PASSES, MAX_PASSES, dark::dark, image::Image, splat::Splats, tile::Frame, warn};
 use crate::{
     api::{
         AtWavelength, Budget, ErrorEstimate, GroundTruth, Overflow, Plan, RenderError, Rendered,
@@ -42,6 +42,8 @@ pub(super) struct Ready<'a> {
     pub frame: Frame<'a>,
     centres: &'a Centres,
     spots: &'a [Option<Spot>],
+    /// No light comes into the gate, so that none is looked for.
+    is_dark: bool,
     /// The spots as sources: those that light the image unless the beams have a width.
     middles: &'a Emitters,
 }
@@ -74,6 +76,15 @@ pub(super) fn prepare<R>(
             ),
         });
     }
+    // Where no light comes into the gate none is looked for.
+    let is_dark = dark(
+        &world,
+        emitters,
+        &settings.gate,
+        settings.max_bounces.unwrap_or(u32::MAX),
+    );
+    let none = Emitters::none();
+    let emitters = if is_dark { &none } else { emitters };
     let mirrors = if settings.strategy.mirror_images.unwrap_or(true) {
         Mirrors::find(&world, emitters, stop)
     } else {
@@ -139,7 +150,7 @@ pub(super) fn prepare<R>(
         _ => Contacts::find(&world, emitters),
     };
     walk.contacts = contacts.as_ref();
-    let glass = ByGlass::find(&walk, &centres, stop)?;
+    let glass = ByGlass::find((&walk, &film), &centres, stop)?;
     walk.glass = glass.as_ref();
     let frame = Frame {
         walk,
@@ -164,6 +175,7 @@ pub(super) fn prepare<R>(
         frame,
         centres: &centres,
         spots: &spots,
+        is_dark,
         middles: &middles,
     })
 }
@@ -192,7 +204,12 @@ impl Ready<'_> {
     /// What the renderer decides to do, beginning with so many passes.
     pub fn plan(&self, passes: u32) -> Plan {
         let sampling = (self.frame.sampling, passes);
-        decide(self.scene, self.settings, &self.frame.walk, sampling)
+        let mut plan = decide(self.scene, self.settings, &self.frame.walk, sampling);
+        if self.is_dark {
+            let none = "no light comes into the gate: none is looked for, and the overflow is a lower bound";
+            plan.approximations.push(none.into());
+        }
+        plan
     }
 
     /// The ground truth, and the rays it took.

@@ -34,6 +34,8 @@ pub(super) struct Frame<'a> {
 pub(super) struct Order {
     pub first: u32,
     pub count: u32,
+    /// The two-bounce part is sampled; else the caller has it from an earlier round.
+    pub two: bool,
 }
 
 /// Renders one tile after another in buffers that it keeps: one for each thread.
@@ -213,9 +215,34 @@ impl Done {
     /// sum of theirs.
     pub fn total_spread(&self) -> Spread {
         Spread::of(&self.all).plus(Spread {
-            variance: self.two_total_variance.iter().sum(),
+            variance: self.two_total_variance(),
             of_variance: 0.0,
         })
+    }
+
+    /// Variance of the tile's energy of two bounces.
+    pub fn two_total_variance(&self) -> f64 {
+        self.two_total_variance.iter().sum()
+    }
+
+    /// ‖draw of the two-bounce part's error‖² of the watched pixels.
+    pub fn two_draws(&self) -> Vec<f64> {
+        self.watched.two_draws()
+    }
+
+    /// The two-bounce part, where there is any: place among all slots, and value.
+    pub fn take_two(&self) -> Vec<(u32, f32)> {
+        let each = (0u32..).zip(&self.two);
+        each.filter(|(_, v)| **v != 0.0)
+            .map(|(at, v)| (at, *v))
+            .collect()
+    }
+
+    /// Puts the two-bounce part of an earlier round in.
+    pub fn put_two(&mut self, two: &[(u32, f32)]) {
+        for &(at, v) in two {
+            self.two[at as usize] = v;
+        }
     }
 
     /// Energy outside the gate.
@@ -260,7 +287,9 @@ impl TileRenderer {
         let rays = self.scratch.stack.rays;
         self.done.reset(frame.film, region, frame.split);
         self.held.resize(self.done.alternating.len(), 0.0);
-        self.two(frame, region, order, go_on)?;
+        if order.two {
+            self.two(frame, region, order, go_on)?;
+        }
         while self.done.passes < order.count {
             if !go_on(self.done.passes as f32 / order.count as f32) {
                 return None;
