@@ -1,5 +1,7 @@
 //! What rooms of a data set cost: furnished rooms of seeds that nothing was tuned by, rendered to an error on one thread.
 
+use std::path::PathBuf;
+
 use picofarm_scene::{
     AssetLibrary,
     furnished::{self, FurnishedSettings},
@@ -13,9 +15,10 @@ const SPOTS: u32 = 25;
 /// Scenes of the data set that the mean is scaled to.
 const DATA_SET: f64 = 97_432.0;
 
-/// Renders as many rooms with a library's furniture, and prints each and the mean and spread over all.
-pub fn run(library: &str, (count, pixels): (u32, u32), error: f64) {
-    let library = AssetLibrary::find(library, &[]).unwrap_or_else(|e| {
+/// Renders as many rooms with a library's furniture, which lies in `folder` if not where it is installed, and prints each and the mean and spread over all.
+pub fn run(library: &str, folder: Option<&String>, (count, pixels): (u32, u32), error: f64) {
+    let folders: Vec<PathBuf> = folder.map(PathBuf::from).into_iter().collect();
+    let library = AssetLibrary::find(library, &folders).unwrap_or_else(|e| {
         eprintln!("rooms: {e}");
         std::process::exit(1);
     });

@@ -249,10 +249,21 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         let foot = v(-2.0, -1.5 + 0.075 * k as f32, -2.6);
         quad(foot, v(4.0, 0.0, 0.0), v(0.0, 0.03, 0.05), grey(0.6))
     }));
+    // The laser stands in the other room.
+    let lit_by_door = |width: f32, spots: &[Vec3]| {
+        let mut objects = walls();
+        objects.extend([partition(-2.0, -width), partition(width, 2.0)]);
+        let mut scene = scene(objects, pixels, spots);
+        scene.laser.origin = v(1.2, 0.2, -3.2);
+        scene
+    };
+    let aside = [v(0.8, 0.1, -0.3), v(0.5, -0.6, -0.4), v(0.6, 0.7, 0.1)];
     let squares: Vec<Object> = walls().iter().map(squared).collect();
 
     let mut all: Vec<(String, Scene)> = [
         ("door", scene(door, pixels, &through)),
+        ("lit-by-door", lit_by_door(0.35, &aside)),
+        ("ajar", lit_by_door(0.06, &aside[..1])),
         ("blinds", scene(blinds, pixels, &BEAMS)),
         ("squares", scene(squares, pixels, &BEAMS)),
         ("everything", scene(everything, pixels, &BEAMS)),
