@@ -40,9 +40,6 @@ const FIRST_PASSES: u32 = 2;
 /// Least passes of a round that samples two bounces again, and of one that is bound in time: how far a single pass is off nothing
 /// tells but those before it.
 const LEAST_ROUND: u32 = 2;
-/// How many passes of light of three bounces and more sampling two bounces takes as long as, about: in furnished rooms of 256×256 pixels
-/// and 25 spots the rays of 1.7.
-const STRATA: u32 = 2;
 /// Share of the progress that the first round counts for.
 const FIRST_SHARE: f32 = 0.3;
 /// How much longer than all before it a round of a render that is bound in time may be: each tells how long the next will take.
@@ -173,7 +170,8 @@ fn whole(
             break error;
         };
         let target = target as f32;
-        wave = further(&errors, frame.sampling, target, stop)?;
+        let strata_cost = |n| image.strata_cost(frame.sampling, n);
+        wave = further(&errors, (frame.sampling, &strata_cost), target, stop)?;
         wave.keeps = keeps;
     };
     let plan = ready.plan(passes);
@@ -189,11 +187,11 @@ fn in_time((began, left): (f64, f64), round: u32) -> u32 {
 }
 
 /// What more the median error of the image needs to reach `target`: passes, and whether two bounces are sampled again, whichever takes
-/// less. All tiles get as many: to give those with larger errors more, up to twice as many, took up to a half more time to the
+/// fewer rays. All tiles get as many: to give those with larger errors more, up to twice as many, took up to a half more time to the
 /// same median, and as long to the same 95th percentile.
 fn further(
     errors: &Errors,
-    sampling: &Sampling,
+    (sampling, strata_cost): (&Sampling, &dyn Fn(u32) -> u32),
     target: f32,
     stop: Stop,
 ) -> Result<Round, RenderError> {
@@ -213,7 +211,7 @@ fn further(
     };
     let (alone, again) = (passes(false), passes(true));
     stop.check()?;
-    let two = again.saturating_add(STRATA) < alone;
+    let two = again.saturating_add(strata_cost(again)) < alone;
     Ok(Round {
         passes: if two { again } else { alone },
         two,

@@ -29,11 +29,44 @@ fn r2(start: (u32, u32), k: u64) -> (f32, f32) {
     (turn(start.0, STEPS.0), turn(start.1, STEPS.1))
 }
 
-/// Where in a pixel its camera path `k` begins, over all passes: spread evenly, as much of the light in a bin depends on it.
+/// Where in a pixel its camera path `k` begins, over all passes: spread evenly, as much of the light in a bin depends on it. Points of
+/// Sobol's sequence, whose digits each pixel scrambles by itself (Owen 1995, by the hash of Burley, JCGT 2020). The steps of an R₂
+/// sequence are all alike: where what a pixel sees repeats itself seven times along it, each began where the last one had, and passes
+/// that agree for that reason state an error that is a seventh of the true one. Scrambled points do no worse than random ones
+/// whatever is seen.
 #[inline]
 pub(crate) fn place(seed: u64, pixel: u64, k: u64) -> (f32, f32) {
     let mut rng = Rng::new(seed, Stream::Place, pixel, 0);
-    r2((rng.next_u32(), rng.next_u32()), k)
+    // Casting cuts: the sequence begins again after 2³² paths.
+    let k = k as u32;
+    let x = scrambled(k.reverse_bits(), rng.next_u32());
+    let y = scrambled(sobol(k), rng.next_u32());
+    let unit = |x: u32| (x >> 8) as f32 * (1.0 / 16_777_216.0);
+    (unit(x), unit(y))
+}
+
+/// The second dimension of Sobol's sequence; the first is the index with its bits reversed.
+#[inline]
+fn sobol(mut k: u32) -> u32 {
+    let (mut x, mut column) = (0, 1u32 << 31);
+    while k != 0 {
+        if k & 1 == 1 {
+            x ^= column;
+        }
+        column ^= column >> 1;
+        k >>= 1;
+    }
+    x
+}
+
+/// Flips each binary digit, or not, by a hash of those before it.
+#[inline]
+fn scrambled(x: u32, seed: u32) -> u32 {
+    let mut x = x.reverse_bits().wrapping_add(seed);
+    for factor in [0x6c50_b47c, 0xb82f_1e52, 0xc7af_e638, 0x8d22_f6e6] {
+        x ^= x.wrapping_mul(factor);
+    }
+    x.reverse_bits()
 }
 
 impl Turns {
@@ -104,6 +137,47 @@ mod tests {
             // Sixteen each. Random numbers would be off by more than three in a third of the 32 rows and columns.
             prop_assert!(cells.as_flattened().iter().all(|c| (11..=22).contains(c)), "{cells:?}");
             prop_assert!(rows.iter().chain(&columns).all(|c| (c - 16).abs() <= 3), "{rows:?} {columns:?}");
+        }
+    }
+
+    /// Variance of the mean over passes of what pixels see, over what passes that are compared with each other state for it.
+    fn true_over_stated(passes: u64, sees: impl Fn((f32, f32), (f32, f32)) -> f32) -> f64 {
+        const PIXELS: u64 = 1000;
+        let (mut found, mut stated) = (0.0, 0.0);
+        for pixel in 0..PIXELS {
+            let phase = place(77, pixel, 0);
+            let see = |at| f64::from(sees(at, phase));
+            let each: Vec<f64> = (0..passes).map(|k| see(place(1, pixel, k))).collect();
+            let n = passes as f64;
+            let mean = each.iter().sum::<f64>() / n;
+            let square = each.iter().map(|x| (x - mean).powi(2)).sum::<f64>();
+            stated += square / (n * (n - 1.0));
+            let grid = |i: u64| (i as f32 + 0.5) / 64.0;
+            let all = (0..64).flat_map(|i| (0..64).map(move |j| see((grid(i), grid(j)))));
+            found += (mean - all.sum::<f64>() / 4096.0).powi(2);
+        }
+        found / stated
+    }
+
+    #[test]
+    fn passes_over_stripes_and_squares_of_any_width_state_no_less_than_their_error() {
+        let odd = |x: f32| x.rem_euclid(2.0) >= 1.0;
+        for times in [3.0f32, 4.0, 6.0, 7.0] {
+            for passes in [2, 4, 8, 13] {
+                let stripes = true_over_stated(passes, |at, phase| {
+                    f32::from(odd(2.0 * (at.1 * times + phase.1)))
+                });
+                let squares = true_over_stated(passes, |at, phase| {
+                    let (x, y) = (at.0 * times + phase.0, at.1 * times + phase.1);
+                    f32::from(odd(2.0 * x) != odd(2.0 * y))
+                });
+                println!("{times} times, {passes} passes: {stripes:.2} {squares:.2}");
+                // With the R₂ sequence stripes came to 40 to 50 at seven times, squares to 2 to 3 at three.
+                assert!(
+                    stripes < 2.5 && squares < 2.5,
+                    "{times} times, {passes} passes"
+                );
+            }
         }
     }
 

@@ -123,7 +123,7 @@ fn within(seconds: u64, budget: Budget) -> Rendered {
 fn a_render_bound_in_time_uses_what_there_is_and_states_the_error_reached() {
     let budget = Budget::Samples(1 << 20);
     let (short, long) = (within(1, budget), within(6, budget));
-    assert_eq!(short.error.samples, 4);
+    assert_eq!(short.error.samples, 2);
     // Rounds of one second each, of up to three times the passes of all before: 4, 12, 48.
     assert!(long.error.samples >= 16, "{}", long.error.samples);
     assert!(long.error.median_relative < 0.8 * short.error.median_relative);

@@ -56,13 +56,13 @@ fn flaked() -> Material {
     }
 }
 
-/// A wall with black and white squares of 2 cm.
-fn squared(wall: &Object) -> Object {
+/// A wall with black and white squares.
+fn squared(wall: &Object, size: f32) -> Object {
     let texels = vec![[20; 3], [235; 3], [235; 3], [20; 3]];
     let texture = Texture::new("squares", 2, 2, texels, Wrap::Repeat).expect("four texels");
     let mut mesh = (*wall.mesh).clone();
     let [corner, right, _, up] = [0, 1, 2, 3].map(|k| mesh.positions[k]);
-    let times = |side: Vec3| side.length() / 0.04;
+    let times = |side: Vec3| side.length() / (2.0 * size);
     let (x, y) = (times(right - corner), times(up - corner));
     mesh.uv = vec![[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]];
     for m in &mut mesh.materials {
@@ -258,14 +258,19 @@ pub fn all(pixels: u32) -> Vec<(String, Scene)> {
         scene
     };
     let aside = [v(0.8, 0.1, -0.3), v(0.5, -0.6, -0.4), v(0.6, 0.7, 0.1)];
-    let squares: Vec<Object> = walls().iter().map(squared).collect();
+    let squares = |side: f32| {
+        let all = walls().iter().map(|wall| squared(wall, side)).collect();
+        scene(all, pixels, &BEAMS)
+    };
 
     let mut all: Vec<(String, Scene)> = [
         ("door", scene(door, pixels, &through)),
         ("lit-by-door", lit_by_door(0.35, &aside)),
         ("ajar", lit_by_door(0.06, &aside[..1])),
         ("blinds", scene(blinds, pixels, &BEAMS)),
-        ("squares", scene(squares, pixels, &BEAMS)),
+        ("squares", squares(0.02)),
+        ("squares-4", squares(0.042)),
+        ("squares-7", squares(0.024)),
         ("everything", scene(everything, pixels, &BEAMS)),
         ("coated", scene(coated, pixels, &BEAMS)),
         ("angled", scene(angled, pixels, &BEAMS)),

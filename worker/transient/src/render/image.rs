@@ -17,7 +17,10 @@ use super::{
     region::Region,
     tile::{Done, Frame, Order, TileRenderer},
 };
-use crate::api::{Progress, RenderError};
+use crate::{
+    api::{Progress, RenderError},
+    two_bounce::Sampling,
+};
 
 /// Side of a tile in pixels: of a large image, and of a small one or one with many histograms a pixel.
 /// A larger tile cuts fewer of the squares that share vertices at its edges, and takes more memory.
@@ -59,6 +62,11 @@ pub(super) struct Image {
     tile_draws: Vec<Vec<Draw>>,
     /// Of two bounces alone, by tile: the light, where later rounds may need it, variance of the energy, and ‖draw‖².
     tile_two: Vec<OfTwo>,
+    /// Rays of the last strata of two bounces, and those of all passes of more.
+    two_rays: u64,
+    multi_rays: u64,
+    /// Passes that the last strata were made for.
+    strata_for: u32,
     width: usize,
     bins: usize,
 }
@@ -254,6 +262,9 @@ impl Image {
             tile_overflow: vec![0.0; tiles.len()],
             tile_draws: vec![vec![]; tiles.len()],
             tile_two: vec![OfTwo::default(); tiles.len()],
+            two_rays: 0,
+            multi_rays: 0,
+            strata_for: 0,
             tiles,
             width: width as usize,
             bins,
@@ -263,6 +274,15 @@ impl Image {
     /// How many tiles there are.
     pub fn tiles(&self) -> usize {
         self.tiles.len()
+    }
+
+    /// How many passes sampling two bounces takes as many rays as, in a round of so many.
+    pub fn strata_cost(&self, sampling: &Sampling, passes: u32) -> u32 {
+        let side = |n: u32| f64::from(sampling.sides(n).0);
+        let more = (side(passes) / side(self.strata_for)).powi(2);
+        let of_pass = self.multi_rays as f64 / f64::from(self.passes.max(1));
+        // Casting saturates.
+        (more * self.two_rays as f64 / of_pass.max(1.0)).round() as u32
     }
 
     /// The errors of what was found so far.
@@ -391,7 +411,7 @@ impl Image {
         let image = Mutex::new(&mut *self);
         // As many as threads, for the whole round: their buffers are large, and new memory is dear.
         let idle: Mutex<Vec<TileRenderer>> = Mutex::default();
-        let rays: Vec<Option<u64>> = range
+        let rays: Vec<Option<(u64, u64)>> = range
             .into_par_iter()
             .map(|t| {
                 if watch.stopped.load(Ordering::Relaxed) {
@@ -402,16 +422,20 @@ impl Image {
                 renderer.render(frame, &tiles[t], &order, &|share| watch.ask(count, share))?;
                 lock(&image).join(frame, t, round, &mut renderer.done);
                 watch.tiles.fetch_add(1, Ordering::Relaxed);
-                let rays = renderer.done.rays;
+                let rays = (renderer.done.rays, renderer.done.two_rays);
                 lock(&idle).push(renderer);
                 Some(rays)
             })
             .collect();
-        let mut all = 0;
+        let (mut all, mut two) = (0, 0);
         for r in rays {
-            all += r.ok_or(RenderError::Stopped)?;
+            let (of_tile, of_two) = r.ok_or(RenderError::Stopped)?;
+            all += of_tile;
+            two += of_two;
         }
+        self.multi_rays += all - two;
         if round.two {
+            (self.two_rays, self.strata_for) = (two, round.passes);
             let before = (self.passes, self.two_unit);
             self.two_unit = frame.sampling.joined(before, round.passes);
         }

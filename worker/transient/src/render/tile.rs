@@ -78,7 +78,9 @@ pub(super) struct Done {
     all: Vec<f64>,
     pooling: Pool,
     pub passes: u32,
+    /// All rays, and those of two bounces.
     pub rays: u64,
+    pub two_rays: u64,
 }
 
 /// What a tile tells of one channel-0 slot of one pixel.
@@ -290,6 +292,7 @@ impl TileRenderer {
         if order.two {
             self.two(frame, region, order, go_on)?;
         }
+        self.done.two_rays = self.scratch.stack.rays - rays;
         while self.done.passes < order.count {
             if !go_on(self.done.passes as f32 / order.count as f32) {
                 return None;
