@@ -78,11 +78,7 @@ impl Sampling {
     /// passes so that neither part of the histogram is much noisier than the other, and are those of eight where there are fewer:
     /// they cost little beside them. `passes` = 0 is a render of two bounces only.
     pub fn sides(&self, passes: u32) -> (u32, u32) {
-        let least = std::env::var("STRATA_LEAST")
-            .ok()
-            .and_then(|x| x.parse().ok())
-            .unwrap_or(8);
-        let passes = if passes == 0 { 64 } else { passes.max(least) };
+        let passes = if passes == 0 { 64 } else { passes.max(8) };
         let side = self.base * libm::powf(passes as f32 / 16.0, 0.4);
         let side = 2 * (0.5 * side).round().clamp(1.0, 16.0) as u32;
         (side, (4 * side).min(64))
