@@ -56,6 +56,8 @@ use crate::{
 /// Camera paths of a pass by way of near-mirrors alone, where a pixel sees one: few of them meet a narrow lobe that a spot
 /// lights, and a single one in a pass made that light a rare event of many times the image's error.
 const MIRROR_PATHS: u32 = 16;
+/// Marks a pixel's other camera paths where places in it are drawn.
+const OTHERS: u64 = 1 << 63;
 /// Light vertices beyond near-mirrors that a gather point is connected to at most.
 const BEYOND: u32 = 2;
 /// The same of a near-mirror that the camera sees, and how many of a pixel's camera paths there are to one that is connected.
@@ -303,10 +305,16 @@ impl Sharing {
                 true => MIRROR_PATHS,
                 false => 1,
             };
+            // The path to the gather point has a sequence of its own: every sixteenth point of one would stay in one part of the pixel.
             let begin = |j: u32| {
-                let path = tile.pass * u64::from(paths) + u64::from(j);
-                walk.world
-                    .camera_ray((row, col), place(tile.seed, index, path))
+                let place = match j.checked_sub(1) {
+                    None => place(tile.seed, index, tile.pass),
+                    Some(j) => {
+                        let path = tile.pass * u64::from(paths - 1) + u64::from(j);
+                        place(tile.seed, index | OTHERS, path)
+                    }
+                };
+                walk.world.camera_ray((row, col), place)
             };
             let share = |j: u32| Share {
                 spots: 1.0 / paths as f32,
